@@ -3,9 +3,10 @@
     python benchmarks/diagnose_null.py --records 300
     python benchmarks/diagnose_null.py --records 300 --whole
 
-Every record is reduced and calibrated by itself, and its largest held-out gain over steps, trends, events, curves, bands and filters is
-ranked among null records drawn from its own calibration. The ranks must be uniform: a share of 1 % below 1 %. With --whole the
-diagnosis itself runs, and what it claims is counted. Prints a Markdown table, and beside it each record in which something was found.
+Every record is reduced and calibrated by itself, and its largest held-out gain over steps, trends,
+events, curves, bands and filters is ranked among null records drawn from its own calibration. The
+ranks must be uniform: a share of 1 % below 1 %. With --whole the diagnosis itself runs, and what it
+claims is counted. Prints a Markdown table, and beside it each record in which something was found.
 """
 
 from __future__ import annotations
@@ -32,20 +33,32 @@ VIEWS = {"means": mean_evidence, "powers": power_evidence}
 
 def main() -> None:
     """Count, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--records", type=int, default=300, help="records of each kind")
     parser.add_argument("--nulls", type=int, default=400, help="null records for each")
     parser.add_argument("--rates", type=float, nargs="+", default=[10.0, 100.0])
-    parser.add_argument("--lost", type=float, nargs="+", default=[0.0, 0.3], help="share of the samples that is missing")
-    parser.add_argument("--whole", action="store_true", help="run the whole diagnosis (slow) in place of the gains")
+    parser.add_argument(
+        "--lost",
+        type=float,
+        nargs="+",
+        default=[0.0, 0.3],
+        help="share of the samples that is missing",
+    )
+    parser.add_argument(
+        "--whole", action="store_true", help="run the whole diagnosis (slow) in place of the gains"
+    )
     options = parser.parse_args()
     kinds = [(rate, lost) for rate in options.rates for lost in options.lost]
     count = whole if options.whole else ranks
-    rows = [row for number, (rate, lost) in enumerate(kinds) for row in count(rate, lost, options, first=number * options.records)]
+    rows = [
+        row
+        for number, (rate, lost) in enumerate(kinds)
+        for row in count(rate, lost, options, first=number * options.records)
+    ]
     if options.whole:
-        head = (
-            "| rate [Hz] | lost | records | named an effect | found a mismatch | 95 % bound of the share that is named | seconds a record |"
-        )
+        head = "| rate [Hz] | lost | records | named an effect | found a mismatch | 95 % bound of the share that is named | seconds a record |"
     else:
         head = "| rate [Hz] | lost | in | noise | p < 0.01 | p < 0.05 | p < 0.1 | uniform (Kolmogorov-Smirnov) | gain at 99 %: null, raw |"
     said = f"{machine()}; {options.records} records of 1 h, one axis, N = 0.003, B = 0.004, K = 0.02; {options.nulls} null records each."
@@ -55,11 +68,18 @@ def main() -> None:
 def logs(rate: float, lost: float, seeds: range) -> Iterator[tuple[int, xr.Dataset]]:
     """Noise with random gaps."""
     for seed in seeds:
-        log = simulate({"log": {"axes": ["x"]}, "noise": NOISE}, duration="1h", rate=rate, seed=seed).compute()
+        log = simulate(
+            {"log": {"axes": ["x"]}, "noise": NOISE}, duration="1h", rate=rate, seed=seed
+        ).compute()
         gone = np.random.default_rng(seed).random(log.sizes["time"]) < lost
         yield (
             seed,
-            log.assign(rate=log["rate"].where(xr.DataArray(~gone, dims="time")).transpose("axis", "time").assign_attrs(log["rate"].attrs)),
+            log.assign(
+                rate=log["rate"]
+                .where(xr.DataArray(~gone, dims="time"))
+                .transpose("axis", "time")
+                .assign_attrs(log["rate"].attrs)
+            ),
         )
 
 
@@ -82,7 +102,10 @@ def candidates(reduced: xr.Dataset) -> dict[str, dict[str, list[np.ndarray]]]:
         "trend": [t[:, None] * flat],
         "event": [one[:, None] * flat for one in events],
         "filter": [-(x**power) * flat for power in (4, 8)],
-        "band": [np.exp(-0.5 * ((x - place) / 0.07) ** 2) * events[1][:, None] for place in (0.5, 0.7, 0.9)],
+        "band": [
+            np.exp(-0.5 * ((x - place) / 0.07) ** 2) * events[1][:, None]
+            for place in (0.5, 0.7, 0.9)
+        ],
         "curve": [curves[:, None, :] * flat[..., None]],
     }
     return {"means": means, "powers": powers}
@@ -94,14 +117,29 @@ def ranks(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
     for seed, log in logs(rate, lost, range(first, first + options.records)):
         reduced = reduce_log(log)
         baseline = calibrate_noise(reduced)
-        chunks = list(null_records(reduced, baseline, count=options.nulls, rng=np.random.default_rng(seed), chunk=100))
-        nulls = xr.concat(chunks, "record", data_vars="minimal", coords="minimal", compat="override", join="override")
+        chunks = list(
+            null_records(
+                reduced, baseline, count=options.nulls, rng=np.random.default_rng(seed), chunk=100
+            )
+        )
+        nulls = xr.concat(
+            chunks,
+            "record",
+            data_vars="minimal",
+            coords="minimal",
+            compat="override",
+            join="override",
+        )
         for view, tried in candidates(reduced).items():
             for tier in ("free", "calibrated"):
                 own = float(VIEWS[view](reduced, baseline, tried, axis="x", tier=tier).max())
-                others = VIEWS[view](nulls, baseline, tried, axis="x", tier=tier).max("candidate").values
+                others = (
+                    VIEWS[view](nulls, baseline, tried, axis="x", tier=tier).max("candidate").values
+                )
                 p = (1 + int((others >= own).sum())) / (1 + others.size)
-                found.setdefault((view, tier), []).append((p, own, float(np.quantile(others, 0.99))))
+                found.setdefault((view, tier), []).append(
+                    (p, own, float(np.quantile(others, 0.99)))
+                )
     rows = []
     for (view, tier), values in found.items():
         p, own, limit = np.array(values).T
@@ -123,12 +161,20 @@ def whole(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
         named += bool(told.effects)
         found += told.verdict != "no mismatch"
         if told.verdict != "no mismatch":
-            boxes = "; ".join(f"{box['statement']} (p = {box['p_value']:.2g})" for box in told.mismatches)
-            print(f"record {seed}: {told.verdict}; {[one['name'] for one in told.effects]}; {boxes}", file=sys.stderr, flush=True)
+            boxes = "; ".join(
+                f"{box['statement']} (p = {box['p_value']:.2g})" for box in told.mismatches
+            )
+            print(
+                f"record {seed}: {told.verdict}; {[one['name'] for one in told.effects]}; {boxes}",
+                file=sys.stderr,
+                flush=True,
+            )
     levels = np.linspace(0.0, 1.0, 10_001)
     bound = float(levels[binom.cdf(named, options.records, levels) >= 0.05].max())
     seconds = (time.monotonic() - begin) / options.records
-    return [f"| {rate:g} | {lost:g} | {options.records} | {named} | {found} | {bound:.3f} | {seconds:.1f} |"]
+    return [
+        f"| {rate:g} | {lost:g} | {options.records} | {named} | {found} | {bound:.3f} | {seconds:.1f} |"
+    ]
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """Kill, damage, starve and disturb the commands that write, and count what was lost; writes the table of docs/durability.md.
 
-    python benchmarks/durability.py [--kills 50] [--seed 1] [--minutes 8] [--write docs/durability.md]
+    python benchmarks/durability.py [--kills 50] [--seed 1] [--minutes 8] [--write
+    docs/durability.md]
 
-Every trial is a child of this process, which has loaded and compiled all that it needs. A kill is SIGKILL at a moment drawn evenly over
-the time that an undisturbed command takes. The log is short; `gyrostab run` cuts it into parts of one unit of work, so that it has as
-many as a long log.
+Every trial is a child of this process, which has loaded and compiled all that it needs. A kill is
+SIGKILL at a moment drawn evenly over the time that an undisturbed command takes. The log is short;
+`gyrostab run` cuts it into parts of one unit of work, so that it has as many as a long log.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ QUIET = "--quiet-progress"
 WINDOW = ("--window", "4000samples", "--step", "4000samples", "--taus", "12", "--workers", "1")
 DIAGNOSE = ("--nulls", "100", "--seed", "1", "--workers", "1")
 _AFTER_KILL = {"run": " with `--resume`", "diagnose": " (one time in five)"}
-_FINISHED = 5  # one in so many killed diagnoses is made again: it takes long, and begins from nothing
+_FINISHED = (
+    5  # one in so many killed diagnoses is made again: it takes long, and begins from nothing
+)
 START, END = "<!-- durability: begin -->", "<!-- durability: end -->"
 
 
@@ -64,8 +67,13 @@ def write_inputs(folder: Path) -> None:
     rate = 5.0 + rng.standard_normal((1, 1_270_000))
     rate[:, 400_000:405_000] = np.nan
     to_netcdf(make_log(rate, rate=100.0, unit="deg/h", start="2026-05-01"), folder / "log.nc")
-    to_netcdf(make_log(rng.standard_normal((1, 6000)), rate=10.0, unit="deg/h", start="2026-05-01"), folder / "short.nc")
-    rows = "\n".join(f"{i / 100:.2f},{value:.4f}" for i, value in enumerate(rate[0, 500_000:800_000]))
+    to_netcdf(
+        make_log(rng.standard_normal((1, 6000)), rate=10.0, unit="deg/h", start="2026-05-01"),
+        folder / "short.nc",
+    )
+    rows = "\n".join(
+        f"{i / 100:.2f},{value:.4f}" for i, value in enumerate(rate[0, 500_000:800_000])
+    )
     (folder / "log.csv").write_text(f"time [s],gyro_x [deg/h]\n{rows}\n")
 
 
@@ -109,7 +117,11 @@ def call(*arguments: object, before: Callable[[], object] | None = None) -> Outc
 
 
 def read_tree(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def is_hidden(folder: Path, name: str) -> bool:
@@ -123,7 +135,11 @@ class Bench:
     """The inputs, undisturbed outputs, and how long they took."""
 
     def __init__(self, folder: Path, seed: int):
-        self.inputs, self.folder, self.draw = folder / "inputs", folder / "trials", random.Random(seed)
+        self.inputs, self.folder, self.draw = (
+            folder / "inputs",
+            folder / "trials",
+            random.Random(seed),
+        )
         self.inputs.mkdir()
         self.folder.mkdir()
         write_inputs(self.inputs)
@@ -137,7 +153,16 @@ class Bench:
         self.whole, self.seconds = {}, {}
         for name, (command, output) in self.commands.items():
             with contextlib.redirect_stdout(io.StringIO()):
-                assert main([*map(str, command), "-o", str(folder / f"first-{name}{Path(output).suffix}")]) == 0  # loads and compiles
+                assert (
+                    main(
+                        [
+                            *map(str, command),
+                            "-o",
+                            str(folder / f"first-{name}{Path(output).suffix}"),
+                        ]
+                    )
+                    == 0
+                )  # loads and compiles
             begun = time.perf_counter()
             outcome = call(*command, "-o", folder / f"{name}-{output}")
             self.seconds[name] = time.perf_counter() - begun
@@ -154,7 +179,11 @@ class Bench:
 
         found = json.loads((output / "diagnosis.json").read_text())
         found.pop("seconds")
-        return json.dumps(found), (output / "model.toml").read_text(), sorted(path.name for path in output.iterdir())
+        return (
+            json.dumps(found),
+            (output / "model.toml").read_text(),
+            sorted(path.name for path in output.iterdir()),
+        )
 
     @contextlib.contextmanager
     def trial(self) -> Iterator[Path]:
@@ -179,13 +208,25 @@ class Bench:
                 if finish(begun).code != -signal.SIGKILL:
                     continue  # it was faster
                 after = self.content(name, target)
-                strange = [item.name for item in folder.iterdir() if item.name != output and not is_hidden(folder, item.name)]
+                strange = [
+                    item.name
+                    for item in folder.iterdir()
+                    if item.name != output and not is_hidden(folder, item.name)
+                ]
                 flags = again or (["--overwrite"] if after is not None else [])
-                good = after in (None, self.whole[name]) and not strange and read_tree(self.inputs) == inputs
+                good = (
+                    after in (None, self.whole[name])
+                    and not strange
+                    and read_tree(self.inputs) == inputs
+                )
                 outcome = None
                 if name != "diagnose" or trials.count % _FINISHED == 0:
                     outcome = call(*command, "-o", target, *flags)
-                    good = good and outcome.code == 0 and self.content(name, target) == self.whole[name]
+                    good = (
+                        good
+                        and outcome.code == 0
+                        and self.content(name, target) == self.whole[name]
+                    )
                 trials.add(good, f"{name}: left {strange}, {outcome}")
         return trials
 
@@ -215,7 +256,9 @@ class Bench:
         """Cut or flip the files of a killed run, and continue it."""
         kinds = []
         for what in ("cut short", "with one bit flipped"):
-            trials = Trials(f"a file of a killed run {what}, then `--resume`", "the same product, bit for bit")
+            trials = Trials(
+                f"a file of a killed run {what}, then `--resume`", "the same product, bit for bit"
+            )
             for _ in range(count):
                 with self.trial() as folder:
                     target = self.interrupted_run(folder)
@@ -228,7 +271,10 @@ class Bench:
                         content[place] ^= 1 << self.draw.randrange(8)
                     path.write_bytes(content)
                     outcome = call(*self.commands["run"][0], "-o", target, "--resume")
-                    trials.add(outcome.code == 0 and target.read_bytes() == self.whole["run"], f"{path.name} {what}: {outcome}")
+                    trials.add(
+                        outcome.code == 0 and target.read_bytes() == self.whole["run"],
+                        f"{path.name} {what}: {outcome}",
+                    )
             kinds.append(trials)
         return kinds
 
@@ -239,27 +285,51 @@ class Bench:
         mount = self.folder / "small"
         mount.mkdir()
         trials = Trials(
-            "disk full (tmpfs of random size), `run` and `ingest`", "exit code 2, one message, no output, the old output unchanged"
+            "disk full (tmpfs of random size), `run` and `ingest`",
+            "exit code 2, one message, no output, the old output unchanged",
         )
         size = {name: len(self.whole[name]) for name in ("run", "ingest")}
         for number in range(count):
             name = ("run", "ingest")[number % 2]
             command, output = self.commands[name]
             room = int(size[name] * self.draw.uniform(0.1, 0.9)) // 4096 * 4096 + 4096
-            mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", mount], capture_output=True).returncode == 0
+            mounted = (
+                subprocess.run(
+                    ["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", mount],
+                    capture_output=True,
+                ).returncode
+                == 0
+            )
             if not mounted:
-                trials.what = trials.what.replace("tmpfs of random size", "by a limit of the file size")
+                trials.what = trials.what.replace(
+                    "tmpfs of random size", "by a limit of the file size"
+                )
             try:
                 old = mount / output
                 if number % 4 > 1:
                     old.write_text("old")
-                limit = None if mounted else (lambda room=room: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)))
+                limit = (
+                    None
+                    if mounted
+                    else (lambda room=room: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)))
+                )
                 outcome = call(*command, "-o", old, "--overwrite", before=limit)
                 kept = old.read_text() == "old" if number % 4 > 1 else not old.exists()
-                left = [item.name for item in mount.iterdir() if item.name != output and not item.name.endswith(".job")]
-                one = sum(not line.startswith("note: ") for line in outcome.message.splitlines()) == 1
+                left = [
+                    item.name
+                    for item in mount.iterdir()
+                    if item.name != output and not item.name.endswith(".job")
+                ]
+                one = (
+                    sum(not line.startswith("note: ") for line in outcome.message.splitlines()) == 1
+                )
                 trials.add(
-                    outcome.code == 2 and kept and not left and one and "cannot be written" in outcome.message, f"{name}: {left}, {outcome}"
+                    outcome.code == 2
+                    and kept
+                    and not left
+                    and one
+                    and "cannot be written" in outcome.message,
+                    f"{name}: {left}, {outcome}",
                 )
             finally:
                 if mounted:
@@ -271,14 +341,20 @@ class Bench:
 
     def read_only(self) -> Trials:
         """Write into a folder without permission, as another user where this one is root."""
-        trials = Trials("output in a folder without permission to write", "exit code 2, one message, nothing written")
+        trials = Trials(
+            "output in a folder without permission to write",
+            "exit code 2, one message, nothing written",
+        )
         for name, (command, output) in self.commands.items():
             with self.trial() as folder:
                 (folder / "locked").mkdir(mode=0o555)
                 user = (lambda: os.seteuid(65534)) if os.geteuid() == 0 else None
                 self.folder.parent.chmod(0o755), self.folder.chmod(0o755), folder.chmod(0o755)
                 outcome = call(*command, "-o", folder / "locked" / output, before=user)
-                trials.add(outcome.code == 2 and not list((folder / "locked").iterdir()), f"{name}: {outcome}")
+                trials.add(
+                    outcome.code == 2 and not list((folder / "locked").iterdir()),
+                    f"{name}: {outcome}",
+                )
         return trials
 
     def changed_input(self, count: int) -> list[Trials]:
@@ -286,7 +362,8 @@ class Bench:
         kinds = []
         for what in ("changes", "vanishes"):
             trials = Trials(
-                f"an input that {what} during `run` or `ingest`", "exit code 2 and no output, or the whole output of the old input"
+                f"an input that {what} during `run` or `ingest`",
+                "exit code 2 and no output, or the whole output of the old input",
             )
             for number in range(count):
                 name = ("run", "ingest")[number % 2]
@@ -304,8 +381,13 @@ class Bench:
                             file.write(b"9" * 64)
                     outcome = finish(begun)
                     found = self.content(name, folder / output)
-                    good = (outcome.code == 2 and found is None) or (outcome.code == 0 and found == self.whole[name])
-                    trials.add(good and "please report" not in outcome.message, f"{name}, {what}: {outcome}")
+                    good = (outcome.code == 2 and found is None) or (
+                        outcome.code == 0 and found == self.whole[name]
+                    )
+                    trials.add(
+                        good and "please report" not in outcome.message,
+                        f"{name}, {what}: {outcome}",
+                    )
             kinds.append(trials)
         return kinds
 
@@ -314,7 +396,10 @@ class Bench:
         kinds = []
         for name in ("run", "ingest"):
             command, output = self.commands[name]
-            trials = Trials(f"two `{name}` of one output at once", "one is done, the other refused (exit code 2), one whole output")
+            trials = Trials(
+                f"two `{name}` of one output at once",
+                "one is done, the other refused (exit code 2), one whole output",
+            )
             for _ in range(count):
                 with self.trial() as folder:
                     begun = [begin(*command, "-o", folder / output)]
@@ -323,7 +408,11 @@ class Bench:
                     outcomes = [finish(one) for one in begun]
                     left = [item.name for item in folder.iterdir()]
                     codes = sorted(outcome.code for outcome in outcomes)
-                    good = codes == [0, 2] and left == [output] and self.content(name, folder / output) == self.whole[name]
+                    good = (
+                        codes == [0, 2]
+                        and left == [output]
+                        and self.content(name, folder / output) == self.whole[name]
+                    )
                     trials.add(good, f"{name}: {left}, {outcomes}")
             kinds.append(trials)
         return kinds
@@ -331,17 +420,25 @@ class Bench:
 
 def publish(page: Path, trials: list[Trials], said: str) -> None:
     """Put the table between the two marks of a page."""
-    table = ["| what was done | trials | what must follow | so it was |", "|---|---|---|---|", *(kind.row() for kind in trials)]
+    table = [
+        "| what was done | trials | what must follow | so it was |",
+        "|---|---|---|---|",
+        *(kind.row() for kind in trials),
+    ]
     text = page.read_text()
     head, tail = text.partition(START)[0], text.partition(END)[2]
     page.write_text(f"{head}{START}\n{said}\n\n" + "\n".join(table) + f"\n{END}{tail}")
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=20.0, help="longest time for the kills of each command")
+    parser.add_argument(
+        "--minutes", type=float, default=20.0, help="longest time for the kills of each command"
+    )
     parser.add_argument("--write", type=Path)
     given = parser.parse_args()
     os.environ["SOURCE_DATE_EPOCH"] = "1700000000"
@@ -350,7 +447,9 @@ def main() -> int:
     davar_parts.__kwdefaults__["samples"] = 1
     with tempfile.TemporaryDirectory() as name:
         bench = Bench(Path(name), given.seed)
-        print({command: f"{seconds:.2f} s" for command, seconds in bench.seconds.items()}, flush=True)
+        print(
+            {command: f"{seconds:.2f} s" for command, seconds in bench.seconds.items()}, flush=True
+        )
         trials: list[Trials] = []
         steps: list[Callable[[], Trials | list[Trials]]] = [
             lambda: bench.damage(10),
@@ -359,14 +458,19 @@ def main() -> int:
             lambda: bench.changed_input(10),
             lambda: bench.two_at_once(10),
         ]
-        kills = [lambda name=name: bench.kill(name, given.kills, time.monotonic() + 60 * given.minutes) for name in bench.commands]
+        kills = [
+            lambda name=name: bench.kill(name, given.kills, time.monotonic() + 60 * given.minutes)
+            for name in bench.commands
+        ]
         for step in (*kills, *steps):
             found = step()
             for kind in found if isinstance(found, list) else [found]:
                 trials.append(kind)
                 print(kind.row(), *kind.wrong, sep="\n", flush=True)
     if given.write:
-        seconds = ", ".join(f"`{command}` {value:.1f} s" for command, value in bench.seconds.items())
+        seconds = ", ".join(
+            f"`{command}` {value:.1f} s" for command, value in bench.seconds.items()
+        )
         publish(
             given.write,
             trials,

@@ -2,11 +2,13 @@
 
     python benchmarks/end_to_end.py --output docs/performance.md
 
-Prints a Markdown table, and puts it into its place in a page. Every figure is the best of some runs, each in a process of its own that
-is warm: kernels compiled, files in the cache of the system. Beside the time on the clock stands the processor time of all threads,
-which says more where the machine has other work to do. A run uses every second difference (``full``, as by default) or those that
-``--overlap octave`` leaves. The peer reads every sample as a double into memory: xarray, one file after the other in as many threads as
-there are workers, or for CSV pyarrow, as a table. Beside it stands the same by gyrostab's own reader, chunk by chunk through dask.
+Prints a Markdown table, and puts it into its place in a page. Every figure is the best of some
+runs, each in a process of its own that is warm: kernels compiled, files in the cache of the system.
+Beside the time on the clock stands the processor time of all threads, which says more where the
+machine has other work to do. A run uses every second difference (``full``, as by default) or those
+that ``--overlap octave`` leaves. The peer reads every sample as a double into memory: xarray, one
+file after the other in as many threads as there are workers, or for CSV pyarrow, as a table. Beside
+it stands the same by gyrostab's own reader, chunk by chunk through dask.
 """
 
 from __future__ import annotations
@@ -31,15 +33,23 @@ TARGETS = {"nc": 2.0, "zarr": 2.0, "csv": 1.5}
 
 def main() -> None:
     """Make the archives, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--hours", type=float, default=48.0, help="length of the NetCDF and Zarr archives")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--hours", type=float, default=48.0, help="length of the NetCDF and Zarr archives"
+    )
     parser.add_argument("--csv-hours", type=float, default=12.0, help="length of the CSV archive")
     parser.add_argument("--rate", type=float, default=400.0)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--formats", nargs="+", choices=FORMATS, default=list(FORMATS))
     parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
-    parser.add_argument("--measure", nargs=3, metavar=("WHAT", "WORKERS", "FOLDER"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--output", type=Path, help="document whose part between the marks is renewed"
+    )
+    parser.add_argument(
+        "--measure", nargs=3, metavar=("WHAT", "WORKERS", "FOLDER"), help=argparse.SUPPRESS
+    )
     options = parser.parse_args()
     if options.measure:
         what, workers, folder = options.measure
@@ -69,7 +79,19 @@ def main() -> None:
 def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
     """The rows of one format."""
     hours = options.csv_hours if form == "csv" else options.hours
-    make_archive.main([str(folder), "--hours", str(hours), "--rate", str(options.rate), "--format", form, "--gaps", "0.02"])
+    make_archive.main(
+        [
+            str(folder),
+            "--hours",
+            str(hours),
+            "--rate",
+            str(options.rate),
+            "--format",
+            form,
+            "--gaps",
+            "0.02",
+        ]
+    )
     samples = 3 * hours * 3600 * options.rate / 1e6
     rows = []
     for workers in options.workers:
@@ -77,16 +99,42 @@ def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
         own = None if form == "csv" else measure("own", workers, folder, options)
         for terms in ("full", "octave"):
             run = measure(terms, workers, folder, options)
-            clock, processor = ([f"{one[i]:.2f}" if one else "" for one in (peer, own, run)] for i in range(2))
-            ratios = [f"{run[0] / peer[0]:.2f}", f"<= {TARGETS[form]:g}", f"{run[0] / own[0]:.2f}" if own else ""]
-            cells = [FORMATS[form], f"{hours:g}", str(workers), terms, *clock, f"{samples / run[0]:.1f}", *ratios, *processor]
+            clock, processor = (
+                [f"{one[i]:.2f}" if one else "" for one in (peer, own, run)] for i in range(2)
+            )
+            ratios = [
+                f"{run[0] / peer[0]:.2f}",
+                f"<= {TARGETS[form]:g}",
+                f"{run[0] / own[0]:.2f}" if own else "",
+            ]
+            cells = [
+                FORMATS[form],
+                f"{hours:g}",
+                str(workers),
+                terms,
+                *clock,
+                f"{samples / run[0]:.1f}",
+                *ratios,
+                *processor,
+            ]
             rows.append("| " + " | ".join([*cells, f"{run[1] / peer[1]:.2f}"]) + " |")
     return rows
 
 
-def measure(what: str, workers: int, folder: Path, options: argparse.Namespace) -> tuple[float, float]:
+def measure(
+    what: str, workers: int, folder: Path, options: argparse.Namespace
+) -> tuple[float, float]:
     """Seconds on the clock and of the processor, measured in a process of its own."""
-    command = [sys.executable, __file__, "--repeat", str(options.repeat), "--measure", what, str(workers), str(folder)]
+    command = [
+        sys.executable,
+        __file__,
+        "--repeat",
+        str(options.repeat),
+        "--measure",
+        what,
+        str(workers),
+        str(folder),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(done.stderr)
@@ -110,7 +158,9 @@ def read_xarray(files: list[Path], workers: int, repeat: int) -> tuple[float, fl
     import xarray as xr
 
     def work() -> None:
-        logs = [xr.open_dataset(file, engine="zarr" if file.is_dir() else "netcdf4") for file in files]  # not in threads: netCDF4 crashes
+        logs = [
+            xr.open_dataset(file, engine="zarr" if file.is_dir() else "netcdf4") for file in files
+        ]  # not in threads: netCDF4 crashes
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(lambda log: log["rate"][:].load().size, logs))
         for log in logs:
@@ -127,7 +177,9 @@ def read_own(files: list[Path], workers: int, repeat: int) -> tuple[float, float
 
     def work() -> None:
         logs = [open_log(file) for file in files]
-        blocks = [log.rate.data.map_blocks(lambda block: block[:, -1:], chunks=(1, 1)) for log in logs]
+        blocks = [
+            log.rate.data.map_blocks(lambda block: block[:, -1:], chunks=(1, 1)) for log in logs
+        ]
         with dask.config.set(scheduler="threads", num_workers=workers):
             dask.compute(*blocks)
         for log in logs:
@@ -155,7 +207,18 @@ def run_whole(terms: str, files: list[Path], workers: int, repeat: int) -> tuple
     from gyrostab.cli import main as command
 
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as folder:
-        options = ["-o", f"{folder}/product.nc", "--window", "10min", "--step", "1min", "--overlap", terms, "--workers", str(workers)]
+        options = [
+            "-o",
+            f"{folder}/product.nc",
+            "--window",
+            "10min",
+            "--step",
+            "1min",
+            "--overlap",
+            terms,
+            "--workers",
+            str(workers),
+        ]
 
         def work(names: list[Path]) -> None:
             code = command(["run", *map(str, names), *options, "--overwrite", "--quiet-progress"])

@@ -3,7 +3,8 @@
     python benchmarks/fit.py                                  # a minute
     python benchmarks/fit.py --output docs/performance.md     # renew the part of the document between its marks
 
-Windows of 5 min at 400 Hz of quantization noise, angle and rate random walk; processor time of one thread, the best of several runs.
+Windows of 5 min at 400 Hz of quantization noise, angle and rate random walk; processor time of one
+thread, the best of several runs.
 """
 
 from __future__ import annotations
@@ -60,14 +61,24 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     whole = best(lambda: fit_noise(surface), repeats)
     kernel = best(lambda: fit_windows(*flat, *arguments), repeats)
     block = best(lambda: fit._fit_block(flat, tables, 31, True), repeats)
-    seconds = [whole, kernel, max(block - kernel, 0.0), max(whole - block, 0.0), best(lambda: identify_noise(*flat, *quick), repeats)]
+    seconds = [
+        whole,
+        kernel,
+        max(block - kernel, 0.0),
+        max(whole - block, 0.0),
+        best(lambda: identify_noise(*flat, *quick), repeats),
+    ]
     once = best(lambda: fit._Tables(ks, shifts, rate, window), 1)
     return ks.size, [1e6 * s / flat[0].shape[0] for s in seconds] + [once]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--output", type=Path, help="document whose part between the marks is renewed"
+    )
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     lines = [
@@ -78,9 +89,13 @@ def main() -> None:
         for missing in (False, True):
             x = record(missing)
             for taus in (24, 40, 48):
-                size, (whole, kernel, limits, rest, quick, once) = measure(x, taus, arguments.repeats)
+                size, (whole, kernel, limits, rest, quick, once) = measure(
+                    x, taus, arguments.repeats
+                )
                 name = "10 % in blocks of 1000" if missing else "none"
-                lines.append(f"| {name} | {size} | {whole:.0f} | {kernel:.0f} | {limits:.1f} | {rest:.1f} | {quick:.1f} | {once:.2f} |")
+                lines.append(
+                    f"| {name} | {size} | {whole:.0f} | {kernel:.0f} | {limits:.1f} | {rest:.1f} | {quick:.1f} | {once:.2f} |"
+                )
     text = f"{machine()}; best of {arguments.repeats}.\n\n" + "\n".join(lines)
     print(text)
     if arguments.output:

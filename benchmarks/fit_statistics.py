@@ -2,7 +2,8 @@
 
     python benchmarks/fit_statistics.py --output docs/statistics.md      # about five minutes
 
-Each row is 1000 independent windows of 40 s at 100 Hz, simulated outside the package (tests/support/noise_records.py).
+Each row is 1000 independent windows of 40 s at 100 Hz, simulated outside the package
+(tests/support/noise_records.py).
 """
 
 from __future__ import annotations
@@ -51,17 +52,26 @@ def simulate(rng: np.random.Generator, truth: dict[str, float]) -> np.ndarray:
 def seen_law(product: xr.Dataset, truth: dict[str, float]) -> xr.DataArray:
     """Expected Allan variance of each cell, with what the gaps do to white and quantization noise."""
     response = {"Q": product.quantization_response, "N": product.white_response}
-    parts = [response.get(term, 1.0) * (0 * product.avar + model_avar(product.tau, {term: value})) for term, value in truth.items()]
+    parts = [
+        response.get(term, 1.0) * (0 * product.avar + model_avar(product.tau, {term: value}))
+        for term, value in truth.items()
+    ]
     return sum(parts[1:], parts[0])
 
 
 def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: float) -> str:
     x = lose(rng, simulate(rng, truth), share, block)
     length = f"{SAMPLES}samples"
-    surface = davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=length, step=length, taus=24)
+    surface = davar(
+        make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=length, step=length, taus=24
+    )
     product = fit_noise(surface, observed_only=False)
     limits, law = confidence_interval(product), seen_law(product, truth)
-    hit = ((limits.avar_lower <= law) & (law <= limits.avar_upper)).where(product.avar.notnull()).mean(("axis", "time"))
+    hit = (
+        ((limits.avar_lower <= law) & (law <= limits.avar_upper))
+        .where(product.avar.notnull())
+        .mean(("axis", "time"))
+    )
     cells = [f"{float(hit.min()):.3f} .. {float(hit.max()):.3f}"]
     for term in TERMS:
         seen = product.observable.sel(term=term)
@@ -78,10 +88,17 @@ def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--output", type=Path, help="document whose part between the marks is renewed"
+    )
     options = parser.parse_args()
-    lines = ["| noise | missing | 95 % intervals of the cells | Q | N | B | K | R |", "|---|---|---|---|---|---|---|---|"]
+    lines = [
+        "| noise | missing | 95 % intervals of the cells | Q | N | B | K | R |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for number, (name, truth) in enumerate(MIXTURES.items()):
         for gap, (share, block) in GAPS.items():
             rng = np.random.default_rng([2026, number, int(block)])

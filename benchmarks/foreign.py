@@ -1,13 +1,16 @@
 """Time and peak memory of `gyrostab run` on files of other programs that hold one time stamp per sample.
 
-    python benchmarks/foreign.py [--hours 12 48] [--formats own-zarr own-netcdf netcdf ...] [--rounds 1] [--jitter 0]
+    python benchmarks/foreign.py [--hours 12 48] [--formats own-zarr own-netcdf netcdf ...]
+    [--rounds 1] [--jitter 0]
                                  [--folder FOLDER] [--output docs/scaling.md]
 
-For each length and format the script writes one archive of three axes at 400 Hz (int64 nanoseconds, doubles in deg/h), runs
-`gyrostab run` on it in a child process, reads the same file with xarray in another child process, records the time and the
-peak resident memory of both, and deletes the archive before it writes the next one. Archives are written block by block, so
-memory stays below 1 GiB at any length. 200 h need up to 10 GB of disk for one archive and 10 GB for temporary columns; a CSV
-file of 200 h has 18 GB. Give --folder on a disk with 60 GB free: TMPDIR of the child processes is set to it.
+For each length and format the script writes one archive of three axes at 400 Hz (int64 nanoseconds,
+doubles in deg/h), runs `gyrostab run` on it in a child process, reads the same file with xarray in
+another child process, records the time and the peak resident memory of both, and deletes the
+archive before it writes the next one. Archives are written block by block, so memory stays below 1
+GiB at any length. 200 h need up to 10 GB of disk for one archive and 10 GB for temporary columns; a
+CSV file of 200 h has 18 GB. Give --folder on a disk with 60 GB free: TMPDIR of the child processes
+is set to it.
 
     python benchmarks/foreign.py --hours 12 48                                    # a few minutes
     python benchmarks/foreign.py --hours 200 --formats own-zarr netcdf zarr2 zarr3 parquet hdf5 matlab csv --output docs/scaling.md
@@ -38,7 +41,8 @@ BLOCK_ROWS = 2**19
 AXIS_NAMES = "xyz"[:AXES]
 MAP = [f"gyro_{axis}" for axis in AXIS_NAMES]
 
-#: A run of the command line's main job, or a pass of xarray over every value; prints seconds and peak memory [MiB].
+#: A run of the command line's main job, or a pass of xarray over every value; prints seconds and
+#: peak memory [MiB].
 _CHILD = """
 import json, resource, sys, time
 def run(path, target, windows, workers):
@@ -82,17 +86,26 @@ def blocks(hours: float, jitter_us: float) -> Iterator[Block]:
         yield begin, stamps, COUNT * np.rint(180.0 * draw.standard_normal((AXES, size)) + 300.0)
 
 
-def write_netcdf(path: Path, hours: float, jitter_us: float, *, kind: str = "NETCDF4", packed: bool = False) -> Path:
+def write_netcdf(
+    path: Path, hours: float, jitter_us: float, *, kind: str = "NETCDF4", packed: bool = False
+) -> Path:
     """A CF file with one variable per axis; doubles as xarray writes them, or packed, shuffled and deflated counts."""
     import netCDF4
 
     with netCDF4.Dataset(path, "w", format=kind) as file:
         file.Conventions = "CF-1.11"
         file.createDimension("time", round(hours * 3600 * RATE))
-        options: dict[str, Any] = {"zlib": True, "complevel": 1, "shuffle": True, "chunksizes": (2**18,)} if packed else {}
+        options: dict[str, Any] = (
+            {"zlib": True, "complevel": 1, "shuffle": True, "chunksizes": (2**18,)}
+            if packed
+            else {}
+        )
         time = file.createVariable("time", "i8", ("time",), **options)
         time.units, time.calendar = "nanoseconds since 1970-01-01", "proleptic_gregorian"
-        gyro = [file.createVariable(name, "i4" if packed else "f8", ("time",), **options) for name in MAP]
+        gyro = [
+            file.createVariable(name, "i4" if packed else "f8", ("time",), **options)
+            for name in MAP
+        ]
         for variable in gyro:
             variable.units = "deg/h"
             if packed:
@@ -113,7 +126,9 @@ def write_zarr(path: Path, hours: float, jitter_us: float, *, version: int) -> P
     arrays = {}
     for name, kind in (("time", "i8"), *((name, "f8") for name in MAP)):
         dims: dict[str, Any] = {"dimension_names": ["time"]} if version == 3 else {}
-        arrays[name] = group.create_array(name, shape=(rows,), chunks=(BLOCK_ROWS,), dtype=kind, **dims)
+        arrays[name] = group.create_array(
+            name, shape=(rows,), chunks=(BLOCK_ROWS,), dtype=kind, **dims
+        )
         arrays[name].attrs["units"] = "nanoseconds since 1970-01-01" if name == "time" else "deg/h"
         if version == 2:
             arrays[name].attrs["_ARRAY_DIMENSIONS"] = ["time"]
@@ -128,7 +143,10 @@ def write_parquet(path: Path, hours: float, jitter_us: float) -> Path:
     import pyarrow as pa
     from pyarrow import parquet
 
-    fields = [pa.field("time", pa.timestamp("ns")), *(pa.field(name, pa.float64(), metadata={"units": "deg/h"}) for name in MAP)]
+    fields = [
+        pa.field("time", pa.timestamp("ns")),
+        *(pa.field(name, pa.float64(), metadata={"units": "deg/h"}) for name in MAP),
+    ]
     with parquet.ParquetWriter(path, pa.schema(fields)) as file:
         for _, stamps, values in blocks(hours, jitter_us):
             columns = [pa.array(stamps.view("datetime64[ns]")), *map(pa.array, values)]
@@ -141,14 +159,20 @@ def write_hdf5(path: Path, hours: float, jitter_us: float, *, matlab: bool = Fal
     import h5py
 
     rows = round(hours * 3600 * RATE)
-    options: dict[str, Any] = {"chunks": (2**16, 1), "compression": "gzip", "compression_opts": 3} if matlab else {}
+    options: dict[str, Any] = (
+        {"chunks": (2**16, 1), "compression": "gzip", "compression_opts": 3} if matlab else {}
+    )
     with h5py.File(path, "w", userblock_size=512 if matlab else 0) as file:
         arrays = {}
         for name, kind in (("time", "i8"), *((name, "f8") for name in MAP)):
-            arrays[name] = file.create_dataset(name, (rows, 1) if matlab else (rows,), kind, **options)
+            arrays[name] = file.create_dataset(
+                name, (rows, 1) if matlab else (rows,), kind, **options
+            )
             arrays[name].attrs["units"] = "ns" if name == "time" else "deg/h"
             if matlab:
-                arrays[name].attrs["MATLAB_class"] = np.bytes_(b"int64" if kind == "i8" else b"double")
+                arrays[name].attrs["MATLAB_class"] = np.bytes_(
+                    b"int64" if kind == "i8" else b"double"
+                )
         for begin, stamps, values in blocks(hours, jitter_us):
             for name, part in zip(arrays, (stamps, *values), strict=True):
                 arrays[name][begin : begin + stamps.size] = part[:, None] if matlab else part
@@ -164,7 +188,9 @@ def write_csv(path: Path, hours: float, jitter_us: float) -> Path:
     from pyarrow import csv
 
     with path.open("wb") as file:
-        file.write(",".join(["time [ns]", *(f"{name} [{COUNT:g} deg/h]" for name in MAP)]).encode() + b"\n")
+        file.write(
+            ",".join(["time [ns]", *(f"{name} [{COUNT:g} deg/h]" for name in MAP)]).encode() + b"\n"
+        )
         for _, stamps, values in blocks(hours, jitter_us):
             counts = np.rint(values / COUNT).astype(np.int64)
             text = pa.table([pa.array(stamps), *map(pa.array, counts)], names=["time", *MAP])
@@ -190,8 +216,14 @@ FORMATS: dict[str, tuple[str, Callable[[Path, float, float], Path]]] = {
     "own-zarr": ("zarr", write_own),
     "own-netcdf": ("nc", write_own),
     "netcdf": ("nc", write_netcdf),
-    "netcdf-packed": ("nc", lambda path, hours, jitter: write_netcdf(path, hours, jitter, packed=True)),
-    "netcdf-classic": ("nc", lambda path, hours, jitter: write_netcdf(path, hours, jitter, kind="NETCDF3_64BIT_DATA")),
+    "netcdf-packed": (
+        "nc",
+        lambda path, hours, jitter: write_netcdf(path, hours, jitter, packed=True),
+    ),
+    "netcdf-classic": (
+        "nc",
+        lambda path, hours, jitter: write_netcdf(path, hours, jitter, kind="NETCDF3_64BIT_DATA"),
+    ),
     "zarr2": ("zarr", lambda path, hours, jitter: write_zarr(path, hours, jitter, version=2)),
     "zarr3": ("zarr", lambda path, hours, jitter: write_zarr(path, hours, jitter, version=3)),
     "parquet": ("parquet", write_parquet),
@@ -205,9 +237,17 @@ def measure(work: str, path: Path, given: argparse.Namespace) -> dict[str, float
     """The quickest of several child processes, with the largest of their peaks; None where the work fails."""
     found = []
     for _ in range(given.rounds):
-        request = json.dumps([work, str(path), str(path.with_name("product.nc")), WINDOW, given.workers])
+        request = json.dumps(
+            [work, str(path), str(path.with_name("product.nc")), WINDOW, given.workers]
+        )
         environment = {**os.environ, "TMPDIR": str(path.parent)}
-        done = subprocess.run([sys.executable, "-c", _CHILD, request], capture_output=True, text=True, check=False, env=environment)
+        done = subprocess.run(
+            [sys.executable, "-c", _CHILD, request],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=environment,
+        )
         if done.returncode:
             print(f"{work} {path.name}: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
             return None
@@ -217,7 +257,11 @@ def measure(work: str, path: Path, given: argparse.Namespace) -> dict[str, float
 
 def size_of(path: Path) -> int:
     """Bytes of a file or of the files of a store."""
-    return sum(one.stat().st_size for one in path.rglob("*") if one.is_file()) if path.is_dir() else path.stat().st_size
+    return (
+        sum(one.stat().st_size for one in path.rglob("*") if one.is_file())
+        if path.is_dir()
+        else path.stat().st_size
+    )
 
 
 def compare(folder: Path, hours: float, given: argparse.Namespace) -> list[list[str]]:
@@ -229,12 +273,21 @@ def compare(folder: Path, hours: float, given: argparse.Namespace) -> list[list[
         path = write(folder / f"{name}.{ending}", hours, given.jitter)
         size = size_of(path)
         run = measure("run", path, given)
-        peer = measure("read_xarray", path, given) if ending in ("nc", "zarr") and not name.startswith("own") else None
+        peer = (
+            measure("read_xarray", path, given)
+            if ending in ("nc", "zarr") and not name.startswith("own")
+            else None
+        )
         shutil.rmtree(path) if path.is_dir() else path.unlink()
         reference = reference or (run["seconds"] if run else None)
         ran = ["failed", "", "", ""]
         if run and reference:
-            ran = [f"{run['seconds']:.2f}", f"{run['seconds'] / reference:.1f}", f"{run['processor']:.2f}", f"{run['peak']:.0f}"]
+            ran = [
+                f"{run['seconds']:.2f}",
+                f"{run['seconds'] / reference:.1f}",
+                f"{run['processor']:.2f}",
+                f"{run['peak']:.0f}",
+            ]
         read = [f"{peer['seconds']:.2f}", f"{peer['peak']:.0f}"] if peer else ["", ""]
         rows.append([f"{hours:g} h", name, f"{size / 1e9:.2f}", *ran, *read])
         print(rows[-1], flush=True)
@@ -242,21 +295,50 @@ def compare(folder: Path, hours: float, given: argparse.Namespace) -> list[list[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--hours", type=float, nargs="+", default=[12.0, 48.0])
-    parser.add_argument("--formats", nargs="+", choices=list(FORMATS), default=list(FORMATS), help="the first is the reference")
-    parser.add_argument("--jitter", type=float, default=0.0, help="standard deviation of the stamps about the grid [us]")
+    parser.add_argument(
+        "--formats",
+        nargs="+",
+        choices=list(FORMATS),
+        default=list(FORMATS),
+        help="the first is the reference",
+    )
+    parser.add_argument(
+        "--jitter",
+        type=float,
+        default=0.0,
+        help="standard deviation of the stamps about the grid [us]",
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--folder", type=Path, help="where the archives are made; the system's temporary folder by default")
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        help="where the archives are made; the system's temporary folder by default",
+    )
     parser.add_argument("--output", type=Path)
     given = parser.parse_args()
     rows = []
     for hours in given.hours:
         with tempfile.TemporaryDirectory(dir=given.folder) as name:
             rows += compare(Path(name), hours, given)
-    head = ["length", "format", "GB", "seconds", "times own", "processor [s]", "peak MiB", "xarray: seconds", "peak MiB"]
-    text = "\n\n".join([table(head, rows), f"{machine()}; {given.workers} workers, best of {given.rounds}."])
+    head = [
+        "length",
+        "format",
+        "GB",
+        "seconds",
+        "times own",
+        "processor [s]",
+        "peak MiB",
+        "xarray: seconds",
+        "peak MiB",
+    ]
+    text = "\n\n".join(
+        [table(head, rows), f"{machine()}; {given.workers} workers, best of {given.rounds}."]
+    )
     print(text)
     if given.output:
         renew(given.output, "foreign", text)

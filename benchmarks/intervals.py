@@ -2,8 +2,9 @@
 
     python benchmarks/intervals.py --output docs/diagnosis.md
 
-Every record is an hour of a good gyro, three axes at 10 Hz: its block statistics are those of noise, to which an effect is added; the fit
-knows the effect, not its size, and has the noise free. "Wrong" forms are those that a fit cannot reproduce.
+Every record is an hour of a good gyro, three axes at 10 Hz: its block statistics are those of
+noise, to which an effect is added; the fit knows the effect, not its size, and has the noise free.
+"Wrong" forms are those that a fit cannot reproduce.
 """
 
 import argparse
@@ -32,9 +33,24 @@ def frames(reduced, baseline, effect, view, column):
     """A naming of the effect on x, with the usual values of its other parameters."""
     known, reasons = effect_candidates(reduced, COEFFICIENT)
     one = next(one for one in known if one.effect == effect and one.view == view)
-    variant = next(variant for variant in one.variants if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0)
-    claim = Identification(effect, one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0)
-    return Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), begin_state(reduced, baseline), fold_blocks(reduced))
+    variant = next(
+        variant
+        for variant in one.variants
+        if variant.columns == (column,) and variant.values.get("exponent", 1.0) == 1.0
+    )
+    claim = Identification(
+        effect, one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
+    )
+    return Identifications(
+        (claim,),
+        (),
+        8.0,
+        np.zeros(1),
+        reasons,
+        tuple(known),
+        begin_state(reduced, baseline),
+        fold_blocks(reduced),
+    )
 
 
 def held(reduced, baseline, drawn, effect, view, column, truth, change):
@@ -67,26 +83,61 @@ def cases(reduced):
 
     for level, size in (("low", 0.1), ("high", 0.5)):
         for form, power in (("right", 2.0), ("wrong", 1.9)):
-            yield "vibration_rectification", "mean", "sensitivity", level, form, size / 36.0, shifted(size * (g / 6.0) ** power)
+            yield (
+                "vibration_rectification",
+                "mean",
+                "sensitivity",
+                level,
+                form,
+                size / 36.0,
+                shifted(size * (g / 6.0) ** power),
+            )
     for level, share in (("low", 0.2), ("high", 1.0)):
         for form, power in (("right", 2.0), ("wrong", 1.9)):
-            yield "vibration_noise", "power", "white", level, form, 0.003 * share**0.5 / 6.0, louder(1.0 + share * (g / 6.0) ** power)
+            yield (
+                "vibration_noise",
+                "power",
+                "white",
+                level,
+                form,
+                0.003 * share**0.5 / 6.0,
+                louder(1.0 + share * (g / 6.0) ** power),
+            )
     for level, size in (("low", 0.3), ("high", 2.0)):
         for form, bend in (("right", 0.0), ("wrong", 0.06)):
             shape = size * (warm + bend * (warm - warm.min()) * (warm.max() - warm))
-            yield "temperature_bias", "mean", "sensitivity", level, form, size / np.ptp(heat), shifted(shape)
+            yield (
+                "temperature_bias",
+                "mean",
+                "sensitivity",
+                level,
+                form,
+                size / np.ptp(heat),
+                shifted(shape),
+            )
 
 
 def main():
     """Fit, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--records", type=int, default=200)
-    parser.add_argument("--output", type=Path, help="document whose part between the marks is renewed")
+    parser.add_argument(
+        "--output", type=Path, help="document whose part between the marks is renewed"
+    )
     options = parser.parse_args()
     count, reduced = options.records, record([])
     baseline = calibrate_noise(reduced)
-    drawn = next(iter(null_records(reduced, baseline, count=count, rng=np.random.default_rng(8), chunk=count)))
-    lines = [f"| effect | signal | form | inside 95 %, of {count} | bias | scatter |", "| --- | --- | --- | --- | --- | --- |"]
+    drawn = next(
+        iter(
+            null_records(reduced, baseline, count=count, rng=np.random.default_rng(8), chunk=count)
+        )
+    )
+    lines = [
+        f"| effect | signal | form | inside 95 %, of {count} | bias | scatter |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     for effect, view, column, level, form, truth, change in cases(reduced):
         share, bias, scatter = held(reduced, baseline, drawn, effect, view, column, truth, change)
         lines.append(f"| {effect} | {level} | {form} | {share:.1%} | {bias:+.1%} | {scatter:.1%} |")

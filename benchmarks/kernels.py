@@ -1,9 +1,9 @@
 """Time the DAVAR kernels beside their peers and beside the bare loop on as many terms, in turns.
 
-x1, x2 and vibration are the shapes of Wang et al., Sensors 16 (2016); the archive is a piece of a multi-day log of three
-axes at 400 Hz. The bare loop squares and adds second differences of one averaging factor in the first-level cache, in
-numba and, where gcc is there, in C: what a processor can do that is given one averaging factor at a time. Run it on an
-idle machine:
+x1, x2 and vibration are the shapes of Wang et al., Sensors 16 (2016); the archive is a piece of a
+multi-day log of three axes at 400 Hz. The bare loop squares and adds second differences of one
+averaging factor in the first-level cache, in numba and, where gcc is there, in C: what a processor
+can do that is given one averaging factor at a time. Run it on an idle machine:
 
     make bench                                                      # ten minutes or so
     python benchmarks/kernels.py --quick                            # short records, one repeat
@@ -68,7 +68,9 @@ def numba_loop(theta, n, k, turns):
     total = 0.0
     for j in range(turns):
         a = j & 7
-        total += energy(theta[a : a + n], theta[a + k : a + k + n], theta[a + 2 * k : a + 2 * k + n])
+        total += energy(
+            theta[a : a + n], theta[a + k : a + k + n], theta[a + 2 * k : a + 2 * k + n]
+        )
     return total
 
 
@@ -120,25 +122,55 @@ def rooflines() -> dict[str, float]:
         with tempfile.TemporaryDirectory() as folder:
             for width in ("256", "512"):
                 library = Path(folder) / f"loop{width}.so"
-                flags = ["-O3", "-march=native", "-ffast-math", f"-mprefer-vector-width={width}", "-shared", "-fPIC", "-x", "c"]
-                if subprocess.run(["gcc", *flags, "-o", library, "-"], input=C_LOOP.encode(), capture_output=True, check=False).returncode:
+                flags = [
+                    "-O3",
+                    "-march=native",
+                    "-ffast-math",
+                    f"-mprefer-vector-width={width}",
+                    "-shared",
+                    "-fPIC",
+                    "-x",
+                    "c",
+                ]
+                if subprocess.run(
+                    ["gcc", *flags, "-o", library, "-"],
+                    input=C_LOOP.encode(),
+                    capture_output=True,
+                    check=False,
+                ).returncode:
                     continue  # a processor without such vectors
                 loop = ctypes.CDLL(str(library)).energy
                 loop.restype = ctypes.c_double
                 pointer = theta.ctypes.data_as(ctypes.c_void_p)
                 arguments = [ctypes.c_long(value) for value in (n, k, turns)]
-                found[f"C, {width}-bit vectors"] = n * turns / seconds(lambda: loop(pointer, *arguments), 9) / 1e9  # noqa: B023
+                found[f"C, {width}-bit vectors"] = (
+                    n * turns / seconds(lambda: loop(pointer, *arguments), 9) / 1e9
+                )  # noqa: B023
     return found
 
 
 def make_unit(ks: np.ndarray, window: int, step: int, rate: float, octave: bool) -> Unit:
     shifts = thin(ks) if octave else np.zeros_like(ks)
     ks = np.unique(ks >> shifts << shifts)
-    return Unit(window, step, ks, thin(ks) if octave else np.zeros_like(ks), False, 1 / rate, False, 0.3, 0.1)
+    return Unit(
+        window,
+        step,
+        ks,
+        thin(ks) if octave else np.zeros_like(ks),
+        False,
+        1 / rate,
+        False,
+        0.3,
+        0.1,
+    )
 
 
 def pieces(x: np.ndarray, unit: Unit) -> list[np.ndarray]:
-    return [row[one.start * unit.step : last_sample(one, unit)] for row in np.atleast_2d(x) for one in units_of_work(row.size, unit)]
+    return [
+        row[one.start * unit.step : last_sample(one, unit)]
+        for row in np.atleast_2d(x)
+        for one in units_of_work(row.size, unit)
+    ]
 
 
 def allantools_loop(x: np.ndarray, window: int, step: int, taus: np.ndarray) -> None:
@@ -152,7 +184,11 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
     x = np.random.default_rng(0).standard_normal(n)
     log = make_log(x, rate=RATE, unit="deg/h")
     length = {"window": f"{window}samples", "step": f"{step}samples"}
-    options = {**length, "taus": "all" if taus == "all" else 32, "tau_max": (window // 2 - 1) / RATE}
+    options = {
+        **length,
+        "taus": "all" if taus == "all" else 32,
+        "tau_max": (window // 2 - 1) / RATE,
+    }
     tau = np.asarray(davar(log, **options).tau)
     unit = make_unit(np.round(tau * RATE).astype(np.int64), window, step, RATE, octave=False)
     parts = pieces(x, unit)
@@ -170,10 +206,14 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
     yield f"\n**{name}**, {n} samples, window {window}, step {step}, {tau.size} averaging times\n"
     yield "| one thread | seconds | times as fast as allantools | share of the bare loop |\n|---|---|---|---|"
     with dask.config.set(scheduler="sync"):
-        took = {label: seconds(call, times) for label, (call, times) in slow.items()} | in_turns(fast, 2 * repeats + 3)
+        took = {label: seconds(call, times) for label, (call, times) in slow.items()} | in_turns(
+            fast, 2 * repeats + 3
+        )
     first = next(iter(took.values()))
     for label, value in took.items():
-        share = f"{took['bare loop, as many terms'] / value:.2f}" if label.startswith("block") else ""
+        share = (
+            f"{took['bare loop, as many terms'] / value:.2f}" if label.startswith("block") else ""
+        )
         yield f"| {label} | {value:.4f} | {first / value:.1f} | {share} |"
 
 
@@ -210,7 +250,11 @@ def archive(repeats: int, quick: bool) -> Iterator[str]:
             calls[f"{name} bare"] = bare(terms[name])
         took = in_turns(calls, repeats + 2)
         for name, record in records.items():
-            speeds = [record.size / took[f"{name} {what} {workers}"] / 1e6 for what in ("kernel", "davar") for workers in (1, 2)]
+            speeds = [
+                record.size / took[f"{name} {what} {workers}"] / 1e6
+                for what in ("kernel", "davar")
+                for workers in (1, 2)
+            ]
             share = took[f"{name} bare"] / took[f"{name} kernel 1"]
             yield (
                 f"| {options['overlap']} | {np.isnan(record).mean():.0%} | {terms[name] / record.size:.1f} | {speeds[0]:.0f} "
@@ -220,7 +264,9 @@ def archive(repeats: int, quick: bool) -> Iterator[str]:
 
 def run_kernel(parts: list[np.ndarray], unit: Unit, workers: int) -> None:
     own = threading.local()
-    with ThreadPoolExecutor(workers, initializer=lambda: setattr(own, "space", Workspace())) as pool:
+    with ThreadPoolExecutor(
+        workers, initializer=lambda: setattr(own, "space", Workspace())
+    ) as pool:
         list(pool.map(lambda part: surface_unit(part, unit, own.space), parts))
 
 
@@ -231,7 +277,15 @@ def run_davar(log: xr.Dataset, options: dict[str, str], workers: int) -> None:
 
 def processor() -> str:
     info = Path("/proc/cpuinfo")
-    names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")] if info.exists() else []
+    names = (
+        [
+            line.split(":")[1].strip()
+            for line in info.read_text().splitlines()
+            if line.startswith("model name")
+        ]
+        if info.exists()
+        else []
+    )
     return f"{names[0] if names else 'processor not named'}, {os.cpu_count()} cores, numba {numba.__version__}, numpy {np.__version__}"
 
 
@@ -239,7 +293,11 @@ def report(quick: bool) -> Iterator[str]:
     repeats = 1 if quick else 5
     yield f"{processor()}; {date.today().isoformat()}; 1-minute load before the run {os.getloadavg()[0]:.2f}; medians of {repeats}.\n"
     roofs = rooflines()
-    yield "Bare loop, 1e9 terms per second: " + ", ".join(f"{name} {value:.2f}" for name, value in roofs.items()) + "."
+    yield (
+        "Bare loop, 1e9 terms per second: "
+        + ", ".join(f"{name} {value:.2f}" for name, value in roofs.items())
+        + "."
+    )
     for name in SHAPES:
         for taus in ("32", "all"):
             yield from shape(name, taus, repeats, quick)
@@ -248,9 +306,15 @@ def report(quick: bool) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="records of a tenth or a quarter, one repeat")
-    parser.add_argument("--output", type=Path, help="Markdown document whose part between the marks is renewed")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="records of a tenth or a quarter, one repeat"
+    )
+    parser.add_argument(
+        "--output", type=Path, help="Markdown document whose part between the marks is renewed"
+    )
     arguments = parser.parse_args()
     lines = []
     for line in report(arguments.quick):

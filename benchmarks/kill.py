@@ -2,9 +2,10 @@
 
     python benchmarks/kill.py [--kills 50] [--seed 1] [--hours 6]
 
-Each run is a process of its own, `gyrostab run`, killed with SIGKILL (with its worker processes, where it has some) at a moment
-drawn evenly over the time that an undisturbed run takes; some runs are killed several times before they may finish. One run in three
-works with processes instead of threads. At the end one of them is given the wrong options, which must be refused.
+Each run is a process of its own, `gyrostab run`, killed with SIGKILL (with its worker processes,
+where it has some) at a moment drawn evenly over the time that an undisturbed run takes; some runs
+are killed several times before they may finish. One run in three works with processes instead of
+threads. At the end one of them is given the wrong options, which must be refused.
 """
 
 from __future__ import annotations
@@ -35,18 +36,40 @@ def write_log(path: Path, hours: float) -> Path:
     log = make_log(rate, rate=100.0, unit="deg/h", start="2026-05-01")
     stamps = log["time"].values[::100]
     log = log.assign_coords(time_temperature=stamps)
-    log["temperature"] = ("time_temperature", 20.0 + np.arange(stamps.size) / 1000.0, {"units": "degree_Celsius"})
+    log["temperature"] = (
+        "time_temperature",
+        20.0 + np.arange(stamps.size) / 1000.0,
+        {"units": "degree_Celsius"},
+    )
     return to_netcdf(log, path)
 
 
 def start(log: Path, output: Path, *options: str) -> subprocess.Popen[str]:
     """Begin a run as a user does, in a process group of its own."""
-    command = [sys.executable, "-c", _COMMAND, "run", str(log), "-o", str(output), *WINDOW, *options]
+    command = [
+        sys.executable,
+        "-c",
+        _COMMAND,
+        "run",
+        str(log),
+        "-o",
+        str(output),
+        *WINDOW,
+        *options,
+    ]
     environment = {**os.environ, "SOURCE_DATE_EPOCH": "1700000000"}
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    return subprocess.Popen(
+        command,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
 
 
-# The command line itself, with parts of one unit of work, so that this short log has as many as a long one.
+# The command line itself, with parts of one unit of work, so that this short log has as many as a
+# long one.
 _COMMAND = """
 import sys
 if __name__ == "__main__":
@@ -63,7 +86,9 @@ def finish(run: subprocess.Popen[str]) -> tuple[int, str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--hours", type=float, default=6.0)
@@ -83,7 +108,11 @@ def main() -> int:
         while kills < given.kills:
             output = folder / f"product{runs}.nc"
             options = ("--scheduler", "processes") if runs % 3 == 2 else ()
-            while not output.exists() and kills < given.kills and (runs % 5 == 0 or not folder.joinpath(f".{output.name}.job").exists()):
+            while (
+                not output.exists()
+                and kills < given.kills
+                and (runs % 5 == 0 or not folder.joinpath(f".{output.name}.job").exists())
+            ):
                 run = start(log, output, "--resume", *options)
                 time.sleep(draw.uniform(0.0, seconds))
                 if run.poll() is None:
@@ -94,12 +123,18 @@ def main() -> int:
                     break
             parts += len(list(folder.joinpath(f".{output.name}.job").glob("*.block")))
             code, said = finish(start(log, output, "--resume", *options))
-            left = [path.name for path in folder.iterdir() if output.name in path.name and path != output]
+            left = [
+                path.name
+                for path in folder.iterdir()
+                if output.name in path.name and path != output
+            ]
             if code or left or hashlib.sha256(output.read_bytes()).hexdigest() != whole:
                 bad.append(f"run {runs}: exit {code}, left {left}: {said}")
             runs += 1
         code, said = finish(start(log, output, "--resume", "--terms", "N"))
-        print(f"seed {given.seed}: {kills} kills in {runs} runs of {seconds:.1f} s; {parts} parts were found again")
+        print(
+            f"seed {given.seed}: {kills} kills in {runs} runs of {seconds:.1f} s; {parts} parts were found again"
+        )
         print(f"{len(bad)} of {runs} products differ from the undisturbed one")
         print(f"resume with another option: exit {code}, {said.strip()}")
         print(*bad, sep="\n")

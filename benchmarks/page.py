@@ -12,7 +12,14 @@ def machine() -> str:
     """Processor, cores, Python, date and load in one line."""
     name, listing = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
     if listing.exists():
-        name = next((line.split(":")[1].strip() for line in listing.read_text().splitlines() if line.startswith("model name")), name)
+        name = next(
+            (
+                line.split(":")[1].strip()
+                for line in listing.read_text().splitlines()
+                if line.startswith("model name")
+            ),
+            name,
+        )
     return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}; {date.today()}, 1-minute load {os.getloadavg()[0]:.1f}"
 
 

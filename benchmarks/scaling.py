@@ -1,11 +1,14 @@
 """How the time of a run grows with the length of the log, the number of averaging times, and the window over the step; and its memory.
 
-    python benchmarks/scaling.py [--hours 1 2 5 10 20 50 100 200] [--workers 2] [--rounds 3] [--output docs/scaling.md]
+    python benchmarks/scaling.py [--hours 1 2 5 10 20 50 100 200] [--workers 2] [--rounds 3]
+    [--output docs/scaling.md]
 
-Each run is the whole `gyrostab run` (read, DAVAR, fit, write) in a process of its own, from a Zarr store of integer counts of three
-axes at 400 Hz, so that its peak memory is its own. The best of several rounds counts; what any run costs, however short (tables,
-compiled kernels), is fitted beside the exponent. The processor time of all threads stands beside the time on the clock, and says more
-where the machine has other work to do. The tables are Markdown; `--output docs/scaling.md` puts them in their place there.
+Each run is the whole `gyrostab run` (read, DAVAR, fit, write) in a process of its own, from a Zarr
+store of integer counts of three axes at 400 Hz, so that its peak memory is its own. The best of
+several rounds counts; what any run costs, however short (tables, compiled kernels), is fitted
+beside the exponent. The processor time of all threads stands beside the time on the clock, and says
+more where the machine has other work to do. The tables are Markdown; `--output docs/scaling.md`
+puts them in their place there.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ from page import machine, renew
 RATE, AXES, COUNT = 400.0, 3, 0.02
 WINDOW = {"window": "10min", "step": "1min", "taus": "40"}
 
-# One run; prints its seconds, on the clock, of the processor and stage by stage, and its peak memory [MiB].
+# One run; prints its seconds, on the clock, of the processor and stage by stage, and its peak
+# memory [MiB].
 _RUN = """
 import json, resource, sys, time
 def work(paths, output, windows, options):
@@ -55,9 +59,18 @@ def write_store(path: Path, hours: float) -> Path:
         axis, part = block_info[None]["chunk-location"]
         shape = block_info[None]["chunk-shape"]
         draw = np.random.default_rng((axis, part))
-        return COUNT * np.rint(180.0 * draw.standard_normal(shape) + 300.0 + np.cumsum(0.05 * draw.standard_normal(shape), axis=1))
+        return COUNT * np.rint(
+            180.0 * draw.standard_normal(shape)
+            + 300.0
+            + np.cumsum(0.05 * draw.standard_normal(shape), axis=1)
+        )
 
-    values = da.map_blocks(counts, chunks=((1,) * AXES, da.core.normalize_chunks(chunk, (size,))[0]), dtype=float, meta=np.empty((0, 0)))
+    values = da.map_blocks(
+        counts,
+        chunks=((1,) * AXES, da.core.normalize_chunks(chunk, (size,))[0]),
+        dtype=float,
+        meta=np.empty((0, 0)),
+    )
     log = make_log(values, rate=RATE, unit="deg/h", start="2026-05-01")
     signal = log["rate"]
     signal.encoding = {"dtype": "int32", "scale_factor": COUNT}
@@ -68,13 +81,22 @@ def measure(store: Path, windows: dict[str, str], options: dict[str, object], ro
     """The best of several runs, by the clock and by the processor; the largest of their peaks of memory."""
     found = []
     for _ in range(rounds):
-        command = [sys.executable, "-c", _RUN, json.dumps([[str(store)], str(store.with_name("product.nc")), windows, options])]
+        command = [
+            sys.executable,
+            "-c",
+            _RUN,
+            json.dumps([[str(store)], str(store.with_name("product.nc")), windows, options]),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(done.stderr)
         found.append(json.loads(done.stdout.splitlines()[-1]))
     quickest = min(found, key=lambda one: one["seconds"])
-    return {**quickest, "processor": min(one["processor"] for one in found), "peak": max(one["peak"] for one in found)}
+    return {
+        **quickest,
+        "processor": min(one["processor"] for one in found),
+        "peak": max(one["peak"] for one in found),
+    }
 
 
 def exponent(hours: list[float], seconds: list[float]) -> str:
@@ -91,7 +113,13 @@ def exponent(hours: list[float], seconds: list[float]) -> str:
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join(["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *("| " + " | ".join(row) + " |" for row in rows)])
+    return "\n".join(
+        [
+            "| " + " | ".join(head) + " |",
+            "|" + "---|" * len(head),
+            *("| " + " | ".join(row) + " |" for row in rows),
+        ]
+    )
 
 
 def against_length(folder: Path, given: argparse.Namespace, options: dict[str, object]) -> str:
@@ -127,24 +155,56 @@ def against_options(folder: Path, given: argparse.Namespace, options: dict[str, 
     for change in (
         *({"taus": taus} for taus in ("10", "20", "40", "80")),
         *({"step": step} for step in ("10min", "5min", "2min", "1min", "30s")),
-        *({"window": window, "step": step} for window, step in (("2min", "12s"), ("10min", "1min"), ("1h", "6min"))),
+        *(
+            {"window": window, "step": step}
+            for window, step in (("2min", "12s"), ("10min", "1min"), ("1h", "6min"))
+        ),
         {"overlap": "octave"},
     ):
         windows = {**WINDOW, **change}
         one = measure(store, windows, options, given.rounds)
         samples = AXES * hours * 3600 * RATE
-        named = [windows["window"], windows["step"], windows["taus"], windows.get("overlap", "full")]
-        cost = [f"{one['seconds']:.2f}", f"{one['processor']:.2f}", f"{1e9 * one['processor'] / samples:.1f}", f"{one['peak']:.0f}"]
+        named = [
+            windows["window"],
+            windows["step"],
+            windows["taus"],
+            windows.get("overlap", "full"),
+        ]
+        cost = [
+            f"{one['seconds']:.2f}",
+            f"{one['processor']:.2f}",
+            f"{1e9 * one['processor'] / samples:.1f}",
+            f"{one['peak']:.0f}",
+        ]
         rows.append([*named, *cost])
     return f"Log of {hours:g} h.\n\n" + table(
-        ["window", "step", "taus", "overlap", "seconds", "processor [s]", "processor [ns a sample]", "peak MiB"], rows
+        [
+            "window",
+            "step",
+            "taus",
+            "overlap",
+            "seconds",
+            "processor [s]",
+            "processor [ns a sample]",
+            "peak MiB",
+        ],
+        rows,
     )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--hours", type=float, nargs="+", default=[1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0])
-    parser.add_argument("--option-hours", type=float, default=8.0, help="length of the log for the scan of averaging times and step")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--hours", type=float, nargs="+", default=[1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0]
+    )
+    parser.add_argument(
+        "--option-hours",
+        type=float,
+        default=8.0,
+        help="length of the log for the scan of averaging times and step",
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--scheduler", default="threads")
@@ -155,10 +215,18 @@ def main() -> None:
     parts = []
     with tempfile.TemporaryDirectory() as name:
         if given.only != "options":
-            parts.append("### Time and memory against length\n\n" + against_length(Path(name), given, options))
+            parts.append(
+                "### Time and memory against length\n\n"
+                + against_length(Path(name), given, options)
+            )
         if given.only != "length":
-            parts.append("### Against averaging times, and window over step\n\n" + against_options(Path(name), given, options))
-    parts.append(f"{machine()}; {given.scheduler}, {given.workers} workers, best of {given.rounds}.")
+            parts.append(
+                "### Against averaging times, and window over step\n\n"
+                + against_options(Path(name), given, options)
+            )
+    parts.append(
+        f"{machine()}; {given.scheduler}, {given.workers} workers, best of {given.rounds}."
+    )
     text = "\n\n".join(parts)
     print(text)
     if given.output:

@@ -1,7 +1,8 @@
 """Slips of the three papers that gyrostab starts from, each with a number that shows it.
 
-P16: Wang et al., Sensors 16 (2016). P15: Wang et al., Measurement 75 (2015) 263. L13: Li et al., Chin. J. Lasers 40 (2013) 0908004.
-The formulae are evaluated here as they are printed, and beside them what is right.
+P16: Wang et al., Sensors 16 (2016). P15: Wang et al., Measurement 75 (2015) 263. L13: Li et al.,
+Chin. J. Lasers 40 (2013) 0908004. The formulae are evaluated here as they are printed, and beside
+them what is right.
 
     python benchmarks/seed_errata.py --output docs/seeds.md
 """
@@ -56,14 +57,20 @@ def _averages(rate: Array, k: int) -> Array:
 def _avar(values: Array, k: int, *, kind: str = "rate", gaps: str = "bridge") -> float:
     """Allan variance of samples at 100 Hz over all of the record, as one window."""
     log = make_log(values, rate=100.0, unit="deg/h" if kind == "rate" else "deg", kind=kind)
-    return float(davar(log, window=f"{values.size - (kind == 'angle')}samples", taus=[k / 100.0], gaps=gaps)["avar"].values.item())
+    return float(
+        davar(log, window=f"{values.size - (kind == 'angle')}samples", taus=[k / 100.0], gaps=gaps)[
+            "avar"
+        ].values.item()
+    )
 
 
 def _filtered(density: Callable[[Array], Array], tau: float) -> float:
     """P16 Eq. 7 with df: 4 int S(f) sin^4(pi f tau) / (pi f tau)^2 df, in the variable pi f tau on a grid of even ratio."""
     u = np.geomspace(1e-5, 2e4, 2_000_001)
     weight = np.where(u < 300.0, np.sin(u) ** 4, 0.375) / u**2  # beyond, the mean of sin^4
-    return float(np.trapezoid(4.0 * density(u / (math.pi * tau)) * weight / (math.pi * tau) * u, np.log(u)))
+    return float(
+        np.trapezoid(4.0 * density(u / (math.pi * tau)) * weight / (math.pi * tau) * u, np.log(u))
+    )
 
 
 def _divided_twice() -> Erratum:
@@ -157,7 +164,14 @@ def _growing_level() -> Erratum:
     log = simulate(
         {
             "log": {"rate": 100, "duration": "6000 s", "axes": ["x"]},
-            "environment": [{"profile": "ramps", "channel": "level", "unit": "g", "points": [[0, 1], [6000, 11]]}],
+            "environment": [
+                {
+                    "profile": "ramps",
+                    "channel": "level",
+                    "unit": "g",
+                    "points": [[0, 1], [6000, 11]],
+                }
+            ],
             "effect": [{"name": "vibration_noise", "driver": "level", "white": 1 / 600}],
         },
         seed=1,
@@ -208,7 +222,9 @@ def _windows(size: int, window: int, step: int, where: str, said: int) -> Erratu
         "both ends count",
         f"windows of {window} in {size} samples, step {step}",
         float(said),
-        float(davar(log, window=f"{window}samples", step=f"{step}samples", taus=[0.01]).sizes["time"]),
+        float(
+            davar(log, window=f"{window}samples", step=f"{step}samples", taus=[0.01]).sizes["time"]
+        ),
     )
 
 
@@ -218,7 +234,11 @@ def _shaken(duration: str, noise: float, **effect: object) -> xr.Dataset:
             "log": {"rate": 400, "duration": duration, "axes": ["x"]},
             "noise": {"N": noise},
             "environment": [
-                {"profile": "vibration", "points": [[0, 0.02], [330, 13.39], [630, 0.02]], "band": [700, 800]},
+                {
+                    "profile": "vibration",
+                    "points": [[0, 0.02], [330, 13.39], [630, 0.02]],
+                    "band": [700, 800],
+                },
                 {"profile": "gaps", "spans": [[432, 450]]},
             ],
             "effect": [effect],
@@ -244,7 +264,9 @@ def _start_of_vibration() -> Erratum:
 
 
 def _folded_band() -> Erratum:
-    shaken = _shaken("430 s", 0.0, name="aliased_vibration", sensitivity=1.0)["rate"].values[0, 340 * 400 :]
+    shaken = _shaken("430 s", 0.0, name="aliased_vibration", sensitivity=1.0)["rate"].values[
+        0, 340 * 400 :
+    ]
     power = np.abs(np.fft.rfft(shaken - shaken.mean())) ** 2
     below = np.fft.rfftfreq(shaken.size, 1 / 400.0) < 100.0
     return Erratum(
@@ -306,9 +328,14 @@ def main() -> None:
     from page import renew
 
     parser = argparse.ArgumentParser(description="Make the table of errata of docs/seeds.md.")
-    parser.add_argument("--output", type=Path, help="page to put the table into; printed only when not given")
+    parser.add_argument(
+        "--output", type=Path, help="page to put the table into; printed only when not given"
+    )
     chosen = parser.parse_args()
-    rows = ["| where | printed | right | shown by | as printed | right |", "| --- | --- | --- | --- | --- | --- |"]
+    rows = [
+        "| where | printed | right | shown by | as printed | right |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     for slip in errata():
         rows.append(f"| {' | '.join(slip[:4])} | {slip.as_printed:.4g} | {slip.in_truth:.4g} |")
     print("\n".join(rows))

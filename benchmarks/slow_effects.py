@@ -1,6 +1,7 @@
 """What knowing the noise is worth for effects of the mean: gains of concealed effects with all known, and with ever less known.
 
-Prints a row for each effect and strength: medians over records of an hour at 10 Hz, summed over the axes [nats].
+Prints a row for each effect and strength: medians over records of an hour at 10 Hz, summed over the
+axes [nats].
 """
 
 from __future__ import annotations
@@ -36,23 +37,48 @@ def waveform(truth: dict[str, Any], axis: str, reduced: xr.Dataset) -> np.ndarra
 
 def ladder(name: str, strength: float, number: int) -> list[float]:
     """Gains in one record, in the order of `COLUMNS`."""
-    plan = plan_case(number, seed=777) | {"rate": 10.0, "seconds": 3600, "kind": "single", "names": [name], "strengths": [strength]}
+    plan = plan_case(number, seed=777) | {
+        "rate": 10.0,
+        "seconds": 3600,
+        "kind": "single",
+        "names": [name],
+        "strengths": [strength],
+    }
     log, truth = make_case(plan | {"gaps": 0.0, "cuts": 0, "heavy": False, "severing": None})
     reduced = reduce_log(log)
     baseline, folds = calibrate_noise(reduced), fold_blocks(reduced)
     total = np.zeros(3)
     for axis in truth["effects"][0]["axes"]:
-        column, noise = waveform(truth, axis, reduced), {term: np.array([truth["noise"][axis].get(term, 0.0)]) for term in "KB"}
+        column, noise = (
+            waveform(truth, axis, reduced),
+            {term: np.array([truth["noise"][axis].get(term, 0.0)]) for term in "KB"},
+        )
         mean = reduced["mean"].sel(axis=axis).values
-        known: dict[str, Any] = {"variance": baseline["mean_variance"].sel(axis=axis).values, "present": np.isfinite(mean), **noise}
-        seen = mean_products(np.nan_to_num(mean)[:, None], column[:, None], step=float(reduced.attrs["block_s"]), **known)
-        told = {f"grid_{term}": (("axis", "grid"), np.full(baseline["grid_K"].shape, value[0])) for term, value in noise.items()}
+        known: dict[str, Any] = {
+            "variance": baseline["mean_variance"].sel(axis=axis).values,
+            "present": np.isfinite(mean),
+            **noise,
+        }
+        seen = mean_products(
+            np.nan_to_num(mean)[:, None],
+            column[:, None],
+            step=float(reduced.attrs["block_s"]),
+            **known,
+        )
+        told = {
+            f"grid_{term}": (("axis", "grid"), np.full(baseline["grid_K"].shape, value[0]))
+            for term, value in noise.items()
+        }
         total += [
             float(seen.cross[0, 0, 0] - 0.5 * seen.gram[0, 0, 0]),
             mean_factors(reduced, baseline.assign(told), [column], axis=axis, folds=folds)[0, 1, 0],
             mean_factors(reduced, baseline, [column], axis=axis, folds=folds)[0, 1, 0],
         ]
-    tried = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == name and one.view == "mean"]
+    tried = [
+        one
+        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        if one.effect == name and one.view == "mean"
+    ]
     scored = totals(compute_evidence(tried, reduced, begin_state(reduced, baseline), folds))
     return [*total, max(float(gain[0]) for gain in scored.values())]
 
@@ -60,14 +86,21 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--records", type=int, default=8, help="records of each effect and strength")
-    parser.add_argument("--strengths", type=float, nargs="+", default=[1.5, 2.5], help="in units of the limit")
+    parser.add_argument(
+        "--records", type=int, default=8, help="records of each effect and strength"
+    )
+    parser.add_argument(
+        "--strengths", type=float, nargs="+", default=[1.5, 2.5], help="in units of the limit"
+    )
     given = parser.parse_args()
     print(f"| effect | strength | {' | '.join(COLUMNS)} |\n| --- | --- {'| --- ' * len(COLUMNS)}|")
     for name in EFFECTS:
         for strength in given.strengths:
             rows = [ladder(name, strength, number) for number in range(given.records)]
-            print(f"| {name} | {strength:g} | {' | '.join(f'{value:.1f}' for value in np.median(rows, axis=0))} |", flush=True)
+            print(
+                f"| {name} | {strength:g} | {' | '.join(f'{value:.1f}' for value in np.median(rows, axis=0))} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

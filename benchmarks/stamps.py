@@ -1,6 +1,7 @@
 """Rows kept, rate and losses found where stamps are times of arrival: the table in docs/method.md.
 
-Run with ``python -m benchmarks.stamps [ROWS]``; 20 000 rows a case by default. A line is the worst of all scatters and units of time.
+Run with ``python -m benchmarks.stamps [ROWS]``; 20 000 rows a case by default. A line is the worst
+of all scatters and units of time.
 """
 
 from __future__ import annotations
@@ -12,35 +13,59 @@ import numpy as np
 
 from gyrostab.ingest.grid.regularise import regularise
 from tests.support.raw_rows import raw_log
-from tests.support.stamp_scatter import JITTER, LOSSES, UNITS, lose_samples, round_stamps, scatter_stamps
+from tests.support.stamp_scatter import (
+    JITTER,
+    LOSSES,
+    UNITS,
+    lose_samples,
+    round_stamps,
+    scatter_stamps,
+)
 
 SCATTERS = (0.1, 0.3, 0.6)
 RATE = 99.7
 
 
-def measure(jitter: str, losses: str, scatter: float, unit: str, rows: int, seed: int) -> tuple[float, float, int, int]:
+def measure(
+    jitter: str, losses: str, scatter: float, unit: str, rows: int, seed: int
+) -> tuple[float, float, int, int]:
     """Share of rows kept, error of the rate [1e-6], error of the number of samples, largest error of a row's sample."""
     random = np.random.default_rng(seed)
     samples = lose_samples(losses, rows, random)
-    log = regularise(raw_log(round_stamps(scatter_stamps(samples, jitter, scatter, random), RATE, unit)))
+    log = regularise(
+        raw_log(round_stamps(scatter_stamps(samples, jitter, scatter, random), RATE, unit))
+    )
     values = log["rate"].values[0]
     given = np.flatnonzero(np.isfinite(values))
     off = given - samples[values[given].astype(int) - 1]
     off -= int(np.median(off))
     error = 1e6 * (log.attrs["sampling_rate_hz"] / RATE - 1)
-    return len(given) / len(samples), abs(error), abs(log.sizes["time"] - 1 - int(samples[-1])), int(np.abs(off).max())
+    return (
+        len(given) / len(samples),
+        abs(error),
+        abs(log.sizes["time"] - 1 - int(samples[-1])),
+        int(np.abs(off).max()),
+    )
 
 
 def main() -> None:
     """Print the table."""
     rows = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
-    print("| jitter | losses | rows kept | rate error [ppm] | samples too many or few | row from its sample, at most |")
+    print(
+        "| jitter | losses | rows kept | rate error [ppm] | samples too many or few | row from its sample, at most |"
+    )
     print("|---|---|---|---|---|---|")
     for jitter, losses in itertools.product(JITTER, LOSSES):
         cases = itertools.product(SCATTERS, UNITS)
-        found = [measure(jitter, losses, scatter, unit, rows, seed) for seed, (scatter, unit) in enumerate(cases)]
+        found = [
+            measure(jitter, losses, scatter, unit, rows, seed)
+            for seed, (scatter, unit) in enumerate(cases)
+        ]
         kept, error, size, far = (list(column) for column in zip(*found, strict=True))
-        print(f"| {jitter} | {losses} | {100 * min(kept):.2f} % | {max(error):.2f} | {max(size)} | {max(far)} |", flush=True)
+        print(
+            f"| {jitter} | {losses} | {100 * min(kept):.2f} % | {max(error):.2f} | {max(size)} | {max(far)} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,25 +1,30 @@
 """Simulate the log of a three-axis fiber-optic gyro on a shaker and write ``mwd_sample.csv.gz`` and ``README.md`` beside this file.
 
-The timeline is that of the vibration experiment in section 8 of Wang et al., Sensors 16 (2016): 930 s, still until 330 s, vibrating
-until 630 s, still again, data lost from 432 s to 450 s, at about 65 degC, 13.39 g rms with its power at 700-800 Hz. The sampling rate
-here is 100 Hz. Time t is in seconds from the first row. Each axis reads
+The timeline is that of the vibration experiment in section 8 of Wang et al., Sensors 16 (2016): 930
+s, still until 330 s, vibrating until 630 s, still again, data lost from 432 s to 450 s, at about 65
+degC, 13.39 g rms with its power at 700-800 Hz. The sampling rate here is 100 Hz. Time t is in
+seconds from the first row. Each axis reads
 
     rate(t) = earth + a_T (T(t) - 60 degC) + k_2 g(t)^2 + b(t) + w(t) + (theta(t) - theta(t - dt)) / dt,    dt = 0.01 s
 
 - ``earth``: earth rate, 15.041 deg/h, in a tool that hangs plumb at 40 degrees north with toolface azimuth 30 degrees.
 - ``a_T``: temperature sensitivity left after compensation, up to 3e-3 deg/h/degC for a gyro of the 0.03 deg/h class (estimate).
 - ``k_2 g^2``: vibration rectification. Published sinusoidal tests at 30 Hz and 6 g gave 0.0118 to 0.0445 deg/h, that is
-  0.7e-3 to 2.5e-3 deg/h/g^2 if 6 g is the amplitude; g is the rms acceleration. It is a step of the mean, not a random walk.
+  0.7e-3 to 2.5e-3 deg/h/g^2 if 6 g is the amplitude; g is the rms acceleration. It is a step of the
+  mean, not a random walk.
 - ``b``: bias instability (flicker, two-sided PSD B^2 / (2 pi f)) plus rate random walk (white steps), at one level throughout.
 - ``w``: white rate noise, N, raised by a factor under vibration (intensity and polarisation noise of the shaken fiber; in stepped
-  vibration tests of a three-axis gyro by Li et al., Chin. J. Lasers 40 (2013) 0908004, N rose four times on average, ten at most).
+  vibration tests of a three-axis gyro by Li et al., Chin. J. Lasers 40 (2013) 0908004, N rose four
+  times on average, ten at most).
 - ``theta``: angle noise. Still, it is the rounding of the angle increments (Q). Under vibration the housing also *turns* to and fro in the
-  band 700-800 Hz. The logger integrates the rate over each interval, so it samples the angle; a flat band of 100 Hz sampled at
-  100 Hz folds to a white sequence, which no Allan variance can tell from quantization noise of Q = the angle's rms value.
+  band 700-800 Hz. The logger integrates the rate over each interval, so it samples the angle; a
+  flat band of 100 Hz sampled at 100 Hz folds to a white sequence, which no Allan variance can tell
+  from quantization noise of Q = the angle's rms value.
 
 So under vibration N and Q rise for two different reasons, B and K do not rise, and the mean steps.
 
-Then the logger and the telemetry spoil the log: absent rows, unreadable words, duplicated rows, rows out of order, flipped bits.
+Then the logger and the telemetry spoil the log: absent rows, unreadable words, duplicated rows,
+rows out of order, flipped bits.
 """
 
 from __future__ import annotations
@@ -44,14 +49,51 @@ G_STILL, G_VIBRATING = 0.02, 13.39  # g rms
 LSB = 0.01  # deg/h
 AXES = ("x", "y", "z")
 
-#: Truth by axis, in the units of the README; ``N_factor`` and ``theta`` (rms angle, urad) act under vibration only.
+#: Truth by axis, in the units of the README; ``N_factor`` and ``theta`` (rms angle, urad) act under
+#: vibration only.
 TRUTH: dict[str, dict[str, float]] = {
-    "x": {"Q": 0.06, "N": 0.006, "B": 0.03, "K": 0.05, "N_factor": 5.0, "theta": 0.40, "k_2": 1.5e-3, "a_T": 3.0e-3},
-    "y": {"Q": 0.06, "N": 0.010, "B": 0.03, "K": 0.05, "N_factor": 2.5, "theta": 0.25, "k_2": 2.4e-3, "a_T": -2.0e-3},
-    "z": {"Q": 0.06, "N": 0.004, "B": 0.02, "K": 0.03, "N_factor": 1.3, "theta": 0.08, "k_2": 0.8e-3, "a_T": 1.0e-3},
+    "x": {
+        "Q": 0.06,
+        "N": 0.006,
+        "B": 0.03,
+        "K": 0.05,
+        "N_factor": 5.0,
+        "theta": 0.40,
+        "k_2": 1.5e-3,
+        "a_T": 3.0e-3,
+    },
+    "y": {
+        "Q": 0.06,
+        "N": 0.010,
+        "B": 0.03,
+        "K": 0.05,
+        "N_factor": 2.5,
+        "theta": 0.25,
+        "k_2": 2.4e-3,
+        "a_T": -2.0e-3,
+    },
+    "z": {
+        "Q": 0.06,
+        "N": 0.004,
+        "B": 0.02,
+        "K": 0.03,
+        "N_factor": 1.3,
+        "theta": 0.08,
+        "k_2": 0.8e-3,
+        "a_T": 1.0e-3,
+    },
 }
 #: Short losses: start [s], length [s].
-DROPOUTS = ((37.42, 0.05), (118.90, 0.30), (203.15, 1.20), (289.77, 0.12), (401.33, 0.75), (547.08, 2.00), (699.51, 0.08), (812.64, 0.45))
+DROPOUTS = (
+    (37.42, 0.05),
+    (118.90, 0.30),
+    (203.15, 1.20),
+    (289.77, 0.12),
+    (401.33, 0.75),
+    (547.08, 2.00),
+    (699.51, 0.08),
+    (812.64, 0.45),
+)
 SPIKES = (251.20, 14)  # s, flipped words on axis y within 0.4 s
 WORDS = ("****", "ERR", "")
 
@@ -60,10 +102,16 @@ def earth_rate() -> dict[str, float]:
     """Earth rate by axis [deg/h]; z points down."""
     latitude, azimuth = np.radians(40.0), np.radians(30.0)
     level = 15.041 * np.cos(latitude)
-    return {"x": level * np.cos(azimuth), "y": -level * np.sin(azimuth), "z": -15.041 * np.sin(latitude)}
+    return {
+        "x": level * np.cos(azimuth),
+        "y": -level * np.sin(azimuth),
+        "z": -15.041 * np.sin(latitude),
+    }
 
 
-def shaped(rng: np.random.Generator, size: int, rate: float, psd: NDArray[np.float64]) -> NDArray[np.float64]:
+def shaped(
+    rng: np.random.Generator, size: int, rate: float, psd: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Gaussian noise of `size` samples at `rate` [Hz] with the two-sided density `psd` at ``rfftfreq(size, 1 / rate)``."""
     parts = rng.standard_normal((2, psd.size))
     spectrum = (parts[0] + 1j * parts[1]) * np.sqrt(psd * rate * size / 2.0)
@@ -83,7 +131,9 @@ def angular_vibration(rng: np.random.Generator, size: int, rms: float) -> NDArra
     """Angle [same unit as `rms`] at the ends of the sampling intervals, of a motion with a flat band of 700-800 Hz."""
     fine = 20  # 2 kHz
     frequency = np.fft.rfftfreq(size * fine, 1.0 / (RATE * fine))
-    psd = np.where((frequency > 700.0) & (frequency < 800.0), rms**2 / 200.0, 0.0)  # 200 Hz: both signs of the frequency
+    psd = np.where(
+        (frequency > 700.0) & (frequency < 800.0), rms**2 / 200.0, 0.0
+    )  # 200 Hz: both signs of the frequency
     return shaped(rng, size * fine, RATE * fine, psd)[::fine]
 
 
@@ -93,18 +143,40 @@ def simulate(rng: np.random.Generator) -> pd.DataFrame:
     second = np.arange(size) / RATE
     shaken = (second >= VIBRATING[0]) & (second < VIBRATING[1])
     # the tool warms by its own electronics towards 68 degC, a little faster while it is shaken
-    temperature = 68.0 - 10.0 * np.exp(-second / 600.0) + 0.4 * np.clip((second - VIBRATING[0]) / 300.0, 0.0, 1.0)
+    temperature = (
+        68.0
+        - 10.0 * np.exp(-second / 600.0)
+        + 0.4 * np.clip((second - VIBRATING[0]) / 300.0, 0.0, 1.0)
+    )
     columns: dict[str, NDArray[np.float64]] = {"second": second}
     for axis in AXES:
         truth, earth = TRUTH[axis], earth_rate()[axis]
-        white = 60.0 * truth["N"] * np.sqrt(RATE) * rng.standard_normal(size) * np.where(shaken, truth["N_factor"], 1.0)
+        white = (
+            60.0
+            * truth["N"]
+            * np.sqrt(RATE)
+            * rng.standard_normal(size)
+            * np.where(shaken, truth["N_factor"], 1.0)
+        )
         walk = np.cumsum(rng.standard_normal(size)) * truth["K"] / np.sqrt(3600.0 * RATE)
         theta = truth["Q"] * rng.standard_normal(size + 1)
         theta[1:][shaken] += angular_vibration(rng, int(shaken.sum()), truth["theta"])
-        mean = earth + truth["a_T"] * (temperature - 60.0) + truth["k_2"] * np.where(shaken, G_VIBRATING, G_STILL) ** 2
-        columns[axis] = mean + walk + flicker(rng, size, truth["B"]) + white + np.diff(theta) * URAD_PER_S * RATE
+        mean = (
+            earth
+            + truth["a_T"] * (temperature - 60.0)
+            + truth["k_2"] * np.where(shaken, G_VIBRATING, G_STILL) ** 2
+        )
+        columns[axis] = (
+            mean
+            + walk
+            + flicker(rng, size, truth["B"])
+            + white
+            + np.diff(theta) * URAD_PER_S * RATE
+        )
     columns["temperature"] = temperature + 0.02 * rng.standard_normal(size)
-    columns["vibration"] = np.where(shaken, G_VIBRATING, G_STILL) * (1.0 + 0.02 * rng.standard_normal(size))
+    columns["vibration"] = np.where(shaken, G_VIBRATING, G_STILL) * (
+        1.0 + 0.02 * rng.standard_normal(size)
+    )
     return pd.DataFrame(columns)
 
 
@@ -114,12 +186,21 @@ def write_cells(frame: pd.DataFrame, rng: np.random.Generator) -> list[list[str]
     first = round(SPIKES[0] * RATE)
     hit = first + np.sort(rng.choice(40, SPIKES[1], replace=False))
     codes["y"][hit] ^= 1 << rng.integers(13, 17, hit.size)
-    stamps = np.datetime_as_string(START + np.rint(frame["second"].to_numpy() * 1000.0).astype("timedelta64[ms]"))
+    stamps = np.datetime_as_string(
+        START + np.rint(frame["second"].to_numpy() * 1000.0).astype("timedelta64[ms]")
+    )
     row = np.arange(len(frame))
     temperature = np.where(row % RATE == 0, [f"{value:.2f}" for value in frame["temperature"]], "")
-    vibration = np.where(row % RATE == RATE // 2, [f"{value:.3f}" for value in frame["vibration"]], "")
+    vibration = np.where(
+        row % RATE == RATE // 2, [f"{value:.3f}" for value in frame["vibration"]], ""
+    )
     gyro = [[f"{code * LSB:.2f}" for code in codes[axis]] for axis in AXES]
-    return [list(cells) for cells in zip((f"{stamp}Z" for stamp in stamps), *gyro, temperature, vibration, strict=True)]
+    return [
+        list(cells)
+        for cells in zip(
+            (f"{stamp}Z" for stamp in stamps), *gyro, temperature, vibration, strict=True
+        )
+    ]
 
 
 def spoil(rows: list[list[str]], rng: np.random.Generator) -> list[list[str]]:
@@ -162,13 +243,17 @@ def truth_table() -> str:
             shaken = state == "vibrating"
             q = np.hypot(truth["Q"], truth["theta"] if shaken else 0.0)
             n = truth["N"] * (truth["N_factor"] if shaken else 1.0)
-            lines.append(f"| {axis} | {state} | {q:.3f} | {n:.4f} | {truth['B']:g} | {truth['K']:g} | {earth + truth['k_2'] * g**2:.3f} |")
+            lines.append(
+                f"| {axis} | {state} | {q:.3f} | {n:.4f} | {truth['B']:g} | {truth['K']:g} | {earth + truth['k_2'] * g**2:.3f} |"
+            )
     return "\n".join(lines)
 
 
 def readme(rows: int) -> str:
     """Text of the README that describes the log and its truth."""
-    steps = ", ".join(f"{axis} {TRUTH[axis]['k_2'] * (G_VIBRATING**2 - G_STILL**2):.2f}" for axis in AXES)
+    steps = ", ".join(
+        f"{axis} {TRUTH[axis]['k_2'] * (G_VIBRATING**2 - G_STILL**2):.2f}" for axis in AXES
+    )
     slopes = ", ".join(f"{axis} {TRUTH[axis]['a_T']:g}" for axis in AXES)
     dropouts = ", ".join(f"{start:g} s ({length:g} s)" for start, length in DROPOUTS)
     return f"""# The shipped log

@@ -1,7 +1,7 @@
 """Errors that gyrostab raises on purpose.
 
-Each one also inherits the builtin that a Python user would expect, so ``except ValueError`` keeps working.
-A message says what was read (file, line or time), what is wrong with it and what to do.
+Each one also inherits the builtin that a Python user would expect, so ``except ValueError`` keeps
+working. A message says what was read (file, line or time), what is wrong with it and what to do.
 """
 
 from __future__ import annotations
@@ -82,8 +82,9 @@ class WorkerError(GyrostabError, RuntimeError):
 def reading_of(path: str | PathLike[str]) -> Iterator[None]:
     """Turn whatever a library raises while it reads a file into a `DamageError` that names the file.
 
-    Format libraries raise exceptions of any type on damaged bytes. Each entry to a file (opening it, and every later read of data
-    that stayed on disk) runs within this context, so that no caller has to know those types.
+    Format libraries raise exceptions of any type on damaged bytes. Each entry to a file (opening
+    it, and every later read of data that stayed on disk) runs within this context, so that no
+    caller has to know those types.
 
     Parameters
     ----------
@@ -93,7 +94,8 @@ def reading_of(path: str | PathLike[str]) -> Iterator[None]:
     Raises
     ------
     DamageError
-        When the block raises anything but a `GyrostabError` or an error of the operating system, such as a missing permission.
+        When the block raises anything but a `GyrostabError` or an error of the operating system,
+        such as a missing permission.
 
     Examples
     --------
@@ -117,6 +119,8 @@ def reading_of(path: str | PathLike[str]) -> Iterator[None]:
 def _describe_damage(path: str | PathLike[str], error: Exception) -> DamageError:
     name, text = Path(path).name, " ".join(str(error).split())
     if isinstance(error, MemoryError):
-        return DamageError(f"{name}: reading it takes more memory than there is{f' ({text})' if text else ''}; is it damaged?")
+        return DamageError(
+            f"{name}: reading it takes more memory than there is{f' ({text})' if text else ''}; is it damaged?"
+        )
     reason = f"{type(error).__name__}: {text}" if text else type(error).__name__
     return DamageError(f"{name}: is damaged, or not of its format ({reason:.300}); copy it again")

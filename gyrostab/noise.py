@@ -14,8 +14,9 @@ The PSDs are two-sided, as in IEEE Std 952; T is the sampling interval.
 
 References
 ----------
-IEEE Std 952-1997, annex C; Wang et al., Sensors 16 (2016), Eq. 8-9 (there Q is labelled arcsec although the factor
-10^6 pi / (180 * 3600 sqrt 3) gives microradian, and Table 1 prints K^2 / (2 pi f^2) for the rate random walk).
+IEEE Std 952-1997, annex C; Wang et al., Sensors 16 (2016), Eq. 8-9 (there Q is labelled arcsec
+although the factor 10^6 pi / (180 * 3600 sqrt 3) gives microradian, and Table 1 prints K^2 / (2 pi
+f^2) for the rate random walk).
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ class NoiseLaw:
     squared_units : str
         Exact dimension of the squared coefficient, as a UDUNITS string.
     tau_ref_hours : float or None
-        Averaging time at which the Allan deviation of the term equals the stored number, where `units` says so.
+        Averaging time at which the Allan deviation of the term equals the stored number, where
+        `units` says so.
     """
 
     symbol: str
@@ -76,10 +78,38 @@ class NoiseLaw:
 LAWS: dict[str, NoiseLaw] = {
     law.symbol: law
     for law in (
-        NoiseLaw("Q", "quantization", 3.0 * URAD_PER_S**2, -2, "urad", "microradian", "microradian2"),
-        NoiseLaw("N", "angle random walk", HOUR, -1, "deg/sqrt(h)", "degree hour-1", "degree2 hour-1", 1.0),
-        NoiseLaw("B", "bias instability", 2.0 * math.log(2.0) / math.pi, 0, "deg/h", "degree hour-1", "degree2 hour-2"),
-        NoiseLaw("K", "rate random walk", 1.0 / (3.0 * HOUR), 1, "deg/h^1.5", "degree hour-1", "degree2 hour-3", 3.0),
+        NoiseLaw(
+            "Q", "quantization", 3.0 * URAD_PER_S**2, -2, "urad", "microradian", "microradian2"
+        ),
+        NoiseLaw(
+            "N",
+            "angle random walk",
+            HOUR,
+            -1,
+            "deg/sqrt(h)",
+            "degree hour-1",
+            "degree2 hour-1",
+            1.0,
+        ),
+        NoiseLaw(
+            "B",
+            "bias instability",
+            2.0 * math.log(2.0) / math.pi,
+            0,
+            "deg/h",
+            "degree hour-1",
+            "degree2 hour-2",
+        ),
+        NoiseLaw(
+            "K",
+            "rate random walk",
+            1.0 / (3.0 * HOUR),
+            1,
+            "deg/h^1.5",
+            "degree hour-1",
+            "degree2 hour-3",
+            3.0,
+        ),
         NoiseLaw("R", "rate ramp", 0.5 / HOUR**2, 2, "deg/h^2", "degree hour-2", "degree2 hour-4"),
     )
 }
@@ -124,7 +154,12 @@ def model_avar(tau: Any, coefficients: Mapping[str, float]) -> NDArray[np.float6
     >>> float(model_avar(3600.0, {"N": 3.0, "B": 0.0}))
     9.0
     """
-    return np.asarray(sum((LAWS[symbol].avar(tau, value) for symbol, value in coefficients.items()), np.zeros(np.shape(tau))))
+    return np.asarray(
+        sum(
+            (LAWS[symbol].avar(tau, value) for symbol, value in coefficients.items()),
+            np.zeros(np.shape(tau)),
+        )
+    )
 
 
 def sample_squares(rate: float) -> NDArray[np.float64]:
@@ -138,8 +173,9 @@ def sample_squares(rate: float) -> NDArray[np.float64]:
     Returns
     -------
     ndarray, shape (5,)
-        In the order of `TERMS`; times a squared coefficient it gives the term of ``3 q / k^2``, ``n / k``,
-        ``(2 ln 2 / pi) b``, ``k w / 3`` or ``r k^2 / 2`` in degree2 hour-2 for an averaging factor k.
+        In the order of `TERMS`; times a squared coefficient it gives the term of ``3 q / k^2``, ``n
+        / k``, ``(2 ln 2 / pi) b``, ``k w / 3`` or ``r k^2 / 2`` in degree2 hour-2 for an averaging
+        factor k.
     """
     one_sample = np.array([3.0, 1.0, 2.0 * math.log(2.0) / math.pi, 1.0 / 3.0, 0.5])
     return np.asarray(avar_columns(1.0 / rate) / one_sample)

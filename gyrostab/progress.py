@@ -14,7 +14,9 @@ __all__ = ["Stage", "no_stage", "show_progress"]
 class Stage(Protocol):
     """What a long function tells of its progress."""
 
-    def __call__(self, label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
+    def __call__(
+        self, label: str, total: int = 0, done: int | None = None, unit: str = "samples"
+    ) -> None:
         """Begin a stage (another label than before), or say how much of it is done.
 
         Parameters
@@ -24,7 +26,8 @@ class Stage(Protocol):
         total : int
             What is to be done in it: samples over all axes, files ...; 0 when nobody knows.
         done : int, optional
-            What is done of it. A stage that does not say so moves with the tasks that dask finishes.
+            What is done of it. A stage that does not say so moves with the tasks that dask
+            finishes.
         unit : str
             What is counted.
         """
@@ -46,7 +49,8 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
     Yields
     ------
     Stage
-        To be called with a label and the number of samples that the stage works through (0 when it has none).
+        To be called with a label and the number of samples that the stage works through (0 when it
+        has none).
 
     Examples
     --------
@@ -95,7 +99,13 @@ def _bar() -> Iterator[Stage]:
     """One bar per stage, with throughput and the time left."""
     from dask.callbacks import Callback
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         TextColumn("{task.description}"),
@@ -105,7 +115,15 @@ def _bar() -> Iterator[Stage]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        now: dict[str, Any] = {"label": "", "task": None, "total": 0, "first": None, "begun": 0.0, "tasks": 0, "ended": 0}
+        now: dict[str, Any] = {
+            "label": "",
+            "task": None,
+            "total": 0,
+            "first": None,
+            "begun": 0.0,
+            "tasks": 0,
+            "ended": 0,
+        }
 
         def finish() -> None:
             if now["task"] is not None:
@@ -115,11 +133,21 @@ def _bar() -> Iterator[Stage]:
             said = _speed(amount, time.perf_counter() - now["begun"], unit)
             progress.update(now["task"], total=1.0, completed=share, speed=said)
 
-        def stage(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
+        def stage(
+            label: str, total: int = 0, done: int | None = None, unit: str = "samples"
+        ) -> None:
             if label != now["label"]:
                 finish()
                 task = progress.add_task(f"{label:<10}", total=None, speed="") if label else None
-                now.update(label=label, task=task, total=total, first=done, begun=time.perf_counter(), tasks=0, ended=0)
+                now.update(
+                    label=label,
+                    task=task,
+                    total=total,
+                    first=done,
+                    begun=time.perf_counter(),
+                    tasks=0,
+                    ended=0,
+                )
             if done is not None and total:
                 now["first"] = done if now["first"] is None else now["first"]
                 show(done / total, done - now["first"], unit)

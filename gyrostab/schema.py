@@ -5,8 +5,8 @@ log          uniform time, NaN at every missing sample, a table of gaps
 surface      dynamic Allan variance by ``(axis, time, tau)``
 product      surface plus the coefficients Q, N, B, K, R by ``(axis, time)``
 
-A recording and a simulation have the same schema. The table `VARIABLES` holds the attributes of every product variable;
-the stages and the export all read it.
+A recording and a simulation have the same schema. The table `VARIABLES` holds the attributes of
+every product variable; the stages and the export all read it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,15 @@ __all__ = [
 ]
 
 #: Flag values of ``gap_cause(gap)``, in the order of their numbers.
-GAP_CAUSES = ("missing", "unreadable", "duplicate", "out_of_order", "outside_range", "clock_step", "restart")
+GAP_CAUSES = (
+    "missing",
+    "unreadable",
+    "duplicate",
+    "out_of_order",
+    "outside_range",
+    "clock_step",
+    "restart",
+)
 
 #: Flag values of ``estimator(axis, time, tau)``: how a cell of the surface was estimated.
 ESTIMATORS = ("none", "strict_runs", "weighted_clusters")
@@ -45,7 +53,8 @@ ESTIMATORS = ("none", "strict_runs", "weighted_clusters")
 #: Flag values of ``observable(axis, time, term)``.
 OBSERVABLE = ("not_observable", "upper_limit_only", "observed")
 
-#: What tau may differ from a whole number of samples, as a share: the rounding of stored numbers, far below a sample in any window.
+#: What tau may differ from a whole number of samples, as a share: the rounding of stored numbers,
+#: far below a sample in any window.
 _TAU_TOLERANCE = 1e-9
 
 #: Name of the gyro signal -> its unit; a log has one of them, and its ``kind`` attribute names it.
@@ -53,21 +62,39 @@ SIGNAL_UNITS = {"rate": INNER["rate"], "angle": INNER["angle"]}
 
 
 def _flags(meanings: tuple[str, ...]) -> dict[str, Any]:
-    return {"flag_values": np.arange(len(meanings), dtype=np.int8), "flag_meanings": " ".join(meanings)}
+    return {
+        "flag_values": np.arange(len(meanings), dtype=np.int8),
+        "flag_meanings": " ".join(meanings),
+    }
 
 
-#: Product variable -> attributes. CF, UDUNITS spelling; ``axis`` and ``term`` hold strings and so carry no unit.
+#: Product variable -> attributes. CF, UDUNITS spelling; ``axis`` and ``term`` hold strings and so
+#: carry no unit.
 VARIABLES: dict[str, dict[str, Any]] = {
-    "time": {"long_name": "centre of the window", "standard_name": "time", "bounds": "time_bounds", "axis": "T"},
+    "time": {
+        "long_name": "centre of the window",
+        "standard_name": "time",
+        "bounds": "time_bounds",
+        "axis": "T",
+    },
     "tau": {"long_name": "averaging time", "units": "s"},
     "axis": {"long_name": "sensor axis"},
     "term": {"long_name": "noise term, symbol of IEEE Std 952"},
-    "avar": {"long_name": "dynamic overlapping Allan variance of the rotation rate", "units": "degree2 hour-2"},
+    "avar": {
+        "long_name": "dynamic overlapping Allan variance of the rotation rate",
+        "units": "degree2 hour-2",
+    },
     "count": {"long_name": "second differences used", "units": "1"},
-    "coverage": {"long_name": "second differences used, share of the gap-free number", "units": "1"},
+    "coverage": {
+        "long_name": "second differences used, share of the gap-free number",
+        "units": "1",
+    },
     "edf": {"long_name": "equivalent degrees of freedom of the Allan variance", "units": "1"},
     "estimator": {"long_name": "estimator of the Allan variance", **_flags(ESTIMATORS)},
-    "gap_factor": {"long_name": "degrees of freedom left by the gaps, share of the gap-free ones", "units": "1"},
+    "gap_factor": {
+        "long_name": "degrees of freedom left by the gaps, share of the gap-free ones",
+        "units": "1",
+    },
     "white_response": {
         "long_name": "Allan variance of angle random walk seen through the gaps, as a share of the gap-free law",
         "units": "1",
@@ -76,12 +103,24 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "long_name": "Allan variance of quantization noise seen through the gaps, as a share of the gap-free law",
         "units": "1",
     },
-    "ramp_response": {"long_name": "Allan variance of a rate ramp seen through the gaps, as a share of the gap-free law", "units": "1"},
+    "ramp_response": {
+        "long_name": "Allan variance of a rate ramp seen through the gaps, as a share of the gap-free law",
+        "units": "1",
+    },
     "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
-    "outlier_count": {"long_name": "single samples of the window that stand far from both neighbours", "units": "1"},
-    "window_coverage": {"long_name": "share of the window's samples that are present", "units": "1"},
+    "outlier_count": {
+        "long_name": "single samples of the window that stand far from both neighbours",
+        "units": "1",
+    },
+    "window_coverage": {
+        "long_name": "share of the window's samples that are present",
+        "units": "1",
+    },
     "observable": {"long_name": "what the window can tell of the noise term", **_flags(OBSERVABLE)},
-    "fit_chi2": {"long_name": "misfit of the five-term model, generalised least squares chi-square", "units": "1"},
+    "fit_chi2": {
+        "long_name": "misfit of the five-term model, generalised least squares chi-square",
+        "units": "1",
+    },
     "fit_dof": {"long_name": "degrees of freedom of the misfit", "units": "1"},
 }
 
@@ -95,10 +134,19 @@ def _add_coefficients() -> None:
             note = f", stored as the Allan deviation of its term at tau = {law.tau_ref_hours:g} h (numerically {symbol} in {law.label})"
         base = {"units": law.units, **extra}
         VARIABLES[symbol] = {"long_name": f"{law.name} coefficient{note}", **base}
-        VARIABLES[f"{symbol}_stderr"] = {"long_name": f"standard error of the {law.name} coefficient{note}", **base}
-        VARIABLES[f"{symbol}_upper"] = {"long_name": f"95 % upper limit of the {law.name} coefficient{note}", **base}
+        VARIABLES[f"{symbol}_stderr"] = {
+            "long_name": f"standard error of the {law.name} coefficient{note}",
+            **base,
+        }
+        VARIABLES[f"{symbol}_upper"] = {
+            "long_name": f"95 % upper limit of the {law.name} coefficient{note}",
+            **base,
+        }
         if symbol in "NK":
-            VARIABLES[f"{symbol}_squared"] = {"long_name": f"square of the {law.name} coefficient", "units": law.squared_units}
+            VARIABLES[f"{symbol}_squared"] = {
+                "long_name": f"square of the {law.name} coefficient",
+                "units": law.squared_units,
+            }
 
 
 _add_coefficients()
@@ -120,7 +168,9 @@ def signal_name(log: xr.Dataset) -> str:
     found = [name for name in SIGNAL_UNITS if name in log.data_vars]
     if len(found) != 1:
         holds = ", ".join(found or sorted(map(str, log.data_vars))) or "nothing"
-        raise SchemaError(f"a log holds either 'rate' or 'angle'; this dataset holds {holds}; make one with gyrostab.make_log")
+        raise SchemaError(
+            f"a log holds either 'rate' or 'angle'; this dataset holds {holds}; make one with gyrostab.make_log"
+        )
     return found[0]
 
 
@@ -138,21 +188,36 @@ def texts(dataset: xr.Dataset, name: str) -> list[str]:
 
 def log_channels(log: xr.Dataset) -> list[str]:
     """Names of the channels of a log: one-dimensional variables on ``time`` or on their own ``time_<channel>``."""
-    return [str(name) for name in log.data_vars if log.variables[name].dims in (("time",), (f"time_{name}",))]
+    return [
+        str(name)
+        for name in log.data_vars
+        if log.variables[name].dims in (("time",), (f"time_{name}",))
+    ]
 
 
 def _require(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -> None:
     if not isinstance(dataset, xr.Dataset):
-        raise SchemaError(f"this is a {type(dataset).__name__}, not a {what}: give the whole xarray.Dataset; {_MAKERS[what]} makes one")
+        raise SchemaError(
+            f"this is a {type(dataset).__name__}, not a {what}: give the whole xarray.Dataset; {_MAKERS[what]} makes one"
+        )
     for name, expected in dims.items():
         if name not in dataset.variables:
-            raise SchemaError(f"this is not a {what}: it has no variable {name!r}; it has {sorted(map(str, dataset.variables))}")
+            raise SchemaError(
+                f"this is not a {what}: it has no variable {name!r}; it has {sorted(map(str, dataset.variables))}"
+            )
         if (has := dataset.variables[name].dims) != expected:
-            raise SchemaError(f"{what}: variable {name!r} has dimensions {has}, expected {expected}; transpose or rename them")
+            raise SchemaError(
+                f"{what}: variable {name!r} has dimensions {has}, expected {expected}; transpose or rename them"
+            )
 
 
 #: What a message calls a dataset -> the function that makes one.
-_MAKERS = {"raw log": "gyrostab.read_log", "log": "gyrostab.make_log", "DAVAR surface": "gyrostab.davar", "product": "gyrostab.fit_noise"}
+_MAKERS = {
+    "raw log": "gyrostab.read_log",
+    "log": "gyrostab.make_log",
+    "DAVAR surface": "gyrostab.davar",
+    "product": "gyrostab.fit_noise",
+}
 
 
 def check_raw(raw: xr.Dataset) -> None:
@@ -165,11 +230,14 @@ def check_raw(raw: xr.Dataset) -> None:
 def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
     """Raise `SchemaError` unless `log` has what a regular log has: ``time``, a signal ``(axis, time)`` with units, a rate.
 
-    Whether ``time`` is uniform, and the rate true, is checked by `gyrostab.ingest.uniform.as_uniform`, which every function that takes
-    a log calls. With ``rate=False`` the attribute ``sampling_rate_hz`` may be absent.
+    Whether ``time`` is uniform, and the rate true, is checked by
+    `gyrostab.ingest.uniform.as_uniform`, which every function that takes a log calls. With
+    ``rate=False`` the attribute ``sampling_rate_hz`` may be absent.
     """
     if "row" in log.dims:
-        raise SchemaError("these are raw rows with their stamps as written; call gyrostab.regularise(raw) first")
+        raise SchemaError(
+            "these are raw rows with their stamps as written; call gyrostab.regularise(raw) first"
+        )
     name = signal_name(log)
     _require(log, "log", {name: ("axis", "time"), "time": ("time",)})
     _check_units(log, name)
@@ -177,23 +245,33 @@ def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
         raise SchemaError("the log is empty: it has no axis or no sample")
     declared = log.attrs.get("sampling_rate_hz")
     if rate and (declared is None or not np.isfinite(declared) or declared <= 0):
-        raise SchemaError(f"the log needs the attribute 'sampling_rate_hz' in Hz, a number above 0; it has {declared!r}")
+        raise SchemaError(
+            f"the log needs the attribute 'sampling_rate_hz' in Hz, a number above 0; it has {declared!r}"
+        )
 
 
 def _check_units(dataset: xr.Dataset, name: str) -> None:
     units = dataset.variables[name].attrs.get("units")
     if units != SIGNAL_UNITS[name]:
-        raise SchemaError(f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; convert it and say so")
+        raise SchemaError(
+            f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; convert it and say so"
+        )
 
 
 def check_surface(surface: xr.Dataset) -> None:
     """Raise `SchemaError` unless `surface` is what `gyrostab.davar` returns, or a part of it."""
     cube = ("axis", "time", "tau")
-    _require(surface, "DAVAR surface", dict.fromkeys(("avar", "count", "coverage", "edf", "estimator"), cube))
+    _require(
+        surface,
+        "DAVAR surface",
+        dict.fromkeys(("avar", "count", "coverage", "edf", "estimator"), cube),
+    )
     _require(surface, "DAVAR surface", dict.fromkeys(("window_mean", "window_coverage"), cube[:2]))
     units, expected = surface.variables["avar"].attrs.get("units"), VARIABLES["avar"]["units"]
     if units != expected:
-        raise SchemaError(f"variable 'avar' has units {units!r}, expected {expected!r}; give the surface as gyrostab.davar made it")
+        raise SchemaError(
+            f"variable 'avar' has units {units!r}, expected {expected!r}; give the surface as gyrostab.davar made it"
+        )
     _check_tau(surface)
 
 
@@ -204,13 +282,21 @@ def _check_tau(surface: xr.Dataset) -> None:
         return
     factors = np.asarray(surface.variables["tau"].values, dtype=np.float64) * float(rate)
     whole = np.rint(factors)
-    if np.any(whole < 1) or np.any(np.abs(factors - whole) > _TAU_TOLERANCE * whole) or np.any(np.diff(whole) <= 0):
+    if (
+        np.any(whole < 1)
+        or np.any(np.abs(factors - whole) > _TAU_TOLERANCE * whole)
+        or np.any(np.diff(whole) <= 0)
+    ):
         raise SchemaError(
             f"the averaging times of the surface are not rising whole numbers of samples at {float(rate):g} Hz (sampling_rate_hz): they "
             "have been averaged, interpolated or sorted, or stem from another log; choose them with taus=... in gyrostab.davar"
         )
     samples, seconds = surface.attrs.get("window_samples"), surface.attrs.get("window_s")
-    if samples is not None and seconds is not None and abs(samples / rate - seconds) > _TAU_TOLERANCE * seconds:
+    if (
+        samples is not None
+        and seconds is not None
+        and abs(samples / rate - seconds) > _TAU_TOLERANCE * seconds
+    ):
         raise SchemaError(
             f"the surface has windows of {samples} samples and of {seconds:g} s, which do not agree at {float(rate):g} Hz: its attributes "
             "have been changed; compute it anew with gyrostab.davar"
@@ -220,4 +306,8 @@ def _check_tau(surface: xr.Dataset) -> None:
 def check_product(product: xr.Dataset) -> None:
     """Raise `SchemaError` unless `product` is what `gyrostab.fit_noise` returns."""
     check_surface(product)
-    _require(product, "product", {**dict.fromkeys(TERMS, ("axis", "time")), "observable": ("axis", "time", "term")})
+    _require(
+        product,
+        "product",
+        {**dict.fromkeys(TERMS, ("axis", "time")), "observable": ("axis", "time", "term")},
+    )

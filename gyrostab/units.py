@@ -1,8 +1,8 @@
 """Unit strings that gyrostab reads and writes, and their factors.
 
-Inside, every quantity has one unit (`INNER`). Readers convert at the door with `parse_unit`; nothing else converts.
-The strings in `INNER` and `ON_DISK` are fixed constants: UDUNITS refuses ``deg`` and reads fractional powers wrongly,
-so no unit string is ever built at run time.
+Inside, every quantity has one unit (`INNER`). Readers convert at the door with `parse_unit`;
+nothing else converts. The strings in `INNER` and `ON_DISK` are fixed constants: UDUNITS refuses
+``deg`` and reads fractional powers wrongly, so no unit string is ever built at run time.
 
 References
 ----------
@@ -34,7 +34,8 @@ INNER = {
     "number": "1",
 }
 
-#: Units whose in-memory spelling UDUNITS would misread (``g`` is the gram) -> the spelling used in files.
+#: Units whose in-memory spelling UDUNITS would misread (``g`` is the gram) -> the spelling used in
+#: files.
 ON_DISK = {"g": "9.80665 m s-2"}
 
 _DEGREE = math.pi / 180.0
@@ -42,7 +43,8 @@ _RATE = 3600.0  # deg/s -> deg/h
 
 # spelling -> (quantity, factor to the inner unit, offset in the inner unit)
 _SPELLINGS: dict[str, tuple[str, float, float]] = {}
-# (quantity, plain form of a spelling) -> the same; None where two spellings of a quantity differ in their case only
+# (quantity, plain form of a spelling) -> the same; None where two spellings of a quantity differ in
+# their case only
 _PLAIN: dict[tuple[str, str], tuple[str, float, float] | None] = {}
 
 # Words of unit strings -> the one form that `_plain` gives them.
@@ -67,7 +69,9 @@ _WORDS = {
 
 def _normal(text: str) -> str:
     """One spelling for ``rad s^-1``, ``rad*s**-1``, ``rad s⁻¹`` and ``rad s-1``; letters keep their case."""
-    text = re.sub("[º˚]", "°", text.strip())  # ordinal sign and ring, often typed for the degree sign
+    text = re.sub(
+        "[º˚]", "°", text.strip()
+    )  # ordinal sign and ring, often typed for the degree sign
     text = unicodedata.normalize("NFKC", text).replace("\N{MINUS SIGN}", "-")
     text = text.replace("**", "^").replace("^-", "-").replace("·", " ").replace("*", " ")
     return re.sub(r"\s+", " ", text)
@@ -78,7 +82,9 @@ def _plain(text: str) -> str:
     text = _normal(text).casefold().replace("°", "deg ").replace(" per ", "/").replace("^", "")
     text = re.sub(r"[a-zμ]+", lambda word: _WORDS.get(word[0], word[0]), text.replace("_", " "))
     text = re.sub(r"\s*/\s*", "/", text)
-    text = re.sub(r"[ .]?\b([a-z]+)-([12])\b", lambda part: f"/{part[1]}{part[2].replace('1', '')}", text)
+    text = re.sub(
+        r"[ .]?\b([a-z]+)-([12])\b", lambda part: f"/{part[1]}{part[2].replace('1', '')}", text
+    )
     return text.replace(" ", "")
 
 
@@ -126,13 +132,24 @@ _add("magnetic", 100.0, "G", "gauss", "Gs")
 _add("magnetic", 0.1, "mG", "milligauss", "mgauss")
 _add("number", 1.0, "1", "-", "count", "")
 
-# Products of powers of angle, time and length: name -> (dimension, numerator, denominator), in degree, s and m.
+# Products of powers of angle, time and length: name -> (dimension, numerator, denominator), in
+# degree, s and m.
 _BASES: dict[str, tuple[str, float, float]] = {
-    **dict.fromkeys(("deg", "degs", "degree", "degrees", "°", "arcdeg", "angular_degree"), ("angle", 1.0, 1.0)),
+    **dict.fromkeys(
+        ("deg", "degs", "degree", "degrees", "°", "arcdeg", "angular_degree"), ("angle", 1.0, 1.0)
+    ),
     **dict.fromkeys(("rad", "radian", "radians"), ("angle", 1.0, _DEGREE)),
-    **dict.fromkeys(("arcmin", "arcminute", "arcminutes", "arc_minute", "arc_minutes"), ("angle", 1.0, 60.0)),
-    **dict.fromkeys(("arcsec", "arcsecs", "asec", "arcsecond", "arcseconds", "arc_second", "arc_seconds", '"'), ("angle", 1.0, 3600.0)),
-    **dict.fromkeys(("rev", "revs", "revolution", "revolutions", "turn", "turns", "cycle", "cycles"), ("angle", 360.0, 1.0)),
+    **dict.fromkeys(
+        ("arcmin", "arcminute", "arcminutes", "arc_minute", "arc_minutes"), ("angle", 1.0, 60.0)
+    ),
+    **dict.fromkeys(
+        ("arcsec", "arcsecs", "asec", "arcsecond", "arcseconds", "arc_second", "arc_seconds", '"'),
+        ("angle", 1.0, 3600.0),
+    ),
+    **dict.fromkeys(
+        ("rev", "revs", "revolution", "revolutions", "turn", "turns", "cycle", "cycles"),
+        ("angle", 360.0, 1.0),
+    ),
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), ("time", 1.0, 1.0)),
     **dict.fromkeys(("min", "minute", "minutes"), ("time", 60.0, 1.0)),
     **dict.fromkeys(("h", "hr", "hrs", "hour", "hours"), ("time", 3600.0, 1.0)),
@@ -141,7 +158,8 @@ _BASES: dict[str, tuple[str, float, float]] = {
 }
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2}
 _PREFIX_NAMES = {"nano": 1e-9, "micro": 1e-6, "milli": 1e-3, "centi": 1e-2}
-#: Powers of angle, time and length -> quantity, and the factor of degree, s and m to its inner unit.
+#: Powers of angle, time and length -> quantity, and the factor of degree, s and m to its inner
+#: unit.
 _SIGNATURES = {
     (1, -1, 0): ("rate", _RATE, 1.0),
     (1, 0, 0): ("angle", 1.0, 1.0),
@@ -169,14 +187,16 @@ class Unit:
 def parse_unit(text: str, quantity: str | None = None) -> Unit:
     """Read a unit string, with an optional factor in front.
 
-    Case, blanks and written-out words (``DEG/HR``, ``degrees per second``) make no difference where the unit stays clear.
+    Case, blanks and written-out words (``DEG/HR``, ``degrees per second``) make no difference where
+    the unit stays clear.
 
     Parameters
     ----------
     text : str
         For instance ``"deg/h"``, ``"rad s^-1"``, ``"0.1 arcsec/s"`` (a count of 0.1 arcsec/s).
     quantity : str, optional
-        A key of `INNER` that is expected; it decides between spellings such as ``G``, gauss or the acceleration.
+        A key of `INNER` that is expected; it decides between spellings such as ``G``, gauss or the
+        acceleration.
 
     Returns
     -------
@@ -208,21 +228,30 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
         kind, factor, offset = found
         scale = float(match.group(1))
         if scale == 0.0 or not math.isfinite(scale):
-            raise UnitError(f"unit {text!r}: the factor {match.group(1)} is not usable; give a finite number other than 0")
+            raise UnitError(
+                f"unit {text!r}: the factor {match.group(1)} is not usable; give a finite number other than 0"
+            )
         return Unit(text, kind, factor * scale, offset)
-    raise UnitError(f"unit {text!r} is not known; known are, for instance, {known_units('rate')} for gyro axes")
+    raise UnitError(
+        f"unit {text!r} is not known; known are, for instance, {known_units('rate')} for gyro axes"
+    )
 
 
 def _parse_base(name: str) -> tuple[str, float, float] | None:
     """Return dimension, numerator and denominator of a name with or without a prefix.
 
-    Upper and lower case are alike but for prefixes of one letter: ``MRAD`` may be milli or mega, and is refused.
+    Upper and lower case are alike but for prefixes of one letter: ``MRAD`` may be milli or mega,
+    and is refused.
     """
     if name.lower() in _BASES:
         return _BASES[name.lower()]
     for prefixes, head, base in (
         (_PREFIXES, name[:1], name[1:]),
-        *((_PREFIX_NAMES, prefix, name[len(prefix) :]) for prefix in _PREFIX_NAMES if name.lower().startswith(prefix)),
+        *(
+            (_PREFIX_NAMES, prefix, name[len(prefix) :])
+            for prefix in _PREFIX_NAMES
+            if name.lower().startswith(prefix)
+        ),
     ):
         if head.lower() != head and prefixes is _PREFIXES:
             continue

@@ -2,8 +2,9 @@
 
     python archive.py [archive.toml]
 
-The log may be larger than the memory: it goes to disk on a uniform time axis first, and every later step reads from there.
-Stopped at any moment, it goes on from there when it is started again. A damaged file leaves a gap, and the table says so.
+The log may be larger than the memory: it goes to disk on a uniform time axis first, and every later
+step reads from there. Stopped at any moment, it goes on from there when it is started again. A
+damaged file leaves a gap, and the table says so.
 """
 
 import sys
@@ -26,7 +27,9 @@ def find_logs(folder, *, pattern):
 
 def is_current(target, *, sources):
     """Whether a result is there and younger than all that it was made of."""
-    return target.exists() and all(source.stat().st_mtime < target.stat().st_mtime for source in sources)
+    return target.exists() and all(
+        source.stat().st_mtime < target.stat().st_mtime for source in sources
+    )
 
 
 def make_log(logs, target, *, reading):
@@ -41,7 +44,9 @@ def show(product):
         part = product[["N", "observable", "window_coverage"]].sel(axis=axis).load()
         observed = part["N"].where(part["observable"].sel(term="N") == 2)
         recorded = float(part["window_coverage"].mean())
-        print(f"axis {axis}: {recorded:.0%} recorded, N = {float(observed.median()):.3g} deg/sqrt(h), median over the windows")
+        print(
+            f"axis {axis}: {recorded:.0%} recorded, N = {float(observed.median()):.3g} deg/sqrt(h), median over the windows"
+        )
 
 
 def main(plan_file):
@@ -55,9 +60,18 @@ def main(plan_file):
     if not is_current(results / "log.nc", sources=[*logs, plan_file]):
         make_log(logs, results / "log.nc", reading=plan["reading"])
     steps = {"windows": plan["windows"], "fitting": plan["fitting"]}
-    run([results / "log.nc"], results / "product.nc", **steps, resume=plan["results"]["resume"], overwrite=True)
+    run(
+        [results / "log.nc"],
+        results / "product.nc",
+        **steps,
+        resume=plan["results"]["resume"],
+        overwrite=True,
+    )
 
-    log, product = gyrostab.open_log(results / "log.nc"), gyrostab.open_product(results / "product.nc")
+    log, product = (
+        gyrostab.open_log(results / "log.nc"),
+        gyrostab.open_product(results / "product.nc"),
+    )
     gyrostab.write_report(product, results / "report.html", log=log, overwrite=True)
     gyrostab.save_figures(product, results / "figures", overwrite=True)
     gyrostab.to_kalibr(product, results / "imu.yaml", overwrite=True)

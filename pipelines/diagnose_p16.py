@@ -16,8 +16,14 @@ def published(log, plan):
     """Fit the five terms as the paper does, and give the median of each over the still and the shaken windows of every axis."""
     product = gyrostab.fit_noise(gyrostab.davar(log, **plan["davar"]), method="adev")
     seconds = (product["time"] - log["time"][0]) / np.timedelta64(1, "s")
-    parts = {name: product.isel(time=((seconds > low) & (seconds < high)).values) for name, (low, high) in plan["parts"].items()}
-    return {name: {term: part[term].median("time").to_series() for term in plan["terms"]} for name, part in parts.items()}
+    parts = {
+        name: product.isel(time=((seconds > low) & (seconds < high)).values)
+        for name, (low, high) in plan["parts"].items()
+    }
+    return {
+        name: {term: part[term].median("time").to_series() for term in plan["terms"]}
+        for name, part in parts.items()
+    }
 
 
 def experiment(plan, folder):
@@ -28,52 +34,99 @@ def experiment(plan, folder):
     log = gyrostab.simulate(tables, seed=plan["seed"]).compute()
     five = {"noise": tables["noise"]}
     against = {name: five if run.get("five_terms") else None for name, run in plan["run"].items()}
-    return log, {name: gyrostab.diagnose(log, simulation=model, nulls=plan["nulls"]) for name, model in against.items()}
+    return log, {
+        name: gyrostab.diagnose(log, simulation=model, nulls=plan["nulls"])
+        for name, model in against.items()
+    }
 
 
 def sizes(effect):
     """Write what an effect measures, with its 95 % interval."""
     entries = effect["parameters"].items()
-    return "; ".join(f"{name} {one['value']:.3g} ({one['low']:.3g} to {one['high']:.3g}) {one['unit']}" for name, one in entries)
+    return "; ".join(
+        f"{name} {one['value']:.3g} ({one['low']:.3g} to {one['high']:.3g}) {one['unit']}"
+        for name, one in entries
+    )
 
 
 def found(runs):
     """Table of the effects that every run names."""
-    rows = [["against", "verdict", "named", "axes", "size, 95 %", "gain [nats]", "cannot be told from"]]
+    rows = [
+        ["against", "verdict", "named", "axes", "size, 95 %", "gain [nats]", "cannot be told from"]
+    ]
     for name, run in runs.items():
         for effect in run.effects or [{}]:
             gain = effect["held_out_gain"] if effect else {"nats": 0.0, "threshold": 0.0}
-            told = [effect.get("name", "nothing"), ", ".join(effect.get("axes", [])), sizes(effect) if effect else ""]
+            told = [
+                effect.get("name", "nothing"),
+                ", ".join(effect.get("axes", [])),
+                sizes(effect) if effect else "",
+            ]
             others = ", ".join(effect.get("alternatives", [])) or "none"
-            rows.append([name, run.verdict, *told, f"{gain['nats']:.3g}, threshold {gain['threshold']:.2g}", others])
+            rows.append(
+                [
+                    name,
+                    run.verdict,
+                    *told,
+                    f"{gain['nats']:.3g}, threshold {gain['threshold']:.2g}",
+                    others,
+                ]
+            )
     return lines(rows)
 
 
 def proof(runs):
     """Table of what the effects are worth on time held out."""
-    rows = [["against", "misfit before", "after", "inside 95 % before", "after", "forecast of the last 30 % [nats]"]]
+    rows = [
+        [
+            "against",
+            "misfit before",
+            "after",
+            "inside 95 % before",
+            "after",
+            "forecast of the last 30 % [nats]",
+        ]
+    ]
     for name, run in runs.items():
         held = run.content["held_out"]
-        shares = [held[f"{what}_{when}"] for what in ("misfit", "coverage95") for when in ("before", "after")]
+        shares = [
+            held[f"{what}_{when}"]
+            for what in ("misfit", "coverage95")
+            for when in ("before", "after")
+        ]
         rows.append([name, *(f"{share:.3g}" for share in shares), f"{held['forecast_gain']:.3g}"])
     return lines(rows)
 
 
 def lines(rows):
     """Write a table."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in [rows[0], ["---"] * len(rows[0]), *rows[1:]])
+    return "\n".join(
+        f"| {' | '.join(row)} |" for row in [rows[0], ["---"] * len(rows[0]), *rows[1:]]
+    )
 
 
 if __name__ == "__main__":
     plan_file = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_suffix(".toml")
     plan, folder = tomllib.loads(plan_file.read_text(encoding="utf-8")), plan_file.parent
     log, runs = experiment(plan, folder)
-    medians = [[part, *(f"{fit[term]['x']:.3g}" for term in plan["terms"])] for part, fit in published(log, plan).items()]
-    made = {"found": found(runs), "proof": proof(runs), "fit": lines([["axis x", *plan["terms"]], *medians])}
+    medians = [
+        [part, *(f"{fit[term]['x']:.3g}" for term in plan["terms"])]
+        for part, fit in published(log, plan).items()
+    ]
+    made = {
+        "found": found(runs),
+        "proof": proof(runs),
+        "fit": lines([["axis x", *plan["terms"]], *medians]),
+    }
     page = folder / plan["page"]
     for name, text in made.items():
-        pattern, put = rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)", rf"\g<1>{text}\n\g<2>"
-        page.write_text(re.sub(pattern, put, page.read_text(encoding="utf-8"), flags=re.S), encoding="utf-8")
+        pattern, put = (
+            rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)",
+            rf"\g<1>{text}\n\g<2>",
+        )
+        page.write_text(
+            re.sub(pattern, put, page.read_text(encoding="utf-8"), flags=re.S), encoding="utf-8"
+        )
     drawn = runs[plan["drawn"]]
     save_png(plot_change(drawn.surfaces, drawn.content), folder / plan["figure"], **plan["figures"])
     print(*runs.values(), sep="\n\n")

@@ -9,7 +9,10 @@ import numpy as np
 
 import gyrostab
 
-ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+ROOT, PLAN = (
+    Path(__file__).resolve().parents[1],
+    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")),
+)
 TAUS = "0.005s,0.01s,0.02s,0.04s,0.08s,0.16s,0.32s,0.5s,1s,5s,10s"
 
 
@@ -23,7 +26,10 @@ def log_of(name, start=0.0, end=np.inf):
 
 def row(name, found):
     """One row of the table: verdict, and each effect with its axes and what it gains."""
-    named = [f"{one['name']} ({', '.join(one['axes'])}): {one['held_out_gain']['nats']:.0f}" for one in found.effects]
+    named = [
+        f"{one['name']} ({', '.join(one['axes'])}): {one['held_out_gain']['nats']:.0f}"
+        for one in found.effects
+    ]
     held = found.content["held_out"]
     return f"| {name} | {found.verdict} | {'; '.join(named)} | {held['coverage95_before']:.0%} | {held['coverage95_after']:.0%} |"
 
@@ -34,13 +40,25 @@ def halves(name, *, nulls=400):
     seconds = whole.sizes["time"] / whole.attrs["sampling_rate_hz"]
     first, second = log_of(name, end=seconds / 2), log_of(name, start=seconds / 2)
     found = gyrostab.diagnose(first, nulls=nulls)
-    before = {axis: {term: one["value"] for term, one in terms.items()} for axis, terms in found.content["baseline"]["noise"].items()}
+    before = {
+        axis: {term: one["value"] for term, one in terms.items()}
+        for axis, terms in found.content["baseline"]["noise"].items()
+    }
     resets = [one for one in found.model["effect"] if one["name"] == "feedback_reset"]
     ratio = {}
-    for case, given in (("five terms", {"noise": before}), ("with resets", {"noise": found.model["noise"], "effect": resets})):
+    for case, given in (
+        ("five terms", {"noise": before}),
+        ("with resets", {"noise": found.model["noise"], "effect": resets}),
+    ):
         made = gyrostab.simulate(given, like=second, seed=1)
-        options = {"window": f"{second.sizes['time']}samples", "step": f"{second.sizes['time']}samples", "taus": TAUS}
-        both = [gyrostab.davar(log, **options)["avar"].isel(axis=0, time=0) for log in (second, made)]
+        options = {
+            "window": f"{second.sizes['time']}samples",
+            "step": f"{second.sizes['time']}samples",
+            "taus": TAUS,
+        }
+        both = [
+            gyrostab.davar(log, **options)["avar"].isel(axis=0, time=0) for log in (second, made)
+        ]
         ratio[case] = both[0].values / both[1].values
     return both[0]["tau"].values, ratio
 
@@ -49,5 +67,7 @@ if __name__ == "__main__":
     os.chdir(os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings"))
     for name in sys.argv[1:] or PLAN["recording"]:
         print(row(name, gyrostab.diagnose(log_of(name))), flush=True)
-    for tau, *cases in zip(*(lambda taus, ratio: (taus, *ratio.values()))(*halves("fog-blueseis-ramp")), strict=True):
+    for tau, *cases in zip(
+        *(lambda taus, ratio: (taus, *ratio.values()))(*halves("fog-blueseis-ramp")), strict=True
+    ):
         print(f"| {tau:g} | {' | '.join(f'{one:.2f}' for one in cases)} |")

@@ -1,6 +1,7 @@
 """Draw what every physical effect does to a log, with and without it, and put the figures and the table of effects into docs/physics/.
 
-Each effect has its experiment in effect_figures.toml; ``python pipelines/effect_figures.py shupe warm_up`` makes some of them.
+Each effect has its experiment in effect_figures.toml; ``python pipelines/effect_figures.py shupe
+warm_up`` makes some of them.
 """
 
 import re
@@ -14,16 +15,27 @@ from gyrostab.plot import plot_comparison
 from gyrostab.plot.style import save_png
 from gyrostab.simulate import read_model, simulate
 
-ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-DEFAULTS, OPTIONS = PLAN.pop("defaults"), ("window", "step", "moments", "driver", "difference", "coherency")
+ROOT, PLAN = (
+    Path(__file__).resolve().parents[1],
+    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")),
+)
+DEFAULTS, OPTIONS = (
+    PLAN.pop("defaults"),
+    ("window", "step", "moments", "driver", "difference", "coherency"),
+)
 
 
 def twins(name):
     """Simulate the experiment of an effect without and with it, from the same seed."""
     entry = PLAN[name]
-    model = read_model({part: DEFAULTS[part] | entry.get(part, {}) for part in ("log", "noise")} | entry.get("also", {}))
+    model = read_model(
+        {part: DEFAULTS[part] | entry.get(part, {}) for part in ("log", "noise")}
+        | entry.get("also", {})
+    )
     effect = effects()[name].example(**entry.get("values", {}))
-    return [simulate(replace(model, effects=model.effects + more)).load() for more in ((), (effect,))]
+    return [
+        simulate(replace(model, effects=model.effects + more)).load() for more in ((), (effect,))
+    ]
 
 
 def draw(name, folder):
@@ -37,7 +49,9 @@ def draw(name, folder):
 def between(text, mark, new):
     """Put `new` between the markers of that name."""
     begin, end = f"<!-- {mark} -->\n", f"<!-- end of {mark} -->\n"
-    return re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: begin + new + end, text, flags=re.S)
+    return re.sub(
+        f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: begin + new + end, text, flags=re.S
+    )
 
 
 def illustrate(page):
@@ -47,7 +61,11 @@ def illustrate(page):
         name = part[3:].split("\n", 1)[0].strip()
         if part.startswith("## ") and name in PLAN:
             if "<!-- figure -->" not in part:
-                part = part.rstrip("\n") + "\n\n<!-- figure -->\n<!-- end of figure -->\n" + "\n" * (number + 1 < len(parts))
+                part = (
+                    part.rstrip("\n")
+                    + "\n\n<!-- figure -->\n<!-- end of figure -->\n"
+                    + "\n" * (number + 1 < len(parts))
+                )
             image = f"![{effects()[name].short}](../figures/effects/{name}.png)\n\n{PLAN[name]['caption']}\n"
             parts[number] = between(part, "figure", image)
     page.write_text("".join(parts), encoding="utf-8")
@@ -58,13 +76,19 @@ def amounts(kind):
     for known in kind.parameters():
         sizes = known.typical if isinstance(known.typical, tuple) else (known.typical,)
         numbers = ", ".join(size if isinstance(size, str) else f"{size:g}" for size in sizes)
-        yield f"`{known.name}` {numbers} {known.unit}".removesuffix(" 1").removesuffix(" text") if sizes else f"`{known.name}`"
+        yield (
+            f"`{known.name}` {numbers} {known.unit}".removesuffix(" 1").removesuffix(" text")
+            if sizes
+            else f"`{known.name}`"
+        )
 
 
 def rows(pages):
     """The table of all effects."""
     for name, kind in effects().items():
-        home = next(page.name for page in pages if f"\n## {name}\n" in page.read_text(encoding="utf-8"))
+        home = next(
+            page.name for page in pages if f"\n## {name}\n" in page.read_text(encoding="utf-8")
+        )
         drivers = ", ".join(f"`{channel}`" for channel in kind.channels) or "–"
         yield f"| [{name}]({home}#{name}) | {kind.short} | {drivers} | {kind.stage} | {'; '.join(amounts(kind))} |\n"
 
@@ -77,4 +101,7 @@ if __name__ == "__main__":
     for section in sections:
         illustrate(section)
     head = "| effect | what it does | driver | stage | parameters and typical sizes |\n|---|---|---|---|---|\n"
-    index.write_text(between(index.read_text(encoding="utf-8"), "effects", head + "".join(rows(sections))), encoding="utf-8")
+    index.write_text(
+        between(index.read_text(encoding="utf-8"), "effects", head + "".join(rows(sections))),
+        encoding="utf-8",
+    )

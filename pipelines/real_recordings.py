@@ -12,21 +12,40 @@ import pandas as pd
 import gyrostab
 from gyrostab.units import parse_unit
 
-ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+ROOT, PLAN = (
+    Path(__file__).resolve().parents[1],
+    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")),
+)
 
 
 def pick(value, log, product):
     """Pick numbers of the log or the product: by name, axis, averaging time, stretch of time, level of a channel."""
     if value["of"] == "gaps":
-        return gyrostab.gap_table(log).loc[lambda gaps: gaps["cause"] == value["cause"], value["column"]]
+        return gyrostab.gap_table(log).loc[
+            lambda gaps: gaps["cause"] == value["cause"], value["column"]
+        ]
     if value["of"] == "published":
-        table = pd.read_csv(value["file"]).query(value["rows"]).sort_values(["channel", "haar_scale_s"])
-        return np.abs(product["avar"].values.ravel() / (2 * table["haar_wavelet_variance"] * parse_unit("deg/s").factor ** 2) - 1)
-    numbers = {**log, **product, "adev": np.sqrt(product["avar"].sel(tau=value.get("tau", 1.0), method="nearest"))}[value["of"]]
+        table = (
+            pd.read_csv(value["file"]).query(value["rows"]).sort_values(["channel", "haar_scale_s"])
+        )
+        return np.abs(
+            product["avar"].values.ravel()
+            / (2 * table["haar_wavelet_variance"] * parse_unit("deg/s").factor ** 2)
+            - 1
+        )
+    numbers = {
+        **log,
+        **product,
+        "adev": np.sqrt(product["avar"].sel(tau=value.get("tau", 1.0), method="nearest")),
+    }[value["of"]]
     numbers = numbers.sel(axis=value["axis"]) if "axis" in value else numbers
     seconds = (numbers["time"] - log["time"][0]) / np.timedelta64(1, "s")
     numbers = numbers[(seconds >= value.get("from", 0)) & (seconds <= value.get("to", np.inf))]
-    return numbers[log[value["where"]] > value["above"] * log[value["where"]].max()] if "where" in value else numbers
+    return (
+        numbers[log[value["where"]] > value["above"] * log[value["where"]].max()]
+        if "where" in value
+        else numbers
+    )
 
 
 def examine(entry, file):
@@ -34,11 +53,20 @@ def examine(entry, file):
     log = gyrostab.regularise(gyrostab.read_log(entry["files"], **entry["read"]))
     product = gyrostab.fit_noise(gyrostab.davar(log, **entry["davar"]), **entry.get("fit", {}))
     product = gyrostab.open_product(gyrostab.to_netcdf(product, file)).load()
-    found = {"hertz": log.attrs["sampling_rate_hz"], "minutes": np.ptp(log["time"].values) / np.timedelta64(1, "m")}
+    found = {
+        "hertz": log.attrs["sampling_rate_hz"],
+        "minutes": np.ptp(log["time"].values) / np.timedelta64(1, "m"),
+    }
     found["missing"] = float(log["rate"].isnull().mean())
     for name, value in entry["values"].items():
-        numbers = np.divide(*map(found.get, value["ratio"])) if "ratio" in value else np.asarray(pick(value, log, product))
-        scale = value.get("times", 1.0) / (parse_unit(value["unit"]).factor if "unit" in value else 1.0)
+        numbers = (
+            np.divide(*map(found.get, value["ratio"]))
+            if "ratio" in value
+            else np.asarray(pick(value, log, product))
+        )
+        scale = value.get("times", 1.0) / (
+            parse_unit(value["unit"]).factor if "unit" in value else 1.0
+        )
         found[name] = float(getattr(np, value.get("over", "nanmedian"))(numbers)) * scale
     return log, product, found
 
@@ -54,9 +82,16 @@ def refusal(entry):
 def command(entry):
     """Write the same job as a line for the shell."""
     words = ["gyrostab", "run", *entry["files"], "-o", "product.nc"]
-    fit = {option.replace("tau_min", "fit_from"): given for option, given in entry.get("fit", {}).items()}
+    fit = {
+        option.replace("tau_min", "fit_from"): given
+        for option, given in entry.get("fit", {}).items()
+    }
     for option, given in {**entry["read"], **entry["davar"], **fit}.items():
-        texts = [f"{key}={text}" for key, text in given.items()] if isinstance(given, dict) else np.atleast_1d(given)
+        texts = (
+            [f"{key}={text}" for key, text in given.items()]
+            if isinstance(given, dict)
+            else np.atleast_1d(given)
+        )
         words += [word for text in texts for word in (f"--{option.replace('_', '-')}", str(text))]
     return shlex.join(words)
 
@@ -64,19 +99,53 @@ def command(entry):
 def describe(name, entry, folder):
     """Process one recording; a row of the table, a section of the page, and what follows temperature."""
     log, product, found = examine(entry, Path(folder, f"{name}.nc"))
-    notes = "".join(f"- {note}\n" for note in log.attrs["notes"] if not any(words in note for words in PLAN["page"]["usual"]))
+    notes = "".join(
+        f"- {note}\n"
+        for note in log.attrs["notes"]
+        if not any(words in note for words in PLAN["page"]["usual"])
+    )
     if "figure" in entry:
-        gyrostab.plot_davar(product, axis=entry["figure"]).savefig(ROOT / "docs" / "figures" / f"{name}.png", dpi=70)
-    about = {**entry, **entry["davar"], **found, "name": name, "axes": ", ".join(log["axis"].values), "gaps": log.sizes["gap"]}
-    about |= {"text": entry["text"].format_map(found | {"refusal": refusal(entry)}), "command": command(entry), "notes": notes}
-    windows = [gyrostab.fit_noise(gyrostab.davar(log, **entry["follow"]))] if "follow" in entry else []
-    cells = [row for made in windows for row in gyrostab.correlation_rows(gyrostab.correlate(made, variables="window_mean"))[::2]]
-    followed = "".join(f"| {' | '.join([name, *map(row.get, PLAN['page']['follow'])])} |\n" for row in cells)
-    return PLAN["page"]["row"].format_map(about), PLAN["page"]["section"].format_map(about), followed
+        gyrostab.plot_davar(product, axis=entry["figure"]).savefig(
+            ROOT / "docs" / "figures" / f"{name}.png", dpi=70
+        )
+    about = {
+        **entry,
+        **entry["davar"],
+        **found,
+        "name": name,
+        "axes": ", ".join(log["axis"].values),
+        "gaps": log.sizes["gap"],
+    }
+    about |= {
+        "text": entry["text"].format_map(found | {"refusal": refusal(entry)}),
+        "command": command(entry),
+        "notes": notes,
+    }
+    windows = (
+        [gyrostab.fit_noise(gyrostab.davar(log, **entry["follow"]))] if "follow" in entry else []
+    )
+    cells = [
+        row
+        for made in windows
+        for row in gyrostab.correlation_rows(gyrostab.correlate(made, variables="window_mean"))[::2]
+    ]
+    followed = "".join(
+        f"| {' | '.join([name, *map(row.get, PLAN['page']['follow'])])} |\n" for row in cells
+    )
+    return (
+        PLAN["page"]["row"].format_map(about),
+        PLAN["page"]["section"].format_map(about),
+        followed,
+    )
 
 
 if __name__ == "__main__":
     os.chdir(os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings"))
     with tempfile.TemporaryDirectory() as folder:
-        parts = zip(*[describe(name, entry, folder) for name, entry in PLAN["recording"].items()], strict=True)
-    (ROOT / "docs" / "real-recordings.md").write_text(PLAN["page"]["head"].format(*map("".join, parts)), encoding="utf-8")
+        parts = zip(
+            *[describe(name, entry, folder) for name, entry in PLAN["recording"].items()],
+            strict=True,
+        )
+    (ROOT / "docs" / "real-recordings.md").write_text(
+        PLAN["page"]["head"].format(*map("".join, parts)), encoding="utf-8"
+    )

@@ -11,7 +11,10 @@ import numpy as np
 import gyrostab
 from gyrostab.plot.style import save_png
 
-ROOT, PLAN = Path(__file__).resolve().parents[1], tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+ROOT, PLAN = (
+    Path(__file__).resolve().parents[1],
+    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")),
+)
 
 
 def simulate(name, run):
@@ -20,7 +23,9 @@ def simulate(name, run):
     kept = [part for part in model.get("effect", []) if part["name"] not in run.get("without", [])]
     model["effect"] = [part | run.get("effects", {}).get(part["name"], {}) for part in kept]
     log = gyrostab.simulate(model, seed=PLAN["seed"])
-    first, last = (round(run.get(edge, 0) * log.attrs["sampling_rate_hz"]) or None for edge in ("from", "to"))
+    first, last = (
+        round(run.get(edge, 0) * log.attrs["sampling_rate_hz"]) or None for edge in ("from", "to")
+    )
     return log.isel(time=slice(first, last))
 
 
@@ -28,17 +33,27 @@ def analyse(log, run):
     """Go from the log to noise coefficients, and note the processor time of the surface."""
     log, began = log.compute(), time.process_time()
     surface = gyrostab.davar(log, **run["davar"]).assign(windows=lambda made: made.sizes["time"])
-    return gyrostab.fit_noise(surface.assign(seconds=time.process_time() - began), **{"observed_only": False, **run.get("fit", {})})
+    return gyrostab.fit_noise(
+        surface.assign(seconds=time.process_time() - began),
+        **{"observed_only": False, **run.get("fit", {})},
+    )
 
 
 def number(wanted, products):
     """Find one number of the table: of which run, variable, axis, averaging time, stretch of time; and over its windows."""
     product = products[wanted["run"]].sel(tau=wanted.get("tau", 1.0), method="nearest")
     product = product.sel(axis=wanted["axis"]) if "axis" in wanted else product.isel(axis=0)
-    begin, end = ((product["time_bounds"] - product["time_bounds"].min()) / np.timedelta64(1, "s")).values.T
+    begin, end = (
+        (product["time_bounds"] - product["time_bounds"].min()) / np.timedelta64(1, "s")
+    ).values.T
     inside = (begin > wanted.get("from", 0) - 1e-6) & (end < wanted.get("to", np.inf) + 1e-6)
-    inside &= np.any([(begin < at) & (at < end) for at in wanted.get("across", [begin + 1e-6])], axis=0)
-    product, over = product.assign(adev=product["avar"].clip(0) ** 0.5).isel(time=inside), getattr(np, wanted.get("over", "nanmedian"))
+    inside &= np.any(
+        [(begin < at) & (at < end) for at in wanted.get("across", [begin + 1e-6])], axis=0
+    )
+    product, over = (
+        product.assign(adev=product["avar"].clip(0) ** 0.5).isel(time=inside),
+        getattr(np, wanted.get("over", "nanmedian")),
+    )
     if wanted["of"] + "_upper" in product:
         seen = product["observable"].sel(term=wanted["of"]) == 2
         if not seen.any() or (over is np.nanmedian and seen.mean() < 0.5):
@@ -49,7 +64,10 @@ def number(wanted, products):
 
 def lines(head, rows):
     """Write a table."""
-    texts = ([f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row] for row in [head, ["---"] * len(head), *rows])
+    texts = (
+        [f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row]
+        for row in [head, ["---"] * len(head), *rows]
+    )
     return "\n".join(f"| {' | '.join(row)} |" for row in texts)
 
 
@@ -62,14 +80,25 @@ def experiment(name, figures):
         shown = (logs if options["draw"] == "plot_signal" else products)[options["run"]]
         drawn = getattr(gyrostab, options["draw"])(shown, **options.get("with", {}))
         save_png(drawn, figures / f"seeds-{file}.png", **PLAN["figures"])
-    head, rows = entry["columns"], [(label, row, iter(row.get("paper", []))) for label, row in entry["rows"].items()]
-    cells = [[label, *(next(said, "") if "paper" in to else number(row | to, products) for to in head)] for label, row, said in rows]
+    head, rows = (
+        entry["columns"],
+        [(label, row, iter(row.get("paper", []))) for label, row in entry["rows"].items()],
+    )
+    cells = [
+        [label, *(next(said, "") if "paper" in to else number(row | to, products) for to in head)]
+        for label, row, said in rows
+    ]
     return lines(["", *(column["title"] for column in head)], cells)
 
 
 def fill(page, name, text):
     """Put a table between the marks of its name."""
-    return re.sub(rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)", lambda marks: f"{marks[1]}{text}\n{marks[2]}", page, flags=re.S)
+    return re.sub(
+        rf"(<!-- {name}: begin -->\n).*?(<!-- {name}: end -->)",
+        lambda marks: f"{marks[1]}{text}\n{marks[2]}",
+        page,
+        flags=re.S,
+    )
 
 
 if __name__ == "__main__":

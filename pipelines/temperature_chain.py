@@ -10,7 +10,9 @@ import gyrostab
 def chain(plan, folder):
     """Correlate one product with one channel of another file, as the plan says; paths start at the plan's folder."""
     product = gyrostab.open_product(folder / plan["product"])
-    channel = gyrostab.read_channel(folder / plan["channel"]["file"], plan["channel"]["name"], **plan["channel"].get("read", {}))
+    channel = gyrostab.read_channel(
+        folder / plan["channel"]["file"], plan["channel"]["name"], **plan["channel"].get("read", {})
+    )
     found = gyrostab.correlate(product, channel=channel, **plan["correlate"])
     gyrostab.to_netcdf(found, folder / plan["output"], overwrite=True)
     gyrostab.plot_correlation(found).savefig(folder / plan["figure"], dpi=150)
@@ -20,8 +22,12 @@ def chain(plan, folder):
 def sentences(found):
     """List what is said of every axis, variable and driver that is coupled, or may be."""
     meanings = found["coupling_verdict"].attrs["flag_meanings"].split()
-    said = found["statement"].where(found["coupling_verdict"] >= meanings.index("not_told_apart"), "")
-    return [str(sentence) for sentence in said.values.ravel() if sentence] or ["Nothing is seen to follow it."]
+    said = found["statement"].where(
+        found["coupling_verdict"] >= meanings.index("not_told_apart"), ""
+    )
+    return [str(sentence) for sentence in said.values.ravel() if sentence] or [
+        "Nothing is seen to follow it."
+    ]
 
 
 if __name__ == "__main__":

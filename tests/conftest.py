@@ -20,7 +20,9 @@ def recordings() -> Callable[[str], Path]:
     def find(name: str) -> Path:
         path = base / name
         if not path.exists():
-            pytest.skip(f"real recording {name} is not in {base} (set GYROSTAB_RECORDINGS to its directory)")
+            pytest.skip(
+                f"real recording {name} is not in {base} (set GYROSTAB_RECORDINGS to its directory)"
+            )
         return path
 
     return find

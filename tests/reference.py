@@ -10,7 +10,12 @@ from scipy.optimize import nnls
 
 
 def direct_surface(
-    x: NDArray[np.float64], window: int, step: int, ks: list[int], *, shifts: list[int] | None = None
+    x: NDArray[np.float64],
+    window: int,
+    step: int,
+    ks: list[int],
+    *,
+    shifts: list[int] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Allan variance and number of terms of every window of a rate record, by the definition; NaN is a gap."""
     n_windows = (x.size - window) // step + 1
@@ -53,17 +58,23 @@ def direct_angle_surface(
     return avar, count
 
 
-def cluster_cell(x: NDArray[np.float64], k: int, *, stride: int = 1, first: int = 0) -> dict[str, float]:
+def cluster_cell(
+    x: NDArray[np.float64], k: int, *, stride: int = 1, first: int = 0
+) -> dict[str, float]:
     """One cell by weighted cluster means with a matrix: a row per pair of clusters at least half full, a column per sample.
 
-    Pairs begin where ``first + m`` is a multiple of `stride`. Degrees of freedom are those under white noise.
+    Pairs begin where ``first + m`` is a multiple of `stride`. Degrees of freedom are those under
+    white noise.
     """
     here = np.isfinite(x)
     rows, offered = [], 0
     for m in range(-first % stride, x.size - 2 * k + 1, stride):
         offered += 1
         clusters = np.zeros((2, x.size))
-        clusters[0, m : m + k], clusters[1, m + k : m + 2 * k] = here[m : m + k], here[m + k : m + 2 * k]
+        clusters[0, m : m + k], clusters[1, m + k : m + 2 * k] = (
+            here[m : m + k],
+            here[m + k : m + 2 * k],
+        )
         number = clusters.sum(axis=1)
         if (2 * number >= k).all():
             rows.append((number.prod(), clusters[1] / number[1] - clusters[0] / number[0]))
@@ -72,7 +83,9 @@ def cluster_cell(x: NDArray[np.float64], k: int, *, stride: int = 1, first: int 
     weight = np.array([row[0] for row in rows])
     design = np.array([row[1] for row in rows]) * np.sqrt(weight)[:, None]
     values = np.where(here, x - x[here].mean(), 0.0)
-    angles = -np.diff(design, axis=1, prepend=0.0, append=0.0)  # the same terms of an angle instead of its differences
+    angles = -np.diff(
+        design, axis=1, prepend=0.0, append=0.0
+    )  # the same terms of an angle instead of its differences
     pairs = design @ design.T
     return {
         "count": len(rows),
@@ -95,9 +108,10 @@ def fit_window_plainly(
 ) -> dict[str, NDArray[np.float64]]:
     """Iterated non-negative generalised least squares of one window with numpy's and scipy's solvers, without any thrift.
 
-    Per term the squared coefficient, its standard error, its estimate free of sign, and the variance of that without the
-    term, its growth with the term and with the square of the term; chi-square; the share by which the variances had to be
-    widened at last for a covariance that is positive definite. `tables` are those of `gyrostab.allan.fit`.
+    Per term the squared coefficient, its standard error, its estimate free of sign, and the
+    variance of that without the term, its growth with the term and with the square of the term;
+    chi-square; the share by which the variances had to be widened at last for a covariance that is
+    positive definite. `tables` are those of `gyrostab.allan.fit`.
     """
     ok = np.isfinite(y) & (y > 0) & (factor > 0)
     y, white, quantization, ramp, factor = y[ok], white[ok], quantization[ok], ramp[ok], factor[ok]
@@ -108,11 +122,23 @@ def fit_window_plainly(
 
     def covariance(s: NDArray[np.float64]) -> NDArray[np.float64]:
         ones = np.ones(y.size)
-        amounts = np.stack([s[0] * np.minimum(quantization, 1), s[1] * white + s[0] * excess, s[2] * ones, s[3] * ones])
+        amounts = np.stack(
+            [
+                s[0] * np.minimum(quantization, 1),
+                s[1] * white + s[0] * excess,
+                s[2] * ones,
+                s[3] * ones,
+            ]
+        )
         roots = np.sqrt(amounts * tables.to_samples[:4, None])
         outer = roots[:, :, None] * roots[:, None, :]
         total = np.einsum("aij,bij,abij->ij", outer, outer, pairs)
-        total += s[4] * tables.to_samples[4] * np.sqrt(np.multiply.outer(ramp, ramp)) * np.einsum("aij,aij->ij", outer, ramps)
+        total += (
+            s[4]
+            * tables.to_samples[4]
+            * np.sqrt(np.multiply.outer(ramp, ramp))
+            * np.einsum("aij,aij->ij", outer, ramps)
+        )
         return total / np.maximum.outer(factor, factor)
 
     def solve(whitener: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -120,13 +146,19 @@ def fit_window_plainly(
         scale = np.linalg.norm(columns, axis=0)
         return nnls(columns / scale, whitener @ y, maxiter=1000)[0] / scale
 
-    squares = solve(np.diag(np.sqrt(weight) / (np.maximum.accumulate(y / design[:, 0]) * design[:, 0])))
+    squares = solve(
+        np.diag(np.sqrt(weight) / (np.maximum.accumulate(y / design[:, 0]) * design[:, 0]))
+    )
     for _ in range(6):
         previous = squares
         spread, jitter = covariance(squares), 1e-7
-        while np.linalg.eigvalsh(spread + np.diag(jitter * np.diag(spread) + 1e-16 * y**2)).min() <= 0:
+        while (
+            np.linalg.eigvalsh(spread + np.diag(jitter * np.diag(spread) + 1e-16 * y**2)).min() <= 0
+        ):
             jitter *= 10
-        whitener = np.linalg.inv(np.linalg.cholesky(spread + np.diag(jitter * np.diag(spread) + 1e-16 * y**2)))
+        whitener = np.linalg.inv(
+            np.linalg.cholesky(spread + np.diag(jitter * np.diag(spread) + 1e-16 * y**2))
+        )
         squares = solve(whitener)
         if (abs(squares - previous) <= 1e-4 * previous).all():
             break
@@ -135,16 +167,34 @@ def fit_window_plainly(
         members = np.flatnonzero((squares > 0) | (np.arange(5) == a))
         columns = whitener @ design[:, members]
         scale = np.linalg.norm(columns, axis=0)
-        estimator = (np.linalg.pinv(columns / scale) / scale[:, None] @ whitener)[list(members).index(a)]
+        estimator = (np.linalg.pinv(columns / scale) / scale[:, None] @ whitener)[
+            list(members).index(a)
+        ]
         trial = np.where(np.arange(5) == a, 0.0, squares)
         cell, stand_in = {0: (0, 1), 2: (-1, 3), 4: (-1, 3)}.get(a, (0, None))
         if stand_in is not None:
             trial[stand_in] += squares[a] * design[cell, a] / design[cell, stand_in]
         unit = np.eye(5)[a]
-        null, both, own = (estimator @ covariance(s) @ estimator for s in (trial, trial + unit, unit))
+        null, both, own = (
+            estimator @ covariance(s) @ estimator for s in (trial, trial + unit, unit)
+        )
         place = list(members).index(a)
-        error = np.sqrt(np.linalg.inv((columns / scale).T @ (columns / scale))[place, place]) / scale[place]
+        error = (
+            np.sqrt(np.linalg.inv((columns / scale).T @ (columns / scale))[place, place])
+            / scale[place]
+        )
         rows[a] = squares[a], error, estimator @ y, null, both - null - own, own
-    names = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square")
+    names = (
+        "square",
+        "square_stderr",
+        "free",
+        "variance_null",
+        "variance_linear",
+        "variance_square",
+    )
     out = dict(zip(names, rows.T, strict=True))
-    return {**out, "chi2": np.asarray(np.sum((whitener @ (y - design @ squares)) ** 2)), "jitter": np.asarray(jitter)}
+    return {
+        **out,
+        "chi2": np.asarray(np.sum((whitener @ (y - design @ squares)) ** 2)),
+        "jitter": np.asarray(jitter),
+    }

@@ -13,11 +13,15 @@ HEAVY = ("matplotlib", "numba", "pyarrow", "netCDF4", "h5py", "pymatreader", "sc
 
 
 def _python(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
 
 
 def test_imports_go_down_only():
-    done = _python("import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(config_filename='pyproject.toml'))")
+    done = _python(
+        "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(config_filename='pyproject.toml'))"
+    )
     assert done.returncode == 0, done.stdout
     assert "0 broken" in done.stdout
 
@@ -27,12 +31,20 @@ def test_imports_go_down_only():
     [
         ("import gyrostab", (*HEAVY, "xarray", "pandas", "dask")),
         ("import gyrostab.plot, gyrostab.report", ("matplotlib", "jinja2", "PIL", "scipy.stats")),
-        ("import gyrostab.cli; gyrostab.cli.main(['--help'])", (*HEAVY, "xarray", "pandas", "dask")),
-        ("import gyrostab.cli; gyrostab.cli.main(['run', '--help'])", (*HEAVY, "xarray", "pandas", "dask")),
+        (
+            "import gyrostab.cli; gyrostab.cli.main(['--help'])",
+            (*HEAVY, "xarray", "pandas", "dask"),
+        ),
+        (
+            "import gyrostab.cli; gyrostab.cli.main(['run', '--help'])",
+            (*HEAVY, "xarray", "pandas", "dask"),
+        ),
     ],
 )
 def test_import_loads_nothing_heavy(code, banned):
-    done = _python(f"import sys; {code}; print([name for name in {banned!r} if name in sys.modules])")
+    done = _python(
+        f"import sys; {code}; print([name for name in {banned!r} if name in sys.modules])"
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]"
 
@@ -61,6 +73,8 @@ def test_unknown_name_is_an_attribute_error():
 def test_a_file_is_written_without_loading_a_scheduler(tmp_path):
     """xarray looks whether dask.distributed is at work by loading it: a quarter of a second."""
     log = f"to_netcdf(make_log(np.arange(60.0), rate=100.0, unit='deg/h'), {str(tmp_path / 'log.nc')!r})"
-    done = _python(f"import sys; import numpy as np; from gyrostab import make_log, to_netcdf; {log}; print('distributed' in sys.modules)")
+    done = _python(
+        f"import sys; import numpy as np; from gyrostab import make_log, to_netcdf; {log}; print('distributed' in sys.modules)"
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "False"

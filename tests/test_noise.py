@@ -22,7 +22,10 @@ def integral(psd, tau):
 
     total = sum(quad(integrand, j * np.pi, (j + 1) * np.pi, epsrel=1e-9)[0] for j in range(400))
     edge = 400 * np.pi
-    return total + 4 * 3 / 8 * quad(lambda u: psd(u / (np.pi * tau)) / u**2 / (np.pi * tau), edge, np.inf)[0]
+    return (
+        total
+        + 4 * 3 / 8 * quad(lambda u: psd(u / (np.pi * tau)) / u**2 / (np.pi * tau), edge, np.inf)[0]
+    )
 
 
 @pytest.mark.parametrize("tau", [0.02, 1.0, 300.0])
@@ -45,7 +48,9 @@ def test_quantization_follows_from_independent_angles():
     """An angle error of Q at both ends: the second difference has the variance 6 Q^2, over 2 tau^2."""
     tau = 0.5
     angle = np.degrees(1e-6)  # 1 urad in degree
-    assert float(LAWS["Q"].avar(tau)) == pytest.approx(6 * angle**2 / (2 * (tau / HOUR) ** 2), rel=1e-12)
+    assert float(LAWS["Q"].avar(tau)) == pytest.approx(
+        6 * angle**2 / (2 * (tau / HOUR) ** 2), rel=1e-12
+    )
     assert pytest.approx(1e6 * np.pi / 180 / HOUR) == 1 / URAD_PER_S
 
 
@@ -53,7 +58,9 @@ def test_the_factor_of_the_papers_gives_microradian_not_arcsec():
     """P16 Eq. 9 and P15 Eq. 4: Q = sqrt(A) 10^6 pi / (180 * 3600 sqrt 3) with A the tau^-2 coefficient in (deg/h)^2 s^2."""
     coefficient = 2.5  # urad
     a = float(LAWS["Q"].avar(1.0, coefficient))
-    assert np.sqrt(a) * 1e6 * np.pi / (180 * 3600 * np.sqrt(3)) == pytest.approx(coefficient, rel=1e-12)
+    assert np.sqrt(a) * 1e6 * np.pi / (180 * 3600 * np.sqrt(3)) == pytest.approx(
+        coefficient, rel=1e-12
+    )
 
 
 def test_stored_numbers_are_deviations_at_their_reference():
@@ -67,7 +74,11 @@ def test_stored_numbers_are_deviations_at_their_reference():
 def test_a_model_is_the_sum_of_its_terms():
     tau = np.geomspace(0.01, 1e4, 7)
     truth = {"Q": 0.5, "N": 0.003, "B": 0.004, "K": 0.02, "R": 0.1}
-    np.testing.assert_allclose(model_avar(tau, truth), avar_columns(tau) @ np.array([truth[t] ** 2 for t in TERMS]), rtol=1e-12)
+    np.testing.assert_allclose(
+        model_avar(tau, truth),
+        avar_columns(tau) @ np.array([truth[t] ** 2 for t in TERMS]),
+        rtol=1e-12,
+    )
 
 
 def test_sample_units_undo_the_columns():
@@ -87,7 +98,11 @@ def test_simulated_noise_follows_its_law_at_every_tau(term):
         "K": lambda: random_walk(rng, trials, n, K=1.0, rate=rate),
     }[term]
     surface = davar(
-        make_log(make().reshape(-1), rate=rate, unit="deg/h"), window=f"{n}samples", step=f"{n}samples", taus="octave", tau_max=4.0
+        make_log(make().reshape(-1), rate=rate, unit="deg/h"),
+        window=f"{n}samples",
+        step=f"{n}samples",
+        taus="octave",
+        tau_max=4.0,
     )
     mean = surface.avar.mean("time").values[0]
     scatter = surface.avar.std("time").values[0] / np.sqrt(trials)
@@ -98,7 +113,12 @@ def test_a_bias_step_looks_like_a_random_walk():
     """A step D inside a window of W hours gives D^2 tau / (3 (W - 2 tau)): an apparent K of D / sqrt(W)."""
     n, rate, step = 20_000, 100.0, 0.1
     x = np.where(np.arange(n) < n // 2, 0.0, step)
-    surface = davar(make_log(x, rate=rate, unit="deg/h"), window=f"{n}samples", step=f"{n}samples", taus=[0.1, 1.0, 2.0])
+    surface = davar(
+        make_log(x, rate=rate, unit="deg/h"),
+        window=f"{n}samples",
+        step=f"{n}samples",
+        taus=[0.1, 1.0, 2.0],
+    )
     window = n / rate
     expected = step**2 * surface.tau / (3 * (window - 2 * surface.tau))
     np.testing.assert_allclose(surface.avar[0, 0], expected, rtol=0.02)

@@ -26,7 +26,9 @@ def test_conversion_agrees_with_udunits(text, udunits):
     unit = parse_unit(text)
     inner = cf_units.Unit(on_disk(INNER[unit.quantity]))
     for value in (0.0, 1.0, -37.5):
-        assert value * unit.factor + unit.offset == pytest.approx(cf_units.Unit(udunits).convert(value, inner), rel=1e-9, abs=1e-9)
+        assert value * unit.factor + unit.offset == pytest.approx(
+            cf_units.Unit(udunits).convert(value, inner), rel=1e-9, abs=1e-9
+        )
 
 
 @pytest.mark.parametrize(
@@ -52,7 +54,9 @@ def test_what_udunits_reads_is_read_alike(text):
     ],
 )  # fmt: skip
 def test_spellings_of_data_sheets(text, plain):
-    assert parse_unit(text).factor == pytest.approx(cf_units.Unit(plain).convert(1.0, cf_units.Unit("degree hour-1")), rel=1e-14)
+    assert parse_unit(text).factor == pytest.approx(
+        cf_units.Unit(plain).convert(1.0, cf_units.Unit("degree hour-1")), rel=1e-14
+    )
 
 
 def test_every_unit_we_write_is_read_by_udunits_as_it_is_meant():
@@ -61,15 +65,32 @@ def test_every_unit_we_write_is_read_by_udunits_as_it_is_meant():
             unit = cf_units.Unit(attributes["units"])
             assert not unit.is_unknown(), name
     hour, degree = 3600.0, np.pi / 180
-    for text, value in (("degree2 hour-1", degree**2 / hour), ("degree2 hour-3", degree**2 / hour**3), ("degree hour-2", degree / hour**2)):
-        assert cf_units.Unit(text).convert(1.0, cf_units.Unit(text.replace("degree", "radian").replace("hour", "s"))) == pytest.approx(
-            value
-        )
+    for text, value in (
+        ("degree2 hour-1", degree**2 / hour),
+        ("degree2 hour-3", degree**2 / hour**3),
+        ("degree hour-2", degree / hour**2),
+    ):
+        assert cf_units.Unit(text).convert(
+            1.0, cf_units.Unit(text.replace("degree", "radian").replace("hour", "s"))
+        ) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
     "text",
-    ["furlong/fortnight", "deg//h", "0 deg/h", "nan deg/h", "1e400 deg/h", "MRAD/S", "deg/h/h", "rad s -1", "rad/s-1", "/s", "deg/", "MS"],
+    [
+        "furlong/fortnight",
+        "deg//h",
+        "0 deg/h",
+        "nan deg/h",
+        "1e400 deg/h",
+        "MRAD/S",
+        "deg/h/h",
+        "rad s -1",
+        "rad/s-1",
+        "/s",
+        "deg/",
+        "MS",
+    ],
 )
 def test_what_is_not_a_unit_is_refused_with_what_is(text):
     with pytest.raises(UnitError):
@@ -87,11 +108,17 @@ def test_known_units_lists_the_contract():
 @pytest.mark.parametrize(
     ("spellings", "meant"),
     [
-        ("Celsius|celsius|°C|ºC|deg C|deg_C|degrees Celsius|degree_Celsius|DEGC|C", "degree_Celsius"),
+        (
+            "Celsius|celsius|°C|ºC|deg C|deg_C|degrees Celsius|degree_Celsius|DEGC|C",
+            "degree_Celsius",
+        ),
         ("Kelvin|K|deg K", "kelvin"),
         ("degF|°F|DEGF|Fahrenheit", "degree_Fahrenheit"),
         ("deg/hr|DEG/HR|DEG/H|°/hr|° / h|degrees per hour|deg h^-1|degree h-1", "degree hour-1"),
-        ("deg/sec|dps|°/s|º/s|Deg/Sec|degrees/second|degrees per second|deg.s-1|deg s⁻¹", "degree s-1"),
+        (
+            "deg/sec|dps|°/s|º/s|Deg/Sec|degrees/second|degrees per second|deg.s-1|deg s⁻¹",
+            "degree s-1",
+        ),
         ("rad/sec|RAD/S|rad*s**-1|rad·s⁻¹|radians/second|rad.s^-1", "radian s-1"),
         ("mdps|mdeg/s", "1e-3 degree s-1"),
         ("rpm|RPM|rev/min|revs per minute", "6 degree s-1"),
@@ -115,7 +142,9 @@ def test_spellings_of_other_programs(spellings, meant):
         inner = cf_units.Unit(on_disk(INNER[unit.quantity]))
         for value in (1.0, -37.5):
             expected = cf_units.Unit(meant).convert(value, inner)
-            assert value * unit.factor + unit.offset == pytest.approx(expected, rel=1e-9, abs=1e-9), text
+            assert value * unit.factor + unit.offset == pytest.approx(
+                expected, rel=1e-9, abs=1e-9
+            ), text
 
 
 def test_the_expected_quantity_decides_where_case_does_not():

@@ -37,15 +37,16 @@ def window_channels(
     window, step : int
         Length of the windows, and from one to the next [samples of the log].
     groups : sequence of slice
-        Windows that are computed together, so that a long channel is never held whole; all windows, in order.
+        Windows that are computed together, so that a long channel is never held whole; all windows,
+        in order.
     part : slice, optional
         Only these windows, at once and in the calling thread.
 
     Returns
     -------
     dict of str to xarray.Variable
-        ``<channel>(time)`` [unit of the channel] and, for temperatures, ``<channel>_rate(time)`` [K hour-1]; dask where
-        the channel is, and no part is asked for.
+        ``<channel>(time)`` [unit of the channel] and, for temperatures, ``<channel>_rate(time)`` [K
+        hour-1]; dask where the channel is, and no part is asked for.
     """
     out: dict[str, xr.Variable] = {}
     rate, start = float(log.attrs["sampling_rate_hz"]), first_stamp(log)
@@ -55,26 +56,48 @@ def window_channels(
             continue
         stamps = None
         if channel.dims != ("time",):
-            stamps = log.variables[f"time_{name}"].values.astype("datetime64[ns]", copy=False).view(np.int64)
+            stamps = (
+                log.variables[f"time_{name}"]
+                .values.astype("datetime64[ns]", copy=False)
+                .view(np.int64)
+            )
 
-        def ends(group: slice, stamps: NDArray[np.int64] | None = stamps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        def ends(
+            group: slice, stamps: NDArray[np.int64] | None = stamps
+        ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             first = np.arange(group.start, group.stop) * step
             if stamps is None:
                 return first, first + window
-            return tuple(np.searchsorted(stamps, grid_times(start, rate, edge)) for edge in (first, first + window))  # type: ignore[return-value]
+            return tuple(
+                np.searchsorted(stamps, grid_times(start, rate, edge))
+                for edge in (first, first + window)
+            )  # type: ignore[return-value]
 
         mean, slope = _means(channel.data, stamps, rate, groups, ends, part)
         units = channel.attrs.get("units", "1")
         label = str(channel.attrs.get("long_name", name.replace("_", " ")))
-        out[name] = xr.Variable(("time",), mean, {"long_name": f"{label}, mean of the window", "units": units})
+        out[name] = xr.Variable(
+            ("time",), mean, {"long_name": f"{label}, mean of the window", "units": units}
+        )
         if units == INNER["temperature"]:
             out[f"{name}_rate"] = xr.Variable(
-                ("time",), slope * HOUR, {"long_name": f"rate of change of {label}, slope over the window", "units": TEMPERATURE_RATE}
+                ("time",),
+                slope * HOUR,
+                {
+                    "long_name": f"rate of change of {label}, slope over the window",
+                    "units": TEMPERATURE_RATE,
+                },
             )
     return out
 
 
-def _trend(values: Any, stamps: NDArray[np.int64] | None, rate: float, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.float64]:
+def _trend(
+    values: Any,
+    stamps: NDArray[np.int64] | None,
+    rate: float,
+    a: NDArray[np.int64],
+    b: NDArray[np.int64],
+) -> NDArray[np.float64]:
     data = np.ascontiguousarray(values, dtype=np.float64)
     seconds = np.arange(data.size) / rate if stamps is None else (stamps - stamps[:1]) / 1e9
     return np.asarray(window_trend(data, seconds, a, b))
@@ -103,7 +126,13 @@ def _means(
             one = dask.delayed(_trend, pure=False)(data[low:high], piece, rate, a - low, b - low)
             parts.append(da.from_delayed(one, (2, a.size), dtype=np.float64))
         else:
-            values = stretch(data, low, high) if together is None else together[low - first : high - first]
+            values = (
+                stretch(data, low, high)
+                if together is None
+                else together[low - first : high - first]
+            )
             parts.append(_trend(values, piece, rate, a - low, b - low))
-    both = (da if lazy else np).concatenate(parts, axis=1)[:, kept.start - chosen[0].start : kept.stop - chosen[0].start]
+    both = (da if lazy else np).concatenate(parts, axis=1)[
+        :, kept.start - chosen[0].start : kept.stop - chosen[0].start
+    ]
     return both[0], both[1]

@@ -17,8 +17,9 @@ __all__ = ["confidence_interval"]
 def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Dataset:
     """Interval that holds the true Allan variance of each cell.
 
-    ``edf * avar / true`` is taken as chi-square with ``edf`` degrees of freedom. Over gaps the true value is the law as
-    seen through them (``white_response``, ``quantization_response``, ``ramp_response``).
+    ``edf * avar / true`` is taken as chi-square with ``edf`` degrees of freedom. Over gaps the true
+    value is the law as seen through them (``white_response``, ``quantization_response``,
+    ``ramp_response``).
 
     Parameters
     ----------
@@ -30,7 +31,8 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     Returns
     -------
     xarray.Dataset
-        ``avar_lower, avar_upper (axis, time, tau)`` [degree2 hour-2]; NaN where there is no estimate; dask if `surface` is.
+        ``avar_lower, avar_upper (axis, time, tau)`` [degree2 hour-2]; NaN where there is no
+        estimate; dask if `surface` is.
 
     Raises
     ------
@@ -57,12 +59,22 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     if not 0.0 < level < 1.0:
         raise OptionError(f"level={level!r}: give a probability between 0 and 1, such as 0.95")
     out = xr.Dataset()
-    for name, side, words in (("avar_lower", 0.5 + level / 2, "lower"), ("avar_upper", 0.5 - level / 2, "upper")):
+    for name, side, words in (
+        ("avar_lower", 0.5 + level / 2, "lower"),
+        ("avar_upper", 0.5 - level / 2, "upper"),
+    ):
         limit = xr.apply_ufunc(
-            _limit, surface["avar"], surface["edf"], side, dask="parallelized", output_dtypes=[np.float64], keep_attrs=False
+            _limit,
+            surface["avar"],
+            surface["edf"],
+            side,
+            dask="parallelized",
+            output_dtypes=[np.float64],
+            keep_attrs=False,
         )
         out[name] = limit.assign_attrs(
-            units=surface["avar"].attrs["units"], long_name=f"{words} end of the {level:.0%} interval of the Allan variance"
+            units=surface["avar"].attrs["units"],
+            long_name=f"{words} end of the {level:.0%} interval of the Allan variance",
         )
     return out
 

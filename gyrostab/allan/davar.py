@@ -39,7 +39,8 @@ _PLANE_FIELDS = ("window_mean", "window_coverage", "outlier_count")
 _TOGETHER = 2**21
 #: Parts at least of a surface of so many units of work, for the threads to share.
 _LEAST_PARTS = 4
-#: A part gets this share at most of the units of work that are left: two threads that share the parts then end at about the same time.
+#: A part gets this share at most of the units of work that are left: two threads that share the
+#: parts then end at about the same time.
 _SHARE = 1 / 2
 
 
@@ -60,7 +61,8 @@ def davar(
 ) -> xr.Dataset:
     """Dynamic overlapping Allan variance of a gyro log (improved fast DAVAR).
 
-    A window slides along the record; inside it the Allan variance is the mean squared second difference of the angle,
+    A window slides along the record; inside it the Allan variance is the mean squared second
+    difference of the angle,
 
         avar(t, tau) = < (theta[m + 2k] - 2 theta[m + k] + theta[m])^2 > / (2 tau^2),   tau = k / sampling rate,
 
@@ -69,49 +71,55 @@ def davar(
     Parameters
     ----------
     log : xarray.Dataset
-        Regular log with ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], NaN where a sample is
-        missing, numpy or dask, float or integer. A dask log stays lazy and gives the same bits for any chunking. The
-        sampling rate is that of ``time``: a log that was thinned or averaged has its new rate, and samples that were
-        dropped are missing. A DataArray with ``attrs["units"]``, or a pandas table as for `gyrostab.from_dataframe`, is
-        taken too.
+        Regular log with ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], NaN
+        where a sample is missing, numpy or dask, float or integer. A dask log stays lazy and gives
+        the same bits for any chunking. The sampling rate is that of ``time``: a log that was
+        thinned or averaged has its new rate, and samples that were dropped are missing. A DataArray
+        with ``attrs["units"]``, or a pandas table as for `gyrostab.from_dataframe`, is taken too.
     window, step : str or timedelta
-        Length and step of the window: a duration (``"10min"``), or a number of samples (``"2000samples"``). A bare number
-        is refused. `step` defaults to a tenth of the window.
+        Length and step of the window: a duration (``"10min"``), or a number of samples
+        (``"2000samples"``). A bare number is refused. `step` defaults to a tenth of the window.
     taus : int, {"octave", "all"} or sequence
-        Averaging times: so many, spaced evenly in log tau; powers of two samples; every one; or a list [s]
-        (numbers, or strings such as ``"0.1s"``). Each is moved to a whole number of samples and reported exactly.
+        Averaging times: so many, spaced evenly in log tau; powers of two samples; every one; or a
+        list [s] (numbers, or strings such as ``"0.1s"``). Each is moved to a whole number of
+        samples and reported exactly.
     tau_max : float or str, optional
         Longest averaging time [s]; a third of the window by default (L13), at most half of it.
     axis : str or sequence of str, optional
         Axes to use; all by default.
     overlap : {"full", "octave"}
-        Use every second difference, or for ``k >= 16`` one in k/16 to k/8 of them, with k moved to a multiple of a power
-        of two: less work on long windows (1.7 times faster as measured by
+        Use every second difference, or for ``k >= 16`` one in k/16 to k/8 of them, with k moved to
+        a multiple of a power of two: less work on long windows (1.7 times faster as measured by
         ``make bench``), with 1 % more scatter.
     gaps : {"bridge", "zero"}
-        ``"bridge"`` counts only what is there. In a rate log those are terms inside unbroken runs, and, where fewer than
-        `min_strict` of them are left, weighted cluster means (see ``estimator``). In an angle log they are terms whose
-        three angles are there. ``"zero"`` divides by the gap-free number instead, which lowers the surface at
-        every gap: the "canyon" of P16.
+        ``"bridge"`` counts only what is there. In a rate log those are terms inside unbroken runs,
+        and, where fewer than `min_strict` of them are left, weighted cluster means (see
+        ``estimator``). In an angle log they are terms whose three angles are there. ``"zero"``
+        divides by the gap-free number instead, which lowers the surface at every gap: the "canyon"
+        of P16.
     min_strict, min_coverage : float
-        Share of terms in unbroken runs below which cluster means are used; coverage below which a cell is NaN.
+        Share of terms in unbroken runs below which cluster means are used; coverage below which a
+        cell is NaN.
     method : {"blocks", "direct", "recursive"}
-        The default; the classical DAVAR (P16 Eq. 16); the published recursion (P16 Eq. 19-22). The last two load the log
-        and are there for comparison.
+        The default; the classical DAVAR (P16 Eq. 16); the published recursion (P16 Eq. 19-22). The
+        last two load the log and are there for comparison.
     convention : {"all", "paper"}
-        With ``"paper"`` the reference methods count ``window - 2k`` terms, and leave out the last window, as P16 does.
+        With ``"paper"`` the reference methods count ``window - 2k`` terms, and leave out the last
+        window, as P16 does.
 
     Returns
     -------
     xarray.Dataset
-        ``avar, count, coverage, edf, estimator, white_response, quantization_response, ramp_response (axis, time, tau)``,
-        ``window_mean, window_coverage, outlier_count (axis, time)``, and every channel of the log averaged over each window; ``time`` is
-        the centre of the window, with ``time_bounds``; ``tau`` [s]. Units stand on the variables.
+        ``avar, count, coverage, edf, estimator, white_response, quantization_response,
+        ramp_response (axis, time, tau)``, ``window_mean, window_coverage, outlier_count (axis,
+        time)``, and every channel of the log averaged over each window; ``time`` is the centre of
+        the window, with ``time_bounds``; ``tau`` [s]. Units stand on the variables.
 
     Raises
     ------
     OptionError
-        When window, step or taus do not fit the record or each other; the message says which and what would.
+        When window, step or taus do not fit the record or each other; the message says which and
+        what would.
     SchemaError
         When `log` is not a regular log.
     TimeError
@@ -119,8 +127,8 @@ def davar(
 
     References
     ----------
-    P16: Wang et al., Sensors 16 (2016), Eq. 16-22. L13: Li et al., Chin. J. Lasers 40 (2013) 0908004.
-    Degrees of freedom: Greenhall and Riley, PTTI 2003.
+    P16: Wang et al., Sensors 16 (2016), Eq. 16-22. L13: Li et al., Chin. J. Lasers 40 (2013)
+    0908004. Degrees of freedom: Greenhall and Riley, PTTI 2003.
 
     Examples
     --------
@@ -140,7 +148,9 @@ def davar(
     if method == "blocks":
         cells, means = _blocks(plan.signal.data, plan.unit, plan.rate)
     else:
-        cells, means = _reference(plan.signal, plan.unit, plan.rate, method, paper=convention == "paper")
+        cells, means = _reference(
+            plan.signal, plan.unit, plan.rate, method, paper=convention == "paper"
+        )
     return _label(cells, means, log, plan)
 
 
@@ -152,7 +162,8 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     log : xarray.Dataset
         Regular log.
     samples : int
-        Samples of a part over all axes; it gets one unit of work at least. Where windows are close, or units few, a part gets fewer.
+        Samples of a part over all axes; it gets one unit of work at least. Where windows are close,
+        or units few, a part gets fewer.
     **options
         Options of `davar`.
 
@@ -172,25 +183,36 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     units = units_of_work(size, plan.unit)
     per_unit = max(1, units[0].stop - units[0].start)
     cells = axes * plan.unit.ks.size
-    together = max(1, min(samples // (axes * per_unit * plan.unit.step), MOST_CELLS // (cells * per_unit), -(-len(units) // _LEAST_PARTS)))
+    together = max(
+        1,
+        min(
+            samples // (axes * per_unit * plan.unit.step),
+            MOST_CELLS // (cells * per_unit),
+            -(-len(units) // _LEAST_PARTS),
+        ),
+    )
     edges = [0]
     while left := len(units) - edges[-1]:
         edges.append(edges[-1] + max(1, min(together, int(left * _SHARE))))
     return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
 
 
-def davar_part(log: xr.Dataset, *, part: slice, space: Workspace | None = None, **options: Any) -> xr.Dataset:
+def davar_part(
+    log: xr.Dataset, *, part: slice, space: Workspace | None = None, **options: Any
+) -> xr.Dataset:
     """Some windows of the surface that `davar` makes, computed at once and in the calling thread.
 
-    Only the samples of these windows are read, and dask is not asked to compute anything beside that, so that many parts
-    can be computed side by side, in threads, processes or on other machines. The numbers are those of `davar`, bit for bit.
+    Only the samples of these windows are read, and dask is not asked to compute anything beside
+    that, so that many parts can be computed side by side, in threads, processes or on other
+    machines. The numbers are those of `davar`, bit for bit.
 
     Parameters
     ----------
     log : xarray.Dataset
         Regular log, numpy or dask.
     part : slice
-        Windows, counted from the first window of the log: one of `davar_parts`, or any other without a step.
+        Windows, counted from the first window of the log: one of `davar_parts`, or any other
+        without a step.
     space : gyrostab.kernels.workspace.Workspace, optional
         Memory to work in, for parts one after the other in one thread.
     **options
@@ -217,24 +239,41 @@ def davar_part(log: xr.Dataset, *, part: slice, space: Workspace | None = None, 
     log = as_log(log)
     plan = make_plan(log, **options)
     if plan.attrs["method"] != "blocks":
-        raise OptionError(f"method={plan.attrs['method']!r} is for whole logs; parts are computed with method='blocks'")
+        raise OptionError(
+            f"method={plan.attrs['method']!r} is for whole logs; parts are computed with method='blocks'"
+        )
     data, unit = plan.signal.data, plan.unit
     tables = _kept_tables(plan)
-    units = [one for one in units_of_work(data.shape[1], unit) if one.start < part.stop and one.stop > part.start]
+    units = [
+        one
+        for one in units_of_work(data.shape[1], unit)
+        if one.start < part.stop and one.stop > part.start
+    ]
     spans = [(one.start * unit.step, last_sample(one, unit)) for one in units]
     space = space or Workspace()
     done = [_work(x, unit, tables, space) for x in _stretches(data, spans, space)]
     rows = range(0, len(done), len(units))
-    cells, means = ([np.concatenate([one[i] for one in done[row : row + len(units)]], axis=1) for row in rows] for i in range(2))
+    cells, means = (
+        [np.concatenate([one[i] for one in done[row : row + len(units)]], axis=1) for row in rows]
+        for i in range(2)
+    )
     kept = slice(part.start - units[0].start, part.stop - units[0].start)
-    return _label(np.stack(cells, axis=1)[:, :, kept], np.stack(means, axis=1)[:, :, kept], log, plan, part=part)
+    return _label(
+        np.stack(cells, axis=1)[:, :, kept],
+        np.stack(means, axis=1)[:, :, kept],
+        log,
+        plan,
+        part=part,
+    )
 
 
-def _stretches(data: Any, spans: Sequence[tuple[int, int]], space: Workspace) -> Iterator[NDArray[np.generic]]:
+def _stretches(
+    data: Any, spans: Sequence[tuple[int, int]], space: Workspace
+) -> Iterator[NDArray[np.generic]]:
     """The samples of each span, of one axis after the other; each is to be used before the next is asked for.
 
-    They are read span by span where that needs no dask; what two spans share is read once. Where dask must be asked, all axes are read
-    together if they are few.
+    They are read span by span where that needs no dask; what two spans share is read once. Where
+    dask must be asked, all axes are read together if they are few.
     """
     begin, end = spans[0][0], spans[-1][1]
     if isinstance(data, da.Array) and can_fill(data):
@@ -265,7 +304,9 @@ def _work(
     else:
         cells, means = surface_unit(x, unit, space)
     outliers = count_outliers(x, np.arange(means.shape[1]) * unit.step, unit.window)
-    scale = HOUR if unit.angle else 1.0  # angles are in degree, so their slopes in degree per second
+    scale = (
+        HOUR if unit.angle else 1.0
+    )  # angles are in degree, so their slopes in degree per second
     cells[0] *= scale**2
     dof = identify_noise(cells[0], cells[5], cells[6], cells[7], cells[3], *tables)
     means[0] *= scale
@@ -293,7 +334,9 @@ def _hashable(unit: Unit) -> Unit:
 
 
 def _with_arrays(unit: Unit) -> Unit:
-    return unit._replace(ks=np.array(unit.ks, dtype=np.int64), shifts=np.array(unit.shifts, dtype=np.int64))
+    return unit._replace(
+        ks=np.array(unit.ks, dtype=np.int64), shifts=np.array(unit.shifts, dtype=np.int64)
+    )
 
 
 def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
@@ -301,7 +344,9 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
     columns = avar_columns(unit.ks / rate)
     to_samples = sample_squares(rate)
     n = [int(unit.window - 2 * k + 1) for k in unit.ks]
-    weight = np.array([count**2 / white_pair_sum(count, int(k)) for count, k in zip(n, unit.ks, strict=True)])
+    weight = np.array(
+        [count**2 / white_pair_sum(count, int(k)) for count, k in zip(n, unit.ks, strict=True)]
+    )
     pairs, ramps = diagonal_products(unit.window, unit.ks, unit.shifts)
     return columns, weight, to_samples, pairs, ramps
 
@@ -317,8 +362,14 @@ def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
         cells, means = [], []
         for windows in units_of_work(data.shape[1], unit):
             n = windows.stop - windows.start
-            one_cells, one_means = work(data[row, windows.start * unit.step : last_sample(windows, unit)], unit, shared)
-            cells.append(da.from_delayed(one_cells, (len(CELL_FIELDS) + 1, n, unit.ks.size), dtype=np.float64))
+            one_cells, one_means = work(
+                data[row, windows.start * unit.step : last_sample(windows, unit)], unit, shared
+            )
+            cells.append(
+                da.from_delayed(
+                    one_cells, (len(CELL_FIELDS) + 1, n, unit.ks.size), dtype=np.float64
+                )
+            )
             means.append(da.from_delayed(one_means, (len(_PLANE_FIELDS), n), dtype=np.float64))
         rows_cells.append(da.concatenate(cells, axis=1))
         rows_means.append(da.concatenate(means, axis=1))
@@ -328,13 +379,17 @@ def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
     return stacked if lazy else dask.compute(*stacked)
 
 
-def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool) -> tuple[Any, Any]:
+def _reference(
+    signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool
+) -> tuple[Any, Any]:
     """The published algorithms, eager: cells (9, axis, time, tau) and plane fields (3, axis, time)."""
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
     n_windows = (all_points - points) // unit.step + (0 if paper else 1)
     if n_windows < 1:
-        raise OptionError("the paper's convention leaves no window: it leaves out the last one; give a longer record")
+        raise OptionError(
+            "the paper's convention leaves no window: it leaves out the last one; give a longer record"
+        )
     run = direct_sums if method == "direct" else recursive_sums
     tables = _noise_tables(unit, rate)
     full = (points - 2 * unit.ks).astype(np.float64)
@@ -347,44 +402,68 @@ def _reference(signal: xr.DataArray, unit: Unit, rate: float, method: str, *, pa
         divisor = full if unit.zero_fill else counts
         interval = unit.interval if unit.angle else 1.0
         with np.errstate(invalid="ignore", divide="ignore"):
-            cells[0, row] = sums / (2.0 * (unit.ks * interval) ** 2 * divisor) * (HOUR**2 if unit.angle else 1.0)
+            cells[0, row] = (
+                sums
+                / (2.0 * (unit.ks * interval) ** 2 * divisor)
+                * (HOUR**2 if unit.angle else 1.0)
+            )
         cells[1, row], cells[2, row] = counts, counts / full
         cells[3, row], cells[4, row], cells[5:8, row] = counts / full, STRICT, 1.0
         if not unit.zero_fill:
             cells[0, row][cells[2, row] < unit.min_coverage] = np.nan
-        cells[8, row] = identify_noise(cells[0, row], cells[5, row], cells[6, row], cells[7, row], cells[3, row], *tables)
+        cells[8, row] = identify_noise(
+            cells[0, row], cells[5, row], cells[6, row], cells[7, row], cells[3, row], *tables
+        )
         means[:2, row] = window_means(x, unit)[:, :n_windows]
         means[2, row] = count_outliers(x, np.arange(n_windows) * unit.step, unit.window)
         means[0, row] *= HOUR if unit.angle else 1.0
     return cells, means
 
 
-def _label(cells: Any, means: Any, log: xr.Dataset, plan: Plan, *, part: slice | None = None) -> xr.Dataset:
+def _label(
+    cells: Any, means: Any, log: xr.Dataset, plan: Plan, *, part: slice | None = None
+) -> xr.Dataset:
     cube, plane = ("axis", "time", "tau"), ("axis", "time")
     signal, unit, rate, _ = plan
     start, begin = first_stamp(log), 0 if part is None else part.start
     first = (begin + np.arange(cells.shape[2])) * unit.step
-    bounds = np.stack([grid_times(start, rate, first), grid_times(start, rate, first + unit.window)], axis=-1)
+    bounds = np.stack(
+        [grid_times(start, rate, first), grid_times(start, rate, first + unit.window)], axis=-1
+    )
     centre = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     names = (*CELL_FIELDS, "edf")
     integers = {"count": np.int64, "estimator": np.int8, "outlier_count": np.int64}
     variables: dict[str, Any] = {
-        name: (cube, cells[i].astype(integers[name]) if name in integers else cells[i], attributes(name))
+        name: (
+            cube,
+            cells[i].astype(integers[name]) if name in integers else cells[i],
+            attributes(name),
+        )
         for i, name in enumerate(names)
         if name != "gap_factor"
     }
     for name, values in zip(_PLANE_FIELDS, means, strict=True):
         variables[name] = (plane, values.astype(integers.get(name, np.float64)), attributes(name))
     # The share of degrees of freedom that the gaps leave is what a fit needs beside the responses.
-    variables["gap_factor"] = (cube, cells[CELL_FIELDS.index("gap_factor")], attributes("gap_factor"))
+    variables["gap_factor"] = (
+        cube,
+        cells[CELL_FIELDS.index("gap_factor")],
+        attributes("gap_factor"),
+    )
     groups = units_of_work(signal.sizes["time"], unit)
     if part is None:  # the paper's convention leaves out the last window
-        groups = [slice(one.start, min(one.stop, first.size)) for one in groups if one.start < first.size]
+        groups = [
+            slice(one.start, min(one.stop, first.size)) for one in groups if one.start < first.size
+        ]
     return xr.Dataset(
         {**variables, **window_channels(log, unit.window, unit.step, groups, part=part)},
         coords={
             "axis": ("axis", signal["axis"].values, attributes("axis")),
-            "time": ("time", pd.DatetimeIndex(centre.view("datetime64[ns]")), {**attributes("time")}),
+            "time": (
+                "time",
+                pd.DatetimeIndex(centre.view("datetime64[ns]")),
+                {**attributes("time")},
+            ),
             "tau": ("tau", unit.ks / rate, attributes("tau")),
             "time_bounds": (("time", "bnds"), bounds.view("datetime64[ns]")),
         },

@@ -23,13 +23,15 @@ from gyrostab.time.durations import duration_seconds, thin
 
 __all__ = ["fit_noise", "fit_part", "is_described", "refit"]
 
-#: Averaging times used at most; more of them share the same information and cost the cube of their number.
+#: Averaging times used at most; more of them share the same information and cost the cube of their
+#: number.
 MOST_TAUS = 48
 #: One-sided normal quantiles: 95 % for limits, 99 % for the claim that a term is there.
 _LIMIT, _CLAIM = 1.6449, 2.3263
 #: The model does not fit where chance alone would make the misfit in fewer windows than this.
 _MISFIT = 1e-3
-#: A window that the model does not fit bounds its terms (but Q) within its longest averaging times: a decade of them.
+#: A window that the model does not fit bounds its terms (but Q) within its longest averaging times:
+#: a decade of them.
 _DECADE = 10.0
 #: More degrees of freedom than this are as good as infinitely many for the limit of a cell.
 _MOST_FREEDOM = 1e6
@@ -52,9 +54,10 @@ def fit_noise(
 
         avar(tau) = 3 Q^2 / tau^2 + N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 + R^2 tau^2 / 2,
 
-    so they follow from non-negative generalised least squares. The covariance between averaging times (overlapping
-    estimates share data) is that of the fitted noise itself, found by iteration. Where gaps forced weighted cluster
-    means, the columns of Q, N and R are those that the mask predicts.
+    so they follow from non-negative generalised least squares. The covariance between averaging
+    times (overlapping estimates share data) is that of the fitted noise itself, found by iteration.
+    Where gaps forced weighted cluster means, the columns of Q, N and R are those that the mask
+    predicts.
 
     Parameters
     ----------
@@ -63,22 +66,26 @@ def fit_noise(
     terms : str or iterable of str
         Terms to fit, a selection of Q, N, B, K, R; the others are taken as zero.
     method : {"gls", "adev"}
-        The default, or the fit of deviations of P15 (Eq. 3), ``sigma = sum C_n tau^(n/2)``, unweighted. It adds
-        deviations where variances add, gives no errors, and is there for comparison.
+        The default, or the fit of deviations of P15 (Eq. 3), ``sigma = sum C_n tau^(n/2)``,
+        unweighted. It adds deviations where variances add, gives no errors, and is there for
+        comparison.
     tau_min, tau_max : float or str, optional
-        Averaging times to fit [s], all by default. Start above what is no noise: a filter, a line, resets of the feedback.
+        Averaging times to fit [s], all by default. Start above what is no noise: a filter, a line,
+        resets of the feedback.
     observed_only : bool
-        Give a coefficient and its standard error only where the term is observed, and NaN elsewhere. With False they are
-        the non-negative least-squares estimates of every window: for the fitted curve, or to study the estimator.
+        Give a coefficient and its standard error only where the term is observed, and NaN
+        elsewhere. With False they are the non-negative least-squares estimates of every window: for
+        the fitted curve, or to study the estimator.
 
     Returns
     -------
     xarray.Dataset
-        The surface, and per ``(axis, time)``: ``Q`` [urad], ``N`` [deg/sqrt(h)], ``B`` [deg/h], ``K`` [deg/h^1.5],
-        ``R`` [deg/h^2], ``*_stderr``, ``*_upper`` (95 % upper limit where the term is not observed),
-        ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``; ``observable(axis, time, term)``: 0 the window
-        cannot see the term, 1 it gives an upper limit only, 2 the term is there (99 % one-sided). No term is observed in
-        a window that the five terms do not describe: see `is_described`. ``edf`` is that of the fitted noise.
+        The surface, and per ``(axis, time)``: ``Q`` [urad], ``N`` [deg/sqrt(h)], ``B`` [deg/h],
+        ``K`` [deg/h^1.5], ``R`` [deg/h^2], ``*_stderr``, ``*_upper`` (95 % upper limit where the
+        term is not observed), ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``;
+        ``observable(axis, time, term)``: 0 the window cannot see the term, 1 it gives an upper
+        limit only, 2 the term is there (99 % one-sided). No term is observed in a window that the
+        five terms do not describe: see `is_described`. ``edf`` is that of the fitted noise.
 
     Raises
     ------
@@ -100,7 +107,14 @@ def fit_noise(
     >>> round(float(product.N.mean()), 3)
     0.01
     """
-    return _fit(surface, terms=terms, method=method, tau_min=tau_min, tau_max=tau_max, observed_only=observed_only)
+    return _fit(
+        surface,
+        terms=terms,
+        method=method,
+        tau_min=tau_min,
+        tau_max=tau_max,
+        observed_only=observed_only,
+    )
 
 
 def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
@@ -127,8 +141,17 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
     >>> bool(product.B.isnull().any()), bool(refit(product).B.isnull().any())
     (True, False)
     """
-    kept = {"terms": "fit_terms", "method": "fit_method", "tau_min": "fit_tau_min_s", "tau_max": "fit_tau_max_s"}
-    own = {name: product.attrs[attribute] for name, attribute in kept.items() if attribute in product.attrs}
+    kept = {
+        "terms": "fit_terms",
+        "method": "fit_method",
+        "tau_min": "fit_tau_min_s",
+        "tau_max": "fit_tau_max_s",
+    }
+    own = {
+        name: product.attrs[attribute]
+        for name, attribute in kept.items()
+        if attribute in product.attrs
+    }
     return fit_noise(product, **{**own, "observed_only": False, **options})
 
 
@@ -143,15 +166,18 @@ def is_described(chi2: Any, dof: Any) -> Any:
     Returns
     -------
     ndarray of bool
-        False where noise that the terms describe would exceed `chi2` in fewer than one window of 1000; True where there
-        is no degree of freedom to tell.
+        False where noise that the terms describe would exceed `chi2` in fewer than one window of
+        1000; True where there is no degree of freedom to tell.
 
     Examples
     --------
     >>> is_described([20.0, 900.0, np.nan], [16.0, 16.0, 0.0])
     array([ True, False,  True])
     """
-    chi2, dof = np.nan_to_num(np.asarray(chi2, np.float64)), np.nan_to_num(np.asarray(dof, np.float64))
+    chi2, dof = (
+        np.nan_to_num(np.asarray(chi2, np.float64)),
+        np.nan_to_num(np.asarray(dof, np.float64)),
+    )
     return ~((dof > 0) & (gammaincc(np.maximum(dof, 1.0) / 2.0, chi2 / 2.0) < _MISFIT))
 
 
@@ -206,7 +232,9 @@ def _fit(
     else:
         product = _fit_adev(surface, wanted, chosen)
     tau = surface["tau"].values[chosen]
-    return product.assign_attrs(fit_method=method, fit_terms="".join(wanted), fit_tau_min_s=tau[0], fit_tau_max_s=tau[-1])
+    return product.assign_attrs(
+        fit_method=method, fit_terms="".join(wanted), fit_tau_min_s=tau[0], fit_tau_max_s=tau[-1]
+    )
 
 
 def _within(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
@@ -216,43 +244,64 @@ def _within(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.
     chosen = np.flatnonzero((tau >= low * (1 - 1e-9)) & (tau <= high * (1 + 1e-9)))
     if chosen.size == 0:
         has = f"it has {tau[0]:g} s to {tau[-1]:g} s; change --fit-from or --fit-to"
-        raise OptionError(f"no averaging time of the surface lies between {low:g} s and {high:g} s; {has}")
+        raise OptionError(
+            f"no averaging time of the surface lies between {low:g} s and {high:g} s; {has}"
+        )
     return chosen
 
 
 def _inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, int]:
     """Cells as (axis, time, tau) arrays, averaging factors, rate and window length."""
     try:
-        rate, window = float(surface.attrs["sampling_rate_hz"]), int(surface.attrs["window_samples"])
+        rate, window = (
+            float(surface.attrs["sampling_rate_hz"]),
+            int(surface.attrs["window_samples"]),
+        )
     except KeyError as missing:
-        raise SchemaError(f"the surface lacks the attribute {missing}; it is not what gyrostab.davar writes") from missing
+        raise SchemaError(
+            f"the surface lacks the attribute {missing}; it is not what gyrostab.davar writes"
+        ) from missing
     ks = np.round(np.asarray(surface["tau"].values) * rate).astype(np.int64)
     if "ramp_response" not in surface:  # of a version that took it as 1
         surface = surface.assign(ramp_response=xr.ones_like(surface["white_response"]))
     names = ("avar", "white_response", "quantization_response", "ramp_response", "gap_factor")
     absent = [name for name in names if name not in surface]
     if absent:
-        raise SchemaError(f"the surface lacks {absent}, which the fit needs to account for gaps; make it with gyrostab.davar")
+        raise SchemaError(
+            f"the surface lacks {absent}, which the fit needs to account for gaps; make it with gyrostab.davar"
+        )
     return [surface[name].data for name in names], ks, rate, window
 
 
-def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool, observed_only: bool) -> xr.Dataset:
+def _fit_gls(
+    surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool, observed_only: bool
+) -> xr.Dataset:
     cells, ks, rate, window = _inputs(surface)
     chosen = within[_choose(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
     tables = _tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window)
 
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
-        flat = [np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64) for a in arrays]
-        return _fit_block(flat, tables, allowed, observed_only).reshape(arrays[0].shape[0], arrays[0].shape[1], -1)
+        flat = [
+            np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
+            for a in arrays
+        ]
+        return _fit_block(flat, tables, allowed, observed_only).reshape(
+            arrays[0].shape[0], arrays[0].shape[1], -1
+        )
 
     if here:
         fitted = block(*cells)
     else:
         width = len(TERMS) * 4 + 2 + chosen.size
         lazy = isinstance(cells[0], da.Array)
-        whole = [cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1)) for cell in cells]
-        fitted = da.map_blocks(block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64)
+        whole = [
+            cell.rechunk({2: -1}) if lazy else da.from_array(cell, chunks=(1, 256, -1))
+            for cell in cells
+        ]
+        fitted = da.map_blocks(
+            block, *whole, chunks=(*whole[0].chunks[:2], (width,)), dtype=np.float64
+        )
         if not lazy:
             fitted = fitted.compute()
     n = len(TERMS)
@@ -261,7 +310,9 @@ def _fit_gls(surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, he
         "fit_chi2": (("axis", "time"), parts[4 * n], attributes("fit_chi2")),
         "fit_dof": (("axis", "time"), parts[4 * n + 1], attributes("fit_dof")),
     }
-    if chosen.size == surface.sizes["tau"]:  # otherwise davar's own, for every averaging time, stands
+    if (
+        chosen.size == surface.sizes["tau"]
+    ):  # otherwise davar's own, for every averaging time, stands
         extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
     return _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
 
@@ -274,10 +325,15 @@ class _Tables:
         self.to_samples = sample_squares(rate)
         self.pairs, self.ramps = product_tables(window, ks, shifts)
         terms = window - 2 * ks + 1
-        self.weight = np.array([n**2 / white_pair_sum(int(n), int(k)) for n, k in zip(terms, ks, strict=True)])
+        self.weight = np.array(
+            [n**2 / white_pair_sum(int(n), int(k)) for n, k in zip(terms, ks, strict=True)]
+        )
         own = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
-        #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp has no scatter of its own.
-        self.own_dof = np.vstack([2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)])
+        #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp has no scatter
+        #: of its own.
+        self.own_dof = np.vstack(
+            [2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)]
+        )
         self.ks = ks.astype(np.float64)
         self.quantile = _quantile_curve(0.05)
 
@@ -287,9 +343,16 @@ def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
 
     A step of 0.02 in ln nu leaves an error below 1e-9 of q.
     """
-    start, step = np.log(0.01 * np.log(level) / np.log(0.05)), 0.02  # where the quantile is still a number above zero
+    start, step = (
+        np.log(0.01 * np.log(level) / np.log(0.05)),
+        0.02,
+    )  # where the quantile is still a number above zero
     freedom = np.exp(start + step * np.arange(int(np.log(1e15) / step)))
-    return float(start), step, np.asarray(freedom * np.log(gammaincinv(freedom / 2.0, level) * 2.0 / freedom))
+    return (
+        float(start),
+        step,
+        np.asarray(freedom * np.log(gammaincinv(freedom / 2.0, level) * 2.0 / freedom)),
+    )
 
 
 @lru_cache(maxsize=4)
@@ -306,20 +369,37 @@ def _choose(ks: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.unique(np.abs(np.log(ks)[:, None] - np.log(wanted)[None, :]).argmin(axis=0))
 
 
-def _fit_block(flat: list[NDArray[np.float64]], tables: _Tables, allowed: int, observed_only: bool) -> NDArray[np.float64]:
+def _fit_block(
+    flat: list[NDArray[np.float64]], tables: _Tables, allowed: int, observed_only: bool
+) -> NDArray[np.float64]:
     """Coefficients, errors, limits, observability (n_terms each), chi2, dof and edf of each window, side by side."""
-    result, misfit, dof = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed)
+    result, misfit, dof = fit_windows(
+        *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed
+    )
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
     square, error = field["square"], field["square_stderr"]
     fails = _widen(field, misfit)
     with np.errstate(invalid="ignore", divide="ignore"):
         value = np.sqrt(square)
-        # d(sqrt s) = ds / (2 sqrt s); near zero the root itself of the error of the square is the scale
-        stderr = np.where(square > error, error / (2.0 * value), np.sqrt(np.maximum(error, 0.0)) / np.where(square > error, 1.0, 2.0))
+        # d(sqrt s) = ds / (2 sqrt s); near zero the root itself of the error of the square is the
+        # scale
+        stderr = np.where(
+            square > error,
+            error / (2.0 * value),
+            np.sqrt(np.maximum(error, 0.0)) / np.where(square > error, 1.0, 2.0),
+        )
         visible = np.isfinite(square) & (field["separation"] > _SEPARATION)
-        observed = visible & (square > 0) & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
-        limit = np.minimum(_limit_of_estimate(field, tables), _limit_of_cell(flat, square, dof, tables))
-        limit[fails] = _limit_of_curve([cell[fails] for cell in flat], square[fails], dof[fails], tables)
+        observed = (
+            visible
+            & (square > 0)
+            & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
+        )
+        limit = np.minimum(
+            _limit_of_estimate(field, tables), _limit_of_cell(flat, square, dof, tables)
+        )
+        limit[fails] = _limit_of_curve(
+            [cell[fails] for cell in flat], square[fails], dof[fails], tables
+        )
         observed &= ~fails[:, None]
         upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
     given = observed if observed_only else visible
@@ -340,28 +420,51 @@ def _widen(field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]) -
     return np.asarray(fails)
 
 
-def _limit_of_estimate(field: dict[str, NDArray[np.float64]], tables: _Tables) -> NDArray[np.float64]:
+def _limit_of_estimate(
+    field: dict[str, NDArray[np.float64]], tables: _Tables
+) -> NDArray[np.float64]:
     """95 % upper limit of a squared coefficient from its estimate.
 
-    The estimate free of sign has the variance ``a + b s + c s^2`` when the truth is s. The part in ``s^2`` is the
-    term's own, a chi-square with ``2 / c`` degrees of freedom, whose lower 5 % point is ``q s``; the rest is taken as
-    normal. The limit is the s at which the estimate lies that far below: ``(s - e)^2 = (1 - q)^2 s^2 + z^2 (a + b s)``.
+    The estimate free of sign has the variance ``a + b s + c s^2`` when the truth is s. The part in
+    ``s^2`` is the term's own, a chi-square with ``2 / c`` degrees of freedom, whose lower 5 % point
+    is ``q s``; the rest is taken as normal. The limit is the s at which the estimate lies that far
+    below: ``(s - e)^2 = (1 - q)^2 s^2 + z^2 (a + b s)``.
     """
     estimate = np.maximum(field["free"], 0.0)
-    a, b, c = (np.maximum(field[name], 0.0) for name in ("variance_null", "variance_linear", "variance_square"))
+    a, b, c = (
+        np.maximum(field[name], 0.0)
+        for name in ("variance_null", "variance_linear", "variance_square")
+    )
     lower = interpolate_quantile(2.0 / np.maximum(c, 1e-12), *tables.quantile)
     curve = 1.0 - (1.0 - lower) ** 2
     half = estimate + 0.5 * _LIMIT**2 * b
-    return np.asarray((half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT**2 * a), 0.0))) / curve)
+    return np.asarray(
+        (half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT**2 * a), 0.0))) / curve
+    )
 
 
 def _limit_of_cell(
-    flat: list[NDArray[np.float64]], square: NDArray[np.float64], dof: NDArray[np.float64], tables: _Tables
+    flat: list[NDArray[np.float64]],
+    square: NDArray[np.float64],
+    dof: NDArray[np.float64],
+    tables: _Tables,
 ) -> NDArray[np.float64]:
     """95 % upper limit of a squared coefficient from the one cell that can bound it best."""
     span = np.full(len(TERMS), np.inf)
     square = np.ascontiguousarray(square)
-    return np.asarray(cell_limits(*flat, square, dof, tables.columns, tables.own_dof, tables.ks, span, _MOST_FREEDOM, *tables.quantile))
+    return np.asarray(
+        cell_limits(
+            *flat,
+            square,
+            dof,
+            tables.columns,
+            tables.own_dof,
+            tables.ks,
+            span,
+            _MOST_FREEDOM,
+            *tables.quantile,
+        )
+    )
 
 
 def _limit_of_curve(
@@ -372,14 +475,27 @@ def _limit_of_curve(
 ) -> NDArray[np.float64]:
     """95 % upper limit of a squared coefficient that needs no model: its part of the curve cannot be more than the whole.
 
-    What else is in a cell, noise or not, only adds to it. What takes away is a filter, or an alias that looks like a
-    filtered noise, and that bends the curve at short averaging times; so the cells are those of the last decade.
-    Quantization, which is what the shortest times tell, is bounded by all. A ramp is given the scatter of the noise that scatters most.
+    What else is in a cell, noise or not, only adds to it. What takes away is a filter, or an alias
+    that looks like a filtered noise, and that bends the curve at short averaging times; so the
+    cells are those of the last decade. Quantization, which is what the shortest times tell, is
+    bounded by all. A ramp is given the scatter of the noise that scatters most.
     """
     span = np.array([np.inf, *[_DECADE] * (len(TERMS) - 1)])
     own_dof = np.vstack([tables.own_dof[:STOCHASTIC], tables.own_dof[:STOCHASTIC].min(axis=0)])
     square = np.ascontiguousarray(square)
-    return np.asarray(cell_limits(*flat, square, dof, tables.columns, own_dof, tables.ks, span, _MOST_FREEDOM, *tables.quantile))
+    return np.asarray(
+        cell_limits(
+            *flat,
+            square,
+            dof,
+            tables.columns,
+            own_dof,
+            tables.ks,
+            span,
+            _MOST_FREEDOM,
+            *tables.quantile,
+        )
+    )
 
 
 def _assemble(
@@ -400,7 +516,11 @@ def _assemble(
         if f"{symbol}_squared" in _SQUARED:
             out[f"{symbol}_squared"] = (plane, value**2, attributes(f"{symbol}_squared"))
     stack = da.stack if isinstance(observable[0], da.Array) else np.stack
-    out["observable"] = ((*plane, "term"), stack(observable, axis=-1).astype(np.int8), attributes("observable"))
+    out["observable"] = (
+        (*plane, "term"),
+        stack(observable, axis=-1).astype(np.int8),
+        attributes("observable"),
+    )
     return surface.assign({**out, **extra, "term": ("term", list(TERMS), attributes("term"))})
 
 
@@ -421,6 +541,8 @@ def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64])
             values[where][members] = np.abs(solution / scale)
     nothing = [np.full(deviation.shape[:2], np.nan) for _ in LAWS]
     seen = [np.where(np.isfinite(values[..., i]), 2, 0) for i in range(len(TERMS))]
-    extra = {name: (("axis", "time"), nothing[0], attributes(name)) for name in ("fit_chi2", "fit_dof")}
+    extra = {
+        name: (("axis", "time"), nothing[0], attributes(name)) for name in ("fit_chi2", "fit_dof")
+    }
     coefficients = [values[..., i] for i in range(len(TERMS))]
     return _assemble(surface, coefficients, nothing, nothing, seen, extra=extra)

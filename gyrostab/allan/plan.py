@@ -13,11 +13,21 @@ from gyrostab.kernels.allan.surface import Unit
 from gyrostab.schema import signal_name
 from gyrostab.time.durations import averaging_factors, samples, thin
 
-__all__ = ["MOST_CELLS", "WINDOWS_S", "Plan", "choose_window", "last_sample", "make_plan", "units_of_work"]
+__all__ = [
+    "MOST_CELLS",
+    "WINDOWS_S",
+    "Plan",
+    "choose_window",
+    "last_sample",
+    "make_plan",
+    "units_of_work",
+]
 
-#: Cells (windows times averaging times) of a unit of work, and of a part of a surface over all axes, at most.
+#: Cells (windows times averaging times) of a unit of work, and of a part of a surface over all
+#: axes, at most.
 MOST_CELLS = 2**20
-#: Windows that are chosen where none is given, the longest that fits four times into the record [s].
+#: Windows that are chosen where none is given, the longest that fits four times into the record
+#: [s].
 WINDOWS_S = (600, 300, 120, 60, 30, 20, 10, 5, 2, 1)
 _METHODS = ("blocks", "direct", "recursive")
 _GAPS = ("bridge", "zero")
@@ -45,12 +55,24 @@ def make_plan(
     signal = log[name] if axis is None else _pick(log[name], axis)
     rate = float(log.attrs["sampling_rate_hz"])
     intervals = signal.sizes["time"] - (1 if name == "angle" else 0)
-    length, hop = _window_and_step(choose_window(log) if window is None else window, step, rate, intervals)
+    length, hop = _window_and_step(
+        choose_window(log) if window is None else window, step, rate, intervals
+    )
     ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max)
     shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
     ks = np.unique(ks >> shifts << shifts)
     shifts = thin(ks) if overlap == "octave" else np.zeros_like(ks)
-    unit = Unit(length, hop, ks, shifts, name == "angle", 1.0 / rate, gaps == "zero", min_strict, min_coverage)
+    unit = Unit(
+        length,
+        hop,
+        ks,
+        shifts,
+        name == "angle",
+        1.0 / rate,
+        gaps == "zero",
+        min_strict,
+        min_coverage,
+    )
     attrs = {
         "window_s": length / rate, "step_s": hop / rate, "window_samples": length, "step_samples": hop,
         "method": method, "overlap": overlap, "gaps": gaps, "convention": convention,
@@ -70,7 +92,8 @@ def choose_window(log: xr.Dataset) -> str:
     Returns
     -------
     str
-        A duration of `WINDOWS_S`, or a number of samples where the record is shorter than four seconds.
+        A duration of `WINDOWS_S`, or a number of samples where the record is shorter than four
+        seconds.
 
     Examples
     --------
@@ -95,9 +118,13 @@ def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> 
         if value not in choices:
             raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
     if convention == "paper" and method == "blocks":
-        raise OptionError("convention='paper' is for method='direct' and method='recursive'; the block sums use all terms")
+        raise OptionError(
+            "convention='paper' is for method='direct' and method='recursive'; the block sums use all terms"
+        )
     if overlap == "octave" and method != "blocks":
-        raise OptionError(f"overlap='octave' is for method='blocks'; method={method!r} uses every term")
+        raise OptionError(
+            f"overlap='octave' is for method='blocks'; method={method!r} uses every term"
+        )
 
 
 def _pick(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
@@ -106,7 +133,9 @@ def _pick(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
         said = ", ".join(map(repr, unknown)) or "''"
-        raise OptionError(f"axis {said} is not in the log; give one that it has: {', '.join(known)}")
+        raise OptionError(
+            f"axis {said} is not in the log; give one that it has: {', '.join(known)}"
+        )
     return signal.sel(axis=wanted)
 
 
@@ -118,7 +147,9 @@ def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tup
             "give a shorter --window"
         )
     if length < 4:
-        raise OptionError(f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at {rate:g} Hz)")
+        raise OptionError(
+            f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at {rate:g} Hz)"
+        )
     hop = max(1, length // 10) if step is None else samples(step, rate, "step")
     if hop > length:
         raise OptionError(
@@ -132,10 +163,13 @@ def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
     """Windows of each unit of work; they depend on the windows alone, not on any chunking."""
     points = unit.window + (1 if unit.angle else 0)
     n_windows = (n_samples - points) // unit.step + 1
-    # A unit works twice on what its last windows share with the next unit: the longer, the less of that.
+    # A unit works twice on what its last windows share with the next unit: the longer, the less of
+    # that.
     length = max(4 * unit.window, min(16 * unit.window, 2**21), 2**18)
     per_unit = max(8, min((length - unit.window) // unit.step, MOST_CELLS // unit.ks.size))
-    return [slice(first, min(first + per_unit, n_windows)) for first in range(0, n_windows, per_unit)]
+    return [
+        slice(first, min(first + per_unit, n_windows)) for first in range(0, n_windows, per_unit)
+    ]
 
 
 def last_sample(windows: slice, unit: Unit) -> int:

@@ -24,15 +24,19 @@ __all__ = [
 ]
 
 _LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
-#: Windows, spread over the record, that are fitted again to find the averaging time from which the terms describe them.
+#: Windows, spread over the record, that are fitted again to find the averaging time from which the
+#: terms describe them.
 _TRIED_WINDOWS = 24
-#: A share of failing windows that is not worth a remark: a window that the terms do describe fails in 0.1 to 2 % of cases
+#: A share of failing windows that is not worth a remark: a window that the terms do describe fails
+#: in 0.1 to 2 % of cases
 #: (docs/method.md), and in a record of few windows one of them is no evidence.
 _FAILING_SHARE = 0.05
-#: Least ratio of longest to shortest averaging time: over a decade, the Allan variances of neighbouring terms, whose slopes
+#: Least ratio of longest to shortest averaging time: over a decade, the Allan variances of
+#: neighbouring terms, whose slopes
 #: differ by one, part by a factor of ten.
 _LEAST_SPAN = 10.0
-#: Twice the rotation of the Earth, 15.041 deg/h: no change of attitude at rest moves the mean rate further.
+#: Twice the rotation of the Earth, 15.041 deg/h: no change of attitude at rest moves the mean rate
+#: further.
 _MOST_AT_REST_DEG_H = 30.082
 
 
@@ -45,12 +49,14 @@ class TermSummary:
     axis, symbol, unit : str
         Axis, symbol of IEEE Std 952, unit of the coefficient.
     status : str
-        ``observed`` where at least as many windows observe the term as only bound it, else ``upper_limit_only``, and
-        ``not_observable`` where no window says anything.
+        ``observed`` where at least as many windows observe the term as only bound it, else
+        ``upper_limit_only``, and ``not_observable`` where no window says anything.
     median, low, high : float
-        Median and 5 % and 95 % quantiles over the windows that observe the term [unit]; NaN when there are none.
+        Median and 5 % and 95 % quantiles over the windows that observe the term [unit]; NaN when
+        there are none.
     limit : float
-        Median of the upper limits over the windows that only bound it [unit]; NaN when there are none.
+        Median of the upper limits over the windows that only bound it [unit]; NaN when there are
+        none.
     observed_share, limited_share : float
         Shares of the windows [1].
     """
@@ -126,7 +132,11 @@ def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
     ('N', 'observed', 0.01)
     """
     check_product(product)
-    return [_summarise_term(product.sel(axis=axis), str(axis), symbol) for axis in product["axis"].values for symbol in LAWS]
+    return [
+        _summarise_term(product.sel(axis=axis), str(axis), symbol)
+        for axis in product["axis"].values
+        for symbol in LAWS
+    ]
 
 
 def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
@@ -141,7 +151,17 @@ def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
     low, median, high = np.quantile(values, [0.05, 0.5, 0.95]) if values.size else (np.nan,) * 3
     limit = float(np.median(limits)) if limits.size else np.nan
     shares = (number / max(state.size, 1) for number in (values.size, limits.size))
-    return TermSummary(axis, symbol, LAWS[symbol].label, status, float(median), float(low), float(high), limit, *shares)
+    return TermSummary(
+        axis,
+        symbol,
+        LAWS[symbol].label,
+        status,
+        float(median),
+        float(low),
+        float(high),
+        limit,
+        *shares,
+    )
 
 
 def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -187,8 +207,8 @@ def summarise_fit(product: xr.Dataset) -> list[FitSummary]:
 def find_fit_from(product: xr.Dataset) -> float | None:
     """Find the shortest averaging time from which the fitted terms describe the windows of a product.
 
-    A filter, a line or motion bends the curve at short averaging times. Up to 24 windows, spread over the record, are
-    fitted again from each averaging time on, a factor of two apart.
+    A filter, a line or motion bends the curve at short averaging times. Up to 24 windows, spread
+    over the record, are fitted again from each averaging time on, a factor of two apart.
 
     Parameters
     ----------
@@ -198,8 +218,8 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     Returns
     -------
     float or None
-        Averaging time [s] for ``--fit-from`` (``tau_min`` of `gyrostab.fit_noise`); None when the terms describe the
-        product as it is, or when no averaging time leaves a decade to fit.
+        Averaging time [s] for ``--fit-from`` (``tau_min`` of `gyrostab.fit_noise`); None when the
+        terms describe the product as it is, or when no averaging time leaves a decade to fit.
     """
     failing = [summary.axis for summary in summarise_fit(product) if summary.fails]
     if not failing:
@@ -213,7 +233,9 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     for start in tau[tau <= longest / _LEAST_SPAN]:
         if start < shortest:
             continue
-        if not any(summary.fails for summary in summarise_fit(refit(windows, tau_min=float(start)))):
+        if not any(
+            summary.fails for summary in summarise_fit(refit(windows, tau_min=float(start)))
+        ):
             return float(start)
         shortest = 2.0 * start
     return None
@@ -233,14 +255,29 @@ def format_product(product: xr.Dataset) -> str:
         A table of the terms, and a line for each thing that was found: misfit, outliers, motion.
     """
     windows = product.sizes["time"]
-    lines = [f"Noise coefficients, median over {windows} window{'s' * (windows != 1)} (<: 95 % upper limit)", ""]
+    lines = [
+        f"Noise coefficients, median over {windows} window{'s' * (windows != 1)} (<: 95 % upper limit)",
+        "",
+    ]
     rows = [("axis", "term", "median", "5 % to 95 %", "unit", "observed in")]
     for term in summarise_terms(product):
         spread = f"{_number(term.low)} to {_number(term.high)}" if term.status == "observed" else ""
         sign = "< " if term.status == "upper_limit_only" else ""
-        rows.append((term.axis, term.symbol, sign + _number(term.value), spread, term.unit, _share(term.observed_share)))
+        rows.append(
+            (
+                term.axis,
+                term.symbol,
+                sign + _number(term.value),
+                spread,
+                term.unit,
+                _share(term.observed_share),
+            )
+        )
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    lines += [
+        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+        for row in rows
+    ]
     return "\n".join([*lines, "", *describe_record(product)])
 
 
@@ -274,14 +311,18 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
         return []
     ratios = ", ".join(f"{fit.axis} {_number(fit.chi2_per_dof)}" for fit in fits)
     lines = [f"Misfit, median chi2/dof (1 is right): {ratios}."]
-    failing = [f"{fit.axis} in {_share(fit.failing_share)} of its windows" for fit in fits if fit.fails]
+    failing = [
+        f"{fit.axis} in {_share(fit.failing_share)} of its windows" for fit in fits if fit.fails
+    ]
     if failing:
         line = f"The terms do not describe {', '.join(failing)}, where no term is called observed"
         start = find_fit_from(product)
         remedy = (
             f"from {start:g} s on they do: fit again with --fit-from {start:g}s"
             if start
-            else ("no shortest averaging time of the fit changes that: look for lines, vibration or motion in the record")
+            else (
+                "no shortest averaging time of the fit changes that: look for lines, vibration or motion in the record"
+            )
         )
         lines.append(f"{line}; {remedy}.")
     return lines
@@ -290,13 +331,17 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
 def _describe_outliers(product: xr.Dataset) -> list[str]:
     if "outlier_count" not in product:
         return []
-    worst = {str(axis): product["outlier_count"].sel(axis=axis).values for axis in product["axis"].values}
+    worst = {
+        str(axis): product["outlier_count"].sel(axis=axis).values for axis in product["axis"].values
+    }
     said = [
         f"{axis} in {np.count_nonzero(counts)} windows (at most {int(counts.max())} in one)"
         for axis, counts in worst.items()
         if counts.size and counts.max() > 0
     ]
-    return [f"Outliers, single samples far from both neighbours: {', '.join(said)}."] if said else []
+    return (
+        [f"Outliers, single samples far from both neighbours: {', '.join(said)}."] if said else []
+    )
 
 
 def _describe_motion(product: xr.Dataset) -> list[str]:
@@ -306,8 +351,12 @@ def _describe_motion(product: xr.Dataset) -> list[str]:
         away = np.abs(mean - np.nanmedian(mean)) if np.isfinite(mean).any() else np.zeros(1)
         count = int(np.count_nonzero(away > _MOST_AT_REST_DEG_H))
         if count:
-            said.append(f"{axis} in {count} windows (up to {_number(float(np.nanmax(away)))} deg/h)")
+            said.append(
+                f"{axis} in {count} windows (up to {_number(float(np.nanmax(away)))} deg/h)"
+            )
     if not said:
         return []
     reason = "motion, or a bias that drifts; leave such times out with --exclude"
-    return [f"Mean rate more than twice the Earth rate from its median: {', '.join(said)}: {reason}."]
+    return [
+        f"Mean rate more than twice the Earth rate from its median: {', '.join(said)}: {reason}."
+    ]

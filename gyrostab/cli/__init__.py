@@ -1,6 +1,7 @@
 """The command line: parse, call, print. Every module of `gyrostab.cli.commands` adds its commands by itself.
 
-Exit codes: 0 done; 2 bad input or usage, with one message on stderr; 3 interrupted; 1 anything else. No traceback unless ``--debug``.
+Exit codes: 0 done; 2 bad input or usage, with one message on stderr; 3 interrupted; 1 anything
+else. No traceback unless ``--debug``.
 """
 
 from __future__ import annotations
@@ -12,7 +13,14 @@ import sys
 from collections.abc import Sequence
 
 from gyrostab.cli import commands
-from gyrostab.cli.console import describe_error, plain_notes, print_error, read_config, relaxed_gc, sigterm_as_interrupt
+from gyrostab.cli.console import (
+    describe_error,
+    plain_notes,
+    print_error,
+    read_config,
+    relaxed_gc,
+    sigterm_as_interrupt,
+)
 from gyrostab.cli.frame import app, find_inputs
 from gyrostab.store.output import protect_inputs
 
@@ -42,15 +50,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
-    logging.getLogger("asyncio").disabled = not debug  # tasks of zarr that nobody asked after would print tracebacks
+    logging.getLogger(
+        "asyncio"
+    ).disabled = not debug  # tasks of zarr that nobody asked after would print tracebacks
     try:
-        app.config = read_config(tokens, [command for command in app if not command.startswith("-")])
+        app.config = read_config(
+            tokens, [command for command in app if not command.startswith("-")]
+        )
         with plain_notes(), sigterm_as_interrupt(), relaxed_gc():
             command, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
             with protect_inputs(find_inputs(bound.arguments)):
                 command(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as stop:
-        said = str(stop) or "interrupted; nothing was written under the name of the output. Start the same command again."
+        said = (
+            str(stop)
+            or "interrupted; nothing was written under the name of the output. Start the same command again."
+        )
         return print_error(said, 3)
     except BrokenPipeError:  # the reader of our output, for instance `head`, has left
         sys.stderr.close()

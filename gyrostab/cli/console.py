@@ -18,7 +18,14 @@ from cyclopts import CycloptsError
 from gyrostab.cli.options import read_toml
 from gyrostab.errors import GyrostabError, OptionError
 
-__all__ = ["describe_error", "plain_notes", "print_error", "read_config", "relaxed_gc", "sigterm_as_interrupt"]
+__all__ = [
+    "describe_error",
+    "plain_notes",
+    "print_error",
+    "read_config",
+    "relaxed_gc",
+    "sigterm_as_interrupt",
+]
 
 
 def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
@@ -32,9 +39,13 @@ def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
     if name is None:
         return None
     table = read_toml(Path(name))
-    strange = [key for key, value in table.items() if isinstance(value, dict) and key not in commands]
+    strange = [
+        key for key, value in table.items() if isinstance(value, dict) and key not in commands
+    ]
     if strange:
-        raise OptionError(f"{name}: table [{strange[0]}] is not a command; the commands are {', '.join(commands)}")
+        raise OptionError(
+            f"{name}: table [{strange[0]}] is not a command; the commands are {', '.join(commands)}"
+        )
 
     def apply(current: Any, path: tuple[str, ...], arguments: Any) -> None:
         from cyclopts.config import Dict
@@ -55,7 +66,12 @@ def plain_notes() -> Iterator[None]:
     seen: set[str] = set()
 
     def show(
-        message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None, line: str | None = None
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
     ) -> None:
         text = str(message)
         if text not in seen:
@@ -76,7 +92,9 @@ def sigterm_as_interrupt() -> Iterator[None]:
         raise KeyboardInterrupt
 
     signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = [number for number in signals if signal.getsignal(number) is signal.SIG_DFL]  # not under nohup
+    ours = [
+        number for number in signals if signal.getsignal(number) is signal.SIG_DFL
+    ]  # not under nohup
     if threading.current_thread() is not threading.main_thread():
         ours = []
     for number in ours:
@@ -111,11 +129,22 @@ def describe_error(error: Exception) -> int:
         return print_error(f"{error} See gyrostab --help, or the command's own --help.", 2)
     if isinstance(error, GyrostabError):
         return print_error(str(error), 2)
-    if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError) and error.filename:
+    if (
+        isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError)
+        and error.filename
+    ):
         return print_error(f"{error.filename}: {error.strerror}", 2)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         where = error.filename or "the standard output"
-        return print_error(f"{where}: cannot be written ({error.strerror}); make room, or write elsewhere", 2)
+        return print_error(
+            f"{where}: cannot be written ({error.strerror}); make room, or write elsewhere", 2
+        )
     if isinstance(error, MemoryError):
-        return print_error(f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers", 1)
-    return print_error(f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.", 1)
+        return print_error(
+            f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers",
+            1,
+        )
+    return print_error(
+        f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.",
+        1,
+    )

@@ -36,7 +36,10 @@ def work(common: Common) -> Iterator[Any]:
     from gyrostab.progress import show_progress
 
     chosen = {"num_workers": common.workers} if common.workers else {}
-    with dask.config.set(scheduler="threads", **chosen), show_progress(quiet=common.quiet_progress) as stage:
+    with (
+        dask.config.set(scheduler="threads", **chosen),
+        show_progress(quiet=common.quiet_progress) as stage,
+    ):
         yield stage
 
 

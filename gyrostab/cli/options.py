@@ -32,15 +32,18 @@ class Reading:
     Parameters
     ----------
     rate
-        Sampling rate in Hz, for a log without a time column (otherwise the rate is found from the time stamps and checked against this).
+        Sampling rate in Hz, for a log without a time column (otherwise the rate is found from the
+        time stamps and checked against this).
     start
         Time of the first row, for a log without a time column: 2026-11-20T14:00:00.
     epoch
         Day from which a time column in seconds counts: 2026-11-20 (default 1970-01-01).
     map
-        Rename a column: wx=gyro_x. Repeat for more columns, or give a TOML file with one line per column: wx = "gyro_x".
+        Rename a column: wx=gyro_x. Repeat for more columns, or give a TOML file with one line per
+        column: wx = "gyro_x".
     unit
-        Unit of a column that has none: gyro=deg/s, gyro_x=deg/s, temperature=degC; of counts: "gyro=0.1 arcsec/s". Repeat for more.
+        Unit of a column that has none: gyro=deg/s, gyro_x=deg/s, temperature=degC; of counts:
+        "gyro=0.1 arcsec/s". Repeat for more.
     kind
         Whether the gyro columns are rotation rates or angles.
     channel
@@ -54,7 +57,8 @@ class Reading:
     time_to
         Use the log up to this time, in the same manner.
     exclude
-        Take the samples of a span as missing: 2026-11-20T14:00/2026-11-20T14:05, or 10min/15min after the start. Repeat for more.
+        Take the samples of a span as missing: 2026-11-20T14:00/2026-11-20T14:05, or 10min/15min
+        after the start. Repeat for more.
     limit
         Raise a limit that a message names: columns=50000. Repeat for more.
     """
@@ -75,7 +79,11 @@ class Reading:
 
     def given(self) -> dict[str, Any]:
         """The options that differ from their defaults."""
-        return {name: value for name, value in self.options().items() if (name, value) != ("max_gap", Reading.max_gap)}
+        return {
+            name: value
+            for name, value in self.options().items()
+            if (name, value) != ("max_gap", Reading.max_gap)
+        }
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `gyrostab.jobs.run.load_log`."""
@@ -87,7 +95,11 @@ class Reading:
             "limits": check_limits(_pairs(self.limit, "--limit")),
         }
         del chosen["limit"]
-        return {name: value for name, value in chosen.items() if value not in (None, (), {}) and value is not False}
+        return {
+            name: value
+            for name, value in chosen.items()
+            if value not in (None, (), {}) and value is not False
+        }
 
 
 @Parameter(name="*", group=_READING)
@@ -98,11 +110,14 @@ class ChannelFile:
     Parameters
     ----------
     channel
-        Another file that holds the channel, in any format that gyrostab reads; aligned by its time stamps.
+        Another file that holds the channel, in any format that gyrostab reads; aligned by its time
+        stamps.
     epoch
-        Day from which a time column in seconds counts in that file: 2026-11-20 (default 1970-01-01).
+        Day from which a time column in seconds counts in that file: 2026-11-20 (default
+        1970-01-01).
     map
-        Rename a column of that file: T_probe=temperature, or "T_probe=temperature [degC]". Repeat for more columns.
+        Rename a column of that file: T_probe=temperature, or "T_probe=temperature [degC]". Repeat
+        for more columns.
     unit
         Unit of a column that has none: temperature=degC. Repeat for more.
     """
@@ -115,8 +130,14 @@ class ChannelFile:
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `gyrostab.read_channel`, apart from the file and the name."""
         if self.channel is None and (self.epoch or self.map or self.unit):
-            raise OptionError("--epoch, --map and --unit say how to read the file of --channel; name that file too")
-        return {"epoch": self.epoch, "map": _pairs(self.map, "--map"), "unit": _pairs(self.unit, "--unit")}
+            raise OptionError(
+                "--epoch, --map and --unit say how to read the file of --channel; name that file too"
+            )
+        return {
+            "epoch": self.epoch,
+            "map": _pairs(self.map, "--map"),
+            "unit": _pairs(self.unit, "--unit"),
+        }
 
 
 @Parameter(name="*", group=_WINDOWS)
@@ -127,18 +148,21 @@ class Windows:
     Parameters
     ----------
     window
-        Length of the sliding window: 10min, 500ms, 2h or 2000samples (default: 10min, or a shorter one that fits four times
-        into the record).
+        Length of the sliding window: 10min, 500ms, 2h or 2000samples (default: 10min, or a shorter
+        one that fits four times into the record).
     step
         Distance from one window to the next, in the same manner (default: a tenth of the window).
     taus
-        Averaging times: how many (40, spread evenly on a logarithmic scale), octave (1, 2, 4 ... samples), all, or a list: 0.1s,1s,10s.
+        Averaging times: how many (40, spread evenly on a logarithmic scale), octave (1, 2, 4 ...
+        samples), all, or a list: 0.1s,1s,10s.
     tau_max
         Longest averaging time (default: a third of the window; at most half of it).
     overlap
-        full uses every second difference; octave thins them out where tau is long: faster on long windows, 1 % more scatter.
+        full uses every second difference; octave thins them out where tau is long: faster on long
+        windows, 1 % more scatter.
     gaps
-        bridge counts only what is there; zero divides by the gap-free number, as some papers do, which digs a canyon at every gap.
+        bridge counts only what is there; zero divides by the gap-free number, as some papers do,
+        which digs a canyon at every gap.
     axis
         Only this gyro axis: x. Repeat for more.
     """
@@ -166,7 +190,8 @@ class Fitting:
     terms
         Terms of the model, letters of QNBKR.
     fit_method
-        gls fits variances with their covariance; adev fits deviations, as some papers do, for comparison.
+        gls fits variances with their covariance; adev fits deviations, as some papers do, for
+        comparison.
     fit_from
         Shortest averaging time to fit: 1s leaves out a filter or a line below that (default: all).
     fit_to
@@ -180,7 +205,12 @@ class Fitting:
 
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `gyrostab.allan.fit.fit_noise`."""
-        return {"terms": self.terms, "method": self.fit_method, "tau_min": self.fit_from, "tau_max": self.fit_to}
+        return {
+            "terms": self.terms,
+            "method": self.fit_method,
+            "tau_min": self.fit_from,
+            "tau_max": self.fit_to,
+        }
 
 
 @Parameter(name="*", group=_RUNNING)
@@ -193,7 +223,8 @@ class Running:
     resume
         Continue a run that was stopped or killed; begin one where there is none.
     scheduler
-        Who does the work: threads, processes, or the workers of a dask scheduler at this address, tcp://cluster:8786.
+        Who does the work: threads, processes, or the workers of a dask scheduler at this address,
+        tcp://cluster:8786.
     """
 
     resume: Flag = False
@@ -230,13 +261,17 @@ def _pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
     """``["wx=gyro_x"]`` as a dict; an item may also name a TOML file of such pairs."""
     found: dict[str, str] = {}
     for item in items or ():
-        name, equals, value = item.rpartition("=")  # a header may hold the sign, a name or a unit does not
+        name, equals, value = item.rpartition(
+            "="
+        )  # a header may hold the sign, a name or a unit does not
         if equals and name.strip() and value.strip():
             found[name.strip()] = value.strip()
         elif item.endswith(".toml"):
             found.update({key: str(value) for key, value in read_toml(Path(item)).items()})
         else:
-            raise OptionError(f"{option} {item!r}: write NAME=VALUE, for instance {option} {_PAIR_EXAMPLES[option]}")
+            raise OptionError(
+                f"{option} {item!r}: write NAME=VALUE, for instance {option} {_PAIR_EXAMPLES[option]}"
+            )
     return found
 
 

@@ -42,7 +42,9 @@ _PER_WINDOW = 8  # windows used per window length; more add nothing
 _FEWEST = 12
 _CLAIM = 0.05
 _DRAWS = (300, 4000)  # of noise; the second where the first leaves a claim possible
-_LEVERAGE = 0.35  # share of the driver's variance in one block, above which the record hangs on that block
+_LEVERAGE = (
+    0.35  # share of the driver's variance in one block, above which the record hangs on that block
+)
 
 
 class _Frame(NamedTuple):
@@ -66,10 +68,11 @@ def correlate(
 ) -> xr.Dataset:
     """Coupling of the window means and noise coefficients with a channel and with its rate of change.
 
-    Each series is regressed on the driver at every lag by generalised least squares, beside a constant, a trend in time and
-    a constant for every stretch between long gaps. The noise of the series is white (windows that overlap share it) with a
-    slow part of unknown strength and memory; slopes and p-values are averaged over these laws by their restricted
-    likelihood. The p-value allows for the search over lags (by simulation with a fixed seed) and over axes, variables and
+    Each series is regressed on the driver at every lag by generalised least squares, beside a
+    constant, a trend in time and a constant for every stretch between long gaps. The noise of the
+    series is white (windows that overlap share it) with a slow part of unknown strength and memory;
+    slopes and p-values are averaged over these laws by their restricted likelihood. The p-value
+    allows for the search over lags (by simulation with a fixed seed) and over axes, variables and
     drivers (Holm).
 
     Parameters
@@ -77,22 +80,26 @@ def correlate(
     product : xarray.Dataset
         Product of `gyrostab.fit_noise`.
     channel : str or DataArray
-        Channel of the product, or one with a time coordinate of its own, which is averaged inside the windows.
+        Channel of the product, or one with a time coordinate of its own, which is averaged inside
+        the windows.
     variables : str or sequence of str, optional
-        Names with dims ``(axis, time)``; ``window_mean`` and every coefficient that is observed somewhere by default.
+        Names with dims ``(axis, time)``; ``window_mean`` and every coefficient that is observed
+        somewhere by default.
     max_lag : str, timedelta or number, optional
-        Longest time by which the gyro may follow the channel [s]; a tenth of the record by default, 0 for none.
+        Longest time by which the gyro may follow the channel [s]; a tenth of the record by default,
+        0 for none.
     level : float
         Level of the intervals.
 
     Returns
     -------
     xarray.Dataset
-        By ``(axis, variable, driver)``: ``coupling_lag`` [s], ``correlation``, ``partial_correlation_time``,
-        ``partial_correlation_channels``, ``p_value``, ``p_value_adjusted``, ``effective_samples``, ``windows_used``,
-        ``coupling_verdict``, ``coupling_limits`` (flags), ``statement``; by ``axis`` the sensitivity
-        ``<variable>_per_<driver>`` with ``_stderr``, ``_low``, ``_high``, ``_rising``, ``_falling`` [units of the variable
-        per unit of the driver]; and the series themselves.
+        By ``(axis, variable, driver)``: ``coupling_lag`` [s], ``correlation``,
+        ``partial_correlation_time``, ``partial_correlation_channels``, ``p_value``,
+        ``p_value_adjusted``, ``effective_samples``, ``windows_used``, ``coupling_verdict``,
+        ``coupling_limits`` (flags), ``statement``; by ``axis`` the sensitivity
+        ``<variable>_per_<driver>`` with ``_stderr``, ``_low``, ``_high``, ``_rising``, ``_falling``
+        [units of the variable per unit of the driver]; and the series themselves.
 
     Raises
     ------
@@ -108,7 +115,9 @@ def correlate(
     """
     check_product(product)
     if not 0.5 <= level < 1.0:
-        raise OptionError(f"level {level:g}: the level of an interval lies between 0.5 and 1, for instance 0.95")
+        raise OptionError(
+            f"level {level:g}: the level of an interval lies between 0.5 and 1, for instance 0.95"
+        )
     names = _variables(product, variables)
     time = (product["time"].values - product["time"].values[0]) / np.timedelta64(1, "s")
     length, step = _lengths(product, time)
@@ -121,11 +130,21 @@ def correlate(
     for place, mask in masks.items():
         groups.setdefault(mask.tobytes(), []).append(place)
     for places in groups.values():
-        frame = _frame(masks[places[0]], time, length, step, product["window_coverage"].values[places[0][0]])
-        series = np.stack([product[names[v]].values[a] for a, v in places], axis=1)[frame.windows] if frame else np.empty((0, len(places)))
+        frame = _frame(
+            masks[places[0]], time, length, step, product["window_coverage"].values[places[0][0]]
+        )
+        series = (
+            np.stack([product[names[v]].values[a] for a, v in places], axis=1)[frame.windows]
+            if frame
+            else np.empty((0, len(places)))
+        )
         for d, driver in enumerate(found):
             others_there = [product[name].values for name in others]
-            for place, entry in zip(places, _fit(frame, series, driver, others_there, lags.astype(np.float64) * step, level), strict=True):
+            for place, entry in zip(
+                places,
+                _fit(frame, series, driver, others_there, lags.astype(np.float64) * step, level),
+                strict=True,
+            ):
                 entries[(*place, d)] = entry
     _adjust(entries)
     for (a, v, d), entry in entries.items():
@@ -137,27 +156,41 @@ def correlate(
 
 def _variables(product: xr.Dataset, variables: str | Sequence[str] | None) -> list[str]:
     if variables is None:
-        seen = [term for term in TERMS if bool((product["observable"].sel(term=term) == OBSERVABLE.index("observed")).any())]
+        seen = [
+            term
+            for term in TERMS
+            if bool((product["observable"].sel(term=term) == OBSERVABLE.index("observed")).any())
+        ]
         return ["window_mean", *seen]
     names = [variables] if isinstance(variables, str) else list(variables)
     for name in names:
         if name not in product or product[name].dims != ("axis", "time"):
-            raise OptionError(f"variable {name!r} is not in the product by (axis, time); try window_mean, {', '.join(TERMS)}")
+            raise OptionError(
+                f"variable {name!r} is not in the product by (axis, time); try window_mean, {', '.join(TERMS)}"
+            )
     return names
 
 
 def _lengths(product: xr.Dataset, time: Array) -> tuple[float, float]:
     """Length and step of the windows [s]."""
     bounds = product["time_bounds"].values
-    length = float(np.median(bounds[:, 1] - bounds[:, 0]) / np.timedelta64(1, "s")) if len(bounds) else 1.0
+    length = (
+        float(np.median(bounds[:, 1] - bounds[:, 0]) / np.timedelta64(1, "s"))
+        if len(bounds)
+        else 1.0
+    )
     apart = float(np.median(np.diff(time))) if time.size > 1 else length
     return length, float(product.attrs.get("step_s", apart))
 
 
 def _lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
-    longest = 0.1 * span if max_lag is None else duration_seconds(max_lag, "max_lag") if max_lag else 0.0
+    longest = (
+        0.1 * span if max_lag is None else duration_seconds(max_lag, "max_lag") if max_lag else 0.0
+    )
     if longest > span:
-        raise OptionError(f"max_lag {max_lag} is longer than the record ({span:g} s); give a shorter --max-lag")
+        raise OptionError(
+            f"max_lag {max_lag} is longer than the record ({span:g} s); give a shorter --max-lag"
+        )
     most = int(longest / step + 1e-9)
     return np.unique(np.rint(np.linspace(0, most, min(most + 1, _LAGS))).astype(np.int64))
 
@@ -166,10 +199,15 @@ def _usable(
     product: xr.Dataset, names: list[str], lags: NDArray[np.int64], found: list[Driver]
 ) -> tuple[dict[tuple[int, int], NDArray[np.bool_]], NDArray[np.int64], list[Driver]]:
     """Windows of each (axis, variable) in which series and driver are known at every lag; lags that cost over a third are left out."""
-    known = np.logical_and.accumulate(np.isfinite(found[0].values) & np.isfinite(found[1].values), axis=0)
+    known = np.logical_and.accumulate(
+        np.isfinite(found[0].values) & np.isfinite(found[1].values), axis=0
+    )
     most = int(np.flatnonzero(known.sum(axis=1) >= min(2 / 3 * known[0].sum(), known[0].sum()))[-1])
     lags = lags[: most + 1]
-    found = [Driver(driver.name, driver.label, driver.units, driver.values[: most + 1]) for driver in found]
+    found = [
+        Driver(driver.name, driver.label, driver.units, driver.values[: most + 1])
+        for driver in found
+    ]
     masks = {}
     for v, name in enumerate(names):
         good = np.isfinite(product[name].values) & (product["window_coverage"].values > 0.05)
@@ -180,11 +218,17 @@ def _usable(
     return masks, lags, found
 
 
-def _frame(mask: NDArray[np.bool_], time: Array, length: float, step: float, share: Array) -> _Frame | None:
+def _frame(
+    mask: NDArray[np.bool_], time: Array, length: float, step: float, share: Array
+) -> _Frame | None:
     """Blocks of whole windows, as long as a window at least; None when there are too few."""
     windows = np.flatnonzero(mask)
     every = max(1, round(length / step / _PER_WINDOW))
-    windows = windows[np.rint(time[windows] / step).astype(np.int64) % every == 0] if every > 1 else windows
+    windows = (
+        windows[np.rint(time[windows] / step).astype(np.int64) % every == 0]
+        if every > 1
+        else windows
+    )
     if windows.size < _FEWEST:
         return None
     at = time[windows]
@@ -202,32 +246,56 @@ def _frame(mask: NDArray[np.bool_], time: Array, length: float, step: float, sha
     return _Frame(average, windows, pieces, offsets, trend, noise_laws(centre, white))
 
 
-def _fit(frame: _Frame | None, series: Array, driver: Driver, others: list[Array], lags: Array, level: float) -> list[dict[str, Any]]:
+def _fit(
+    frame: _Frame | None,
+    series: Array,
+    driver: Driver,
+    others: list[Array],
+    lags: Array,
+    level: float,
+) -> list[dict[str, Any]]:
     """Every number of the entries of some series that share their windows, against one driver."""
     if frame is None:
         return [_empty({"too_few"}) for _ in range(series.shape[1])]
     x = np.asarray(frame.average @ driver.values[:, frame.windows].T)
     y = np.asarray(frame.average @ series)
-    limits = driver_limits(x[:, 0], frame.pieces, driver.units, derived=driver.name.endswith("_rate"))
+    limits = driver_limits(
+        x[:, 0], frame.pieces, driver.units, derived=driver.name.endswith("_rate")
+    )
     timed = np.concatenate([frame.offsets, frame.trend], axis=1)
     nuisance = frame.offsets if "no_reversal" in limits else timed
     if not limits & {"constant", "too_few"}:
-        if x.shape[0] - nuisance.shape[1] - 1 < _FEWEST // 2:  # nearly every block is a stretch of its own
+        if (
+            x.shape[0] - nuisance.shape[1] - 1 < _FEWEST // 2
+        ):  # nearly every block is a stretch of its own
             limits = limits | {"too_few"}
         elif _heaviest(x[:, 0], nuisance) > _LEVERAGE:
             limits = limits | {"one_moment"}
     if limits & {"constant", "too_few", "one_moment"}:
         return [_empty(limits, windows=frame.windows.size) for _ in range(series.shape[1])]
-    others = [np.asarray(frame.average @ np.nan_to_num(row[frame.windows])) for row in others if np.isfinite(row[frame.windows]).all()]
-    more = np.concatenate([timed, *(_unit(row)[:, None] for row in others if np.ptp(row) > 0)], axis=1)
+    others = [
+        np.asarray(frame.average @ np.nan_to_num(row[frame.windows]))
+        for row in others
+        if np.isfinite(row[frame.windows]).all()
+    ]
+    more = np.concatenate(
+        [timed, *(_unit(row)[:, None] for row in others if np.ptp(row) > 0)], axis=1
+    )
     laws = beside(frame.laws, nuisance)
-    alone = beside(decompose([_covariance(frame, 0)], np.zeros(1)), nuisance) if "no_reversal" in limits else None
+    alone = (
+        beside(decompose([_covariance(frame, 0)], np.zeros(1)), nuisance)
+        if "no_reversal" in limits
+        else None
+    )
     entries = []
     for row in y.T:
         if np.ptp(row) == 0.0:
             entries.append(_empty(limits | {"too_few"}, windows=frame.windows.size))
             continue
-        entry = _sensitivity(laws, row, x, lags, level) | {"limits": set(limits), "windows": frame.windows.size}
+        entry = _sensitivity(laws, row, x, lags, level) | {
+            "limits": set(limits),
+            "windows": frame.windows.size,
+        }
         column = x[:, entry["best"]]
         entry |= {
             "correlation": _partial(row, column, np.ones((row.size, 1))),
@@ -238,9 +306,14 @@ def _fit(frame: _Frame | None, series: Array, driver: Driver, others: list[Array
         entry |= _ramps(frame, entry["law"], nuisance, row[:, None], column[:, None])
         if alone is not None:
             white = _sensitivity(alone, row, x, lags, level)
-            entry |= {f"{key}_white": white[other] for key, other in (("p", "p_search"), ("slope", "slope"), ("lag", "lag"))}
+            entry |= {
+                f"{key}_white": white[other]
+                for key, other in (("p", "p_search"), ("slope", "slope"), ("lag", "lag"))
+            }
         if timed.shape[1] < more.shape[1] < row.size - 3:
-            again = fit_lags(beside(frame.laws, more), row[:, None] / np.std(row), _unit(column)[:, None])
+            again = fit_lags(
+                beside(frame.laws, more), row[:, None] / np.std(row), _unit(column)[:, None]
+            )
             entry["p_channels"] = float(p_values(again)[0, 0])
         entries.append(entry)
     return entries
@@ -249,15 +322,17 @@ def _fit(frame: _Frame | None, series: Array, driver: Driver, others: list[Array
 def _sensitivity(laws: Laws, y: Array, x: Array, lags: Array, level: float) -> dict[str, Any]:
     """Lag, slope and interval of one series, and how often noise alone would do as much: at that lag, and at any.
 
-    The noise is simulated under the laws by their weights. The interval leaves out 0 where the p-value at that lag is
-    below one less the level, and nowhere else.
+    The noise is simulated under the laws by their weights. The interval leaves out 0 where the
+    p-value at that lag is below one less the level, and nowhere else.
     """
     scale, reach = float(np.std(y)), np.maximum(np.std(x, axis=0), 1e-300)
     driver = (x - x.mean(axis=0)) / reach
     fit = fit_lags(laws, ((y - y.mean()) / scale)[:, None], driver)
     p = p_values(fit)[0]
     best = int(np.argmin(p))
-    few = np.unique(np.append(np.linspace(0, lags.size - 1, min(lags.size, _SIMULATED)).astype(np.int64), best))
+    few = np.unique(
+        np.append(np.linspace(0, lags.size - 1, min(lags.size, _SIMULATED)).astype(np.int64), best)
+    )
     for draws in _DRAWS:
         chance = chances(laws, driver[:, few], null_weights(fit, 0), draws)
         alone = chance[:, np.searchsorted(few, best)]
@@ -267,7 +342,13 @@ def _sensitivity(laws: Laws, y: Array, x: Array, lags: Array, level: float) -> d
             break
     found = slope_interval(fit, 0, best, uncalibrated(1.0 - level, alone))
     slope, error, low, high = (value * scale / float(reach[best]) for value in found)
-    entry = {"best": best, "lag": float(lags[best]), "law": int(np.argmax(weights(fit)[:, 0, best])), "p_value": single, "p_search": search}
+    entry = {
+        "best": best,
+        "lag": float(lags[best]),
+        "law": int(np.argmax(weights(fit)[:, 0, best])),
+        "p_value": single,
+        "p_search": search,
+    }
     return entry | {"slope": slope, "stderr": error, "low": low, "high": high}
 
 
@@ -276,8 +357,21 @@ def _covariance(frame: _Frame, law: int) -> Array:
 
 
 def _empty(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
-    names = ("lag", "slope", "stderr", "low", "high", "p_value", "p_search", "correlation", "partial_time", "partial_channels")
-    empty = dict.fromkeys((*names, "effective", "rising", "rising_stderr", "falling", "falling_stderr"), np.nan)
+    names = (
+        "lag",
+        "slope",
+        "stderr",
+        "low",
+        "high",
+        "p_value",
+        "p_search",
+        "correlation",
+        "partial_time",
+        "partial_channels",
+    )
+    empty = dict.fromkeys(
+        (*names, "effective", "rising", "rising_stderr", "falling", "falling_stderr"), np.nan
+    )
     return {**empty, "limits": limits, "windows": windows}
 
 
@@ -305,7 +399,9 @@ def _effective(y: Array, x: Array, nuisance: Array, error: float) -> float:
     rest = y - q @ (q.T @ y)
     q, _ = np.linalg.qr(nuisance)
     left = x - q @ (q.T @ x)
-    wanted = float(rest.var() / (max(float(left.var()), 1e-300) * error**2)) if error > 0 else np.inf
+    wanted = (
+        float(rest.var() / (max(float(left.var()), 1e-300) * error**2)) if error > 0 else np.inf
+    )
     return float(min(y.size, wanted + nuisance.shape[1] + 1))
 
 
@@ -318,25 +414,45 @@ def _ramps(frame: _Frame, law: int, nuisance: Array, y: Array, x: Array) -> dict
         keep = np.flatnonzero(part)
         out[name] = out[f"{name}_stderr"] = np.nan
         columns = nuisance[keep][:, 1:]  # the offsets of all stretches add up to the constant
-        columns = np.concatenate([np.ones((keep.size, 1)), columns[:, np.ptp(columns, axis=0) > 0] if keep.size else columns], axis=1)
+        columns = np.concatenate(
+            [
+                np.ones((keep.size, 1)),
+                columns[:, np.ptp(columns, axis=0) > 0] if keep.size else columns,
+            ],
+            axis=1,
+        )
         if keep.size < _FEWEST // 2 + columns.shape[1] or np.ptp(x[keep]) < 0.1 * np.ptp(x):
             continue
-        if np.linalg.matrix_rank(np.concatenate([columns, _unit(x[keep, 0])[:, None]], axis=1)) <= columns.shape[1]:
+        if (
+            np.linalg.matrix_rank(np.concatenate([columns, _unit(x[keep, 0])[:, None]], axis=1))
+            <= columns.shape[1]
+        ):
             continue
-        fit = fit_lags(beside(decompose([covariance[np.ix_(keep, keep)]], np.zeros(1)), columns), y[keep], x[keep])
+        fit = fit_lags(
+            beside(decompose([covariance[np.ix_(keep, keep)]], np.zeros(1)), columns),
+            y[keep],
+            x[keep],
+        )
         out[name], out[f"{name}_stderr"] = float(fit.slope[0, 0, 0]), float(fit.stderr[0, 0, 0])
     return out
 
 
 def _adjust(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:
     """Allow for all the entries by Holm's steps, and give every entry its verdict."""
-    tested = sorted((entry for entry in entries.values() if np.isfinite(entry["p_search"])), key=lambda entry: float(entry["p_search"]))
+    tested = sorted(
+        (entry for entry in entries.values() if np.isfinite(entry["p_search"])),
+        key=lambda entry: float(entry["p_search"]),
+    )
     before = 0.0
     for rank, entry in enumerate(tested):
-        before = entry["p_adjusted"] = min(1.0, max(before, (len(tested) - rank) * entry["p_search"]))
+        before = entry["p_adjusted"] = min(
+            1.0, max(before, (len(tested) - rank) * entry["p_search"])
+        )
     for entry in entries.values():
         entry.setdefault("p_adjusted", np.nan)
-        if entry["limits"] & {"constant", "too_few", "clusters"} or not np.isfinite(entry["p_search"]):
+        if entry["limits"] & {"constant", "too_few", "clusters"} or not np.isfinite(
+            entry["p_search"]
+        ):
             verdict = "cannot_tell"
         elif entry["p_adjusted"] >= _CLAIM and entry.get("p_white", 1.0) * len(tested) < _CLAIM:
             verdict = "not_told_apart"
@@ -345,5 +461,9 @@ def _adjust(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:
         else:
             if entry.get("p_channels", 0.0) >= _CLAIM:
                 entry["limits"].add("other_channel")
-            verdict = "not_told_apart" if entry["limits"] & {"no_reversal", "other_channel"} else "coupled"
+            verdict = (
+                "not_told_apart"
+                if entry["limits"] & {"no_reversal", "other_channel"}
+                else "coupled"
+            )
         entry["verdict"] = VERDICTS.index(verdict)

@@ -18,10 +18,22 @@ __all__ = ["assemble", "join"]
 _NUMBERS = {
     "coupling_lag": ("lag", "time by which the variable follows the driver", "s"),
     "correlation": ("correlation", "correlation of the block means at that lag", "1"),
-    "partial_correlation_time": ("partial_time", "partial correlation at that lag, given time", "1"),
-    "partial_correlation_channels": ("partial_channels", "partial correlation at that lag, given time and the other channels", "1"),
+    "partial_correlation_time": (
+        "partial_time",
+        "partial correlation at that lag, given time",
+        "1",
+    ),
+    "partial_correlation_channels": (
+        "partial_channels",
+        "partial correlation at that lag, given time and the other channels",
+        "1",
+    ),
     "p_value": ("p_value", "p-value of the sensitivity at that lag alone", "1"),
-    "p_value_adjusted": ("p_adjusted", "p-value adjusted for the search over lags, axes, variables and drivers", "1"),
+    "p_value_adjusted": (
+        "p_adjusted",
+        "p-value adjusted for the search over lags, axes, variables and drivers",
+        "1",
+    ),
     "effective_samples": ("effective", "independent samples that the windows are worth", "1"),
 }
 _SLOPES = {"": "slope", "_stderr": "stderr", "_low": "low", "_high": "high"}
@@ -52,41 +64,86 @@ def assemble(
     made: dict[str, Any] = {}
     for driver in found:
         what = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
-        made[driver.name] = product[driver.name] if driver.name in product.data_vars else ("time", driver.values[0], what)
+        made[driver.name] = (
+            product[driver.name]
+            if driver.name in product.data_vars
+            else ("time", driver.values[0], what)
+        )
     for name, (key, label, units) in _NUMBERS.items():
         made[name] = (dims, table(key), {"long_name": label, "units": units})
-    made["windows_used"] = (dims, table("windows", np.int32), {"long_name": "windows used", "units": "1"})
-    flags = {"flag_values": np.arange(len(VERDICTS), dtype=np.int8), "flag_meanings": " ".join(VERDICTS)}
-    made["coupling_verdict"] = (dims, table("verdict", np.int8), {"long_name": "what the record tells of the coupling", **flags})
+    made["windows_used"] = (
+        dims,
+        table("windows", np.int32),
+        {"long_name": "windows used", "units": "1"},
+    )
+    flags = {
+        "flag_values": np.arange(len(VERDICTS), dtype=np.int8),
+        "flag_meanings": " ".join(VERDICTS),
+    }
+    made["coupling_verdict"] = (
+        dims,
+        table("verdict", np.int8),
+        {"long_name": "what the record tells of the coupling", **flags},
+    )
     made["coupling_limits"] = (dims, *_limit_flags(shape, entries))
     for v, name in enumerate(names):
         for d, driver in enumerate(found):
             units = slope_units(str(product[name].attrs.get("units", "1")), driver.units)
             for suffix, key in _SLOPES.items():
-                label = f"sensitivity of {name.replace('_', ' ')} to {driver.label}{_said(key, level)}"
-                made[f"{name}_per_{driver.name}{suffix}"] = ("axis", table(key)[:, v, d], {"long_name": label, "units": units})
-    made["statement"] = (dims, table("statement", object).astype(str), {"long_name": "the finding in one sentence"})
+                label = (
+                    f"sensitivity of {name.replace('_', ' ')} to {driver.label}{_said(key, level)}"
+                )
+                made[f"{name}_per_{driver.name}{suffix}"] = (
+                    "axis",
+                    table(key)[:, v, d],
+                    {"long_name": label, "units": units},
+                )
+    made["statement"] = (
+        dims,
+        table("statement", object).astype(str),
+        {"long_name": "the finding in one sentence"},
+    )
     result = result.assign(made)
-    labels = {"variable": (names, "variable of the product"), "driver": ([driver.name for driver in found], "what may drive the variable")}
-    result = result.assign_coords({dim: (dim, np.array(values, dtype=str), {"long_name": text}) for dim, (values, text) in labels.items()})
+    labels = {
+        "variable": (names, "variable of the product"),
+        "driver": ([driver.name for driver in found], "what may drive the variable"),
+    }
+    result = result.assign_coords(
+        {
+            dim: (dim, np.array(values, dtype=str), {"long_name": text})
+            for dim, (values, text) in labels.items()
+        }
+    )
     kept_attrs = ("sampling_rate_hz", "window_s", "step_s", "source_files", "history")
     result.attrs = {name: product.attrs[name] for name in kept_attrs if name in product.attrs}
-    result.attrs |= {"title": "Coupling of a gyro's noise coefficients and window means with a channel", "interval_level": level}
+    result.attrs |= {
+        "title": "Coupling of a gyro's noise coefficients and window means with a channel",
+        "interval_level": level,
+    }
     return result.assign_attrs(longest_lag_s=longest)
 
 
-def _limit_flags(shape: tuple[int, ...], entries: Mapping[tuple[int, int, int], Mapping[str, Any]]) -> tuple[Any, dict[str, Any]]:
+def _limit_flags(
+    shape: tuple[int, ...], entries: Mapping[tuple[int, int, int], Mapping[str, Any]]
+) -> tuple[Any, dict[str, Any]]:
     """One bit for each thing that limits a verdict, and the attributes that say which."""
     masks = {name: np.int8(1 << bit) for bit, name in enumerate(LIMITS)}
     bits = np.zeros(shape, np.int8)
     for place, entry in entries.items():
         bits[place] = sum(int(masks[name]) for name in entry["limits"])
-    meanings = {"flag_masks": np.array(list(masks.values()), np.int8), "flag_meanings": " ".join(masks)}
+    meanings = {
+        "flag_masks": np.array(list(masks.values()), np.int8),
+        "flag_meanings": " ".join(masks),
+    }
     return bits, {"long_name": "what limits the verdict", **meanings}
 
 
 def _said(key: str, level: float) -> str:
-    ends = {"stderr": "standard error", "low": f"lower end of the {level:.0%} interval", "high": f"upper end of the {level:.0%} interval"}
+    ends = {
+        "stderr": "standard error",
+        "low": f"lower end of the {level:.0%} interval",
+        "high": f"upper end of the {level:.0%} interval",
+    }
     ramps = {
         f"{way}{end}": f"while it {verb}{text}"
         for way, verb in (("rising", "rises"), ("falling", "falls"))

@@ -18,9 +18,11 @@ __all__ = ["Driver", "drivers", "other_channels", "slope_units"]
 
 Array = NDArray[np.float64]
 
-_SPACINGS = 3.0  # a hole is bridged when it is no longer than this many spacings of the channel, or than a window
+# a hole is bridged when it is no longer than this many spacings of the channel, or than a window
+_SPACINGS = 3.0
 
-# Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS takes "g" for the gram.
+# Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS
+# takes "g" for the gram.
 _DIFFERENCE = {"degree_Celsius": "K", "g": "standard_free_fall", "9.80665": "standard_free_fall"}
 
 
@@ -34,7 +36,9 @@ class Driver:
     values: Array
 
 
-def drivers(product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.int64], step: float) -> list[Driver]:
+def drivers(
+    product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.int64], step: float
+) -> list[Driver]:
     """Channel and its rate of change, averaged inside the windows, for every lag.
 
     Parameters
@@ -51,13 +55,15 @@ def drivers(product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.i
     Returns
     -------
     list of Driver
-        Two; NaN where the channel is not known. Holes as long as a window or three spacings of the channel are bridged,
-        nothing is extrapolated.
+        Two; NaN where the channel is not known. Holes as long as a window or three spacings of the
+        channel are bridged, nothing is extrapolated.
     """
     if isinstance(channel, str):
         if channel not in product.data_vars or product[channel].dims != ("time",):
             there = ", ".join(_channels(product)) or "none"
-            raise OptionError(f"the product has no channel {channel!r}; it has {there}; give another, or a file with --channel")
+            raise OptionError(
+                f"the product has no channel {channel!r}; it has {there}; give another, or a file with --channel"
+            )
         name, units = channel, str(product[channel].attrs.get("units", "1"))
         both = _of_product(product, channel, lags, step)
     else:
@@ -66,7 +72,12 @@ def drivers(product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.i
     label = name.replace("_", " ")
     return [
         Driver(name, label, units, both[0]),
-        Driver(f"{name}_rate", f"rate of change of {label}", _times(_difference(units), {"hour": -1}), both[1]),
+        Driver(
+            f"{name}_rate",
+            f"rate of change of {label}",
+            _times(_difference(units), {"hour": -1}),
+            both[1],
+        ),
     ]
 
 
@@ -77,7 +88,9 @@ def other_channels(product: xr.Dataset, driver: str) -> list[str]:
 
 
 def _channels(product: xr.Dataset) -> list[str]:
-    numeric = (name for name, v in product.data_vars.items() if v.dims == ("time",) and v.dtype.kind == "f")
+    numeric = (
+        name for name, v in product.data_vars.items() if v.dims == ("time",) and v.dtype.kind == "f"
+    )
     return [str(name) for name in numeric]
 
 
@@ -117,12 +130,20 @@ def _length(product: xr.Dataset) -> int:
     return int(np.median(bounds[:, 1] - bounds[:, 0]))
 
 
-def _of_product(product: xr.Dataset, name: str, lags: NDArray[np.int64], step: float) -> list[Array]:
+def _of_product(
+    product: xr.Dataset, name: str, lags: NDArray[np.int64], step: float
+) -> list[Array]:
     place = _grid(product, step)
     mean = np.full(int(place[-1]) + 1, np.nan)
     mean[place] = product[name].values
     apart = np.diff(np.flatnonzero(np.isfinite(mean)))
-    most = max(_length(product) / 1e9 / step, _SPACINGS * float(np.median(apart)) if apart.size else 0.0) + 1e-6
+    most = (
+        max(
+            _length(product) / 1e9 / step,
+            _SPACINGS * float(np.median(apart)) if apart.size else 0.0,
+        )
+        + 1e-6
+    )
     mean = _bridged(mean, most)
     if f"{name}_rate" in product.data_vars:
         rate = np.full(mean.size, np.nan)
@@ -140,10 +161,13 @@ def _slope(mean: Array, step: float) -> Array:
     return slope
 
 
-def _of_file(channel: xr.DataArray, product: xr.Dataset, lags: NDArray[np.int64], step: float) -> list[Array]:
+def _of_file(
+    channel: xr.DataArray, product: xr.Dataset, lags: NDArray[np.int64], step: float
+) -> list[Array]:
     """Mean and slope of a channel on its own time inside the windows, from the longest lag before the first window on.
 
-    A channel with fewer than two values in a window is interpolated to the middle of the windows instead.
+    A channel with fewer than two values in a window is interpolated to the middle of the windows
+    instead.
     """
     values, stamps = _checked(channel, product)
     place, before = _grid(product, step), int(lags[-1])
@@ -167,7 +191,9 @@ def _of_file(channel: xr.DataArray, product: xr.Dataset, lags: NDArray[np.int64]
     return [_lagged(row, before, place, lags) for row in (mean, rate)]
 
 
-def _between(values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], longest: float) -> Array:
+def _between(
+    values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], longest: float
+) -> Array:
     """A line from each value to the next, NaN before the first, after the last and where two are too far apart."""
     after = np.clip(np.searchsorted(stamps, at), 1, max(stamps.size - 1, 1))
     if stamps.size < 2:
@@ -180,17 +206,25 @@ def _between(values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], lo
 
 def _checked(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray[np.int64]]:
     if channel.ndim != 1 or channel.dtype.kind not in "iuf":
-        raise SchemaError(f"channel {channel.name!r} must be numbers along one dimension of time; it has dimensions {channel.dims}")
+        raise SchemaError(
+            f"channel {channel.name!r} must be numbers along one dimension of time; it has dimensions {channel.dims}"
+        )
     dim = channel.dims[0]
     if dim not in channel.coords or channel[dim].dtype.kind != "M":
-        raise SchemaError(f"channel {channel.name!r} has no coordinate {dim!r} of dates; give it one")
+        raise SchemaError(
+            f"channel {channel.name!r} has no coordinate {dim!r} of dates; give it one"
+        )
     good = np.isfinite(channel.values) & ~np.isnat(channel[dim].values)
     stamps = _nanoseconds(channel[dim].values[good])
     order = np.argsort(stamps, kind="stable")
     stamps, values = stamps[order], channel.values[good][order].astype(np.float64)
     bounds = _nanoseconds(product["time_bounds"].values)
     if not stamps.size or stamps[-1] < bounds[0, 0] or stamps[0] >= bounds[-1, 1]:
-        said = "holds no value" if not stamps.size else f"spans {_day(stamps[0])} to {_day(stamps[-1])}"
+        said = (
+            "holds no value"
+            if not stamps.size
+            else f"spans {_day(stamps[0])} to {_day(stamps[-1])}"
+        )
         raise TimeError(
             f"channel {channel.name!r} {said}, the product {_day(bounds[0, 0])} to {_day(bounds[-1, 1])}: they do not overlap; "
             "check the file, or the zero of its time with --epoch"

@@ -36,7 +36,10 @@ def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: b
         found.add("too_few")
     if span <= max(_QUANTUM.get(units, 0.0), 1e-9 * float(np.abs(x).max(initial=0.0))):
         return found | {"constant"}
-    inside = sum(float(((x[pieces == piece] - x[pieces == piece].mean()) ** 2).sum()) for piece in np.unique(pieces))
+    inside = sum(
+        float(((x[pieces == piece] - x[pieces == piece].mean()) ** 2).sum())
+        for piece in np.unique(pieces)
+    )
     if pieces.max() > 0 and inside < 0.1 * float(((x - x.mean()) ** 2).sum()):
         found.add("clusters")
     rise = float((x - np.minimum.accumulate(x)).max())
@@ -88,7 +91,11 @@ def statement(entry: dict[str, Any], driver: str, series: str) -> str:
     reasons = [LIMITS[name].format(driver=driver) for name in LIMITS if name in entry["limits"]]
     verdict = VERDICTS[entry["verdict"]]
     if verdict == "cannot_tell":
-        hard = [LIMITS[name].format(driver=driver) for name in ("constant", "too_few", "clusters", "one_moment") if name in entry["limits"]]
+        hard = [
+            LIMITS[name].format(driver=driver)
+            for name in ("constant", "too_few", "clusters", "one_moment")
+            if name in entry["limits"]
+        ]
         return f"The record cannot tell whether {series} follows {driver}: {'; '.join(hard) or 'no window holds both'}."
     units = plain_units(entry["units"])
     between = f"{entry['low']:.3g} to {entry['high']:.3g}"
@@ -98,7 +105,11 @@ def statement(entry: dict[str, Any], driver: str, series: str) -> str:
     odds = f"p {'' if entry['p_adjusted'] < 1e-4 else '= '}{chance(entry['p_adjusted'])}"
     if verdict == "none_seen":
         apart = not entry["low"] <= 0.0 <= entry["high"]
-        note = "; at that lag alone it would stand out, in the whole search it does not" if apart else ""
+        note = (
+            "; at that lag alone it would stand out, in the whole search it does not"
+            if apart
+            else ""
+        )
         tail = f" ({'; '.join(reasons)})" if reasons else ""
         return f"No coupling of {series} with {driver} is seen: {number}{late}, {odds} for the whole search{note}{tail}."
     if verdict == "not_told_apart" and entry["p_adjusted"] >= 0.05:

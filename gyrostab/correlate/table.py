@@ -30,8 +30,15 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                 cell = result.isel(axis=a, variable=v, driver=d)
                 slope = cell[f"{name}_per_{driver}"]
                 low, high = (float(cell[f"{name}_per_{driver}_{end}"]) for end in ("low", "high"))
-                numbers = (float(cell["coupling_lag"]), float(slope), float(cell["correlation"]), float(cell["effective_samples"]))
-                lag, value, r, n = ("-" if np.isnan(number) else f"{number:.3g}" for number in numbers)
+                numbers = (
+                    float(cell["coupling_lag"]),
+                    float(slope),
+                    float(cell["correlation"]),
+                    float(cell["effective_samples"]),
+                )
+                lag, value, r, n = (
+                    "-" if np.isnan(number) else f"{number:.3g}" for number in numbers
+                )
                 p = float(cell["p_value_adjusted"])
                 rows.append(
                     {
@@ -40,7 +47,9 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                         "driver": str(driver),
                         "lag [s]": lag,
                         "sensitivity": value,
-                        f"{result.attrs['interval_level']:.0%} interval": "-" if np.isnan(low) else f"{low:.3g} .. {high:.3g}",
+                        f"{result.attrs['interval_level']:.0%} interval": "-"
+                        if np.isnan(low)
+                        else f"{low:.3g} .. {high:.3g}",
                         "unit": plain_units(str(slope.attrs["units"])),
                         "r": r,
                         "n eff": n,
@@ -68,11 +77,20 @@ def format_correlation(result: xr.Dataset) -> str:
     table = [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
     verdicts = result["coupling_verdict"].values.ravel()
     sentences = result["statement"].values.ravel()
-    said = [str(sentences[place]) for place in np.flatnonzero(verdicts >= VERDICTS.index("not_told_apart"))]
+    said = [
+        str(sentences[place])
+        for place in np.flatnonzero(verdicts >= VERDICTS.index("not_told_apart"))
+    ]
     cannot = np.flatnonzero(verdicts == VERDICTS.index("cannot_tell"))
     if cannot.size:
-        said.append(str(sentences[cannot[0]]) + (f" ({cannot.size - 1} more like it)" if cannot.size > 1 else ""))
+        said.append(
+            str(sentences[cannot[0]])
+            + (f" ({cannot.size - 1} more like it)" if cannot.size > 1 else "")
+        )
     widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in table
+    ]
     note = "Lag, sensitivity and interval are those of the lag that fits best; p adjusted is for the whole search."
     return "\n".join([*lines, note, "", *(said or ["No coupling is seen."])])

@@ -11,7 +11,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model, baseline_from_simulation, calibrate_noise
+from gyrostab.diagnose.baseline.calibrate import (
+    baseline_from_model,
+    baseline_from_simulation,
+    calibrate_noise,
+)
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_lines
 from gyrostab.diagnose.estimate.expected_effects import expected_baseline, without_expected
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
@@ -56,19 +60,20 @@ def diagnose(
 ) -> Diagnosis:
     """Find where a recording differs from a simulation, name the physics that is missing, and measure what it is worth.
 
-    The recording is reduced to block statistics; null records with the noise of the simulation say how far chance goes; places that lie
-    beyond become mismatches; effects are named by what they explain on time that was kept apart, fitted together, and added to the model.
+    The recording is reduced to block statistics; null records with the noise of the simulation say
+    how far chance goes; places that lie beyond become mismatches; effects are named by what they
+    explain on time that was kept apart, fitted together, and added to the model.
 
     Parameters
     ----------
     log : xarray.Dataset
         The recording: a regular log with its channels, in memory or lazy.
     simulation : model, path of a model, or xarray.Dataset, optional
-        What it is compared with: noise and effects of a model, or a simulated log on the same stamps. Without it the five noise terms,
-        calibrated on quiet stretches of the recording.
+        What it is compared with: noise and effects of a model, or a simulated log on the same
+        stamps. Without it the five noise terms, calibrated on quiet stretches of the recording.
     quiet : (start, end) or list of these, optional
-        Quiet stretches, as seconds since the start or ISO times; detected automatically by default. With a `simulation` they calibrate
-        the level of its noise: one factor for each axis.
+        Quiet stretches, as seconds since the start or ISO times; detected automatically by default.
+        With a `simulation` they calibrate the level of its noise: one factor for each axis.
     seed : int
         Of the null records.
     nulls : int
@@ -84,14 +89,16 @@ def diagnose(
     Returns
     -------
     Diagnosis
-        Verdict, mismatches, effects with their numbers and alternatives, what was not found, the model, the surfaces.
+        Verdict, mismatches, effects with their numbers and alternatives, what was not found, the
+        model, the surfaces.
 
     Raises
     ------
     SchemaError
         When it is no regular log, or no axis ever changes.
     OptionError
-        When the record is too short, an option makes no sense, or recording and simulation do not fit together.
+        When the record is too short, an option makes no sense, or recording and simulation do not
+        fit together.
 
     Examples
     --------
@@ -103,8 +110,12 @@ def diagnose(
 
     _check_options(nulls, false_alarm_level, seed)
     log = as_log(log)
-    with threadpool_limits(1, user_api="blas"):  # the matrices are many and small: threads would only wait for each other
-        return _diagnose(log, simulation, quiet, seed, nulls, false_alarm_level, block, restart_gap, progress)
+    with threadpool_limits(
+        1, user_api="blas"
+    ):  # the matrices are many and small: threads would only wait for each other
+        return _diagnose(
+            log, simulation, quiet, seed, nulls, false_alarm_level, block, restart_gap, progress
+        )
 
 
 def _diagnose(
@@ -121,7 +132,11 @@ def _diagnose(
     """One step after the other."""
     begun = time.perf_counter()
     log = _with_aligned_channels(log)
-    given = simulation if simulation is None or isinstance(simulation, xr.Dataset | Model) else read_model(simulation)
+    given = (
+        simulation
+        if simulation is None or isinstance(simulation, xr.Dataset | Model)
+        else read_model(simulation)
+    )
     if isinstance(given, xr.Dataset):
         given = as_log(given)
         _check_alike(log, given)
@@ -154,10 +169,21 @@ def _compare(task: Task, reduced: xr.Dataset, baseline: xr.Dataset) -> Compared:
     task.progress("naming", 0)
     half = task.level / 2.0  # the names have one half, the places the other
     known = _known_apart(baseline, task.given)
-    naming = name_effects(seen, baseline, records(), level=half, seed=task.seed, known=known, progress=task.progress)
+    naming = name_effects(
+        seen, baseline, records(), level=half, seed=task.seed, known=known, progress=task.progress
+    )
     before = expected_baseline(naming, baseline)
-    apart = without_expected(still_lines(task, seen, before) if naming.expected else seen, baseline, naming.expected)
-    found = unexpected(locate_mismatches(apart, before, null, level=half), naming.expected, seen, before, null, level=half)
+    apart = without_expected(
+        still_lines(task, seen, before) if naming.expected else seen, baseline, naming.expected
+    )
+    found = unexpected(
+        locate_mismatches(apart, before, null, level=half),
+        naming.expected,
+        seen,
+        before,
+        null,
+        level=half,
+    )
     return Compared(reduced, baseline, found, naming, null)
 
 
@@ -166,7 +192,9 @@ def _calibrated(task: Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset
     task.progress("calibrating", 0)
     baseline = _baseline(task, reduced)
     if isinstance(task.given, Model) and (turning := expect_known_motion(reduced, baseline)).any():
-        left = without_motion(task.log, reduced, turning, restart_gap=task.restart_gap, progress=task.progress)
+        left = without_motion(
+            task.log, reduced, turning, restart_gap=task.restart_gap, progress=task.progress
+        )
         reduced = left.drop_vars("moving")  # it is accounted for
         baseline = _baseline(task, reduced)
     return reduced, baseline
@@ -174,14 +202,23 @@ def _calibrated(task: Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset
 
 def _at_rest(task: Task, compared: Compared) -> Compared:
     """The comparison once more without the blocks of a motion that has no name; the same where there are none, or too few are left."""
-    moving = unexplained_motion(compared.reduced, compared.naming.claims) if task.given is None else np.zeros(1, np.bool_)
+    moving = (
+        unexplained_motion(compared.reduced, compared.naming.claims)
+        if task.given is None
+        else np.zeros(1, np.bool_)
+    )
     if not moving.any():
         return compared
-    at_rest = without_motion(task.log, compared.reduced, moving, restart_gap=task.restart_gap, progress=task.progress)
+    at_rest = without_motion(
+        task.log, compared.reduced, moving, restart_gap=task.restart_gap, progress=task.progress
+    )
     try:
         return _compare(task, *_calibrated(task, at_rest))
     except SchemaError as error:
-        warnings.warn(f"compared with its motion in it, for what is at rest does not do: {error}", stacklevel=4)
+        warnings.warn(
+            f"compared with its motion in it, for what is at rest does not do: {error}",
+            stacklevel=4,
+        )
         return compared
 
 
@@ -193,9 +230,13 @@ def _beside_hops(task: Task, compared: Compared) -> Compared:
 
 def _check_options(nulls: int, level: float, seed: int) -> None:
     if not 0.0 < level < 0.5:
-        raise OptionError(f"false_alarm_level={level!r}: give the share of false alarms, above 0 and below 0.5, for instance 0.01")
+        raise OptionError(
+            f"false_alarm_level={level!r}: give the share of false alarms, above 0 and below 0.5, for instance 0.01"
+        )
     if nulls < _LEAST_NULLS:
-        raise OptionError(f"nulls={nulls!r}: fewer than {_LEAST_NULLS} records do not tell how often chance does as much; give 400")
+        raise OptionError(
+            f"nulls={nulls!r}: fewer than {_LEAST_NULLS} records do not tell how often chance does as much; give 400"
+        )
     if seed < 0:
         raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
 
@@ -207,16 +248,24 @@ def _axes_alive(reduced: xr.Dataset) -> list[str]:
     alive = [axis for axis, power in zip(axes, loudest, strict=True) if not power <= _DEAD]
     dead = [axis for axis in axes if axis not in alive]
     if not alive:
-        raise SchemaError(f"all samples are the same on axis {', '.join(dead)}: there is no noise to compare; is it the right column?")
+        raise SchemaError(
+            f"all samples are the same on axis {', '.join(dead)}: there is no noise to compare; is it the right column?"
+        )
     if dead:
-        warnings.warn(f"all samples are the same on axis {', '.join(dead)}: left out of the diagnosis", stacklevel=4)
+        warnings.warn(
+            f"all samples are the same on axis {', '.join(dead)}: left out of the diagnosis",
+            stacklevel=4,
+        )
     return alive
 
 
 def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:
     """Raise `OptionError` unless the two logs have the same stamps and axes."""
     for what, one, other in (
-        ("sampling rate", *(f"{float(each.attrs['sampling_rate_hz']):.10g} Hz" for each in (simulated, log))),
+        (
+            "sampling rate",
+            *(f"{float(each.attrs['sampling_rate_hz']):.10g} Hz" for each in (simulated, log)),
+        ),
         ("number of samples", *(str(each.sizes["time"]) for each in (simulated, log))),
         ("axes", *(", ".join(map(str, each["axis"].values)) for each in (simulated, log))),
         ("start", *(f"{np.datetime64(first_stamp(each), 'ns')}" for each in (simulated, log))),
@@ -233,17 +282,23 @@ def _baseline(task: Task, reduced: xr.Dataset) -> xr.Dataset:
         return calibrate_noise(reduced, quiet=task.quiet)
     if isinstance(task.given, xr.Dataset):
         same = f"{reduced.attrs['block_samples']}samples"
-        simulated = reduce_log(task.given, block=same, restart_gap=task.restart_gap, progress=task.progress)
+        simulated = reduce_log(
+            task.given, block=same, restart_gap=task.restart_gap, progress=task.progress
+        )
         return baseline_from_simulation(reduced, simulated, quiet=task.quiet)
     return baseline_from_model(reduced, task.given, quiet=task.quiet)
 
 
-def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -> Callable[[], Iterable[xr.Dataset]]:
+def _records(
+    reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int
+) -> Callable[[], Iterable[xr.Dataset]]:
     """The same null records as often as they are asked for: kept where they are small, drawn again where not."""
     together = int(np.clip(_AT_ONCE / (reduced["power"].size * 8), 25, count))
 
     def draw() -> Iterable[xr.Dataset]:
-        return null_records(reduced, baseline, count=count, rng=np.random.default_rng(seed), chunk=together)
+        return null_records(
+            reduced, baseline, count=count, rng=np.random.default_rng(seed), chunk=together
+        )
 
     if count * reduced["power"].size * 3 * 8 > _KEPT:
         return draw
@@ -259,7 +314,11 @@ def _records(reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int) -
 
 def _known_apart(baseline: xr.Dataset, given: xr.Dataset | Model | None) -> list[Effect]:
     """Effects of the model that its baseline leaves out, in part or whole."""
-    return [one for one in given.effects if one.name in baseline.attrs["left_out"]] if isinstance(given, Model) else []
+    return (
+        [one for one in given.effects if one.name in baseline.attrs["left_out"]]
+        if isinstance(given, Model)
+        else []
+    )
 
 
 def parse_quiescent_span(text: str) -> tuple[float | str, float | str]:
@@ -277,7 +336,9 @@ def parse_quiescent_span(text: str) -> tuple[float | str, float | str]:
     """
     parts = [part.strip() for part in text.split("/")]
     if len(parts) != 2 or not all(parts):
-        raise OptionError(f"quiet {text!r}: write START/END, for instance 2026-03-14T08:00/2026-03-14T08:30 or 0s/30min after the start")
+        raise OptionError(
+            f"quiet {text!r}: write START/END, for instance 2026-03-14T08:00/2026-03-14T08:30 or 0s/30min after the start"
+        )
     ends = [_end(part, text) for part in parts]
     return ends[0], ends[1]
 
@@ -285,7 +346,11 @@ def parse_quiescent_span(text: str) -> tuple[float | str, float | str]:
 def _end(part: str, text: str) -> float | str:
     try:
         return (
-            str(np.datetime64(part.removesuffix("Z"))) if "-" in part else 0.0 if part in ("0", "0s") else duration_seconds(part, "quiet")
+            str(np.datetime64(part.removesuffix("Z")))
+            if "-" in part
+            else 0.0
+            if part in ("0", "0s")
+            else duration_seconds(part, "quiet")
         )
     except ValueError as error:
         raise OptionError(

@@ -65,11 +65,16 @@ class Compared(NamedTuple):
 def still_lines(task: Task, reduced: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
     """The record with the line spectra of the blocks in which nothing that is known moves; the log is read once more where something does.
 
-    A step within a block has the spectrum of a step, and a part of the record has only one for all its blocks.
+    A step within a block has the spectrum of a step, and a part of the record has only one for all
+    its blocks.
     """
     there = np.isfinite(reduced["power"].transpose("axis", "block", "band").values).any(axis=-1)
     moving = expect_known_motion(reduced, known)
     if not (moving & there).any():
         return reduced
-    calm = without_motion(task.log, reduced, moving | ~there, restart_gap=task.restart_gap, progress=task.progress)
-    return remove_known_lines(reduced.assign({name: calm[name] for name in ("line_power", "line_weight")}), known)
+    calm = without_motion(
+        task.log, reduced, moving | ~there, restart_gap=task.restart_gap, progress=task.progress
+    )
+    return remove_known_lines(
+        reduced.assign({name: calm[name] for name in ("line_power", "line_weight")}), known
+    )

@@ -54,8 +54,12 @@ def read_channel(
     array([20.5, 21. ])
     """
     chosen: dict[str, Any] = {"epoch": epoch, "map": dict(map or {}), "unit": dict(unit or {})}
-    held = attach_channels(xr.Dataset(), [_read(Path(path), ReadOptions(channels_only=True, **chosen))])
+    held = attach_channels(
+        xr.Dataset(), [_read(Path(path), ReadOptions(channels_only=True, **chosen))]
+    )
     if name not in held.data_vars:
         there = ", ".join(map_name for map_name in sorted(str(key) for key in held.data_vars))
-        raise OptionError(f"{path}: it has no channel {name!r}; it has {there}: name one of these, or rename one with --map")
+        raise OptionError(
+            f"{path}: it has no channel {name!r}; it has {there}: name one of these, or rename one with --map"
+        )
     return held[name]

@@ -24,7 +24,11 @@ __all__ = ["attach_channels", "concatenate", "memory", "to_disk", "with_channels
 
 def memory(part: xr.Dataset) -> int:
     """Bytes of the columns of a raw log that are held in memory."""
-    arrays = sum(variable.nbytes for variable in part.variables.values() if isinstance(variable._data, np.ndarray))
+    arrays = sum(
+        variable.nbytes
+        for variable in part.variables.values()
+        if isinstance(variable._data, np.ndarray)
+    )
     return arrays + sum(pieces.held for pieces in _pieces(part))
 
 
@@ -37,11 +41,19 @@ def to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
 
     def moved(variable: xr.Variable) -> Any:
         values = variable.values
-        return lazily(spool.store(values)) if values.ndim == 1 else stack_rows([lazily(spool.store(row)) for row in values])
+        return (
+            lazily(spool.store(values))
+            if values.ndim == 1
+            else stack_rows([lazily(spool.store(row)) for row in values])
+        )
 
     for pieces in _pieces(part):
         pieces.spill(spool)
-    long = {name: variable for name, variable in part.variables.items() if name != "axis" and isinstance(variable._data, np.ndarray)}
+    long = {
+        name: variable
+        for name, variable in part.variables.items()
+        if name != "axis" and isinstance(variable._data, np.ndarray)
+    }
     return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
 
 
@@ -63,7 +75,10 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         whole = _in_order([group for part in parts for group in split_axes(part)])
         signal = _signal(whole)
         own = [_off_rows(part) for part in whole]
-        ordered = [part.drop_vars([*names, *(f"time_{name}" for name in names)]) for part, names in zip(whole, own, strict=True)]
+        ordered = [
+            part.drop_vars([*names, *(f"time_{name}" for name in names)])
+            for part, names in zip(whole, own, strict=True)
+        ]
         groups = _group_by_axes(ordered)
         if "time" in ordered[0].variables:
             groups = [drop_repeats(group) for group in groups]
@@ -78,19 +93,27 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 
 def _off_rows(part: xr.Dataset) -> list[str]:
     """Channels that have a time of their own."""
-    return [str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)]
+    return [
+        str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)
+    ]
 
 
 def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
     """Put files that have no axis in common, but the same time, into groups of their own; otherwise all are one group."""
-    groups = [[parts[number] for number in group] for group in group_axes([_axes(part) for part in parts])]
+    groups = [
+        [parts[number] for number in group] for group in group_axes([_axes(part) for part in parts])
+    ]
     if len(groups) == 1 or not all(_axes(group[0]) for group in groups):
         return [list(parts)]
     if "time" not in parts[0].variables:
         return groups
     spans = [[stamp_span(part) for part in group] for group in groups]
-    ends = sorted((min(first for first, _ in span), max(last for _, last in span)) for span in spans)
-    in_time = [later[0] > earlier[1] for earlier, later in pairwise(ends)]  # one begins after the other has ended
+    ends = sorted(
+        (min(first for first, _ in span), max(last for _, last in span)) for span in spans
+    )
+    in_time = [
+        later[0] > earlier[1] for earlier, later in pairwise(ends)
+    ]  # one begins after the other has ended
     return [list(parts)] if any(in_time) else groups
 
 
@@ -104,9 +127,12 @@ def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
         return list(parts)
     if not all(timed):
         with_time, without = (
-            next(p.attrs["source_files"][0] for p, t in zip(parts, timed, strict=True) if t is want) for want in (True, False)
+            next(p.attrs["source_files"][0] for p, t in zip(parts, timed, strict=True) if t is want)
+            for want in (True, False)
         )
-        raise TimeError(f"{with_time} has time stamps and {without} has none; read them one by one, or give the latter a time column")
+        raise TimeError(
+            f"{with_time} has time stamps and {without} has none; read them one by one, or give the latter a time column"
+        )
     return sorted(parts, key=_first_stamp)
 
 
@@ -123,12 +149,19 @@ def _signal(parts: Sequence[xr.Dataset]) -> str | None:
     first = parts[0]
     for part in parts[1:]:
         if part.attrs.get("kind") != first.attrs.get("kind"):
-            (a, b), (kind_a, kind_b) = zip(*((p.attrs["source_files"][0], p.attrs.get("kind")) for p in (first, part)), strict=True)
-            raise UnitError(f"{a} holds a gyro signal of kind {kind_a!r}, {b} of kind {kind_b!r}; read them one by one")
+            (a, b), (kind_a, kind_b) = zip(
+                *((p.attrs["source_files"][0], p.attrs.get("kind")) for p in (first, part)),
+                strict=True,
+            )
+            raise UnitError(
+                f"{a} holds a gyro signal of kind {kind_a!r}, {b} of kind {kind_b!r}; read them one by one"
+            )
     return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
 
 
-def _join(parts: list[xr.Dataset], signal: str | None, groups: list[list[xr.Dataset]]) -> xr.Dataset:
+def _join(
+    parts: list[xr.Dataset], signal: str | None, groups: list[list[xr.Dataset]]
+) -> xr.Dataset:
     sizes = [part.sizes["row"] for part in parts]
     names = [part.attrs["source_files"][0] for part in parts]
     absent: dict[str, list[str]] = {}
@@ -144,31 +177,52 @@ def _join(parts: list[xr.Dataset], signal: str | None, groups: list[list[xr.Data
         packing = common_packing(part[signal].encoding for part in parts)
         data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]}, packing)
         coords["axis"] = np.array(axes, dtype=str)
-    for channel in dict.fromkeys(str(name) for part in parts for name in part.data_vars if name != signal):
+    for channel in dict.fromkeys(
+        str(name) for part in parts for name in part.data_vars if name != signal
+    ):
         units = _channel_units(parts, channel)
-        columns = [part[channel].data if channel in part else np.full(size, np.nan) for part, size in zip(parts, sizes, strict=True)]
+        columns = [
+            part[channel].data if channel in part else np.full(size, np.nan)
+            for part, size in zip(parts, sizes, strict=True)
+        ]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
         data[channel] = ("row", end_to_end(columns, CHUNK_ROWS), {"units": units}, packing)
         absent[f"channel {channel}"] = _lacking(groups, lambda part, name=channel: name in part)  # type: ignore[misc]
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
-    gaps = [f"{what} is not in {some(files)} and is missing there" for what, files in absent.items() if files]
+    gaps = [
+        f"{what} is not in {some(files)} and is missing there"
+        for what, files in absent.items()
+        if files
+    ]
     joined.attrs.update(
         source_files=names,
         row_start=[int(start) for start in np.cumsum([0, *sizes[:-1]])],
-        notes=[*together((part.attrs["source_files"][0], part.attrs["notes"]) for part in parts), *gaps],
+        notes=[
+            *together((part.attrs["source_files"][0], part.attrs["notes"]) for part in parts),
+            *gaps,
+        ],
         unreadable_rows=sum(part.attrs["unreadable_rows"] for part in parts),
         unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
     )
     if len(groups) > 1:
-        ends = np.cumsum([0, *(sum(part.sizes["row"] for part in group) for group in groups)]).tolist()
+        ends = np.cumsum(
+            [0, *(sum(part.sizes["row"] for part in group) for group in groups)]
+        ).tolist()
         axes_of = [sorted({axis for part in group for axis in _axes(part)}) for group in groups]
-        joined.attrs["axis_rows"] = [[axes, *rows] for axes, rows in zip(axes_of, pairwise(ends), strict=True)]
+        joined.attrs["axis_rows"] = [
+            [axes, *rows] for axes, rows in zip(axes_of, pairwise(ends), strict=True)
+        ]
     return joined
 
 
 def _lacking(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], bool]) -> list[str]:
     """Name the files that lack something which others of their group have; those of other groups hold other axes."""
-    found = [(str(part.attrs["source_files"][0]), has(part)) for group in groups if any(map(has, group)) for part in group]
+    found = [
+        (str(part.attrs["source_files"][0]), has(part))
+        for group in groups
+        if any(map(has, group))
+        for part in group
+    ]
     return [name for name, is_there in found if not is_there]
 
 
@@ -180,9 +234,13 @@ def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
         for part in parts:
             end += part.sizes["row"]
             for axis in map(str, part["axis"].values):
-                whole[axes.index(axis), end - part.sizes["row"] : end] = part[signal].sel(axis=axis).data
+                whole[axes.index(axis), end - part.sizes["row"] : end] = (
+                    part[signal].sel(axis=axis).data
+                )
         return whole
-    return stack_rows([end_to_end([_axis(part, signal, axis) for part in parts], CHUNK_ROWS) for axis in axes])
+    return stack_rows(
+        [end_to_end([_axis(part, signal, axis) for part in parts], CHUNK_ROWS) for axis in axes]
+    )
 
 
 def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
@@ -193,7 +251,10 @@ def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
 
 def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
     holders = [part for part in parts if channel in part]
-    units = {str(part[channel].attrs["units"]): part.attrs["source_files"][0] for part in reversed(holders)}
+    units = {
+        str(part[channel].attrs["units"]): part.attrs["source_files"][0]
+        for part in reversed(holders)
+    }
     if len(units) > 1:
         listed = ", ".join(f"{unit!r} in {name}" for unit, name in units.items())
         raise UnitError(
@@ -204,7 +265,11 @@ def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
 
 def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
     """Add the channels of other tables of the same files, each on its own ``time_<channel>``; the log's attributes stay as they are."""
-    return attach_channels(log, sources).drop_attrs(deep=False).assign_attrs(log.attrs) if sources else log
+    return (
+        attach_channels(log, sources).drop_attrs(deep=False).assign_attrs(log.attrs)
+        if sources
+        else log
+    )
 
 
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -222,16 +287,22 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
         files.append(name)
         for channel, stamps, values, units in _channels(source, name):
             if channel in log.variables:
-                fix = f"rename it with --map {channel}={channel}_2 or drop it with --map {channel}=-"
+                fix = (
+                    f"rename it with --map {channel}={channel}_2 or drop it with --map {channel}=-"
+                )
                 raise OptionError(f"channel {channel!r} of {name} is in the log too; {fix}")
             pieces.setdefault(channel, []).append((stamps, values, units))
     for channel, found in pieces.items():
         if len({units for _, _, units in found}) > 1:
-            raise UnitError(f"channel {channel!r} has different units in {some(files)}; give one with --unit {channel}=UNIT")
+            raise UnitError(
+                f"channel {channel!r} has different units in {some(files)}; give one with --unit {channel}=UNIT"
+            )
         stamps, values = (np.concatenate([piece[place] for piece in found]) for place in (0, 1))
         order = np.argsort(stamps, kind="stable")
         dim = f"time_{channel}"
-        log = log.assign_coords({dim: (dim, stamps[order])}).assign({channel: (dim, values[order], {"units": found[0][2]})})
+        log = log.assign_coords({dim: (dim, stamps[order])}).assign(
+            {channel: (dim, values[order], {"units": found[0][2]})}
+        )
     if files:
         notes = [note for source in sources for note in source.attrs.get("notes", [])]
         log = log.assign_attrs(notes=[*log.attrs.get("notes", []), *notes], channel_files=files)
@@ -242,13 +313,23 @@ def _channels(source: xr.Dataset, name: str) -> list[tuple[str, NDArray[Any], ND
     found = []
     for channel, variable in source.data_vars.items():
         dim = f"time_{channel}" if f"time_{channel}" in source.variables else "time"
-        if len(variable.dims) != 1 or channel in SIGNAL_UNITS or str(variable.dims[0]) not in ("row", "time", dim):
+        if (
+            len(variable.dims) != 1
+            or channel in SIGNAL_UNITS
+            or str(variable.dims[0]) not in ("row", "time", dim)
+        ):
             continue
         if dim not in source.variables:
-            raise OptionError(f"--channel {name}: it has no time column, so its rows cannot be placed; add one, or --map NAME=time")
+            raise OptionError(
+                f"--channel {name}: it has no time column, so its rows cannot be placed; add one, or --map NAME=time"
+            )
         stamps, values = np.asarray(source[dim].values), np.asarray(variable.values)
         filled = np.isfinite(values) & ~np.isnat(stamps)
-        found.append((str(channel), stamps[filled], values[filled], str(variable.attrs.get("units", "1"))))
+        found.append(
+            (str(channel), stamps[filled], values[filled], str(variable.attrs.get("units", "1")))
+        )
     if not found:
-        raise OptionError(f"--channel {name}: it holds no channel with a unit; give one with --unit NAME=UNIT")
+        raise OptionError(
+            f"--channel {name}: it holds no channel with a unit; give one with --unit NAME=UNIT"
+        )
     return found

@@ -27,8 +27,9 @@ def as_log(data: Any) -> xr.Dataset:
     Parameters
     ----------
     data : xarray.Dataset, xarray.DataArray, pandas.DataFrame or pandas.Series
-        A log, also one that xarray operations have changed (see `gyrostab.ingest.uniform.as_uniform`); a signal with units, on ``time`` or
-        ``(axis, time)``; a table with a DatetimeIndex and units in the names of its columns or in ``attrs["units"]``.
+        A log, also one that xarray operations have changed (see
+        `gyrostab.ingest.uniform.as_uniform`); a signal with units, on ``time`` or ``(axis, time)``;
+        a table with a DatetimeIndex and units in the names of its columns or in ``attrs["units"]``.
 
     Returns
     -------
@@ -38,7 +39,8 @@ def as_log(data: Any) -> xr.Dataset:
     Raises
     ------
     SchemaError, TimeError, UnitError, OptionError
-        When it is none of these, its time is not uniform or not in order, or its units are not known.
+        When it is none of these, its time is not uniform or not in order, or its units are not
+        known.
     """
     if isinstance(data, xr.DataArray):
         return as_uniform(_dataset_of(data, None, None)[0])
@@ -61,11 +63,13 @@ def from_dataframe(
     Parameters
     ----------
     df : pandas.DataFrame or Series
-        A column for each gyro axis (``gyro_x`` or ``x``; ``angle_x``) and channel (``temperature`` ...), with a DatetimeIndex (UTC, or
-        with a time zone) that does not run backwards. Samples may be missing.
+        A column for each gyro axis (``gyro_x`` or ``x``; ``angle_x``) and channel (``temperature``
+        ...), with a DatetimeIndex (UTC, or with a time zone) that does not run backwards. Samples
+        may be missing.
     units : str or mapping, optional
-        Unit of all gyro columns (``"deg/s"``), or units by column (``{"gyro": "deg/s", "temperature": "degC"}``). By default those in the
-        names of the columns (``"gyro_x [deg/s]"``), or in ``df.attrs["units"]``.
+        Unit of all gyro columns (``"deg/s"``), or units by column (``{"gyro": "deg/s",
+        "temperature": "degC"}``). By default those in the names of the columns (``"gyro_x
+        [deg/s]"``), or in ``df.attrs["units"]``.
     map : mapping, optional
         Column name -> contract name: ``{"wx": "gyro_x"}``; ``"-"`` drops a column.
     kind : {"rate", "angle"}, optional
@@ -78,8 +82,8 @@ def from_dataframe(
     Returns
     -------
     xarray.Dataset
-        ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], channels and table of gaps, as from
-        `gyrostab.regularise`.
+        ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], channels and table
+        of gaps, as from `gyrostab.regularise`.
 
     Raises
     ------
@@ -120,12 +124,14 @@ def from_dataarray(
     Parameters
     ----------
     da : xarray.DataArray
-        On ``time`` or on ``axis`` and ``time`` in any order, with a datetime64 coordinate ``time`` that does not run backwards.
-        Samples may be missing. A lazy array on a uniform time axis stays lazy.
+        On ``time`` or on ``axis`` and ``time`` in any order, with a datetime64 coordinate ``time``
+        that does not run backwards. Samples may be missing. A lazy array on a uniform time axis
+        stays lazy.
     units : str, optional
         Unit of the values; ``da.attrs["units"]`` by default.
     kind : {"rate", "angle"}, optional
-        How angles are meant: ``"angle"`` cumulative, ``"rate"`` increments. An array called ``angle`` is cumulative.
+        How angles are meant: ``"angle"`` cumulative, ``"rate"`` increments. An array called
+        ``angle`` is cumulative.
     rate : float, optional
         Sampling rate [Hz]; found from the stamps when not given.
     max_gap : str or float
@@ -163,20 +169,30 @@ def from_dataarray(
             raise
         from gyrostab.ingest.grid.regularise import regularise
 
-        raw = log.drop_vars("time").rename_dims(time="row").assign_coords(time=("row", stamps.astype("datetime64[ns]")))
+        raw = (
+            log.drop_vars("time")
+            .rename_dims(time="row")
+            .assign_coords(time=("row", stamps.astype("datetime64[ns]")))
+        )
         found = regularise(raw.assign_attrs(source_files=["DataArray"]), rate=rate, max_gap=max_gap)
         _warn_notes(found)
     if rate is not None and abs(rate / found.attrs["sampling_rate_hz"] - 1) > 1e-6:
-        raise TimeError(f"rate={rate:g} Hz, but the time of the DataArray says {found.attrs['sampling_rate_hz']:.9g} Hz; leave rate out")
+        raise TimeError(
+            f"rate={rate:g} Hz, but the time of the DataArray says {found.attrs['sampling_rate_hz']:.9g} Hz; leave rate out"
+        )
     if increments:
-        found["rate"] = found["rate"].copy(data=found["rate"].data * (found.attrs["sampling_rate_hz"] * HOUR))
+        found["rate"] = found["rate"].copy(
+            data=found["rate"].data * (found.attrs["sampling_rate_hz"] * HOUR)
+        )
     return found
 
 
 def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[xr.Dataset, bool]:
     """The array as a log whose time is not checked yet, and whether its values are increments, still to be divided by the period."""
     if set(da.dims) not in ({"time"}, {"axis", "time"}):
-        raise SchemaError(f"the DataArray has dimensions {da.dims}; a log has 'time', or 'axis' and 'time': rename them, da.rename(...)")
+        raise SchemaError(
+            f"the DataArray has dimensions {da.dims}; a log has 'time', or 'axis' and 'time': rename them, da.rename(...)"
+        )
     if "time" not in da.coords or da["time"].dtype.kind != "M":
         raise SchemaError(
             "the DataArray has no datetime64 coordinate 'time'; give it one, or use gyrostab.make_log(values, rate=..., unit=...)"
@@ -185,18 +201,30 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
     if kind not in (None, "rate", "angle"):
         raise OptionError(f"kind={kind!r}: give 'rate' or 'angle'")
     if unit.quantity == "angle" and kind is None and da.name != "angle":
-        raise OptionError(f"the values are angles ({unit.text}): give kind='angle' if they are cumulative, kind='rate' if increments")
+        raise OptionError(
+            f"the values are angles ({unit.text}): give kind='angle' if they are cumulative, kind='rate' if increments"
+        )
     increments = unit.quantity == "angle" and kind == "rate"
     if unit.quantity == "rate" and kind == "angle":
         raise OptionError(f"kind='angle', but {unit.text!r} is a unit of rates; leave kind out")
     name = "angle" if unit.quantity == "angle" and not increments else "rate"
-    axes = [str(axis) for axis in np.atleast_1d(da["axis"].values)] if "axis" in da.coords else list("xyz"[: da.sizes.get("axis", 1)])
+    axes = (
+        [str(axis) for axis in np.atleast_1d(da["axis"].values)]
+        if "axis" in da.coords
+        else list("xyz"[: da.sizes.get("axis", 1)])
+    )
     array = da if "axis" in da.dims else da.drop_vars("axis", errors="ignore").expand_dims("axis")
     signal = array.variable.transpose("axis", "time")
     data = signal.data * unit.factor if unit.factor != 1.0 else signal.data
-    packing = {"dtype": signal.dtype, "scale_factor": unit.factor} if signal.dtype.kind in "iu" and not increments else {}
+    packing = (
+        {"dtype": signal.dtype, "scale_factor": unit.factor}
+        if signal.dtype.kind in "iu" and not increments
+        else {}
+    )
     attrs = {"long_name": _LONG_NAMES[name], **da.attrs, "units": SIGNAL_UNITS[name]}
-    bare = array.coords.to_dataset().drop_vars([coord for coord in array.coords if coord not in ("time", "axis")])
+    bare = array.coords.to_dataset().drop_vars(
+        [coord for coord in array.coords if coord not in ("time", "axis")]
+    )
     log = bare.assign({name: (("axis", "time"), data, attrs, packing)})
     return log.assign_coords(axis=axes).assign_attrs(kind=name), increments
 
@@ -204,10 +232,14 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
 def _unit_of(da: xr.DataArray, units: str | None) -> Unit:
     text = da.attrs.get("units") if units is None else units
     if text is None:
-        raise MissingUnitError("the DataArray has no units; give them: gyrostab.from_dataarray(da, units='deg/s'), or da.attrs['units']")
+        raise MissingUnitError(
+            "the DataArray has no units; give them: gyrostab.from_dataarray(da, units='deg/s'), or da.attrs['units']"
+        )
     unit = parse_unit(str(text))
     if unit.quantity not in SIGNAL_UNITS:
-        raise UnitError(f"unit {text!r} of the DataArray is a unit of {unit.quantity}; units of rates are {known_units('rate')}")
+        raise UnitError(
+            f"unit {text!r} of the DataArray is a unit of {unit.quantity}; units of rates are {known_units('rate')}"
+        )
     return unit
 
 

@@ -70,14 +70,21 @@ def check_share(lost: Sequence[LostFile], total: int) -> None:
 
 def _name_key(path: Path) -> list[tuple[int, int, str]]:
     """Order of names in which run_9 comes before run_10."""
-    return [(0, int(piece), "") if piece.isdigit() else (1, 0, piece) for piece in re.split(r"(\d+)", str(path)) if piece]
+    return [
+        (0, int(piece), "") if piece.isdigit() else (1, 0, piece)
+        for piece in re.split(r"(\d+)", str(path))
+        if piece
+    ]
 
 
-def lost_spans(lost: Sequence[LostFile], spans: Mapping[Path, Span], look: Callable[[Path], FileSummary]) -> dict[Path, Span]:
+def lost_spans(
+    lost: Sequence[LostFile], spans: Mapping[Path, Span], look: Callable[[Path], FileSummary]
+) -> dict[Path, Span]:
     """Where the time of the lost files lies, of those that let it be told.
 
-    A lost file fills the time between the files whose names come before and after its own, when these follow each other in
-    time with a gap between them. Otherwise the stamps that a look at the file still shows tell it.
+    A lost file fills the time between the files whose names come before and after its own, when
+    these follow each other in time with a gap between them. Otherwise the stamps that a look at the
+    file still shows tell it.
 
     Parameters
     ----------
@@ -127,7 +134,9 @@ def _ns(stamp: np.datetime64) -> int:
     return int(stamp.astype("datetime64[ns]").astype(np.int64))
 
 
-def lost_attributes(log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Path, Span]) -> xr.Dataset:
+def lost_attributes(
+    log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Path, Span]
+) -> xr.Dataset:
     """The log with notes on the lost files, and their names in ``unreadable_files``."""
     if not lost:
         return log
@@ -135,8 +144,13 @@ def lost_attributes(log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Pa
     for one in lost:
         where = "where no other file has its time, there is a gap"
         if one.path in spans:
-            first, last = (str(np.datetime64(stamp, "ns").astype("datetime64[ms]")) for stamp in spans[one.path])
-            where = f"its time is between {first} and {last}, which is a gap unless another file has it"
+            first, last = (
+                str(np.datetime64(stamp, "ns").astype("datetime64[ms]"))
+                for stamp in spans[one.path]
+            )
+            where = (
+                f"its time is between {first} and {last}, which is a gap unless another file has it"
+            )
         notes.append(f"{one.reason}; the file is left out: {where}")
     return log.assign_attrs(
         notes=[*texts(log, "notes"), *notes],

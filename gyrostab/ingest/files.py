@@ -21,7 +21,14 @@ from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.combine import attach_channels, concatenate, memory, to_disk
 from gyrostab.ingest.concat import concatenate_logs, log_span
-from gyrostab.ingest.damaged_files import LostFile, check_share, is_damage, lost_attributes, lost_spans, reason_of
+from gyrostab.ingest.damaged_files import (
+    LostFile,
+    check_share,
+    is_damage,
+    lost_attributes,
+    lost_spans,
+    reason_of,
+)
 from gyrostab.ingest.formats.binary import has_layout
 from gyrostab.ingest.formats.unread import refuse_unread
 from gyrostab.ingest.options import FileSummary, ReadOptions
@@ -53,7 +60,10 @@ class Reader(Protocol):
 
 @cache
 def _registered() -> dict[str, Any]:
-    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
+    return {
+        point.name: point
+        for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)
+    }
 
 
 def readers() -> tuple[str, ...]:
@@ -78,9 +88,13 @@ def _reader(path: Path) -> Reader:
         if reader.matches(path):
             return reader
     if path.is_dir():
-        raise FormatError(f"{path}: no reader takes this directory; name the files in it, for instance {path / '*.csv'}")
+        raise FormatError(
+            f"{path}: no reader takes this directory; name the files in it, for instance {path / '*.csv'}"
+        )
     what = f"no reader takes this file with the suffix {path.suffix!r}, and it is not text"
-    raise FormatError(f"{path}: {what}; formats are {', '.join(readers())}: save it as one of these")
+    raise FormatError(
+        f"{path}: {what}; formats are {', '.join(readers())}: save it as one of these"
+    )
 
 
 def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
@@ -119,7 +133,8 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
     Returns
     -------
     FileSummary
-        Format, columns, axes, channels, and what is cheap to know of the stamps and the number of rows.
+        Format, columns, axes, channels, and what is cheap to know of the stamps and the number of
+        rows.
 
     Raises
     ------
@@ -167,8 +182,9 @@ def read_log(
     Parameters
     ----------
     paths : path, pattern, or several of them
-        Files are put in the order of their first stamps and joined; an axis or channel that one of them lacks is NaN there.
-        Either raw logs, or regular logs that gyrostab wrote, which become one regular log without being loaded.
+        Files are put in the order of their first stamps and joined; an axis or channel that one of
+        them lacks is NaN there. Either raw logs, or regular logs that gyrostab wrote, which become
+        one regular log without being loaded.
     rate : float, optional
         Sampling rate [Hz] of files without a time column.
     start : str, optional
@@ -184,27 +200,31 @@ def read_log(
     channel : path or sequence of path, optional
         Files with further channels; each keeps its stamps as ``time_<channel>``.
     strict : bool
-        Raise an error for a damaged or missing file. Otherwise one among several is left out with a note, and its time is a gap.
+        Raise an error for a damaged or missing file. Otherwise one among several is left out with a
+        note, and its time is a gap.
     max_gap : str or float
-        Between regular logs, a longer step of time is taken as a step of the clock (raw logs: see `gyrostab.regularise`);
-        a number is in seconds.
+        Between regular logs, a longer step of time is taken as a step of the clock (raw logs: see
+        `gyrostab.regularise`); a number is in seconds.
     limits : mapping of str to float, optional
         Limits of `gyrostab.ingest.limits` with other values, ``{"columns": 50_000}``.
     on_file : callable, optional
-        Called with the number of the file (from 1), the number of files and the path before each file is read.
+        Called with the number of the file (from 1), the number of files and the path before each
+        file is read.
 
     Returns
     -------
     xarray.Dataset
-        The raw log: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree], ``time(row)`` where the file has
-        stamps (NaT where unreadable), channels, and the attributes ``kind``, ``source_files``, ``row_start``, ``notes``,
-        ``unreadable_rows``, ``unreadable_cells``. Regular logs that gyrostab wrote are returned as one such log, lazily.
+        The raw log: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree],
+        ``time(row)`` where the file has stamps (NaT where unreadable), channels, and the attributes
+        ``kind``, ``source_files``, ``row_start``, ``notes``, ``unreadable_rows``,
+        ``unreadable_cells``. Regular logs that gyrostab wrote are returned as one such log, lazily.
         ``unreadable_files`` lists the files that were left out.
 
     Raises
     ------
     FormatError, UnitError, OptionError, TimeError
-        With the file, the place, what is wrong and what to do. `FormatError` also when more than half of the files cannot be read.
+        With the file, the place, what is wrong and what to do. `FormatError` also when more than
+        half of the files cannot be read.
 
     Examples
     --------
@@ -252,13 +272,19 @@ def read_log(
         check_options([*parts.values(), *channels])
         log = concatenate(list(parts.values()))
         if lost and "time" not in log.variables:
-            raise FormatError(f"{lost[0].reason}; the files have no time stamps, so the time of those that follow it is not known: mend it")
+            raise FormatError(
+                f"{lost[0].reason}; the files have no time stamps, so the time of those that follow it is not known: mend it"
+            )
         if spans:
-            log.attrs["unreadable_spans"] = [list(span) for span in spans.values()]  # where regularise will find the gaps
+            log.attrs["unreadable_spans"] = [
+                list(span) for span in spans.values()
+            ]  # where regularise will find the gaps
     return attach_channels(lost_attributes(log, lost, spans), channels)
 
 
-def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None = None) -> tuple[dict[Path, xr.Dataset], list[LostFile]]:
+def _read_all(
+    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None = None
+) -> tuple[dict[Path, xr.Dataset], list[LostFile]]:
     """Read the files one by one; what does not fit into memory together waits on disk."""
     parts: dict[Path, xr.Dataset] = {}
     lost: list[LostFile] = []
@@ -282,7 +308,9 @@ def _read_all(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | Non
     return parts, lost
 
 
-def _ahead(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None) -> Generator[Callable[[], xr.Dataset], None, None]:
+def _ahead(
+    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None
+) -> Generator[Callable[[], xr.Dataset], None, None]:
     """What reads each file; a text file is read already, while the one before it is looked at, as its beginning takes one thread."""
     stop = Event()
     with ThreadPoolExecutor(_TOGETHER, thread_name_prefix="gyrostab-file") as pool:
@@ -292,7 +320,11 @@ def _ahead(paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None) 
                 if on_file is not None:
                     on_file(number, len(paths), path)
                 early = len(paths) > 1 and _is_text(path)
-                waiting.append(pool.submit(_read_text, path, options, stop).result if early else partial(_read, path, options))
+                waiting.append(
+                    pool.submit(_read_text, path, options, stop).result
+                    if early
+                    else partial(_read, path, options)
+                )
                 if len(waiting) == _TOGETHER:
                     yield waiting.popleft()
             while waiting:
@@ -333,7 +365,11 @@ def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Datas
         raise OptionError(
             f"{name} is a regular log of {rate:.10g} Hz, not of {options.rate:.10g} Hz; leave out --rate, or ingest its source anew"
         )
-    idle = [f"--{option}" for option in ("start", "epoch", "map", "unit", "kind") if getattr(options, option)]
+    idle = [
+        f"--{option}"
+        for option in ("start", "epoch", "map", "unit", "kind")
+        if getattr(options, option)
+    ]
     if not idle or options.channel:
         return log
     note = f"{name}: is a regular log already, so {', '.join(idle)} is not used"
@@ -345,5 +381,9 @@ def check_options(parts: Sequence[xr.Dataset]) -> None:
     unmatched = set.intersection(*(set(part.attrs.pop("unmatched_options", ())) for part in parts))
     headers = dict.fromkeys(name for part in parts for name in part.attrs.pop("headers", ()))
     if unmatched:
-        files = ", ".join(dict.fromkeys(name for part in parts for name in part.attrs["source_files"]))
-        raise OptionError(f"{' and '.join(sorted(unmatched))}: no such column in {files}; the columns are {', '.join(headers)}")
+        files = ", ".join(
+            dict.fromkeys(name for part in parts for name in part.attrs["source_files"])
+        )
+        raise OptionError(
+            f"{' and '.join(sorted(unmatched))}: no such column in {files}; the columns are {', '.join(headers)}"
+        )

@@ -33,15 +33,25 @@ def read_frame(
     xarray.Dataset
         Raw log by ``row``, as from `gyrostab.read_log`.
     """
-    table = frame.to_frame("x" if frame.name is None else frame.name) if isinstance(frame, pd.Series) else frame
+    table = (
+        frame.to_frame("x" if frame.name is None else frame.name)
+        if isinstance(frame, pd.Series)
+        else frame
+    )
     if not isinstance(table, pd.DataFrame):
-        raise SchemaError(f"this is a {type(frame).__name__}; give a pandas DataFrame or Series with a DatetimeIndex")
+        raise SchemaError(
+            f"this is a {type(frame).__name__}; give a pandas DataFrame or Series with a DatetimeIndex"
+        )
     index = _check_index(table)
     units = frame.attrs.get("units") if units is None else units
     headers = [str(column) for column in table.columns]
     renamed = dict(map or {})
     if not isinstance(units, Mapping):
-        renamed |= {header: f"gyro_{split_header(header)[0].lower()}" for header in headers if _is_axis_name(split_header(header)[0])}
+        renamed |= {
+            header: f"gyro_{split_header(header)[0].lower()}"
+            for header in headers
+            if _is_axis_name(split_header(header)[0])
+        }
     given = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
     options = ReadOptions(map=renamed, unit=given, kind=kind)
     stamps = index.to_numpy()
@@ -65,11 +75,19 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
     index: Any = table.index
     columns: Any = table.columns
     if not isinstance(index, pd.DatetimeIndex):
-        how = "transpose it: df.T" if isinstance(columns, pd.DatetimeIndex) else "set one: df.set_index(pd.DatetimeIndex(...))"
-        raise SchemaError(f"the index of the DataFrame holds {index.inferred_type}, not times; {how}")
+        how = (
+            "transpose it: df.T"
+            if isinstance(columns, pd.DatetimeIndex)
+            else "set one: df.set_index(pd.DatetimeIndex(...))"
+        )
+        raise SchemaError(
+            f"the index of the DataFrame holds {index.inferred_type}, not times; {how}"
+        )
     index = index.tz_convert("UTC").tz_localize(None) if index.tz is not None else index
     if not index.is_monotonic_increasing:
         values = index.to_numpy()
         at = int(np.argmax(values[1:] < values[:-1]))
-        raise TimeError(f"the index of the DataFrame runs backwards after row {at} ({index[at]}); sort it: df.sort_index()")
+        raise TimeError(
+            f"the index of the DataFrame runs backwards after row {at} ({index[at]}); sort it: df.sort_index()"
+        )
     return pd.DatetimeIndex(index)

@@ -30,7 +30,8 @@ __all__ = [
 #: Rows of the table from which on neighbours of one cause are counted in one row.
 MOST_GAPS = 10_000
 
-#: Columns of the table: first missing sample, first present sample after, samples missing, rows concerned, cause.
+#: Columns of the table: first missing sample, first present sample after, samples missing, rows
+#: concerned, cause.
 COLUMNS = FIRST, END, SAMPLES, ROWS, CAUSE = range(5)
 
 _MISSING, _UNREADABLE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("unreadable")
@@ -52,7 +53,11 @@ def duration(seconds: float) -> str:
 
 def stamp_text(stamp: int) -> str:
     """Write a stamp [ns since 1970] as ISO 8601, to the millisecond."""
-    return "no stamp" if stamp == np.iinfo(np.int64).min else str(np.datetime64(int(stamp), "ns").astype("datetime64[ms]"))
+    return (
+        "no stamp"
+        if stamp == np.iinfo(np.int64).min
+        else str(np.datetime64(int(stamp), "ns").astype("datetime64[ms]"))
+    )
 
 
 def thinned(table: NDArray[np.int64], most: int = MOST_GAPS) -> NDArray[np.int64]:
@@ -65,7 +70,9 @@ def thinned(table: NDArray[np.int64], most: int = MOST_GAPS) -> NDArray[np.int64
         room = max(1, int(most * len(part) / len(table)))
         if len(part) > room and cause not in _NEVER_THINNED:
             distance = part[1:, FIRST] - part[:-1, END]
-            at = np.concatenate([[0], np.sort(np.argsort(distance, kind="stable")[len(distance) - room + 1 :]) + 1])
+            at = np.concatenate(
+                [[0], np.sort(np.argsort(distance, kind="stable")[len(distance) - room + 1 :]) + 1]
+            )
             last = np.append(at[1:], len(part)) - 1
             sums = np.add.reduceat(part[:, [SAMPLES, ROWS]], at, axis=0)
             part = np.column_stack([part[at, FIRST], part[last, END], sums, part[at, CAUSE]])
@@ -86,12 +93,17 @@ def clip_table(table: NDArray[np.int64], low: int, high: int) -> NDArray[np.int6
     kept = np.where(event, (table[:, FIRST] >= low) & (table[:, FIRST] < high), end > first)
     out = table[kept].copy()
     cut = (end - first)[kept] < out[:, END] - out[:, FIRST]
-    out[:, FIRST], out[:, END] = np.where(event, table[:, FIRST], first)[kept], np.where(event, table[:, END], end)[kept]
+    out[:, FIRST], out[:, END] = (
+        np.where(event, table[:, FIRST], first)[kept],
+        np.where(event, table[:, END], end)[kept],
+    )
     out[cut, SAMPLES] = np.minimum(out[:, SAMPLES], out[:, END] - out[:, FIRST])[cut]
     return out
 
 
-def name_lost(table: NDArray[np.int64], spans: Iterable[Iterable[int]], start: int, rate: float) -> NDArray[np.int64]:
+def name_lost(
+    table: NDArray[np.int64], spans: Iterable[Iterable[int]], start: int, rate: float
+) -> NDArray[np.int64]:
     """The table with the cause of those gaps changed to "unreadable" that files leave which could not be read.
 
     Parameters
@@ -108,19 +120,32 @@ def name_lost(table: NDArray[np.int64], spans: Iterable[Iterable[int]], start: i
         low, high = grid_index(start, rate, np.asarray(list(span)))
         shared = np.minimum(table[:, END], high) - np.maximum(table[:, FIRST], low)
         length = table[:, END] - table[:, FIRST]
-        belongs = (table[:, CAUSE] == _MISSING) & (shared > 0) & (shared >= 0.5 * np.minimum(length, high - low))
+        belongs = (
+            (table[:, CAUSE] == _MISSING)
+            & (shared > 0)
+            & (shared >= 0.5 * np.minimum(length, high - low))
+        )
         table[belongs, CAUSE] = _UNREADABLE
     return table
 
 
 def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str, Any]:
     """Variables of the table of gaps, for a log that starts at `start` [ns] with `rate` [Hz]."""
-    flags = {"flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8), "flag_meanings": " ".join(GAP_CAUSES)}
-    first, end = (grid_times(start, rate, table[:, column]).view("datetime64[ns]") for column in (FIRST, END))
+    flags = {
+        "flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8),
+        "flag_meanings": " ".join(GAP_CAUSES),
+    }
+    first, end = (
+        grid_times(start, rate, table[:, column]).view("datetime64[ns]") for column in (FIRST, END)
+    )
     return {
         "gap_start": ("gap", first, {"long_name": "first missing sample"}),
         "gap_end": ("gap", end, {"long_name": "first present sample after the gap"}),
         "gap_samples": ("gap", table[:, SAMPLES], {"long_name": "samples missing", "units": "1"}),
         "gap_rows": ("gap", table[:, ROWS], {"long_name": "rows concerned", "units": "1"}),
-        "gap_cause": ("gap", table[:, CAUSE].astype(np.int8), {"long_name": "cause of the gap", **flags}),
+        "gap_cause": (
+            "gap",
+            table[:, CAUSE].astype(np.int8),
+            {"long_name": "cause of the gap", **flags},
+        ),
     }

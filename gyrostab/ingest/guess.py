@@ -1,12 +1,14 @@
 """A guess at what the columns of a file are: which three are the gyro, their unit, and the time.
 
-Names and units decide where there are any, and the numbers where there are none. The bounds come from physics and from the market:
+Names and units decide where there are any, and the numbers where there are none. The bounds come
+from physics and from the market:
 
 - a gyro at rest turns with the Earth, 15.04 deg/h (7.292e-5 rad/s; IERS conventions 2010, table 1.2), so the mean of three axes is that
   much or more, and that of one axis of a fine gyro is not more;
 - the largest range of gyros on the market is 4000 deg/s (automotive and sports MEMS);
 - angle random walk goes from 3e-4 deg/sqrt(h) (laser gyros) to 10 deg/sqrt(h) (the noisiest MEMS); that of the usual MEMS parts is
-  0.1 to 1 deg/sqrt(h) (IEEE Std 952, and the data sheets of the recordings that are named in docs/real-recordings.md).
+  0.1 to 1 deg/sqrt(h) (IEEE Std 952, and the data sheets of the recordings that are named in
+  docs/real-recordings.md).
 """
 
 from __future__ import annotations
@@ -39,15 +41,26 @@ TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
 #: What a group of columns must score to be called the gyro: one sign in its name, or its unit.
 LEAST_SCORE = 1.5
 
-_STRONG = re.compile(r"gyr|omega|ang(ular)?[ _.]?(rate|vel)|rot(ation)?[ _.]?(rate|vel)|turn[ _.]?rate|uncompgyro")
+_STRONG = re.compile(
+    r"gyr|omega|ang(ular)?[ _.]?(rate|vel)|rot(ation)?[ _.]?(rate|vel)|turn[ _.]?rate|uncompgyro"
+)
 _LETTER = re.compile(r"(^|[^a-z])[wg]_?\*|w_rs_s_\*|(^|[^a-z])rate|^\*?j\*$")
 _OTHER = re.compile(
     r"acc|(^|[^a-z])[amft]_?\*|mag|quat|pos|euler|orient|gps|temp|press|cov|force|free|linear|lat|lon|field|torque|curr|volt|batt|state"
 )
-_DERIVED = re.compile(r"est|pred|filt|ref|bias|cal|std|var|noise|err|setpoint|sp_|integral|delta|dt|ramp|theta|incr")
+_DERIVED = re.compile(
+    r"est|pred|filt|ref|bias|cal|std|var|noise|err|setpoint|sp_|integral|delta|dt|ramp|theta|incr"
+)
 _TIME_WORD = re.compile(r"time|stamp|tow|clock|epoch|elapsed|seconds|(^|[^a-z])t($|[^a-z])|sec$")
-_COUNTER_WORD = re.compile(r"count|packet|seq|index|sample|(^|[^a-z])(n|no|nr|id|row|frame)($|[^a-z])")
-_EPOCHS = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}  # Unix time between 2001 and 2033 is 1 to 2 of these
+_COUNTER_WORD = re.compile(
+    r"count|packet|seq|index|sample|(^|[^a-z])(n|no|nr|id|row|frame)($|[^a-z])"
+)
+_EPOCHS = {
+    "s": 1e9,
+    "ms": 1e12,
+    "us": 1e15,
+    "ns": 1e18,
+}  # Unix time between 2001 and 2033 is 1 to 2 of these
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _AXES = {**{a: a for a in "xyz"}, **dict(zip("012", "xyz", strict=True)), "pqr": "xyz"}
 
@@ -56,9 +69,9 @@ _AXES = {**{a: a for a in "xyz"}, **dict(zip("012", "xyz", strict=True)), "pqr":
 class Guess:
     """What the columns are taken for; each part says why.
 
-    `axes` are the columns of the gyro by axis (empty when none looks like one); `unit` has to be given for them, None when they
-    carry one; `time` and `time_unit` likewise; `rate` [Hz] is given where there is no time. `sampling_rate_hz` is the rate that
-    was taken for the guess.
+    `axes` are the columns of the gyro by axis (empty when none looks like one); `unit` has to be
+    given for them, None when they carry one; `time` and `time_unit` likewise; `rate` [Hz] is given
+    where there is no time. `sampling_rate_hz` is the rate that was taken for the guess.
     """
 
     axes: dict[str, ColumnLook]
@@ -72,7 +85,13 @@ class Guess:
     sampling_rate_hz: float = math.nan
 
 
-def guess_columns(look: FileInspection, *, rate: float | None = None, rate_hint: float | None = None, angles: bool = False) -> Guess:
+def guess_columns(
+    look: FileInspection,
+    *,
+    rate: float | None = None,
+    rate_hint: float | None = None,
+    angles: bool = False,
+) -> Guess:
     """Guess what the columns of a file are.
 
     Parameters
@@ -97,25 +116,38 @@ def guess_columns(look: FileInspection, *, rate: float | None = None, rate_hint:
     assumed = None
     if look.time is None and time is None and rate is None:
         assumed = rate_hint or TYPICAL_RATE_HZ
-        told = "is named in the file" if rate_hint else "is an assumption, as the file holds no time: put the true rate in its place"
+        told = (
+            "is named in the file"
+            if rate_hint
+            else "is an assumption, as the file holds no time: put the true rate in its place"
+        )
         (reasons if rate_hint else warnings).append(f"--rate {assumed:g} {told}")
-    sampling = rate or assumed or (1.0 / (time.pace * _seconds(time_unit)) if time is not None else look.rate_hz)
+    sampling = (
+        rate
+        or assumed
+        or (1.0 / (time.pace * _seconds(time_unit)) if time is not None else look.rate_hz)
+    )
     axes = _guess_axes(look, time, reasons)
     unit = None
     if axes and not all(_given_unit(column) for column in axes.values()):
         unit = _guess_unit(look, axes, sampling, reasons, warnings, angles=angles)
     if not axes:
-        warnings.append("no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s")
+        warnings.append(
+            "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
+        )
     taken = {column.key for column in axes.values()}
     temperature = next((c for c in look.columns if c.key not in taken and _is_temperature(c)), None)
-    return Guess(axes, unit, time, time_unit, assumed, temperature, tuple(reasons), tuple(warnings), sampling)
+    return Guess(
+        axes, unit, time, time_unit, assumed, temperature, tuple(reasons), tuple(warnings), sampling
+    )
 
 
 def _seconds(unit: str | None) -> float:
     return _SECONDS.get(unit or "s", 1.0)
 
 
-# --- the time ----------------------------------------------------------------------------------------------------
+# --- the time
+# ----------------------------------------------------------------------------------------------------
 
 
 def _guess_time(look: FileInspection, reasons: list[str]) -> tuple[ColumnLook | None, str | None]:
@@ -131,7 +163,11 @@ def _guess_time(look: FileInspection, reasons: list[str]) -> tuple[ColumnLook | 
             continue
         low = column.key.lower()
         named = bool(TIME.match(low) or _TIME_WORD.search(low))
-        counter = column.whole and abs(column.pace - 1.0) < 1e-6 and abs(column.std - look.rows / math.sqrt(12)) < 0.1 * look.rows
+        counter = (
+            column.whole
+            and abs(column.pace - 1.0) < 1e-6
+            and abs(column.std - look.rows / math.sqrt(12)) < 0.1 * look.rows
+        )
         if not named and (counter or _COUNTER_WORD.search(low)):
             continue
         unit, why = _time_unit(column)
@@ -165,14 +201,21 @@ def _rate_distance(column: ColumnLook, unit: str) -> float:
     return abs(math.log10(1.0 / (column.pace * _seconds(unit)) / TYPICAL_RATE_HZ)) / RATE_DECADES
 
 
-# --- the axes ----------------------------------------------------------------------------------------------------
+# --- the axes
+# ----------------------------------------------------------------------------------------------------
 
 
-def _guess_axes(look: FileInspection, time: ColumnLook | None, reasons: list[str]) -> dict[str, ColumnLook]:
+def _guess_axes(
+    look: FileInspection, time: ColumnLook | None, reasons: list[str]
+) -> dict[str, ColumnLook]:
     known = {column.name.lower(): column for column in look.columns if column.role == "gyro"}
     if known:
         return {AXIS.sub(r"\2", name): column for name, column in known.items()}
-    usable = [c for c in look.columns if c is not time and c.rows >= 0.25 * look.rows and c.std > 0 and _may_be_gyro(c)]
+    usable = [
+        c
+        for c in look.columns
+        if c is not time and c.rows >= 0.25 * look.rows and c.std > 0 and _may_be_gyro(c)
+    ]
     groups = list(_groups(usable))
     steady = [_steadiness(list(group.values())) for _, group in groups]
     best: tuple[float, dict[str, ColumnLook]] | None = None
@@ -180,13 +223,17 @@ def _guess_axes(look: FileInspection, time: ColumnLook | None, reasons: list[str
         score = _score(template, list(group.values()), look)
         others = [other for other in steady if other is not own]
         if others and len(group) == 3:
-            score += 0.75 if own <= min(others) else -0.75 if own > max(others) else 0.0  # gravity makes an accelerometer steady
+            score += (
+                0.75 if own <= min(others) else -0.75 if own > max(others) else 0.0
+            )  # gravity makes an accelerometer steady
         if score >= LEAST_SCORE and (best is None or score > best[0]):
             best = score, group
     if best is None:
         return {}
     names = ", ".join(column.key for column in best[1].values())
-    named = _STRONG.search(names.lower()) or any(_given_unit(column) or _name_unit(column, "rate") for column in best[1].values())
+    named = _STRONG.search(names.lower()) or any(
+        _given_unit(column) or _name_unit(column, "rate") for column in best[1].values()
+    )
     reasons.append(f"{names}: the gyro, by {'name' if named else 'name and numbers'}")
     return best[1]
 
@@ -196,11 +243,14 @@ def _may_be_gyro(column: ColumnLook) -> bool:
     if column.unit is not None and is_unit_of(column.unit, ("rate", "angle", "number")):
         return True
     if column.unit is not None and any(
-        is_unit_of(column.unit, (kind,)) for kind in ("acceleration", "temperature", "magnetic", "pressure")
+        is_unit_of(column.unit, (kind,))
+        for kind in ("acceleration", "temperature", "magnetic", "pressure")
     ):
         return False
     kinds = ("acceleration", "temperature", "magnetic", "pressure", "voltage")
-    return _name_unit(column, "rate") is not None or not any(_name_unit(column, kind) for kind in kinds)
+    return _name_unit(column, "rate") is not None or not any(
+        _name_unit(column, kind) for kind in kinds
+    )
 
 
 def _groups(columns: Sequence[ColumnLook]) -> Iterator[tuple[str, dict[str, ColumnLook]]]:
@@ -215,8 +265,18 @@ def _groups(columns: Sequence[ColumnLook]) -> Iterator[tuple[str, dict[str, Colu
         for trio in ("xyz", "XYZ", "pqr", "ENZ"):
             if len(letters & set(trio)) >= 2 and (trio != "pqr" or template == "*"):
                 axes = trio.lower() if trio in ("ENZ",) else "xyz"
-                yield template, {axis: found[letter] for letter, axis in zip(trio, axes, strict=True) if letter in found}
-        digits = sorted(((int(text), column) for text, column in found.items() if text.isdigit()), key=lambda pair: pair[0])
+                yield (
+                    template,
+                    {
+                        axis: found[letter]
+                        for letter, axis in zip(trio, axes, strict=True)
+                        if letter in found
+                    },
+                )
+        digits = sorted(
+            ((int(text), column) for text, column in found.items() if text.isdigit()),
+            key=lambda pair: pair[0],
+        )
         digits = [(number, column) for number, column in digits if column.rising < 0.9]
         for place in range(0, len(digits) - 2, 3 if len(digits) % 3 == 0 else 1):
             numbers, trio_columns = zip(*digits[place : place + 3], strict=True)
@@ -226,7 +286,10 @@ def _groups(columns: Sequence[ColumnLook]) -> Iterator[tuple[str, dict[str, Colu
         if not column.key.isdigit():
             letter = re.search(r"[xyzXYZ](?![a-zA-Z])", column.key)
             place = letter.start() if letter else len(column.key)
-            yield f"{column.key[:place]}*{column.key[place + 1 :]}", {letter[0].lower() if letter else "x": column}
+            yield (
+                f"{column.key[:place]}*{column.key[place + 1 :]}",
+                {letter[0].lower() if letter else "x": column},
+            )
 
 
 def _score(template: str, group: Sequence[ColumnLook], look: FileInspection) -> float:
@@ -236,8 +299,18 @@ def _score(template: str, group: Sequence[ColumnLook], look: FileInspection) -> 
         score = 4.0
     else:
         score = 2.5 * any(_name_unit(column, "rate") for column in group)
-        score += 1.0 * any(_name_unit(column, "angle") is not None for column in group) * bool(_STRONG.search(low))
-    score += 3.0 if _STRONG.search(low) else 2.0 if _LETTER.search(low) or re.search(r"(^|\.)[A-Z]J(\*|\w)", template) else 0.0
+        score += (
+            1.0
+            * any(_name_unit(column, "angle") is not None for column in group)
+            * bool(_STRONG.search(low))
+        )
+    score += (
+        3.0
+        if _STRONG.search(low)
+        else 2.0
+        if _LETTER.search(low) or re.search(r"(^|\.)[A-Z]J(\*|\w)", template)
+        else 0.0
+    )
     score -= 4.0 if _OTHER.search(low) and not _STRONG.search(low) else 0.0
     score -= 1.0 if _DERIVED.search(low) else 0.0
     score += 0.5 * (len(group) - 1)
@@ -245,7 +318,10 @@ def _score(template: str, group: Sequence[ColumnLook], look: FileInspection) -> 
         scatters = [column.scatter for column in group]
         score += 0.5 if max(scatters) < 30 * max(min(scatters), 1e-30) else -0.5
         norm = math.hypot(*(column.mean for column in group))
-        if any(abs(norm / gravity - 1) < 0.05 for gravity in (9.80665, 1.0)) and _steadiness(group) > 10:
+        if (
+            any(abs(norm / gravity - 1) < 0.05 for gravity in (9.80665, 1.0))
+            and _steadiness(group) > 10
+        ):
             score -= 3.0  # an accelerometer at rest, in m/s^2 or g
     if any(column.rising > 0.9 or column.held > 0.98 for column in group):
         score -= 3.0  # a counter, or a state
@@ -256,10 +332,13 @@ def _score(template: str, group: Sequence[ColumnLook], look: FileInspection) -> 
 
 def _steadiness(group: Sequence[ColumnLook]) -> float:
     """Mean over scatter."""
-    return math.hypot(*(c.mean for c in group)) / max(math.hypot(*(c.scatter for c in group)), 1e-300)
+    return math.hypot(*(c.mean for c in group)) / max(
+        math.hypot(*(c.scatter for c in group)), 1e-300
+    )
 
 
-# --- the unit ----------------------------------------------------------------------------------------------------
+# --- the unit
+# ----------------------------------------------------------------------------------------------------
 
 
 def _given_unit(column: ColumnLook) -> bool:
@@ -268,12 +347,20 @@ def _given_unit(column: ColumnLook) -> bool:
 
 def _name_unit(column: ColumnLook, quantity: str) -> str | None:
     """The unit that the end of a name says, ``deg/h`` of ``gx_deg_per_h``."""
-    tokens = [token for token in re.split(r"[\s_./\-]+", re.sub(r"\[\d+\]$", "", column.key)) if token]
+    tokens = [
+        token for token in re.split(r"[\s_./\-]+", re.sub(r"\[\d+\]$", "", column.key)) if token
+    ]
     for count in range(min(4, len(tokens) - 1), 0, -1):
         last = tokens[-count:]
         for text in (" ".join(last), "/".join(last)):
             if len(text) > 1 or text in ("C", "K", "F", "g", "V", "T", "G"):
-                text = text.replace("degs", "deg/s") if text == "degs" else "rad/s" if text == "rads" else text
+                text = (
+                    text.replace("degs", "deg/s")
+                    if text == "degs"
+                    else "rad/s"
+                    if text == "rads"
+                    else text
+                )
                 if is_unit_of(text, (quantity,)) and text not in ("1", "-"):
                     return parse_unit(text, quantity).text.replace(" per ", "/")
     return None
@@ -292,7 +379,13 @@ def temperature_unit(column: ColumnLook) -> str:
 
 
 def _guess_unit(
-    look: FileInspection, axes: dict[str, ColumnLook], rate: float, reasons: list[str], warnings: list[str], *, angles: bool
+    look: FileInspection,
+    axes: dict[str, ColumnLook],
+    rate: float,
+    reasons: list[str],
+    warnings: list[str],
+    *,
+    angles: bool,
 ) -> str:
     group = list(axes.values())
     for column in group:
@@ -303,25 +396,42 @@ def _guess_unit(
             reasons.append(f"unit {named}, by name")
             return named
     if angles:
-        warnings.append("nothing says the unit of the angles; deg is an assumption, put the true one in its place")
+        warnings.append(
+            "nothing says the unit of the angles; deg is an assumption, put the true one in its place"
+        )
         return "deg"
-    counts = [*(c.unit for c in group if c.unit), *(c.key for c in group if re.search(r"count|lsb|raw", c.key.lower()))]
-    large = look.summary.format == "miniseed" and max(max(abs(c.low), abs(c.high)) for c in group) > 10.0
+    counts = [
+        *(c.unit for c in group if c.unit),
+        *(c.key for c in group if re.search(r"count|lsb|raw", c.key.lower())),
+    ]
+    large = (
+        look.summary.format == "miniseed"
+        and max(max(abs(c.low), abs(c.high)) for c in group) > 10.0
+    )
     if counts or large or all(c.whole for c in group):
         return _scale_of_counts(group, reasons, warnings)
     means = np.array([c.mean for c in group])
     scatter = float(np.median([c.scatter for c in group]))
     top = max(max(abs(c.low), abs(c.high)) for c in group)
-    scores = {unit: rate_plausibility(means, scatter, top, parse_unit(unit).factor, rate) for unit in ("rad/s", "deg/s", "deg/h")}
+    scores = {
+        unit: rate_plausibility(means, scatter, top, parse_unit(unit).factor, rate)
+        for unit in ("rad/s", "deg/s", "deg/h")
+    }
     unit = max(scores, key=lambda unit: scores[unit])
     factor = parse_unit(unit).factor
     walk = scatter * factor / (60.0 * math.sqrt(rate)) if rate > 0 else math.nan
-    reasons.append(f"unit {unit}, by the noise: {walk:.2g} deg/sqrt(h); the mean is {np.linalg.norm(means) * factor:.4g} deg/h")
-    warnings.append(f"the unit {unit} is a guess from the numbers, as the file says none; check it with the data sheet")
+    reasons.append(
+        f"unit {unit}, by the noise: {walk:.2g} deg/sqrt(h); the mean is {np.linalg.norm(means) * factor:.4g} deg/h"
+    )
+    warnings.append(
+        f"the unit {unit} is a guess from the numbers, as the file says none; check it with the data sheet"
+    )
     return unit
 
 
-def rate_plausibility(means: np.ndarray, scatter: float, top: float, factor: float, rate: float) -> float:
+def rate_plausibility(
+    means: np.ndarray, scatter: float, top: float, factor: float, rate: float
+) -> float:
     """How well a unit of `factor` deg/h fits the numbers of a gyro, as a logarithm."""
     if top * factor > MAX_RATE_DPH:
         return -math.inf
@@ -329,7 +439,8 @@ def rate_plausibility(means: np.ndarray, scatter: float, top: float, factor: flo
     score = -((math.log10(walk / TYPICAL_ARW) / ARW_DECADES) ** 2) / 2
     norm = float(np.linalg.norm(means)) * factor
     if len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_TOLERANCE:
-        score += 4.0  # the rotation of the Earth; by chance 0.04 of 4 ln 10 in the logarithm, which is e^-5
+        # the rotation of the Earth; by chance 0.04 of 4 ln 10 in the logarithm, which is e^-5
+        score += 4.0
     elif len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_NEIGHBOURHOOD:
         score += 2.0  # with a bias of some deg/h; by chance 0.6 of 4 ln 10, which is e^-3
     elif len(means) == 3 and norm < 0.5 * EARTH_RATE_DPH:
@@ -343,15 +454,26 @@ def _scale_of_counts(group: Sequence[ColumnLook], reasons: list[str], warnings: 
     if len(group) == 3 and norm > 0:
         per_count = EARTH_RATE_DPH / norm  # deg/h = arcsec/s
         decade = 10.0 ** math.floor(math.log10(per_count))
-        round_one = min((digit * decade for digit in (1.0, 2.0, 2.5, 5.0, 10.0)), key=lambda scale: abs(math.log(scale / per_count)))
+        round_one = min(
+            (digit * decade for digit in (1.0, 2.0, 2.5, 5.0, 10.0)),
+            key=lambda scale: abs(math.log(scale / per_count)),
+        )
         if abs(round_one / per_count - 1) < EARTH_TOLERANCE:
-            reasons.append(f"{round_one:g} arcsec/s a count, as the mean of the three axes is then the rotation of the Earth")
-            warnings.append(f"the scale of {round_one:g} arcsec/s a count is a guess; put that of the data sheet in its place")
+            reasons.append(
+                f"{round_one:g} arcsec/s a count, as the mean of the three axes is then the rotation of the Earth"
+            )
+            warnings.append(
+                f"the scale of {round_one:g} arcsec/s a count is a guess; put that of the data sheet in its place"
+            )
             return f"{round_one:g} arcsec/s"
     earth = EARTH_RATE_DPH / parse_unit("rad/s").factor
     exponent = math.floor(math.log10(earth / norm)) if norm > 0 else -9
     unit = "nrad/s" if exponent == -9 else f"1e{exponent:d} rad/s"
     text = f"1 {unit}" if unit == "nrad/s" else unit
-    reasons.append(f"{text} a count is the largest decimal scale at which the mean is not more than the rotation of the Earth")
-    warnings.append(f"the columns are counts, and nothing in the file says how much one is: put the scale of the data sheet for {text}")
+    reasons.append(
+        f"{text} a count is the largest decimal scale at which the mean is not more than the rotation of the Earth"
+    )
+    warnings.append(
+        f"the columns are counts, and nothing in the file says how much one is: put the scale of the data sheet for {text}"
+    )
     return text

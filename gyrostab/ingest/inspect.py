@@ -22,13 +22,15 @@ __all__ = ["ColumnLook", "FileInspection", "inspect_file"]
 MOST_COLUMNS = 100
 #: Rows that are looked at together.
 CHUNK_ROWS = 2**18
-#: Share of whole numbers above which a column is of counts: junk in the first rows makes no difference.
+#: Share of whole numbers above which a column is of counts: junk in the first rows makes no
+#: difference.
 WHOLE_SHARE = 0.999
 #: Numbers of this size are fillers: the squares of smaller ones can be summed.
 MOST_SIZE = 1e100
 #: Blocks of a chunk in which the mean step is taken.
 PACES = 64
-# Median of |x - y| of two normal values with one standard deviation: sqrt(2) times 0.6745, the upper quartile of the normal law.
+# Median of |x - y| of two normal values with one standard deviation: sqrt(2) times 0.6745, the
+# upper quartile of the normal law.
 _MEDIAN_STEP = 0.6745 * math.sqrt(2.0)
 
 
@@ -36,9 +38,10 @@ _MEDIAN_STEP = 0.6745 * math.sqrt(2.0)
 class ColumnLook:
     """What one column holds; the numbers are in the unit of the file, NaN where the column holds no numbers.
 
-    `scatter` is the standard deviation of a sample about its neighbours, by the median of the steps; `held` is the share of
-    samples equal to the one before, `rising` the share of steps upwards, `pace` the mean step by the median of blocks, `rows` the
-    filled ones, and `rate_hz` how many of them there are in a second, NaN where no time is known.
+    `scatter` is the standard deviation of a sample about its neighbours, by the median of the
+    steps; `held` is the share of samples equal to the one before, `rising` the share of steps
+    upwards, `pace` the mean step by the median of blocks, `rows` the filled ones, and `rate_hz` how
+    many of them there are in a second, NaN where no time is known.
     """
 
     key: str
@@ -103,16 +106,30 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     """
     path, options = Path(path), options or ReadOptions()
     summary = scan_file(path, options)
-    time = next((column for column in summary.columns if column.role == "time" and column.unit is not None), None)
+    time = next(
+        (column for column in summary.columns if column.role == "time" and column.unit is not None),
+        None,
+    )
     others = [column for column in summary.columns if column is not time]
     names = {f"column_{place}": column for place, column in enumerate(others[:MOST_COLUMNS])}
     chosen = {column.key: f"{name} [1]" for name, column in names.items()}
     chosen.update({column.key: "-" for column in others[MOST_COLUMNS:]})
     if time is not None:
         chosen[time.key] = "time" if time.unit == "ISO 8601" else f"time [{time.unit}]"
-        if time.key == "time" and "time" not in options.map:  # stamps of the format, which no option names
+        if (
+            time.key == "time" and "time" not in options.map
+        ):  # stamps of the format, which no option names
             del chosen[time.key]
-    reading = replace(options, map=chosen, unit={}, rate=1.0, start=None, channels_only=True, channel=(), kind=None)
+    reading = replace(
+        options,
+        map=chosen,
+        unit={},
+        rate=1.0,
+        start=None,
+        channels_only=True,
+        channel=(),
+        kind=None,
+    )
     try:
         log = _read(path, reading)
     except GyrostabError as error:
@@ -120,7 +137,11 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     columns = [_look(column, log, name) for name, column in names.items()]
     if not any(column.rows for column in columns):
         raise FormatError(f"{path.name}: there is no number in any of its columns; is it a log?")
-    notes = [f"{len(others) - MOST_COLUMNS} further columns are not looked into"] if len(others) > MOST_COLUMNS else []
+    notes = (
+        [f"{len(others) - MOST_COLUMNS} further columns are not looked into"]
+        if len(others) > MOST_COLUMNS
+        else []
+    )
     rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
     return FileInspection(summary, tuple(columns), rows, time, _row_rate(log, "row"), tuple(notes))
 
@@ -149,13 +170,24 @@ def _paces(values: NDArray[np.float64]) -> list[float]:
 def _chunks(variable: xr.DataArray) -> Iterator[NDArray[np.float64]]:
     dim = str(variable.dims[0])
     for start in range(0, variable.size, CHUNK_ROWS):
-        values = np.asarray(variable.isel({dim: slice(start, start + CHUNK_ROWS)}).values, dtype=np.float64)
+        values = np.asarray(
+            variable.isel({dim: slice(start, start + CHUNK_ROWS)}).values, dtype=np.float64
+        )
         yield values[np.abs(values) < MOST_SIZE]
 
 
 def _look(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnLook:
     counts: dict[str, Any] = dict.fromkeys(("rows", "steps", "same", "up"), 0)
-    low, high, total, squares, origin, first, last, whole = math.inf, -math.inf, 0.0, 0.0, 0.0, math.nan, math.nan, 0
+    low, high, total, squares, origin, first, last, whole = (
+        math.inf,
+        -math.inf,
+        0.0,
+        0.0,
+        0.0,
+        math.nan,
+        math.nan,
+        0,
+    )
     scatters: list[tuple[float, int]] = []
     paces: list[float] = []
     for values in _chunks(log[name]) if name in log.data_vars else ():
@@ -176,11 +208,17 @@ def _look(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnLook:
         counts["up"] += int((steps > 0).sum())
         if steps.size:
             typical = float(np.median(np.abs(steps))) / _MEDIAN_STEP
-            scatters.append((typical or float(np.sqrt(np.mean(steps**2) / 2)), steps.size))  # most samples may be held
+            scatters.append(
+                (typical or float(np.sqrt(np.mean(steps**2) / 2)), steps.size)
+            )  # most samples may be held
     rows, steps_seen = counts["rows"], max(1, counts["steps"])
     mean = origin + total / rows if rows else math.nan
     variance = squares / rows - (total / rows) ** 2 if rows else math.nan
-    scatter = sum(size * weight for size, weight in scatters) / sum(weight for _, weight in scatters) if scatters else math.nan
+    scatter = (
+        sum(size * weight for size, weight in scatters) / sum(weight for _, weight in scatters)
+        if scatters
+        else math.nan
+    )
     dim = str(log[name].dims[0]) if name in log.data_vars else "row"
     filled = rows / max(1, log.sizes.get(dim, 1))
     return ColumnLook(

@@ -1,7 +1,8 @@
 """The limits of what a reader does for the bytes that are there, each with its reason and the option that lifts it.
 
-Every reader knows rows, columns and bytes of a file before it reads values, and the regularisation knows rows and samples
-before it lays out the grid. They compare these numbers with the limits here, so a damaged or absurd file ends in one message.
+Every reader knows rows, columns and bytes of a file before it reads values, and the regularisation
+knows rows and samples before it lays out the grid. They compare these numbers with the limits here,
+so a damaged or absurd file ends in one message.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ LIMITS: Mapping[str, Limit] = {
     ),
 }
 
-#: Samples of the grid for each row, and samples claimed for each byte present, that are in proportion; see `LIMITS`.
+#: Samples of the grid for each row, and samples claimed for each byte present, that are in
+#: proportion; see `LIMITS`.
 GRID_SAMPLES_PER_ROW = 100
 STORED_SAMPLES_PER_BYTE = 1000
 
@@ -94,11 +96,15 @@ def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
     found = {}
     for name, text in (given or {}).items():
         if name not in LIMITS:
-            raise OptionError(f"--limit {name}: there is no such limit; the limits are {', '.join(LIMITS)}")
+            raise OptionError(
+                f"--limit {name}: there is no such limit; the limits are {', '.join(LIMITS)}"
+            )
         try:
             found[name] = float(text)
         except (TypeError, ValueError) as error:
-            raise OptionError(f"--limit {name}={text}: give a number of {LIMITS[name].unit}") from error
+            raise OptionError(
+                f"--limit {name}={text}: give a number of {LIMITS[name].unit}"
+            ) from error
         if not found[name] > 0:
             raise OptionError(f"--limit {name}={text}: give a number above 0")
     return found
@@ -165,7 +171,9 @@ def bytes_present(path: Path) -> int:
     return total
 
 
-def check_stored(path: Path, rows: int, columns: int, given: Mapping[str, float] | None = None) -> None:
+def check_stored(
+    path: Path, rows: int, columns: int, given: Mapping[str, float] | None = None
+) -> None:
     """Refuse a file that claims far more samples than its bytes can hold.
 
     Parameters
@@ -208,7 +216,9 @@ def check_columns(path: Path, columns: int, given: Mapping[str, float] | None = 
         )
 
 
-def check_chunk(path: Path, name: str, chunk_bytes: int, given: Mapping[str, float] | None = None) -> None:
+def check_chunk(
+    path: Path, name: str, chunk_bytes: int, given: Mapping[str, float] | None = None
+) -> None:
     """Refuse a variable whose chunks are too large to be decoded in memory.
 
     Raises

@@ -31,7 +31,8 @@ def make_log(
     Parameters
     ----------
     values : array_like, shape (time,) or (axis, time)
-        Rotation rate or cumulative angle; NaN marks a missing sample. numpy or dask, float or integer.
+        Rotation rate or cumulative angle; NaN marks a missing sample. numpy or dask, float or
+        integer.
     rate : float
         Sampling rate [Hz].
     unit : str
@@ -70,16 +71,23 @@ def make_log(
     if parsed.quantity != kind:
         raise OptionError(f"unit {unit!r} is a unit of {parsed.quantity}, but kind is {kind!r}")
     data = values if hasattr(values, "ndim") else np.asarray(values)
-    packing = {"dtype": data.dtype, "scale_factor": parsed.factor} if data.dtype.kind in "iu" else {}
+    packing = (
+        {"dtype": data.dtype, "scale_factor": parsed.factor} if data.dtype.kind in "iu" else {}
+    )
     data = data[None, :] if data.ndim == 1 else data
     names = list(axis) if axis is not None else list("xyz")[: data.shape[0]]
     if data.ndim != 2 or len(names) != data.shape[0]:
-        raise OptionError(f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, time) and one name per axis")
+        raise OptionError(
+            f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, time) and one name per axis"
+        )
     if parsed.factor != 1.0:
         data = data * parsed.factor
     check_span(stamp_ns(start), rate, data.shape[1], "make_log")
     coordinates = time_coordinate(stamp_ns(start), rate, data.shape[1])
-    attrs = {"units": SIGNAL_UNITS[kind], "long_name": "rotation rate" if kind == "rate" else "angle"}
+    attrs = {
+        "units": SIGNAL_UNITS[kind],
+        "long_name": "rotation rate" if kind == "rate" else "angle",
+    }
     log = xr.Dataset(
         {kind: (("axis", "time"), data, attrs, packing)},
         coords=coordinates,

@@ -28,12 +28,15 @@ class ReadOptions:
     epoch : str, optional
         Zero of a numeric time column (ISO 8601, UTC); 1970-01-01 when not given.
     map : mapping of str to str
-        Header name -> contract name, with a unit if wanted: ``{"wx": "gyro_x [deg/s]"}``. ``""`` or ``"-"`` drops the column.
-        Files without a header row are mapped by column number counted from 0: ``{"1": "gyro_x"}``.
+        Header name -> contract name, with a unit if wanted: ``{"wx": "gyro_x [deg/s]"}``. ``""`` or
+        ``"-"`` drops the column. Files without a header row are mapped by column number counted
+        from 0: ``{"1": "gyro_x"}``.
     unit : mapping of str to str
-        Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time": "us"}``; factors allowed (``"0.1 arcsec/s"``).
+        Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time":
+        "us"}``; factors allowed (``"0.1 arcsec/s"``).
     kind : {"rate", "angle"}, optional
-        How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` the increment of each sample.
+        How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` the increment of each
+        sample.
     channel : sequence of path
         Files that hold further channels.
     channels_only : bool
@@ -69,7 +72,9 @@ class ReadOptions:
         if self.rate is not None:
             check_rate(self.rate, "--rate")
         if self.kind not in (None, "rate", "angle"):
-            raise OptionError(f"--kind {self.kind}: choose 'rate' (increment of each sample) or 'angle' (cumulative angle)")
+            raise OptionError(
+                f"--kind {self.kind}: choose 'rate' (increment of each sample) or 'angle' (cumulative angle)"
+            )
         for name in ("start", "epoch"):
             value = getattr(self, name)
             if value is not None:

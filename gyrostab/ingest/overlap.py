@@ -21,8 +21,9 @@ _SAME = 0.9  # share of the compared rows that must be alike; a copy may have be
 def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     """Leave out what a file repeats of the files before it.
 
-    Two files overlap when rows of both have the same stamps and the same values. Files whose clocks merely cover the same
-    hours, as after a restart of the clock, have other values and stay as they are.
+    Two files overlap when rows of both have the same stamps and the same values. Files whose clocks
+    merely cover the same hours, as after a restart of the clock, have other values and stay as they
+    are.
 
     Parameters
     ----------
@@ -32,8 +33,8 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     Returns
     -------
     list of xarray.Dataset
-        The raw logs without repeated rows, each with a note where rows were left out; a file that holds nothing new is
-        left out as a whole, and the file that holds its rows says so.
+        The raw logs without repeated rows, each with a note where rows were left out; a file that
+        holds nothing new is left out as a whole, and the file that holds its rows says so.
     """
     kept: list[xr.Dataset] = []
     ends: list[int] = []
@@ -46,7 +47,9 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
             tail, head = _rows_from(held, first), _rows_until(part, ends[place])
             if not _alike(held, part, tail, head):
                 continue
-            if head > held.sizes["row"] - tail and end >= ends[place]:  # it has rows that the earlier file lost
+            if (
+                head > held.sizes["row"] - tail and end >= ends[place]
+            ):  # it has rows that the earlier file lost
                 kept[place], part = _shorten(held, slice(0, tail), part)
                 ends[place] = first - 1
             else:
@@ -65,8 +68,12 @@ def _shorten(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Datas
     shorter = part.isel(row=rows)
     left_out = part.sizes["row"] - shorter.sizes["row"]
     if shorter.sizes["row"]:
-        return _with_note(shorter, f"{name}: {left_out} rows are in {holder} too and were left out here"), other
-    return shorter, _with_note(other, f"{holder}: all {left_out} rows of {name} are here too, so that file was left out")
+        return _with_note(
+            shorter, f"{name}: {left_out} rows are in {holder} too and were left out here"
+        ), other
+    return shorter, _with_note(
+        other, f"{holder}: all {left_out} rows of {name} are here too, so that file was left out"
+    )
 
 
 def _with_note(part: xr.Dataset, note: str) -> xr.Dataset:
@@ -74,7 +81,11 @@ def _with_note(part: xr.Dataset, note: str) -> xr.Dataset:
 
 
 def _stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
-    return np.asarray(part["time"][max(begin, 0) : end].values).astype("datetime64[ns]", copy=False).view(np.int64)
+    return (
+        np.asarray(part["time"][max(begin, 0) : end].values)
+        .astype("datetime64[ns]", copy=False)
+        .view(np.int64)
+    )
 
 
 def stamp_span(part: xr.Dataset) -> tuple[int, int]:
@@ -118,12 +129,16 @@ def _alike(held: xr.Dataset, part: xr.Dataset, tail: int, head: int) -> bool:
     return common >= 2 and same >= _SAME * common
 
 
-def _common(held: xr.Dataset, part: xr.Dataset, rows: tuple[int, int], others: tuple[int, int]) -> tuple[int, int]:
+def _common(
+    held: xr.Dataset, part: xr.Dataset, rows: tuple[int, int], others: tuple[int, int]
+) -> tuple[int, int]:
     """How many rows of two stretches have the same stamp, and how many of these the same values; NaN is like anything."""
     ours, theirs = _stamps(held, *rows), _stamps(part, *others)
     stamps, a, b = np.intersect1d(ours, theirs, return_indices=True)
     a, b = a[stamps != NAT], b[stamps != NAT]
-    signal = next((name for name in SIGNAL_UNITS if name in held.data_vars and name in part.data_vars), None)
+    signal = next(
+        (name for name in SIGNAL_UNITS if name in held.data_vars and name in part.data_vars), None
+    )
     if signal is None or not len(a):
         return 0, 0
     axes = [axis for axis in held["axis"].values if axis in part["axis"].values]

@@ -21,13 +21,38 @@ if TYPE_CHECKING:
     from gyrostab.ingest.guess import Guess
     from gyrostab.ingest.inspect import FileInspection
 
-__all__ = ["COLUMNS", "Examined", "Look", "examine", "next_command", "print_look", "print_next", "print_scan", "scan"]
+__all__ = [
+    "COLUMNS",
+    "Examined",
+    "Look",
+    "examine",
+    "next_command",
+    "print_look",
+    "print_next",
+    "print_scan",
+    "scan",
+]
 
-#: Share of missing samples above which the sampling rate may be wrong: it is then tried with the mean rate of the rows.
+#: Share of missing samples above which the sampling rate may be wrong: it is then tried with the
+#: mean rate of the rows.
 MUCH_MISSING = 0.1
 
-#: Columns of the table; span in s, rate in Hz, missing as a share of the samples between start and end.
-COLUMNS = ("file", "format", "start", "end", "span_s", "rate_hz", "axes", "channels", "rows", "gaps", "missing_share", "odd")
+#: Columns of the table; span in s, rate in Hz, missing as a share of the samples between start and
+#: end.
+COLUMNS = (
+    "file",
+    "format",
+    "start",
+    "end",
+    "span_s",
+    "rate_hz",
+    "axes",
+    "channels",
+    "rows",
+    "gaps",
+    "missing_share",
+    "odd",
+)
 
 
 def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFrame:
@@ -40,13 +65,15 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     paths : path, pattern, or several of them
         Logs in any format that gyrostab reads.
     **reading
-        Options of `gyrostab.jobs.run.load_log`: those of `gyrostab.ingest.read_log`, and ``max_gap``.
+        Options of `gyrostab.jobs.run.load_log`: those of `gyrostab.ingest.read_log`, and
+        ``max_gap``.
 
     Returns
     -------
     pandas.DataFrame
-        Columns of `COLUMNS`: file, format, start and end (UTC), span [s], sampling rate [Hz], axes, channels, rows, number of gaps, share
-        of missing samples, and what is odd (for a file that cannot be read, why).
+        Columns of `COLUMNS`: file, format, start and end (UTC), span [s], sampling rate [Hz], axes,
+        channels, rows, number of gaps, share of missing samples, and what is odd (for a file that
+        cannot be read, why).
 
     Raises
     ------
@@ -90,7 +117,9 @@ class Examined:
     looks: list[Look]
 
 
-def examine(paths: Sequence[str | Path] | str | Path, *, look: bool = True, **reading: Any) -> Examined:
+def examine(
+    paths: Sequence[str | Path] | str | Path, *, look: bool = True, **reading: Any
+) -> Examined:
     """Scan logs, and look into each column of those that cannot be read as they are.
 
     Parameters
@@ -120,7 +149,11 @@ def examine(paths: Sequence[str | Path] | str | Path, *, look: bool = True, **re
             if found is not None:
                 rows[-1].update(format=found.look.summary.format)
                 rows[-1].update(rows=found.look.rows if found.paths == [path] else None)
-    return Examined(pd.DataFrame(rows, columns=list(COLUMNS)), errors, [found for found in looks.values() if found is not None])
+    return Examined(
+        pd.DataFrame(rows, columns=list(COLUMNS)),
+        errors,
+        [found for found in looks.values() if found is not None],
+    )
 
 
 def _look(path: Path, reading: dict[str, Any], looks: dict[Any, Look | None]) -> Look | None:
@@ -129,14 +162,20 @@ def _look(path: Path, reading: dict[str, Any], looks: dict[Any, Look | None]) ->
     from gyrostab.ingest.guess import guess_columns
     from gyrostab.ingest.inspect import inspect_file
 
-    options = ReadOptions(**{name: value for name, value in reading.items() if name not in ("max_gap", "on_file")})
+    options = ReadOptions(
+        **{name: value for name, value in reading.items() if name not in ("max_gap", "on_file")}
+    )
     try:
-        headers = tuple((column.header, column.role, column.unit) for column in scan_file(path, options).columns)
+        headers = tuple(
+            (column.header, column.role, column.unit) for column in scan_file(path, options).columns
+        )
         if headers not in looks:
             looks[headers] = None
             inside = inspect_file(path, options)
             angles = options.kind == "angle"
-            guess = guess_columns(inside, rate=options.rate, rate_hint=_named_rate(path), angles=angles)
+            guess = guess_columns(
+                inside, rate=options.rate, rate_hint=_named_rate(path), angles=angles
+            )
             looks[headers] = _try_guess(path, inside, guess, reading)
     except GyrostabError:
         return None
@@ -150,8 +189,14 @@ def _try_guess(path: Path, look: FileInspection, guess: Guess, reading: dict[str
     """Read the file by the guess, and with the sampling rate if the stamps alone do not tell it."""
     from gyrostab.ingest.guess import temperature_unit
 
-    options = {**reading, "map": dict(reading.get("map", {})), "unit": dict(reading.get("unit", {}))}
-    options["map"].update({column.key: f"gyro_{axis}" for axis, column in guess.axes.items() if column.role != "gyro"})
+    options = {
+        **reading,
+        "map": dict(reading.get("map", {})),
+        "unit": dict(reading.get("unit", {})),
+    }
+    options["map"].update(
+        {column.key: f"gyro_{axis}" for axis, column in guess.axes.items() if column.role != "gyro"}
+    )
     if guess.unit is not None:
         angle = any(column.name.lower().startswith("angle_") for column in guess.axes.values())
         options["unit"]["angle" if angle else "gyro"] = guess.unit
@@ -160,7 +205,9 @@ def _try_guess(path: Path, look: FileInspection, guess: Guess, reading: dict[str
             options["map"][guess.time.key] = "time"
         options["unit"]["time"] = guess.time_unit
     if guess.temperature is not None and guess.temperature.role != "channel":
-        options["map"][guess.temperature.key] = f"temperature [{temperature_unit(guess.temperature)}]"
+        options["map"][guess.temperature.key] = (
+            f"temperature [{temperature_unit(guess.temperature)}]"
+        )
     if guess.rate is not None:
         options["rate"] = guess.rate
     options = {name: value for name, value in options.items() if value != {}}
@@ -176,7 +223,9 @@ def _try_guess(path: Path, look: FileInspection, guess: Guess, reading: dict[str
             reason = str(error)
         if read and read[-1].row is not None and read[-1].row["missing_share"] < MUCH_MISSING:
             break
-    best = min(read, key=lambda found: found.row["missing_share"] if found.row else 1.0, default=None)
+    best = min(
+        read, key=lambda found: found.row["missing_share"] if found.row else 1.0, default=None
+    )
     return best or Look([path], look, guess, options, None, reason)
 
 
@@ -232,15 +281,25 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
 
     max_gap = reading.get("max_gap", "10D")
     cut = {name: reading[name] for name in ("time_from", "time_to", "exclude") if name in reading}
-    reading = {name: value for name, value in reading.items() if name not in ("max_gap", "on_file", *cut)}
+    reading = {
+        name: value for name, value in reading.items() if name not in ("max_gap", "on_file", *cut)
+    }
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
     regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
-    log = raw if regular else regularise(raw, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits"))
+    log = (
+        raw
+        if regular
+        else regularise(
+            raw, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits")
+        )
+    )
     log = cut_log(log, **cut)
     start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
     signal = log[signal_name(log)]
-    notes = dict.fromkeys(note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *texts(log, "notes")])
+    notes = dict.fromkeys(
+        note.removeprefix(f"{path.name}: ") for note in [*summary.notes, *texts(log, "notes")]
+    )
     return {
         "file": str(path),
         "format": summary.format,
@@ -251,7 +310,9 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         "axes": " ".join(map(str, log["axis"].values)),
         "channels": " ".join(log_channels(log)),
         "rows": int(raw.sizes["time" if regular else "row"]),
-        "gaps": len(gap_table(log)) if "gap_start" in log.variables else _count_runs(signal.isnull().all("axis")),
+        "gaps": len(gap_table(log))
+        if "gap_start" in log.variables
+        else _count_runs(signal.isnull().all("axis")),
         "missing_share": 1.0 - count_present(signal.data) / signal.size,
         "odd": "; ".join(notes),
     }
@@ -273,8 +334,22 @@ def print_scan(table: pd.DataFrame) -> None:
 
     console = Console()
     framed = Table()
-    for heading in ("file", "start (UTC)", "span", "rate [Hz]", "axes", "channels", "rows", "gaps", "missing"):
-        framed.add_column(heading, overflow="fold", justify="right" if heading in ("rows", "gaps", "missing") else "left")
+    for heading in (
+        "file",
+        "start (UTC)",
+        "span",
+        "rate [Hz]",
+        "axes",
+        "channels",
+        "rows",
+        "gaps",
+        "missing",
+    ):
+        framed.add_column(
+            heading,
+            overflow="fold",
+            justify="right" if heading in ("rows", "gaps", "missing") else "left",
+        )
     for _, row in table.iterrows():
         if pd.isna(row["rate_hz"]):
             told = "cannot be read" if pd.isna(row["format"]) else "needs options, see below"
@@ -315,12 +390,27 @@ def _look_rows(found: Look) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     if found.look.time is not None:
         time = found.look.time
-        rows.append((time.header, time.unit or "", "", "", "", "", _number(found.look.rate_hz), "time"))
+        rows.append(
+            (time.header, time.unit or "", "", "", "", "", _number(found.look.rate_hz), "time")
+        )
     for column in found.look.columns:
         known = math.isfinite(column.rate_hz) or column.rows == 0
-        numbers = (column.low, column.high, column.mean, column.scatter, column.rate_hz if known else guess.sampling_rate_hz)
+        numbers = (
+            column.low,
+            column.high,
+            column.mean,
+            column.scatter,
+            column.rate_hz if known else guess.sampling_rate_hz,
+        )
         kept = column.name if column.role == "channel" else ""
-        rows.append((column.key, column.unit or "", *map(_number, numbers), taken.get(column.key, kept) if column.rows else "no numbers"))
+        rows.append(
+            (
+                column.key,
+                column.unit or "",
+                *map(_number, numbers),
+                taken.get(column.key, kept) if column.rows else "no numbers",
+            )
+        )
     return rows
 
 
@@ -354,7 +444,9 @@ def print_look(found: Look) -> None:
     framed = Table(title=escape(f"{found.paths[0]}: {found.look.rows:,} rows"))
     for heading in LOOK_COLUMNS:
         framed.add_column(
-            heading.replace("_", " "), overflow="fold", justify="left" if heading in ("column", "unit", "taken_for") else "right"
+            heading.replace("_", " "),
+            overflow="fold",
+            justify="left" if heading in ("column", "unit", "taken_for") else "right",
         )
     for row in rows:
         framed.add_row(*map(escape, row))

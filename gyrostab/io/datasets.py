@@ -1,8 +1,9 @@
 """Logs, surfaces and products as CF NetCDF or Zarr, and back as they were in memory.
 
-On disk the dimensions are ``(axis, tau, time)``, every time is an exact integer, every unit string is one that UDUNITS reads
-rightly, only data carries a fill value, and lists stand in the attributes as JSON. `open_dataset` turns all of that back
-(`gyrostab.store.cf` holds the rules; `gyrostab.store` the chunks of a log). A file takes its final name only once it is complete.
+On disk the dimensions are ``(axis, tau, time)``, every time is an exact integer, every unit string
+is one that UDUNITS reads rightly, only data carries a fill value, and lists stand in the attributes
+as JSON. `open_dataset` turns all of that back (`gyrostab.store.cf` holds the rules;
+`gyrostab.store` the chunks of a log). A file takes its final name only once it is complete.
 """
 
 from __future__ import annotations
@@ -52,22 +53,22 @@ def to_netcdf(
 ) -> Path:
     """Write a product, a DAVAR surface or a log as one flat CF NetCDF file.
 
-    Lazy (dask) variables are computed together and chunk by chunk; none is held in memory as a whole.
-    A variable whose encoding declares an integer dtype and a ``scale_factor`` (counts of the source) is stored as integers
-    if that gives back the same numbers, bit for bit.
+    Lazy (dask) variables are computed together and chunk by chunk; none is held in memory as a
+    whole. A variable whose encoding declares an integer dtype and a ``scale_factor`` (counts of the
+    source) is stored as integers if that gives back the same numbers, bit for bit.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        In memory ``(axis, time, tau)``, units as in `gyrostab.units.INNER`. A log is written with the sampling rate of its ``time``,
-        and with NaN where samples have been dropped.
+        In memory ``(axis, time, tau)``, units as in `gyrostab.units.INNER`. A log is written with
+        the sampling rate of its ``time``, and with NaN where samples have been dropped.
     path : path-like
         The file to make. It takes this name only once it is complete.
     overwrite : bool
         Replace an existing file, unless the dataset is lazy and still reads from it.
     compression : {"zstd", "zlib"}, optional
-        zlib is read by every NetCDF program and is the default; zstd is two to four times as fast, and Octave, MATLAB and
-        h5netcdf do not read it.
+        zlib is read by every NetCDF program and is the default; zstd is two to four times as fast,
+        and Octave, MATLAB and h5netcdf do not read it.
     progress : callable, optional
         Told the share of the long variables that is written.
 
@@ -110,7 +111,9 @@ def to_netcdf(
         rest = {name: options for name, options in encoding.items() if name not in long}
         with new_output(path, overwrite=overwrite, inputs=sources) as temporary:
             _begin_netcdf(packed.drop_vars(long), temporary, rest)
-            (append_netcdf if log else append_deflated)(temporary, long, encoding, progress=progress)
+            (append_netcdf if log else append_deflated)(
+                temporary, long, encoding, progress=progress
+            )
 
     _write_counts(stored, write)
     return Path(path)
@@ -122,14 +125,22 @@ def _with_true_time(dataset: Any) -> xr.Dataset:
         return as_log(dataset)
     for name, units in SIGNAL_UNITS.items():
         signal = dataset.variables.get(name)
-        if signal is not None and "time" in signal.dims and set(signal.dims) <= {"axis", "time"} and signal.attrs.get("units") == units:
+        if (
+            signal is not None
+            and "time" in signal.dims
+            and set(signal.dims) <= {"axis", "time"}
+            and signal.attrs.get("units") == units
+        ):
             return as_log(dataset)
     return dataset
 
 
 def _begin_netcdf(rest: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
     """Write what is not long. `Dataset.to_netcdf` would do, but loads dask.distributed to see whether that is at work."""
-    if any(variable.chunks is not None and variable.size >= CHUNK_VALUES for variable in rest.variables.values()):
+    if any(
+        variable.chunks is not None and variable.size >= CHUNK_VALUES
+        for variable in rest.variables.values()
+    ):
         rest.to_netcdf(path, engine="netcdf4", format="NETCDF4", encoding=encoding)
         return
     open_store: Any = xr.backends.NetCDF4DataStore.open
@@ -146,9 +157,15 @@ def _netcdf_encoding(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, d
     encoding: dict[Any, dict[str, Any]] = {}
     for name, variable in stored.variables.items():
         text = variable.dtype.kind in "OUST"
-        encoding[name] = {} if "_FillValue" in variable.attrs else {"_FillValue": None, **({"dtype": "S1"} if text else {})}
+        encoding[name] = (
+            {}
+            if "_FillValue" in variable.attrs
+            else {"_FillValue": None, **({"dtype": "S1"} if text else {})}
+        )
         if _is_data(stored, name) and variable.dtype.kind == "f":
-            encoding[name]["_FillValue"] = variable.dtype.type(netCDF4.default_fillvals[variable.dtype.str[1:]])
+            encoding[name]["_FillValue"] = variable.dtype.type(
+                netCDF4.default_fillvals[variable.dtype.str[1:]]
+            )
         if variable.ndim and variable.size and not text:
             encoding[name] |= {**filters, "chunksizes": _chunks(variable, _rate(stored))}
     return encoding
@@ -164,11 +181,20 @@ def _filters(compression: str | None) -> dict[str, Any]:
         with netCDF4.Dataset("probe", "w", diskless=True, persist=False) as probe:
             if probe.has_zstd_filter():
                 return {"compression": "zstd", "complevel": 3, "fletcher32": True}
-        warnings.warn(f"netCDF library {netCDF4.__netcdf4libversion__} has no zstd here: the log is compressed with zlib", stacklevel=3)
+        warnings.warn(
+            f"netCDF library {netCDF4.__netcdf4libversion__} has no zstd here: the log is compressed with zlib",
+            stacklevel=3,
+        )
     return {"zlib": True, "complevel": 4, "shuffle": True}
 
 
-def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None) -> Path:
+def to_zarr(
+    dataset: xr.Dataset,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
     """Write a product, a DAVAR surface or a log as a Zarr store (a directory, format 2), by the same rules as `to_netcdf`.
 
     Parameters
@@ -178,7 +204,8 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
     path : path-like
         The directory to make.
     overwrite : bool
-        Replace an existing store, unless other files are in it, or the dataset is lazy and still reads from it.
+        Replace an existing store, unless other files are in it, or the dataset is lazy and still
+        reads from it.
     progress : callable, optional
         Told the share of the long variables that is written.
 
@@ -210,11 +237,27 @@ def to_zarr(dataset: xr.Dataset, path: str | os.PathLike[str], *, overwrite: boo
         long = long_variables(packed) if _rate(packed) is not None else {}
         encoding = _zarr_encoding(packed)
         rest = {name: options for name, options in encoding.items() if name not in long}
-        lazy = {name: packed[name].variable for name in rest if packed[name].chunks is not None and "chunks" in encoding[name]}
-        aligned = {name: v.chunk(dict(zip(v.dims, encoding[name]["chunks"], strict=True))) for name, v in lazy.items()}
-        with new_output(path, overwrite=overwrite, find_foreign=find_foreign_item, inputs=sources) as temporary:
+        lazy = {
+            name: packed[name].variable
+            for name in rest
+            if packed[name].chunks is not None and "chunks" in encoding[name]
+        }
+        aligned = {
+            name: v.chunk(dict(zip(v.dims, encoding[name]["chunks"], strict=True)))
+            for name, v in lazy.items()
+        }
+        with new_output(
+            path, overwrite=overwrite, find_foreign=find_foreign_item, inputs=sources
+        ) as temporary:
             whole = packed.drop_vars(long).assign(aligned)
-            whole.to_zarr(temporary, mode="w", zarr_format=2, consolidated=not long, encoding=rest, write_empty_chunks=True)
+            whole.to_zarr(
+                temporary,
+                mode="w",
+                zarr_format=2,
+                consolidated=not long,
+                encoding=rest,
+                write_empty_chunks=True,
+            )
             append_zarr(temporary, long, encoding, progress=progress)
 
     _write_counts(stored, write)
@@ -233,7 +276,10 @@ def _zarr_encoding(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
         if variable.ndim and variable.size:
             encoding[name]["chunks"] = _chunks(variable, _rate(stored))
             if _rate(stored) is not None and variable.dtype.kind in "if":
-                encoding[name] |= {"compressors": Blosc("lz4", clevel=5, shuffle=Blosc.SHUFFLE), "filters": [Fletcher32()]}
+                encoding[name] |= {
+                    "compressors": Blosc("lz4", clevel=5, shuffle=Blosc.SHUFFLE),
+                    "filters": [Fletcher32()],
+                }
     return encoding
 
 
@@ -241,20 +287,31 @@ def _write_counts(stored: xr.Dataset, write: Callable[[xr.Dataset], None]) -> No
     """Write with integer counts where they are declared, in a wider type or as doubles where they turn out not to fit."""
     while True:
         try:
-            return write(stored.assign({name: as_counts(str(name), v.variable) for name, v in stored.data_vars.items()}))
+            return write(
+                stored.assign(
+                    {name: as_counts(str(name), v.variable) for name, v in stored.data_vars.items()}
+                )
+            )
         except Misfit as misfit:
             (name,) = misfit.args
             declared = stored[name].encoding
             if np.dtype(declared["dtype"]) != np.dtype("i4"):
                 stored[name].encoding = {**declared, "dtype": np.dtype("i4")}
                 continue
-            warnings.warn(f"{name}: not every value is a whole multiple of {declared['scale_factor']:g}; stored as doubles", stacklevel=3)
+            warnings.warn(
+                f"{name}: not every value is a whole multiple of {declared['scale_factor']:g}; stored as doubles",
+                stacklevel=3,
+            )
             stored[name].encoding = {}
 
 
 def _rate(stored: xr.Dataset) -> float | None:
     """Sampling rate of a log [Hz]; None for anything else."""
-    return float(stored.attrs["sampling_rate_hz"]) if stored.attrs["gyrostab_content"] == "log" else None
+    return (
+        float(stored.attrs["sampling_rate_hz"])
+        if stored.attrs["gyrostab_content"] == "log"
+        else None
+    )
 
 
 def _is_data(dataset: xr.Dataset, name: Any) -> bool:
@@ -265,12 +322,23 @@ def _is_data(dataset: xr.Dataset, name: Any) -> bool:
 
 def _chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
     """One axis (and one term) a chunk, every tau, and as much time as fits; of a log 20 minutes."""
-    inner = int(np.prod([size for dim, size in variable.sizes.items() if dim not in ("axis", "term", variable.dims[-1])]))
+    inner = int(
+        np.prod(
+            [
+                size
+                for dim, size in variable.sizes.items()
+                if dim not in ("axis", "term", variable.dims[-1])
+            ]
+        )
+    )
     most = max(1, CHUNK_VALUES // max(1, inner))
     if rate is not None:
         most = chunk_samples(rate if variable.dims[-1] in ("time", index_dim("time")) else 0.0)
     last = max(1, min(variable.shape[-1], most))
-    return tuple(last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size for dim, size in variable.sizes.items())
+    return tuple(
+        last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size
+        for dim, size in variable.sizes.items()
+    )
 
 
 def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
@@ -283,14 +351,14 @@ def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
     path : path-like
         A NetCDF file or a Zarr directory.
     strict : bool
-        What a chunk of a log does that turns out to be damaged or missing: raise `FormatError` as it is read, or
-        become a gap, of which a warning tells the file, the axis and the times.
+        What a chunk of a log does that turns out to be damaged or missing: raise `FormatError` as
+        it is read, or become a gap, of which a warning tells the file, the axis and the times.
 
     Returns
     -------
     xarray.Dataset
-        Product, surface or log: ``(axis, time, tau)``, units of `gyrostab.units.INNER`, a computed time axis for a log,
-        whose chunks are those on disk.
+        Product, surface or log: ``(axis, time, tau)``, units of `gyrostab.units.INNER`, a computed
+        time axis for a log, whose chunks are those on disk.
 
     Raises
     ------
@@ -314,13 +382,14 @@ def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
     Parameters
     ----------
     path : path-like
-        NetCDF file or Zarr directory that ``gyrostab run``, ``gyrostab fit``, `to_netcdf` or `to_zarr` wrote.
+        NetCDF file or Zarr directory that ``gyrostab run``, ``gyrostab fit``, `to_netcdf` or
+        `to_zarr` wrote.
 
     Returns
     -------
     xarray.Dataset
-        ``avar(axis, time, tau)`` [degree2 hour-2], ``Q, N, B, K, R (axis, time)`` with errors and limits, and the rest of
-        ``docs/product.md``; data stays on disk (dask) until it is used.
+        ``avar(axis, time, tau)`` [degree2 hour-2], ``Q, N, B, K, R (axis, time)`` with errors and
+        limits, and the rest of ``docs/product.md``; data stays on disk (dask) until it is used.
 
     Raises
     ------
@@ -349,12 +418,14 @@ def open_surface(path: str | os.PathLike[str]) -> xr.Dataset:
     Parameters
     ----------
     path : path-like
-        NetCDF file or Zarr directory that ``gyrostab davar``, `to_netcdf` or `to_zarr` wrote, or a product.
+        NetCDF file or Zarr directory that ``gyrostab davar``, `to_netcdf` or `to_zarr` wrote, or a
+        product.
 
     Returns
     -------
     xarray.Dataset
-        ``avar(axis, time, tau)`` [degree2 hour-2] with ``count``, ``coverage`` and ``edf``; data stays on disk (dask) until it is used.
+        ``avar(axis, time, tau)`` [degree2 hour-2] with ``count``, ``coverage`` and ``edf``; data
+        stays on disk (dask) until it is used.
 
     Raises
     ------
@@ -370,16 +441,18 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
     Parameters
     ----------
     path : path-like
-        NetCDF file or Zarr directory that ``gyrostab ingest``, ``gyrostab simulate``, `to_netcdf` or `to_zarr` wrote.
+        NetCDF file or Zarr directory that ``gyrostab ingest``, ``gyrostab simulate``, `to_netcdf`
+        or `to_zarr` wrote.
     strict : bool
-        Raise `FormatError` where a chunk that is read turns out to be damaged or missing; by default it becomes a gap, of
-        which a warning tells the file, the axis and the times.
+        Raise `FormatError` where a chunk that is read turns out to be damaged or missing; by
+        default it becomes a gap, of which a warning tells the file, the axis and the times.
 
     Returns
     -------
     xarray.Dataset
-        ``rate(axis, time)`` [degree hour-1] or ``angle`` [degree], NaN where a sample is missing, with the channels and the
-        table of gaps; data stays on disk (dask, the chunks of the file) until it is used.
+        ``rate(axis, time)`` [degree hour-1] or ``angle`` [degree], NaN where a sample is missing,
+        with the channels and the table of gaps; data stays on disk (dask, the chunks of the file)
+        until it is used.
 
     Raises
     ------
@@ -396,7 +469,13 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
     ...         print(log.rate.values)
     [[ 1. nan  2.]]
     """
-    log = _open(path, "a regular log", partial(check_log, rate=False), "make one with 'gyrostab ingest'", strict=strict)
+    log = _open(
+        path,
+        "a regular log",
+        partial(check_log, rate=False),
+        "make one with 'gyrostab ingest'",
+        strict=strict,
+    )
     try:
         return as_log(log)
     except (SchemaError, TimeError) as error:
@@ -404,7 +483,9 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
         raise type(error)(f"{path}: {error}") from error
 
 
-def _open(path: str | os.PathLike[str], what: str, check: Any, advice: str, *, strict: bool = False) -> xr.Dataset:
+def _open(
+    path: str | os.PathLike[str], what: str, check: Any, advice: str, *, strict: bool = False
+) -> xr.Dataset:
     dataset = open_dataset(path, strict=strict)
     try:
         with reading_of(path):

@@ -9,11 +9,13 @@ gyroscope_bias_instability  rad/s             B          pi / 180 / 3600, B in d
 update_rate                 Hz                           sampling rate of the log
 ==========================  ================  =========  =======================================
 
-Kalibr itself knows no bias instability and passes its key over. The floor of the Allan deviation lies at 0.664 of it.
+Kalibr itself knows no bias instability and passes its key over. The floor of the Allan deviation
+lies at 0.664 of it.
 
 References
 ----------
-Kalibr wiki, "IMU Noise Model": the white noise is read off the Allan deviation at 1 s, the random walk at 3 s.
+Kalibr wiki, "IMU Noise Model": the white noise is read off the Allan deviation at 1 s, the random
+walk at 3 s.
 """
 
 from __future__ import annotations
@@ -50,8 +52,8 @@ class KalibrValue:
     Attributes
     ----------
     value : float
-        Median over the windows that observe the term, or of their upper limits where more windows only bound it [unit of
-        the key in `KEYS`]; NaN when there is neither.
+        Median over the windows that observe the term, or of their upper limits where more windows
+        only bound it [unit of the key in `KEYS`]; NaN when there is neither.
     meaning : str
         What the value is.
     share : float
@@ -69,7 +71,8 @@ def kalibr_noise(product: xr.Dataset) -> dict[str, dict[str, KalibrValue]]:
     Parameters
     ----------
     product : xarray.Dataset
-        Product with ``N`` [deg/sqrt(h)], ``K`` [deg/h^1.5], ``B`` [deg/h] and their upper limits, dims ``(axis, time)``.
+        Product with ``N`` [deg/sqrt(h)], ``K`` [deg/h^1.5], ``B`` [deg/h] and their upper limits,
+        dims ``(axis, time)``.
 
     Returns
     -------
@@ -91,17 +94,22 @@ def kalibr_noise(product: xr.Dataset) -> dict[str, dict[str, KalibrValue]]:
 
 
 def _convert_term(term: TermSummary, factor: float) -> KalibrValue:
-    share = {"observed": term.observed_share, "upper_limit_only": term.limited_share}.get(term.status, 0.0)
+    share = {"observed": term.observed_share, "upper_limit_only": term.limited_share}.get(
+        term.status, 0.0
+    )
     return KalibrValue(term.value * factor, term.status, share)
 
 
-def to_kalibr(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+def to_kalibr(
+    product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False
+) -> Path:
     """Write N, K and B as a YAML file for Kalibr: the worst axis at the top, where Kalibr looks, and each axis below.
 
     Parameters
     ----------
     product : xarray.Dataset
-        What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens, with the attribute ``sampling_rate_hz``.
+        What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens, with the attribute
+        ``sampling_rate_hz``.
     path : path-like
         The file to make.
     overwrite : bool
@@ -122,7 +130,9 @@ def to_kalibr(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: b
     noise = kalibr_noise(product)
     rate = product.attrs.get("sampling_rate_hz")
     if rate is None:
-        raise SchemaError("the product has no attribute 'sampling_rate_hz', which is Kalibr's update_rate; give it one in Hz")
+        raise SchemaError(
+            "the product has no attribute 'sampling_rate_hz', which is Kalibr's update_rate; give it one in Hz"
+        )
     names = [Path(name).name for name in texts(product, "source_files")]
     lines = [
         "# Noise of a gyro for Kalibr: medians over the windows of a dynamic Allan variance, made by gyrostab",

@@ -1,7 +1,8 @@
 """Finished parts of a product as files: each is whole or is not trusted, and all together read as one dataset.
 
-A block file holds, one after the other, a magic word, the length of a header, the header as JSON, the arrays as they stand in
-memory, and the SHA-256 of everything before. It is written under another name, brought to the disk and only then renamed.
+A block file holds, one after the other, a magic word, the length of a header, the header as JSON,
+the arrays as they stand in memory, and the SHA-256 of everything before. It is written under
+another name, brought to the disk and only then renamed.
 """
 
 from __future__ import annotations
@@ -78,7 +79,10 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     OutputError
         When it cannot be written, with the reason.
     """
-    arrays = {str(name): np.ascontiguousarray(variable.values) for name, variable in dataset.variables.items()}
+    arrays = {
+        str(name): np.ascontiguousarray(variable.values)
+        for name, variable in dataset.variables.items()
+    }
     described, place = {}, 0
     for (name, values), variable in zip(arrays.items(), dataset.variables.values(), strict=True):
         described[name] = {
@@ -95,8 +99,19 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     path = block_path(folder, part)
     with replace_file(path) as temporary, temporary.open("wb", buffering=0) as file:
         digest = hashlib.sha256()
-        for piece in (head, *(piece for values in arrays.values() for piece in (values, bytes(-values.nbytes % _ALIGN)))):
-            view = memoryview(piece) if isinstance(piece, bytes) else piece.reshape(-1).view(np.uint8).data
+        for piece in (
+            head,
+            *(
+                piece
+                for values in arrays.values()
+                for piece in (values, bytes(-values.nbytes % _ALIGN))
+            ),
+        ):
+            view = (
+                memoryview(piece)
+                if isinstance(piece, bytes)
+                else piece.reshape(-1).view(np.uint8).data
+            )
             digest.update(view)
             _write_all(file, view)
         _write_all(file, memoryview(digest.digest()))
@@ -161,8 +176,8 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        The product: coordinates in memory, and the rest too where all of it is small; otherwise dask arrays in the chunks of the
-        file that will be written.
+        The product: coordinates in memory, and the rest too where all of it is small; otherwise
+        dask arrays in the chunks of the file that will be written.
     """
     first = blocks[0].header
     small = sum(block.path.stat().st_size for block in blocks) <= _SMALL
@@ -173,9 +188,14 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
         if "time" not in dims:
             data = _section(blocks[0], name)
         elif small:
-            data = np.concatenate([_part(mapped, block, name) for mapped, block in zip(maps, blocks, strict=True)], axis=dims.index("time"))
+            data = np.concatenate(
+                [_part(mapped, block, name) for mapped, block in zip(maps, blocks, strict=True)],
+                axis=dims.index("time"),
+            )
         elif name in first["coords"]:
-            data = np.concatenate([_section(block, name) for block in blocks], axis=dims.index("time"))
+            data = np.concatenate(
+                [_section(block, name) for block in blocks], axis=dims.index("time")
+            )
         else:
             data = _lazily(blocks, name)
         variables[name] = xr.Variable(dims, data, attrs)
@@ -188,7 +208,9 @@ def _part(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
     begin = block.begin + described["place"]
-    return np.asarray(mapped[begin : begin + int(np.prod(shape)) * dtype.itemsize].view(dtype).reshape(shape))
+    return np.asarray(
+        mapped[begin : begin + int(np.prod(shape)) * dtype.itemsize].view(dtype).reshape(shape)
+    )
 
 
 def _section(block: Block, name: str) -> NDArray[Any]:
@@ -197,7 +219,9 @@ def _section(block: Block, name: str) -> NDArray[Any]:
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
     if 0 in shape:
         return np.empty(shape, dtype)
-    return np.memmap(block.path, dtype=dtype, mode="r", offset=block.begin + described["place"], shape=shape)
+    return np.memmap(
+        block.path, dtype=dtype, mode="r", offset=block.begin + described["place"], shape=shape
+    )
 
 
 def _lazily(blocks: Sequence[Block], name: str) -> Any:
@@ -215,24 +239,44 @@ def _lazily(blocks: Sequence[Block], name: str) -> Any:
     def part(place: tuple[slice, ...]) -> NDArray[Any]:
         begin, end = place[along].start, place[along].stop
         values = np.empty([one.stop - one.start for one in place], dtype)
-        for i in range(int(np.searchsorted(edges, begin, side="right")) - 1, int(np.searchsorted(edges, end, side="left"))):
+        for i in range(
+            int(np.searchsorted(edges, begin, side="right")) - 1,
+            int(np.searchsorted(edges, end, side="left")),
+        ):
             first, last = max(begin, int(edges[i])), min(end, int(edges[i + 1]))
-            inside = [slice(first - int(edges[i]), last - int(edges[i])) if n == along else one for n, one in enumerate(place)]
-            _read_into(values[(slice(None),) * along + (slice(first - begin, last - begin),)], blocks[i], name, inside)
+            inside = [
+                slice(first - int(edges[i]), last - int(edges[i])) if n == along else one
+                for n, one in enumerate(place)
+            ]
+            _read_into(
+                values[(slice(None),) * along + (slice(first - begin, last - begin),)],
+                blocks[i],
+                name,
+                inside,
+            )
         return values
 
     def read(block_info: Mapping[Any, Any]) -> NDArray[Any]:
         return part(tuple(slice(*ends) for ends in block_info[None]["array-location"]))
 
-    chunks = da.core.normalize_chunks([sizes.get(dim, size) for dim, size in dims], shape=tuple(shape))
+    chunks = da.core.normalize_chunks(
+        [sizes.get(dim, size) for dim, size in dims], shape=tuple(shape)
+    )
     label = f"{blocks[0].header['job']}-{name}"  # without it dask would hash all that `read` knows
-    return with_part(da.map_blocks(read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label), part)
+    return with_part(
+        da.map_blocks(
+            read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label
+        ),
+        part,
+    )
 
 
 def _read_into(out: NDArray[Any], block: Block, name: str, place: Sequence[slice]) -> None:
     """Part of a variable of a block, read at once where it lies in one piece: mapping a file anew costs more than it is long."""
     shape = block.header["variables"][name]["shape"]
-    inner = max((i for i, size in enumerate(shape) if out.shape[i] < size), default=0)  # from the dimension after on, all is wanted
+    inner = max(
+        (i for i, size in enumerate(shape) if out.shape[i] < size), default=0
+    )  # from the dimension after on, all is wanted
     if out.flags.c_contiguous and out.size and all(size == 1 for size in out.shape[:inner]):
         first = int(np.ravel_multi_index([one.start for one in place], shape)) * out.itemsize
         with block.path.open("rb", buffering=0) as file:
@@ -255,7 +299,11 @@ def _to_json(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     plain: dict[str, Any] = {}
     for name, value in attrs.items():
         array = isinstance(value, np.ndarray | np.generic)
-        plain[str(name)] = {"dtype": value.dtype.str, "shape": list(value.shape), "values": value.tolist()} if array else value
+        plain[str(name)] = (
+            {"dtype": value.dtype.str, "shape": list(value.shape), "values": value.tolist()}
+            if array
+            else value
+        )
     return plain
 
 
@@ -263,5 +311,9 @@ def _from_json(plain: Mapping[str, Any]) -> dict[str, Any]:
     attrs: dict[str, Any] = {}
     for name, value in plain.items():
         marked = isinstance(value, dict) and value.keys() == {"dtype", "shape", "values"}
-        attrs[name] = np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])[()] if marked else value
+        attrs[name] = (
+            np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])[()]
+            if marked
+            else value
+        )
     return attrs

@@ -11,7 +11,12 @@ __all__ = ["check_windows"]
 
 
 def check_windows(
-    *, window: str | None = None, step: str | None = None, taus: str = "40", tau_max: str | None = None, **other: Any
+    *,
+    window: str | None = None,
+    step: str | None = None,
+    taus: str = "40",
+    tau_max: str | None = None,
+    **other: Any,
 ) -> None:
     """Make sure, before the long work starts, that the lengths of time can be read at all.
 
@@ -23,7 +28,8 @@ def check_windows(
     Raises
     ------
     OptionError
-        When one of them is no length of time, or the step or an averaging time is too long for the window.
+        When one of them is no length of time, or the step or an averaging time is too long for the
+        window.
 
     Examples
     --------
@@ -38,8 +44,12 @@ def check_windows(
         return
     length, hop = samples(window, fine, "window"), samples(step, fine, "step") if step else 1
     if step and ("sample" in window) == ("sample" in step) and hop > length:
-        raise OptionError(f"the step of {step} is longer than the window of {window}, so samples would be left out; give a shorter --step")
-    half = None if "sample" in window else length / fine / 2  # how long a number of samples is depends on the rate
+        raise OptionError(
+            f"the step of {step} is longer than the window of {window}, so samples would be left out; give a shorter --step"
+        )
+    half = (
+        None if "sample" in window else length / fine / 2
+    )  # how long a number of samples is depends on the rate
     given = [tau_max] if tau_max else []
     if taus.strip().isdigit():
         averaging_factors(taus, rate=fine, window=2)

@@ -16,7 +16,15 @@ from gyrostab.progress import Stage, no_stage
 __all__ = ["find_parts", "format_summary", "run_demo", "sample_log", "summarise"]
 
 WINDOW, STEP = "60s", "10s"
-FILES = ("product.nc", "log.nc", "report.html", "signal.png", "davar.png", "davar_3d.png", "coefficients.png")
+FILES = (
+    "product.nc",
+    "log.nc",
+    "report.html",
+    "signal.png",
+    "davar.png",
+    "davar_3d.png",
+    "coefficients.png",
+)
 
 
 def sample_log() -> Path:
@@ -32,7 +40,9 @@ def sample_log() -> Path:
         path = folder / "mwd_sample.csv.gz"
         if path.exists():
             return path
-    raise OutputError(f"the shipped log mwd_sample.csv.gz is missing from {here / 'data'}; install gyrostab again")
+    raise OutputError(
+        f"the shipped log mwd_sample.csv.gz is missing from {here / 'data'}; install gyrostab again"
+    )
 
 
 def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Timestamp]]:
@@ -46,7 +56,8 @@ def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Time
     Returns
     -------
     dict
-        ``still``, ``vibrating`` and ``after``: first and last stamp [UTC] that surely lie in the part.
+        ``still``, ``vibrating`` and ``after``: first and last stamp [UTC] that surely lie in the
+        part.
 
     Raises
     ------
@@ -65,7 +76,9 @@ def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Time
     stamps, level = pd.DatetimeIndex(known[dim].values), known.values
     shaken = np.flatnonzero(level > 0.5 * level.max()) if level.size else np.array([], dtype=int)
     if shaken.size == 0 or shaken[0] == 0 or shaken[-1] == level.size - 1:
-        raise SchemaError("the channel 'vibration' does not rise and fall again within the log; no parts can be told apart")
+        raise SchemaError(
+            "the channel 'vibration' does not rise and fall again within the log; no parts can be told apart"
+        )
     first, last = int(shaken[0]), int(shaken[-1])
     return {
         "still": (stamps[0], stamps[first - 1]),
@@ -74,21 +87,25 @@ def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Time
     }
 
 
-def summarise(product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Timestamp]]) -> pd.DataFrame:
+def summarise(
+    product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Timestamp]]
+) -> pd.DataFrame:
     """Tabulate the coefficients of each part, over the windows that lie wholly in it.
 
     Parameters
     ----------
     product : xarray.Dataset
-        Product of `gyrostab.fit_noise`, with the length of its windows in the attribute ``window_s``.
+        Product of `gyrostab.fit_noise`, with the length of its windows in the attribute
+        ``window_s``.
     parts : dict
         Name to first and last stamp, as `find_parts` gives them.
 
     Returns
     -------
     pandas.DataFrame
-        One row per axis and term: axis, term, unit, and one column of text per part: the median where most windows observe the term,
-        ``< x`` with the median of the upper limits where most do not.
+        One row per axis and term: axis, term, unit, and one column of text per part: the median
+        where most windows observe the term, ``< x`` with the median of the upper limits where most
+        do not.
     """
     half = pd.Timedelta(seconds=float(product.attrs["window_s"])) / 2
     centre = pd.DatetimeIndex(product["time"].values)
@@ -96,7 +113,10 @@ def summarise(product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Times
     for name, (start, end) in parts.items():
         inside = np.flatnonzero((centre - half >= start) & (centre + half <= end))
         for term in summarise_terms(product.isel(time=inside)):
-            row = rows.setdefault((term.axis, term.symbol), {"axis": term.axis, "term": term.symbol, "unit": term.unit})
+            row = rows.setdefault(
+                (term.axis, term.symbol),
+                {"axis": term.axis, "term": term.symbol, "unit": term.unit},
+            )
             row[name] = _format_term(term)
     return pd.DataFrame(list(rows.values()))
 
@@ -115,7 +135,9 @@ def format_summary(summary: pd.DataFrame) -> str:
     )
 
 
-def run_demo(folder: str | Path, *, overwrite: bool = False, stage: Stage = no_stage) -> tuple[pd.DataFrame, list[Path]]:
+def run_demo(
+    folder: str | Path, *, overwrite: bool = False, stage: Stage = no_stage
+) -> tuple[pd.DataFrame, list[Path]]:
     """Run the main job on the shipped log.
 
     Parameters
@@ -135,7 +157,8 @@ def run_demo(folder: str | Path, *, overwrite: bool = False, stage: Stage = no_s
     Raises
     ------
     OutputError
-        When the folder cannot be written to, or holds one of the files and `overwrite` is not given.
+        When the folder cannot be written to, or holds one of the files and `overwrite` is not
+        given.
     """
     from gyrostab.allan.davar import davar
     from gyrostab.allan.fit import fit_noise

@@ -22,12 +22,21 @@ __all__ = ["Blocks", "compute_blocks", "compute_part", "share_constant", "write_
 
 #: Finished parts by their number.
 Blocks = dict[int, Block]
-_HELD_SECONDS, _HELD_BYTES = 1.0, 2**26  # results wait so long at most until the inputs are looked at again
-_LOOKS = 50  # and no longer than so many of the looks take: what has been written need not be at the end
+_HELD_SECONDS, _HELD_BYTES = (
+    1.0,
+    2**26,
+)  # results wait so long at most until the inputs are looked at again
+_LOOKS = (
+    50  # and no longer than so many of the looks take: what has been written need not be at the end
+)
 
 
 def compute_part(
-    log: xr.Dataset, part: slice, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, space: Workspace | None = None
+    log: xr.Dataset,
+    part: slice,
+    windows: Mapping[str, Any],
+    fitting: Mapping[str, Any] | None,
+    space: Workspace | None = None,
 ) -> xr.Dataset:
     """Some windows of a product (or of a surface, where `fitting` is None), at once and in the calling thread."""
     surface = davar_part(log, part=part, space=space, **windows)
@@ -56,7 +65,8 @@ def compute_blocks(
     parts : sequence of slice
         All parts.
     blocks : dict
-        Finished parts; those that are computed are added, so that it says what is done even after an error.
+        Finished parts; those that are computed are added, so that it says what is done even after
+        an error.
     job : str
         Digest of the job.
     pool : Pool
@@ -87,9 +97,14 @@ def compute_blocks(
     function, *arguments = call
     numbers = {parts[number].start: number for number in missing}
     try:
-        for done, result in in_any_order(pool, ((function, *arguments, parts[number]) for number in missing)):
+        for done, result in in_any_order(
+            pool, ((function, *arguments, parts[number]) for number in missing)
+        ):
             held.append((numbers[done[-1].start], result))
-            if time.monotonic() - last > min(_HELD_SECONDS, _LOOKS * look) or sum(one.nbytes for _, one in held) > _HELD_BYTES:
+            if (
+                time.monotonic() - last > min(_HELD_SECONDS, _LOOKS * look)
+                or sum(one.nbytes for _, one in held) > _HELD_BYTES
+            ):
                 keep()
     except BaseException as error:
         if isinstance(error, Exception):
@@ -99,7 +114,9 @@ def compute_blocks(
     keep()
 
 
-def write_blocks(blocks: Blocks, target: Path, *, attrs: Mapping[str, Any], overwrite: bool, stage: Stage) -> xr.Dataset:
+def write_blocks(
+    blocks: Blocks, target: Path, *, attrs: Mapping[str, Any], overwrite: bool, stage: Stage
+) -> xr.Dataset:
     """Write all blocks as one NetCDF file, always in the same order, so that the same numbers make the same bytes.
 
     Returns
@@ -127,7 +144,12 @@ def write_blocks(blocks: Blocks, target: Path, *, attrs: Mapping[str, Any], over
 
     def share(written: float) -> None:
         if variables:
-            stage("writing", variables, max(min(done, variables), int(written * variables)), "variables")
+            stage(
+                "writing",
+                variables,
+                max(min(done, variables), int(written * variables)),
+                "variables",
+            )
 
     stage("writing", variables, 0, "variables")
     with dask.config.set(scheduler=in_order):
@@ -139,4 +161,9 @@ def share_constant(product: xr.Dataset) -> dict[str, float]:
     """Share of the windows in which an axis never moved: the Allan variance is zero at the shortest and the longest tau."""
     ends = product["avar"].isel(tau=[0, -1])
     still = (ends == 0.0).all("tau").mean("time").compute(scheduler="synchronous")
-    return {str(axis): float(share) for axis, share in zip(np.atleast_1d(still["axis"].values), np.atleast_1d(still.values), strict=True)}
+    return {
+        str(axis): float(share)
+        for axis, share in zip(
+            np.atleast_1d(still["axis"].values), np.atleast_1d(still.values), strict=True
+        )
+    }

@@ -1,7 +1,8 @@
 """The folder of a run beside its output: what the run was asked for, what is finished, and who works on it.
 
-``.PRODUCT.nc.job/`` holds ``job.json`` (inputs, options, versions), a file for each finished block (`gyrostab.jobs.checkpoint`) and
-``lock``. ``job.json`` is there before the first block and is removed first, so that blocks without it are leftovers.
+``.PRODUCT.nc.job/`` holds ``job.json`` (inputs, options, versions), a file for each finished block
+(`gyrostab.jobs.checkpoint`) and ``lock``. ``job.json`` is there before the first block and is
+removed first, so that blocks without it are leftovers.
 """
 
 from __future__ import annotations
@@ -109,8 +110,17 @@ def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[
     versions = {name: _version(name) for name in ("gyrostab", "numpy", "numba")}
     return {
         "inputs": describe_inputs(paths),
-        "options": json.loads(json.dumps({name: value for name, value in options.items() if value is not None}, default=str)),
-        "versions": {**versions, "byte order": sys.byteorder, "float": np.dtype(float).str, "processor": platform.machine()},
+        "options": json.loads(
+            json.dumps(
+                {name: value for name, value in options.items() if value is not None}, default=str
+            )
+        ),
+        "versions": {
+            **versions,
+            "byte order": sys.byteorder,
+            "float": np.dtype(float).str,
+            "processor": platform.machine(),
+        },
     }
 
 
@@ -124,7 +134,12 @@ def _version(name: str) -> str:
 def digest(fingerprint: Mapping[str, Any]) -> str:
     """Short name of a fingerprint; where the inputs lie does not matter, but what they are called, their size and their time do."""
     inputs = [{**item, "path": os.path.basename(item["path"])} for item in fingerprint["inputs"]]
-    return "sha256:" + hashlib.sha256(json.dumps({**fingerprint, "inputs": inputs}, sort_keys=True).encode()).hexdigest()
+    return (
+        "sha256:"
+        + hashlib.sha256(
+            json.dumps({**fingerprint, "inputs": inputs}, sort_keys=True).encode()
+        ).hexdigest()
+    )
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
@@ -141,9 +156,13 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     for kind in ("options", "versions"):
         old, new = before[kind], now[kind]
         said += [
-            f"{name} is {_option(new.get(name))}, was {_option(old.get(name))}" for name in {**old, **new} if old.get(name) != new.get(name)
+            f"{name} is {_option(new.get(name))}, was {_option(old.get(name))}"
+            for name in {**old, **new}
+            if old.get(name) != new.get(name)
         ]
-    return "; ".join(said[:_SAID]) + (f"; and {len(said) - _SAID} more" if len(said) > _SAID else "")
+    return "; ".join(said[:_SAID]) + (
+        f"; and {len(said) - _SAID} more" if len(said) > _SAID else ""
+    )
 
 
 def _option(value: Any) -> str:
@@ -163,9 +182,13 @@ def _input_differences(before: list[dict[str, Any]], now: list[dict[str, Any]]) 
         if size is None:
             said.append(f"{_short(path)} has vanished")
         elif size != was:
-            said.append(f"{_short(path)} has changed: {size} bytes, was {'missing' if was is None else was}")
+            said.append(
+                f"{_short(path)} has changed: {size} bytes, was {'missing' if was is None else was}"
+            )
         elif new[path]["changed_ns"] != old[path]["changed_ns"]:
-            said.append(f"{_short(path)} has changed: written {_when(new[path])}, was {_when(old[path])}")
+            said.append(
+                f"{_short(path)} has changed: written {_when(new[path])}, was {_when(old[path])}"
+            )
         else:
             said.append(f"{_short(path)} has changed: other files are in it")
     if not said and list(old) != list(new):
@@ -212,7 +235,9 @@ def hold(folder: Path) -> Iterator[None]:
                 raise
     try:
         os.ftruncate(handle, 0)
-        os.pwrite(handle, f"process {os.getpid()} on {platform.node()}\n".encode("ascii", "replace"), 0)
+        os.pwrite(
+            handle, f"process {os.getpid()} on {platform.node()}\n".encode("ascii", "replace"), 0
+        )
         yield
     finally:
         os.close(handle)
@@ -225,7 +250,9 @@ def _lock(handle: int, folder: Path) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         who = os.pread(handle, 100, 0).decode("ascii", "replace").strip() or "another process"
-        raise ResumeError(f"{folder.name}: {who} is making this product now; wait for it, or stop it first") from None
+        raise ResumeError(
+            f"{folder.name}: {who} is making this product now; wait for it, or stop it first"
+        ) from None
     except OSError:  # a file system without locks
         return
 
@@ -246,7 +273,9 @@ def begin_job(folder: Path, fingerprint: Mapping[str, Any], *, parts: int, overw
     """Write what the run was asked for, before its first block."""
     job = {"schema": _SCHEMA, "overwrite": overwrite, "parts": parts, **fingerprint}
     with replace_file(folder / "job.json") as temporary:
-        temporary.write_text(json.dumps({**job, "sha256": _hash_json(job)}, indent=1), encoding="utf-8")
+        temporary.write_text(
+            json.dumps({**job, "sha256": _hash_json(job)}, indent=1), encoding="utf-8"
+        )
 
 
 def seal_store(folder: Path) -> None:
@@ -275,7 +304,9 @@ def _hash_tree(folder: Path) -> str:
     total = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as file:
-            total.update(f"{path.relative_to(folder).as_posix()} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
+            total.update(
+                f"{path.relative_to(folder).as_posix()} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode()
+            )
     return total.hexdigest()
 
 
@@ -293,7 +324,9 @@ def kept_parts(folder: Path) -> int:
 
 def is_begun(folder: Path) -> bool:
     """Whether a job folder holds work that is worth keeping: finished parts, or a store of the log."""
-    return (folder / "job.json").exists() and (kept_parts(folder) > 0 or "log.zarr" in _names(folder))
+    return (folder / "job.json").exists() and (
+        kept_parts(folder) > 0 or "log.zarr" in _names(folder)
+    )
 
 
 def _names(folder: Path) -> list[str]:

@@ -56,17 +56,19 @@ def load_log(
     Parameters
     ----------
     paths : sequence of path
-        Files, in any order; NetCDF and Zarr logs that gyrostab wrote are joined as they are, without loading them.
+        Files, in any order; NetCDF and Zarr logs that gyrostab wrote are joined as they are,
+        without loading them.
     max_gap : str
         Longest gap; a longer step of the stamps is taken for a step of the clock.
     time_from, time_to : str, datetime or duration, optional
-        Keep the samples from the one up to, but not including, the other: dates and times (ISO 8601, UTC), or durations
-        after the start of the log.
+        Keep the samples from the one up to, but not including, the other: dates and times (ISO
+        8601, UTC), or durations after the start of the log.
     exclude : sequence of str or pairs
-        Spans ``"START/END"`` of which the samples are taken as missing; see `gyrostab.ingest.uniform.cut_log`.
+        Spans ``"START/END"`` of which the samples are taken as missing; see
+        `gyrostab.ingest.uniform.cut_log`.
     **reading
-        Options of `gyrostab.ingest.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``, ``kind``, ``channel``,
-        ``strict``, ``limits``, ``on_file``.
+        Options of `gyrostab.ingest.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``,
+        ``kind``, ``channel``, ``strict``, ``limits``, ``on_file``.
 
     Returns
     -------
@@ -80,8 +82,14 @@ def load_log(
 
     log = read_log(paths, max_gap=max_gap, **reading)
     if "sampling_rate_hz" not in log.attrs:
-        log = regularise(log, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits"))
-        said = "; ".join(f"{name}: {_said(value)}" for name, value in reading.items() if value and name != "on_file")
+        log = regularise(
+            log, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits")
+        )
+        said = "; ".join(
+            f"{name}: {_said(value)}"
+            for name, value in reading.items()
+            if value and name != "on_file"
+        )
         if said:
             log.attrs["history"] += f" (read with {said})"
     elif reading.get("channel"):
@@ -120,8 +128,9 @@ def run(
 ) -> Path:
     """Make the product of some logs and write it as NetCDF, without holding the log in memory, and so that it can be continued.
 
-    The work is done in parts, and each finished part is kept in the folder ``.PRODUCT.nc.job`` beside the output until
-    the product is complete. A run that was stopped, or killed, is continued with `resume`; its product is the same, bit for bit.
+    The work is done in parts, and each finished part is kept in the folder ``.PRODUCT.nc.job``
+    beside the output until the product is complete. A run that was stopped, or killed, is continued
+    with `resume`; its product is the same, bit for bit.
 
     Parameters
     ----------
@@ -130,19 +139,23 @@ def run(
     output : path
         NetCDF file to be written.
     reading, windows, fitting : mapping
-        Options of `gyrostab.ingest.read_log`, `gyrostab.allan.davar.davar` and `gyrostab.allan.fit.fit_noise`.
+        Options of `gyrostab.ingest.read_log`, `gyrostab.allan.davar.davar` and
+        `gyrostab.allan.fit.fit_noise`.
     surface_only : bool
         Write the dynamic Allan variance without fitting it.
     overwrite : bool
         Whether an existing output may be replaced, and an unfinished run of it forgotten.
     resume : bool
-        Continue an unfinished run of the same inputs and options; begin where there is none; do nothing when the product is complete.
+        Continue an unfinished run of the same inputs and options; begin where there is none; do
+        nothing when the product is complete.
     scheduler : str
-        ``threads``, ``processes``, or the address of a dask.distributed scheduler, whose workers must see the same files.
+        ``threads``, ``processes``, or the address of a dask.distributed scheduler, whose workers
+        must see the same files.
     workers : int, optional
         Threads or processes; one for each core by default.
     stage : callable
-        Told the name of each stage as it begins, how much is to be done in it, and how much is done.
+        Told the name of each stage as it begins, how much is to be done in it, and how much is
+        done.
 
     Returns
     -------
@@ -152,17 +165,23 @@ def run(
     Raises
     ------
     ResumeError
-        When an unfinished run is in the way, cannot be continued as asked, or is being worked on by another process.
+        When an unfinished run is in the way, cannot be continued as asked, or is being worked on by
+        another process.
     WorkerError
         When the workers cannot do the work.
     OutputError, OptionError, FormatError
-        For an output, an option or an input that is wrong; the message says whether finished parts are kept.
+        For an output, an option or an input that is wrong; the message says whether finished parts
+        are kept.
     KeyboardInterrupt
         When interrupted; its message says how much is done.
     """
     scheduler = check_scheduler(scheduler)
     fitting = None if surface_only else dict(fitting or {})
-    options: dict[str, Any] = {"reading": dict(reading or {}), "windows": dict(windows or {}), "fitting": fitting}
+    options: dict[str, Any] = {
+        "reading": dict(reading or {}),
+        "windows": dict(windows or {}),
+        "fitting": fitting,
+    }
     check_windows(**options["windows"])
     with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
         check_output(output, suffixes=[".nc"], overwrite=True)
@@ -229,8 +248,15 @@ def _describe(paths: Sequence[str | Path], target: Path, options: dict[str, Any]
 
     extra = options["reading"].get("channel", ())
     files = expand(paths) + (expand(extra) if extra else [])
-    plain = {**options["reading"], "channel": None, **options["windows"], **{f"fit {k}": v for k, v in (options["fitting"] or {}).items()}}
-    fingerprint = make_fingerprint(files, {**plain, "fit": "left out" if options["fitting"] is None else None})
+    plain = {
+        **options["reading"],
+        "channel": None,
+        **options["windows"],
+        **{f"fit {k}": v for k, v in (options["fitting"] or {}).items()},
+    }
+    fingerprint = make_fingerprint(
+        files, {**plain, "fit": "left out" if options["fitting"] is None else None}
+    )
     return _Job(target, folder_of(target), files, fingerprint, digest(fingerprint), options)
 
 
@@ -240,7 +266,10 @@ def _look(job: _Job, *, resume: bool, overwrite: bool) -> _Begun:
     if resume and _made_by(job.target) == job.name:
         return _Begun(complete=True, fresh=False, overwrite=False)
     if before and kept and not (resume or overwrite):
-        raise ResumeError(_kept(job, f"{job.target}: a run of it was begun and not finished") + ", --overwrite starts anew")
+        raise ResumeError(
+            _kept(job, f"{job.target}: a run of it was begun and not finished")
+            + ", --overwrite starts anew"
+        )
     said = differences(before, job.fingerprint) if before else ""
     if resume and kept and said:
         raise ResumeError(
@@ -291,7 +320,15 @@ def _is_log(path: Path) -> bool:
     return True
 
 
-def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _Begun, pool: Pool, stage: Stage) -> None:
+def _compute(
+    job: _Job,
+    blocks: Blocks,
+    paths: Sequence[str | Path],
+    *,
+    begun: _Begun,
+    pool: Pool,
+    stage: Stage,
+) -> None:
     """Compute what is missing of the job."""
     from gyrostab.allan.davar import davar_parts
     from gyrostab.allan.plan import choose_window
@@ -313,15 +350,29 @@ def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _
     begin_job(job.folder, job.fingerprint, parts=len(parts), overwrite=begun.overwrite)
     blocks.update(find_blocks(job.folder, parts, job=job.name))
     axis = windows.get("axis")
-    total = log.sizes["time"] * (log.sizes["axis"] if axis is None else 1 if isinstance(axis, str) else len(axis))
+    total = log.sizes["time"] * (
+        log.sizes["axis"] if axis is None else 1 if isinstance(axis, str) else len(axis)
+    )
 
     def advance(count: int) -> None:
-        stage("computing", total, total * sum(block.part.stop - block.part.start for block in blocks.values()) // parts[-1].stop)
+        stage(
+            "computing",
+            total,
+            total
+            * sum(block.part.stop - block.part.start for block in blocks.values())
+            // parts[-1].stop,
+        )
 
     call: tuple[Any, ...] = (_part_of_log, log, Workspaces(), windows, fitting)
     if pool.remote and len(blocks) < len(parts):
-        source = {**reading, "paths": _absolute(paths), "channel": _absolute(reading.get("channel", ()))}
-        if not store.exists() and not any(map(_is_log, job.files)):  # some may be damaged; the two kinds do not mix
+        source = {
+            **reading,
+            "paths": _absolute(paths),
+            "channel": _absolute(reading.get("channel", ())),
+        }
+        if not store.exists() and not any(
+            map(_is_log, job.files)
+        ):  # some may be damaged; the two kinds do not mix
             stage("storing", 0)
             to_zarr(log, store)
             seal_store(job.folder)
@@ -329,7 +380,16 @@ def _compute(job: _Job, blocks: Blocks, paths: Sequence[str | Path], *, begun: _
             source = {"paths": _absolute([store])}
         call = (_part_of_files, pool.share(json.dumps(source, default=str)), windows, fitting)
     advance(0)
-    compute_blocks(job.folder, parts, blocks, job=job.name, pool=pool, call=call, check=partial(_check_inputs, job), advance=advance)
+    compute_blocks(
+        job.folder,
+        parts,
+        blocks,
+        job=job.name,
+        pool=pool,
+        call=call,
+        check=partial(_check_inputs, job),
+        advance=advance,
+    )
 
 
 def _say_file(stage: Stage, number: int, count: int, path: Path) -> None:
@@ -347,12 +407,18 @@ def _absolute(paths: Sequence[str | Path]) -> list[str]:
 
 
 def _part_of_log(
-    log: xr.Dataset, spaces: Workspaces, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice
+    log: xr.Dataset,
+    spaces: Workspaces,
+    windows: Mapping[str, Any],
+    fitting: Mapping[str, Any] | None,
+    part: slice,
 ) -> xr.Dataset:
     return compute_part(log, part, windows, fitting, spaces.own)
 
 
-def _part_of_files(source: str, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice) -> xr.Dataset:
+def _part_of_files(
+    source: str, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice
+) -> xr.Dataset:
     """In another process: open the log there, once, so that only names travel."""
     return compute_part(_opened(source), part, windows, fitting)
 
@@ -366,10 +432,13 @@ def _opened(source: str) -> xr.Dataset:
 
 def _write(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) -> None:
     """Write the product, and warn of windows in which an axis never moved."""
-    product = write_blocks(blocks, job.target, attrs={"gyrostab_job": job.name}, overwrite=overwrite, stage=stage)
+    product = write_blocks(
+        blocks, job.target, attrs={"gyrostab_job": job.name}, overwrite=overwrite, stage=stage
+    )
     stage("checking", 0)
     for axis, share in share_constant(product).items():
         if share > 0.0:
             warnings.warn(
-                f"gyro axis {axis} is constant in {share:.0%} of the windows: is the sensor stuck, or its column a filler?", stacklevel=2
+                f"gyro axis {axis} is constant in {share:.0%} of the windows: is the sensor stuck, or its column a filler?",
+                stacklevel=2,
             )

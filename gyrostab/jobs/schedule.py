@@ -78,7 +78,9 @@ def check_scheduler(scheduler: str) -> str:
 
 
 @contextlib.contextmanager
-def open_pool(scheduler: str, *, workers: int | None = None, files: Sequence[Path] = ()) -> Iterator[Pool]:
+def open_pool(
+    scheduler: str, *, workers: int | None = None, files: Sequence[Path] = ()
+) -> Iterator[Pool]:
     """Open threads, processes, or a connection to a scheduler, for the length of the ``with`` block.
 
     Parameters
@@ -86,7 +88,8 @@ def open_pool(scheduler: str, *, workers: int | None = None, files: Sequence[Pat
     scheduler : str
         From `check_scheduler`.
     workers : int, optional
-        Threads or processes; one for each core by default. A dask.distributed scheduler has its own.
+        Threads or processes; one for each core by default. A dask.distributed scheduler has its
+        own.
     files : sequence of Path
         Files that every worker of dask.distributed must see under the same name.
 
@@ -122,7 +125,12 @@ def _processes(count: int) -> Any:
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
-    return ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_process, initargs=(os.getpid(),))
+    return ProcessPoolExecutor(
+        count,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_begin_process,
+        initargs=(os.getpid(),),
+    )
 
 
 def _begin_process(parent: int) -> None:
@@ -135,7 +143,9 @@ def _begin_process(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-    warnings.showwarning = lambda message, *_: None  # the parent opens the same files and says the same
+    warnings.showwarning = lambda message, *_: (
+        None
+    )  # the parent opens the same files and says the same
 
 
 class _Noted(NamedTuple):
@@ -187,7 +197,9 @@ def _cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
             executor.shutdown(wait=False)
 
 
-def _reach_scheduler(address: str, request: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+def _reach_scheduler(
+    address: str, request: Callable[..., Any], *arguments: Any, **options: Any
+) -> Any:
     """Make a request of a scheduler, or raise `WorkerError` when it does not answer: distributed raises errors of many kinds."""
     try:
         return request(*arguments, **options)
@@ -197,7 +209,9 @@ def _reach_scheduler(address: str, request: Callable[..., Any], *arguments: Any,
 
 def _describe_loss(address: str, error: BaseException) -> str:
     said = " ".join(str(error).split()) or type(error).__name__
-    return f"the dask scheduler {address} has died or is out of reach ({said}); start it again".replace("  ", " ")
+    return f"the dask scheduler {address} has died or is out of reach ({said}); start it again".replace(
+        "  ", " "
+    )
 
 
 def _same(value: Any) -> Any:
@@ -218,10 +232,14 @@ def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
             )
         version, seen = answer
         if version != __version__:
-            raise WorkerError(f"--scheduler {address}: worker {worker} has gyrostab {version}, here it is {__version__}; install the same")
+            raise WorkerError(
+                f"--scheduler {address}: worker {worker} has gyrostab {version}, here it is {__version__}; install the same"
+            )
         for path, size in sizes.items():
             if seen[path] != size:
-                what = "does not see" if seen[path] is None else "sees another file under the name of"
+                what = (
+                    "does not see" if seen[path] is None else "sees another file under the name of"
+                )
                 raise WorkerError(
                     f"--scheduler {address}: worker {worker} {what} {path}; all workers need the same file system under the same names"
                 )
@@ -241,7 +259,9 @@ def _size(path: str | Path) -> int | None:
         return None
 
 
-def in_any_order(pool: Pool, calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[tuple[Any, ...], Any]]:
+def in_any_order(
+    pool: Pool, calls: Iterable[tuple[Any, ...]]
+) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """Make calls side by side, few more at a time than can run, and give each back with its result as it comes.
 
     Parameters
@@ -274,7 +294,9 @@ def in_any_order(pool: Pool, calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple
             if done or pool.width():
                 idle_since = time.monotonic()
             elif time.monotonic() - idle_since > _PATIENCE:
-                raise WorkerError(f"the scheduler has had no worker for {_PATIENCE:.0f} s; start workers again")
+                raise WorkerError(
+                    f"the scheduler has had no worker for {_PATIENCE:.0f} s; start workers again"
+                )
             for future in done:
                 yield waiting.pop(future), _result(future)
     finally:
@@ -293,12 +315,18 @@ def _result(future: Future[Any]) -> Any:
     except GyrostabError:
         raise
     except BrokenProcessPool as error:
-        raise WorkerError("a worker process has died: is the memory enough? Give fewer --workers") from error
+        raise WorkerError(
+            "a worker process has died: is the memory enough? Give fewer --workers"
+        ) from error
     except CancelledError as error:
         raise WorkerError(_describe_loss("", error)) from error
     except Exception as error:
         if type(error).__name__ == "KilledWorker":
-            raise WorkerError(f"the workers died again and again on the same part ({error}); is their memory enough?") from error
-        if type(error).__module__.startswith("distributed."):  # not of the call, but of the way to it
+            raise WorkerError(
+                f"the workers died again and again on the same part ({error}); is their memory enough?"
+            ) from error
+        if type(error).__module__.startswith(
+            "distributed."
+        ):  # not of the call, but of the way to it
             raise WorkerError(_describe_loss("", error)) from error
         raise

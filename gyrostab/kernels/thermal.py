@@ -1,7 +1,8 @@
 """What temperature leaves behind in a body: diffusion through a coil, and play.
 
-A winding of thickness d, insulated on one side and heated on the other, follows its surface with modes of the relaxation times
-``t_n = 4 d^2 / ((2 n - 1)^2 pi^2 kappa)``. All processes go on where they stopped, bit for bit, however time is cut into calls.
+A winding of thickness d, insulated on one side and heated on the other, follows its surface with
+modes of the relaxation times ``t_n = 4 d^2 / ((2 n - 1)^2 pi^2 kappa)``. All processes go on where
+they stopped, bit for bit, however time is cut into calls.
 
 References
 ----------
@@ -63,7 +64,9 @@ def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
 
 
 @njit(**KERNEL)
-def _relax(change: Array, decay: Array, gain: Array, weight: Array, carry: Array) -> tuple[Array, Array]:
+def _relax(
+    change: Array, decay: Array, gain: Array, weight: Array, carry: Array
+) -> tuple[Array, Array]:
     size, count = change.size, decay.size
     total = np.empty((weight.shape[0], size))
     here = carry.copy()
@@ -79,7 +82,9 @@ def _relax(change: Array, decay: Array, gain: Array, weight: Array, carry: Array
     return total, here
 
 
-def relax(values: Array, rate: float, times: Array, weight: Array, carry: tuple[float, Array]) -> tuple[Array, tuple[float, Array]]:
+def relax(
+    values: Array, rate: float, times: Array, weight: Array, carry: tuple[float, Array]
+) -> tuple[Array, tuple[float, Array]]:
     """Rate of change of samples, delayed by every mode: ``v' = (T' - v) / t``, T straight between its samples.
 
     Parameters
@@ -103,7 +108,9 @@ def relax(values: Array, rate: float, times: Array, weight: Array, carry: tuple[
     """
     last, position = carry
     change = np.diff(values, prepend=last) * rate
-    total, position = _relax(change, np.exp(-1.0 / (rate * times)), -np.expm1(-1.0 / (rate * times)), weight, position)
+    total, position = _relax(
+        change, np.exp(-1.0 / (rate * times)), -np.expm1(-1.0 / (rate * times)), weight, position
+    )
     return total, (float(values[-1]), position)
 
 
@@ -148,7 +155,9 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
     """
     at, line = _joined(known, values, begin, end)
     followed = _follow(at, line, time)
-    return np.asarray((followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin))
+    return np.asarray(
+        (followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin)
+    )
 
 
 def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
@@ -173,7 +182,9 @@ def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: f
     followed = _follow(at, line, time)
     total = np.concatenate([[0.0], np.cumsum((line[1:] + line[:-1]) / 2.0 * np.diff(at))])
     whole = total - time * followed  # the integral of y is that of T less t times the growth of y
-    return np.asarray((whole[np.searchsorted(at, end)] - whole[np.searchsorted(at, begin)]) / (end - begin))
+    return np.asarray(
+        (whole[np.searchsorted(at, end)] - whole[np.searchsorted(at, begin)]) / (end - begin)
+    )
 
 
 def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
@@ -195,7 +206,9 @@ def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
     array([0.2, 0.2])
     """
     at, line = _joined(known, values, begin, end)
-    return np.asarray((line[np.searchsorted(at, end)] - line[np.searchsorted(at, begin)]) / (end - begin))
+    return np.asarray(
+        (line[np.searchsorted(at, end)] - line[np.searchsorted(at, begin)]) / (end - begin)
+    )
 
 
 def _joined(known: Array, values: Array, begin: Array, end: Array) -> tuple[Array, Array]:
@@ -259,9 +272,16 @@ def mean_play(known: Array, values: Array, begin: Array, end: Array, width: floa
     array([ 2.19, -1.25])
     """
     at, line = _joined(known, values, begin, end)
-    corner = np.arange(8 * (at.size - 1) + 1) / 8.0  # the slider starts and stops between the corners of the polygon
-    at, line = np.interp(corner, np.arange(at.size), at), np.interp(corner, np.arange(at.size), line)
+    corner = (
+        np.arange(8 * (at.size - 1) + 1) / 8.0
+    )  # the slider starts and stops between the corners of the polygon
+    at, line = (
+        np.interp(corner, np.arange(at.size), at),
+        np.interp(corner, np.arange(at.size), line),
+    )
     slider, _ = play(line, width, float(line[0]))
     apart = line - slider
     total = np.concatenate([[0.0], np.cumsum((apart[1:] + apart[:-1]) / 2.0 * np.diff(at))])
-    return np.asarray((total[np.searchsorted(at, end)] - total[np.searchsorted(at, begin)]) / (end - begin))
+    return np.asarray(
+        (total[np.searchsorted(at, end)] - total[np.searchsorted(at, begin)]) / (end - begin)
+    )

@@ -1,7 +1,8 @@
 """The frame of a physical effect: its parameters, and its three faces *generate*, *explain* and *say*.
 
-An effect is one frozen dataclass that inherits from `Effect`. Its fields are its parameters, made with `parameter`; the rest it
-says in class attributes. `gyrostab.physics.registry` finds it by itself. See docs/physics/README.md.
+An effect is one frozen dataclass that inherits from `Effect`. Its fields are its parameters, made
+with `parameter`; the rest it says in class attributes. `gyrostab.physics.registry` finds it by
+itself. See docs/physics/README.md.
 """
 
 from __future__ import annotations
@@ -34,7 +35,15 @@ __all__ = [
 Stage = Literal["motion", "noise", "rate", "sensor", "electronics", "sampling", "logger"]
 
 #: What happens to a signal, in the order in which it happens.
-STAGES: tuple[Stage, ...] = ("motion", "noise", "rate", "sensor", "electronics", "sampling", "logger")
+STAGES: tuple[Stage, ...] = (
+    "motion",
+    "noise",
+    "rate",
+    "sensor",
+    "electronics",
+    "sampling",
+    "logger",
+)
 
 
 @dataclass(frozen=True)
@@ -56,9 +65,11 @@ class Setup:
     gaps : ndarray of int64, shape (n, 2)
         All gaps of the log, [first missing sample, first sample after].
     restarts : ndarray of int64, shape (n, 2)
-        All losses of power, [sample at which it went, sample at which it came back]; the start of the log is not among them.
+        All losses of power, [sample at which it went, sample at which it came back]; the start of
+        the log is not among them.
     oversampling : int
-        Samples that the instrument takes in one sampling interval of the log; `rate` is so much higher before the stage "logger".
+        Samples that the instrument takes in one sampling interval of the log; `rate` is so much
+        higher before the stage "logger".
     """
 
     rate: float
@@ -84,9 +95,11 @@ class Chunk:
     size : int
         Number of samples.
     drivers : mapping of str to ndarray, shape (size,)
-        Channels that the effect needs, by the names of `Effect.channels`, without NaN, in the units given there.
+        Channels that the effect needs, by the names of `Effect.channels`, without NaN, in the units
+        given there.
     true : mapping of str to ndarray, shape (size,)
-        True rotation rate of every axis of the log [degree hour-1], also those that the effect does not act on; complete after "motion".
+        True rotation rate of every axis of the log [degree hour-1], also those that the effect does
+        not act on; complete after "motion".
     signal : ndarray, shape (axes, size)
         What has come so far [degree hour-1]; for the stages "sensor" and later.
     level : mapping of str to ndarray, shape (axes, size)
@@ -134,7 +147,8 @@ class Effect:
     size_parameters : tuple of str
         Parameters that switch the effect off when all of them are zero.
     terms : str
-        For the stage "noise": symbols that it may change, of QNBK; all of them when it does not say.
+        For the stage "noise": symbols that it may change, of QNBK; all of them when it does not
+        say.
     references : tuple of str
         Where the equation and the sizes come from.
 
@@ -143,7 +157,8 @@ class Effect:
     axes : tuple of str
         Axes of the log that it acts on; empty for all.
     driver : tuple of str
-        Names that its channels have in the log, in the order of `channels`; empty when they have the same.
+        Names that its channels have in the log, in the order of `channels`; empty when they have
+        the same.
     """
 
     name: ClassVar[str] = ""
@@ -165,7 +180,9 @@ class Effect:
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
         if self.driver and len(self.driver) != len(self.channels):
             needs = ", ".join(self.channels) or "no channel"
-            raise OptionError(f"effect {self.name!r}: driver names {len(self.driver)} channels; it takes {needs}, in this order")
+            raise OptionError(
+                f"effect {self.name!r}: driver names {len(self.driver)} channels; it takes {needs}, in this order"
+            )
         for known in self.parameters():
             if known.many and self.axes:
                 self.each(known.name, self.axes)
@@ -173,12 +190,20 @@ class Effect:
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
         """The parameters, in the order of the class."""
-        return tuple(Parameter(name=item.name, **item.metadata["parameter"]) for item in fields(cls) if "parameter" in item.metadata)
+        return tuple(
+            Parameter(name=item.name, **item.metadata["parameter"])
+            for item in fields(cls)
+            if "parameter" in item.metadata
+        )
 
     @classmethod
     def required(cls) -> tuple[str, ...]:
         """Names of the parameters that a model must give."""
-        return tuple(item.name for item in fields(cls) if item.default is MISSING and "parameter" in item.metadata)
+        return tuple(
+            item.name
+            for item in fields(cls)
+            if item.default is MISSING and "parameter" in item.metadata
+        )
 
     @classmethod
     def example(cls, **values: Any) -> Self:
@@ -187,7 +212,10 @@ class Effect:
 
     def switched_off(self) -> Self:
         """The same effect with zero size."""
-        zero: dict[str, Any] = {known.name: (0.0,) * len(getattr(self, known.name)) if known.many else 0.0 for known in self.parameters()}
+        zero: dict[str, Any] = {
+            known.name: (0.0,) * len(getattr(self, known.name)) if known.many else 0.0
+            for known in self.parameters()
+        }
         return replace(self, **{name: zero[name] for name in self.size_parameters})
 
     def needs(self) -> tuple[str, ...]:
@@ -214,7 +242,8 @@ class Effect:
             )
         return np.array(np.broadcast_to(numbers if numbers.size else 0.0, len(axes)))
 
-    # ------------------------------------------------------------------------------------------------------- three faces
+    # -------------------------------------------------------------------------------------------------------
+    # three faces
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """State before the first sample; anything that can be copied. What is random keeps `rng` (or children of it) here."""
@@ -223,15 +252,17 @@ class Effect:
     def generate(self, chunk: Chunk, state: Any) -> tuple[Any, Any]:
         """Return what the effect does to a stretch of time, and the state after it.
 
-        The state given may be changed in place. The result must not depend on how time is cut into chunks.
+        The state given may be changed in place. The result must not depend on how time is cut into
+        chunks.
 
         Returns
         -------
         values
-            By stage: "motion" and "rate": contribution to the rate [degree hour-1], shape (axes, size) or (size,).
-            "noise": mapping of changed symbols to squared coefficients, from `Chunk.level`.
-            "sensor", "electronics", "logger": the signal afterwards, shape (axes, size).
-            "sampling": the same, or with ``size / oversampling`` samples where it picks or averages the samples of the log.
+            By stage: "motion" and "rate": contribution to the rate [degree hour-1], shape (axes,
+            size) or (size,). "noise": mapping of changed symbols to squared coefficients, from
+            `Chunk.level`. "sensor", "electronics", "logger": the signal afterwards, shape (axes,
+            size). "sampling": the same, or with ``size / oversampling`` samples where it picks or
+            averages the samples of the log.
         state
         """
         raise NotImplementedError
@@ -252,7 +283,8 @@ class Effect:
         """Say in one sentence what it does, with its numbers and, where given, their standard errors."""
         raise NotImplementedError
 
-    # ----------------------------------------------------------------------------------------------------------- phrases
+    # -----------------------------------------------------------------------------------------------------------
+    # phrases
 
     def on_axes(self) -> str:
         """``"on axis x"``, ``"on axes x and y"``, ``"on all axes"``: for sentences."""
@@ -265,7 +297,9 @@ class Effect:
         """A parameter with its error and unit: ``"0.4 ± 0.1 deg/h"``."""
         unit = next(known.unit for known in self.parameters() if known.name == name)
         value = getattr(self, name)
-        text = ", ".join(f"{one:.4g}" for one in value) if isinstance(value, tuple) else f"{value:.4g}"
+        text = (
+            ", ".join(f"{one:.4g}" for one in value) if isinstance(value, tuple) else f"{value:.4g}"
+        )
         if errors and name in errors:
             text += f" ± {errors[name]:.2g}"
         return text if unit in ("1", "text") else f"{text} {unit}"

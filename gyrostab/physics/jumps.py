@@ -28,7 +28,8 @@ def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, si
     positions : sequence of float
         Where it steps, rising [samples since the start of the log].
     levels : sequence
-        Values before the first step, after it, and so on: one more than steps. A value may be an array, of rows.
+        Values before the first step, after it, and so on: one more than steps. A value may be an
+        array, of rows.
     first, size : int
         The samples asked for.
 
@@ -60,7 +61,9 @@ class _Stepping:
     next: float
 
 
-def _go(process: _Stepping, end: float, step: Callable[[_Stepping], None]) -> tuple[list[float], list[Any]]:
+def _go(
+    process: _Stepping, end: float, step: Callable[[_Stepping], None]
+) -> tuple[list[float], list[Any]]:
     """Steps before the sample `end`; `step` changes the level and sets when it steps next."""
     positions: list[float] = []
     levels = [process.level]
@@ -86,20 +89,23 @@ def _share_after(windows: Windows, instant: float) -> Array:
 class BiasJump(Effect):
     """Bias that jumps, at restarts, at shocks, or at a time that is given, and stays.
 
-    ``b = J_1 + J_2 + ...``, with normal J of the rms `restart` each time power comes back, and of the rms `shock` at random times;
-    and the step `step` at the time `at`. A shock concerns all axes, with sizes of their own.
+    ``b = J_1 + J_2 + ...``, with normal J of the rms `restart` each time power comes back, and of
+    the rms `shock` at random times; and the step `step` at the time `at`. A shock concerns all
+    axes, with sizes of their own.
 
-    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` in the windows W across a jump D, at least 2 tau from their ends: an apparent
-    ``K = D / sqrt(W)``, gone in windows wholly before or after. *Window mean*: steps and stays. *Spectrum*: nothing between the
-    jumps. *Axes*: at the same times, with sizes and signs that have nothing to do with each other.
+    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` in the windows W across a jump D, at least 2 tau from
+    their ends: an apparent ``K = D / sqrt(W)``, gone in windows wholly before or after. *Window
+    mean*: steps and stays. *Spectrum*: nothing between the jumps. *Axes*: at the same times, with
+    sizes and signs that have nothing to do with each other.
 
-    Confused with vibration_rectification (goes back when vibration ends), warm_up (decays), telegraph (comes back to the same level)
-    and K (grows within windows as well): the jump coincides with a restart or a shock and does not go back.
+    Confused with vibration_rectification (goes back when vibration ends), warm_up (decays),
+    telegraph (comes back to the same level) and K (grows within windows as well): the jump
+    coincides with a restart or a shock and does not go back.
 
     References
     ----------
-    Wang et al. 2016, Sensors (loss of power and vibration in one record). Sizes are estimates: 0.01 to 0.1 deg/h for a good gyro, 0.1 to
-    3 deg/h for a simple one.
+    Wang et al. 2016, Sensors (loss of power and vibration in one record). Sizes are estimates: 0.01
+    to 0.1 deg/h for a good gyro, 0.1 to 3 deg/h for a simple one.
 
     Examples
     --------
@@ -113,11 +119,21 @@ class BiasJump(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("restart", "shock", "step")
     references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)
 
-    restart: float = parameter("deg/h", "rms of the jump at every restart", default=0.0, typical=0.05, low=0.0, high=1e6)
-    shock: float = parameter("deg/h", "rms of the jump at every shock", default=0.0, typical=0.02, low=0.0, high=1e6)
-    shocks_per_hour: float = parameter("1/h", "shocks at random times", default=0.0, typical=2.0, low=0.0, high=1e6)
-    step: tuple[float, ...] = parameter("deg/h", "jump at the time `at`", default=(), typical=(0.1,), low=-1e9, high=1e9, many=True)
-    at: float = parameter("s", "time of that jump since the start of the log", default=0.0, typical=100.0, low=0.0)
+    restart: float = parameter(
+        "deg/h", "rms of the jump at every restart", default=0.0, typical=0.05, low=0.0, high=1e6
+    )
+    shock: float = parameter(
+        "deg/h", "rms of the jump at every shock", default=0.0, typical=0.02, low=0.0, high=1e6
+    )
+    shocks_per_hour: float = parameter(
+        "1/h", "shocks at random times", default=0.0, typical=2.0, low=0.0, high=1e6
+    )
+    step: tuple[float, ...] = parameter(
+        "deg/h", "jump at the time `at`", default=(), typical=(0.1,), low=-1e9, high=1e9, many=True
+    )
+    at: float = parameter(
+        "s", "time of that jump since the start of the log", default=0.0, typical=100.0, low=0.0
+    )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Jumps at restarts and at the time given, which are known; and the first shock."""
@@ -136,16 +152,24 @@ class BiasJump(Effect):
         places, levels, process, mean = state
 
         def jump(process: _Stepping) -> None:
-            process.level = process.level + self.shock * process.rng.standard_normal(len(chunk.setup.axes))
+            process.level = process.level + self.shock * process.rng.standard_normal(
+                len(chunk.setup.axes)
+            )
             process.next += _wait(process.rng, mean)
 
         known = step_means(places, levels, chunk.first, chunk.size)
-        return known + step_means(*_go(process, chunk.first + chunk.size, jump), chunk.first, chunk.size), state
+        return known + step_means(
+            *_go(process, chunk.first + chunk.size, jump), chunk.first, chunk.size
+        ), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Times of the jump: where power came back, and the edges and the middles of the windows."""
         known = windows.restarts[:, 1] if windows.restarts.size else np.empty(0)
-        return {"at": np.unique(np.concatenate([known, windows.begin[1:], (windows.begin + windows.end) / 2.0]))}
+        return {
+            "at": np.unique(
+                np.concatenate([known, windows.begin[1:], (windows.begin + windows.end) / 2.0])
+            )
+        }
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means: the share of every window after the jump. The sizes of random jumps are found as `step`, one after the other."""
@@ -156,7 +180,9 @@ class BiasJump(Effect):
         parts = [f"by {self.quantity('step', errors)} at {self.at:.6g} s"] if any(self.step) else []
         parts += [f"by {self.quantity('restart', errors)} rms at restarts"] if self.restart else []
         if self.shock:
-            parts.append(f"by {self.quantity('shock', errors)} rms at shocks, {self.shocks_per_hour:.3g} in an hour")
+            parts.append(
+                f"by {self.quantity('shock', errors)} rms at shocks, {self.shocks_per_hour:.3g} in an hour"
+            )
         return f"The bias jumps {self.on_axes()}: {'; '.join(parts) or 'by nothing'}."
 
 
@@ -164,18 +190,22 @@ class BiasJump(Effect):
 class Telegraph(Effect):
     """Bias that switches between two levels at random times.
 
-    ``b = 0`` or ``D``; the times between switches have no memory, with the means `low` (at 0) and `high` (at D).
+    ``b = 0`` or ``D``; the times between switches have no memory, with the means `low` (at 0) and
+    `high` (at D).
 
-    *DAVAR*: that of a Gauss-Markov process with the variance ``D^2 p (1 - p)``, p = high / (low + high), and the correlation time T_c of
-    ``1 / T_c = 1 / low + 1 / high``: a bump at 1.89 T_c; +1/2 before, -1/2 after it. *Window mean*: two levels, smeared
-    where windows are longer than T_c. *Spectrum*: Lorentzian. *Axes*: independent.
+    *DAVAR*: that of a Gauss-Markov process with the variance ``D^2 p (1 - p)``, p = high / (low +
+    high), and the correlation time T_c of ``1 / T_c = 1 / low + 1 / high``: a bump at 1.89 T_c;
+    +1/2 before, -1/2 after it. *Window mean*: two levels, smeared where windows are longer than
+    T_c. *Spectrum*: Lorentzian. *Axes*: independent.
 
-    Confused with gauss_markov, which second-order statistics cannot tell from it: the histogram of short means has two peaks (negative
-    excess kurtosis), and it takes some ten switches to see it. bias_jump does not come back to the same level.
+    Confused with gauss_markov, which second-order statistics cannot tell from it: the histogram of
+    short means has two peaks (negative excess kurtosis), and it takes some ten switches to see it.
+    bias_jump does not come back to the same level.
 
     References
     ----------
-    Machlup 1954, J. Appl. Phys. 25, 341 (spectrum). Sizes are estimates: 0.01 to 0.3 deg/h, 10 to 1000 s.
+    Machlup 1954, J. Appl. Phys. 25, 341 (spectrum). Sizes are estimates: 0.01 to 0.3 deg/h, 10 to
+    1000 s.
 
     Examples
     --------
@@ -189,8 +219,12 @@ class Telegraph(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("step",)
     references: ClassVar[tuple[str, ...]] = ("Machlup 1954, J. Appl. Phys.",)
 
-    step: tuple[float, ...] = parameter("deg/h", "upper level over the lower", typical=(0.1,), low=-1e9, high=1e9, many=True)
-    low: float = parameter("s", "mean time at the lower level, where the bias is 0", default=100.0, low=1e-3, high=1e9)
+    step: tuple[float, ...] = parameter(
+        "deg/h", "upper level over the lower", typical=(0.1,), low=-1e9, high=1e9, many=True
+    )
+    low: float = parameter(
+        "s", "mean time at the lower level, where the bias is 0", default=100.0, low=1e-3, high=1e9
+    )
     high: float = parameter("s", "mean time at the upper level", default=100.0, low=1e-3, high=1e9)
 
     @property
@@ -203,7 +237,9 @@ class Telegraph(Effect):
         rows = []
         for child in rng.spawn(len(setup.axes)):
             up = float(child.random() < self.high / (self.low + self.high))
-            rows.append(_Stepping(child, up, _wait(child, (self.high if up else self.low) * setup.rate)))
+            rows.append(
+                _Stepping(child, up, _wait(child, (self.high if up else self.low) * setup.rate))
+            )
         return rows
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
@@ -211,24 +247,36 @@ class Telegraph(Effect):
 
         def switch(process: _Stepping) -> None:
             process.level = 1.0 - process.level
-            process.next += _wait(process.rng, (self.high if process.level else self.low) * chunk.rate)
+            process.next += _wait(
+                process.rng, (self.high if process.level else self.low) * chunk.rate
+            )
 
         end = chunk.first + chunk.size
-        unit = np.stack([step_means(*_go(row, end, switch), chunk.first, chunk.size) for row in state])
+        unit = np.stack(
+            [step_means(*_go(row, end, switch), chunk.first, chunk.size) for row in state]
+        )
         return self.each("step", chunk.setup.axes)[:, None] * unit, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Mean times at both levels, from a sample to the whole record."""
-        times = np.geomspace(10.0 / windows.rate, max(windows.end[-1] / 4.0, 20.0 / windows.rate), 6)
+        times = np.geomspace(
+            10.0 / windows.rate, max(windows.end[-1] / 4.0, 20.0 / windows.rate), 6
+        )
         return {"low": times, "high": times}
 
     def explain(self, windows: Windows) -> Prediction:
         """The spectrum of the samples."""
         share = self.high / (self.low + self.high)
-        density = share * (1.0 - share) * lorentz_density(windows.frequency, self.correlation_time, windows.rate)
+        density = (
+            share
+            * (1.0 - share)
+            * lorentz_density(windows.frequency, self.correlation_time, windows.rate)
+        )
         return Prediction(
             spectrum={"step": np.broadcast_to(density, (windows.begin.size, density.size))},
-            wander={"step": (self.correlation_time, np.full(windows.begin.size, share * (1.0 - share)))},
+            wander={
+                "step": (self.correlation_time, np.full(windows.begin.size, share * (1.0 - share)))
+            },
             levels="step",
         )
 
@@ -242,20 +290,21 @@ class Telegraph(Effect):
 class FringeHop(Effect):
     """The loop locks on another fringe: the rate steps by a whole number of fringes.
 
-    ``w_out = w + k lambda c / (L D)``, L the length and D the diameter of the coil; the index of the glass does not matter. A hop
-    by k = ``order`` comes at the time `at`, or else at random times by plus or minus k, stays for a time of mean `hold`, and
-    ends at a restart.
+    ``w_out = w + k lambda c / (L D)``, L the length and D the diameter of the coil; the index of
+    the glass does not matter. A hop by k = ``order`` comes at the time `at`, or else at random
+    times by plus or minus k, stays for a time of mean `hold`, and ends at a restart.
 
-    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` with the huge D of a fringe: nothing else is seen in windows across. *Window mean*: steps
-    of one size, both signs. *Spectrum*: that of a few steps. *Axes*: independent, the size of each from its own coil.
+    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` with the huge D of a fringe: nothing else is seen in
+    windows across. *Window mean*: steps of one size, both signs. *Spectrum*: that of a few steps.
+    *Axes*: independent, the size of each from its own coil.
 
-    Confused with bias_jump (any size), clipping (ends at the range) and bit errors (single samples, powers of two): the size of the
-    step is that of the coil, always.
+    Confused with bias_jump (any size), clipping (ends at the range) and bit errors (single samples,
+    powers of two): the size of the step is that of the coil, always.
 
     References
     ----------
-    Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (unambiguous range): 500 m on 4 cm at 1550 nm make 1331 deg/s. How often is an
-    estimate.
+    Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (unambiguous range): 500 m on 4 cm at 1550 nm
+    make 1331 deg/s. How often is an estimate.
 
     Examples
     --------
@@ -272,18 +321,37 @@ class FringeHop(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("order",)
     references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)
 
-    order: float = parameter("1", "fringes of a hop, with its sign", default=1.0, low=-1000.0, high=1000.0)
-    length: float = parameter("m", "length of the coil's fibre", default=500.0, low=1.0, high=1e5, source="Lefevre 2014")
-    diameter: float = parameter("m", "diameter of the coil", default=0.04, low=1e-3, high=10.0, source="Lefevre 2014")
-    wavelength: float = parameter("nm", "wavelength of the light", default=1550.0, low=100.0, high=1e4, source="Lefevre 2014")
+    order: float = parameter(
+        "1", "fringes of a hop, with its sign", default=1.0, low=-1000.0, high=1000.0
+    )
+    length: float = parameter(
+        "m", "length of the coil's fibre", default=500.0, low=1.0, high=1e5, source="Lefevre 2014"
+    )
+    diameter: float = parameter(
+        "m", "diameter of the coil", default=0.04, low=1e-3, high=10.0, source="Lefevre 2014"
+    )
+    wavelength: float = parameter(
+        "nm", "wavelength of the light", default=1550.0, low=100.0, high=1e4, source="Lefevre 2014"
+    )
     at: float = parameter("s", "time of the hop; inf for random ones", default=math.inf, low=0.0)
-    per_hour: float = parameter("1/h", "random hops, while on the right fringe", default=0.0, typical=60.0, low=0.0, high=1e6)
-    hold: float = parameter("s", "mean time until it hops back; inf for never", default=math.inf, typical=20.0, low=1e-6)
+    per_hour: float = parameter(
+        "1/h",
+        "random hops, while on the right fringe",
+        default=0.0,
+        typical=60.0,
+        low=0.0,
+        high=1e6,
+    )
+    hold: float = parameter(
+        "s", "mean time until it hops back; inf for never", default=math.inf, typical=20.0, low=1e-6
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.order != int(self.order):
-            raise OptionError(f"effect {self.name!r}, parameter 'order': {self.order:g} is not a whole number of fringes; give one")
+            raise OptionError(
+                f"effect {self.name!r}, parameter 'order': {self.order:g} is not a whole number of fringes; give one"
+            )
 
     @property
     def fringe(self) -> float:
@@ -300,7 +368,11 @@ class FringeHop(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """The signal with the hops [degree hour-1]."""
-        mean = _HOUR * chunk.rate / self.per_hour if self.per_hour and math.isinf(self.at) else math.inf
+        mean = (
+            _HOUR * chunk.rate / self.per_hour
+            if self.per_hour and math.isinf(self.at)
+            else math.inf
+        )
         losses = chunk.setup.restarts[:, 0].astype(np.float64)
 
         def hop(process: _Stepping) -> None:
@@ -311,10 +383,15 @@ class FringeHop(Effect):
             sign = 1.0 if math.isfinite(self.at) or process.rng.random() < 0.5 else -1.0
             process.level = sign
             later = losses[losses > process.next]
-            process.next = min(process.next + _wait(process.rng, self.hold * chunk.rate), float(later[0]) if later.size else math.inf)
+            process.next = min(
+                process.next + _wait(process.rng, self.hold * chunk.rate),
+                float(later[0]) if later.size else math.inf,
+            )
 
         end = chunk.first + chunk.size
-        fringes = np.stack([step_means(*_go(row, end, hop), chunk.first, chunk.size) for row in state])
+        fringes = np.stack(
+            [step_means(*_go(row, end, hop), chunk.first, chunk.size) for row in state]
+        )
         return chunk.signal + self.order * self.fringe * fringes, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
@@ -331,5 +408,9 @@ class FringeHop(Effect):
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
         count = self.quantity("order", errors)
-        when = f"at {self.at:.6g} s" if math.isfinite(self.at) else f"{self.per_hour:.3g} times in an hour"
+        when = (
+            f"at {self.at:.6g} s"
+            if math.isfinite(self.at)
+            else f"{self.per_hour:.3g} times in an hour"
+        )
         return f"The gyro hops by {count} fringe{'' if self.order == 1 else 's'} of {self.fringe:.4g} deg/h {self.on_axes()}, {when}."

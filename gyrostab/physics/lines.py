@@ -11,7 +11,14 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
-from gyrostab.physics.phase import TURN, fold, line_density, turn_means, turns_of_samples, turns_of_windows
+from gyrostab.physics.phase import (
+    TURN,
+    fold,
+    line_density,
+    turn_means,
+    turns_of_samples,
+    turns_of_windows,
+)
 from gyrostab.units import INNER
 
 __all__ = ["RotationLine", "SpectralLine"]
@@ -21,21 +28,24 @@ __all__ = ["RotationLine", "SpectralLine"]
 class SpectralLine(Effect):
     """A line at a frequency that does not move: steady, or a resonance of stated quality.
 
-    ``rate(t) = A sin(2 pi f t + phi)``; or, with a quality Q, the velocity of an oscillator of that frequency shaken by white noise, of
-    the same mean square ``A^2 / 2``, with the density ``(A^2 / 2) w f^2 / (pi ((f^2 - f0^2)^2 + w^2 f^2))`` and w = f0 / Q. Every sample is
-    the mean over its interval, so a line above half of the sampling rate folds down with the factor sinc(f / fs).
+    ``rate(t) = A sin(2 pi f t + phi)``; or, with a quality Q, the velocity of an oscillator of that
+    frequency shaken by white noise, of the same mean square ``A^2 / 2``, with the density ``(A^2 /
+    2) w f^2 / (pi ((f^2 - f0^2)^2 + w^2 f^2))`` and w = f0 / Q. Every sample is the mean over its
+    interval, so a line above half of the sampling rate folds down with the factor sinc(f / fs).
 
-    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``: a bump of sigma = 0.725 A at tau = 0.371 / f, then a comb that falls with 1 / tau;
-    a resonance has the bump without the comb. *Window mean*: nothing. *Spectrum*: a line, or a peak of width f0 / Q. *Axes*: one
-    motion, with a factor for each axis.
+    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``: a bump of sigma = 0.725 A at tau = 0.371 / f,
+    then a comb that falls with 1 / tau; a resonance has the bump without the comb. *Window mean*:
+    nothing. *Spectrum*: a line, or a peak of width f0 / Q. *Axes*: one motion, with a factor for
+    each axis.
 
-    Confused with rotation_line and earth_rate (move with the rotation), feedback_reset (moves with the gyro's own rate) and
-    aliased_vibration (moves with the sampling rate, follows vibration): see whether f moves with rotation, temperature, sampling rate.
+    Confused with rotation_line and earth_rate (move with the rotation), feedback_reset (moves with
+    the gyro's own rate) and aliased_vibration (moves with the sampling rate, follows vibration):
+    see whether f moves with rotation, temperature, sampling rate.
 
     References
     ----------
-    IEEE Std 952-1997, annex C (Allan variance of a sinusoid). Sizes are estimates: structures resonate at 20 to 2000 Hz with a quality
-    of 5 to 50.
+    IEEE Std 952-1997, annex C (Allan variance of a sinusoid). Sizes are estimates: structures
+    resonate at 20 to 2000 Hz with a quality of 5 to 50.
 
     Examples
     --------
@@ -49,10 +59,21 @@ class SpectralLine(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
 
-    amplitude: tuple[float, ...] = parameter("deg/h", "amplitude, sqrt(2) times the rms", typical=0.2, low=-1e6, high=1e6, many=True)
+    amplitude: tuple[float, ...] = parameter(
+        "deg/h", "amplitude, sqrt(2) times the rms", typical=0.2, low=-1e6, high=1e6, many=True
+    )
     frequency: float = parameter("Hz", "frequency", typical=2.7, low=1e-6, high=1e5)
-    quality: float = parameter("1", "frequency over width; inf for a steady line", default=math.inf, low=0.5)
-    phase: tuple[float, ...] = parameter("deg", "phase of a steady line at the start of the log", default=(), low=-1e6, high=1e6, many=True)
+    quality: float = parameter(
+        "1", "frequency over width; inf for a steady line", default=math.inf, low=0.5
+    )
+    phase: tuple[float, ...] = parameter(
+        "deg",
+        "phase of a steady line at the start of the log",
+        default=(),
+        low=-1e6,
+        high=1e6,
+        many=True,
+    )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """The oscillator in its stationary state; nothing for a steady line."""
@@ -69,13 +90,17 @@ class SpectralLine(Effect):
         amplitude = self.each("amplitude", chunk.setup.axes)[:, None]
         if state is None:
             cycles = self.frequency / chunk.rate
-            middle: Array = (np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5) * cycles
+            middle: Array = (
+                np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5
+            ) * cycles
             phase = np.radians(self.each("phase", chunk.setup.axes))[:, None] - math.pi / 2.0
             return np.asarray(amplitude * turn_means(middle, np.full(1, cycles), phase)), None
         from gyrostab.kernels.random.coloured import march
 
         reading, rng, position = state
-        values, position = march(reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position)
+        values, position = march(
+            reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position
+        )
         return amplitude / math.sqrt(2.0) * values, (reading, rng, position)
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
@@ -88,7 +113,11 @@ class SpectralLine(Effect):
         place = np.full(windows.begin.shape, float(fold(self.frequency, windows.rate)))
         if math.isinf(self.quality):
             power = 0.5 * np.sinc(self.frequency / windows.rate) ** 2
-            return Prediction(spectrum={"amplitude": line_density(windows, place, power)}, coherent=True, line=place)
+            return Prediction(
+                spectrum={"amplitude": line_density(windows, place, power)},
+                coherent=True,
+                line=place,
+            )
         from gyrostab.kernels.random.coloured import folded_psd, oscillator_psd
 
         def density(f: Array) -> Array:
@@ -111,20 +140,24 @@ class SpectralLine(Effect):
 class RotationLine(Effect):
     """Lines locked to the rotation of the tool, or with another driver to the strokes of a pump or the modes of stick-slip.
 
-    ``rate(t) = sum_k A k^-p cos(k (m theta(t) + phi))`` over k = 1 to `harmonics`, theta the turns of the channel since the start of
-    the log, m the `order`: lines in a turn. The phase is the integral of the channel, carried on from sample to sample, and each sample
-    is the mean over its interval, so a line folds where its frequency passes half of the sampling rate.
+    ``rate(t) = sum_k A k^-p cos(k (m theta(t) + phi))`` over k = 1 to `harmonics`, theta the turns
+    of the channel since the start of the log, m the `order`: lines in a turn. The phase is the
+    integral of the channel, carried on from sample to sample, and each sample is the mean over its
+    interval, so a line folds where its frequency passes half of the sampling rate.
 
-    *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f wanders inside a window; it moves to shorter times as the tool
-    speeds up. *Window mean*: nothing while it turns; ``A cos(phi)`` of the standing tool. *Spectrum*: a comb that follows the rotation.
-    *Axes*: phase locked, with amplitude and phase of each axis.
+    *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f wanders inside a window; it
+    moves to shorter times as the tool speeds up. *Window mean*: nothing while it turns; ``A
+    cos(phi)`` of the standing tool. *Spectrum*: a comb that follows the rotation. *Axes*: phase
+    locked, with amplitude and phase of each axis.
 
-    Confused with earth_rate (15 deg/h at most, quadrature between the cross axes), g_sensitivity and magnetic (proportional to their
-    channels), and spectral_line (does not move): see whether the line moves with the rotation, and with which multiple.
+    Confused with earth_rate (15 deg/h at most, quadrature between the cross axes), g_sensitivity
+    and magnetic (proportional to their channels), and spectral_line (does not move): see whether
+    the line moves with the rotation, and with which multiple.
 
     References
     ----------
-    No published sizes; estimates: pumps 1 to 6 Hz, stick-slip 0.1 to 0.5 Hz with 0 to 2 times the mean rotation rate, whirl 5 to 20 Hz.
+    No published sizes; estimates: pumps 1 to 6 Hz, stick-slip 0.1 to 0.5 Hz with 0 to 2 times the
+    mean rotation rate, whirl 5 to 20 Hz.
 
     Examples
     --------
@@ -138,16 +171,26 @@ class RotationLine(Effect):
     channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
 
-    amplitude: tuple[float, ...] = parameter("deg/h", "amplitude of the first line", typical=0.5, low=-1e6, high=1e6, many=True)
-    order: float = parameter("1", "frequency of the first line [per turn]", default=1.0, low=1e-3, high=1e3)
+    amplitude: tuple[float, ...] = parameter(
+        "deg/h", "amplitude of the first line", typical=0.5, low=-1e6, high=1e6, many=True
+    )
+    order: float = parameter(
+        "1", "frequency of the first line [per turn]", default=1.0, low=1e-3, high=1e3
+    )
     harmonics: float = parameter("1", "number of lines", default=1.0, low=1.0, high=100.0)
-    rolloff: float = parameter("1", "the k-th line is k^-rolloff of the first", default=1.0, low=-5.0, high=5.0)
-    phase: tuple[float, ...] = parameter("deg", "phase of the first line at the start", default=(), low=-1e6, high=1e6, many=True)
+    rolloff: float = parameter(
+        "1", "the k-th line is k^-rolloff of the first", default=1.0, low=-5.0, high=5.0
+    )
+    phase: tuple[float, ...] = parameter(
+        "deg", "phase of the first line at the start", default=(), low=-1e6, high=1e6, many=True
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.harmonics != int(self.harmonics):
-            raise OptionError(f"effect {self.name!r}, parameter 'harmonics': {self.harmonics:g} is not a whole number of lines; give one")
+            raise OptionError(
+                f"effect {self.name!r}, parameter 'harmonics': {self.harmonics:g} is not a whole number of lines; give one"
+            )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Turns of the channel so far."""
@@ -155,10 +198,16 @@ class RotationLine(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
-        middle, inside, state = turns_of_samples(self.order * chunk.drivers["rotation_rate"], chunk.rate, state)
-        return self._lines(middle, inside, chunk.setup.axes, self.each("amplitude", chunk.setup.axes)), state
+        middle, inside, state = turns_of_samples(
+            self.order * chunk.drivers["rotation_rate"], chunk.rate, state
+        )
+        return self._lines(
+            middle, inside, chunk.setup.axes, self.each("amplitude", chunk.setup.axes)
+        ), state
 
-    def _lines(self, middle: Array, inside: Array, axes: tuple[str, ...], amplitude: Array) -> Array:
+    def _lines(
+        self, middle: Array, inside: Array, axes: tuple[str, ...], amplitude: Array
+    ) -> Array:
         """Sum of the lines over intervals, of amplitude one."""
         total = np.zeros((len(axes), middle.size))
         phase = np.radians(self.each("phase", axes))[:, None]
@@ -179,9 +228,14 @@ class RotationLine(Effect):
         cycles = k * np.abs(rotation) / TURN
         place = fold(cycles, windows.rate)
         power = 0.5 * (k**-self.rolloff * np.sinc(cycles / windows.rate)) ** 2
-        comb = sum((line_density(windows, one, weight) for one, weight in zip(place, power, strict=True)), np.zeros(()))
+        comb = sum(
+            (line_density(windows, one, weight) for one, weight in zip(place, power, strict=True)),
+            np.zeros(()),
+        )
         order = {"amplitude": np.ones((len(windows.axes), 3), np.complex128)}
-        return Prediction(mean={"amplitude": mean}, spectrum={"amplitude": comb}, line=place, order=order)
+        return Prediction(
+            mean={"amplitude": mean}, spectrum={"amplitude": comb}, line=place, order=order
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

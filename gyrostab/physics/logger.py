@@ -21,7 +21,9 @@ def _whole(effect: Effect, name: str) -> int:
     """A parameter that must be a whole number."""
     value = float(getattr(effect, name))
     if value != int(value):
-        raise OptionError(f"effect {effect.name!r}, parameter {name!r}: {value:g} is not a whole number; give one")
+        raise OptionError(
+            f"effect {effect.name!r}, parameter {name!r}: {value:g} is not a whole number; give one"
+        )
     return int(value)
 
 
@@ -29,23 +31,26 @@ def _whole(effect: Effect, name: str) -> int:
 class LoggerFilter(Effect):
     """The logger's filter, at the rate of the instrument, and how it makes the samples of the log.
 
-    Low-pass: Butterworth of `order` poles with half power at `cutoff`, made digital by the bilinear transform. Then a moving average
-    over `length`. Then the samples of the log: the mean of those of the instrument (integrate and dump), or with ``pick = 1`` every
-    n-th of them, n the `oversampling` of the model, so that what the filter lets through above half of the log's rate folds down. All
-    are causal and remember from chunk to chunk. Where it is to explain a recording, `instrument` is this n: 1 for a filter at the rate of
-    the log, 0 for an instrument much faster than it; a simulation has the model's.
+    Low-pass: Butterworth of `order` poles with half power at `cutoff`, made digital by the bilinear
+    transform. Then a moving average over `length`. Then the samples of the log: the mean of those
+    of the instrument (integrate and dump), or with ``pick = 1`` every n-th of them, n the
+    `oversampling` of the model, so that what the filter lets through above half of the log's rate
+    folds down. All are causal and remember from chunk to chunk. Where it is to explain a recording,
+    `instrument` is this n: 1 for a filter at the rate of the log, 0 for an instrument much faster
+    than it; a simulation has the model's.
 
-    *DAVAR*: less at times below ``1 / cutoff`` or `length`, where sigma grows with tau as if of K or R; nothing at long times. Picked
-    without a filter: more white noise at all times, n times the variance. *Window mean*: nothing. *Spectrum*: multiplied by
-    ``sum_k |H(f + k fs)|^2``. *Axes*: all alike.
+    *DAVAR*: less at times below ``1 / cutoff`` or `length`, where sigma grows with tau as if of K
+    or R; nothing at long times. Picked without a filter: more white noise at all times, n times the
+    variance. *Window mean*: nothing. *Spectrum*: multiplied by ``sum_k |H(f + k fs)|^2``. *Axes*:
+    all alike.
 
-    Confused with a smaller N (look at long times), negative Q, held_samples, and a wrong sampling rate (lines move): the spectrum
-    up to 0.3 fs decides.
+    Confused with a smaller N (look at long times), negative Q, held_samples, and a wrong sampling
+    rate (lines move): the spectrum up to 0.3 fs decides.
 
     References
     ----------
-    Oppenheim and Schafer 2010, Discrete-Time Signal Processing, 3rd ed. (bilinear transform, decimation). Sizes are estimates: 0.2 to 0.4
-    times the log's rate.
+    Oppenheim and Schafer 2010, Discrete-Time Signal Processing, 3rd ed. (bilinear transform,
+    decimation). Sizes are estimates: 0.2 to 0.4 times the log's rate.
 
     Examples
     --------
@@ -57,13 +62,23 @@ class LoggerFilter(Effect):
     short: ClassVar[str] = "low-pass, integrate-and-dump, decimation"
     stage: ClassVar[Stage] = "sampling"
     size_parameters: ClassVar[tuple[str, ...]] = ("cutoff", "length", "pick")
-    references: ClassVar[tuple[str, ...]] = ("Oppenheim and Schafer 2010, Discrete-Time Signal Processing",)
+    references: ClassVar[tuple[str, ...]] = (
+        "Oppenheim and Schafer 2010, Discrete-Time Signal Processing",
+    )
 
-    cutoff: float = parameter("Hz", "half power of the low-pass; 0 for none", default=0.0, typical=2.0, low=0.0, high=1e6)
+    cutoff: float = parameter(
+        "Hz", "half power of the low-pass; 0 for none", default=0.0, typical=2.0, low=0.0, high=1e6
+    )
     order: float = parameter("1", "poles of the low-pass", default=2.0, low=1.0, high=12.0)
-    length: float = parameter("s", "length of the moving average; 0 for none", default=0.0, low=0.0, high=1e4)
-    pick: float = parameter("1", "1: every n-th sample of the instrument; 0: means of n", default=0.0, low=0.0, high=1.0)
-    instrument: float = parameter("1", "n, where it is to explain a recording; 0: many", default=0.0, low=0.0, high=1000.0)
+    length: float = parameter(
+        "s", "length of the moving average; 0 for none", default=0.0, low=0.0, high=1e4
+    )
+    pick: float = parameter(
+        "1", "1: every n-th sample of the instrument; 0: means of n", default=0.0, low=0.0, high=1.0
+    )
+    instrument: float = parameter(
+        "1", "n, where it is to explain a recording; 0: many", default=0.0, low=0.0, high=1000.0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,11 +131,22 @@ class LoggerFilter(Effect):
         cutoff = windows.rate * np.geomspace(0.02, 1.5, 27)
         found: list[dict[str, float]] = []
         for order in (1.0, 2.0, 4.0):
-            found += [{"cutoff": f, "order": order, "instrument": 1.0} for f in cutoff[cutoff < 0.49 * windows.rate].tolist()]
+            found += [
+                {"cutoff": f, "order": order, "instrument": 1.0}
+                for f in cutoff[cutoff < 0.49 * windows.rate].tolist()
+            ]
             found += [{"cutoff": f, "order": order, "instrument": 0.0} for f in cutoff.tolist()]
-        found += [{"cutoff": f, "order": 1.0, "instrument": 0.0, "pick": 1.0} for f in cutoff.tolist()]
-        found += [{"length": taps / windows.rate, "instrument": 1.0} for taps in (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)]
-        found += [{"length": taps / windows.rate, "instrument": 0.0} for taps in (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)]
+        found += [
+            {"cutoff": f, "order": 1.0, "instrument": 0.0, "pick": 1.0} for f in cutoff.tolist()
+        ]
+        found += [
+            {"length": taps / windows.rate, "instrument": 1.0}
+            for taps in (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+        ]
+        found += [
+            {"length": taps / windows.rate, "instrument": 0.0}
+            for taps in (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
+        ]
         nothing = {"cutoff": 0.0, "order": 2.0, "length": 0.0, "pick": 0.0, "instrument": 0.0}
         return [nothing | point for point in found]
 
@@ -132,20 +158,33 @@ class LoggerFilter(Effect):
             return Prediction()
         if self.instrument:
             return Prediction(response=self._digital(windows.frequency, windows.rate))
-        highest = min(20.0 * self.cutoff if self.cutoff else math.inf, 50.0 / self.length if self.length else math.inf)
+        highest = min(
+            20.0 * self.cutoff if self.cutoff else math.inf,
+            50.0 / self.length if self.length else math.inf,
+        )
 
         def gain(f: Array) -> Array:
             low = 1.0 / (1.0 + (f / self.cutoff) ** (2 * int(self.order))) if self.cutoff else 1.0
             return np.asarray(low * np.sinc(f * self.length) ** 2)
 
-        return Prediction(response=folded_psd(gain, windows.frequency, windows.rate, max(highest, windows.rate), average=not self.pick))
+        return Prediction(
+            response=folded_psd(
+                gain,
+                windows.frequency,
+                windows.rate,
+                max(highest, windows.rate),
+                average=not self.pick,
+            )
+        )
 
     def _digital(self, frequency: Array, rate: float) -> Array:
         """For an instrument of `instrument` samples in one of the log: all frequencies of its samples that look the same in the log."""
         n = int(self.instrument)
         fast = n * rate
         if self.cutoff >= fast / 2.0:
-            raise OptionError(f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of the instrument's {fast:g} Hz")
+            raise OptionError(
+                f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of the instrument's {fast:g} Hz"
+            )
         f = np.asarray(frequency, np.float64)[..., None] + rate * np.arange(n)
         response = np.ones_like(f)
         if self.cutoff:
@@ -153,14 +192,27 @@ class LoggerFilter(Effect):
             response = 1.0 / (1.0 + ratio ** (2 * int(self.order)))
         for taps in (max(1, round(self.length * fast)), 1 if self.pick else n):
             if taps > 1:  # mean of so many samples
-                response = response * (np.sin(np.pi * taps * f / fast) / (taps * np.sin(np.pi * f / fast))) ** 2
+                response = (
+                    response
+                    * (np.sin(np.pi * taps * f / fast) / (taps * np.sin(np.pi * f / fast))) ** 2
+                )
         return np.asarray(response.sum(axis=-1))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        parts = [f"low-pass of order {int(self.order)} at {self.quantity('cutoff', errors)}"] if self.cutoff else []
+        parts = (
+            [f"low-pass of order {int(self.order)} at {self.quantity('cutoff', errors)}"]
+            if self.cutoff
+            else []
+        )
         parts += [f"average over {self.quantity('length', errors)}"] if self.length else []
-        taken = "filtered at the rate of the log" if self.instrument == 1.0 else "picked" if self.pick else "means"
+        taken = (
+            "filtered at the rate of the log"
+            if self.instrument == 1.0
+            else "picked"
+            if self.pick
+            else "means"
+        )
         return f"The logger filters {self.on_axes()}: {', '.join(parts) or 'nothing'}; its samples are {taken}."
 
 
@@ -168,19 +220,22 @@ class LoggerFilter(Effect):
 class RateQuantization(Effect):
     """The rate is rounded to a lattice of values.
 
-    ``out = q round(w / q)``, or with ``mode = "floor"`` the value below, with ``"zero"`` the one on the side of zero.
+    ``out = q round(w / q)``, or with ``mode = "floor"`` the value below, with ``"zero"`` the one on
+    the side of zero.
 
-    *DAVAR*: ``q^2 / (12 k)`` more at k samples, white like N, where the noise of a sample is above q / 2; where it is smaller, steps
-    and dead bands: nothing at all, or too much. *Window mean*: -q / 2 for "floor", and for "zero" q / 2 towards
-    zero, where the value 0 stands for two steps. *Spectrum*: flat. *Axes*: independent.
+    *DAVAR*: ``q^2 / (12 k)`` more at k samples, white like N, where the noise of a sample is above
+    q / 2; where it is smaller, steps and dead bands: nothing at all, or too much. *Window mean*: -q
+    / 2 for "floor", and for "zero" q / 2 towards zero, where the value 0 stands for two steps.
+    *Spectrum*: flat. *Axes*: independent.
 
-    Confused with N (the same, but for the lattice) and Q, the rounding of an angle that is carried on, with slope -1: look at the
-    differences of values, which are multiples of q.
+    Confused with N (the same, but for the lattice) and Q, the rounding of an angle that is carried
+    on, with slope -1: look at the differences of values, which are multiples of q.
 
     References
     ----------
-    Widrow and Kollar 2008, Quantization Noise (q^2 / 12). Sizes: recordings of an ADIS16405 and a CH104 stand on lattices of 180 and 36
-    deg/h; 0.1 arcsec in 10 ms, in a common file format, is 10 deg/h.
+    Widrow and Kollar 2008, Quantization Noise (q^2 / 12). Sizes: recordings of an ADIS16405 and a
+    CH104 stand on lattices of 180 and 36 deg/h; 0.1 arcsec in 10 ms, in a common file format, is 10
+    deg/h.
 
     Examples
     --------
@@ -196,7 +251,10 @@ class RateQuantization(Effect):
 
     step: float = parameter("deg/h", "distance between the values", typical=1.0, low=0.0, high=1e9)
     mode: str = parameter(
-        "text", "to the nearest value, to the one below, or towards zero", default="round", choices=("round", "floor", "zero")
+        "text",
+        "to the nearest value, to the one below, or towards zero",
+        default="round",
+        choices=("round", "floor", "zero"),
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
@@ -204,12 +262,15 @@ class RateQuantization(Effect):
         if self.step == 0.0:
             return chunk.signal, state
         count = chunk.signal / self.step
-        return self.step * {"round": np.rint, "floor": np.floor, "zero": np.trunc}[self.mode](count), state
+        return self.step * {"round": np.rint, "floor": np.floor, "zero": np.trunc}[self.mode](
+            count
+        ), state
 
     def explain(self, windows: Windows) -> Prediction:
         """White noise of step^2 / 12 in every sample; half a step less on average where the value below is taken.
 
-        Cut off towards zero the rate loses half a step as well, with its sign: a constant, as long as it keeps that.
+        Cut off towards zero the rate loses half a step as well, with its sign: a constant, as long
+        as it keeps that.
         """
         white = np.full((windows.begin.size, windows.frequency.size), 1.0 / (12.0 * windows.rate))
         mean = {"step": np.full(windows.begin.size, -0.5)} if self.mode == "floor" else {}
@@ -224,14 +285,16 @@ class RateQuantization(Effect):
 class Spikes(Effect):
     """Single samples that are wrong: a bit of the number, or an outlier.
 
-    At random times, each axis by itself: ``kind = "bit"`` turns one bit, any of `bits` with equal chance, of the count of `lsb`
-    (two's complement); ``"outlier"`` adds a normal number of the rms `size`.
+    At random times, each axis by itself: ``kind = "bit"`` turns one bit, any of `bits` with equal
+    chance, of the count of `lsb` (two's complement); ``"outlier"`` adds a normal number of the rms
+    `size`.
 
-    *DAVAR*: white, ``p E[d^2] / k`` more at k samples, p the chance of a sample and d the spike, which the largest bits rule; windows
-    with a spike stand out from those without. *Window mean*: moved by d / n. *Spectrum*: flat. *Axes*: independent.
+    *DAVAR*: white, ``p E[d^2] / k`` more at k samples, p the chance of a sample and d the spike,
+    which the largest bits rule; windows with a spike stand out from those without. *Window mean*:
+    moved by d / n. *Spectrum*: flat. *Axes*: independent.
 
-    Confused with Q, N and real shocks (last longer than a sample, seen by accelerometers): kurtosis; the sizes of bit errors
-    are powers of two times the lattice.
+    Confused with Q, N and real shocks (last longer than a sample, seen by accelerometers):
+    kurtosis; the sizes of bit errors are powers of two times the lattice.
 
     References
     ----------
@@ -249,7 +312,9 @@ class Spikes(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
 
-    per_hour: float = parameter("1/h", "wrong samples of every axis", typical=60.0, low=0.0, high=1e8)
+    per_hour: float = parameter(
+        "1/h", "wrong samples of every axis", typical=60.0, low=0.0, high=1e8
+    )
     kind: str = parameter("text", "what is wrong", default="bit", choices=("bit", "outlier"))
     lsb: float = parameter("deg/h", "what the lowest bit counts", default=0.1, low=1e-12, high=1e9)
     bits: float = parameter("1", "bits of the number", default=16.0, low=2.0, high=48.0)
@@ -266,7 +331,10 @@ class Spikes(Effect):
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """The first wrong sample of every axis."""
         chance = self._chance(setup.rate)
-        return [(child, int(child.geometric(chance)) - 1 if chance else None) for child in rng.spawn(len(setup.axes))]
+        return [
+            (child, int(child.geometric(chance)) - 1 if chance else None)
+            for child in rng.spawn(len(setup.axes))
+        ]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """The signal with the wrong samples [degree hour-1]."""
@@ -291,8 +359,13 @@ class Spikes(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """White noise of the mean square of the spikes, which hides that they are few."""
         bits = int(self.bits)
-        name, square = ("size", 1.0) if self.kind == "outlier" else ("lsb", (4.0**bits - 1.0) / (3.0 * bits))
-        white = np.full((windows.begin.size, windows.frequency.size), self._chance(windows.rate) * square / windows.rate)
+        name, square = (
+            ("size", 1.0) if self.kind == "outlier" else ("lsb", (4.0**bits - 1.0) / (3.0 * bits))
+        )
+        white = np.full(
+            (windows.begin.size, windows.frequency.size),
+            self._chance(windows.rate) * square / windows.rate,
+        )
         return Prediction(spectrum={name: white}, marks=("outliers",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
@@ -307,14 +380,16 @@ class Spikes(Effect):
 class HeldSamples(Effect):
     """Samples that were lost and filled: with the last good one, or with zero, without a word.
 
-    From random times on, all axes together, as many samples as `length` says on average (at least one; without memory) are filled.
+    From random times on, all axes together, as many samples as `length` says on average (at least
+    one; without memory) are filled.
 
-    *DAVAR*: ``repeat``: less at one sample, by the share of held ones; more at long times, where one sample counts for many: N^2 grows
-    by the factor ``1 + 2 p m^2`` for m samples with the chance p. ``zero``: pulses as high as the rate. *Window mean*: pulled to zero
-    by "zero". *Spectrum*: less at the top, more below. *Axes*: the same samples.
+    *DAVAR*: ``repeat``: less at one sample, by the share of held ones; more at long times, where
+    one sample counts for many: N^2 grows by the factor ``1 + 2 p m^2`` for m samples with the
+    chance p. ``zero``: pulses as high as the rate. *Window mean*: pulled to zero by "zero".
+    *Spectrum*: less at the top, more below. *Axes*: the same samples.
 
-    Confused with logger_filter and small noise (no runs), clipping (runs at the limit only), real gaps: runs of equal values, which noise
-    does not make.
+    Confused with logger_filter and small noise (no runs), clipping (runs at the limit only), real
+    gaps: runs of equal values, which noise does not make.
 
     References
     ----------
@@ -332,8 +407,12 @@ class HeldSamples(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
     references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)
 
-    per_hour: float = parameter("1/h", "losses, while there is none", typical=360.0, low=0.0, high=1e8)
-    length: float = parameter("s", "mean length of one; at least a sample", default=0.5, low=0.0, high=1e6)
+    per_hour: float = parameter(
+        "1/h", "losses, while there is none", typical=360.0, low=0.0, high=1e8
+    )
+    length: float = parameter(
+        "s", "mean length of one; at least a sample", default=0.5, low=0.0, high=1e6
+    )
     fill: str = parameter("text", "what stands there", default="repeat", choices=("repeat", "zero"))
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
@@ -375,10 +454,15 @@ class HeldSamples(Effect):
             own = np.stack([windows.own[axis] for axis in windows.axes])
             return Prediction(mean={"per_hour": -share * own}, marks=("filled",))
         growth = 2.0 * count**2 / (_HOUR * windows.rate)
-        return Prediction(level={("N", "per_hour"): np.full(windows.begin.size, growth)}, marks=("repeats",))
+        return Prediction(
+            level={("N", "per_hour"): np.full(windows.begin.size, growth)}, marks=("repeats",)
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
         what = "the last one" if self.fill == "repeat" else "zero"
-        often, length = self.quantity("per_hour", errors).removesuffix(" 1/h"), self.quantity("length", errors)
+        often, length = (
+            self.quantity("per_hour", errors).removesuffix(" 1/h"),
+            self.quantity("length", errors),
+        )
         return f"Samples are lost and filled with {what} {self.on_axes()}, {often} times in an hour for {length} on average."

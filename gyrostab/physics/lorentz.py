@@ -14,8 +14,9 @@ __all__ = ["lorentz_density"]
 def lorentz_density(frequency: Array, correlation_time: float, rate: float) -> Array:
     """Two-sided density [Hz-1] of the samples of a process of unit variance and exponential correlation, folding included.
 
-    A sample is the mean over its interval, so the samples have the covariances ``c_0 = 2 (x - 1 + e^-x) / x^2`` and ``c_k =
-    ((1 - e^-x) / x)^2 e^-(k-1)x``, x the interval over the correlation time; the density is their sum.
+    A sample is the mean over its interval, so the samples have the covariances ``c_0 = 2 (x - 1 +
+    e^-x) / x^2`` and ``c_k = ((1 - e^-x) / x)^2 e^-(k-1)x``, x the interval over the correlation
+    time; the density is their sum.
 
     Parameters
     ----------
@@ -37,4 +38,6 @@ def lorentz_density(frequency: Array, correlation_time: float, rate: float) -> A
     lost = -math.expm1(-x)
     at_once = 2.0 * (x - lost) / x**2 if x > 1e-4 else 1.0 - x / 3.0
     turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64) / rate)
-    return np.asarray((at_once + 2.0 * (lost / x) ** 2 * (turn / (1.0 - math.exp(-x) * turn)).real) / rate)
+    return np.asarray(
+        (at_once + 2.0 * (lost / x) ** 2 * (turn / (1.0 - math.exp(-x) * turn)).real) / rate
+    )

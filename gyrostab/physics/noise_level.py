@@ -1,7 +1,7 @@
 """Effects of temperature, light power and vibration on the level of the noise.
 
-All of them add to the squared coefficients, each in proportion to those of the model and not to what the others made of them. So their
-order does not matter.
+All of them add to the squared coefficients, each in proportion to those of the model and not to
+what the others made of them. So their order does not matter.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from gyrostab.units import INNER
 __all__ = ["LightPowerNoise", "TemperatureNoise", "VibrationNoise", "VibrationRandomWalk"]
 
 
-#: Least N^2 of a law that is a polynomial, as a share of its value at the reference: a tenth of N. Beyond the range where such a law was
+#: Least N^2 of a law that is a polynomial, as a share of its value at the reference: a tenth of N.
+#: Beyond the range where such a law was
 #: measured it would cross zero, which no noise does.
 LEAST_SHARE = 0.01
 
@@ -46,16 +47,18 @@ class TemperatureNoise(Effect):
 
     ``N^2(T) = N0^2 (1 + c1 (T - T0) + c2 (T - T0)^2)``, N0 of the model; no less than 1 % of N0^2
 
-    *DAVAR*: the whole slope -1/2 shifts up and down with the temperature, at once and the same on plateaus and ramps. *Window mean*:
-    nothing. *Spectrum*: white, with a level that follows T. *Axes*: all alike where the source or the detectors' supply is at work.
+    *DAVAR*: the whole slope -1/2 shifts up and down with the temperature, at once and the same on
+    plateaus and ramps. *Window mean*: nothing. *Spectrum*: white, with a level that follows T.
+    *Axes*: all alike where the source or the detectors' supply is at work.
 
-    Confused with ageing_noise and light_power_noise (T trends with time, light is lost with T: see whether the noise comes back with
-    the temperature, and which of both channels it follows) and vibration_noise (drilling warms and shakes at once).
+    Confused with ageing_noise and light_power_noise (T trends with time, light is lost with T: see
+    whether the noise comes back with the temperature, and which of both channels it follows) and
+    vibration_noise (drilling warms and shakes at once).
 
     References
     ----------
-    Li et al. 2013, Chin. J. Lasers 40, 0908004 (dynamic Allan variance of three gyros from -40 to 60 degC). The size is an estimate: a
-    few per cent of N per 30 degC.
+    Li et al. 2013, Chin. J. Lasers 40, 0908004 (dynamic Allan variance of three gyros from -40 to
+    60 degC). The size is an estimate: a few per cent of N per 30 degC.
 
     Examples
     --------
@@ -71,9 +74,15 @@ class TemperatureNoise(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("linear", "quadratic")
     references: ClassVar[tuple[str, ...]] = ("Li et al. 2013, Chin. J. Lasers 40, 0908004",)
 
-    linear: float = parameter("1/degC", "growth of N^2 per degree, as a share of it", typical=2e-3, low=-1.0, high=10.0)
-    quadratic: float = parameter("1/degC^2", "the same per degree squared", default=0.0, typical=1e-5, low=-1.0, high=1.0)
-    reference: float = parameter("degC", "temperature of the model's N", default=25.0, low=-273.15, high=500.0)
+    linear: float = parameter(
+        "1/degC", "growth of N^2 per degree, as a share of it", typical=2e-3, low=-1.0, high=10.0
+    )
+    quadratic: float = parameter(
+        "1/degC^2", "the same per degree squared", default=0.0, typical=1e-5, low=-1.0, high=1.0
+    )
+    reference: float = parameter(
+        "degC", "temperature of the model's N", default=25.0, low=-273.15, high=500.0
+    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Squared N on every sample."""
@@ -97,22 +106,25 @@ class TemperatureNoise(Effect):
 class LightPowerNoise(Effect):
     """Angle random walk that follows the light power at the detector.
 
-    ``N^2(P) = a_th / P^2 + a_sh / P + a_x``: noise of the detector, shot noise, and excess noise of the source. The model's N is that at
-    the nominal power P0, and the parameters are the shares of the first two there; the rest is excess noise:
-    ``N^2(P) = N0^2 (s_th (P0 / P)^2 + s_sh P0 / P + 1 - s_th - s_sh)``.
+    ``N^2(P) = a_th / P^2 + a_sh / P + a_x``: noise of the detector, shot noise, and excess noise of
+    the source. The model's N is that at the nominal power P0, and the parameters are the shares of
+    the first two there; the rest is excess noise: ``N^2(P) = N0^2 (s_th (P0 / P)^2 + s_sh P0 / P +
+    1 - s_th - s_sh)``.
 
-    *DAVAR*: the whole slope -1/2 rises as light is lost; no more than by the shares of detector and shot noise, so that N which stays
-    while P falls means excess noise. *Window mean*: nothing. *Spectrum*: white, with a level that follows P. *Axes*: all alike when the
-    source ages, one when its coil or a splice does.
+    *DAVAR*: the whole slope -1/2 rises as light is lost; no more than by the shares of detector and
+    shot noise, so that N which stays while P falls means excess noise. *Window mean*: nothing.
+    *Spectrum*: white, with a level that follows P. *Axes*: all alike when the source ages, one when
+    its coil or a splice does.
 
-    Confused with temperature_noise (light is lost with temperature; the power decides), ageing_noise (no record of P) and a gain of the
-    logger (scales the rate and the earth's, too).
+    Confused with temperature_noise (light is lost with temperature; the power decides),
+    ageing_noise (no record of P) and a gain of the logger (scales the rate and the earth's, too).
 
     References
     ----------
-    Blin et al. 2007, IEEE Photonics Technol. Lett. 19, 1520 (detector noise below 5 uW, above it excess noise that does not depend on
-    the power); Jin et al. 2010, Sci. China Tech. Sci. 53, 3056 (loss of an irradiated coil). With 5 uW as the point where both are the
-    same and P0 = 10 uW, detector noise has 0.2 of N^2; that and 0.1 of shot noise are the typical sizes.
+    Blin et al. 2007, IEEE Photonics Technol. Lett. 19, 1520 (detector noise below 5 uW, above it
+    excess noise that does not depend on the power); Jin et al. 2010, Sci. China Tech. Sci. 53, 3056
+    (loss of an irradiated coil). With 5 uW as the point where both are the same and P0 = 10 uW,
+    detector noise has 0.2 of N^2; that and 0.1 of shot noise are the typical sizes.
 
     Examples
     --------
@@ -131,15 +143,27 @@ class LightPowerNoise(Effect):
         "Jin et al. 2010, Sci. China Tech. Sci. 53, 3056",
     )
 
-    thermal: float = parameter("1", "share of the detector's noise in N^2 at the nominal power", typical=0.2, low=0.0, high=1.0)
-    shot: float = parameter("1", "share of shot noise there", default=0.0, typical=0.1, low=0.0, high=1.0)
-    nominal: float = parameter("W", "light power of the model's N", default=1e-4, low=1e-12, high=10.0)
+    thermal: float = parameter(
+        "1",
+        "share of the detector's noise in N^2 at the nominal power",
+        typical=0.2,
+        low=0.0,
+        high=1.0,
+    )
+    shot: float = parameter(
+        "1", "share of shot noise there", default=0.0, typical=0.1, low=0.0, high=1.0
+    )
+    nominal: float = parameter(
+        "W", "light power of the model's N", default=1e-4, low=1e-12, high=10.0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.thermal + self.shot > 1.0 + 1e-12:
             total = self.thermal + self.shot
-            raise OptionError(f"effect {self.name!r}: thermal + shot are {total:g} of N^2; give shares that are together 1 or less")
+            raise OptionError(
+                f"effect {self.name!r}: thermal + shot are {total:g} of N^2; give shares that are together 1 or less"
+            )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Squared N on every sample."""
@@ -151,7 +175,9 @@ class LightPowerNoise(Effect):
                 f"effect {self.name!r}: the channel {name!r} is {power[place]:g} W {when:.6g} s after the start; it must be above 0: "
                 "correct the channel, or leave its bad values out"
             )
-        return {"N": chunk.level["N"] + chunk.setup.noise["N"][:, None] ** 2 * self._share(power)}, state
+        return {
+            "N": chunk.level["N"] + chunk.setup.noise["N"][:, None] ** 2 * self._share(power)
+        }, state
 
     def _share(self, power: Array) -> Array:
         loss = self.nominal / power
@@ -177,21 +203,25 @@ def _excited(vibration: Array, exponent: float) -> Array:
 class VibrationNoise(Effect):
     """Noise level that follows the vibration: angle random walk, and noise of the angle.
 
-    ``N^2(t) = N0^2 + s_N^2 g^2p``, ``Q^2(t) = Q0^2 + s_Q^2 g^2p``, g the rms acceleration in units of 1 g, p the exponent
+    ``N^2(t) = N0^2 + s_N^2 g^2p``, ``Q^2(t) = Q0^2 + s_Q^2 g^2p``, g the rms acceleration in units
+    of 1 g, p the exponent
 
-    *DAVAR*: a crest as long as the vibration, over all averaging times for the white part, with slope -1 at short ones for the other.
-    *Window mean*: nothing. *Spectrum*: more of white noise, and of noise that grows with f^2. *Axes*: independent noise.
+    *DAVAR*: a crest as long as the vibration, over all averaging times for the white part, with
+    slope -1 at short ones for the other. *Window mean*: nothing. *Spectrum*: more of white noise,
+    and of noise that grows with f^2. *Axes*: independent noise.
 
     Noise in a band, from a resonance or folded, is aliased_vibration, whose mount may resonate.
 
-    Confused with aliased_vibration (has the edges of its band, and is one motion on all axes), temperature_noise and light_power_noise
-    (follow other channels; several levels of vibration separate), spikes (heavy tails) and vibration_random_walk (slope +1/2).
+    Confused with aliased_vibration (has the edges of its band, and is one motion on all axes),
+    temperature_noise and light_power_noise (follow other channels; several levels of vibration
+    separate), spikes (heavy tails) and vibration_random_walk (slope +1/2).
 
     References
     ----------
-    Li et al. 2013, Chin. J. Lasers 40, 0908004 (vibration made N four times as large over the record, ten times in a window, and Q five
-    times); Zhang et al. 2017, Sensors 17, 2367 (vibration noise from the dynamic Allan variance). The sizes per g are estimates: the
-    levels of vibration are not printed.
+    Li et al. 2013, Chin. J. Lasers 40, 0908004 (vibration made N four times as large over the
+    record, ten times in a window, and Q five times); Zhang et al. 2017, Sensors 17, 2367 (vibration
+    noise from the dynamic Allan variance). The sizes per g are estimates: the levels of vibration
+    are not printed.
 
     Examples
     --------
@@ -205,11 +235,25 @@ class VibrationNoise(Effect):
     terms: ClassVar[str] = "QN"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("white", "quantization")
-    references: ClassVar[tuple[str, ...]] = ("Li et al. 2013, Chin. J. Lasers 40, 0908004", "Zhang et al. 2017, Sensors 17, 2367")
+    references: ClassVar[tuple[str, ...]] = (
+        "Li et al. 2013, Chin. J. Lasers 40, 0908004",
+        "Zhang et al. 2017, Sensors 17, 2367",
+    )
 
-    white: float = parameter("deg/sqrt(h)/g", "added N, in squares, per rms g", default=0.0, typical=0.02, low=0.0, high=1e3)
-    quantization: float = parameter("urad/g", "added Q, in squares, per rms g", default=0.0, typical=5.0, low=0.0, high=1e6)
-    exponent: float = parameter("1", "power of the vibration with which the noise grows", default=1.0, low=0.1, high=4.0)
+    white: float = parameter(
+        "deg/sqrt(h)/g",
+        "added N, in squares, per rms g",
+        default=0.0,
+        typical=0.02,
+        low=0.0,
+        high=1e3,
+    )
+    quantization: float = parameter(
+        "urad/g", "added Q, in squares, per rms g", default=0.0, typical=5.0, low=0.0, high=1e6
+    )
+    exponent: float = parameter(
+        "1", "power of the vibration with which the noise grows", default=1.0, low=0.1, high=4.0
+    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Squared N and Q on every sample."""
@@ -226,14 +270,29 @@ class VibrationNoise(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """The added spectra, of independent noise on each axis."""
         excited = _excited(windows.drivers["vibration"], self.exponent)[:, None]
-        rounding = (2.0 * URAD_PER_S * np.sin(math.pi * windows.frequency / windows.rate)) ** 2 * windows.rate
-        return Prediction(spectrum={"white": excited * np.full(windows.frequency.size, HOUR), "quantization": excited * rounding})
+        rounding = (
+            2.0 * URAD_PER_S * np.sin(math.pi * windows.frequency / windows.rate)
+        ) ** 2 * windows.rate
+        return Prediction(
+            spectrum={
+                "white": excited * np.full(windows.frequency.size, HOUR),
+                "quantization": excited * rounding,
+            }
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
         named = (("white", "N"), ("quantization", "Q"))
-        terms = [f"{self.quantity(name, errors)} of {symbol}" for name, symbol in named if getattr(self, name)]
-        power = "" if self.exponent == 1.0 else f", with the power {self.quantity('exponent', errors)} of the vibration"
+        terms = [
+            f"{self.quantity(name, errors)} of {symbol}"
+            for name, symbol in named
+            if getattr(self, name)
+        ]
+        power = (
+            ""
+            if self.exponent == 1.0
+            else f", with the power {self.quantity('exponent', errors)} of the vibration"
+        )
         return f"Vibration raises the noise {self.on_axes()}: {' and '.join(terms) or 'nothing'}, added in squares{power}."
 
 
@@ -243,16 +302,19 @@ class VibrationRandomWalk(Effect):
 
     ``K^2(t) = K0^2 + s^2 g^2p``, g the rms acceleration in units of 1 g, p the exponent
 
-    *DAVAR*: slope +1/2 in every window inside the vibration, not only in those across its edges. *Window mean*: wanders while it shakes
-    and stays where it got to. *Spectrum*: 1 / f^2. *Axes*: independent.
+    *DAVAR*: slope +1/2 in every window inside the vibration, not only in those across its edges.
+    *Window mean*: wanders while it shakes and stays where it got to. *Spectrum*: 1 / f^2. *Axes*:
+    independent.
 
-    Confused with vibration_rectification and bias_jump: a step D in a window of W hours looks like ``K = D / sqrt(W)``. Windows wholly
-    inside the vibration decide, and the mean afterwards, which comes back from rectification and stays after a walk.
+    Confused with vibration_rectification and bias_jump: a step D in a window of W hours looks like
+    ``K = D / sqrt(W)``. Windows wholly inside the vibration decide, and the mean afterwards, which
+    comes back from rectification and stays after a walk.
 
     References
     ----------
-    Li et al. 2013, Chin. J. Lasers 40, 0908004 (K of 0.32 at rest, up to 5.9 deg/h^1.5 in windows under vibration); Wang et al. 2016,
-    Sensors (K grows under vibration). The size per g is an estimate, and both papers leave open whether it is a walk or a step.
+    Li et al. 2013, Chin. J. Lasers 40, 0908004 (K of 0.32 at rest, up to 5.9 deg/h^1.5 in windows
+    under vibration); Wang et al. 2016, Sensors (K grows under vibration). The size per g is an
+    estimate, and both papers leave open whether it is a walk or a step.
 
     Examples
     --------
@@ -266,14 +328,24 @@ class VibrationRandomWalk(Effect):
     terms: ClassVar[str] = "K"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
-    references: ClassVar[tuple[str, ...]] = ("Li et al. 2013, Chin. J. Lasers 40, 0908004", "Wang et al. 2016, Sensors")
+    references: ClassVar[tuple[str, ...]] = (
+        "Li et al. 2013, Chin. J. Lasers 40, 0908004",
+        "Wang et al. 2016, Sensors",
+    )
 
-    sensitivity: float = parameter("deg/h^1.5/g", "added K, in squares, per rms g", typical=0.5, low=0.0, high=1e4)
-    exponent: float = parameter("1", "power of the vibration with which K grows", default=1.0, low=0.1, high=4.0)
+    sensitivity: float = parameter(
+        "deg/h^1.5/g", "added K, in squares, per rms g", typical=0.5, low=0.0, high=1e4
+    )
+    exponent: float = parameter(
+        "1", "power of the vibration with which K grows", default=1.0, low=0.1, high=4.0
+    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Squared K on every sample."""
-        return {"K": chunk.level["K"] + self.sensitivity**2 * _excited(chunk.drivers["vibration"], self.exponent)}, state
+        return {
+            "K": chunk.level["K"]
+            + self.sensitivity**2 * _excited(chunk.drivers["vibration"], self.exponent)
+        }, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """The exponent."""
@@ -284,9 +356,16 @@ class VibrationRandomWalk(Effect):
         excited = _excited(windows.drivers["vibration"], self.exponent)[:, None]
         cycles = 2.0 * math.pi * windows.frequency / windows.rate
         walk = (2.0 + np.cos(cycles)) / (6.0 * (1.0 - np.cos(cycles))) / (HOUR * windows.rate**2)
-        return Prediction(spectrum={"sensitivity": excited * walk}, wander={"sensitivity": (math.inf, excited[:, 0] / HOUR)})
+        return Prediction(
+            spectrum={"sensitivity": excited * walk},
+            wander={"sensitivity": (math.inf, excited[:, 0] / HOUR)},
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        power = "" if self.exponent == 1.0 else f", with the power {self.quantity('exponent', errors)} of the vibration"
+        power = (
+            ""
+            if self.exponent == 1.0
+            else f", with the power {self.quantity('exponent', errors)} of the vibration"
+        )
         return f"Vibration makes the bias walk {self.on_axes()}: {self.quantity('sensitivity', errors)} of K, added in squares{power}."

@@ -25,21 +25,24 @@ _HARMONICS = 40
 class DeadZone(Effect):
     """Output that sticks near zero rate.
 
-    ``out = 0`` where ``|w - c| < d``, else ``w - d sgn(w - c)`` (``edge = "offset"``) or w itself (``"jump"``), with ``0`` and w counted
-    from the centre c. The loop sticks to what it follows: w is the signal below `bandwidth`, and what is faster rides on
-    the output unchanged. Without a bandwidth every sample sticks by itself, and noise above d dithers the zone away.
+    ``out = 0`` where ``|w - c| < d``, else ``w - d sgn(w - c)`` (``edge = "offset"``) or w itself
+    (``"jump"``), with ``0`` and w counted from the centre c. The loop sticks to what it follows: w
+    is the signal below `bandwidth`, and what is faster rides on the output unchanged. Without a
+    bandwidth every sample sticks by itself, and noise above d dithers the zone away.
 
-    *DAVAR*: too small at all times that the loop follows, while the rate is inside. *Window mean*: flat at the centre, and lines of
-    slope one left and right of it, off by d. *Spectrum*: odd harmonics of a rotation that goes through zero; less noise inside. *Axes*:
-    each by its own rate, or that of the axis whose light leaks in.
+    *DAVAR*: too small at all times that the loop follows, while the rate is inside. *Window mean*:
+    flat at the centre, and lines of slope one left and right of it, off by d. *Spectrum*: odd
+    harmonics of a rotation that goes through zero; less noise inside. *Axes*: each by its own rate,
+    or that of the axis whose light leaks in.
 
-    Confused with rate_quantization (steps everywhere), held_samples (also far from zero) and small noise: it depends on the rate, and a
-    slow sweep through zero, or the tool turned by 180 degrees, shows it.
+    Confused with rate_quantization (steps everywhere), held_samples (also far from zero) and small
+    noise: it depends on the rate, and a slow sweep through zero, or the tool turned by 180 degrees,
+    shows it.
 
     References
     ----------
-    Cao et al. 2025, Opt. Commun. 596, 132504 (0.2 deg/h with one source for several axes, below 0.01 deg/h after suppression); US patent
-    6744519 (suppression).
+    Cao et al. 2025, Opt. Commun. 596, 132504 (0.2 deg/h with one source for several axes, below
+    0.01 deg/h after suppression); US patent 6744519 (suppression).
 
     Examples
     --------
@@ -53,10 +56,19 @@ class DeadZone(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("width",)
     references: ClassVar[tuple[str, ...]] = ("Cao et al. 2025, Opt. Commun.", "US patent 6744519")
 
-    width: float = parameter("deg/h", "half of the zone", typical=0.2, low=0.0, high=1e6, source="Cao et al. 2025")
+    width: float = parameter(
+        "deg/h", "half of the zone", typical=0.2, low=0.0, high=1e6, source="Cao et al. 2025"
+    )
     centre: float = parameter("deg/h", "rate that it sticks to", default=0.0, low=-1e6, high=1e6)
-    bandwidth: float = parameter("Hz", "what the loop follows; inf for every sample by itself", default=math.inf, low=1e-9)
-    edge: str = parameter("text", "rate outside: less the width, or untouched", default="offset", choices=("offset", "jump"))
+    bandwidth: float = parameter(
+        "Hz", "what the loop follows; inf for every sample by itself", default=math.inf, low=1e-9
+    )
+    edge: str = parameter(
+        "text",
+        "rate outside: less the width, or untouched",
+        default="offset",
+        choices=("offset", "jump"),
+    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """The signal with the zone cut out [degree hour-1]."""
@@ -72,7 +84,9 @@ class DeadZone(Effect):
             slow, state = lfilter([1.0 - keep], [1.0, -keep], chunk.signal, zi=state)
         away = slow - self.centre
         inside = np.clip(away, -self.width, self.width)
-        change = -inside if self.edge == "offset" else np.where(np.abs(away) < self.width, -inside, 0.0)
+        change = (
+            -inside if self.edge == "offset" else np.where(np.abs(away) < self.width, -inside, 0.0)
+        )
         return chunk.signal + change, state
 
     def explain(self, windows: Windows) -> Prediction:
@@ -91,23 +105,29 @@ class DeadZone(Effect):
 class FeedbackReset(Effect):
     """Error tied to the 2-pi ramp of the feedback: to its resets, and to its phase.
 
-    The ramp turns once for every ``n lambda / D`` of rotation, so it resets at ``f_r = D w / (n lambda)``. Each reset adds an error of
-    angle: `kick` at once and `tail` over the time `decay`, falling exponentially; with the sign of the rotation. Besides, the error ``A
-    (1 - 2 phase)`` goes along the ramp, A the `sawtooth`, phase from 0 to 1. All of it is averaged exactly over every sample, so resets
-    that come faster than the samples fold as they do. The phase is that of the gyro's own rate, noise and all, or with ``phase =
-    "channel"`` that of the channel `ramp`, read at the end of every sample.
+    The ramp turns once for every ``n lambda / D`` of rotation, so it resets at ``f_r = D w / (n
+    lambda)``. Each reset adds an error of angle: `kick` at once and `tail` over the time `decay`,
+    falling exponentially; with the sign of the rotation. Besides, the error ``A (1 - 2 phase)``
+    goes along the ramp, A the `sawtooth`, phase from 0 to 1. All of it is averaged exactly over
+    every sample, so resets that come faster than the samples fold as they do. The phase is that of
+    the gyro's own rate, noise and all, or with ``phase = "channel"`` that of the channel `ramp`,
+    read at the end of every sample.
 
-    *DAVAR*: a comb at the multiples of 1 / f_r, a bump at 0.371 / f_r, moving to shorter times as the rate grows; at short times it
-    hides N. *Window mean*: ``(kick + tail) f_r``, in proportion to the rate, like a scale factor of ``(kick + tail) D / (n lambda)``.
-    *Spectrum*: a comb at the multiples of f_r, flat for the kick, f^-2 for tail and sawtooth, folded. *Axes*: each by its own rate.
+    *DAVAR*: a comb at the multiples of 1 / f_r, a bump at 0.371 / f_r, moving to shorter times as
+    the rate grows; at short times it hides N. *Window mean*: ``(kick + tail) f_r``, in proportion
+    to the rate, like a scale factor of ``(kick + tail) D / (n lambda)``. *Spectrum*: a comb at the
+    multiples of f_r, flat for the kick, f^-2 for tail and sawtooth, folded. *Axes*: each by its own
+    rate.
 
-    Confused with spectral_line (does not move), rotation_line (moves with the tool), vibration and Q: the frequency is proportional to
-    the measured rate, and sorted by the phase of the ramp all of it stands at one place.
+    Confused with spectral_line (does not move), rotation_line (moves with the tool), vibration and
+    Q: the frequency is proportional to the measured rate, and sorted by the phase of the ramp all
+    of it stands at one place.
 
     References
     ----------
-    Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (digital phase ramp, 2-pi reset). Sizes: a recording of a blueSeis-3A at rest shows
-    11.5 nrad at once and 18 nrad over 12 ms at every reset, one reset for 12.96 urad, and a sawtooth below 0.003 deg/h.
+    Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (digital phase ramp, 2-pi reset). Sizes: a
+    recording of a blueSeis-3A at rest shows 11.5 nrad at once and 18 nrad over 12 ms at every
+    reset, one reset for 12.96 urad, and a sawtooth below 0.003 deg/h.
 
     Examples
     --------
@@ -120,24 +140,65 @@ class FeedbackReset(Effect):
     stage: ClassVar[Stage] = "electronics"
     channels: ClassVar[Mapping[str, str]] = {"ramp": INNER["number"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("kick", "tail", "sawtooth")
-    references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope", "recording of a blueSeis-3A")
-
-    kick: float = parameter("nrad", "angle lost at once at a reset", default=0.0, typical=11.5, low=-1e6, high=1e6, source="blueSeis-3A")
-    tail: float = parameter("nrad", "angle lost slowly after it", default=0.0, typical=18.0, low=-1e6, high=1e6, source="blueSeis-3A")
-    decay: float = parameter("s", "time constant of the tail", default=0.012, low=1e-9, high=1e3, source="blueSeis-3A")
-    sawtooth: float = parameter(
-        "deg/h", "error at the foot of the ramp, the opposite at its top", default=0.0, typical=0.01, low=-1e6, high=1e6
+    references: ClassVar[tuple[str, ...]] = (
+        "Lefevre 2014, The Fiber-Optic Gyroscope",
+        "recording of a blueSeis-3A",
     )
-    diameter: float = parameter("m", "diameter of the coil", default=0.1734, low=1e-3, high=10.0, source="blueSeis-3A")
-    wavelength: float = parameter("nm", "wavelength of the light", default=1550.0, low=100.0, high=1e4, source="Lefevre 2014")
-    index: float = parameter("1", "refractive index of the fibre", default=1.45, low=1.0, high=3.0, source="Lefevre 2014")
-    phase: str = parameter("text", "what moves the ramp: own rate, or the channel", default="rate", choices=("rate", "channel"))
-    full: float = parameter("1", "channel's reading of a full ramp; negative if it falls at positive rate", default=1.0)
+
+    kick: float = parameter(
+        "nrad",
+        "angle lost at once at a reset",
+        default=0.0,
+        typical=11.5,
+        low=-1e6,
+        high=1e6,
+        source="blueSeis-3A",
+    )
+    tail: float = parameter(
+        "nrad",
+        "angle lost slowly after it",
+        default=0.0,
+        typical=18.0,
+        low=-1e6,
+        high=1e6,
+        source="blueSeis-3A",
+    )
+    decay: float = parameter(
+        "s", "time constant of the tail", default=0.012, low=1e-9, high=1e3, source="blueSeis-3A"
+    )
+    sawtooth: float = parameter(
+        "deg/h",
+        "error at the foot of the ramp, the opposite at its top",
+        default=0.0,
+        typical=0.01,
+        low=-1e6,
+        high=1e6,
+    )
+    diameter: float = parameter(
+        "m", "diameter of the coil", default=0.1734, low=1e-3, high=10.0, source="blueSeis-3A"
+    )
+    wavelength: float = parameter(
+        "nm", "wavelength of the light", default=1550.0, low=100.0, high=1e4, source="Lefevre 2014"
+    )
+    index: float = parameter(
+        "1", "refractive index of the fibre", default=1.45, low=1.0, high=3.0, source="Lefevre 2014"
+    )
+    phase: str = parameter(
+        "text",
+        "what moves the ramp: own rate, or the channel",
+        default="rate",
+        choices=("rate", "channel"),
+    )
+    full: float = parameter(
+        "1", "channel's reading of a full ramp; negative if it falls at positive rate", default=1.0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.full == 0.0:
-            raise OptionError(f"effect {self.name!r}, parameter 'full': 0 is no ramp; give the channel's reading of a full one")
+            raise OptionError(
+                f"effect {self.name!r}, parameter 'full': 0 is no ramp; give the channel's reading of a full one"
+            )
 
     @property
     def turn(self) -> float:
@@ -189,7 +250,13 @@ class FeedbackReset(Effect):
         """Times of the tail about the sampling interval; diameters of coils, or what a recorded ramp says of it and of its sign."""
         decay = np.array([0.5, 1.0, 2.0, 4.0, 8.0]) / windows.rate
         turns = float(np.nanmean(windows.turns)) if np.isfinite(windows.turns).any() else 0.0
-        rates = np.array([np.nanmean(windows.own[axis]) for axis in windows.axes if np.isfinite(windows.own[axis]).any()])
+        rates = np.array(
+            [
+                np.nanmean(windows.own[axis])
+                for axis in windows.axes
+                if np.isfinite(windows.own[axis]).any()
+            ]
+        )
         rates = rates[rates != 0.0]
         if turns == 0.0 or not rates.size:
             return {"diameter": np.geomspace(0.03, 0.3, 8), "decay": decay}
@@ -197,7 +264,11 @@ class FeedbackReset(Effect):
         known = next(one for one in self.parameters() if one.name == "diameter")
         likely = diameter[(diameter >= known.low) & (diameter <= known.high)]
         full = np.unique(np.sign(turns * rates))
-        return {"diameter": likely if likely.size else np.array([self.diameter]), "decay": decay, "full": full}
+        return {
+            "diameter": likely if likely.size else np.array([self.diameter]),
+            "decay": decay,
+            "full": full,
+        }
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means in proportion to the rate; the comb and where its lines show, at the rate of the first axis."""
@@ -212,10 +283,18 @@ class FeedbackReset(Effect):
         tail = kick / (1.0 + (2.0 * np.pi * cycles * self.decay) ** 2)
         power = {"kick": kick, "tail": tail, "sawtooth": seen / (np.pi * number) ** 2}
         spectrum = {
-            name: sum((line_density(windows, *line) for line in zip(place, strength, strict=True)), np.zeros(()))
+            name: sum(
+                (line_density(windows, *line) for line in zip(place, strength, strict=True)),
+                np.zeros(()),
+            )
             for name, strength in power.items()
         }
-        return Prediction(mean={"kick": resets, "tail": resets}, spectrum=spectrum, line=place, phase_locked=self._profiles(windows))
+        return Prediction(
+            mean={"kick": resets, "tail": resets},
+            spectrum=spectrum,
+            line=place,
+            phase_locked=self._profiles(windows),
+        )
 
     def _profiles(self, windows: Windows) -> dict[str, Array]:
         """Error by phase of the ramp at the end of the sample: that sample holds the kick which the ramp passed its foot in."""
@@ -230,14 +309,26 @@ class FeedbackReset(Effect):
         kick = (since < step) * (_NRAD_PER_S * windows.rate) * np.sign(moved)
         seconds = since / max(abs(moved), 1e-9) / windows.rate
         cycle = 1.0 / max(abs(moved), 1e-9) / windows.rate / self.decay
-        tail = np.exp(-seconds / self.decay) / self.decay / -np.expm1(-cycle) * _NRAD_PER_S * np.sign(moved)
+        tail = (
+            np.exp(-seconds / self.decay)
+            / self.decay
+            / -np.expm1(-cycle)
+            * _NRAD_PER_S
+            * np.sign(moved)
+        )
         return {"kick": kick, "tail": tail, "sawtooth": 1.0 - 2.0 * windows.phase}
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
         parts = [self.quantity("kick", errors)] if self.kick else []
-        parts += [f"{self.quantity('tail', errors)} within {self.quantity('decay', errors)}"] if self.tail else []
-        also = f", besides a sawtooth of {self.quantity('sawtooth', errors)}" if self.sawtooth else ""
+        parts += (
+            [f"{self.quantity('tail', errors)} within {self.quantity('decay', errors)}"]
+            if self.tail
+            else []
+        )
+        also = (
+            f", besides a sawtooth of {self.quantity('sawtooth', errors)}" if self.sawtooth else ""
+        )
         size = " and ".join(parts) or "nothing"
         return f"Every reset of the ramp leaves {size} {self.on_axes()}{also}, one reset for {self.turn / 1e3:.4g} urad of rotation."
 
@@ -248,7 +339,9 @@ def _sawtooth_means(edges: Array) -> Array:
     area = phase * (1.0 - phase)
     moved = np.diff(edges, axis=1)
     still = np.abs(moved) < 1e-6
-    return np.where(still, 1.0 - 2.0 * phase[:, :-1], np.diff(area, axis=1) / np.where(still, 1.0, moved))
+    return np.where(
+        still, 1.0 - 2.0 * phase[:, :-1], np.diff(area, axis=1) / np.where(still, 1.0, moved)
+    )
 
 
 def _resets(edges: Array, samples: float) -> tuple[Array, Array]:
@@ -257,7 +350,9 @@ def _resets(edges: Array, samples: float) -> tuple[Array, Array]:
     resets = np.diff(whole, axis=1)
     moved = np.abs(np.diff(edges, axis=1))
     forward = resets >= 0
-    last = np.where(forward, edges[:, 1:] - whole[:, 1:], whole[:, 1:] + 1.0 - edges[:, 1:])  # turns since the last reset
+    last = np.where(
+        forward, edges[:, 1:] - whole[:, 1:], whole[:, 1:] + 1.0 - edges[:, 1:]
+    )  # turns since the last reset
     between = 1.0 / np.where(resets == 0, 1.0, moved) / samples
     many = -np.expm1(-np.abs(resets) * between) / -np.expm1(-between)
     return resets, np.sign(resets) * np.exp(-last * between) * many
@@ -267,19 +362,23 @@ def _resets(edges: Array, samples: float) -> tuple[Array, Array]:
 class SharedSource(Effect):
     """White noise of the light source that all axes share.
 
-    ``n_a = r_a n(t)``, one n for all axes and r_a the angle random walk that it makes on axis a, with the sign of the modulation there;
-    behind a low-pass of one pole at `bandwidth`, if that is given. It comes on top of the model's own N.
+    ``n_a = r_a n(t)``, one n for all axes and r_a the angle random walk that it makes on axis a,
+    with the sign of the modulation there; behind a low-pass of one pole at `bandwidth`, if that is
+    given. It comes on top of the model's own N.
 
-    *DAVAR*: ``r_a^2 / tau`` more, which nobody can tell from N: it shows in the cross-axis Allan covariance alone, ``r_a r_b / tau``
-    at all times. *Window mean*: noise. *Spectrum*: flat, and so is the coherence of the axes. *Axes*: ``r_a r_b``, lag zero.
+    *DAVAR*: ``r_a^2 / tau`` more, which nobody can tell from N: it shows in the cross-axis Allan
+    covariance alone, ``r_a r_b / tau`` at all times. *Window mean*: noise. *Spectrum*: flat, and so
+    is the coherence of the axes. *Axes*: ``r_a r_b``, lag zero.
 
-    Confused with misalignment and real_motion (coherent at some frequencies, and only in motion), common vibration (coherent with the
-    accelerometers): broadband coherence without lag, at rest as well.
+    Confused with misalignment and real_motion (coherent at some frequencies, and only in motion),
+    common vibration (coherent with the accelerometers): broadband coherence without lag, at rest as
+    well.
 
     References
     ----------
-    Blin et al. 2007, IEEE Photon. Technol. Lett. 19, 1520 (excess noise of the source); Cao et al. 2025, Opt. Commun. 596, 132504 (one
-    source for several axes). Sizes are estimates: where the source limits, a correlation of tens of per cent.
+    Blin et al. 2007, IEEE Photon. Technol. Lett. 19, 1520 (excess noise of the source); Cao et al.
+    2025, Opt. Commun. 596, 132504 (one source for several axes). Sizes are estimates: where the
+    source limits, a correlation of tens of per cent.
 
     Examples
     --------
@@ -291,12 +390,22 @@ class SharedSource(Effect):
     short: ClassVar[str] = "broadband noise common to axes"
     stage: ClassVar[Stage] = "rate"
     size_parameters: ClassVar[tuple[str, ...]] = ("N",)
-    references: ClassVar[tuple[str, ...]] = ("Blin et al. 2007, IEEE Photon. Technol. Lett.", "Cao et al. 2025, Opt. Commun.")
+    references: ClassVar[tuple[str, ...]] = (
+        "Blin et al. 2007, IEEE Photon. Technol. Lett.",
+        "Cao et al. 2025, Opt. Commun.",
+    )
 
     N: tuple[float, ...] = parameter(
-        "deg/sqrt(h)", "angle random walk in common, with sign", typical=(1e-3,), low=-1e4, high=1e4, many=True
+        "deg/sqrt(h)",
+        "angle random walk in common, with sign",
+        typical=(1e-3,),
+        low=-1e4,
+        high=1e4,
+        many=True,
     )
-    bandwidth: float = parameter("Hz", "half power of its low-pass; inf for white noise", default=math.inf, low=1e-6)
+    bandwidth: float = parameter(
+        "Hz", "half power of its low-pass; inf for white noise", default=math.inf, low=1e-6
+    )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Where the common noise stands."""
@@ -311,7 +420,9 @@ class SharedSource(Effect):
             from gyrostab.kernels.random.stochastic import ornstein_uhlenbeck_means
 
             time = self._time()
-            common, position = ornstein_uhlenbeck_means(rng.standard_normal((chunk.size, 2)), time * chunk.rate, position)
+            common, position = ornstein_uhlenbeck_means(
+                rng.standard_normal((chunk.size, 2)), time * chunk.rate, position
+            )
             common = common / math.sqrt(2.0 * time)
         return 60.0 * self.each("N", chunk.setup.axes)[:, None] * common, (rng, position)
 
@@ -326,10 +437,19 @@ class SharedSource(Effect):
         """A spectrum, the same process on all axes."""
         density = np.full(windows.frequency.size, 3600.0)
         if math.isfinite(self.bandwidth):
-            density = 3600.0 * lorentz_density(windows.frequency, self._time(), windows.rate) / (2.0 * self._time())
-        return Prediction(spectrum={"N": np.broadcast_to(density, (windows.begin.size, density.size))}, coherent=True)
+            density = (
+                3600.0
+                * lorentz_density(windows.frequency, self._time(), windows.rate)
+                / (2.0 * self._time())
+            )
+        return Prediction(
+            spectrum={"N": np.broadcast_to(density, (windows.begin.size, density.size))},
+            coherent=True,
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        below = f", below {self.quantity('bandwidth', errors)}" if math.isfinite(self.bandwidth) else ""
+        below = (
+            f", below {self.quantity('bandwidth', errors)}" if math.isfinite(self.bandwidth) else ""
+        )
         return f"The light source adds the same noise {self.on_axes()}, {self.quantity('N', errors)}{below}."

@@ -61,10 +61,16 @@ class Parameter:
         if isinstance(value, list | tuple) and not self.many:
             raise OptionError(f"{where}: give one number in {self.unit}, not the list {value!r}")
         for number in given:
-            if isinstance(number, bool) or not isinstance(number, int | float | np.number) or math.isnan(number):
+            if (
+                isinstance(number, bool)
+                or not isinstance(number, int | float | np.number)
+                or math.isnan(number)
+            ):
                 raise OptionError(f"{where}: {number!r} is not a number; give one in {self.unit}")
             if not self.low <= number <= self.high:
-                raise OptionError(f"{where}: {number:g} {self.unit} is outside of the allowed range {self.low:g} to {self.high:g}")
+                raise OptionError(
+                    f"{where}: {number:g} {self.unit} is outside of the allowed range {self.low:g} to {self.high:g}"
+                )
         return tuple(float(number) for number in given) if self.many else float(value)
 
 
@@ -81,6 +87,16 @@ def parameter(
     source: str = "estimate",
 ) -> Any:
     """Declare a field of an effect; see `Parameter` for the arguments. Without a default a model must give it."""
-    known = {"unit": unit, "meaning": meaning, "typical": default if typical is None else typical, "low": low, "high": high}
+    known = {
+        "unit": unit,
+        "meaning": meaning,
+        "typical": default if typical is None else typical,
+        "low": low,
+        "high": high,
+    }
     known |= {"choices": choices, "many": many, "source": source, "default": default}
-    return field(metadata={"parameter": known}) if default is None else field(default=default, metadata={"parameter": known})
+    return (
+        field(metadata={"parameter": known})
+        if default is None
+        else field(default=default, metadata={"parameter": known})
+    )

@@ -56,7 +56,9 @@ def turns_of_windows(windows: Windows, rotation: Array) -> tuple[Array, Array]:
     """Turns from the start of the log to the middle of every window, and inside of it, from its mean rotation rate [degree s-1]."""
     rate, centre = rotation / TURN, windows.centre
     between = (rate[1:] + rate[:-1]) / 2.0 * np.diff(centre)
-    return np.cumsum(np.concatenate([rate[:1] * centre[:1], between])), rate * (windows.end - windows.begin)
+    return np.cumsum(np.concatenate([rate[:1] * centre[:1], between])), rate * (
+        windows.end - windows.begin
+    )
 
 
 def line_density(windows: Windows, frequency: Array | float, power: Array | float) -> Array:
@@ -80,7 +82,9 @@ def line_density(windows: Windows, frequency: Array | float, power: Array | floa
         edges = np.array([0.5, 1.5]) * centres
     else:
         inner = np.sqrt(centres[1:] * centres[:-1])
-        edges = np.concatenate([[centres[0] ** 2 / inner[0]], inner, [centres[-1] ** 2 / inner[-1]]])
+        edges = np.concatenate(
+            [[centres[0] ** 2 / inner[0]], inner, [centres[-1] ** 2 / inner[-1]]]
+        )
     where = np.broadcast_to(np.asarray(frequency, np.float64), windows.begin.shape)[:, None]
     hit = (where >= edges[:-1]) & (where < edges[1:])
     strength = np.broadcast_to(np.asarray(power, np.float64), windows.begin.shape)[:, None]

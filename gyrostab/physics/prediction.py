@@ -28,9 +28,11 @@ class Windows:
     axes : tuple of str
         The axes looked at.
     drivers : mapping of str to ndarray, shape (window,)
-        Channels averaged over each window, by the names of `Effect.channels`; vibration as the rms over the window.
+        Channels averaged over each window, by the names of `Effect.channels`; vibration as the rms
+        over the window.
     fine : mapping of str to ndarray, shape (window, part)
-        Channels averaged over equal parts of each window and freed from noise, where they were sampled that often.
+        Channels averaged over equal parts of each window and freed from noise, where they were
+        sampled that often.
     own : mapping of str to ndarray, shape (window,)
         Measured rate of every axis of the log, averaged over each window [degree hour-1].
     gaps, restarts : ndarray, shape (n, 2)
@@ -38,7 +40,8 @@ class Windows:
     phase : ndarray, shape (phase,)
         Centres of the bins of the ramp's phase, from 0 to 1; empty where no ramp was recorded.
     turns : ndarray, shape (window,)
-        Turns of the ramp in a second, negative where it falls [Hz]; empty where no ramp was recorded.
+        Turns of the ramp in a second, negative where it falls [Hz]; empty where no ramp was
+        recorded.
     bands : mapping of str to (float, float)
         Edges of the band [Hz] that a channel is the rms of, where the log tells.
     """
@@ -76,39 +79,48 @@ class Windows:
 class Prediction:
     """What an effect predicts for `Windows`; each part that it leaves empty it does not touch.
 
-    The parts are linear in the parameters named by their keys, so that a fit can solve for these; a parameter in which the effect
-    is not linear is one of `Effect.nuisance`, and is held at the value of the effect that was asked.
+    The parts are linear in the parameters named by their keys, so that a fit can solve for these; a
+    parameter in which the effect is not linear is one of `Effect.nuisance`, and is held at the
+    value of the effect that was asked.
 
     Attributes
     ----------
     mean : mapping of str to ndarray, shape (window,) or (axis, window)
         Parameter -> window mean per unit of it [degree hour-1 per unit].
     level : mapping of (str, str) to ndarray, shape (window,) or (axis, window)
-        (symbol of the noise term, parameter) -> change of the term's squared coefficient per unit, as a share of it.
+        (symbol of the noise term, parameter) -> change of the term's squared coefficient per unit,
+        as a share of it.
     spectrum : mapping of str to ndarray, shape (window, band) or (axis, window, band)
-        Parameter -> added two-sided power spectral density per unit of its square [degree2 hour-2 Hz-1].
+        Parameter -> added two-sided power spectral density per unit of its square [degree2 hour-2
+        Hz-1].
     response : ndarray, shape (band,), or None
         Squared magnitude by which the whole spectrum is multiplied (a filter).
     coherent : bool
-        The added spectrum is one process on all axes: it fills the cross-spectra too, with one factor (and sign) per axis.
+        The added spectrum is one process on all axes: it fills the cross-spectra too, with one
+        factor (and sign) per axis.
     line : ndarray, shape (window,) or (harmonic, window), or None
         Frequency of a line in every window [Hz], folded below half of the sampling rate.
     marks : tuple of str
-        What it raises in the distribution of the samples: outliers, repeats (of any value but zero and the ends of the range), extremes,
-        stuck (zeros of one axis by itself), filled (zeros of all axes at once, or of a single axis in runs), lattice.
+        What it raises in the distribution of the samples: outliers, repeats (of any value but zero
+        and the ends of the range), extremes, stuck (zeros of one axis by itself), filled (zeros of
+        all axes at once, or of a single axis in runs), lattice.
     transfer : mapping of (str, str) to complex ndarray, shape (band,)
-        (parameter, channel) -> transfer function from the channel to the rate, per unit [degree hour-1 per unit of the channel]. The
-        name of an axis in place of a channel stands for the rate of that axis.
+        (parameter, channel) -> transfer function from the channel to the rate, per unit [degree
+        hour-1 per unit of the channel]. The name of an axis in place of a channel stands for the
+        rate of that axis.
     order : mapping of str to complex ndarray, shape (axis, harmonic)
-        Parameter -> pattern of the harmonics of the rotation over axes, up to one complex factor (size and phase); where the
-        parameter is one number for each axis, every axis and harmonic has a factor of its own.
+        Parameter -> pattern of the harmonics of the rotation over axes, up to one complex factor
+        (size and phase); where the parameter is one number for each axis, every axis and harmonic
+        has a factor of its own.
     phase_locked : mapping of str to ndarray, shape (phase,)
         Parameter -> mean by phase of the ramp, per unit [degree hour-1 per unit].
     wander : mapping of str to (float, ndarray of shape (window,))
-        Parameter -> a random mean: time constant of its memory [s], inf for a walk; and per squared unit its variance
-        [degree2 hour-2], for a walk the growth of its variance [degree2 hour-2 s-1], in every window.
+        Parameter -> a random mean: time constant of its memory [s], inf for a walk; and per squared
+        unit its variance [degree2 hour-2], for a walk the growth of its variance [degree2 hour-2
+        s-1], in every window.
     levels : str
-        Parameter that is the step between two levels of the mean, where it hops to and fro between them at random.
+        Parameter that is the step between two levels of the mean, where it hops to and fro between
+        them at random.
     """
 
     mean: Mapping[str, Array] = field(default_factory=dict)

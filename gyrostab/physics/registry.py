@@ -35,10 +35,17 @@ def effects() -> Mapping[str, type[Effect]]:
     for module in pkgutil.iter_modules(package.__path__):
         home = f"{package.__name__}.{module.name}"
         for item in vars(importlib.import_module(home)).values():
-            if not (isinstance(item, type) and issubclass(item, Effect) and item.__module__ == home and item.name):
+            if not (
+                isinstance(item, type)
+                and issubclass(item, Effect)
+                and item.__module__ == home
+                and item.name
+            ):
                 continue
             if item.name in found:
-                raise TypeError(f"two effects have the name {item.name!r}: {found[item.name].__module__} and {home}")
+                raise TypeError(
+                    f"two effects have the name {item.name!r}: {found[item.name].__module__} and {home}"
+                )
             found[item.name] = item
     return MappingProxyType(dict(sorted(found.items())))
 
@@ -49,14 +56,16 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     Parameters
     ----------
     table : mapping
-        ``name``, ``axes``, ``driver``, and the parameters: numbers in the unit of the reference, or text with a unit ("3 min").
+        ``name``, ``axes``, ``driver``, and the parameters: numbers in the unit of the reference, or
+        text with a unit ("3 min").
     where : str
         Beginning of a message, for instance the file.
 
     Raises
     ------
     OptionError
-        When a name is unknown, a required parameter is missing, or a value, its unit or its range is wrong; it lists what exists.
+        When a name is unknown, a required parameter is missing, or a value, its unit or its range
+        is wrong; it lists what exists.
 
     Examples
     --------
@@ -69,9 +78,13 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     """
     name = table.get("name")
     if name is None:
-        raise OptionError(f"{where}: an effect has no name; write name = ... with one of {', '.join(effects())}")
+        raise OptionError(
+            f"{where}: an effect has no name; write name = ... with one of {', '.join(effects())}"
+        )
     if not isinstance(name, str) or name not in effects():
-        raise OptionError(f"{where}: there is no effect {name!r}{close_to(name, list(effects()))}; there are {', '.join(effects())}")
+        raise OptionError(
+            f"{where}: there is no effect {name!r}{close_to(name, list(effects()))}; there are {', '.join(effects())}"
+        )
     kind = effects()[name]
     known = {item.name: item for item in kind.parameters()}
     values = {key: value for key, value in table.items() if key != "name"}
@@ -83,7 +96,9 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
             )
     for key in ("axes", "driver"):
         given = values.get(key, [])
-        if not isinstance(given, str) and not (isinstance(given, list | tuple) and all(isinstance(one, str) for one in given)):
+        if not isinstance(given, str) and not (
+            isinstance(given, list | tuple) and all(isinstance(one, str) for one in given)
+        ):
             raise OptionError(f"{where}: effect {name!r}: {key} = {given!r} is not a list of names")
     for key in kind.required():
         if key not in values:
@@ -92,7 +107,12 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
                 f"{where}: effect {name!r} lacks the parameter {key!r} ({item.meaning}); give a number in {item.unit}, {_typical(item)}"
             )
     try:
-        return kind(**{key: _number(value, known[key]) if key in known else value for key, value in values.items()})
+        return kind(
+            **{
+                key: _number(value, known[key]) if key in known else value
+                for key, value in values.items()
+            }
+        )
     except OptionError as error:
         raise OptionError(f"{where}: {error}") from error
 
@@ -135,7 +155,9 @@ def amount(value: Any, unit: str, where: str) -> Any:
         return value
     match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*", value)
     if match is None:
-        raise OptionError(f"{where}: {value!r} is not a number with a unit; write for instance '1 {unit}'")
+        raise OptionError(
+            f"{where}: {value!r} is not a number with a unit; write for instance '1 {unit}'"
+        )
     number, given = float(match.group(1)), match.group(2)
     if given in ("", unit):
         return number
@@ -168,9 +190,20 @@ def effect_table() -> pd.DataFrame:
     for name, kind in effects().items():
         must = kind.required()
         for item in kind.parameters():
-            rows.append({"effect": name, "parameter": item.name, "unit": item.unit, "required": item.name in must} | _columns(item))
+            rows.append(
+                {
+                    "effect": name,
+                    "parameter": item.name,
+                    "unit": item.unit,
+                    "required": item.name in must,
+                }
+                | _columns(item)
+            )
     return pd.DataFrame(rows)
 
 
 def _columns(item: Parameter) -> dict[str, Any]:
-    return {key: getattr(item, key) for key in ("default", "typical", "low", "high", "meaning", "source")}
+    return {
+        key: getattr(item, key)
+        for key in ("default", "typical", "low", "high", "meaning", "source")
+    }

@@ -27,17 +27,19 @@ class ScaleFactor(Effect):
 
     ``e = (S + S_T (T - T0)) w + A |w| + C w^3``
 
-    *DAVAR*: a copy of what w does: ramps give R, steps a K, stick-slip a bump; nothing while w stands. *Window mean*: follows w.
-    *Spectrum*: that of w. *Axes*: the axis of rotation only; 100 ppm of 180 r/min are 389 deg/h.
+    *DAVAR*: a copy of what w does: ramps give R, steps a K, stick-slip a bump; nothing while w
+    stands. *Window mean*: follows w. *Spectrum*: that of w. *Axes*: the axis of rotation only; 100
+    ppm of 180 r/min are 389 deg/h.
 
-    Confused with misalignment (seen on the other axes, in proportion to a foreign rate), and clock_error (the same on all axes): the
-    error turns its sign with w, but for the asymmetry, and the rotation must be known by other means than the gyro (magnetometer,
-    accelerometers).
+    Confused with misalignment (seen on the other axes, in proportion to a foreign rate), and
+    clock_error (the same on all axes): the error turns its sign with w, but for the asymmetry, and
+    the rotation must be known by other means than the gyro (magnetometer, accelerometers).
 
     References
     ----------
-    IEEE Std 952-1997 (scale factor errors); He et al. 2015, OECC (the temperature of the scale factor leads the error of a gyro survey).
-    Sizes are estimates: 10 to 100 ppm for a good gyro, 100 to 1000 ppm for a simple one.
+    IEEE Std 952-1997 (scale factor errors); He et al. 2015, OECC (the temperature of the scale
+    factor leads the error of a gyro survey). Sizes are estimates: 10 to 100 ppm for a good gyro,
+    100 to 1000 ppm for a simple one.
 
     Examples
     --------
@@ -48,22 +50,45 @@ class ScaleFactor(Effect):
     name: ClassVar[str] = "scale_factor"
     short: ClassVar[str] = "error proportional to (a function of) rotation rate"
     stage: ClassVar[Stage] = "rate"
-    channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"], "temperature": INNER["temperature"]}
+    channels: ClassVar[Mapping[str, str]] = {
+        "rotation_rate": INNER["rotation_rate"],
+        "temperature": INNER["temperature"],
+    }
     size_parameters: ClassVar[tuple[str, ...]] = ("linear", "asymmetry", "cubic", "thermal")
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997", "He et al. 2015, OECC")
 
-    linear: float = parameter("ppm", "error of the scale factor", default=0.0, typical=50.0, low=-1e6, high=1e6)
-    asymmetry: float = parameter("ppm", "the same sign for both directions", default=0.0, typical=10.0, low=-1e6, high=1e6)
-    cubic: float = parameter("ppm/(deg/s)^2", "growth with the square of the rate", default=0.0, typical=1e-5, low=-1.0, high=1.0)
-    thermal: float = parameter("ppm/degC", "growth with the temperature", default=0.0, typical=1.0, low=-1e4, high=1e4)
-    reference: float = parameter("degC", "temperature of the calibration", default=25.0, low=-273.15, high=500.0)
+    linear: float = parameter(
+        "ppm", "error of the scale factor", default=0.0, typical=50.0, low=-1e6, high=1e6
+    )
+    asymmetry: float = parameter(
+        "ppm", "the same sign for both directions", default=0.0, typical=10.0, low=-1e6, high=1e6
+    )
+    cubic: float = parameter(
+        "ppm/(deg/s)^2",
+        "growth with the square of the rate",
+        default=0.0,
+        typical=1e-5,
+        low=-1.0,
+        high=1.0,
+    )
+    thermal: float = parameter(
+        "ppm/degC", "growth with the temperature", default=0.0, typical=1.0, low=-1e4, high=1e4
+    )
+    reference: float = parameter(
+        "degC", "temperature of the calibration", default=25.0, low=-273.15, high=500.0
+    )
     rotation: str = parameter(
-        "text", "rotation about the axis: the channel, or the true rate of the model", default="channel", choices=("channel", "true")
+        "text",
+        "rotation about the axis: the channel, or the true rate of the model",
+        default="channel",
+        choices=("channel", "true"),
     )
 
     def needs(self) -> tuple[str, ...]:
         """The rotation rate unless the true rate is taken, and the temperature if it matters."""
-        return ("rotation_rate",) * (self.rotation == "channel") + ("temperature",) * bool(self.thermal)
+        return ("rotation_rate",) * (self.rotation == "channel") + ("temperature",) * bool(
+            self.thermal
+        )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
@@ -71,7 +96,11 @@ class ScaleFactor(Effect):
             rate = chunk.drivers["rotation_rate"] * _HOUR
         else:
             rate = np.stack([chunk.true[axis] for axis in chunk.setup.axes])
-        error = self.linear * rate + self.asymmetry * np.abs(rate) + self.cubic * rate * (rate / _HOUR) ** 2
+        error = (
+            self.linear * rate
+            + self.asymmetry * np.abs(rate)
+            + self.cubic * rate * (rate / _HOUR) ** 2
+        )
         if self.thermal:
             error = error + self.thermal * (chunk.drivers["temperature"] - self.reference) * rate
         return error * _PPM, state
@@ -89,7 +118,11 @@ class ScaleFactor(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        terms = [f"{name} {self.quantity(name, errors)}" for name in self.size_parameters if getattr(self, name)]
+        terms = [
+            f"{name} {self.quantity(name, errors)}"
+            for name in self.size_parameters
+            if getattr(self, name)
+        ]
         return f"The scale factor is wrong {self.on_axes()}, {', '.join(terms) or 'by nothing'}."
 
 
@@ -97,14 +130,16 @@ class ScaleFactor(Effect):
 class Misalignment(Effect):
     """The true rate of other axes leaks in.
 
-    ``e = m_x w_x + m_y w_y + m_z w_z``, without the axis's own rate, w the true rates of the log's axes named x, y and z. What moves
-    them stands in the same model: real_motion, earth_rate.
+    ``e = m_x w_x + m_y w_y + m_z w_z``, without the axis's own rate, w the true rates of the log's
+    axes named x, y and z. What moves them stands in the same model: real_motion, earth_rate.
 
-    *DAVAR*: a copy of the other axis's motion, scaled: 1 mrad of 180 r/min is 3900 deg/h. *Window mean*: follows the other axis.
-    *Spectrum*: lines and motion of the other axis only. *Axes*: coherent with the other gyro where there is true motion, not elsewhere.
+    *DAVAR*: a copy of the other axis's motion, scaled: 1 mrad of 180 r/min is 3900 deg/h. *Window
+    mean*: follows the other axis. *Spectrum*: lines and motion of the other axis only. *Axes*:
+    coherent with the other gyro where there is true motion, not elsewhere.
 
-    Confused with scale_factor (own axis only), shared_source (broadband coherence also at rest) and real_motion (accelerometers see it):
-    the coherence has to vanish while the tool stands, and the factor to be the same at all rates.
+    Confused with scale_factor (own axis only), shared_source (broadband coherence also at rest) and
+    real_motion (accelerometers see it): the coherence has to vanish while the tool stands, and the
+    factor to be the same at all rates.
 
     References
     ----------
@@ -122,9 +157,15 @@ class Misalignment(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
 
-    x: float = parameter("mrad", "lean towards axis x", default=0.0, typical=0.5, low=-1e3, high=1e3)
-    y: float = parameter("mrad", "lean towards axis y", default=0.0, typical=0.5, low=-1e3, high=1e3)
-    z: float = parameter("mrad", "lean towards axis z", default=0.0, typical=0.5, low=-1e3, high=1e3)
+    x: float = parameter(
+        "mrad", "lean towards axis x", default=0.0, typical=0.5, low=-1e3, high=1e3
+    )
+    y: float = parameter(
+        "mrad", "lean towards axis y", default=0.0, typical=0.5, low=-1e3, high=1e3
+    )
+    z: float = parameter(
+        "mrad", "lean towards axis z", default=0.0, typical=0.5, low=-1e3, high=1e3
+    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
@@ -148,13 +189,19 @@ class Misalignment(Effect):
         mean = {}
         for source in self.size_parameters:
             if source in windows.own and any(axis != source for axis in windows.axes):
-                mean[source] = np.stack([_MRAD * windows.own[source] * (axis != source) for axis in windows.axes])
+                mean[source] = np.stack(
+                    [_MRAD * windows.own[source] * (axis != source) for axis in windows.axes]
+                )
         flat = np.full(windows.frequency.size, _MRAD, np.complex128)
         return Prediction(mean=mean, transfer={(source, source): flat for source in mean})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        terms = [f"{self.quantity(name, errors)} of {name}" for name in self.size_parameters if getattr(self, name)]
+        terms = [
+            f"{self.quantity(name, errors)} of {name}"
+            for name in self.size_parameters
+            if getattr(self, name)
+        ]
         return f"The rotation of other axes leaks in {self.on_axes()}, by {', '.join(terms) or 'nothing'}."
 
 
@@ -162,23 +209,27 @@ class Misalignment(Effect):
 class EarthRate(Effect):
     """The rotation of the earth, seen by a tool that rotates about its own axis.
 
-    With inclination I from straight down, azimuth A and latitude L, the tool sees ``W_d = W (cos L sin I cos A - sin L cos I)`` along
-    its axis, ``W_h = W (cos L cos I cos A + sin L sin I)`` towards the high side and ``W_r = -W cos L sin A`` to the right of it. An
-    axis that stands at `off` degrees from the tool's axis, and `around` it at the angle a from x towards y, sees ``cos(off) W_d +
-    sin(off) (W_h cos(F + a) + W_r sin(F + a))``, with the toolface F = F0 + integral of the rotation rate, clockwise looking down the
-    hole. Axes named x, y, z (or ending so) stand at 90, 90, 0 degrees off and 0, 90, 0 around. Each sample is the mean over its
+    With inclination I from straight down, azimuth A and latitude L, the tool sees ``W_d = W (cos L
+    sin I cos A - sin L cos I)`` along its axis, ``W_h = W (cos L cos I cos A + sin L sin I)``
+    towards the high side and ``W_r = -W cos L sin A`` to the right of it. An axis that stands at
+    `off` degrees from the tool's axis, and `around` it at the angle a from x towards y, sees
+    ``cos(off) W_d + sin(off) (W_h cos(F + a) + W_r sin(F + a))``, with the toolface F = F0 +
+    integral of the rotation rate, clockwise looking down the hole. Axes named x, y, z (or ending
+    so) stand at 90, 90, 0 degrees off and 0, 90, 0 around. Each sample is the mean over its
     interval.
 
-    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``, a bump of sigma at tau = 0.371 / f with A of at most 15.04 deg/h, smeared where f
-    wanders; nothing while the tool stands. *Window mean*: the constant part along the tool; steps between toolfaces where it stands.
-    *Spectrum*: a line at the frequency of rotation. *Axes*: quadrature between x and y, equal in size; none on z.
+    *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``, a bump of sigma at tau = 0.371 / f with A of at
+    most 15.04 deg/h, smeared where f wanders; nothing while the tool stands. *Window mean*: the
+    constant part along the tool; steps between toolfaces where it stands. *Spectrum*: a line at the
+    frequency of rotation. *Axes*: quadrature between x and y, equal in size; none on z.
 
-    Confused with g_sensitivity and magnetic (free amplitude, phase of gravity or field), and rotation_line: here amplitude and phase
-    follow from latitude, inclination and azimuth.
+    Confused with g_sensitivity and magnetic (free amplitude, phase of gravity or field), and
+    rotation_line: here amplitude and phase follow from latitude, inclination and azimuth.
 
     References
     ----------
-    IEEE Std 952-1997, annex C (Allan variance of a sinusoid); 15.041067 deg/h is the earth's rotation against the stars.
+    IEEE Std 952-1997, annex C (Allan variance of a sinusoid); 15.041067 deg/h is the earth's
+    rotation against the stars.
 
     Examples
     --------
@@ -193,17 +244,48 @@ class EarthRate(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("rate",)
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997, annex C",)
 
-    latitude: float = parameter("deg", "latitude, north positive", typical=45.0, low=-90.0, high=90.0)
-    inclination: float = parameter("deg", "angle of the tool from straight down", default=0.0, typical=30.0, low=0.0, high=180.0)
-    azimuth: float = parameter("deg", "direction of the tool, clockwise from north", default=0.0, typical=60.0, low=-360.0, high=360.0)
-    toolface: float = parameter("deg", "angle of x from the high side at the start", default=0.0, low=-360.0, high=360.0)
-    off: tuple[float, ...] = parameter("deg", "angle of each axis from the tool's", default=(), low=0.0, high=180.0, many=True)
-    around: tuple[float, ...] = parameter("deg", "angle of each axis around the tool", default=(), low=-360.0, high=360.0, many=True)
-    rate: float = parameter("deg/h", "rotation of the earth", default=15.041067, low=0.0, high=20.0, source="sidereal day of 86164.1 s")
+    latitude: float = parameter(
+        "deg", "latitude, north positive", typical=45.0, low=-90.0, high=90.0
+    )
+    inclination: float = parameter(
+        "deg",
+        "angle of the tool from straight down",
+        default=0.0,
+        typical=30.0,
+        low=0.0,
+        high=180.0,
+    )
+    azimuth: float = parameter(
+        "deg",
+        "direction of the tool, clockwise from north",
+        default=0.0,
+        typical=60.0,
+        low=-360.0,
+        high=360.0,
+    )
+    toolface: float = parameter(
+        "deg", "angle of x from the high side at the start", default=0.0, low=-360.0, high=360.0
+    )
+    off: tuple[float, ...] = parameter(
+        "deg", "angle of each axis from the tool's", default=(), low=0.0, high=180.0, many=True
+    )
+    around: tuple[float, ...] = parameter(
+        "deg", "angle of each axis around the tool", default=(), low=-360.0, high=360.0, many=True
+    )
+    rate: float = parameter(
+        "deg/h",
+        "rotation of the earth",
+        default=15.041067,
+        low=0.0,
+        high=20.0,
+        source="sidereal day of 86164.1 s",
+    )
 
     def components(self) -> tuple[float, float, float]:
         """Rate along the tool, towards its high side and to the right of it [degree hour-1]."""
-        lat, inc, azi = (math.radians(angle) for angle in (self.latitude, self.inclination, self.azimuth))
+        lat, inc, azi = (
+            math.radians(angle) for angle in (self.latitude, self.inclination, self.azimuth)
+        )
         north, down = self.rate * math.cos(lat), -self.rate * math.sin(lat)
         along = north * math.sin(inc) * math.cos(azi) + down * math.cos(inc)
         high = north * math.cos(inc) * math.cos(azi) - down * math.sin(inc)
@@ -217,7 +299,9 @@ class EarthRate(Effect):
         known = {"x": (90.0, 0.0), "y": (90.0, 90.0), "z": (0.0, 0.0)}
         for axis in axes:
             if axis[-1:].lower() not in known:
-                raise OptionError(f"effect {self.name!r}: axis {axis!r} is not x, y or z; say where it looks with off and around [deg]")
+                raise OptionError(
+                    f"effect {self.name!r}: axis {axis!r} is not x, y or z; say where it looks with off and around [deg]"
+                )
         off, around = np.radians(np.array([known[axis[-1].lower()] for axis in axes])).T
         return off, around
 
@@ -237,7 +321,10 @@ class EarthRate(Effect):
         off, around = self.directions(axes)
         phase = math.radians(self.toolface) + around - math.atan2(right, high)
         across = math.hypot(high, right) * np.sin(off)
-        return np.asarray(along * np.cos(off)[:, None] + across[:, None] * turn_means(middle, inside, phase[:, None]))
+        return np.asarray(
+            along * np.cos(off)[:, None]
+            + across[:, None] * turn_means(middle, inside, phase[:, None])
+        )
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """The toolface at the start; the rest is known to a survey."""
@@ -261,7 +348,9 @@ class EarthRate(Effect):
         """Say it in one sentence."""
         along, high, right = self.components()
         across = math.hypot(high, right)
-        seen = f"sees {across:.4g} deg/h across and {along:.4g} deg/h along itself, {self.on_axes()}"
+        seen = (
+            f"sees {across:.4g} deg/h across and {along:.4g} deg/h along itself, {self.on_axes()}"
+        )
         return f"The earth turns with {self.quantity('rate', errors)}; the tool at latitude {self.quantity('latitude')} {seen}."
 
 
@@ -269,23 +358,27 @@ class EarthRate(Effect):
 class RealMotion(Effect):
     """Rotation that is no error: sway, the turning of the tool, and tilt of the mounting under acceleration.
 
-    ``w_a = d_a (sway(t) + spin w(t) + d/dt (c_x a_x + c_y a_y + c_z a_z))``: d_a is the share of each axis (a direction); sway is the
-    velocity of an oscillator of stated frequency and quality shaken by white noise; w the rotation rate; c the tilt per acceleration,
-    whose change in a sample is the rotation in it. All of it is true rate, which misalignment, scale_factor and dead_zone see. The
-    turning of the tool itself is in the log without this effect where the channel ``rotation_rate`` names the axis in its attribute
-    ``rotation_axis``; `spin` is for what another direction sees of it.
+    ``w_a = d_a (sway(t) + spin w(t) + d/dt (c_x a_x + c_y a_y + c_z a_z))``: d_a is the share of
+    each axis (a direction); sway is the velocity of an oscillator of stated frequency and quality
+    shaken by white noise; w the rotation rate; c the tilt per acceleration, whose change in a
+    sample is the rotation in it. All of it is true rate, which misalignment, scale_factor and
+    dead_zone see. The turning of the tool itself is in the log without this effect where the
+    channel ``rotation_rate`` names the axis in its attribute ``rotation_axis``; `spin` is for what
+    another direction sees of it.
 
-    *DAVAR*: bump of the sway at 0.371 / f without a floor at long times; the turning as it is. *Window mean*: the turning; sway and
-    tilt leave nothing, because the angle stays bounded. *Spectrum*: a peak of width f / Q; tilt has f^2 times that of the
-    accelerations. *Axes*: one motion in one direction: coherence of one, with the signs of the direction.
+    *DAVAR*: bump of the sway at 0.371 / f without a floor at long times; the turning as it is.
+    *Window mean*: the turning; sway and tilt leave nothing, because the angle stays bounded.
+    *Spectrum*: a peak of width f / Q; tilt has f^2 times that of the accelerations. *Axes*: one
+    motion in one direction: coherence of one, with the signs of the direction.
 
-    Confused with vibration_rectification and vibration_noise (not coherent over the axes as one rotation) and shared_source (broadband,
-    also at rest): accelerometers and the fixed direction in space tell.
+    Confused with vibration_rectification and vibration_noise (not coherent over the axes as one
+    rotation) and shared_source (broadband, also at rest): accelerometers and the fixed direction in
+    space tell.
 
     References
     ----------
-    Optik, linear vibration and three-axis FOGs in MWD (angular vibration from linear vibration by the mounting). Sizes are estimates:
-    0.01 deg of sway at 0.5 Hz are 113 deg/h.
+    Optik, linear vibration and three-axis FOGs in MWD (angular vibration from linear vibration by
+    the mounting). Sizes are estimates: 0.01 deg of sway at 0.5 Hz are 113 deg/h.
 
     Examples
     --------
@@ -296,24 +389,55 @@ class RealMotion(Effect):
     name: ClassVar[str] = "real_motion"
     short: ClassVar[str] = "rotation that is not an error"
     stage: ClassVar[Stage] = "motion"
-    channels: ClassVar[Mapping[str, str]] = {"rotation_rate": INNER["rotation_rate"]} | dict.fromkeys(
-        ("accel_x", "accel_y", "accel_z"), INNER["acceleration"]
-    )
+    channels: ClassVar[Mapping[str, str]] = {
+        "rotation_rate": INNER["rotation_rate"]
+    } | dict.fromkeys(("accel_x", "accel_y", "accel_z"), INNER["acceleration"])
     size_parameters: ClassVar[tuple[str, ...]] = ("sway", "spin", "x", "y", "z")
     references: ClassVar[tuple[str, ...]] = ("Optik, linear vibration and three-axis FOGs in MWD",)
 
-    direction: tuple[float, ...] = parameter("1", "share of each axis", default=(1.0,), low=-1.0, high=1.0, many=True)
-    sway: float = parameter("deg/h", "rms rate of the sway", default=0.0, typical=10.0, low=0.0, high=1e7)
+    direction: tuple[float, ...] = parameter(
+        "1", "share of each axis", default=(1.0,), low=-1.0, high=1.0, many=True
+    )
+    sway: float = parameter(
+        "deg/h", "rms rate of the sway", default=0.0, typical=10.0, low=0.0, high=1e7
+    )
     frequency: float = parameter("Hz", "frequency of the sway", default=0.3, low=1e-4, high=1e4)
-    quality: float = parameter("1", "frequency of the sway over its width", default=20.0, low=0.5, high=1e4)
-    spin: float = parameter("1", "share of the rotation rate", default=0.0, typical=1.0, low=-1.0, high=1.0)
-    x: float = parameter("mrad/g", "tilt of the mounting per acceleration along x", default=0.0, typical=0.01, low=-100.0, high=100.0)
-    y: float = parameter("mrad/g", "tilt of the mounting per acceleration along y", default=0.0, typical=0.01, low=-100.0, high=100.0)
-    z: float = parameter("mrad/g", "tilt of the mounting per acceleration along z", default=0.0, typical=0.01, low=-100.0, high=100.0)
+    quality: float = parameter(
+        "1", "frequency of the sway over its width", default=20.0, low=0.5, high=1e4
+    )
+    spin: float = parameter(
+        "1", "share of the rotation rate", default=0.0, typical=1.0, low=-1.0, high=1.0
+    )
+    x: float = parameter(
+        "mrad/g",
+        "tilt of the mounting per acceleration along x",
+        default=0.0,
+        typical=0.01,
+        low=-100.0,
+        high=100.0,
+    )
+    y: float = parameter(
+        "mrad/g",
+        "tilt of the mounting per acceleration along y",
+        default=0.0,
+        typical=0.01,
+        low=-100.0,
+        high=100.0,
+    )
+    z: float = parameter(
+        "mrad/g",
+        "tilt of the mounting per acceleration along z",
+        default=0.0,
+        typical=0.01,
+        low=-100.0,
+        high=100.0,
+    )
 
     def needs(self) -> tuple[str, ...]:
         """The rotation rate if there is spin, and the accelerations that tilt it."""
-        return ("rotation_rate",) * bool(self.spin) + tuple(f"accel_{name}" for name in "xyz" if getattr(self, name))
+        return ("rotation_rate",) * bool(self.spin) + tuple(
+            f"accel_{name}" for name in "xyz" if getattr(self, name)
+        )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """The oscillator in its stationary state; no tilt yet."""
@@ -327,16 +451,28 @@ class RealMotion(Effect):
         from gyrostab.kernels.random.coloured import march
 
         reading, rng, position, tilt = state
-        motion, position = march(reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position)
+        motion, position = march(
+            reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position
+        )
         motion = self.sway * motion
         if self.spin:
             motion += self.spin * _HOUR * chunk.drivers["rotation_rate"]
         bent = [name for name in "xyz" if getattr(self, name)]
         if bent:
-            angle = sum((self._bend(name) * chunk.drivers[f"accel_{name}"] for name in bent), np.zeros(chunk.size))
-            motion += np.diff(angle, prepend=angle[0] if tilt is None else tilt) * (chunk.rate * _HOUR)
+            angle = sum(
+                (self._bend(name) * chunk.drivers[f"accel_{name}"] for name in bent),
+                np.zeros(chunk.size),
+            )
+            motion += np.diff(angle, prepend=angle[0] if tilt is None else tilt) * (
+                chunk.rate * _HOUR
+            )
             tilt = float(angle[-1])
-        return self.each("direction", chunk.setup.axes)[:, None] * motion, (reading, rng, position, tilt)
+        return self.each("direction", chunk.setup.axes)[:, None] * motion, (
+            reading,
+            rng,
+            position,
+            tilt,
+        )
 
     def _bend(self, name: str) -> float:
         """Tilt per acceleration [degree g-1]."""
@@ -368,15 +504,27 @@ class RealMotion(Effect):
         place = np.full(windows.begin.size, float(fold(self.frequency, windows.rate)))
         turning = np.asarray(2j * np.pi * windows.frequency * (math.degrees(_MRAD) * _HOUR))
         transfer = {(name, f"accel_{name}"): turning for name in "xyz"}
-        return Prediction(mean=mean, spectrum={"sway": sway}, coherent=True, line=place, transfer=transfer)
+        return Prediction(
+            mean=mean, spectrum={"sway": sway}, coherent=True, line=place, transfer=transfer
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
         terms = []
         if self.sway:
-            terms.append(f"sway {self.quantity('sway', errors)} at {self.quantity('frequency', errors)}")
+            terms.append(
+                f"sway {self.quantity('sway', errors)} at {self.quantity('frequency', errors)}"
+            )
         if self.spin:
-            terms.append(f"{self.quantity('spin', errors)} of {self.channel_names()['rotation_rate']}")
-        terms += [f"tilt {self.quantity(name, errors)} along {name}" for name in "xyz" if getattr(self, name)]
+            terms.append(
+                f"{self.quantity('spin', errors)} of {self.channel_names()['rotation_rate']}"
+            )
+        terms += [
+            f"tilt {self.quantity(name, errors)} along {name}"
+            for name in "xyz"
+            if getattr(self, name)
+        ]
         shares = f", with shares {self.quantity('direction')}" if len(self.direction) > 1 else ""
-        return f"The tool really rotates {self.on_axes()}{shares}: {', '.join(terms) or 'not at all'}."
+        return (
+            f"The tool really rotates {self.on_axes()}{shares}: {', '.join(terms) or 'not at all'}."
+        )

@@ -25,17 +25,20 @@ class TemperatureBias(Effect):
 
     ``b = a1 (T - T0) + a2 (T - T0)^2 + a3 (T - T0)^3``
 
-    *DAVAR*: nothing while the temperature stands, an apparent R of ``|a1 dT/dt|`` at the longest averaging times while it moves.
-    *Window mean*: follows the temperature, the same on the way up and down. *Spectrum*: that of the temperature. *Axes*: each has
-    its own coefficient, of either sign.
+    *DAVAR*: nothing while the temperature stands, an apparent R of ``|a1 dT/dt|`` at the longest
+    averaging times while it moves. *Window mean*: follows the temperature, the same on the way up
+    and down. *Spectrum*: that of the temperature. *Axes*: each has its own coefficient, of either
+    sign.
 
-    Confused with shupe (follows dT/dt: changes sign with the direction of the ramp), with ageing_bias and random walk (do not turn
-    back with the temperature) and with supply_bias (the supply follows the temperature: regress on both).
+    Confused with shupe (follows dT/dt: changes sign with the direction of the ramp), with
+    ageing_bias and random walk (do not turn back with the temperature) and with supply_bias (the
+    supply follows the temperature: regress on both).
 
     References
     ----------
-    IEEE Std 952-1997 (temperature sensitivity of the bias). Sizes are estimates of what is left after compensation:
-    1e-4 to 3e-3 deg/h/degC for a gyro of 0.03 deg/h, 0.01 to 0.06 for one of 1 to 10 deg/h.
+    IEEE Std 952-1997 (temperature sensitivity of the bias). Sizes are estimates of what is left
+    after compensation: 1e-4 to 3e-3 deg/h/degC for a gyro of 0.03 deg/h, 0.01 to 0.06 for one of 1
+    to 10 deg/h.
 
     Examples
     --------
@@ -50,10 +53,18 @@ class TemperatureBias(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quadratic", "cubic")
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
 
-    sensitivity: float = parameter("deg/h/degC", "bias per degree", typical=1e-3, low=-10.0, high=10.0)
-    quadratic: float = parameter("deg/h/degC^2", "bias per degree squared", default=0.0, typical=1e-5, low=-1.0, high=1.0)
-    cubic: float = parameter("deg/h/degC^3", "bias per degree cubed", default=0.0, typical=1e-7, low=-0.1, high=0.1)
-    reference: float = parameter("degC", "temperature at which the bias is zero", default=25.0, low=-273.15, high=500.0)
+    sensitivity: float = parameter(
+        "deg/h/degC", "bias per degree", typical=1e-3, low=-10.0, high=10.0
+    )
+    quadratic: float = parameter(
+        "deg/h/degC^2", "bias per degree squared", default=0.0, typical=1e-5, low=-1.0, high=1.0
+    )
+    cubic: float = parameter(
+        "deg/h/degC^3", "bias per degree cubed", default=0.0, typical=1e-7, low=-0.1, high=0.1
+    )
+    reference: float = parameter(
+        "degC", "temperature at which the bias is zero", default=25.0, low=-273.15, high=500.0
+    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
@@ -78,27 +89,33 @@ class Shupe(Effect):
 
     ``b = s h * dT/dt + r d/dt (T_outer - T_inner)``
 
-    The coil is a winding that is heated from outside (T) and insulated inside. h is how the mean of the winding follows its surface: a sum
-    of diffusion modes of the times ``lag / (2 n - 1)^2``, the slowest ``lag = 4 d^2 / (pi^2 kappa)`` for the thickness d. s is what is
-    left of the winding's asymmetry, pure and elasto-optic in one; r what the outer half of the layers does against the inner one, while
-    heat is on its way. A sensor that is later than the surface by ``sensor_lag`` shows it a temperature of which the surface was
-    ``T + sensor_lag dT/dt``; layers that nearly cancel do the same, for they follow the second derivative.
+    The coil is a winding that is heated from outside (T) and insulated inside. h is how the mean of
+    the winding follows its surface: a sum of diffusion modes of the times ``lag / (2 n - 1)^2``,
+    the slowest ``lag = 4 d^2 / (pi^2 kappa)`` for the thickness d. s is what is left of the
+    winding's asymmetry, pure and elasto-optic in one; r what the outer half of the layers does
+    against the inner one, while heat is on its way. A sensor that is later than the surface by
+    ``sensor_lag`` shows it a temperature of which the surface was ``T + sensor_lag dT/dt``; layers
+    that nearly cancel do the same, for they follow the second derivative.
 
-    *DAVAR*: nothing at a steady ramp, for the bias is constant. Where a ramp of the rate v begins or ends the bias moves by s v within
-    the lag: K = s v / sqrt(W) in windows W much longer than the lag, R of about s v / lag in short ones. *Window mean*: a plateau s v while
-    ramping, then an exponential return; odd in the direction.
-    *Spectrum*: f^2 times that of the temperature, below the lag. *Axes*: each coil has its own size and sign.
+    *DAVAR*: nothing at a steady ramp, for the bias is constant. Where a ramp of the rate v begins
+    or ends the bias moves by s v within the lag: K = s v / sqrt(W) in windows W much longer than
+    the lag, R of about s v / lag in short ones. *Window mean*: a plateau s v while ramping, then an
+    exponential return; odd in the direction. *Spectrum*: f^2 times that of the temperature, below
+    the lag. *Axes*: each coil has its own size and sign.
 
-    Confused with temperature_bias (even: the same on the way up and down), warm_up (starts with the power, not with the temperature
-    outside), thermal_hysteresis (stays on a plateau) and thermal_gradient (a second sensor decides). A ramp up, a plateau and a ramp down
-    separate them, by regression on T and on dT/dt at several lags together.
+    Confused with temperature_bias (even: the same on the way up and down), warm_up (starts with the
+    power, not with the temperature outside), thermal_hysteresis (stays on a plateau) and
+    thermal_gradient (a second sensor decides). A ramp up, a plateau and a ramp down separate them,
+    by regression on T and on dT/dt at several lags together.
 
     References
     ----------
-    Shupe 1980, Appl. Opt. 19, 654; Mohr and Schadt 2004, Proc. SPIE 5502, 410 (elasto-optic part); Zhuo and Du, Shupe effect of fiber
-    sensing coils in multidimensional thermal field (the second part); Senol et al. 2024, Sci. Rep. (0.05 deg/h left at any ramp after
-    trimming); Carslaw and Jaeger 1959 (the modes). A winding of 12 mm with kappa = 2.2e-7 m^2/s has a lag of
-    265 s (estimate); a coil of 500 m and 4 cm whose halves differ by 0.1 % of a ramp of 1 degC/min reads about 0.3 deg/h.
+    Shupe 1980, Appl. Opt. 19, 654; Mohr and Schadt 2004, Proc. SPIE 5502, 410 (elasto-optic part);
+    Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field (the second
+    part); Senol et al. 2024, Sci. Rep. (0.05 deg/h left at any ramp after trimming); Carslaw and
+    Jaeger 1959 (the modes). A winding of 12 mm with kappa = 2.2e-7 m^2/s has a lag of 265 s
+    (estimate); a coil of 500 m and 4 cm whose halves differ by 0.1 % of a ramp of 1 degC/min reads
+    about 0.3 deg/h.
 
     Examples
     --------
@@ -119,23 +136,45 @@ class Shupe(Effect):
     )
 
     sensitivity: float = parameter(
-        "deg/h/(degC/min)", "bias at a steady ramp", typical=0.05, low=-1e3, high=1e3, source="Senol et al. 2024"
+        "deg/h/(degC/min)",
+        "bias at a steady ramp",
+        typical=0.05,
+        low=-1e3,
+        high=1e3,
+        source="Senol et al. 2024",
     )
     transient: float = parameter(
-        "deg/h/(degC/min)", "bias per difference of ramps, outer minus inner half", default=0.0, typical=0.3, low=-1e3, high=1e3
+        "deg/h/(degC/min)",
+        "bias per difference of ramps, outer minus inner half",
+        default=0.0,
+        typical=0.3,
+        low=-1e3,
+        high=1e3,
     )
-    lag: float = parameter("s", "relaxation time of the slowest mode", default=265.0, low=1e-3, high=1e6)
-    modes: float = parameter("1", "number of modes; 1 for a simple lag", default=5.0, low=1.0, high=50.0)
+    lag: float = parameter(
+        "s", "relaxation time of the slowest mode", default=265.0, low=1e-3, high=1e6
+    )
+    modes: float = parameter(
+        "1", "number of modes; 1 for a simple lag", default=5.0, low=1.0, high=50.0
+    )
     sensor_lag: float = parameter(
-        "s", "by how much the sensor of the temperature is later than the surface of the winding", default=0.0, low=0.0, high=3600.0
+        "s",
+        "by how much the sensor of the temperature is later than the surface of the winding",
+        default=0.0,
+        low=0.0,
+        high=3600.0,
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.modes != int(self.modes):
-            raise OptionError(f"effect {self.name!r}, parameter 'modes': {self.modes:g} is not a whole number of modes; give one")
+            raise OptionError(
+                f"effect {self.name!r}, parameter 'modes': {self.modes:g} is not a whole number of modes; give one"
+            )
         if self.transient and self.modes < 2:
-            raise OptionError(f"effect {self.name!r}: transient needs at least 2 modes, for one mode has no outer and inner half")
+            raise OptionError(
+                f"effect {self.name!r}: transient needs at least 2 modes, for one mode has no outer and inner half"
+            )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """No heat on its way."""
@@ -152,13 +191,18 @@ class Shupe(Effect):
         before = (float(temperature[0]), np.zeros(times.size)) if state is None else state
         change = np.diff(temperature, prepend=before[0]) * chunk.rate
         ahead = self.sensor_lag / times  # (T' - v) / t is the lagged second derivative
-        felt, state = relax(temperature, chunk.rate, times, np.stack([whole, halves]) * (1.0 - ahead), before)
+        felt, state = relax(
+            temperature, chunk.rate, times, np.stack([whole, halves]) * (1.0 - ahead), before
+        )
         felt = felt + np.stack([whole @ ahead * change, halves @ ahead * change])
         return _MINUTE * (self.sensitivity * felt[0] + self.transient * felt[1]), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Lags from none over simple sensors to thick windings, beside sensors on the winding and off it."""
-        return {"lag": np.append(_AT_ONCE, np.geomspace(30.0, 3000.0, 6)), "sensor_lag": np.array([0.0, 20.0, 60.0])}
+        return {
+            "lag": np.append(_AT_ONCE, np.geomspace(30.0, 3000.0, 6)),
+            "sensor_lag": np.array([0.0, 20.0, 60.0]),
+        }
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means, from the temperature as finely as it is known, joined by straight lines."""
@@ -169,15 +213,27 @@ class Shupe(Effect):
         modes = np.stack([_felt(windows, at, temperature, float(time)) for time in times])
         if self.sensor_lag:
             ahead = (self.sensor_lag / times)[:, None]
-            modes = (1.0 - ahead) * modes + ahead * _MINUTE * mean_rates(at, temperature, windows.begin, windows.end)
+            modes = (1.0 - ahead) * modes + ahead * _MINUTE * mean_rates(
+                at, temperature, windows.begin, windows.end
+            )
         return Prediction(mean={"sensitivity": whole @ modes, "transient": halves @ modes})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        terms = [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
-        terms += [f"{self.quantity('transient', errors)} while heat goes through the winding"] if self.transient else []
+        terms = (
+            [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
+        )
+        terms += (
+            [f"{self.quantity('transient', errors)} while heat goes through the winding"]
+            if self.transient
+            else []
+        )
         size = f"{' and '.join(terms)} {_with_lag(self, errors)}"
-        size += f", seen by a sensor that is {self.quantity('sensor_lag', errors)} late" if self.sensor_lag else ""
+        size += (
+            f", seen by a sensor that is {self.quantity('sensor_lag', errors)} late"
+            if self.sensor_lag
+            else ""
+        )
         return f"The bias follows the change of the temperature {self.on_axes()}, by {size}."
 
 
@@ -185,7 +241,11 @@ def _with_lag(effect: Shupe | ThermalGradient, errors: Mapping[str, float] | Non
     """The lag in words; one that is none is known to be short."""
     if effect.lag > _AT_ONCE:
         return f"with a lag of {effect.quantity('lag', errors)}"
-    return f"with a lag of {_TWO_SIDED * errors['lag']:.2g} s at most" if errors and "lag" in errors else "without a lag"
+    return (
+        f"with a lag of {_TWO_SIDED * errors['lag']:.2g} s at most"
+        if errors and "lag" in errors
+        else "without a lag"
+    )
 
 
 def _felt(windows: Windows, at: Array, values: Array, lag: float) -> Array:
@@ -201,18 +261,21 @@ class ThermalGradient(Effect):
 
     ``b = s (T1 - T2) + r h * d(T1 - T2)/dt``, h a lag
 
-    *DAVAR*: nothing at a steady gradient, R while it builds up, K-like in windows longer than that. *Window mean*: follows the
-    difference: zero on plateaus, a plateau at steady ramps, with the lag between both sensors. *Spectrum*: that of the difference.
-    *Axes*: often of opposite sign on axes mounted the other way round.
+    *DAVAR*: nothing at a steady gradient, R while it builds up, K-like in windows longer than that.
+    *Window mean*: follows the difference: zero on plateaus, a plateau at steady ramps, with the lag
+    between both sensors. *Spectrum*: that of the difference. *Axes*: often of opposite sign on axes
+    mounted the other way round.
 
-    Confused with shupe, which looks the same where one of the temperatures follows the other with a lag: only a second sensor, and heat
-    that comes from another side (electronics, circulation), separate them. With one sensor both belong to the answer.
+    Confused with shupe, which looks the same where one of the temperatures follows the other with a
+    lag: only a second sensor, and heat that comes from another side (electronics, circulation),
+    separate them. With one sensor both belong to the answer.
 
     References
     ----------
-    Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field (bias by the difference of dT/dt between the sides of
-    a coil); Jo et al., J. Korea Inst. Mil. Sci. Technol. (by temperature and its gradient; three times smaller after compensation).
-    Sizes are estimates: 0.01 to 1 deg/h/degC.
+    Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field (bias by the
+    difference of dT/dt between the sides of a coil); Jo et al., J. Korea Inst. Mil. Sci. Technol.
+    (by temperature and its gradient; three times smaller after compensation). Sizes are estimates:
+    0.01 to 1 deg/h/degC.
 
     Examples
     --------
@@ -223,15 +286,26 @@ class ThermalGradient(Effect):
     name: ClassVar[str] = "thermal_gradient"
     short: ClassVar[str] = "bias follows a difference of two temperatures"
     stage: ClassVar[Stage] = "rate"
-    channels: ClassVar[Mapping[str, str]] = dict.fromkeys(("temperature", "temperature_2"), INNER["temperature"])
+    channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("temperature", "temperature_2"), INNER["temperature"]
+    )
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "change")
     references: ClassVar[tuple[str, ...]] = (
         "Zhuo and Du, Shupe effect of fiber sensing coils in multidimensional thermal field",
         "Jo et al., J. Korea Inst. Mil. Sci. Technol.",
     )
 
-    sensitivity: float = parameter("deg/h/degC", "bias per difference", default=0.0, typical=0.05, low=-1e3, high=1e3)
-    change: float = parameter("deg/h/(degC/min)", "bias per change of the difference", default=0.0, typical=0.1, low=-1e3, high=1e3)
+    sensitivity: float = parameter(
+        "deg/h/degC", "bias per difference", default=0.0, typical=0.05, low=-1e3, high=1e3
+    )
+    change: float = parameter(
+        "deg/h/(degC/min)",
+        "bias per change of the difference",
+        default=0.0,
+        typical=0.1,
+        low=-1e3,
+        high=1e3,
+    )
     lag: float = parameter("s", "lag of that change", default=60.0, low=1e-3, high=1e6)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
@@ -257,13 +331,19 @@ class ThermalGradient(Effect):
         """Window means of the difference and of its change."""
         difference = windows.drivers["temperature"] - windows.drivers["temperature_2"]
         at, one, other = windows.course("temperature", "temperature_2")
-        return Prediction(mean={"sensitivity": difference, "change": _felt(windows, at, one - other, self.lag)})
+        return Prediction(
+            mean={"sensitivity": difference, "change": _felt(windows, at, one - other, self.lag)}
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        terms = [self.quantity("sensitivity", errors)] if self.sensitivity or not self.change else []
+        terms = (
+            [self.quantity("sensitivity", errors)] if self.sensitivity or not self.change else []
+        )
         if self.change:
-            terms.append(f"{self.quantity('change', errors)} of its change, {_with_lag(self, errors)}")
+            terms.append(
+                f"{self.quantity('change', errors)} of its change, {_with_lag(self, errors)}"
+            )
         return f"The bias follows the difference of {' and '.join(self.channel_names().values())} {self.on_axes()}, by {', '.join(terms)}."
 
 
@@ -271,21 +351,24 @@ class ThermalGradient(Effect):
 class ThermalHysteresis(Effect):
     """Bias that depends on the way that the temperature came.
 
-    ``b = a (T - H)``, H the play of half-width w: a slider that T drags along, and that stands while T moves inside of its play
+    ``b = a (T - H)``, H the play of half-width w: a slider that T drags along, and that stands
+    while T moves inside of its play
 
-    So b goes from -a w on the way down to a w on the way up, over the first 2 w after a turn, whatever the speed; at the start it is zero.
+    So b goes from -a w on the way down to a w on the way up, over the first 2 w after a turn,
+    whatever the speed; at the start it is zero.
 
-    *DAVAR*: an apparent R of ``a dT/dt`` over the first 2 w after a turn and nothing beyond; in long windows a step of 2 a w. *Window
-    mean*: a loop over T of the area ``2 a w (range - 2 w)``, run through in one direction. *Spectrum*: that of slow steps. *Axes*: each
-    has its own size and sign.
+    *DAVAR*: an apparent R of ``a dT/dt`` over the first 2 w after a turn and nothing beyond; in
+    long windows a step of 2 a w. *Window mean*: a loop over T of the area ``2 a w (range - 2 w)``,
+    run through in one direction. *Spectrum*: that of slow steps. *Axes*: each has its own size and
+    sign.
 
-    Confused with shupe (goes back on a plateau; this one stays) and ageing_bias (comes not back in a closed cycle): hold the temperature,
-    and run closed cycles at two speeds.
+    Confused with shupe (goes back on a plateau; this one stays) and ageing_bias (comes not back in
+    a closed cycle): hold the temperature, and run closed cycles at two speeds.
 
     References
     ----------
-    Zhou et al. 2025, Micromachines 16, 357 (hysteresis of resonator gyros over temperature). Sizes are estimates: a play of 1 to 10 degC,
-    10 to 50 % of what the temperature does by itself.
+    Zhou et al. 2025, Micromachines 16, 357 (hysteresis of resonator gyros over temperature). Sizes
+    are estimates: a play of 1 to 10 degC, 10 to 50 % of what the temperature does by itself.
 
     Examples
     --------
@@ -300,7 +383,9 @@ class ThermalHysteresis(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
     references: ClassVar[tuple[str, ...]] = ("Zhou et al. 2025, Micromachines 16, 357",)
 
-    sensitivity: float = parameter("deg/h/degC", "bias per degree inside of the play", typical=3e-4, low=-10.0, high=10.0)
+    sensitivity: float = parameter(
+        "deg/h/degC", "bias per degree inside of the play", typical=3e-4, low=-10.0, high=10.0
+    )
     width: float = parameter("degC", "half of the play", default=3.0, low=0.0, high=500.0)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
@@ -314,12 +399,16 @@ class ThermalHysteresis(Effect):
         temperature = np.ascontiguousarray(chunk.drivers["temperature"])
         if not chunk.size:
             return np.zeros(0), state
-        slider, state = play(temperature, self.width, float(temperature[0]) if state is None else state)
+        slider, state = play(
+            temperature, self.width, float(temperature[0]) if state is None else state
+        )
         return self.sensitivity * (temperature - slider), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Plays up to a third of the range of the temperature."""
-        return {"width": np.ptp(windows.drivers["temperature"]) * np.array([0.01, 0.03, 0.1, 0.2, 0.33])}
+        return {
+            "width": np.ptp(windows.drivers["temperature"]) * np.array([0.01, 0.03, 0.1, 0.2, 0.33])
+        }
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means, with the play run by the temperature as finely as it is known, joined by straight lines."""

@@ -34,11 +34,19 @@ class _Vector(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means: the components that there are."""
-        return Prediction(mean={name[-1]: windows.drivers[name] for name in self.channels if name in windows.drivers})
+        return Prediction(
+            mean={
+                name[-1]: windows.drivers[name] for name in self.channels if name in windows.drivers
+            }
+        )
 
     def parts(self, errors: Mapping[str, float] | None) -> str:
         """``"0.01 deg/h/g along x"``, for sentences."""
-        named = [f"{self.quantity(name, errors)} along {name}" for name in self.size_parameters if getattr(self, name)]
+        named = [
+            f"{self.quantity(name, errors)} along {name}"
+            for name in self.size_parameters
+            if getattr(self, name)
+        ]
         return ", ".join(named) or "nothing"
 
 
@@ -48,17 +56,20 @@ class GSensitivity(_Vector):
 
     ``b = G_x a_x + G_y a_y + G_z a_z`` for each axis that it acts on.
 
-    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps at changes of the toolface (apparent K in the
-    windows across them). *Window mean*: follows gravity in the tool. *Spectrum*: a line at the frequency of rotation.
-    *Axes*: every axis follows the same accelerations with factors of its own.
+    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps at changes of
+    the toolface (apparent K in the windows across them). *Window mean*: follows gravity in the
+    tool. *Spectrum*: a line at the frequency of rotation. *Axes*: every axis follows the same
+    accelerations with factors of its own.
 
-    Confused with vibration_rectification (even in g, this one is odd: turn the tool over), earth_rate (known amplitude, no free
-    factor) and magnetic (phase of the magnetic field, not of gravity).
+    Confused with vibration_rectification (even in g, this one is odd: turn the tool over),
+    earth_rate (known amplitude, no free factor) and magnetic (phase of the magnetic field, not of
+    gravity).
 
     References
     ----------
-    IEEE Std 952-1997 (acceleration-sensitive drift); Cordova 1998, US patent 5847829 (sensitivity by geometry of the coil).
-    Sizes are estimates: 1e-4 to 1e-2 deg/h/g for a good coil, below 0.1 for a simple one.
+    IEEE Std 952-1997 (acceleration-sensitive drift); Cordova 1998, US patent 5847829 (sensitivity
+    by geometry of the coil). Sizes are estimates: 1e-4 to 1e-2 deg/h/g for a good coil, below 0.1
+    for a simple one.
 
     Examples
     --------
@@ -69,18 +80,28 @@ class GSensitivity(_Vector):
     name: ClassVar[str] = "g_sensitivity"
     short: ClassVar[str] = "bias follows acceleration"
     stage: ClassVar[Stage] = "rate"
-    channels: ClassVar[Mapping[str, str]] = dict.fromkeys(("accel_x", "accel_y", "accel_z"), INNER["acceleration"])
+    channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("accel_x", "accel_y", "accel_z"), INNER["acceleration"]
+    )
     size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997", "Cordova 1998, US patent 5847829")
 
-    x: float = parameter("deg/h/g", "bias per g along x", default=0.0, typical=1e-3, low=-10.0, high=10.0)
-    y: float = parameter("deg/h/g", "bias per g along y", default=0.0, typical=1e-3, low=-10.0, high=10.0)
-    z: float = parameter("deg/h/g", "bias per g along z", default=0.0, typical=1e-3, low=-10.0, high=10.0)
+    x: float = parameter(
+        "deg/h/g", "bias per g along x", default=0.0, typical=1e-3, low=-10.0, high=10.0
+    )
+    y: float = parameter(
+        "deg/h/g", "bias per g along y", default=0.0, typical=1e-3, low=-10.0, high=10.0
+    )
+    z: float = parameter(
+        "deg/h/g", "bias per g along z", default=0.0, typical=1e-3, low=-10.0, high=10.0
+    )
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means: the components that there are; and the same factor at every frequency."""
         flat = np.ones(windows.frequency.size, np.complex128)
-        return replace(super().explain(windows), transfer={(name[-1], name): flat for name in self.channels})
+        return replace(
+            super().explain(windows), transfer={(name[-1], name): flat for name in self.channels}
+        )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -93,17 +114,21 @@ class VibrationRectification(Effect):
 
     ``b = k2 g^2 + k4 g^4``, g the rms acceleration
 
-    *DAVAR*: a step D where vibration starts or stops, and so ``D^2 tau / (3 (W - 2 tau))`` in the windows W across it: an apparent
-    ``K = D / sqrt(W)`` that is gone in windows wholly inside. *Window mean*: steps up with the vibration and back with it.
-    *Spectrum*: nothing but that of ``g^2``. *Axes*: each has its own factor; the sign does not depend on the direction of the vibration.
+    *DAVAR*: a step D where vibration starts or stops, and so ``D^2 tau / (3 (W - 2 tau))`` in the
+    windows W across it: an apparent ``K = D / sqrt(W)`` that is gone in windows wholly inside.
+    *Window mean*: steps up with the vibration and back with it. *Spectrum*: nothing but that of
+    ``g^2``. *Axes*: each has its own factor; the sign does not depend on the direction of the
+    vibration.
 
-    Confused with g_sensitivity (odd in g; one event cannot tell g from g^2, two levels of vibration can), bias_jump (does not go back when
-    vibration ends), vibration_random_walk (grows inside the windows, too) and real_motion (seen by accelerometers and by the other axes).
+    Confused with g_sensitivity (odd in g; one event cannot tell g from g^2, two levels of vibration
+    can), bias_jump (does not go back when vibration ends), vibration_random_walk (grows inside the
+    windows, too) and real_motion (seen by accelerometers and by the other axes).
 
     References
     ----------
-    Qin et al. 2026 (0.0118 to 0.0445 deg/h under a sine of 6 g at 30 Hz, which is 0.7e-3 to 2.5e-3 deg/h/g^2); Cordova 1998, US patent
-    5847829 (windings that bring it down). Scaled to the 13.39 g of Wang et al. 2016: 0.1 to 0.4 deg/h.
+    Qin et al. 2026 (0.0118 to 0.0445 deg/h under a sine of 6 g at 30 Hz, which is 0.7e-3 to 2.5e-3
+    deg/h/g^2); Cordova 1998, US patent 5847829 (windings that bring it down). Scaled to the 13.39 g
+    of Wang et al. 2016: 0.1 to 0.4 deg/h.
 
     Examples
     --------
@@ -116,10 +141,23 @@ class VibrationRectification(Effect):
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity", "quartic")
-    references: ClassVar[tuple[str, ...]] = ("Qin et al. 2026", "Cordova 1998, US patent 5847829", "Wang et al. 2016, Sensors")
+    references: ClassVar[tuple[str, ...]] = (
+        "Qin et al. 2026",
+        "Cordova 1998, US patent 5847829",
+        "Wang et al. 2016, Sensors",
+    )
 
-    sensitivity: float = parameter("deg/h/g^2", "bias per mean square", typical=1.5e-3, low=-10.0, high=10.0, source="Qin et al. 2026")
-    quartic: float = parameter("deg/h/g^4", "bias per mean square squared", default=0.0, typical=1e-7, low=-1.0, high=1.0)
+    sensitivity: float = parameter(
+        "deg/h/g^2",
+        "bias per mean square",
+        typical=1.5e-3,
+        low=-10.0,
+        high=10.0,
+        source="Qin et al. 2026",
+    )
+    quartic: float = parameter(
+        "deg/h/g^4", "bias per mean square squared", default=0.0, typical=1e-7, low=-1.0, high=1.0
+    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
@@ -135,7 +173,9 @@ class VibrationRectification(Effect):
         """Say it in one sentence."""
         terms = []
         if self.sensitivity or not self.quartic:
-            terms.append(f"{self.quantity('sensitivity', errors)} times the square of the rms vibration")
+            terms.append(
+                f"{self.quantity('sensitivity', errors)} times the square of the rms vibration"
+            )
         if self.quartic:
             power = "its fourth power" if terms else "the fourth power of the rms vibration"
             terms.append(f"{self.quantity('quartic', errors)} times {power}")
@@ -146,24 +186,30 @@ class VibrationRectification(Effect):
 class AliasedVibration(Effect):
     """Angular vibration in a band, as the samples see it: what lies above half of the sampling rate folds down.
 
-    ``rate(t) = s g(t) v(t)``: v is noise of unit power between `low` and `high` (Butterworth, half power at both), behind a mount of
-    stated resonance, if any; g is the rms of the vibration. A sample is v at its beginning (``"point"``) or the mean of v over its
-    interval (``"average"``, integrate and dump). So the samples have the density ``sum_k S(f + k fs) |H(f + k fs)|^2`` with H = 1 or
-    sinc(f / fs), because they are drawn from the process in continuous time, not because it is put in. Where the model makes the
-    instrument sample faster than the log, this is about the instrument, and the logger's own filter decides the rest.
+    ``rate(t) = s g(t) v(t)``: v is noise of unit power between `low` and `high` (Butterworth, half
+    power at both), behind a mount of stated resonance, if any; g is the rms of the vibration. A
+    sample is v at its beginning (``"point"``) or the mean of v over its interval (``"average"``,
+    integrate and dump). So the samples have the density ``sum_k S(f + k fs) |H(f + k fs)|^2`` with
+    H = 1 or sinc(f / fs), because they are drawn from the process in continuous time, not because
+    it is put in. Where the model makes the instrument sample faster than the log, this is about the
+    instrument, and the logger's own filter decides the rest.
 
-    *DAVAR*: point samples raise sigma at all averaging times, like N, where the band folds onto zero frequency (the 700 to 800 Hz of
-    Wang et al. 2016 at 400 Hz fills 0 to 100 Hz: 8 times at 2.5 ms, 19 times from 40 ms on with 50 deg/h and N = 0.0031); integrate and
-    dump has its zeros there and raises short times only, like Q (1.3, 1.4, 1.1 times at 2.5, 10, 40 ms). *Window mean*: nothing, and no
-    bias. *Spectrum*: the folded band. *Axes*: one rigid motion, with a factor for each axis.
+    *DAVAR*: point samples raise sigma at all averaging times, like N, where the band folds onto
+    zero frequency (the 700 to 800 Hz of Wang et al. 2016 at 400 Hz fills 0 to 100 Hz: 8 times at
+    2.5 ms, 19 times from 40 ms on with 50 deg/h and N = 0.0031); integrate and dump has its zeros
+    there and raises short times only, like Q (1.3, 1.4, 1.1 times at 2.5, 10, 40 ms). *Window
+    mean*: nothing, and no bias. *Spectrum*: the folded band. *Axes*: one rigid motion, with a
+    factor for each axis.
 
-    Confused with vibration_noise (flat, no cross-spectrum), with Q (not tied to vibration) and spikes (heavy tails). What separates
-    them is the edge of the folded band, coherence of the axes, and another sampling rate, at which the band folds elsewhere.
+    Confused with vibration_noise (flat, no cross-spectrum), with Q (not tied to vibration) and
+    spikes (heavy tails). What separates them is the edge of the folded band, coherence of the axes,
+    and another sampling rate, at which the band folds elsewhere.
 
     References
     ----------
-    Wang et al. 2016, Sensors (13.39 g, 1 g^2/Hz at 700 to 800 Hz, logged at 400 Hz); Optik, linear vibration and three-axis FOGs
-    in MWD (angular vibration by the mounting, under-sampled). The angular rate per g is an estimate.
+    Wang et al. 2016, Sensors (13.39 g, 1 g^2/Hz at 700 to 800 Hz, logged at 400 Hz); Optik, linear
+    vibration and three-axis FOGs in MWD (angular vibration by the mounting, under-sampled). The
+    angular rate per g is an estimate.
 
     Examples
     --------
@@ -176,14 +222,37 @@ class AliasedVibration(Effect):
     stage: ClassVar[Stage] = "rate"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
-    references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors", "Optik, linear vibration and three-axis FOGs in MWD")
+    references: ClassVar[tuple[str, ...]] = (
+        "Wang et al. 2016, Sensors",
+        "Optik, linear vibration and three-axis FOGs in MWD",
+    )
 
-    sensitivity: tuple[float, ...] = parameter("deg/h/g", "rms rate in the band per rms g", typical=3.7, low=-1e6, high=1e6, many=True)
-    low: float = parameter("Hz", "lower edge of the band", default=700.0, low=_LOWEST, high=1e5, source="Wang et al. 2016")
-    high: float = parameter("Hz", "upper edge of the band", default=800.0, low=_LOWEST, high=1e5, source="Wang et al. 2016")
-    resonance: float = parameter("Hz", "resonance of the mount; 0 for a rigid one", default=0.0, low=0.0, high=1e5)
+    sensitivity: tuple[float, ...] = parameter(
+        "deg/h/g", "rms rate in the band per rms g", typical=3.7, low=-1e6, high=1e6, many=True
+    )
+    low: float = parameter(
+        "Hz",
+        "lower edge of the band",
+        default=700.0,
+        low=_LOWEST,
+        high=1e5,
+        source="Wang et al. 2016",
+    )
+    high: float = parameter(
+        "Hz",
+        "upper edge of the band",
+        default=800.0,
+        low=_LOWEST,
+        high=1e5,
+        source="Wang et al. 2016",
+    )
+    resonance: float = parameter(
+        "Hz", "resonance of the mount; 0 for a rigid one", default=0.0, low=0.0, high=1e5
+    )
     quality: float = parameter("1", "quality of that resonance", default=10.0, low=0.5, high=1000.0)
-    sampling: str = parameter("text", "how a sample is taken", default="point", choices=("point", "average"))
+    sampling: str = parameter(
+        "text", "how a sample is taken", default="point", choices=("point", "average")
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -197,8 +266,20 @@ class AliasedVibration(Effect):
         from gyrostab.kernels.random.coloured import band, rest
 
         average = self.sampling == "average"
-        reading = band(self.low, self.high, setup.rate, resonance=self.resonance, quality=self.quality, average=average)
-        return reading, rng, rest(reading, rng.standard_normal(reading.read.size)), self.each("sensitivity", setup.axes)
+        reading = band(
+            self.low,
+            self.high,
+            setup.rate,
+            resonance=self.resonance,
+            quality=self.quality,
+            average=average,
+        )
+        return (
+            reading,
+            rng,
+            rest(reading, rng.standard_normal(reading.read.size)),
+            self.each("sensitivity", setup.axes),
+        )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
@@ -207,7 +288,12 @@ class AliasedVibration(Effect):
         reading, rng, position, sensitivity = state
         normal = rng.standard_normal((chunk.size, position.size + 1))
         values, position = march(reading.step, reading.read, reading.kick, normal, position)
-        return sensitivity[:, None] * (chunk.drivers["vibration"] * values), (reading, rng, position, sensitivity)
+        return sensitivity[:, None] * (chunk.drivers["vibration"] * values), (
+            reading,
+            rng,
+            position,
+            sensitivity,
+        )
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """Points and averages of the band that the log tells of its vibration; of the usual band where it tells none."""
@@ -223,13 +309,19 @@ class AliasedVibration(Effect):
             return band_psd(f, self.low, self.high, resonance=self.resonance, quality=self.quality)
 
         average = self.sampling == "average"
-        folded = folded_psd(density, windows.frequency, windows.rate, 3.0 * self.high, average=average)
+        folded = folded_psd(
+            density, windows.frequency, windows.rate, 3.0 * self.high, average=average
+        )
         power = windows.drivers["vibration"] ** 2
         return Prediction(spectrum={"sensitivity": power[:, None] * folded}, coherent=True)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
-        mount = f", behind a mount with a resonance at {self.quantity('resonance', errors)}" if self.resonance else ""
+        mount = (
+            f", behind a mount with a resonance at {self.quantity('resonance', errors)}"
+            if self.resonance
+            else ""
+        )
         taken = "a point of it" if self.sampling == "point" else "its mean over the interval"
         size = self.quantity("sensitivity", errors)
         band = f"{self.low:.4g} to {self.high:.4g} Hz"
@@ -242,17 +334,20 @@ class Magnetic(_Vector):
 
     ``b = m_x B_x + m_y B_y + m_z B_z`` for each axis that it acts on, B in the frame of the tool.
 
-    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps where the tool turns or passes casing. *Window
-    mean*: follows the field. *Spectrum*: a line at the frequency of rotation, with the phase of the field. *Axes*: every axis follows
-    the same field with factors of its own.
+    *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps where the tool
+    turns or passes casing. *Window mean*: follows the field. *Spectrum*: a line at the frequency of
+    rotation, with the phase of the field. *Axes*: every axis follows the same field with factors of
+    its own.
 
-    Confused with earth_rate (known amplitude, quadrature between the cross axes) and g_sensitivity (phase of gravity): the angle
-    between field and gravity in the tool separates them, best at two places with different fields.
+    Confused with earth_rate (known amplitude, quadrature between the cross axes) and g_sensitivity
+    (phase of gravity): the angle between field and gravity in the tool separates them, best at two
+    places with different fields.
 
     References
     ----------
-    Fizoptika, glossary of fiber-optic gyros (magnetic sensitivity). Sizes are estimates: 0.1 to 10 deg/h/G without a shield, which is
-    1e-3 to 0.1 deg/h/uT, and a hundredth of it with one; the earth's field is 25 to 65 uT.
+    Fizoptika, glossary of fiber-optic gyros (magnetic sensitivity). Sizes are estimates: 0.1 to 10
+    deg/h/G without a shield, which is 1e-3 to 0.1 deg/h/uT, and a hundredth of it with one; the
+    earth's field is 25 to 65 uT.
 
     Examples
     --------
@@ -263,13 +358,21 @@ class Magnetic(_Vector):
     name: ClassVar[str] = "magnetic"
     short: ClassVar[str] = "bias follows the magnetic field"
     stage: ClassVar[Stage] = "rate"
-    channels: ClassVar[Mapping[str, str]] = dict.fromkeys(("mag_x", "mag_y", "mag_z"), INNER["magnetic"])
+    channels: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("mag_x", "mag_y", "mag_z"), INNER["magnetic"]
+    )
     size_parameters: ClassVar[tuple[str, ...]] = ("x", "y", "z")
     references: ClassVar[tuple[str, ...]] = ("Fizoptika, glossary of fiber-optic gyros",)
 
-    x: float = parameter("deg/h/uT", "bias per microtesla along x", default=0.0, typical=1e-3, low=-10.0, high=10.0)
-    y: float = parameter("deg/h/uT", "bias per microtesla along y", default=0.0, typical=1e-3, low=-10.0, high=10.0)
-    z: float = parameter("deg/h/uT", "bias per microtesla along z", default=0.0, typical=1e-3, low=-10.0, high=10.0)
+    x: float = parameter(
+        "deg/h/uT", "bias per microtesla along x", default=0.0, typical=1e-3, low=-10.0, high=10.0
+    )
+    y: float = parameter(
+        "deg/h/uT", "bias per microtesla along y", default=0.0, typical=1e-3, low=-10.0, high=10.0
+    )
+    z: float = parameter(
+        "deg/h/uT", "bias per microtesla along z", default=0.0, typical=1e-3, low=-10.0, high=10.0
+    )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

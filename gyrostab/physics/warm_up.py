@@ -22,20 +22,24 @@ class WarmUp(Effect):
 
     ``b = A q exp(-(t - t_on) / t_w) + A2 q2 exp(-(t - t_on) / t_2)``
 
-    t_on is the start of the log, the end of every restart, and of every gap of at least `gap`. q is one for a cold gyro; with a time of
-    `cooling` a short loss of power brings back only what it had time to cool by: ``q = 1 - (1 - left) exp(-t_off / cooling)``.
+    t_on is the start of the log, the end of every restart, and of every gap of at least `gap`. q is
+    one for a cold gyro; with a time of `cooling` a short loss of power brings back only what it had
+    time to cool by: ``q = 1 - (1 - left) exp(-t_off / cooling)``.
 
-    *DAVAR*: an apparent R of ``(A / t_w) exp(-(t - t_on) / t_w)`` at long averaging times, a ridge that fades after every restart, and a
-    step across it. *Window mean*: an exponential after each. *Spectrum*: nothing but the lowest bands. *Axes*: all at once, with sizes
-    and signs of their own.
+    *DAVAR*: an apparent R of ``(A / t_w) exp(-(t - t_on) / t_w)`` at long averaging times, a ridge
+    that fades after every restart, and a step across it. *Window mean*: an exponential after each.
+    *Spectrum*: nothing but the lowest bands. *Axes*: all at once, with sizes and signs of their
+    own.
 
-    Confused with shupe and temperature_bias (the gyro warms itself: a temperature inside shows both), bias_jump (stays) and a random walk
-    (does not repeat): stack what follows the restarts; it is the same curve after equally long breaks.
+    Confused with shupe and temperature_bias (the gyro warms itself: a temperature inside shows
+    both), bias_jump (stays) and a random walk (does not repeat): stack what follows the restarts;
+    it is the same curve after equally long breaks.
 
     References
     ----------
-    Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (thermal transients). Sizes are estimates: 0.01 to 0.5 deg/h for a gyro of 0.03 deg/h,
-    0.3 to 5 for one of 1 to 10 deg/h; 1 to 30 min, often two times at once.
+    Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (thermal transients). Sizes are estimates: 0.01
+    to 0.5 deg/h for a gyro of 0.03 deg/h, 0.3 to 5 for one of 1 to 10 deg/h; 1 to 30 min, often two
+    times at once.
 
     Examples
     --------
@@ -49,16 +53,37 @@ class WarmUp(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("amplitude", "slow_amplitude")
     references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)
 
-    amplitude: float = parameter("deg/h", "bias of a cold gyro at power-on", typical=0.1, low=-1e4, high=1e4)
+    amplitude: float = parameter(
+        "deg/h", "bias of a cold gyro at power-on", typical=0.1, low=-1e4, high=1e4
+    )
     time: float = parameter("s", "time constant", default=600.0, low=1e-3, high=1e6)
-    slow_amplitude: float = parameter("deg/h", "amplitude of a second, slower part", default=0.0, typical=0.05, low=-1e4, high=1e4)
+    slow_amplitude: float = parameter(
+        "deg/h", "amplitude of a second, slower part", default=0.0, typical=0.05, low=-1e4, high=1e4
+    )
     slow_time: float = parameter("s", "its time constant", default=3600.0, low=1e-3, high=1e7)
-    cooling: float = parameter("s", "time constant of cooling without power; 0 for at once", default=0.0, low=0.0, high=1e6)
-    gap: float = parameter("s", "shortest gap that counts as a loss of power; inf for restarts only", default=math.inf, low=0.0)
-    cold: float = parameter("1", "share of the amplitude at the start of the log: 1 for a cold gyro", default=1.0, low=0.0, high=1.0)
+    cooling: float = parameter(
+        "s", "time constant of cooling without power; 0 for at once", default=0.0, low=0.0, high=1e6
+    )
+    gap: float = parameter(
+        "s",
+        "shortest gap that counts as a loss of power; inf for restarts only",
+        default=math.inf,
+        low=0.0,
+    )
+    cold: float = parameter(
+        "1",
+        "share of the amplitude at the start of the log: 1 for a cold gyro",
+        default=1.0,
+        low=0.0,
+        high=1.0,
+    )
 
     def _parts(self) -> tuple[tuple[str, float, float], ...]:
-        return ("amplitude", self.amplitude, self.time), ("slow_amplitude", self.slow_amplitude, self.slow_time)
+        return ("amplitude", self.amplitude, self.time), (
+            "slow_amplitude",
+            self.slow_amplitude,
+            self.slow_time,
+        )
 
     def _losses(self, gaps: NDArray[Any], restarts: NDArray[Any], second: float) -> Array:
         """Losses of power [s] from the tables of gaps and restarts, in which a second is `second`."""
@@ -70,7 +95,9 @@ class WarmUp(Effect):
         on, share, found = 0.0, self.cold, [self.cold]
         for gone, back in losses.tolist():
             left = share * math.exp(-(gone - on) / time)
-            share = 1.0 - (1.0 - left) * (math.exp(-(back - gone) / self.cooling) if self.cooling else 0.0)
+            share = 1.0 - (1.0 - left) * (
+                math.exp(-(back - gone) / self.cooling) if self.cooling else 0.0
+            )
             on = back
             found.append(share)
         return np.array(found)
@@ -78,25 +105,37 @@ class WarmUp(Effect):
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Times of power-on, and where each part starts then."""
         losses = self._losses(setup.gaps, setup.restarts, setup.rate)
-        return np.concatenate([[0.0], losses[:, 1]]), [self._shares(losses, time) for _, _, time in self._parts()]
+        return np.concatenate([[0.0], losses[:, 1]]), [
+            self._shares(losses, time) for _, _, time in self._parts()
+        ]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1], averaged over every sample."""
         on, shares = state
-        which = np.searchsorted(np.rint(on * chunk.rate), chunk.first + np.arange(chunk.size), side="right") - 1
+        which = (
+            np.searchsorted(
+                np.rint(on * chunk.rate), chunk.first + np.arange(chunk.size), side="right"
+            )
+            - 1
+        )
         since = chunk.seconds - on[which]
         bias = np.zeros(chunk.size)
         for (_, amplitude, time), share in zip(self._parts(), shares, strict=True):
             if not amplitude:
                 continue
             inside = 1.0 / (chunk.rate * time)
-            bias += amplitude * (-math.expm1(-inside) / inside) * share[which] * np.exp(-since / time)
+            bias += (
+                amplitude * (-math.expm1(-inside) / inside) * share[which] * np.exp(-since / time)
+            )
         return bias, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Time constants of the gyro and of its cooling."""
         slow = {"slow_time": np.geomspace(1800.0, 14400.0, 4)} if self.slow_amplitude else {}
-        return {"time": np.geomspace(60.0, 1800.0, 6), "cooling": np.array([0.0, 300.0, 1800.0])} | slow
+        return {
+            "time": np.geomspace(60.0, 1800.0, 6),
+            "cooling": np.array([0.0, 300.0, 1800.0]),
+        } | slow
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means over the time in which there are data."""
@@ -109,14 +148,23 @@ class WarmUp(Effect):
         mean = {}
         for name, _, time in self._parts():
             share = self._shares(losses, time)[which]
-            total = _over(windows, begin, end, partial(_decay, time=time, size=share, since=begin - on[which], begin=begin))
+            total = _over(
+                windows,
+                begin,
+                end,
+                partial(_decay, time=time, size=share, since=begin - on[which], begin=begin),
+            )
             mean[name] = np.divide(total, present, out=np.zeros_like(total), where=present > 0)
         return Prediction(mean=mean)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
         size, time = self.quantity("amplitude", errors), self.quantity("time", errors)
-        slow = f", and {self.quantity('slow_amplitude', errors)} with {self.quantity('slow_time', errors)}" if self.slow_amplitude else ""
+        slow = (
+            f", and {self.quantity('slow_amplitude', errors)} with {self.quantity('slow_time', errors)}"
+            if self.slow_amplitude
+            else ""
+        )
         return f"The bias starts {size} off {self.on_axes()} after every power-on and settles with {time}{slow}."
 
 
@@ -131,12 +179,18 @@ def _merged(spans: NDArray[Any]) -> Array:
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 
-def _decay(row: NDArray[np.int64], t: Array, *, time: float, size: Array, since: Array, begin: Array) -> Array:
+def _decay(
+    row: NDArray[np.int64], t: Array, *, time: float, size: Array, since: Array, begin: Array
+) -> Array:
     """Integral of an exponential from the beginning of a stretch, `since` after its power-on, to t."""
-    return np.asarray(time * size[row] * np.exp(-since[row] / time) * -np.expm1(-(t - begin[row]) / time))
+    return np.asarray(
+        time * size[row] * np.exp(-since[row] / time) * -np.expm1(-(t - begin[row]) / time)
+    )
 
 
-def _over(windows: Windows, begin: Array, end: Array, part: Callable[[NDArray[np.int64], Array], Array]) -> Array:
+def _over(
+    windows: Windows, begin: Array, end: Array, part: Callable[[NDArray[np.int64], Array], Array]
+) -> Array:
     """Integral over every window of what is given in the stretches `begin` to `end`; ``part(row, t)`` is that from begin[row] to t."""
     until = np.maximum(np.minimum(end, windows.end.max()), begin)
     before = np.concatenate([[0.0], np.cumsum(part(np.arange(begin.size), until))])

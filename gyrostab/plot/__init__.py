@@ -1,7 +1,8 @@
 """Figures of logs, surfaces and products.
 
-Every function returns a `matplotlib.figure.Figure` that belongs to nobody else: no pyplot, no window, no global state.
-Save it with ``figure.savefig("name.png", dpi=150)`` or as ``.svg`` or ``.pdf``.
+Every function returns a `matplotlib.figure.Figure` that belongs to nobody else: no pyplot, no
+window, no global state. Save it with ``figure.savefig("name.png", dpi=150)`` or as ``.svg`` or
+``.pdf``.
 """
 
 from __future__ import annotations

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import COLOURS, axis_names, axis_style, literal_text, new_figure, stack_panels
+from gyrostab.plot.style import (
+    COLOURS,
+    axis_names,
+    axis_style,
+    literal_text,
+    new_figure,
+    stack_panels,
+)
 from gyrostab.schema import OBSERVABLE, check_surface
 
 if TYPE_CHECKING:
@@ -34,7 +41,8 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     axis : str
         The axis.
     when : datetime-like, optional
-        The window whose centre is nearest; when not given, the best covered window nearest to the middle of the record.
+        The window whose centre is nearest; when not given, the best covered window nearest to the
+        middle of the record.
 
     Returns
     -------
@@ -54,9 +62,19 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     panel = figure.subplots()
     colour = axis_style(product, name)["color"]
     low, high = band(window["avar"].values, window["edf"].values)
-    panel.fill_between(tau, np.sqrt(low), np.sqrt(high), color=colour, alpha=0.2, linewidth=0, label="95 % band")
+    panel.fill_between(
+        tau, np.sqrt(low), np.sqrt(high), color=colour, alpha=0.2, linewidth=0, label="95 % band"
+    )
     deviation = np.sqrt(window["avar"].values)
-    panel.plot(tau, deviation, color=colour, marker="o", markersize=3.5, linewidth=1.2, label=f"axis {name}, measured")
+    panel.plot(
+        tau,
+        deviation,
+        color=colour,
+        marker="o",
+        markersize=3.5,
+        linewidth=1.2,
+        label=f"axis {name}, measured",
+    )
     if "observable" in window:
         from gyrostab.allan.fit import refit
 
@@ -68,7 +86,14 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     panel.set_xlim(tau.min() / 1.3, tau.max() * 1.3)
     if not shown.size:
         panel.set_ylim(0.1, 10.0)
-        panel.text(0.5, 0.5, "no estimate in this window", transform=panel.transAxes, ha="center", va="center")
+        panel.text(
+            0.5,
+            0.5,
+            "no estimate in this window",
+            transform=panel.transAxes,
+            ha="center",
+            va="center",
+        )
     else:
         panel.set_ylim(shown.min() / 4.0, np.nanmax(np.sqrt(high)) * 1.5)
     panel.set_xlabel("averaging time τ [s]")
@@ -112,15 +137,23 @@ def _window(part: xr.Dataset, when: Any) -> int:
     time = part["time"].values.astype("datetime64[ns]")
     if when is None:
         coverage = part["window_coverage"].values
-        best = np.flatnonzero(coverage >= np.nanmax(coverage) - 1e-9) if np.isfinite(coverage).any() else np.arange(time.size)
+        best = (
+            np.flatnonzero(coverage >= np.nanmax(coverage) - 1e-9)
+            if np.isfinite(coverage).any()
+            else np.arange(time.size)
+        )
         return int(best[np.argmin(np.abs(best - time.size // 2))])
     try:
         stamp = np.datetime64(str(np.datetime64(when))).astype("datetime64[ns]")
     except ValueError as error:
-        raise OptionError(f"time {when!r} is not understood; write it as 2026-11-20T14:30:00") from error
+        raise OptionError(
+            f"time {when!r} is not understood; write it as 2026-11-20T14:30:00"
+        ) from error
     half = np.timedelta64(int(float(part.attrs.get("window_s", 0.0)) * 1e9), "ns")
     if not time[0] - half <= stamp <= time[-1] + half:
-        raise OptionError(f"time {when} is outside the record, which has windows from {time[0]} to {time[-1]}")
+        raise OptionError(
+            f"time {when} is outside the record, which has windows from {time[0]} to {time[-1]}"
+        )
     return int(np.argmin(np.abs(time - stamp)))
 
 
@@ -138,9 +171,18 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
         total += term
         if state == _SEEN:
             label = f"{symbol} = {value:.3g} ± {error:.1g} {law.label} ({law.name})"
-            panel.plot(tau, np.sqrt(term), linestyle=_DASHES[number], color=colours[number], linewidth=1.3, label=label)
+            panel.plot(
+                tau,
+                np.sqrt(term),
+                linestyle=_DASHES[number],
+                color=colours[number],
+                linewidth=1.3,
+                label=label,
+            )
         elif state == _LIMIT:
-            panel.plot([], [], linestyle="none", label=f"{symbol} < {upper:.3g} {law.label} ({law.name})")
+            panel.plot(
+                [], [], linestyle="none", label=f"{symbol} < {upper:.3g} {law.label} ({law.name})"
+            )
     if total.any():
         panel.plot(tau, np.sqrt(total), color="black", linewidth=1.6, label=_name_curve(window))
 

@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_coefficients"]
 
-_NOT, _LIMIT, _SEEN = (OBSERVABLE.index(name) for name in ("not_observable", "upper_limit_only", "observed"))
+_NOT, _LIMIT, _SEEN = (
+    OBSERVABLE.index(name) for name in ("not_observable", "upper_limit_only", "observed")
+)
 
 
 @literal_text
@@ -72,15 +74,25 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
         panel.set_ylabel(f"{symbol} [{law.label}]")
         panel.set_title(law.name, loc="left", fontsize="medium", pad=3, y=1.0)
         panel.grid(alpha=0.3)
-    figure.legend(handles=_key(product, names), loc="lower center", ncols=len(names) + 3, fontsize="small", frameon=False)
+    figure.legend(
+        handles=_key(product, names),
+        loc="lower center",
+        ncols=len(names) + 3,
+        fontsize="small",
+        frameon=False,
+    )
     whose = f" of axis {names[0]}" if len(names) == 1 else ""
-    figure.suptitle(", ".join(filter(None, [f"Noise coefficients{whose} over time", window_text(product)])))
+    figure.suptitle(
+        ", ".join(filter(None, [f"Noise coefficients{whose} over time", window_text(product)]))
+    )
     time_axis(panels[-1], edges)
     stack_panels(panels, between=0.32, below=0.3)
     return figure
 
 
-def _draw_axis(panel: Axes, part: xr.Dataset, symbol: str, name: str, style: dict[str, Any]) -> None:
+def _draw_axis(
+    panel: Axes, part: xr.Dataset, symbol: str, name: str, style: dict[str, Any]
+) -> None:
     time = part["time"].values
     state = part["observable"].sel(term=symbol).values
     value = np.where(state == _SEEN, part[symbol].values, np.nan)
@@ -94,12 +106,30 @@ def _draw_axis(panel: Axes, part: xr.Dataset, symbol: str, name: str, style: dic
         alone = known[1:-1] & ~known[:-2] & ~known[2:]
         panel.plot(time[alone], value[alone], **marks | {"linestyle": "none", "markersize": 2.0})
     if few:
-        panel.errorbar(time, value, yerr=np.nan_to_num(error), fmt="none", ecolor=style["color"], elinewidth=0.9, alpha=0.7)
+        panel.errorbar(
+            time,
+            value,
+            yerr=np.nan_to_num(error),
+            fmt="none",
+            ecolor=style["color"],
+            elinewidth=0.9,
+            alpha=0.7,
+        )
     else:
-        panel.fill_between(time, value - error, value + error, color=style["color"], alpha=0.25, linewidth=0)
+        panel.fill_between(
+            time, value - error, value + error, color=style["color"], alpha=0.25, linewidth=0
+        )
     marked = np.flatnonzero(np.isfinite(upper))
     marked = marked[:: max(1, marked.size // 150)]
-    limits = panel.scatter(time[marked], upper[marked], marker="v", s=14, facecolors="none", edgecolors=style["color"], linewidths=0.8)
+    limits = panel.scatter(
+        time[marked],
+        upper[marked],
+        marker="v",
+        s=14,
+        facecolors="none",
+        edgecolors=style["color"],
+        linewidths=0.8,
+    )
     limits.set_gid(f"upper {symbol} {name}")
 
 
@@ -107,7 +137,10 @@ def _scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> N
     """Log scale where the numbers span more than a decade, else linear from zero."""
     chosen = product.sel(axis=names)
     state = chosen["observable"].sel(term=symbol).values
-    shown = (chosen[symbol].values[state == _SEEN], chosen[f"{symbol}_upper"].values[state == _LIMIT])
+    shown = (
+        chosen[symbol].values[state == _SEEN],
+        chosen[f"{symbol}_upper"].values[state == _LIMIT],
+    )
     numbers = np.concatenate(shown)
     numbers = numbers[np.isfinite(numbers) & (numbers > 0)]
     if numbers.size and numbers.max() > 10 * numbers.min():
@@ -118,17 +151,46 @@ def _scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> N
         panel.set_ylim(0.0, numbers.max() * 1.15)
     else:
         panel.set_yticks([])
-        panel.text(0.5, 0.5, "not observable in any window", transform=panel.transAxes, ha="center", va="center")
+        panel.text(
+            0.5,
+            0.5,
+            "not observable in any window",
+            transform=panel.transAxes,
+            ha="center",
+            va="center",
+        )
 
 
 def _key(product: xr.Dataset, names: list[str]) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    keys: list[Any] = [Line2D([], [], **axis_style(product, name), label=f"axis {name}", markersize=4.0) for name in names]
-    keys.append(Line2D([], [], color="black", marker="|", linestyle="none", markersize=9.0, label="standard error"))
+    keys: list[Any] = [
+        Line2D([], [], **axis_style(product, name), label=f"axis {name}", markersize=4.0)
+        for name in names
+    ]
     keys.append(
-        Line2D([], [], color="black", marker="v", markerfacecolor="none", linestyle="none", markersize=5.0, label="95 % upper limit")
+        Line2D(
+            [],
+            [],
+            color="black",
+            marker="|",
+            linestyle="none",
+            markersize=9.0,
+            label="standard error",
+        )
+    )
+    keys.append(
+        Line2D(
+            [],
+            [],
+            color="black",
+            marker="v",
+            markerfacecolor="none",
+            linestyle="none",
+            markersize=5.0,
+            label="95 % upper limit",
+        )
     )
     more = " (darker: on more axes)" if len(names) > 1 else ""
     keys.append(Patch(facecolor=GREY, alpha=0.5, label=f"not observable{more}"))

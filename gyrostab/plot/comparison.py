@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 __all__ = ["plot_comparison"]
 
 Array = NDArray[np.float64]
-_STYLES: tuple[dict[str, Any], dict[str, Any]] = ({"color": GREY, "lw": 2.4}, {"color": COLOURS[0], "lw": 1.1})
+_STYLES: tuple[dict[str, Any], dict[str, Any]] = (
+    {"color": GREY, "lw": 2.4},
+    {"color": COLOURS[0], "lw": 1.1},
+)
 
 
 @literal_text
@@ -45,18 +48,21 @@ def plot_comparison(
     Parameters
     ----------
     without, with_it : xarray.Dataset
-        Two regular logs with ``rate(axis, time)`` [degree hour-1] on the same stamps, for instance simulated with one seed.
+        Two regular logs with ``rate(axis, time)`` [degree hour-1] on the same stamps, for instance
+        simulated with one seed.
     window, step : str, float or timedelta
         Windows of the dynamic Allan variance, as for `gyrostab.davar`.
     moments : sequence of float or str
-        Times since the start [s] whose Allan deviation is drawn; by default a map of the ratio over time.
+        Times since the start [s] whose Allan deviation is drawn; by default a map of the ratio over
+        time.
     driver : str
         Channel of `with_it` to draw beside the window means.
     difference : bool
         Draw the window means less those of `without`: for errors of a rate that is large itself.
     coherency : bool
-        Draw the coherency of the two axes over frequency, in phase and in quadrature; by default their Allan correlation over averaging
-        time, ``(avar(x + y) - avar(x - y)) / 4`` by the root of their variances, with what chance gives in 95 of 100.
+        Draw the coherency of the two axes over frequency, in phase and in quadrature; by default
+        their Allan correlation over averaging time, ``(avar(x + y) - avar(x - y)) / 4`` by the root
+        of their variances, with what chance gives in 95 of 100.
 
     Returns
     -------
@@ -65,7 +71,8 @@ def plot_comparison(
     Raises
     ------
     SchemaError, OptionError
-        When they are no logs of rates, differ in axes or length, have one axis only, or lack the channel.
+        When they are no logs of rates, differ in axes or length, have one axis only, or lack the
+        channel.
 
     Examples
     --------
@@ -79,16 +86,33 @@ def plot_comparison(
     logs = without, with_it = as_log(without), as_log(with_it)
     shapes = {(signal_name(log), tuple(log["axis"].values), log.sizes["time"]) for log in logs}
     if len(shapes) > 1 or signal_name(without) != "rate" or without.sizes["axis"] < 2:
-        raise OptionError(f"plot_comparison needs two logs of rates with the same two axes or more, and as many samples; not {shapes}")
+        raise OptionError(
+            f"plot_comparison needs two logs of rates with the same two axes or more, and as many samples; not {shapes}"
+        )
     if driver and driver not in with_it:
-        raise OptionError(f"driver {driver!r} is not in the log; it has {', '.join(map(str, with_it.data_vars))}")
+        raise OptionError(
+            f"driver {driver!r} is not in the log; it has {', '.join(map(str, with_it.data_vars))}"
+        )
     figure = new_figure(7.6, 4.9)
     panels = figure.subplots(2, 2)
-    pair = tuple(davar(log, window=window, step=step, taus=30, axis=[str(log["axis"].values[0])]).isel(axis=0).load() for log in logs)
+    pair = tuple(
+        davar(log, window=window, step=step, taus=30, axis=[str(log["axis"].values[0])])
+        .isel(axis=0)
+        .load()
+        for log in logs
+    )
     seconds = float(pair[0].attrs["window_s"])
-    name = f"{seconds / 3600:g} h" if seconds >= 3600 else f"{seconds / 60:g} min" if seconds >= 600 else f"{seconds:g} s"
+    name = (
+        f"{seconds / 3600:g} h"
+        if seconds >= 3600
+        else f"{seconds / 60:g} min"
+        if seconds >= 600
+        else f"{seconds:g} s"
+    )
     if moments:
-        _curves(panels[0, 0], logs, pair, [duration_seconds(moment, "moment") for moment in moments])
+        _curves(
+            panels[0, 0], logs, pair, [duration_seconds(moment, "moment") for moment in moments]
+        )
         panels[0, 0].set_title(f"Allan deviation, windows of {name}")
     else:
         _ratio(panels[0, 0], logs, pair)
@@ -115,7 +139,12 @@ def _since(log: xr.Dataset, times: Any) -> tuple[Any, str]:
 def _curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> None:
     centres, word = _since(logs[0], pair[0]["time"].values)
     tau = pair[0]["tau"].values
-    panel.loglog(tau, np.sqrt(np.nanmean(pair[0]["avar"].values, axis=0)), **_STYLES[0], label="without, mean")
+    panel.loglog(
+        tau,
+        np.sqrt(np.nanmean(pair[0]["avar"].values, axis=0)),
+        **_STYLES[0],
+        label="without, mean",
+    )
     for colour, dashes, moment in zip(COLOURS, ("-", "--", "-.", ":"), moments, strict=False):
         when = moment / {"h": 3600.0, "min": 60.0}[word]
         curve = np.sqrt(pair[1]["avar"].values[np.abs(centres - when).argmin()])
@@ -136,7 +165,13 @@ def _ratio(panel: Axes, logs: Any, pair: Any) -> None:
     panel.set_facecolor("#d0d0d0")
     shown: Any = np.ma.masked_invalid(ratio.T)
     mesh = panel.pcolormesh(
-        centres, pair[0]["tau"].values, shown, norm=LogNorm(1 / reach, reach), cmap=CHANGE_CMAP, shading="nearest", rasterized=True
+        centres,
+        pair[0]["tau"].values,
+        shown,
+        norm=LogNorm(1 / reach, reach),
+        cmap=CHANGE_CMAP,
+        shading="nearest",
+        rasterized=True,
     )
     panel.set(yscale="log", xlabel=f"time [{word}]", ylabel="averaging time [s]")
     bar = panel.figure.colorbar(mesh, ax=panel, extend="both", pad=0.02)
@@ -151,11 +186,28 @@ def _means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
     centres, word = _since(logs[0], pair[0]["time"].values)
     for product, style, label in zip(pair, _STYLES, ("without", "with"), strict=True):
         panel.plot(centres, product["window_mean"] - first, **style, label=label)
-    gaps = [_since(logs[0], logs[0][edge].values)[0] for edge in ("gap_start", "gap_end") if logs[0].sizes.get("gap")]
+    gaps = [
+        _since(logs[0], logs[0][edge].values)[0]
+        for edge in ("gap_start", "gap_end")
+        if logs[0].sizes.get("gap")
+    ]
     if gaps:
         lost = list(zip(gaps[0], gaps[1] - gaps[0], strict=True))
-        panel.broken_barh(lost, (0, 1), transform=panel.get_xaxis_transform(), color=GREY, alpha=0.5, lw=0, zorder=0.5, label="data lost")
-    panel.set(title="Window mean, less that without" if difference else "Window mean", xlabel=f"time [{word}]", ylabel="[deg/h]")
+        panel.broken_barh(
+            lost,
+            (0, 1),
+            transform=panel.get_xaxis_transform(),
+            color=GREY,
+            alpha=0.5,
+            lw=0,
+            zorder=0.5,
+            label="data lost",
+        )
+    panel.set(
+        title="Window mean, less that without" if difference else "Window mean",
+        xlabel=f"time [{word}]",
+        ylabel="[deg/h]",
+    )
     panel.legend(fontsize="x-small", frameon=False)
 
 
@@ -168,7 +220,9 @@ def _channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
         twin.plot(times, (low + high) / 2, ":", color=COLOURS[1], lw=1.2)
     else:  # faster than the columns of the figure
         twin.fill_between(times, low, high, step="mid", color=COLOURS[1], alpha=0.3, lw=0.6)
-    twin.set_ylabel(f"{driver.replace('_', ' ')} {unit_label(log[driver].attrs.get('units'))}", color=COLOURS[1])
+    twin.set_ylabel(
+        f"{driver.replace('_', ' ')} {unit_label(log[driver].attrs.get('units'))}", color=COLOURS[1]
+    )
     panel.set(zorder=twin.get_zorder() + 1, facecolor="none")
 
 
@@ -185,7 +239,11 @@ def _spectrum(panel: Axes, logs: Any) -> None:
     from scipy.signal import welch
 
     for log, style in zip(logs, _STYLES, strict=True):
-        how: dict[str, Any] = {"fs": log.attrs["sampling_rate_hz"], "nperseg": max(8, log.sizes["time"] // 10), "detrend": "linear"}
+        how: dict[str, Any] = {
+            "fs": log.attrs["sampling_rate_hz"],
+            "nperseg": max(8, log.sizes["time"] // 10),
+            "detrend": "linear",
+        }
         f, power = welch(_filled(log)[0], **how)
         panel.loglog(f[1:], power[1:], **style | {"lw": style["lw"] * 0.8})
     label_log_axis(panel.yaxis, *panel.get_ylim())
@@ -200,7 +258,11 @@ def _coherency(panel: Axes, logs: Any) -> None:
     from scipy.signal import csd, welch
 
     for log, style, quadrature in zip(logs, _STYLES, (GREY, COLOURS[1]), strict=True):
-        how: dict[str, Any] = {"fs": log.attrs["sampling_rate_hz"], "nperseg": max(8, log.sizes["time"] // 30), "detrend": "linear"}
+        how: dict[str, Any] = {
+            "fs": log.attrs["sampling_rate_hz"],
+            "nperseg": max(8, log.sizes["time"] // 30),
+            "detrend": "linear",
+        }
         x, y = _filled(log)
         f, cross = csd(x, y, **how)
         ratio = cross / np.sqrt(welch(x, **how)[1] * welch(y, **how)[1])
@@ -216,7 +278,10 @@ def _correlation(panel: Axes, logs: Any) -> None:
     for log, style in zip(logs, _STYLES, strict=True):
         x, y = log["rate"].transpose("axis", "time").values[:2]
         sums = make_log(
-            np.stack([x, y, x + y, x - y]), rate=log.attrs["sampling_rate_hz"], unit="deg/h", axis=["x", "y", "sum", "difference"]
+            np.stack([x, y, x + y, x - y]),
+            rate=log.attrs["sampling_rate_hz"],
+            unit="deg/h",
+            axis=["x", "y", "sum", "difference"],
         )
         whole = davar(sums, window=f"{sums.sizes['time']}samples", taus=30).isel(time=0).load()
         a, b, plus, minus = whole["avar"].values
@@ -225,4 +290,8 @@ def _correlation(panel: Axes, logs: Any) -> None:
         if log is logs[0]:
             chance = 2.0 / np.sqrt(whole["edf"].values[0])
             panel.fill_between(whole["tau"].values, -chance, chance, color=GREY, alpha=0.15, lw=0)
-    panel.set(title=f"Allan correlation of {_names(logs[0])}", xlabel="averaging time [s]", ylim=(-1.1, 1.1))
+    panel.set(
+        title=f"Allan correlation of {_names(logs[0])}",
+        xlabel="averaging time [s]",
+        ylim=(-1.1, 1.1),
+    )

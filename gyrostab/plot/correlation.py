@@ -24,11 +24,14 @@ _MOST = 3000
 
 
 @literal_text
-def plot_correlation(result: xr.Dataset, *, axis: str | None = None, driver: str | None = None) -> Figure:
+def plot_correlation(
+    result: xr.Dataset, *, axis: str | None = None, driver: str | None = None
+) -> Figure:
     """Draw every variable against the channel at its lag, one row a variable and one column an axis.
 
-    Filled triangles up are windows in which the channel rises, open triangles down those in which it falls. The band holds the
-    slopes that the record allows, about the middle of the data; a line, the sensitivity, is drawn only where a coupling is claimed.
+    Filled triangles up are windows in which the channel rises, open triangles down those in which
+    it falls. The band holds the slopes that the record allows, about the middle of the data; a
+    line, the sensitivity, is drawn only where a coupling is claimed.
 
     Parameters
     ----------
@@ -49,11 +52,15 @@ def plot_correlation(result: xr.Dataset, *, axis: str | None = None, driver: str
         When it is no correlation, or has no such axis.
     """
     if "coupling_verdict" not in result:
-        raise SchemaError("this dataset holds no correlation; call gyrostab.correlate (or 'gyrostab correlate') first")
+        raise SchemaError(
+            "this dataset holds no correlation; call gyrostab.correlate (or 'gyrostab correlate') first"
+        )
     names = axis_names(result, axis)
     driver = str(result["driver"].values[0]) if driver is None else driver
     if driver not in result["driver"].values:
-        raise SchemaError(f"the correlation has no driver {driver!r}; it has {', '.join(map(str, result['driver'].values))}")
+        raise SchemaError(
+            f"the correlation has no driver {driver!r}; it has {', '.join(map(str, result['driver'].values))}"
+        )
     variables = [str(name) for name in result["variable"].values]
     figure = new_figure(1.0 + 3.4 * len(names), 1.2 + 2.5 * len(variables))
     panels = figure.subplots(len(variables), len(names), sharex="col", squeeze=False)
@@ -61,11 +68,23 @@ def plot_correlation(result: xr.Dataset, *, axis: str | None = None, driver: str
         for panel, name in zip(row, names, strict=True):
             _draw(panel, result.sel(axis=name), variable, driver)
             panel.grid(alpha=0.3)
-        units = f"[{LAWS[variable].label}]" if variable in LAWS else unit_label(result[variable].attrs.get("units"))
+        units = (
+            f"[{LAWS[variable].label}]"
+            if variable in LAWS
+            else unit_label(result[variable].attrs.get("units"))
+        )
         row[0].set_ylabel(f"{variable.replace('_', ' ')} {units}".strip())
     label = f"{driver.replace('_', ' ')} {unit_label(result[driver].attrs.get('units'))}".strip()
     for panel, name in zip(panels[0], names, strict=True):
-        panel.annotate(f"axis {name}", (0.5, 1.0), (0, 22), "axes fraction", "offset points", ha="center", fontweight="bold")
+        panel.annotate(
+            f"axis {name}",
+            (0.5, 1.0),
+            (0, 22),
+            "axes fraction",
+            "offset points",
+            ha="center",
+            fontweight="bold",
+        )
     for panel in panels[-1]:
         panel.set_xlabel(label)
     figure.legend(
@@ -93,7 +112,15 @@ def _draw(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
     ]
     for part_of, style in styles:
         chosen = np.flatnonzero(good & part_of)[::every]
-        panel.plot(x[chosen], y[chosen], linestyle="none", markersize=3.5, alpha=0.75, markeredgewidth=0.7, **style)
+        panel.plot(
+            x[chosen],
+            y[chosen],
+            linestyle="none",
+            markersize=3.5,
+            alpha=0.75,
+            markeredgewidth=0.7,
+            **style,
+        )
     verdict = VERDICTS[int(cell["coupling_verdict"])]
     panel.set_title(_heading(verdict, lag, float(cell["p_value_adjusted"])), fontsize="small")
     if not good.any():
@@ -107,7 +134,9 @@ def _draw(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
         )
         panel.tick_params(left=False, labelleft=False)
         return
-    slope, low, high = (float(part[f"{variable}_per_{driver}{end}"]) for end in ("", "_low", "_high"))
+    slope, low, high = (
+        float(part[f"{variable}_per_{driver}{end}"]) for end in ("", "_low", "_high")
+    )
     if not np.isfinite(slope):
         return
     ends = np.linspace(x[good].min(), x[good].max(), 50)
@@ -116,7 +145,9 @@ def _draw(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
     if verdict == "coupled":
         panel.plot(ends, level + slope * (ends - middle), color="black", linewidth=1.2)
     edges = [level + value * (ends - middle) for value in (low, high)]
-    panel.fill_between(ends, np.minimum(*edges), np.maximum(*edges), color="#8c8c8c", alpha=0.3, linewidth=0)
+    panel.fill_between(
+        ends, np.minimum(*edges), np.maximum(*edges), color="#8c8c8c", alpha=0.3, linewidth=0
+    )
     panel.set_ylim(y[good].min() - 0.1 * span, y[good].max() + 0.1 * span)
 
 
@@ -150,6 +181,19 @@ def _key(driver: str, level: float) -> list[Any]:
     what = driver.replace("_", " ")
     return [
         Line2D([], [], linestyle="none", marker="^", color=_UP, label=f"{what} rises"),
-        Line2D([], [], linestyle="none", marker="v", color=_DOWN, markerfacecolor="none", label=f"{what} falls"),
-        Patch(facecolor="#8c8c8c", alpha=0.3, edgecolor="black", label=f"slopes the record allows ({level:.0%}); line: coupled"),
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker="v",
+            color=_DOWN,
+            markerfacecolor="none",
+            label=f"{what} falls",
+        ),
+        Patch(
+            facecolor="#8c8c8c",
+            alpha=0.3,
+            edgecolor="black",
+            label=f"slopes the record allows ({level:.0%}); line: coupled",
+        ),
     ]

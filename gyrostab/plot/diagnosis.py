@@ -9,7 +9,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.plot.style import COLOURS, GREY, label_log_axis, literal_text, log_edges, new_figure, unit_label, unit_of_time
+from gyrostab.plot.style import (
+    COLOURS,
+    GREY,
+    label_log_axis,
+    literal_text,
+    log_edges,
+    new_figure,
+    unit_label,
+    unit_of_time,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,10 +48,15 @@ def _edges(begin: Array, end: Array) -> Array:
 
 
 def _time_of(text: str, start: str) -> float:
-    return float((np.datetime64(text.removesuffix("Z"), "ns") - np.datetime64(start.removesuffix("Z"), "ns")) / np.timedelta64(1, "s"))
+    return float(
+        (np.datetime64(text.removesuffix("Z"), "ns") - np.datetime64(start.removesuffix("Z"), "ns"))
+        / np.timedelta64(1, "s")
+    )
 
 
-def _boxes(panel: Axes, axis: str, content: Mapping[str, Any], size: float, *, taus: Array, faint: bool) -> None:
+def _boxes(
+    panel: Axes, axis: str, content: Mapping[str, Any], size: float, *, taus: Array, faint: bool
+) -> None:
     """Frames around the mismatches of the axis that have averaging times."""
     from matplotlib.patches import Rectangle
 
@@ -50,7 +64,11 @@ def _boxes(panel: Axes, axis: str, content: Mapping[str, Any], size: float, *, t
     low_edge, high_edge = log_edges(taus)[[0, -1]]
     left, right = panel.get_xlim()
     for box in content["mismatches"]:
-        if axis not in box["axes"] or box["view"] not in ("davar", "cross_axis") or not box["tau_min_s"]:
+        if (
+            axis not in box["axes"]
+            or box["view"] not in ("davar", "cross_axis")
+            or not box["tau_min_s"]
+        ):
             continue
         begin, end = _time_of(box["start"], start) / size, _time_of(box["end"], start) / size
         least = _LEAST_WIDTH * (right - left)
@@ -59,16 +77,32 @@ def _boxes(panel: Axes, axis: str, content: Mapping[str, Any], size: float, *, t
         low, high = max(box["tau_min_s"] / 1.3, low_edge), min(box["tau_max_s"] * 1.3, high_edge)
         if high <= low:
             continue
-        style = {"fill": False, "edgecolor": "#D00000", "linewidth": 1.0 if faint else 2.0, "linestyle": ":" if faint else "-"}
+        style = {
+            "fill": False,
+            "edgecolor": "#D00000",
+            "linewidth": 1.0 if faint else 2.0,
+            "linestyle": ":" if faint else "-",
+        }
         panel.add_patch(Rectangle((begin, low), end - begin, high - low, **style))  # type: ignore[arg-type]
         if not faint:
-            at = {"xy": (begin, high), "xytext": (2, -2), "textcoords": "offset points", "va": "top", "ha": "left"}
+            at = {
+                "xy": (begin, high),
+                "xytext": (2, -2),
+                "textcoords": "offset points",
+                "va": "top",
+                "ha": "left",
+            }
             told = panel.annotate(str(box["id"]), **at, fontsize=9, color="white", weight="bold")  # type: ignore[arg-type]
             told.set_bbox({"facecolor": "#D00000", "edgecolor": "none", "pad": 1.2})
 
 
 def _maps(
-    surfaces: xr.Dataset, content: Mapping[str, Any], columns: Sequence[tuple[str, Array, Any]], norm: Any, cmap: str, label: str
+    surfaces: xr.Dataset,
+    content: Mapping[str, Any],
+    columns: Sequence[tuple[str, Array, Any]],
+    norm: Any,
+    cmap: str,
+    label: str,
 ) -> Figure:
     """One row of maps an axis; `columns` are titles, values by (axis, window, tau), and how opaque each is, None for all."""
     from matplotlib.cm import ScalarMappable
@@ -78,7 +112,14 @@ def _maps(
     size, unit = unit_of_time(float(end[-1]))
     height = 1.1 + 2.3 * len(names)
     figure = new_figure(12.0, height, stacked=True)
-    figure.subplots_adjust(left=0.075, right=0.9, top=1.0 - 0.35 / height, bottom=0.6 / height, wspace=0.06, hspace=0.08)
+    figure.subplots_adjust(
+        left=0.075,
+        right=0.9,
+        top=1.0 - 0.35 / height,
+        bottom=0.6 / height,
+        wspace=0.06,
+        hspace=0.08,
+    )
     panels = figure.subplots(len(names), len(columns), sharex=True, sharey=True, squeeze=False)
     for row, name in enumerate(names):
         for column, (title, values, opaque) in enumerate(columns):
@@ -86,7 +127,9 @@ def _maps(
             edges = _edges(begin, end) / size, log_edges(tau)
             missing = np.ma.masked_where(np.isfinite(values[row]), np.full(values[row].shape, 0.2))
             panel.pcolormesh(*edges, missing.T, cmap="Greys", vmin=0.0, vmax=1.0, rasterized=True)
-            alpha = None if opaque is None else np.where(np.isfinite(values[row]), opaque[row], 0.0).T
+            alpha = (
+                None if opaque is None else np.where(np.isfinite(values[row]), opaque[row], 0.0).T
+            )
             shown = np.ma.masked_invalid(values[row])
             panel.pcolormesh(*edges, shown.T, norm=norm, cmap=cmap, rasterized=True, alpha=alpha)
             panel.set_yscale("log")
@@ -101,7 +144,9 @@ def _maps(
                 panel.set_xlabel(f"time since the start [{unit}]")
     label_log_axis(panels[0, 0].yaxis, tau[0], tau[-1])
     bar = ScalarMappable(norm, cmap)  # the maps may be partly transparent
-    scale = figure.colorbar(bar, cax=figure.add_axes((0.912, 0.6 / height, 0.013, 1.0 - 0.95 / height)), label=label)
+    scale = figure.colorbar(
+        bar, cax=figure.add_axes((0.912, 0.6 / height, 0.013, 1.0 - 0.95 / height)), label=label
+    )
     label_log_axis(scale.ax.yaxis, norm.vmin, norm.vmax)
     return figure
 
@@ -113,7 +158,8 @@ def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     Parameters
     ----------
     surfaces : xarray.Dataset
-        From `gyrostab.diagnose.result.surfaces`: ``avar(case, axis, window, tau)`` [degree2 hour-2].
+        From `gyrostab.diagnose.result.surfaces`: ``avar(case, axis, window, tau)`` [degree2
+        hour-2].
     content : mapping
         Of the diagnosis; its mismatches are framed.
 
@@ -127,7 +173,9 @@ def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     positive = deviation[np.isfinite(deviation) & (deviation > 0)]
     norm = LogNorm(*(np.quantile(positive, [0.005, 0.995]) if positive.size else (0.1, 1.0)))
     cases = [str(name) for name in surfaces["case"].values]
-    columns = [(_TITLES.get(name, name), deviation[place], None) for place, name in enumerate(cases)]
+    columns = [
+        (_TITLES.get(name, name), deviation[place], None) for place, name in enumerate(cases)
+    ]
     return _maps(surfaces, content, columns, norm, "viridis", "Allan deviation [deg/h]")
 
 
@@ -137,17 +185,28 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import FixedLocator, NullFormatter
 
-    avar, low, high = (surfaces[name].transpose("case", "axis", "window", "tau") for name in ("avar", "avar_low", "avar_high"))
+    avar, low, high = (
+        surfaces[name].transpose("case", "axis", "window", "tau")
+        for name in ("avar", "avar_low", "avar_high")
+    )
     recording = avar.sel(case="recording").values
     columns = []
     for name in ("before", "after"):
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.sqrt(recording / avar.sel(case=name).values)
-            usual = (recording >= low.sel(case=name).values) & (recording <= high.sel(case=name).values)
+            usual = (recording >= low.sel(case=name).values) & (
+                recording <= high.sel(case=name).values
+            )
         columns.append(
-            (f"Recording over simulation, {'without' if name == 'before' else 'with'} the effects", ratio, np.where(usual, _PALE, 1.0))
+            (
+                f"Recording over simulation, {'without' if name == 'before' else 'with'} the effects",
+                ratio,
+                np.where(usual, _PALE, 1.0),
+            )
         )
-    figure = _maps(surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations")
+    figure = _maps(
+        surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations"
+    )
     bar = figure.axes[-1]
     bar.yaxis.set_major_locator(FixedLocator([0.5, 0.7, 1.0, 1.4, 2.0]))
     bar.set_yticklabels(["≤ 0.5", "0.7", "1", "1.4", "≥ 2"])
@@ -162,7 +221,8 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     Parameters
     ----------
     surfaces : xarray.Dataset
-        ``mean``, ``mean_stderr`` (case, axis, window), ``block_mean(axis, block)`` [degree hour-1] and the ``channel_<name>(block)``.
+        ``mean``, ``mean_stderr`` (case, axis, window), ``block_mean(axis, block)`` [degree hour-1]
+        and the ``channel_<name>(block)``.
     content : mapping
         Of the diagnosis.
     """
@@ -173,26 +233,48 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     block = (surfaces["block_begin"].values + surfaces["block_end"].values) / (2.0 * size)
     ratios = [1.9] * len(names) + [1.3] * len(channels)
     figure = new_figure(12.0, 1.0 + sum(ratios))
-    panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": ratios})[:, 0]
+    panels = figure.subplots(
+        len(ratios), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": ratios}
+    )[:, 0]
     for panel, name in zip(panels, names, strict=False):
         one = surfaces.sel(axis=name)
         single = one["block_mean"].values
         panel.plot(block, single, ".", color=GREY, ms=2.5, label="recording, blocks")
-        panel.plot(time, one["mean"].sel(case="recording").values, color="black", lw=1.2, label="recording, windows")
+        panel.plot(
+            time,
+            one["mean"].sel(case="recording").values,
+            color="black",
+            lw=1.2,
+            label="recording, windows",
+        )
         for case in ("before", "after"):
-            mean, error = one["mean"].sel(case=case).values, one["mean_stderr"].sel(case=case).values
+            mean, error = (
+                one["mean"].sel(case=case).values,
+                one["mean_stderr"].sel(case=case).values,
+            )
             panel.plot(time, mean, **_STYLES[case], label=f"{_TITLES[case].lower()}, 95 %")
-            panel.fill_between(time, mean - 1.96 * error, mean + 1.96 * error, color=_STYLES[case]["color"], alpha=0.18, lw=0)
+            panel.fill_between(
+                time,
+                mean - 1.96 * error,
+                mean + 1.96 * error,
+                color=_STYLES[case]["color"],
+                alpha=0.18,
+                lw=0,
+            )
         _mark_spans(panel, name, content, size)
         panel.set_ylabel(f"axis {name}\nmean rate [deg/h]")
         panel.margins(x=0)
         _limit(panel, single)
     for panel, channel in zip(panels[len(names) :], channels, strict=True):
         panel.plot(block, surfaces[f"channel_{channel}"].values, color=COLOURS[2], lw=1.2)
-        panel.set_ylabel(f"{channel.replace('_', ' ')}\n{unit_label(surfaces[f'channel_{channel}'].attrs.get('units'))}")
+        panel.set_ylabel(
+            f"{channel.replace('_', ' ')}\n{unit_label(surfaces[f'channel_{channel}'].attrs.get('units'))}"
+        )
     panels[-1].set_xlabel(f"time since the start [{unit}]")
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize="small", frameon=False)
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=4, fontsize="small", frameon=False
+    )
     return figure
 
 
@@ -206,9 +288,17 @@ def _limit(panel: Axes, values: Array) -> None:
 
 def _channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[str]:
     """Channels to draw: those that named effects follow first."""
-    there = [str(name).removeprefix("channel_") for name in surfaces.data_vars if str(name).startswith("channel_")]
+    there = [
+        str(name).removeprefix("channel_")
+        for name in surfaces.data_vars
+        if str(name).startswith("channel_")
+    ]
     there = [name for name in there if np.isfinite(surfaces[f"channel_{name}"].values).any()]
-    named = [name.strip() for effect in content["effects"] for name in str(effect["driver"] or "").split(",")]
+    named = [
+        name.strip()
+        for effect in content["effects"]
+        for name in str(effect["driver"] or "").split(",")
+    ]
     usual = [name for name in ("temperature", "vibration", "rotation_rate") if name in there]
     first = [name for name in dict.fromkeys(named) if name in there]
     return list(dict.fromkeys([*first, *usual]))[:_MOST_CHANNELS]
@@ -237,7 +327,12 @@ def plot_deviations(surfaces: xr.Dataset) -> Figure:
         whole = surfaces["avar"].mean("window", skipna=True) ** 0.5
     for panel, name in zip(panels, names, strict=True):
         for case in ("recording", "before", "after"):
-            panel.plot(tau, whole.sel(axis=name, case=case).values, **_STYLES[case], label=_TITLES[case].lower())
+            panel.plot(
+                tau,
+                whole.sel(axis=name, case=case).values,
+                **_STYLES[case],
+                label=_TITLES[case].lower(),
+            )
         panel.set(xscale="log", yscale="log", xlabel="averaging time [s]", title=f"axis {name}")
         panel.grid(True, which="major", alpha=0.4)
     panels[0].set_ylabel("Allan deviation [deg/h]")
@@ -253,17 +348,25 @@ def plot_spectra(surfaces: xr.Dataset) -> Figure:
     Parameters
     ----------
     surfaces : xarray.Dataset
-        ``density(case, axis, band)`` over ``frequency`` [Hz] and ``line_density(axis, line)`` over ``line_frequency``, two-sided
-        [degree2 hour-2 Hz-1].
+        ``density(case, axis, band)`` over ``frequency`` [Hz] and ``line_density(axis, line)`` over
+        ``line_frequency``, two-sided [degree2 hour-2 Hz-1].
     """
     names = [str(name) for name in surfaces["axis"].values]
     figure = new_figure(min(4.2 * len(names), 12.0) if len(names) > 1 else 6.0, 3.8)
     panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for panel, name in zip(panels, names, strict=True):
-        panel.plot(surfaces["line_frequency"].values, surfaces["line_density"].sel(axis=name).values, color=GREY, lw=0.6, label="recording")
+        panel.plot(
+            surfaces["line_frequency"].values,
+            surfaces["line_density"].sel(axis=name).values,
+            color=GREY,
+            lw=0.6,
+            label="recording",
+        )
         for case in ("before", "after"):
             values = surfaces["density"].sel(axis=name, case=case).values
-            panel.plot(surfaces["frequency"].values, values, **_STYLES[case], label=_TITLES[case].lower())
+            panel.plot(
+                surfaces["frequency"].values, values, **_STYLES[case], label=_TITLES[case].lower()
+            )
         panel.set(xscale="log", yscale="log", xlabel="frequency [Hz]", title=f"axis {name}")
         panel.grid(True, which="major", alpha=0.4)
     panels[0].set_ylabel("power density [(deg/h)²/Hz]")

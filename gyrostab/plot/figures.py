@@ -36,9 +36,9 @@ def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
     Returns
     -------
     dict
-        ``coefficients``, ``davar``, ``davar_change``, ``temperature`` where there is one, and for each axis
-        ``adev_<axis>`` and ``davar_3d_<axis>``; the surface in three
-        dimensions only where there are two windows and two averaging times at least.
+        ``coefficients``, ``davar``, ``davar_change``, ``temperature`` where there is one, and for
+        each axis ``adev_<axis>`` and ``davar_3d_<axis>``; the surface in three dimensions only
+        where there are two windows and two averaging times at least.
 
     Raises
     ------
@@ -52,7 +52,9 @@ def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
         "davar_change": lambda: plot_davar(product, relative=True),
     }
     if "temperature" in product and product["temperature"].dims == ("time",):
-        figures["temperature"] = lambda: plot_correlation(product if "coupling_verdict" in product else correlate(product))
+        figures["temperature"] = lambda: plot_correlation(
+            product if "coupling_verdict" in product else correlate(product)
+        )
     for axis in map(str, product["axis"].values):
         figures[f"adev_{axis}"] = lambda axis=axis: plot_adev(product, axis)  # type: ignore[misc]
         if min(product.sizes["time"], product.sizes["tau"]) > 1:
@@ -60,7 +62,9 @@ def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
     return figures
 
 
-def save_figures(product: xr.Dataset, folder: str | os.PathLike[str], *, dpi: int = 150, overwrite: bool = False) -> list[Path]:
+def save_figures(
+    product: xr.Dataset, folder: str | os.PathLike[str], *, dpi: int = 150, overwrite: bool = False
+) -> list[Path]:
     """Write all the figures of a product into a folder, as PNG.
 
     Parameters
@@ -84,10 +88,14 @@ def save_figures(product: xr.Dataset, folder: str | os.PathLike[str], *, dpi: in
     SchemaError
         When it is no product.
     OutputError
-        When a figure exists and `overwrite` is not given, or when the folder cannot be written to; none is written then.
+        When a figure exists and `overwrite` is not given, or when the folder cannot be written to;
+        none is written then.
     """
     folder = Path(folder)
-    figures = {re.sub(r"[^\w.-]", "_", name) + ".png": draw for name, draw in product_figures(product).items()}
+    figures = {
+        re.sub(r"[^\w.-]", "_", name) + ".png": draw
+        for name, draw in product_figures(product).items()
+    }
     check_folder(folder, figures, overwrite=overwrite)
     with new_folder(folder, overwrite=overwrite) as temporary:
         for name, draw in figures.items():

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
-from gyrostab.plot.style import axis_names, axis_style, literal_text, new_figure, shade_spans, stack_panels, time_axis, unit_label
+from gyrostab.plot.style import (
+    axis_names,
+    axis_style,
+    literal_text,
+    new_figure,
+    shade_spans,
+    stack_panels,
+    time_axis,
+    unit_label,
+)
 from gyrostab.schema import log_channels, signal_name
 
 if TYPE_CHECKING:
@@ -24,10 +33,17 @@ _BLOCK = 2**22  # samples read at a time: 32 MiB
 
 
 @literal_text
-def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[str] | None = None, columns: int = 1500) -> Figure:
+def plot_signal(
+    log: xr.Dataset,
+    *,
+    axis: str | None = None,
+    channels: Sequence[str] | None = None,
+    columns: int = 1500,
+) -> Figure:
     """Draw the gyro signal of all axes with the channels below; gaps are grey.
 
-    A long record is thinned to the smallest and largest sample of every column, so no spike is lost; it is read block by block.
+    A long record is thinned to the smallest and largest sample of every column, so no spike is
+    lost; it is read block by block.
 
     Parameters
     ----------
@@ -62,7 +78,9 @@ def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[
     axes, known = axis_names(log, axis), log_channels(log)
     shown = known if channels is None else list(channels)
     if missing := [channel for channel in shown if channel not in known]:
-        raise OptionError(f"channel {', '.join(missing)} is not in the log; it has {', '.join(known) or 'none'}")
+        raise OptionError(
+            f"channel {', '.join(missing)} is not in the log; it has {', '.join(known) or 'none'}"
+        )
     figure = new_figure(10.0, 1.2 + 1.7 * len(axes) + 1.4 * len(shown), stacked=True)
     ratios = [1.2] * len(axes) + [1.0] * len(shown)
     panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
@@ -71,7 +89,9 @@ def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[
         panel.set_ylabel(f"{axis_name} {unit_label(log[name].attrs.get('units'))}")
     for panel, channel in zip(panels[len(axes) :], shown, strict=True):
         _trace(panel, log[channel], "#333333", columns)
-        panel.set_ylabel(f"{channel.replace('_', ' ')}\n{unit_label(log[channel].attrs.get('units'))}".rstrip())
+        panel.set_ylabel(
+            f"{channel.replace('_', ' ')}\n{unit_label(log[channel].attrs.get('units'))}".rstrip()
+        )
     _shade_gaps(list(panels), log, columns)
     what = "Rotation rate" if name == "rate" else "Rotation angle"
     rate = log.attrs.get("sampling_rate_hz")
@@ -81,7 +101,9 @@ def plot_signal(log: xr.Dataset, *, axis: str | None = None, channels: Sequence[
     return figure
 
 
-def thin(values: xr.DataArray, *, columns: int = 1500) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def thin(
+    values: xr.DataArray, *, columns: int = 1500
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Smallest and largest sample of every column of a long record.
 
     Parameters
@@ -122,7 +144,9 @@ def _trace(panel: Axes, values: xr.DataArray, colour: str, columns: int) -> None
         lone = times.size < 60 or not np.any(np.isfinite(low[1:]) & np.isfinite(low[:-1]))
         panel.plot(times, low, color=colour, linewidth=0.7, marker="." if lone else "")
     else:
-        panel.plot(np.repeat(times, 2), np.stack([low, high], axis=1).ravel(), color=colour, linewidth=0.7)
+        panel.plot(
+            np.repeat(times, 2), np.stack([low, high], axis=1).ravel(), color=colour, linewidth=0.7
+        )
     panel.grid(alpha=0.3)
 
 

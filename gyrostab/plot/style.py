@@ -94,7 +94,14 @@ def unit_of_time(seconds: float) -> tuple[float, str]:
     >>> unit_of_time(7200.0)
     (60.0, 'min')
     """
-    return next(((size, name) for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")) if seconds >= 3 * size), (1.0, "s"))
+    return next(
+        (
+            (size, name)
+            for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+            if seconds >= 3 * size
+        ),
+        (1.0, "s"),
+    )
 
 
 def log_edges(values: NDArray[Any]) -> NDArray[Any]:
@@ -108,7 +115,11 @@ def log_edges(values: NDArray[Any]) -> NDArray[Any]:
 def window_text(product: xr.Dataset) -> str:
     """How the windows lie, for a title; empty when the attributes do not say."""
     window, step = product.attrs.get("window_s"), product.attrs.get("step_s")
-    return "" if window is None or step is None else f"windows of {duration(float(window))} every {duration(float(step))}"
+    return (
+        ""
+        if window is None or step is None
+        else f"windows of {duration(float(window))} every {duration(float(step))}"
+    )
 
 
 def axis_names(dataset: xr.Dataset, axis: str | None) -> list[str]:
@@ -163,10 +174,17 @@ def _keep_literal(artist: Any) -> None:
         _keep_literal(child)
 
 
-def stack_panels(panels: Sequence[Axes] | NDArray[Any], *, between: float = 0.13, below: float = 0.0, right: float = 0.2) -> None:
+def stack_panels(
+    panels: Sequence[Axes] | NDArray[Any],
+    *,
+    between: float = 0.13,
+    below: float = 0.0,
+    right: float = 0.2,
+) -> None:
     """Lay out panels that stand above each other, with their y labels in one line left of the widest tick label.
 
-    The margins are known beforehand, so nothing is measured but the tick labels; matplotlib's own engine measures every artist, twice.
+    The margins are known beforehand, so nothing is measured but the tick labels; matplotlib's own
+    engine measures every artist, twice.
 
     Parameters
     ----------
@@ -186,16 +204,28 @@ def stack_panels(panels: Sequence[Axes] | NDArray[Any], *, between: float = 0.13
     width, height = figure.get_size_inches()
     top, bottom = 0.3 + between, 0.55 + below
     average = (height - top - bottom - between * (len(panels) - 1)) / len(panels)
-    figure.subplots_adjust(top=1 - top / height, bottom=bottom / height, right=1 - right / width, hspace=between / average)
+    figure.subplots_adjust(
+        top=1 - top / height,
+        bottom=bottom / height,
+        right=1 - right / width,
+        hspace=between / average,
+    )
     renderer = figure.canvas.get_renderer()
     ticks = [
-        label.get_window_extent(renderer).width for panel in panels for label in panel.get_yticklabels(which="both") if label.get_text()
+        label.get_window_extent(renderer).width
+        for panel in panels
+        for label in panel.get_yticklabels(which="both")
+        if label.get_text()
     ]
     labels = [panel.yaxis.label.get_window_extent(renderer).width for panel in panels]
     inches = max(ticks, default=0.0) / figure.dpi + 0.14
     figure.subplots_adjust(left=(inches + max(labels) / figure.dpi + 0.1) / width)
     for panel in panels:
-        panel.yaxis.set_label_coords(0.0, 0.5, transform=panel.transAxes + ScaledTranslation(-inches, 0.0, figure.dpi_scale_trans))
+        panel.yaxis.set_label_coords(
+            0.0,
+            0.5,
+            transform=panel.transAxes + ScaledTranslation(-inches, 0.0, figure.dpi_scale_trans),
+        )
 
 
 def label_log_axis(axis: Axis, low: float, high: float) -> None:
@@ -208,7 +238,9 @@ def label_log_axis(axis: Axis, low: float, high: float) -> None:
         axis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
 
 
-def save_png(figure: Figure, target: str | os.PathLike[str] | IO[bytes], *, dpi: int = _DPI, colours: int = 0) -> None:
+def save_png(
+    figure: Figure, target: str | os.PathLike[str] | IO[bytes], *, dpi: int = _DPI, colours: int = 0
+) -> None:
     """Write a figure as PNG in a single pass; ``figure.savefig`` makes two, and lays the figure out in each.
 
     Parameters
@@ -241,7 +273,11 @@ def embedded(figure: Figure, alt: str, caption: str) -> dict[str, str]:
     """A figure for a page that is one file: its PNG in base 64, what it shows in a few words, and how to read it."""
     buffer = io.BytesIO()
     save_png(figure, buffer)
-    return {"png": base64.b64encode(buffer.getvalue()).decode("ascii"), "alt": alt, "caption": caption}
+    return {
+        "png": base64.b64encode(buffer.getvalue()).decode("ascii"),
+        "alt": alt,
+        "caption": caption,
+    }
 
 
 def time_axis(ax: Axes, times: NDArray[Any]) -> None:
@@ -256,7 +292,15 @@ def time_axis(ax: Axes, times: NDArray[Any]) -> None:
         ax.set_xlim(times[0], times[-1])
 
 
-def shade_spans(ax: Axes, starts: Any, ends: Any, *, label: str | None = None, alpha: float = 0.35, hatch: str | None = None) -> None:
+def shade_spans(
+    ax: Axes,
+    starts: Any,
+    ends: Any,
+    *,
+    label: str | None = None,
+    alpha: float = 0.35,
+    hatch: str | None = None,
+) -> None:
     """Grey the stretches of time from `starts` to `ends` (datetime64) over the whole height of the panel."""
     from matplotlib.dates import date2num
 
@@ -279,6 +323,10 @@ def shade_spans(ax: Axes, starts: Any, ends: Any, *, label: str | None = None, a
 def require_coefficients(product: xr.Dataset) -> None:
     """Raise `SchemaError` when the dataset holds a surface only."""
     if not isinstance(product, xr.Dataset):
-        raise SchemaError(f"this is a {type(product).__name__}, not a product: give what gyrostab.fit_noise returns")
+        raise SchemaError(
+            f"this is a {type(product).__name__}, not a product: give what gyrostab.fit_noise returns"
+        )
     if "observable" not in product.variables:
-        raise SchemaError("this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') first")
+        raise SchemaError(
+            "this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') first"
+        )

@@ -34,10 +34,13 @@ _WEIGHTED = ESTIMATORS.index("weighted_clusters")
 
 
 @literal_text
-def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool = False, columns: int = 1500) -> Figure:
+def plot_davar(
+    product: xr.Dataset, *, axis: str | None = None, relative: bool = False, columns: int = 1500
+) -> Figure:
     """Draw the Allan deviation as colour over time and averaging time, one panel an axis.
 
-    Cells with no estimate are hatched grey; cells that were estimated from incomplete clusters carry white dots.
+    Cells with no estimate are hatched grey; cells that were estimated from incomplete clusters
+    carry white dots.
 
     Parameters
     ----------
@@ -77,7 +80,14 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
         panel.patch.set_hatch("////")
         panel.patch.set_edgecolor("#909090")
         shown = np.ma.masked_invalid(np.where(deviation > 0, deviation, np.nan))
-        mesh = panel.pcolormesh(time_edges, tau_edges, shown.T, norm=norm, cmap=CHANGE_CMAP if relative else CMAP, rasterized=True)
+        mesh = panel.pcolormesh(
+            time_edges,
+            tau_edges,
+            shown.T,
+            norm=norm,
+            cmap=CHANGE_CMAP if relative else CMAP,
+            rasterized=True,
+        )
         _mark_weighted(panel, time_edges, tau, weighted)
         panel.set_yscale("log", subs=(2, 5))
         label_log_axis(panel.yaxis, tau[0], tau[-1])
@@ -85,7 +95,14 @@ def plot_davar(product: xr.Dataset, *, axis: str | None = None, relative: bool =
     label = "σ(τ) / its median over time" if relative else "Allan deviation σ(τ) [deg/h]"
     handles: list[Any] = []
     if any(not (deviation > 0).all() for deviation, _ in cells):
-        handles.append(Patch(facecolor="#d0d0d0", edgecolor="#909090", hatch="////", label="no estimate (gap, or too few terms)"))
+        handles.append(
+            Patch(
+                facecolor="#d0d0d0",
+                edgecolor="#909090",
+                hatch="////",
+                label="no estimate (gap, or too few terms)",
+            )
+        )
     if any(weighted.any() for _, weighted in cells):
         handles.append(_dot_key())
     if handles:
@@ -134,7 +151,9 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
 
     name = axis_names(product, axis)[0]
     if min(product.sizes["time"], product.sizes["tau"]) < 2:
-        raise OptionError("a surface needs at least two windows and two averaging times; draw this product with plot_adev")
+        raise OptionError(
+            "a surface needs at least two windows and two averaging times; draw this product with plot_adev"
+        )
     ((deviation, _),), merged = _columns(product, [name], columns)
     time = product["time"].values
     seconds = (time[::merged] - time[0]) / np.timedelta64(1, "s")
@@ -144,21 +163,39 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
     x, y = np.meshgrid(seconds / size, np.log10(product["tau"].values), indexing="ij")
     with np.errstate(divide="ignore"):
         z = np.log10(np.where(deviation > 0, deviation, np.nan))
-    panel.plot_surface(x, y, z, cmap=CMAP, rcount=columns, ccount=60, linewidth=0.15, edgecolor="#222222", antialiased=True)
-    panel.set_xlabel(f"time since {str(np.datetime_as_string(time[0], unit='s')).replace('T', ' ')} [{unit}]", labelpad=8)
+    panel.plot_surface(
+        x,
+        y,
+        z,
+        cmap=CMAP,
+        rcount=columns,
+        ccount=60,
+        linewidth=0.15,
+        edgecolor="#222222",
+        antialiased=True,
+    )
+    panel.set_xlabel(
+        f"time since {str(np.datetime_as_string(time[0], unit='s')).replace('T', ' ')} [{unit}]",
+        labelpad=8,
+    )
     panel.set_ylabel("averaging time τ [s]", labelpad=8)
     panel.set_zlabel("Allan deviation σ [deg/h]", labelpad=6)
     for scale in (panel.yaxis, panel.zaxis):
         scale.set_major_locator(MaxNLocator(nbins=6, integer=True))
         scale.set_major_formatter(FuncFormatter(lambda power, _: f"$10^{{{power:.0f}}}$"))
-    panel.invert_yaxis()  # the steep side of short averaging times goes to the back and hides nothing
+    # the steep side of short averaging times goes to the back and hides nothing
+    panel.invert_yaxis()
     panel.view_init(elev=30, azim=-62)
     panel.set_box_aspect((1.5, 1.15, 0.85), zoom=1.0)
-    figure.suptitle(", ".join(filter(None, [f"Dynamic Allan deviation of axis {name}", window_text(product)])))
+    figure.suptitle(
+        ", ".join(filter(None, [f"Dynamic Allan deviation of axis {name}", window_text(product)]))
+    )
     return figure
 
 
-def _columns(product: xr.Dataset, names: list[str], columns: int) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], int]:
+def _columns(
+    product: xr.Dataset, names: list[str], columns: int
+) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], int]:
     """Allan deviation (time, tau) and the mark of weighted cells for each axis, and how many windows one column holds."""
     size = product.sizes["time"]
     merged = max(1, -(-size // columns))
@@ -170,7 +207,9 @@ def _columns(product: xr.Dataset, names: list[str], columns: int) -> tuple[list[
         weighted = np.logical_or.reduceat(part["estimator"].values == _WEIGHTED, edges, axis=0)
         number = np.add.reduceat(np.isfinite(avar).astype(float), edges, axis=0)
         total = np.add.reduceat(np.nan_to_num(avar, nan=0.0), edges, axis=0)
-        known = (number > 0) & (total >= 0.0)  # the recursion as printed drifts below zero where there is next to no noise
+        known = (number > 0) & (
+            total >= 0.0
+        )  # the recursion as printed drifts below zero where there is next to no noise
         mean = np.divide(total, number, out=np.full_like(total, np.nan), where=known)
         cells.append((np.sqrt(mean), weighted & np.isfinite(mean)))
     return cells, merged
@@ -201,7 +240,11 @@ def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> Non
     bar = figure.colorbar(mesh, cax=place, label=label, extend="both")
     if relative:
         low, high = mesh.get_clim()
-        ticks = [tick for tick in (0.1, 0.2, 0.33, 0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0) if low <= tick <= high]
+        ticks = [
+            tick
+            for tick in (0.1, 0.2, 0.33, 0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
+            if low <= tick <= high
+        ]
         bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
         bar.minorticks_off()
 
@@ -209,12 +252,22 @@ def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> Non
 def _time_edges(time: NDArray[Any], merged: int, step: Any) -> NDArray[Any]:
     """Edges of the columns: half-way between window centres."""
     stamps = time.astype("datetime64[ns]").astype(np.int64)
-    half = int(float(step) * 5e8) if step is not None else int(np.median(np.diff(stamps)) // 2) if stamps.size > 1 else 5 * 10**8
-    inner = [stamps[i - 1] + (stamps[i] - stamps[i - 1]) // 2 for i in range(merged, stamps.size, merged)]
+    half = (
+        int(float(step) * 5e8)
+        if step is not None
+        else int(np.median(np.diff(stamps)) // 2)
+        if stamps.size > 1
+        else 5 * 10**8
+    )
+    inner = [
+        stamps[i - 1] + (stamps[i] - stamps[i - 1]) // 2 for i in range(merged, stamps.size, merged)
+    ]
     return np.array([stamps[0] - half, *inner, stamps[-1] + half]).astype("datetime64[ns]")
 
 
-def _mark_weighted(panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], weighted: NDArray[Any]) -> None:
+def _mark_weighted(
+    panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], weighted: NDArray[Any]
+) -> None:
     """Put dots on the weighted cells, thinned to what the eye can separate."""
     columns = np.arange(0, weighted.shape[0], max(1, weighted.shape[0] // 120))
     rows = np.arange(0, weighted.shape[1], max(1, weighted.shape[1] // 25))
@@ -225,12 +278,25 @@ def _mark_weighted(panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], wei
         where = np.argwhere(weighted)[:: max(1, int(weighted.sum()) // 500)]
     if where.size:
         centres = time_edges[:-1] + (time_edges[1:] - time_edges[:-1]) // 2
-        dots = panel.scatter(centres[where[:, 0]], tau[where[:, 1]], s=5, color="white", edgecolors="black", linewidths=0.3)
+        dots = panel.scatter(
+            centres[where[:, 0]],
+            tau[where[:, 1]],
+            s=5,
+            color="white",
+            edgecolors="black",
+            linewidths=0.3,
+        )
         dots.set_gid("weighted")
 
 
 def _dot_key() -> Any:
     from matplotlib.lines import Line2D
 
-    style = {"marker": "o", "markersize": 4.0, "markerfacecolor": "white", "markeredgecolor": "black", "linestyle": "none"}
+    style = {
+        "marker": "o",
+        "markersize": 4.0,
+        "markerfacecolor": "white",
+        "markeredgecolor": "black",
+        "linestyle": "none",
+    }
     return Line2D([], [], **style, label="estimated from incomplete (weighted) clusters")  # type: ignore[arg-type]

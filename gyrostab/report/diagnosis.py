@@ -43,7 +43,9 @@ _SOURCE = {
 _REASON = {"below limit": "looked for, not seen"}
 
 
-def write_diagnosis_report(diagnosis: Diagnosis, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+def write_diagnosis_report(
+    diagnosis: Diagnosis, path: str | os.PathLike[str], *, overwrite: bool = False
+) -> Path:
     """Write the page of a diagnosis.
 
     Parameters
@@ -84,7 +86,8 @@ def write_diagnosis_report(diagnosis: Diagnosis, path: str | os.PathLike[str], *
             limits=_limits(content),
             noise=_noise(content),
             level=f"{100.0 * content['false_alarm_level']:g} %",
-            rare=f"{50.0 * content['false_alarm_level']:g} %",  # the other half of the level is for places
+            # the other half of the level is for places
+            rare=f"{50.0 * content['false_alarm_level']:g} %",
         )
         temporary.write_text(text, encoding="utf-8")
     return Path(path)
@@ -106,22 +109,35 @@ def _recording(content: Mapping[str, Any]) -> str:
 
 def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     recording, baseline = content["recording"], content["baseline"]
-    length = (np.datetime64(recording["end"].removesuffix("Z")) - np.datetime64(recording["start"].removesuffix("Z"))) / np.timedelta64(
-        1, "s"
+    length = (
+        np.datetime64(recording["end"].removesuffix("Z"))
+        - np.datetime64(recording["start"].removesuffix("Z"))
+    ) / np.timedelta64(1, "s")
+    spans = "; ".join(
+        f"{_stamp(first)} to {_stamp(last)}" for first, last in baseline["calibrated_on"][:6]
     )
-    spans = "; ".join(f"{_stamp(first)} to {_stamp(last)}" for first, last in baseline["calibrated_on"][:6])
     more = len(baseline["calibrated_on"]) - 6
     expected = " ".join(one["statement"] for one in baseline.get("expected", []))
     return [
         ("Recording", _recording(content)),
-        ("Span (UTC)", f"{_stamp(recording['start'])} to {_stamp(recording['end'])}, {length_text(float(length))}"),
-        ("Axes, sampling rate", f"{', '.join(recording['axes'])} at {recording['sampling_rate_hz']:g} Hz"),
+        (
+            "Span (UTC)",
+            f"{_stamp(recording['start'])} to {_stamp(recording['end'])}, {length_text(float(length))}",
+        ),
+        (
+            "Axes, sampling rate",
+            f"{', '.join(recording['axes'])} at {recording['sampling_rate_hz']:g} Hz",
+        ),
         ("Channels", ", ".join(recording["channels"]) or "none"),
         *([("Channels not used", _unused_text(content))] if content.get("unused_channels") else []),
         ("Missing samples", f"{100.0 * recording['missing_share']:.2g} %"),
         ("Simulation compared with", _source_text(baseline)),
         *([("Expected, with the size it has here", expected)] if expected else []),
-        *([("Quiet stretches (UTC)", spans + (f" and {more} more" if more > 0 else ""))] if spans else []),
+        *(
+            [("Quiet stretches (UTC)", spans + (f" and {more} more" if more > 0 else ""))]
+            if spans
+            else []
+        ),
         ("Time taken", f"{content['seconds']:.3g} s"),
     ]
 
@@ -158,7 +174,9 @@ def _effect(effect: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, 
         "alternatives": [f"{plain_name(name)} ({name})" for name in effect["alternatives"]],
         "next": next_measurement(effect["name"], effect["alternatives"]),
         "boxes": [
-            box["id"] for box in content["mismatches"] if effect["name"] in box["explained_by"] and set(effect["axes"]) & set(box["axes"])
+            box["id"]
+            for box in content["mismatches"]
+            if effect["name"] in box["explained_by"] and set(effect["axes"]) & set(box["axes"])
         ],
     }
 
@@ -190,9 +208,24 @@ def _proof(content: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
             gain,
             "Every stretch is predicted from the others. Above 0 is better; 5 nats are 150 to 1.",
         ),
-        ("Misfit of the surface (mean z²)", _number(held["misfit_before"]), _number(held["misfit_after"]), "1 is what noise alone gives."),
-        ("Cells inside their 95 % band", share(held["coverage95_before"]), share(held["coverage95_after"]), "95 % is right."),
-        ("Forecast of the last 30 %", "0", forecast, "Fitted on the first 70 % only. A dash: no effect acts in both."),
+        (
+            "Misfit of the surface (mean z²)",
+            _number(held["misfit_before"]),
+            _number(held["misfit_after"]),
+            "1 is what noise alone gives.",
+        ),
+        (
+            "Cells inside their 95 % band",
+            share(held["coverage95_before"]),
+            share(held["coverage95_after"]),
+            "95 % is right.",
+        ),
+        (
+            "Forecast of the last 30 %",
+            "0",
+            forecast,
+            "Fitted on the first 70 % only. A dash: no effect acts in both.",
+        ),
     ]
 
 
@@ -200,8 +233,17 @@ def _limits(content: Mapping[str, Any]) -> list[dict[str, str]]:
     rows = []
     for name, entry in content["not_found"].items():
         unit = "" if entry["unit"] in (None, "1") else f" {entry['unit']}"
-        limit = "–" if entry["upper_limit"] is None else f"< {_number(entry['upper_limit'], 2)}{unit}"
-        rows.append({"name": name, "plain": plain_name(name), "limit": limit, "reason": _REASON.get(entry["reason"], entry["reason"])})
+        limit = (
+            "–" if entry["upper_limit"] is None else f"< {_number(entry['upper_limit'], 2)}{unit}"
+        )
+        rows.append(
+            {
+                "name": name,
+                "plain": plain_name(name),
+                "limit": limit,
+                "reason": _REASON.get(entry["reason"], entry["reason"]),
+            }
+        )
     return sorted(rows, key=lambda row: (row["limit"] == "–", row["name"]))
 
 
@@ -222,14 +264,28 @@ def _noise(content: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    from gyrostab.plot.diagnosis import plot_change, plot_deviations, plot_means, plot_spectra, plot_surfaces
+    from gyrostab.plot.diagnosis import (
+        plot_change,
+        plot_deviations,
+        plot_means,
+        plot_spectra,
+        plot_surfaces,
+    )
 
     surfaces, content = diagnosis.surfaces, diagnosis.content
     return [
-        embedded(plot_surfaces(surfaces, content), "Recording, simulation before and after", _READ["surfaces"]),
+        embedded(
+            plot_surfaces(surfaces, content),
+            "Recording, simulation before and after",
+            _READ["surfaces"],
+        ),
         embedded(plot_change(surfaces, content), "Where they differ", _READ["change"]),
-        embedded(plot_means(surfaces, content), "Mean rate over time, and what drives it", _READ["means"]),
-        embedded(plot_deviations(surfaces), "Allan deviation of the whole record", _READ["deviations"]),
+        embedded(
+            plot_means(surfaces, content), "Mean rate over time, and what drives it", _READ["means"]
+        ),
+        embedded(
+            plot_deviations(surfaces), "Allan deviation of the whole record", _READ["deviations"]
+        ),
         embedded(plot_spectra(surfaces), "Power spectrum of the whole record", _READ["spectra"]),
     ]
 

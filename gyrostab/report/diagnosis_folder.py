@@ -22,7 +22,9 @@ __all__ = ["FILES", "find_foreign_file", "open_diagnosis", "write_diagnosis"]
 FILES = ("diagnosis.json", "model.toml", "diagnosis.nc", "report.html")
 
 
-def write_diagnosis(diagnosis: Diagnosis, directory: str | os.PathLike[str], *, overwrite: bool = False) -> list[Path]:
+def write_diagnosis(
+    diagnosis: Diagnosis, directory: str | os.PathLike[str], *, overwrite: bool = False
+) -> list[Path]:
     """Write ``diagnosis.json``, ``model.toml``, ``diagnosis.nc`` and ``report.html`` into a folder, which appears once all are complete.
 
     Parameters
@@ -50,7 +52,9 @@ def write_diagnosis(diagnosis: Diagnosis, directory: str | os.PathLike[str], *, 
     directory = Path(directory)
     with new_output(directory, overwrite=overwrite, find_foreign=find_foreign_file) as temporary:
         (temporary / "diagnosis.json").write_text(diagnosis.to_json(), encoding="utf-8")
-        (temporary / "model.toml").write_text(model_text(diagnosis.model, heading=_heading(diagnosis)), encoding="utf-8")
+        (temporary / "model.toml").write_text(
+            model_text(diagnosis.model, heading=_heading(diagnosis)), encoding="utf-8"
+        )
         to_netcdf(diagnosis.surfaces, temporary / "diagnosis.nc")
         write_diagnosis_report(diagnosis, temporary / "report.html")
     return [directory / name for name in FILES]
@@ -60,13 +64,22 @@ def find_foreign_file(directory: Path) -> str | None:
     """Find an item in a folder that is not part of a diagnosis; None for the folder of a diagnosis, and for an empty one."""
     names = sorted(item.name for item in directory.iterdir())
     ours = is_diagnosis(directory)
-    return next((name for name in names if not ours or name not in FILES or not _is_plain_file(directory / name)), None)
+    return next(
+        (
+            name
+            for name in names
+            if not ours or name not in FILES or not _is_plain_file(directory / name)
+        ),
+        None,
+    )
 
 
 def is_diagnosis(directory: Path) -> bool:
     """Whether a folder holds a diagnosis of any version."""
     content = read_json(directory / "diagnosis.json")
-    return isinstance(content, dict) and str(content.get("schema")).startswith("gyrostab.diagnosis/")
+    return isinstance(content, dict) and str(content.get("schema")).startswith(
+        "gyrostab.diagnosis/"
+    )
 
 
 def _is_plain_file(path: Path) -> bool:
@@ -74,7 +87,10 @@ def _is_plain_file(path: Path) -> bool:
 
 
 def _heading(diagnosis: Diagnosis) -> str:
-    files = ", ".join(Path(name).name for name in diagnosis.content["recording"]["files"]) or "the recording"
+    files = (
+        ", ".join(Path(name).name for name in diagnosis.content["recording"]["files"])
+        or "the recording"
+    )
     return f"The simulation of {files} with what its diagnosis found.\ngyrostab simulate model.toml --like RECORDING -o simulation.nc"
 
 
@@ -103,15 +119,21 @@ def open_diagnosis(directory: str | os.PathLike[str]) -> Diagnosis:
     """
     directory = Path(directory)
     if not directory.is_dir():
-        raise FormatError(f"{directory}: there is no such folder; gyrostab diagnose RECORDING -o DIR makes one")
+        raise FormatError(
+            f"{directory}: there is no such folder; gyrostab diagnose RECORDING -o DIR makes one"
+        )
     try:
         content = json.loads((directory / "diagnosis.json").read_text(encoding="utf-8"))
         check_diagnosis(content)
         model = tomllib.loads((directory / "model.toml").read_text(encoding="utf-8"))
     except OSError as error:
-        raise FormatError(f"{error.filename}: cannot be read ({error.strerror}); is {directory} the folder of a diagnosis?") from error
+        raise FormatError(
+            f"{error.filename}: cannot be read ({error.strerror}); is {directory} the folder of a diagnosis?"
+        ) from error
     except (ValueError, SchemaError) as error:
-        raise FormatError(f"{directory}: holds no diagnosis that can be read ({error}); make it again with gyrostab diagnose") from error
+        raise FormatError(
+            f"{directory}: holds no diagnosis that can be read ({error}); make it again with gyrostab diagnose"
+        ) from error
     surfaces: xr.Dataset = open_dataset(directory / "diagnosis.nc").load()
     surfaces.close()
     return Diagnosis(content, surfaces, model)

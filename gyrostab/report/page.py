@@ -24,7 +24,12 @@ def page_text(template: str, *, title: str, **content: Any) -> str:
     import jinja2
 
     templates = jinja2.Environment(
-        loader=jinja2.PackageLoader("gyrostab", "report"), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+        loader=jinja2.PackageLoader("gyrostab", "report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
     )
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    return templates.get_template(template).render(title=title, made=made, version=metadata.version("gyrostab"), **content)
+    return templates.get_template(template).render(
+        title=title, made=made, version=metadata.version("gyrostab"), **content
+    )

@@ -25,7 +25,13 @@ _LONGEST_GAPS = 20
 _GAIN = 1.5  # a variation of N over the record that is worth a sentence
 
 
-def write_report(product: xr.Dataset, path: str | os.PathLike[str], *, log: xr.Dataset | None = None, overwrite: bool = False) -> Path:
+def write_report(
+    product: xr.Dataset,
+    path: str | os.PathLike[str],
+    *,
+    log: xr.Dataset | None = None,
+    overwrite: bool = False,
+) -> Path:
     """Write a report on a product as one HTML file that needs nothing beside it.
 
     Parameters
@@ -109,7 +115,9 @@ def _share(share: float) -> str:
 
 def _missing(product: xr.Dataset) -> dict[str, float]:
     coverage = product["window_coverage"]
-    return {str(name): 1.0 - float(coverage.sel(axis=name).mean()) for name in product["axis"].values}
+    return {
+        str(name): 1.0 - float(coverage.sel(axis=name).mean()) for name in product["axis"].values
+    }
 
 
 def _files(product: xr.Dataset) -> list[str]:
@@ -135,13 +143,23 @@ def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]
 
     lines = []
     for axis, rows in table:
-        seen = [f"{row['symbol']} = {row['median']} {row['unit']}{row['rare']}" for row in rows if row["median"] != "–"]
-        text = f"Axis {axis}: {', '.join(seen)}; medians." if seen else f"Axis {axis}: no coefficient is observed in any window."
+        seen = [
+            f"{row['symbol']} = {row['median']} {row['unit']}{row['rare']}"
+            for row in rows
+            if row["median"] != "–"
+        ]
+        text = (
+            f"Axis {axis}: {', '.join(seen)}; medians."
+            if seen
+            else f"Axis {axis}: no coefficient is observed in any window."
+        )
         lines.append(text + _change(product.sel(axis=axis)))
     missing = {axis: share for axis, share in _missing(product).items() if share > 0.0}
     if missing:
         lines.append(
-            "Missing samples, mean over the windows: " + ", ".join(f"axis {axis} {_share(share)}" for axis, share in missing.items()) + "."
+            "Missing samples, mean over the windows: "
+            + ", ".join(f"axis {axis} {_share(share)}" for axis, share in missing.items())
+            + "."
         )
     else:
         lines.append("No sample is missing in any window.")
@@ -169,23 +187,43 @@ def _facts(product: xr.Dataset) -> list[tuple[str, str]]:
         ("Files", ", ".join(_files(product)) or "not recorded"),
         ("Span (UTC)", f"{_stamp(start)} to {_stamp(end)}"),
         ("Axes", ", ".join(str(name) for name in product["axis"].values)),
-        ("Missing samples", ", ".join(f"{axis}: {_share(share)}" for axis, share in _missing(product).items())),
-        ("Averaging times", f"{tau.size}, from {duration(float(tau[0]))} to {duration(float(tau[-1]))}"),
+        (
+            "Missing samples",
+            ", ".join(f"{axis}: {_share(share)}" for axis, share in _missing(product).items()),
+        ),
+        (
+            "Averaging times",
+            f"{tau.size}, from {duration(float(tau[0]))} to {duration(float(tau[-1]))}",
+        ),
         ("Windows", str(product.sizes["time"])),
     ]
     timed = {"window_s": "Window", "step_s": "Step"}
-    facts += [(label, duration(float(attrs[name]))) for name, label in timed.items() if name in attrs]
+    facts += [
+        (label, duration(float(attrs[name]))) for name, label in timed.items() if name in attrs
+    ]
     if "sampling_rate_hz" in attrs:
         facts.append(("Sampling rate", f"{float(attrs['sampling_rate_hz']):g} Hz"))
-    plain = {"kind": "Kind of signal", "method": "Method", "gaps": "Treatment of gaps", "overlap": "Overlap", "fit_method": "Fit"}
-    facts += [(label, str(attrs[name]).replace("_", " ")) for name, label in plain.items() if name in attrs]
+    plain = {
+        "kind": "Kind of signal",
+        "method": "Method",
+        "gaps": "Treatment of gaps",
+        "overlap": "Overlap",
+        "fit_method": "Fit",
+    }
+    facts += [
+        (label, str(attrs[name]).replace("_", " "))
+        for name, label in plain.items()
+        if name in attrs
+    ]
     shares = [f"{label}: {_share(share)}" for label, share in _estimators(product)]
     return [*facts, ("Cells of the surface", ", ".join(shares))]
 
 
 def _estimators(product: xr.Dataset) -> list[tuple[str, float]]:
     labels = ("no estimate", "from complete clusters", "from incomplete (weighted) clusters")
-    counts = np.bincount(np.asarray(product["estimator"].values, dtype=np.int64).ravel(), minlength=len(labels))
+    counts = np.bincount(
+        np.asarray(product["estimator"].values, dtype=np.int64).ravel(), minlength=len(labels)
+    )
     return [(label, float(counts[number] / counts.sum())) for number, label in enumerate(labels)]
 
 
@@ -196,9 +234,13 @@ def _coefficients(terms: list[TermSummary]) -> list[dict[str, Any]]:
             "name": LAWS[term.symbol].name,
             "unit": term.unit,
             "median": _number(term.median),
-            "range": f"{_number(term.low)} to {_number(term.high)}" if np.isfinite(term.median) else "–",
+            "range": f"{_number(term.low)} to {_number(term.high)}"
+            if np.isfinite(term.median)
+            else "–",
             "observed": _share(term.observed_share),
-            "rare": f" (observed in {_share(term.observed_share)} of the windows only)" if term.observed_share < 0.5 else "",
+            "rare": f" (observed in {_share(term.observed_share)} of the windows only)"
+            if term.observed_share < 0.5
+            else "",
             "limited": _share(term.limited_share),
             "limit": f"< {_number(term.limit)}" if np.isfinite(term.limit) else "–",
         }
@@ -226,7 +268,9 @@ def _gaps(log: xr.Dataset) -> list[dict[str, Any]]:
 
 def _gap_summary(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
     total = log.sizes["gap"]
-    missing = duration(float(np.sum(log["gap_samples"].values)) / float(log.attrs["sampling_rate_hz"]))
+    missing = duration(
+        float(np.sum(log["gap_samples"].values)) / float(log.attrs["sampling_rate_hz"])
+    )
     shown = f" The {len(gaps)} longest are listed." if total > len(gaps) else ""
     return f"{total} gap{'s' if total != 1 else ''}, {missing} in all.{shown}"
 
@@ -237,15 +281,35 @@ def _figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]
     figures = []
     if log is not None:
         figures.append(embedded(plot_signal(log), "Signal as recorded", _READ["signal"]))
-    figures.append(embedded(plot_coefficients(product), "Noise coefficients over time", _READ["coefficients"]))
+    figures.append(
+        embedded(plot_coefficients(product), "Noise coefficients over time", _READ["coefficients"])
+    )
     figures.append(embedded(plot_davar(product), "Dynamic Allan deviation", _READ["davar"]))
-    figures.append(embedded(plot_davar(product, relative=True), "Change of the dynamic Allan deviation", _READ["change"]))
+    figures.append(
+        embedded(
+            plot_davar(product, relative=True),
+            "Change of the dynamic Allan deviation",
+            _READ["change"],
+        )
+    )
     for name in product["axis"].values:
-        figures.append(embedded(plot_adev(product, str(name)), f"Allan deviation of one window, axis {name}", _READ["adev"]))
+        figures.append(
+            embedded(
+                plot_adev(product, str(name)),
+                f"Allan deviation of one window, axis {name}",
+                _READ["adev"],
+            )
+        )
     if min(product.sizes["time"], product.sizes["tau"]) < 2:
         return figures
     first = str(product["axis"].values[0])
-    figures.append(embedded(plot_davar_3d(product, axis=first), f"Dynamic Allan deviation as a surface, axis {first}", _READ["davar_3d"]))
+    figures.append(
+        embedded(
+            plot_davar_3d(product, axis=first),
+            f"Dynamic Allan deviation as a surface, axis {first}",
+            _READ["davar_3d"],
+        )
+    )
     return figures
 
 

@@ -110,7 +110,9 @@ def next_block(
     instants = grid_times(plan.start, plan.rate * factor, index)
     channels = {}
     for name, source in plan.sources.items():
-        channels[name], state.drivers[name] = source.at(instants, parts.get(name), state.drivers.get(name))
+        channels[name], state.drivers[name] = source.at(
+            instants, parts.get(name), state.drivers.get(name)
+        )
     true = {axis: np.zeros(index.size) for axis in plan.axes}
     if plan.turning:
         true[plan.turning] += channels["rotation_rate"] * 3600.0
@@ -122,14 +124,21 @@ def next_block(
         step = plan.steps[number]
         size, skip = (index.size, 1) if fast else (count, factor)
         names = step.effect.channel_names()
-        drivers = {role: channels[names[role]][::skip] * step.factors.get(role, 1.0) for role in step.effect.needs()}
-        chunk = Chunk(setup=step.setup, first=first * (factor // skip), size=size, drivers=drivers, **given)
+        drivers = {
+            role: channels[names[role]][::skip] * step.factors.get(role, 1.0)
+            for role in step.effect.needs()
+        }
+        chunk = Chunk(
+            setup=step.setup, first=first * (factor // skip), size=size, drivers=drivers, **given
+        )
         values, state.effects[number] = step.effect.generate(chunk, state.effects[number])
         return step, values
 
     for number in by_stage["motion"]:
         step, values = act(number, true=true)
-        for row, part in zip(step.rows, np.broadcast_to(values, (len(step.rows), index.size)), strict=True):
+        for row, part in zip(
+            step.rows, np.broadcast_to(values, (len(step.rows), index.size)), strict=True
+        ):
             true[plan.axes[row]] = true[plan.axes[row]] + part
     signal = _noise(plan, state, by_stage["noise"], act, units, true)
     for number in by_stage["rate"]:
@@ -140,24 +149,43 @@ def next_block(
             step, values = act(number, true=true, signal=signal[list(plan.steps[number].rows)])
             signal[list(step.rows)] = values
     slow = _sample(plan, by_stage["sampling"], act, signal, true, count)
-    true = {axis: values.reshape(count, factor).mean(axis=1) for axis, values in true.items()} if factor > 1 else true
+    true = (
+        {axis: values.reshape(count, factor).mean(axis=1) for axis, values in true.items()}
+        if factor > 1
+        else true
+    )
     for number in by_stage["logger"]:
-        step, values = act(number, fast=False, true=true, signal=slow[list(plan.steps[number].rows)])
+        step, values = act(
+            number, fast=False, true=true, signal=slow[list(plan.steps[number].rows)]
+        )
         slow[list(step.rows)] = values
     _lose(plan, slow, first)
     return slow, state
 
 
-def _noise(plan: Plan, state: BlockState, numbers: list[int], act: Any, units: Sequence[Units], true: Mapping[str, Array]) -> Array:
+def _noise(
+    plan: Plan,
+    state: BlockState,
+    numbers: list[int],
+    act: Any,
+    units: Sequence[Units],
+    true: Mapping[str, Array],
+) -> Array:
     """True rate and noise, with the noise at the level that the effects give it."""
     size = units[0].size
     levels = [
-        {term: np.full(size, value**2) if numbers else value**2 for term, value in coefficients.items()}
+        {
+            term: np.full(size, value**2) if numbers else value**2
+            for term, value in coefficients.items()
+        }
         for coefficients in plan.coefficients
     ]
     for number in numbers:
         rows = plan.steps[number].rows
-        before = {term: np.stack([levels[row][term] for row in rows]) for term in plan.steps[number].effect.terms}
+        before = {
+            term: np.stack([levels[row][term] for row in rows])
+            for term in plan.steps[number].effect.terms
+        }
         step, changed = act(number, true=true, level=before)
         for term, values in changed.items():
             for row, one in zip(step.rows, np.broadcast_to(values, (len(rows), size)), strict=True):
@@ -165,30 +193,47 @@ def _noise(plan: Plan, state: BlockState, numbers: list[int], act: Any, units: S
     signal = np.empty((len(plan.axes), size))
     for row, axis in enumerate(plan.axes):
         noise, state.noise[axis] = shape(
-            units[row], levels[row], plan.rate * plan.oversampling, state.noise.get(axis, {}), ramp=plan.coefficients[row]["R"]
+            units[row],
+            levels[row],
+            plan.rate * plan.oversampling,
+            state.noise.get(axis, {}),
+            ramp=plan.coefficients[row]["R"],
         )
         signal[row] = noise + true[axis]
     return signal
 
 
-def _sample(plan: Plan, numbers: list[int], act: Any, signal: Array, true: Mapping[str, Array], count: int) -> Array:
+def _sample(
+    plan: Plan, numbers: list[int], act: Any, signal: Array, true: Mapping[str, Array], count: int
+) -> Array:
     """The samples of the log: those that an effect picked, or means over the sampling interval."""
     rows: list[Array] = list(signal)
     for number in numbers:
         before = [rows[row] for row in plan.steps[number].rows]
         if any(row.size != count * plan.oversampling for row in before):
             name = plan.steps[number].effect.name
-            raise OptionError(f"effect {name!r} comes after another that has picked the samples of the log already; leave one of them out")
+            raise OptionError(
+                f"effect {name!r} comes after another that has picked the samples of the log already; leave one of them out"
+            )
         step, values = act(number, true=true, signal=np.stack(before))
         for row, one in zip(step.rows, values, strict=True):
             rows[row] = one
-    return np.stack([row if row.size == count else row.reshape(count, plan.oversampling).mean(axis=1) for row in rows])
+    return np.stack(
+        [
+            row if row.size == count else row.reshape(count, plan.oversampling).mean(axis=1)
+            for row in rows
+        ]
+    )
 
 
 def _lose(plan: Plan, rate: Array, first: int) -> None:
     """Put NaN into the gaps."""
     count = rate.shape[1]
-    for begin, end in plan.gaps[np.searchsorted(plan.gaps[:, 1], first, side="right") : np.searchsorted(plan.gaps[:, 0], first + count)]:
+    for begin, end in plan.gaps[
+        np.searchsorted(plan.gaps[:, 1], first, side="right") : np.searchsorted(
+            plan.gaps[:, 0], first + count
+        )
+    ]:
         rate[:, max(begin - first, 0) : end - first] = np.nan
 
 

@@ -34,7 +34,9 @@ def inner_unit(unit: str, values: Any) -> tuple[str, Any]:
     except ValueError:
         return unit, values
     if known.quantity == "rate":  # of a tool, not of a gyro's output
-        return INNER["rotation_rate"], np.asarray(values) * (known.factor / parse_unit(INNER["rotation_rate"]).factor)
+        return INNER["rotation_rate"], np.asarray(values) * (
+            known.factor / parse_unit(INNER["rotation_rate"]).factor
+        )
     return INNER[known.quantity], np.asarray(values) * known.factor + known.offset
 
 
@@ -44,8 +46,15 @@ def check_points(points: Any, where: str, columns: Sequence[str]) -> Array:
         table = np.asarray(points, dtype=np.float64)
     except (ValueError, TypeError):
         table = np.empty(0)
-    if table.ndim != 2 or table.shape[0] == 0 or table.shape[1] != len(columns) or not np.isfinite(table).all():
-        raise OptionError(f"{where}: {points!r} is not a list of [{', '.join(columns)}]; write for instance [{[0.0] * len(columns)}]")
+    if (
+        table.ndim != 2
+        or table.shape[0] == 0
+        or table.shape[1] != len(columns)
+        or not np.isfinite(table).all()
+    ):
+        raise OptionError(
+            f"{where}: {points!r} is not a list of [{', '.join(columns)}]; write for instance [{[0.0] * len(columns)}]"
+        )
     if np.any(np.diff(table[:, 0]) < 0):
         raise OptionError(f"{where}: the times {table[:, 0].tolist()} do not rise; sort them")
     return table
@@ -57,7 +66,9 @@ def piecewise(points: Array, *, held: bool) -> Callable[[Array], Array]:
 
     def at(seconds: Array) -> Array:
         if held:
-            return np.asarray(values[np.maximum(np.searchsorted(times, seconds, side="right") - 1, 0)])
+            return np.asarray(
+                values[np.maximum(np.searchsorted(times, seconds, side="right") - 1, 0)]
+            )
         return np.asarray(np.interp(seconds, times, values))
 
     return at
@@ -101,7 +112,9 @@ def channel(
     Frozen({'time_supply_voltage': 3600})
     """
     if not 0 < sensor_rate <= 1e5:
-        raise OptionError(f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number of Hz above 0 and up to 1e5")
+        raise OptionError(
+            f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number of Hz above 0 and up to 1e5"
+        )
     size = max(1, math.ceil(duration_seconds(duration, "duration") * sensor_rate - 1e-6))
     dim = f"time_{name}"
     attrs = {"units": unit, "long_name": name.replace("_", " "), **(attributes or {})}
@@ -120,7 +133,9 @@ def _sampled(values: Callable[[Array], Array], size: int, rate: float) -> Any:
 
     make = dask.delayed(part, pure=False)
     spans = [(first, min(_EAGER, size - first)) for first in range(0, size, _EAGER)]
-    return da.concatenate([da.from_delayed(make(first, count), (count,), dtype=np.float64) for first, count in spans])
+    return da.concatenate(
+        [da.from_delayed(make(first, count), (count,), dtype=np.float64) for first, count in spans]
+    )
 
 
 def combine(*parts: xr.Dataset) -> xr.Dataset:
@@ -147,8 +162,12 @@ def combine(*parts: xr.Dataset) -> xr.Dataset:
         channels = part.drop_vars(gaps)
         twice = [name for name in channels.data_vars if name in names]
         if twice:
-            raise OptionError(f"the environment has the channel {twice[0]!r} twice; leave one out, or name it otherwise (channel = ...)")
+            raise OptionError(
+                f"the environment has the channel {twice[0]!r} twice; leave one out, or name it otherwise (channel = ...)"
+            )
         names += list(channels.data_vars)
         rest.append(channels)
     table = [xr.concat(tables, dim="gap", data_vars="all").sortby("gap_start")] if tables else []
-    return xr.merge([*rest, *table], combine_attrs="drop_conflicts", join="exact", compat="no_conflicts")
+    return xr.merge(
+        [*rest, *table], combine_attrs="drop_conflicts", join="exact", compat="no_conflicts"
+    )

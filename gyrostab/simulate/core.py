@@ -19,7 +19,14 @@ from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
-from gyrostab.schema import GAP_CAUSES, SIGNAL_UNITS, attributes, check_log, log_channels, signal_name
+from gyrostab.schema import (
+    GAP_CAUSES,
+    SIGNAL_UNITS,
+    attributes,
+    check_log,
+    log_channels,
+    signal_name,
+)
 from gyrostab.simulate.block import BlockState, Plan, Step, check_effects
 from gyrostab.simulate.channels import combine
 from gyrostab.simulate.drivers import make_source
@@ -56,25 +63,30 @@ def simulate(
     model : path, mapping or Model
         Noise, effects, environment and frame of the log; see docs/simulate.md.
     duration : str or float, optional
-        Length of the log ("200h"); a number is in seconds. Without it that of the model, or of `like`.
+        Length of the log ("200h"); a number is in seconds. Without it that of the model, or of
+        `like`.
     rate : float, optional
         Sampling rate [Hz].
     start : str, optional
         Time of the first sample, ISO 8601, UTC.
     seed : int, optional
-        The same seed gives the same bits, whatever the chunks; with and without effects it gives the same noise. 0 by default.
+        The same seed gives the same bits, whatever the chunks; with and without effects it gives
+        the same noise. 0 by default.
     like : xarray.Dataset, optional
-        Regular log whose stamps, gaps and channels are taken; rate, start and axes are then its own.
+        Regular log whose stamps, gaps and channels are taken; rate, start and axes are then its
+        own.
     environment : xarray.Dataset, optional
-        More channels and gaps, from the functions of `gyrostab.simulate.environment` and `gyrostab.simulate.losses`.
+        More channels and gaps, from the functions of `gyrostab.simulate.environment` and
+        `gyrostab.simulate.losses`.
     chunk : int, optional
         Samples of a chunk of the lazy log.
 
     Returns
     -------
     xarray.Dataset
-        ``rate(axis, time)`` [degree hour-1], lazy, NaN at every missing sample; the channels; the table of gaps.
-        Its chunks are made one after the other and remember how to go on; a late one alone needs those before it, once.
+        ``rate(axis, time)`` [degree hour-1], lazy, NaN at every missing sample; the channels; the
+        table of gaps. Its chunks are made one after the other and remember how to go on; a late one
+        alone needs those before it, once.
 
     Raises
     ------
@@ -104,10 +116,22 @@ def simulate(
     steps = _steps(made, frame, table)
     plan = _plan(made, frame, world, table, steps)
     starts = [
-        begin_noise(frame.seed, axis, rate=frame.rate * frame.oversampling, terms=_terms(plan, row), flicker_band=made.flicker_band)
+        begin_noise(
+            frame.seed,
+            axis,
+            rate=frame.rate * frame.oversampling,
+            terms=_terms(plan, row),
+            flicker_band=made.flicker_band,
+        )
         for row, axis in enumerate(frame.axes)
     ]
-    data = lazy_rates(plan, _begin(plan, frame.seed), starts, frame.size, chunk=chunk or max(1, BLOCK // frame.oversampling))
+    data = lazy_rates(
+        plan,
+        _begin(plan, frame.seed),
+        starts,
+        frame.size,
+        chunk=chunk or max(1, BLOCK // frame.oversampling),
+    )
     if like is not None:
         data = _lost(data, like[signal_name(like)].transpose("axis", "time").data)
     return _labelled(made, frame, world, table, data)
@@ -125,7 +149,15 @@ class _Frame:
     oversampling: int
 
 
-def _frame(model: Model, *, duration: Any, rate: float | None, start: Any, seed: int | None, like: xr.Dataset | None) -> _Frame:
+def _frame(
+    model: Model,
+    *,
+    duration: Any,
+    rate: float | None,
+    start: Any,
+    seed: int | None,
+    like: xr.Dataset | None,
+) -> _Frame:
     chosen = int(model.log.get("seed", 0) if seed is None else seed)
     if chosen < 0:
         raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
@@ -134,39 +166,78 @@ def _frame(model: Model, *, duration: Any, rate: float | None, start: Any, seed:
         given = {"duration": duration, "rate": rate, "start": start}
         extra = [name for name, value in given.items() if value is not None]
         if extra:
-            raise OptionError(f"{extra[0]} is taken from the recording that the log shall be like; leave out {extra[0]} or like")
+            raise OptionError(
+                f"{extra[0]} is taken from the recording that the log shall be like; leave out {extra[0]} or like"
+            )
         axes = tuple(str(axis) for axis in like["axis"].values)
-        return _checked(model, _Frame(float(like.attrs["sampling_rate_hz"]), like.sizes["time"], first_stamp(like), chosen, axes, factor))
+        return _checked(
+            model,
+            _Frame(
+                float(like.attrs["sampling_rate_hz"]),
+                like.sizes["time"],
+                first_stamp(like),
+                chosen,
+                axes,
+                factor,
+            ),
+        )
     hertz = model.log.get("rate") if rate is None else rate
     length = model.log.get("duration") if duration is None else duration
     for name, value, example in (("rate", hertz, "100 (Hz)"), ("duration", length, "1h")):
         if value is None:
-            raise OptionError(f"{model.source}: there is no {name}; give {name} = {example} in [log], --{name}, or --like RECORDING")
-    if isinstance(hertz, bool) or not isinstance(hertz, int | float) or not (math.isfinite(hertz) and 0 < hertz <= 1e6):
-        raise OptionError(f"{model.source}: rate {hertz!r} is not a number of Hz above 0 and up to 1e6")
+            raise OptionError(
+                f"{model.source}: there is no {name}; give {name} = {example} in [log], --{name}, or --like RECORDING"
+            )
+    if (
+        isinstance(hertz, bool)
+        or not isinstance(hertz, int | float)
+        or not (math.isfinite(hertz) and 0 < hertz <= 1e6)
+    ):
+        raise OptionError(
+            f"{model.source}: rate {hertz!r} is not a number of Hz above 0 and up to 1e6"
+        )
     if isinstance(length, bool) or duration_seconds(length, "duration") > 1e9:
-        raise OptionError(f"{model.source}: a duration of {length} is not one; give for instance 1h, at most 1e9 s")
+        raise OptionError(
+            f"{model.source}: a duration of {length} is not one; give for instance 1h, at most 1e9 s"
+        )
     size = round(duration_seconds(length, "duration") * hertz)
     if size < 1:
-        raise OptionError(f"{model.source}: a duration of {length} is shorter than one sample at {hertz:g} Hz")
+        raise OptionError(
+            f"{model.source}: a duration of {length} is shorter than one sample at {hertz:g} Hz"
+        )
     begin = stamp_ns(start if start is not None else model.log.get("start", "1970-01-01"))
-    return _checked(model, _Frame(float(hertz), size, begin, chosen, model.axes or ("x", "y", "z"), factor))
+    return _checked(
+        model, _Frame(float(hertz), size, begin, chosen, model.axes or ("x", "y", "z"), factor)
+    )
 
 
 def _checked(model: Model, frame: _Frame) -> _Frame:
-    named = [axis for axis in model.noise if axis] + [axis for effect in model.effects for axis in effect.axes]
+    named = [axis for axis in model.noise if axis] + [
+        axis for effect in model.effects for axis in effect.axes
+    ]
     for axis in named:
         if axis not in frame.axes:
-            raise OptionError(f"{model.source}: there is no axis {axis!r} in this log; it has {', '.join(frame.axes)}")
+            raise OptionError(
+                f"{model.source}: there is no axis {axis!r} in this log; it has {', '.join(frame.axes)}"
+            )
     return frame
 
 
-def _world(model: Model, frame: _Frame, like: xr.Dataset | None, environment: xr.Dataset | None) -> xr.Dataset:
+def _world(
+    model: Model, frame: _Frame, like: xr.Dataset | None, environment: xr.Dataset | None
+) -> xr.Dataset:
     """Channels and gaps from all that there are."""
     parts = []
     if like is not None:
-        kept = {*log_channels(like), *(name for name, variable in like.variables.items() if variable.dims == ("gap",))}
-        parts.append(like[[name for name in like.variables if name in kept]].drop_vars("axis", errors="ignore"))
+        kept = {
+            *log_channels(like),
+            *(name for name, variable in like.variables.items() if variable.dims == ("gap",)),
+        }
+        parts.append(
+            like[[name for name in like.variables if name in kept]].drop_vars(
+                "axis", errors="ignore"
+            )
+        )
     for name, values in model.environment:
         function = PROFILES[name][0]
         given = {"duration": frame.size / frame.rate, "start": frame.start, **values}
@@ -183,12 +254,21 @@ def _gap_table(world: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
     if "gap_start" not in world:
         return np.empty((0, 5), np.int64)
     first, end = (
-        np.ceil(grid_index(frame.start, frame.rate, world[name].values.astype("datetime64[ns]").astype(np.int64)) - 1e-3)
+        np.ceil(
+            grid_index(
+                frame.start,
+                frame.rate,
+                world[name].values.astype("datetime64[ns]").astype(np.int64),
+            )
+            - 1e-3
+        )
         for name in ("gap_start", "gap_end")
     )
     first, end = (np.clip(edge, 0, frame.size).astype(np.int64) for edge in (first, end))
     rows: list[list[int]] = []
-    for begin, until, cause in sorted(zip(first.tolist(), end.tolist(), world["gap_cause"].values.tolist(), strict=True)):
+    for begin, until, cause in sorted(
+        zip(first.tolist(), end.tolist(), world["gap_cause"].values.tolist(), strict=True)
+    ):
         if until <= begin:
             continue
         if rows and begin < rows[-1][1]:
@@ -204,8 +284,12 @@ def _gap_table(world: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
 def _steps(model: Model, frame: _Frame, table: NDArray[np.int64]) -> list[Step]:
     """The effects in the order in which they act."""
     steps = []
-    for effect in sorted(model.effects, key=lambda effect: STAGES.index(effect.stage)):  # keeps the model's order within a stage
-        rows = tuple(row for row, axis in enumerate(frame.axes) if not effect.axes or axis in effect.axes)
+    for effect in sorted(
+        model.effects, key=lambda effect: STAGES.index(effect.stage)
+    ):  # keeps the model's order within a stage
+        rows = tuple(
+            row for row, axis in enumerate(frame.axes) if not effect.axes or axis in effect.axes
+        )
         factor = 1 if effect.stage == "logger" else frame.oversampling
         noise = [model.coefficients(frame.axes[row]) for row in rows]
         setup = Setup(
@@ -237,15 +321,23 @@ def _factors(effect: Effect, world: xr.Dataset, present: list[str]) -> dict[str,
             if one.quantity == other.quantity and one.offset == other.offset:
                 factors[role] = one.factor / other.factor
                 continue
-        raise SchemaError(f"effect {effect.name!r} needs {names[role]!r} in {wanted}; the channel is in {found!r}")
+        raise SchemaError(
+            f"effect {effect.name!r} needs {names[role]!r} in {wanted}; the channel is in {found!r}"
+        )
     return factors
 
 
-def _plan(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], steps: list[Step]) -> Plan:
+def _plan(
+    model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], steps: list[Step]
+) -> Plan:
     present = log_channels(world)
     steps = [replace(step, factors=_factors(step.effect, world, present)) for step in steps]
     needed = {step.effect.channel_names()[role] for step in steps for role in step.effect.needs()}
-    turning = str(world["rotation_rate"].attrs.get("rotation_axis", "")) if "rotation_rate" in present else ""
+    turning = (
+        str(world["rotation_rate"].attrs.get("rotation_axis", ""))
+        if "rotation_rate" in present
+        else ""
+    )
     if turning and turning not in frame.axes:
         raise OptionError(
             f"{model.source}: the tool turns about the axis {turning!r}, which the log has not; it has {', '.join(frame.axes)}"
@@ -267,7 +359,11 @@ def _plan(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int6
 
 def _terms(plan: Plan, row: int) -> str:
     """Noise terms of an axis that some stretch may hold."""
-    changed = "".join(step.effect.terms for step in plan.steps if step.effect.stage == "noise" and row in step.rows)
+    changed = "".join(
+        step.effect.terms
+        for step in plan.steps
+        if step.effect.stage == "noise" and row in step.rows
+    )
     return "".join(term for term in "QNBK" if plan.coefficients[row][term] > 0.0 or term in changed)
 
 
@@ -288,11 +384,17 @@ def _lost(data: Any, signal: Any) -> Any:
     return da.where(da.isnan(da.asarray(signal)).rechunk(data.chunks), np.nan, data)
 
 
-def _labelled(model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], data: Any) -> xr.Dataset:
+def _labelled(
+    model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], data: Any
+) -> xr.Dataset:
     gaps = [name for name, variable in world.variables.items() if variable.dims == ("gap",)]
     log = world.drop_vars(gaps).assign(
         {
-            "rate": (("axis", "time"), data, {"units": SIGNAL_UNITS["rate"], "long_name": "rotation rate"}),
+            "rate": (
+                ("axis", "time"),
+                data,
+                {"units": SIGNAL_UNITS["rate"], "long_name": "rotation rate"},
+            ),
             **gap_variables(table, frame.start, frame.rate),
         }
     )

@@ -65,11 +65,15 @@ class Source:
         """Which values the instants after `before` up to `end` [ns] need; None for a channel that is in memory."""
         if self.stamps is not None:
             return None
-        first, last = np.floor(grid_index(self.start, self.rate, [before, end])).astype(int).tolist()
+        first, last = (
+            np.floor(grid_index(self.start, self.rate, [before, end])).astype(int).tolist()
+        )
         size = self.size
         return Stretch(min(max(first, 0), size - 1), min(max(last + 2, 1), size))
 
-    def at(self, instants: NDArray[np.int64], part: tuple[Stretch, Any] | None, carry: float | None) -> tuple[Array, float | None]:
+    def at(
+        self, instants: NDArray[np.int64], part: tuple[Stretch, Any] | None, carry: float | None
+    ) -> tuple[Array, float | None]:
         """Values at rising `instants` [ns since 1970].
 
         Parameters
@@ -93,12 +97,15 @@ class Source:
         known = np.asarray(values, dtype=np.float64)
         whole = _filled(np.concatenate([[self.first if carry is None else carry], known]))
         position = grid_index(self.start, self.rate, instants)
-        position = np.where(np.abs(position - np.rint(position)) < 1e-6, np.rint(position), position)
+        position = np.where(
+            np.abs(position - np.rint(position)) < 1e-6, np.rint(position), position
+        )
         position = np.clip(position, 0, self.size - 1)
         base = np.floor(position).astype(np.int64)
         place = base - stretch.low + 1
         after = whole[place]
-        if not self.held:  # from the number of the sample itself, so that the last bit is the same in every stretch
+        # from the number of the sample itself, so that the last bit is the same in every stretch
+        if not self.held:
             after = after + (position - base) * (whole[np.minimum(place + 1, known.size)] - after)
         return after, float(whole[place[-1]])
 
@@ -106,11 +113,16 @@ class Source:
         stamps = self.stamps
         assert stamps is not None
         if self.held:
-            return np.asarray(self.values[np.maximum(np.searchsorted(stamps, instants, side="right") - 1, 0)])
+            return np.asarray(
+                self.values[np.maximum(np.searchsorted(stamps, instants, side="right") - 1, 0)]
+            )
         low = max(0, int(np.searchsorted(stamps, instants[0], side="right")) - 1)
         high = int(np.searchsorted(stamps, instants[-1], side="left")) + 1
         origin = stamps[low]
-        at, known = (instants - origin).astype(np.float64), (stamps[low:high] - origin).astype(np.float64)
+        at, known = (
+            (instants - origin).astype(np.float64),
+            (stamps[low:high] - origin).astype(np.float64),
+        )
         return np.asarray(np.interp(at, known, self.values[low:high]))
 
 
@@ -128,7 +140,9 @@ def _first_number(values: Any, name: str) -> float:
         if good.size:
             return float(good[0])
         low, step = low + step, min(SHORT, 8 * step)
-    raise SchemaError(f"the channel {name!r} holds no number; leave it out, or name another with driver = ...")
+    raise SchemaError(
+        f"the channel {name!r} holds no number; leave it out, or name another with driver = ..."
+    )
 
 
 def make_source(log: xr.Dataset, name: str) -> Source:
@@ -153,7 +167,17 @@ def make_source(log: xr.Dataset, name: str) -> Source:
     held = variable.attrs.get("interpolation") == "previous"
     index = log.xindexes.get(dim)
     if data.size > SHORT and isinstance(index, TimeGridIndex):
-        return Source(name, units, held, None, data, start=index.start, rate=index.rate, first=_first_number(data, name), size=data.size)
+        return Source(
+            name,
+            units,
+            held,
+            None,
+            data,
+            start=index.start,
+            rate=index.rate,
+            first=_first_number(data, name),
+            size=data.size,
+        )
     values = np.asarray(data, dtype=np.float64)
     good = ~np.isnan(values)
     if not good.any():

@@ -1,6 +1,7 @@
 """Environment of a simulated tool: channels that drive the effects, each a function that gives a Dataset.
 
-Times are seconds since the start of the log. ``PROFILES`` lists the functions and the units of their parameters for models.
+Times are seconds since the start of the log. ``PROFILES`` lists the functions and the units of
+their parameters for models.
 """
 
 from __future__ import annotations
@@ -14,7 +15,15 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
-from gyrostab.simulate.channels import HELD, Points, channel, check_points, combine, inner_unit, piecewise
+from gyrostab.simulate.channels import (
+    HELD,
+    Points,
+    channel,
+    check_points,
+    combine,
+    inner_unit,
+    piecewise,
+)
 from gyrostab.simulate.turning import rotation
 from gyrostab.time.durations import duration_seconds
 
@@ -23,15 +32,40 @@ __all__ = ["chamber", "light_power", "ramps", "rotation", "steps", "supply", "tr
 Array = NDArray[np.float64]
 
 
-def _points(name: str, unit: str, points: Points, held: bool, duration: Any, start: Any, sensor_rate: float, **extra: Any) -> xr.Dataset:
+def _points(
+    name: str,
+    unit: str,
+    points: Points,
+    held: bool,
+    duration: Any,
+    start: Any,
+    sensor_rate: float,
+    **extra: Any,
+) -> xr.Dataset:
     table = check_points(points, f"points of {name}", ("time [s]", f"{name} [{unit}]"))
     inner, table[:, 1] = inner_unit(unit, table[:, 1])
     more = {**(HELD if held else {}), **extra}
     function = piecewise(table, held=held)
-    return channel(name, inner, function, duration=duration, start=start, sensor_rate=sensor_rate, attributes=more)
+    return channel(
+        name,
+        inner,
+        function,
+        duration=duration,
+        start=start,
+        sensor_rate=sensor_rate,
+        attributes=more,
+    )
 
 
-def steps(channel: str, unit: str, points: Points, *, duration: Any, start: Any = "1970-01-01", sensor_rate: float = 1.0) -> xr.Dataset:
+def steps(
+    channel: str,
+    unit: str,
+    points: Points,
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    sensor_rate: float = 1.0,
+) -> xr.Dataset:
     """Any channel that jumps from value to value.
 
     Parameters
@@ -55,7 +89,15 @@ def steps(channel: str, unit: str, points: Points, *, duration: Any, start: Any 
     return _points(channel, unit, points, True, duration, start, sensor_rate)
 
 
-def ramps(channel: str, unit: str, points: Points, *, duration: Any, start: Any = "1970-01-01", sensor_rate: float = 1.0) -> xr.Dataset:
+def ramps(
+    channel: str,
+    unit: str,
+    points: Points,
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    sensor_rate: float = 1.0,
+) -> xr.Dataset:
     """Any channel that runs straight from value to value; arguments as for `steps`.
 
     Examples
@@ -67,14 +109,20 @@ def ramps(channel: str, unit: str, points: Points, *, duration: Any, start: Any 
 
 
 def vibration(
-    points: Points, *, duration: Any, start: Any = "1970-01-01", sensor_rate: float = 1.0, band: Sequence[float] = (20.0, 2000.0)
+    points: Points,
+    *,
+    duration: Any,
+    start: Any = "1970-01-01",
+    sensor_rate: float = 1.0,
+    band: Sequence[float] = (20.0, 2000.0),
 ) -> xr.Dataset:
     """Vibration as its rms acceleration, on and off or in steps, with a flat spectrum in a band.
 
     Parameters
     ----------
     points : list of (time, rms)
-        Each rms acceleration [g] holds from its time [s] to the next. Wang et al. 2016: [[0, 0.02], [330, 13.39], [630, 0.02]].
+        Each rms acceleration [g] holds from its time [s] to the next. Wang et al. 2016: [[0, 0.02],
+        [330, 13.39], [630, 0.02]].
     band : (float, float)
         Edges of the band [Hz]; Wang et al. 2016: up to 1 g^2/Hz at 700 to 800 Hz.
     duration, start, sensor_rate
@@ -94,7 +142,9 @@ def vibration(
     low, high = (float(edge) for edge in band)
     if not 0.0 <= low < high:
         raise OptionError(f"band of vibration {list(band)}: give [lower, higher] frequency in Hz")
-    return _points("vibration", "g", points, True, duration, start, sensor_rate, band_hz=[low, high])
+    return _points(
+        "vibration", "g", points, True, duration, start, sensor_rate, band_hz=[low, high]
+    )
 
 
 def _lagged(values: Array, lag: float, sensor_rate: float) -> Array:
@@ -149,7 +199,9 @@ def chamber(
     array([-40. , -38.3,  -6.7,  25. ,  56.7,  60. ])
     """
     if not (low < high and speed > 0):
-        raise OptionError(f"chamber: give low below high and a speed above 0, not {low!r}, {high!r}, {speed!r}")
+        raise OptionError(
+            f"chamber: give low below high and a speed above 0, not {low!r}, {high!r}, {speed!r}"
+        )
     if first not in ("low", "high"):
         raise OptionError(f"chamber: first is 'low' or 'high', not {first!r}")
     seconds, wait = duration_seconds(duration, "duration"), _seconds(hold)
@@ -158,21 +210,32 @@ def chamber(
     begin = np.arange(count) * (wait + way)
     ends = np.where(np.arange(count) % 2 == (first == "high"), low, high)
     table = np.stack([np.stack([begin, begin + wait], axis=1).ravel(), np.repeat(ends, 2)], axis=1)
-    return _temperature(channel, lambda t: piecewise(table, held=False)(t), seconds, start, sensor_rate, _seconds(lag))
+    return _temperature(
+        channel,
+        lambda t: piecewise(table, held=False)(t),
+        seconds,
+        start,
+        sensor_rate,
+        _seconds(lag),
+    )
 
 
 def _seconds(value: Any) -> float:
     return 0.0 if value == 0 else duration_seconds(value, "time")
 
 
-def _temperature(name: str, function: Any, seconds: float, start: Any, sensor_rate: float, lag: float) -> xr.Dataset:
+def _temperature(
+    name: str, function: Any, seconds: float, start: Any, sensor_rate: float, lag: float
+) -> xr.Dataset:
     size = max(1, math.ceil(seconds * sensor_rate - 1e-6))
     felt = _lagged(function(np.arange(size) / sensor_rate), lag, sensor_rate)
 
     def values(t: Array) -> Array:
         return np.asarray(felt[np.rint(t * sensor_rate).astype(np.int64)])
 
-    return channel(name, "degree_Celsius", values, duration=seconds, start=start, sensor_rate=sensor_rate)
+    return channel(
+        name, "degree_Celsius", values, duration=seconds, start=start, sensor_rate=sensor_rate
+    )
 
 
 def trip(
@@ -190,13 +253,15 @@ def trip(
 ) -> xr.Dataset:
     """Temperature of a tool that is run into a well, drills and comes out, and its depth.
 
-    The tool follows the mud around it with a time constant. Standing mud has the temperature of the rock, ``surface + gradient depth``;
-    mud that circulates comes from above and takes a share of that warmth away.
+    The tool follows the mud around it with a time constant. Standing mud has the temperature of the
+    rock, ``surface + gradient depth``; mud that circulates comes from above and takes a share of
+    that warmth away.
 
     Parameters
     ----------
     depths : list of (time, depth)
-        Vertical depth [m], straight between the times [s]. A trip in goes at 300 to 600 m/h, drilling at 5 to 30 m/h.
+        Vertical depth [m], straight between the times [s]. A trip in goes at 300 to 600 m/h,
+        drilling at 5 to 30 m/h.
     surface : float
         Temperature of the rock at the surface [degC].
     gradient : float
@@ -219,7 +284,11 @@ def trip(
     (array([15., 45.]), np.float64(1000.0))
     """
     table = check_points(depths, "depths of trip", ("time [s]", "depth [m]"))
-    pumps = check_points(circulation, "circulation of trip", ("from [s]", "to [s]")) if len(circulation) else np.empty((0, 2))
+    pumps = (
+        check_points(circulation, "circulation of trip", ("from [s]", "to [s]"))
+        if len(circulation)
+        else np.empty((0, 2))
+    )
     depth = piecewise(table, held=False)
 
     def mud(t: Array) -> Array:
@@ -249,7 +318,8 @@ def supply(
     Parameters
     ----------
     full, empty : float
-        Voltage without load at the beginning and at the end of its life [V]; flat first, falling fast at the end.
+        Voltage without load at the beginning and at the end of its life [V]; flat first, falling
+        fast at the end.
     life : str or float
         Life of the battery [s].
     loads : list of (from, to, drop)
@@ -262,17 +332,25 @@ def supply(
     >>> supply(duration=4.0, life=4.0, loads=[[1, 2, 0.5]]).supply_voltage.values.round(2)
     array([29.  , 28.28, 28.11, 26.68])
     """
-    table = check_points(loads, "loads of supply", ("from [s]", "to [s]", "drop [V]")) if len(loads) else np.empty((0, 3))
+    table = (
+        check_points(loads, "loads of supply", ("from [s]", "to [s]", "drop [V]"))
+        if len(loads)
+        else np.empty((0, 3))
+    )
     end = duration_seconds(life, "life")
 
     def voltage(t: Array) -> Array:
         used = np.clip(t / end, 0.0, 1.0)
-        level = full - (full - empty) * (0.5 * used**2 + 0.5 * used**8)  # a plateau that sags, then the end
+        level = full - (full - empty) * (
+            0.5 * used**2 + 0.5 * used**8
+        )  # a plateau that sags, then the end
         for begin, until, drop in table:
             level = level - drop * ((t >= begin) & (t < until))
         return np.asarray(level)
 
-    return channel("supply_voltage", "V", voltage, duration=duration, start=start, sensor_rate=sensor_rate)
+    return channel(
+        "supply_voltage", "V", voltage, duration=duration, start=start, sensor_rate=sensor_rate
+    )
 
 
 def light_power(
@@ -302,10 +380,16 @@ def light_power(
     >>> light_power(duration="1h", loss=0.0, points=[[0, 0], [3600, 3.0103]]).light_power[[0, 1800]].values.round(7)
     array([1.00e-04, 7.07e-05])
     """
-    table = check_points(points, "points of light_power", ("time [s]", "loss [dB]")) if len(points) else np.zeros((1, 2))
+    table = (
+        check_points(points, "points of light_power", ("time [s]", "loss [dB]"))
+        if len(points)
+        else np.zeros((1, 2))
+    )
     more = piecewise(table, held=False)
 
     def level(t: Array) -> Array:
         return np.asarray(power * 10.0 ** (-(loss * t / 3.6e6 + more(t)) / 10.0))
 
-    return channel("light_power", "W", level, duration=duration, start=start, sensor_rate=sensor_rate)
+    return channel(
+        "light_power", "W", level, duration=duration, start=start, sensor_rate=sensor_rate
+    )

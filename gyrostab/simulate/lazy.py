@@ -26,13 +26,15 @@ STATES = 512
 class Chain:
     """Steps of which each needs the state after the one before.
 
-    A chain remembers states on its way, so that going through it costs every step once, however it is cut into calls, and going back
-    costs little. Threads may ask at the same time. A copy in another process starts anew; the results are the same.
+    A chain remembers states on its way, so that going through it costs every step once, however it
+    is cut into calls, and going back costs little. Threads may ask at the same time. A copy in
+    another process starts anew; the results are the same.
 
     Parameters
     ----------
     step : callable
-        (number of the step, state before it) -> (result, state after it); leaves the state given as it is.
+        (number of the step, state before it) -> (result, state after it); leaves the state given as
+        it is.
     state : object
         State before step 0.
     length : int
@@ -57,7 +59,9 @@ class Chain:
             if number not in self._recent:
                 known = max(place for place in self._states if place <= number)
                 for place in range(known, number + 1):
-                    self._recent[place], self._states[place + 1] = self._step(place, self._states[place])
+                    self._recent[place], self._states[place + 1] = self._step(
+                        place, self._states[place]
+                    )
                     self._forget(place)
                 self._taken = max(self._taken, number + 1)
             return self._recent[number]
@@ -91,16 +95,28 @@ class _Channel:
         first, last = np.searchsorted(self.edges, [stretch.low, stretch.high - 1], side="right") - 1
         pieces = [get_sync(*self.chunks[number]) for number in range(first, last + 1)]
         offset = int(self.edges[first])
-        return np.concatenate(pieces).astype(np.float64)[stretch.low - offset : stretch.high - offset]
+        return np.concatenate(pieces).astype(np.float64)[
+            stretch.low - offset : stretch.high - offset
+        ]
 
 
 class _Log:
     """The blocks of a log: a chain of random numbers for each axis, and the chain of the blocks themselves."""
 
-    def __init__(self, plan: Plan, state: BlockState, starts: Sequence[NoiseState], counts: Sequence[int]):
+    def __init__(
+        self, plan: Plan, state: BlockState, starts: Sequence[NoiseState], counts: Sequence[int]
+    ):
         long = {name: source for name, source in plan.sources.items() if source.stamps is None}
-        self.channels: Mapping[str, _Channel] = {name: _Channel(source.values) for name, source in long.items()}
-        self.plan = replace(plan, sources={**plan.sources, **{name: replace(one, values=None) for name, one in long.items()}})
+        self.channels: Mapping[str, _Channel] = {
+            name: _Channel(source.values) for name, source in long.items()
+        }
+        self.plan = replace(
+            plan,
+            sources={
+                **plan.sources,
+                **{name: replace(one, values=None) for name, one in long.items()},
+            },
+        )
         self.firsts, self.counts = np.concatenate([[0], np.cumsum(counts)]).tolist(), list(counts)
         self.draws = [Chain(self._draw, start, len(counts)) for start in starts]
         self.blocks = Chain(self._block, state, len(counts))
@@ -118,7 +134,9 @@ class _Log:
             stretch = self.plan.sources[name].stretch(before, end)
             assert stretch is not None
             parts[name] = (stretch, channel(stretch))
-        return next_block(self.plan, state, first, count, [one(number) for one in self.draws], parts)
+        return next_block(
+            self.plan, state, first, count, [one(number) for one in self.draws], parts
+        )
 
 
 def _go_draw(log: _Log, row: int, number: int, *before: Any) -> None:
@@ -135,7 +153,9 @@ def _rates(log: _Log, number: int, made: Any) -> NDArray[np.float64]:
     return np.asarray(log.blocks(number) if made is None else made)
 
 
-def lazy_rates(plan: Plan, state: BlockState, starts: Sequence[NoiseState], size: int, *, chunk: int) -> Any:
+def lazy_rates(
+    plan: Plan, state: BlockState, starts: Sequence[NoiseState], size: int, *, chunk: int
+) -> Any:
     """Rates of a whole log, block by block.
 
     Parameters
@@ -169,6 +189,17 @@ def lazy_rates(plan: Plan, state: BlockState, starts: Sequence[NoiseState], size
             before = [(f"{log}-draw", row, number - 1)] if number else []
             gate = [(f"{log}-block", number - RECENT)] if number >= RECENT else []
             tasks[(f"{log}-draw", row, number)] = (_go_draw, log, row, number, *before, *gate)
-        tasks[(f"{log}-block", number)] = (_go_block, log, number, *earlier, *((f"{log}-draw", row, number) for row in rows))
+        tasks[(f"{log}-block", number)] = (
+            _go_block,
+            log,
+            number,
+            *earlier,
+            *((f"{log}-draw", row, number) for row in rows),
+        )
         tasks[(name, 0, number)] = (_rates, log, number, (f"{log}-block", number))
-    return da.Array(HighLevelGraph.from_collections(name, tasks), name, chunks=((len(plan.axes),), counts), dtype=np.float64)
+    return da.Array(
+        HighLevelGraph.from_collections(name, tasks),
+        name,
+        chunks=((len(plan.axes),), counts),
+        dtype=np.float64,
+    )

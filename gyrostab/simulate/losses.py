@@ -23,12 +23,27 @@ _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
 def _table(spans: NDArray[np.float64], cause: int, start: Any) -> xr.Dataset:
     """Gaps from seconds; they are cut to samples when the log is made."""
     edges = stamp_ns(start) + np.rint(spans.reshape(-1, 2) * 1e9).astype(np.int64)
-    flags = {"flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8), "flag_meanings": " ".join(GAP_CAUSES)}
+    flags = {
+        "flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8),
+        "flag_meanings": " ".join(GAP_CAUSES),
+    }
     return xr.Dataset(
         {
-            "gap_start": ("gap", edges[:, 0].view("datetime64[ns]"), {"long_name": "first missing sample"}),
-            "gap_end": ("gap", edges[:, 1].view("datetime64[ns]"), {"long_name": "first present sample after the gap"}),
-            "gap_cause": ("gap", np.full(len(edges), cause, np.int8), {"long_name": "cause of the gap", **flags}),
+            "gap_start": (
+                "gap",
+                edges[:, 0].view("datetime64[ns]"),
+                {"long_name": "first missing sample"},
+            ),
+            "gap_end": (
+                "gap",
+                edges[:, 1].view("datetime64[ns]"),
+                {"long_name": "first present sample after the gap"},
+            ),
+            "gap_cause": (
+                "gap",
+                np.full(len(edges), cause, np.int8),
+                {"long_name": "cause of the gap", **flags},
+            ),
         }
     )
 
@@ -95,7 +110,11 @@ def losses(
     True
     """
     seconds, length, spell = (duration_seconds(value, "time") for value in (duration, mean, burst))
-    for name, value in {"per_hour": per_hour, "bursts_per_hour": bursts_per_hour, "within": within}.items():
+    for name, value in {
+        "per_hour": per_hour,
+        "bursts_per_hour": bursts_per_hour,
+        "within": within,
+    }.items():
         if not value >= 0.0:
             raise OptionError(f"losses: {name}={value!r} must not be below zero")
     rng = stream(seed, "losses")
@@ -109,9 +128,13 @@ def losses(
     return _table(spans, _MISSING, start)
 
 
-def _poisson(rng: np.random.Generator, begin: float, end: float, per_hour: float) -> NDArray[np.float64]:
+def _poisson(
+    rng: np.random.Generator, begin: float, end: float, per_hour: float
+) -> NDArray[np.float64]:
     if not 0.0 <= per_hour * (end - begin) <= 1e8:
-        raise OptionError(f"{per_hour:g} gaps in an hour: give a number from 0 up, for at most 1e8 gaps in all")
+        raise OptionError(
+            f"{per_hour:g} gaps in an hour: give a number from 0 up, for at most 1e8 gaps in all"
+        )
     return np.sort(rng.uniform(begin, end, rng.poisson(per_hour * (end - begin) / 3600.0)))
 
 
@@ -142,8 +165,14 @@ def power_cuts(
     >>> power_cuts([[100, 160]], duration="1h").gap_cause.values
     array([6], dtype=int8)
     """
-    table = check_points(cuts, "cuts of power_cuts", ("from [s]", "to [s]")) if len(cuts) else np.empty((0, 2))
+    table = (
+        check_points(cuts, "cuts of power_cuts", ("from [s]", "to [s]"))
+        if len(cuts)
+        else np.empty((0, 2))
+    )
     rng = stream(seed, "power_cuts")
     begin = _poisson(rng, 0.0, duration_seconds(duration, "duration"), per_day / 24.0)
-    more = np.stack([begin, begin + rng.exponential(duration_seconds(mean, "mean"), begin.size)], axis=1)
+    more = np.stack(
+        [begin, begin + rng.exponential(duration_seconds(mean, "mean"), begin.size)], axis=1
+    )
     return _table(np.concatenate([table, more]), _RESTART, start)

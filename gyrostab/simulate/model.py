@@ -28,20 +28,42 @@ PROFILES: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
     "vibration": (environment.vibration, {"band": "Hz", "sensor_rate": "Hz"}),
     "chamber": (
         environment.chamber,
-        {"low": "degC", "high": "degC", "speed": "degC/min", "hold": "s", "lag": "s", "sensor_rate": "Hz"},
+        {
+            "low": "degC",
+            "high": "degC",
+            "speed": "degC/min",
+            "hold": "s",
+            "lag": "s",
+            "sensor_rate": "Hz",
+        },
     ),
     "trip": (
         environment.trip,
-        {"surface": "degC", "gradient": "degC/km", "cooling": "1", "response": "s", "sensor_rate": "Hz"},
+        {
+            "surface": "degC",
+            "gradient": "degC/km",
+            "cooling": "1",
+            "response": "s",
+            "sensor_rate": "Hz",
+        },
     ),
     "rotation": (
         environment.rotation,
-        {"stick_slip": "1", "period": "s", "inclination": "deg", "toolface": "deg", "sensor_rate": "Hz"},
+        {
+            "stick_slip": "1",
+            "period": "s",
+            "inclination": "deg",
+            "toolface": "deg",
+            "sensor_rate": "Hz",
+        },
     ),
     "supply": (environment.supply, {"full": "V", "empty": "V", "life": "s", "sensor_rate": "Hz"}),
     "light_power": (environment.light_power, {"power": "W", "loss": "dB", "sensor_rate": "Hz"}),
     "gaps": (losses.gaps, {}),
-    "losses": (losses.losses, {"per_hour": "1", "mean": "s", "bursts_per_hour": "1", "burst": "s", "within": "1"}),
+    "losses": (
+        losses.losses,
+        {"per_hour": "1", "mean": "s", "bursts_per_hour": "1", "burst": "s", "within": "1"},
+    ),
     "power_cuts": (losses.power_cuts, {"per_day": "1", "mean": "s"}),
 }
 _GIVEN = ("duration", "start")  # by the log, not by the table of a profile
@@ -93,9 +115,10 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     Parameters
     ----------
     model : path-like or mapping
-        The file, or its tables ``log``, ``noise``, ``environment`` and ``effect`` as in ``docs/simulate.md``. Numbers are in the
-        units of the coefficients (Q [urad], N [deg/sqrt(h)], B [deg/h], K [deg/h^1.5], R [deg/h^2]) and of the parameters of the
-        effects; text carries a unit of its own.
+        The file, or its tables ``log``, ``noise``, ``environment`` and ``effect`` as in
+        ``docs/simulate.md``. Numbers are in the units of the coefficients (Q [urad], N
+        [deg/sqrt(h)], B [deg/h], K [deg/h^1.5], R [deg/h^2]) and of the parameters of the effects;
+        text carries a unit of its own.
 
     Returns
     -------
@@ -107,7 +130,8 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     FormatError
         When the file is not TOML or cannot be read.
     OptionError
-        When a name, a parameter or a unit is unknown or missing; the message names it and lists what exists.
+        When a name, a parameter or a unit is unknown or missing; the message names it and lists
+        what exists.
 
     Examples
     --------
@@ -132,14 +156,24 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
                 f"{where}: there is no section {key!r}{close_to(key, known)}; there are [log], [noise], [[effect]], [[environment]]"
             )
         if not isinstance(table, list if key in ("effect", "environment") else Mapping):
-            raise OptionError(f"{where}: write {key} as {'[[' + key + ']]' if key in ('effect', 'environment') else '[' + key + ']'}")
+            raise OptionError(
+                f"{where}: write {key} as {'[[' + key + ']]' if key in ('effect', 'environment') else '[' + key + ']'}"
+            )
     for key in ("effect", "environment"):
         for number, table in enumerate(tables.get(key, []), start=1):
             if not isinstance(table, Mapping):
-                raise OptionError(f"{where}: {key} {number} is {table!r}, not a table; write [[{key}]] and its parameters below")
+                raise OptionError(
+                    f"{where}: {key} {number} is {table!r}, not a table; write [[{key}]] and its parameters below"
+                )
     noise, band = _noise(tables.get("noise", {}), where)
-    effects = [make_effect(table, where=f"{where}, effect {number}") for number, table in enumerate(tables.get("effect", []), start=1)]
-    profiles = [_profile(table, f"{where}, environment {number}") for number, table in enumerate(tables.get("environment", []), start=1)]
+    effects = [
+        make_effect(table, where=f"{where}, effect {number}")
+        for number, table in enumerate(tables.get("effect", []), start=1)
+    ]
+    profiles = [
+        _profile(table, f"{where}, environment {number}")
+        for number, table in enumerate(tables.get("environment", []), start=1)
+    ]
     log = _log(tables.get("log", {}), where)
     axes = tuple(log.pop("axes", ())) or _axes(noise, effects)
     found = Model(axes, noise, band, tuple(effects), tuple(profiles), log, source=where, text=text)
@@ -147,17 +181,28 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     return found
 
 
-def _noise(table: Mapping[str, Any], where: str) -> tuple[dict[str, dict[str, float]], tuple[float, float]]:
+def _noise(
+    table: Mapping[str, Any], where: str
+) -> tuple[dict[str, dict[str, float]], tuple[float, float]]:
     noise: dict[str, dict[str, float]] = {}
     band = (FLICKER_LOW, math.inf)
     for key, value in table.items():
         if key == "flicker_band":
             edges = amount(value, "Hz", f"{where}: flicker_band")
-            if not (isinstance(edges, list) and len(edges) == 2 and all(isinstance(edge, int | float) for edge in edges)):
-                raise OptionError(f"{where}: flicker_band is {value!r}; write [lowest, highest] frequency in Hz")
+            if not (
+                isinstance(edges, list)
+                and len(edges) == 2
+                and all(isinstance(edge, int | float) for edge in edges)
+            ):
+                raise OptionError(
+                    f"{where}: flicker_band is {value!r}; write [lowest, highest] frequency in Hz"
+                )
             band = (float(edges[0]), float(edges[1]))
         elif isinstance(value, Mapping):
-            noise[key] = {term: _coefficient(term, number, f"{where}, [noise.{key}]") for term, number in value.items()}
+            noise[key] = {
+                term: _coefficient(term, number, f"{where}, [noise.{key}]")
+                for term, number in value.items()
+            }
         else:
             noise.setdefault("", {})[key] = _coefficient(key, value, f"{where}, [noise]")
     return noise, band
@@ -166,10 +211,19 @@ def _noise(table: Mapping[str, Any], where: str) -> tuple[dict[str, dict[str, fl
 def _coefficient(term: str, value: Any, where: str) -> float:
     if term not in LAWS:
         listed = ", ".join(f"{symbol} [{law.label}]" for symbol, law in LAWS.items())
-        raise OptionError(f"{where}: there is no noise term {term!r}; there are {listed}, and flicker_band in [noise]")
+        raise OptionError(
+            f"{where}: there is no noise term {term!r}; there are {listed}, and flicker_band in [noise]"
+        )
     number = amount(value, LAWS[term].label, f"{where}: {term}")
-    if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number) or (number < 0 and term != "R"):
-        raise OptionError(f"{where}: {term} = {value!r} is not a number from 0 up; give one in {LAWS[term].label}")
+    if (
+        isinstance(number, bool)
+        or not isinstance(number, int | float)
+        or not math.isfinite(number)
+        or (number < 0 and term != "R")
+    ):
+        raise OptionError(
+            f"{where}: {term} = {value!r} is not a number from 0 up; give one in {LAWS[term].label}"
+        )
     return float(number)
 
 
@@ -177,11 +231,23 @@ def _log(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in table.items():
         if key not in _LOG:
-            raise OptionError(f"{where}, [log]: there is no {key!r}{close_to(key, _LOG)}; there are {', '.join(_LOG)}")
-        found[key] = amount(value, {"rate": "Hz", "duration": "s"}[key], f"{where}: {key}") if key in ("rate", "duration") else value
+            raise OptionError(
+                f"{where}, [log]: there is no {key!r}{close_to(key, _LOG)}; there are {', '.join(_LOG)}"
+            )
+        found[key] = (
+            amount(value, {"rate": "Hz", "duration": "s"}[key], f"{where}: {key}")
+            if key in ("rate", "duration")
+            else value
+        )
     for key in ("seed", "oversampling"):
-        if key in found and (not isinstance(found[key], int) or isinstance(found[key], bool) or found[key] < (key == "oversampling")):
-            raise OptionError(f"{where}, [log]: {key} = {found[key]!r} is not a whole number {'above 0' if key != 'seed' else 'from 0 up'}")
+        if key in found and (
+            not isinstance(found[key], int)
+            or isinstance(found[key], bool)
+            or found[key] < (key == "oversampling")
+        ):
+            raise OptionError(
+                f"{where}, [log]: {key} = {found[key]!r} is not a whole number {'above 0' if key != 'seed' else 'from 0 up'}"
+            )
     axes = found.get("axes", ["x"])
     if (
         not isinstance(axes, list | tuple)
@@ -189,9 +255,13 @@ def _log(table: Mapping[str, Any], where: str) -> dict[str, Any]:
         or not all(isinstance(axis, str) and axis for axis in axes)
         or len(set(axes)) < len(axes)
     ):
-        raise OptionError(f'{where}, [log]: axes = {axes!r} is not a list of different names; write for instance axes = ["x", "y", "z"]')
+        raise OptionError(
+            f'{where}, [log]: axes = {axes!r} is not a list of different names; write for instance axes = ["x", "y", "z"]'
+        )
     if found.get("oversampling", 1) > 1000:
-        raise OptionError(f"{where}, [log]: oversampling = {found['oversampling']!r} is more than 1000")
+        raise OptionError(
+            f"{where}, [log]: oversampling = {found['oversampling']!r} is more than 1000"
+        )
     if "start" in found:
         found["start"] = str(found["start"])
     return found
@@ -210,31 +280,60 @@ def _check_axes(model: Model) -> None:
     for effect in model.effects:
         strange = [axis for axis in effect.axes if axis not in model.axes]
         if strange:
-            raise OptionError(f"{model.source}: effect {effect.name!r}: the log has no axis {strange[0]!r}; it has {', '.join(model.axes)}")
+            raise OptionError(
+                f"{model.source}: effect {effect.name!r}: the log has no axis {strange[0]!r}; it has {', '.join(model.axes)}"
+            )
 
 
 def _profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[str, Any]]:
     name = table.get("profile")
     if not isinstance(name, str) or name not in PROFILES:
-        what = "an environment has no profile" if name is None else f"there is no profile {name!r}{close_to(name, list(PROFILES))}"
+        what = (
+            "an environment has no profile"
+            if name is None
+            else f"there is no profile {name!r}{close_to(name, list(PROFILES))}"
+        )
         raise OptionError(f"{where}: {what}; there are {', '.join(PROFILES)}")
     function, units = PROFILES[str(name)]
-    arguments = {key: item for key, item in inspect.signature(function).parameters.items() if key not in _GIVEN}
+    arguments = {
+        key: item
+        for key, item in inspect.signature(function).parameters.items()
+        if key not in _GIVEN
+    }
     values = {key: value for key, value in table.items() if key != "profile"}
     for key in values:
         if key not in arguments:
-            listed = ", ".join(f"{item} [{units[item]}]" if item in units else item for item in arguments)
-            raise OptionError(f"{where}: profile {name!r} has no parameter {key!r}{close_to(key, list(arguments))}; it has {listed}")
+            listed = ", ".join(
+                f"{item} [{units[item]}]" if item in units else item for item in arguments
+            )
+            raise OptionError(
+                f"{where}: profile {name!r} has no parameter {key!r}{close_to(key, list(arguments))}; it has {listed}"
+            )
     for key, item in arguments.items():
         if item.default is inspect.Parameter.empty and key not in values:
-            raise OptionError(f"{where}: profile {name!r} lacks {key!r}; see gyrostab.simulate.environment.{name} for what it holds")
+            raise OptionError(
+                f"{where}: profile {name!r} lacks {key!r}; see gyrostab.simulate.environment.{name} for what it holds"
+            )
     for key, value in values.items():
-        kind, what = (str, "text") if key in _WORDS else (list | tuple, "a list") if key in _LISTS else (object, "")
+        kind, what = (
+            (str, "text")
+            if key in _WORDS
+            else (list | tuple, "a list")
+            if key in _LISTS
+            else (object, "")
+        )
         if not isinstance(value, kind) or value == "":
             raise OptionError(f"{where}: {key} = {value!r} is not {what or 'a value'}")
-    converted = {key: amount(value, units[key], f"{where}: {key}") if key in units else value for key, value in values.items()}
+    converted = {
+        key: amount(value, units[key], f"{where}: {key}") if key in units else value
+        for key, value in values.items()
+    }
     for key, unit in units.items():
         number = converted.get(key, 0.0)
-        if key != "band" and (isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number)):
+        if key != "band" and (
+            isinstance(number, bool)
+            or not isinstance(number, int | float)
+            or not math.isfinite(number)
+        ):
             raise OptionError(f"{where}: {key} = {number!r} is not a number; give one in {unit}")
     return str(name), converted

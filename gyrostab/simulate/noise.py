@@ -1,7 +1,8 @@
 """Noise of a gyro axis: Q, N, B, K, R of the noise table, and Gauss-Markov and sinusoidal parts.
 
-Every term of every axis has a stream of random numbers of its own, which depends on the seed, the axis and the term and on nothing else. So
-a term stays the same whatever the other terms, the effects, the length and the chunks are.
+Every term of every axis has a stream of random numbers of its own, which depends on the seed, the
+axis and the term and on nothing else. So a term stays the same whatever the other terms, the
+effects, the length and the chunks are.
 """
 
 from __future__ import annotations
@@ -26,10 +27,20 @@ from gyrostab.kernels.random.stochastic import (
 )
 from gyrostab.noise import HOUR, TERMS, URAD_PER_S
 
-__all__ = ["FLICKER_LOW", "NoiseState", "Units", "begin_noise", "draw", "make_noise", "shape", "stream"]
+__all__ = [
+    "FLICKER_LOW",
+    "NoiseState",
+    "Units",
+    "begin_noise",
+    "draw",
+    "make_noise",
+    "shape",
+    "stream",
+]
 
 Array = NDArray[np.float64]
-#: Lowest frequency of flicker noise [Hz] unless a model says otherwise: flat within 0.2 % to averaging times of 20 h.
+#: Lowest frequency of flicker noise [Hz] unless a model says otherwise: flat within 0.2 % to
+#: averaging times of 20 h.
 FLICKER_LOW = 5e-9
 #: Samples of a block.
 CHUNK = 2**18
@@ -66,7 +77,12 @@ class Units:
 
 
 def begin_noise(
-    seed: int, axis: str, *, rate: float, terms: str = "QNBK", flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf)
+    seed: int,
+    axis: str,
+    *,
+    rate: float,
+    terms: str = "QNBK",
+    flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf),
 ) -> NoiseState:
     """State of the noise of one axis before its first sample.
 
@@ -90,8 +106,12 @@ def begin_noise(
             f"the band of flicker noise {low:g} to {high:g} Hz is empty; give the lower frequency, above 0, and the higher one"
         )
     times = flicker_times(rate, low=low, high=high)
-    position = streams["B"].standard_normal(64)[: times.size] if "B" in streams else np.zeros(times.size)
-    state = NoiseState(rate=rate, streams=streams, times=times, endless=math.isinf(high), flicker=position)
+    position = (
+        streams["B"].standard_normal(64)[: times.size] if "B" in streams else np.zeros(times.size)
+    )
+    state = NoiseState(
+        rate=rate, streams=streams, times=times, endless=math.isinf(high), flicker=position
+    )
     if "Q" in streams:
         state.angle = float(_uniform(streams["Q"], 1)[0])
     return state
@@ -126,12 +146,19 @@ def _flicker(state: NoiseState, rng: np.random.Generator, size: int) -> Array:
     for first in range(0, size, _PIECE):
         part = means[first : first + _PIECE]
         normal = rng.standard_normal((part.size, state.times.size + 1))
-        part[:], state.flicker = flicker_means(normal, state.times, state.rate, state.flicker, endless=state.endless)
+        part[:], state.flicker = flicker_means(
+            normal, state.times, state.rate, state.flicker, endless=state.endless
+        )
     return means
 
 
 def shape(
-    units: Units, level: Mapping[str, Any], rate: float, carry: Mapping[str, float], *, ramp: float = 0.0
+    units: Units,
+    level: Mapping[str, Any],
+    rate: float,
+    carry: Mapping[str, float],
+    *,
+    ramp: float = 0.0,
 ) -> tuple[Array, dict[str, float]]:
     """Give the numbers their level.
 
@@ -155,7 +182,9 @@ def shape(
     carry : dict
         To be given to the next call.
     """
-    total: Array = np.asarray(ramp * (units.first + 0.5 + np.arange(units.size)) / (HOUR * rate), dtype=np.float64)
+    total: Array = np.asarray(
+        ramp * (units.first + 0.5 + np.arange(units.size)) / (HOUR * rate), dtype=np.float64
+    )
     after = dict(carry)
     for term, values in units.values.items():
         strength = np.sqrt(np.broadcast_to(level[term], units.size))
@@ -184,7 +213,9 @@ class _Parts:
     sinusoid: tuple[float, float, float] | None
 
 
-def _more(parts: _Parts, state: tuple[Any, ...], first: int, size: int) -> tuple[Array, tuple[Any, ...]]:
+def _more(
+    parts: _Parts, state: tuple[Any, ...], first: int, size: int
+) -> tuple[Array, tuple[Any, ...]]:
     """The next `size` samples."""
     noise, carry, rng, position = copy.deepcopy(state)
     units, noise = draw(noise, first, size)
@@ -192,7 +223,9 @@ def _more(parts: _Parts, state: tuple[Any, ...], first: int, size: int) -> tuple
     total, carry = shape(units, level, parts.rate, carry, ramp=parts.coefficients.get("R", 0.0))
     if parts.markov:
         sigma, time = parts.markov
-        means, position = ornstein_uhlenbeck_means(rng.standard_normal((size, 2)), time * parts.rate, position)
+        means, position = ornstein_uhlenbeck_means(
+            rng.standard_normal((size, 2)), time * parts.rate, position
+        )
         total += sigma * means
     if parts.sinusoid:
         amplitude, frequency, phase = parts.sinusoid
@@ -219,8 +252,9 @@ def make_noise(
 ) -> Any:
     """Make the noise of one gyro axis; each sample is the mean rate over its own interval.
 
-    The Allan variance is exactly that of the noise table at every averaging time: quantization noise is white in the angle, random walk and
-    Gauss-Markov noise are continuous processes averaged over each sample, flicker noise is a sum of such processes.
+    The Allan variance is exactly that of the noise table at every averaging time: quantization
+    noise is white in the angle, random walk and Gauss-Markov noise are continuous processes
+    averaged over each sample, flicker noise is a sum of such processes.
 
     Parameters
     ----------
@@ -265,7 +299,9 @@ def make_noise(
     for name, value in {"rate": rate, "size": size, "chunk": chunk, **coefficients}.items():
         least = 0.0 if name in TERMS else 1e-9
         if not (math.isfinite(value) and (value >= least or name == "R")):
-            raise OptionError(f"{name}={value!r}: give a number {'from 0 up' if name in TERMS else 'above 0'}")
+            raise OptionError(
+                f"{name}={value!r}: give a number {'from 0 up' if name in TERMS else 'above 0'}"
+            )
     terms = "".join(term for term in "QNBK" if coefficients[term] > 0.0)
     noise = begin_noise(seed, axis, rate=rate, terms=terms, flicker_band=flicker_band)
     rng = stream(seed, "noise", axis, "gauss_markov")

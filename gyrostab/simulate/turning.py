@@ -28,12 +28,16 @@ def _turn(table: Array, stick_slip: float, period: float) -> tuple[Any, Any]:
     omega = 2.0 * math.pi / period
 
     def pieces(t: Array) -> tuple[Array, NDArray[np.int64]]:
-        return np.clip(t, times[0], times[-1]), np.clip(np.searchsorted(times, t, side="right") - 1, 0, slope.size - 1)
+        return np.clip(t, times[0], times[-1]), np.clip(
+            np.searchsorted(times, t, side="right") - 1, 0, slope.size - 1
+        )
 
     def rate(t: Array) -> Array:
         return np.asarray(np.interp(t, times, rates) * (1.0 - stick_slip * np.cos(omega * t)))
 
-    def swing(t: Array, base: Array, rise: Array) -> Array:  # integral of base(t) cos(omega t), base rising by `rise`
+    def swing(
+        t: Array, base: Array, rise: Array
+    ) -> Array:  # integral of base(t) cos(omega t), base rising by `rise`
         return np.asarray(base * np.sin(omega * t) / omega + rise * np.cos(omega * t) / omega**2)
 
     # the oscillating part of the angle, up to the beginning of each piece
@@ -71,9 +75,11 @@ def rotation(
     Parameters
     ----------
     points : list of (time, rate)
-        Rotation rate [deg/s], straight between the times [s]: one point for steady rotation, two for a ramp. 120 r/min are 720 deg/s.
+        Rotation rate [deg/s], straight between the times [s]: one point for steady rotation, two
+        for a ramp. 120 r/min are 720 deg/s.
     stick_slip : float
-        Amplitude of the torsional oscillation as a share of the rate; at 1 the tool stands still once in a period [1].
+        Amplitude of the torsional oscillation as a share of the rate; at 1 the tool stands still
+        once in a period [1].
     period : str or float
         Period of the oscillation [s]; 2 to 10 s in wells.
     inclination : float
@@ -81,7 +87,8 @@ def rotation(
     toolface : float
         Toolface at the start [deg].
     axis : str
-        Gyro axis along the tool's axis, which feels this rotation; empty when the log shall not hold it.
+        Gyro axis along the tool's axis, which feels this rotation; empty when the log shall not
+        hold it.
     accelerations : bool
         Whether to give ``accel_x``, ``accel_y``, ``accel_z``.
     sensor_rate : float
@@ -92,8 +99,9 @@ def rotation(
     Returns
     -------
     xarray.Dataset
-        ``rotation_rate`` [degree s-1], ``toolface`` [degree, 0 to 360], and what accelerometers at rest in the tool read [g]: z points
-        down the hole, x to the high side at toolface 0, and the tool turns clockwise looking down.
+        ``rotation_rate`` [degree s-1], ``toolface`` [degree, 0 to 360], and what accelerometers at
+        rest in the tool read [g]: z points down the hole, x to the high side at toolface 0, and the
+        tool turns clockwise looking down.
 
     Examples
     --------
@@ -121,4 +129,9 @@ def rotation(
             "accel_z": ("g", lambda t: np.full(t.shape, -math.cos(tilt)), {}),
         }
     timing: dict[str, Any] = {"duration": duration, "start": start, "sensor_rate": sensor_rate}
-    return combine(*(channel(name, unit, values, attributes=more, **timing) for name, (unit, values, more) in made.items()))
+    return combine(
+        *(
+            channel(name, unit, values, attributes=more, **timing)
+            for name, (unit, values, more) in made.items()
+        )
+    )

@@ -1,7 +1,8 @@
 """The working store: how the long variables of a log lie on disk in chunks, and how they are read back lazily.
 
-One chunk holds about 20 minutes of one axis. What a source delivered as integers is kept as integers with their factor, if that
-gives back the same doubles. A chunk that is missing or damaged becomes a gap, and a warning says where; never does it in silence.
+One chunk holds about 20 minutes of one axis. What a source delivered as integers is kept as
+integers with their factor, if that gives back the same doubles. A chunk that is missing or damaged
+becomes a gap, and a warning says where; never does it in silence.
 """
 
 from gyrostab.store.deflate import append_deflated, large_variables
@@ -9,7 +10,16 @@ from gyrostab.store.layout import stored_attribute
 from gyrostab.store.lock import library_lock
 from gyrostab.store.named import name_file
 from gyrostab.store.read import open_stored
-from gyrostab.store.write import Misfit, Progress, append_netcdf, append_zarr, as_counts, chunk_samples, common_packing, long_variables
+from gyrostab.store.write import (
+    Misfit,
+    Progress,
+    append_netcdf,
+    append_zarr,
+    as_counts,
+    chunk_samples,
+    common_packing,
+    long_variables,
+)
 
 __all__ = [
     "Misfit",

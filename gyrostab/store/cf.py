@@ -2,7 +2,8 @@
 
 References
 ----------
-CF conventions 1.11, sections 2.5.1 (missing data), 3.1 (units), 4.4 (time), 6.1 (labels), 7.1 (bounds); ACDD 1.3.
+CF conventions 1.11, sections 2.5.1 (missing data), 3.1 (units), 4.4 (time), 6.1 (labels), 7.1
+(bounds); ACDD 1.3.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ _CALENDAR = {"calendar": "proleptic_gregorian", "units_metadata": "leap_seconds:
 PACKING = ("dtype", "scale_factor", "add_offset")
 _JSON_NAMES = "json_attributes"
 
-# Names that UDUNITS reads as we mean them. A whole power may follow; a broken one is misread without a word, so it never passes.
+# Names that UDUNITS reads as we mean them. A whole power may follow; a broken one is misread
+# without a word, so it never passes.
 _NAMES = "degree_Celsius|standard_free_fall|degree|hour|microradian|radian|s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
 _SAFE_UNIT = re.compile(rf"(?:{_NAMES})(?:-?[1-9])?(?: (?:{_NAMES})(?:-?[1-9])?)*")
 
@@ -64,14 +66,25 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
     dataset = store_names(dataset)
     grids = _grids(dataset)
     divisor = 1000 if _whole_microseconds(dataset, grids) else 1
-    since = {"units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}", **_CALENDAR}
-    bounds = [str(variable.attrs["bounds"]) for variable in dataset.variables.values() if "bounds" in variable.attrs]
+    since = {
+        "units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}",
+        **_CALENDAR,
+    }
+    bounds = [
+        str(variable.attrs["bounds"])
+        for variable in dataset.variables.values()
+        if "bounds" in variable.attrs
+    ]
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
         if name in grids:
             variables[f"{name}_start"] = _first_stamp(grids[name], variable.attrs, divisor, since)
             continue
-        stored = transposed(_lazy(variable), _disk_order(variable.dims)) if name not in dataset.dims else variable
+        stored = (
+            transposed(_lazy(variable), _disk_order(variable.dims))
+            if name not in dataset.dims
+            else variable
+        )
         attrs = _attributes_to_disk({"long_name": str(name).replace("_", " "), **variable.attrs})
         data = stored.data if name not in dataset.dims else None
         if variable.dtype.kind == "M":
@@ -83,12 +96,20 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
         elif data is None:
             data = variable.values
         packing = (
-            {key: variable.encoding[key] for key in PACKING if key in variable.encoding} if "scale_factor" in variable.encoding else {}
+            {key: variable.encoding[key] for key in PACKING if key in variable.encoding}
+            if "scale_factor" in variable.encoding
+            else {}
         )
         variables[name] = xr.Variable(stored.dims, data, {} if name in bounds else attrs, packing)
-    coords = {name: variables.pop(name) for name in list(dataset.coords) if name not in bounds and name in variables}
+    coords = {
+        name: variables.pop(name)
+        for name in list(dataset.coords)
+        if name not in bounds and name in variables
+    }
     stored_set = xr.Dataset(variables, coords=xr.Coordinates(coords, indexes={}))
-    stored_set = stored_set.rename_dims({dim: index_dim(dim) for dim in grids if dim in stored_set.dims})
+    stored_set = stored_set.rename_dims(
+        {dim: index_dim(dim) for dim in grids if dim in stored_set.dims}
+    )
     if "avar" in variables:
         beside = [name for name in ("count", "coverage", "edf", "estimator") if name in variables]
         stored_set["avar"].attrs["ancillary_variables"] = " ".join(beside)
@@ -98,20 +119,37 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
 
 def _disk_order(dims: tuple[Any, ...]) -> list[Any]:
     last = [dim for dim in ("time", "bnds") if dim in dims]
-    return [dim for dim in _ORDER if dim in dims] + [dim for dim in dims if dim not in (*_ORDER, *last)] + last
+    return (
+        [dim for dim in _ORDER if dim in dims]
+        + [dim for dim in dims if dim not in (*_ORDER, *last)]
+        + last
+    )
 
 
 def _lazy(variable: xr.Variable) -> xr.Variable:
     """Turn a variable that still sits in another file into a dask array, so that it is copied chunk by chunk."""
-    return variable if variable._in_memory or variable.chunks is not None else variable.chunk("auto")
+    return (
+        variable if variable._in_memory or variable.chunks is not None else variable.chunk("auto")
+    )
 
 
 def _grids(dataset: xr.Dataset) -> dict[Any, Any]:
     """The rules of the time axes that are computed."""
-    grids = {name: index.transform for name, index in dataset.xindexes.items() if isinstance(index, TimeGridIndex)}
-    taken = [other for name in grids for other in (f"{name}_start", index_dim(name)) if other in dataset.variables]
+    grids = {
+        name: index.transform
+        for name, index in dataset.xindexes.items()
+        if isinstance(index, TimeGridIndex)
+    }
+    taken = [
+        other
+        for name in grids
+        for other in (f"{name}_start", index_dim(name))
+        if other in dataset.variables
+    ]
     if taken:
-        raise SchemaError(f"the name {taken[0]!r} is needed for the time axis; rename that variable")
+        raise SchemaError(
+            f"the name {taken[0]!r} is needed for the time axis; rename that variable"
+        )
     return grids
 
 
@@ -120,10 +158,19 @@ def index_dim(dim: Any) -> str:
     return f"{dim}_index"
 
 
-def _first_stamp(grid: Any, attrs: dict[Any, Any], divisor: int, since: dict[str, Any]) -> xr.Variable:
+def _first_stamp(
+    grid: Any, attrs: dict[Any, Any], divisor: int, since: dict[str, Any]
+) -> xr.Variable:
     """What stands in the file for a computed time axis: its first stamp, with the rate and the exact rule as attributes."""
     (dim,) = grid.dims
-    rule = {"dim": dim, "start_ns": grid.start, "rate_hz": grid.rate, "first": grid.first, "stride": grid.stride, "size": grid.size}
+    rule = {
+        "dim": dim,
+        "start_ns": grid.start,
+        "rate_hz": grid.rate,
+        "first": grid.first,
+        "stride": grid.stride,
+        "size": grid.size,
+    }
     first = int(grid_times(grid.start, grid.rate, grid.first))
     said = {
         "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
@@ -155,7 +202,9 @@ def _stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.int64]
     """Whole microseconds or nanoseconds since 1970."""
     stamps = variable.values
     if np.isnat(stamps).any():
-        raise SchemaError(f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); every time must be known")
+        raise SchemaError(
+            f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); every time must be known"
+        )
     return _nanoseconds(stamps) // divisor
 
 
@@ -171,10 +220,14 @@ def _attributes_to_disk(attrs: dict[str, Any]) -> dict[str, Any]:
     for name, value in attrs.items():
         if isinstance(value, np.generic):
             attrs[name] = value = value.item()
-        if isinstance(value, str) or (isinstance(value, int | float) and not isinstance(value, bool)):
+        if isinstance(value, str) or (
+            isinstance(value, int | float) and not isinstance(value, bool)
+        ):
             continue
         if not isinstance(value, np.ndarray):
-            attrs[name] = json.dumps(value, default=str)  # in ASCII: Octave lists no file that has any other global attribute
+            attrs[name] = json.dumps(
+                value, default=str
+            )  # in ASCII: Octave lists no file that has any other global attribute
             coded.append(name)
     if coded:
         attrs[_JSON_NAMES] = " ".join(coded)
@@ -190,25 +243,44 @@ def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, A
     given = dict(dataset.attrs)
     history = given.get("history", "")
     lines = [history] if isinstance(history, str) else [str(line) for line in history]
-    given["history"] = "\n".join([*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"])
-    if given.get("title") in (None, *TITLES.values()):  # a title of ours may stem from an earlier stage
+    given["history"] = "\n".join(
+        [*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"]
+    )
+    if given.get("title") in (
+        None,
+        *TITLES.values(),
+    ):  # a title of ours may stem from an earlier stage
         given["title"] = TITLES[kind]
     names = texts(dataset, "source_files")
     source = "gyro log: " + ", ".join(names) if names else "gyro log"
     given.setdefault("source", source.encode("ascii", "backslashreplace").decode())
-    given |= {"Conventions": CONVENTIONS, "date_created": now, "gyrostab_version": version, "gyrostab_content": kind}
-    given.setdefault("references", "IEEE Std 952; Wang et al., Sensors 16 (2016) 2081 (dynamic Allan variance of gyros with missing data)")
+    given |= {
+        "Conventions": CONVENTIONS,
+        "date_created": now,
+        "gyrostab_version": version,
+        "gyrostab_content": kind,
+    }
+    given.setdefault(
+        "references",
+        "IEEE Std 952; Wang et al., Sensors 16 (2016) 2081 (dynamic Allan variance of gyros with missing data)",
+    )
     times = dataset.get("time")
     if times is not None and times.dtype.kind == "M" and times.size:
         for end, position in (("start", 0), ("end", -1)):
-            stamp = np.asarray(times[position].values).ravel()[0]  # one dimension where the axis is computed
+            stamp = np.asarray(times[position].values).ravel()[
+                0
+            ]  # one dimension where the axis is computed
             given[f"time_coverage_{end}"] = f"{stamp.astype('datetime64[us]')}Z"
     return _attributes_to_disk(given)
 
 
 def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     """Turn what was opened without decoding times and without indexes into the dataset it was in memory; `where` is for messages."""
-    bounds = {variable.attrs["bounds"]: name for name, variable in stored.variables.items() if "bounds" in variable.attrs}
+    bounds = {
+        variable.attrs["bounds"]: name
+        for name, variable in stored.variables.items()
+        if "bounds" in variable.attrs
+    }
     variables: dict[Any, xr.Variable] = {}
     grids = declared_grids(stored, where)
     axes, close = _axes(stored, grids, where), stored._close
@@ -226,13 +298,25 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
         opened.attrs = _attributes_from_disk(dict(opened.attrs))
         opened.dims = tuple(dims.get(dim, dim) for dim in opened.dims)
         variables[name] = opened.transpose(*_memory_order(opened.dims))
-    beside = xr.Coordinates({name: variables.pop(name) for name in list(variables) if name in stored.coords or name in bounds})
+    beside = xr.Coordinates(
+        {
+            name: variables.pop(name)
+            for name in list(variables)
+            if name in stored.coords or name in bounds
+        }
+    )
     coords, indexes = dict(beside.variables), dict(beside.xindexes)
     for name, axis in axes.items():
         coords |= axis.variables
         indexes |= axis.xindexes
-        coords[grids[name]["dim"]].attrs = json.loads(stored.variables[name].attrs.get("axis_attributes", "{}"))
-    dataset = xr.Dataset(variables, xr.Coordinates(coords, indexes=indexes), _attributes_from_disk(dict(stored.attrs)))
+        coords[grids[name]["dim"]].attrs = json.loads(
+            stored.variables[name].attrs.get("axis_attributes", "{}")
+        )
+    dataset = xr.Dataset(
+        variables,
+        xr.Coordinates(coords, indexes=indexes),
+        _attributes_from_disk(dict(stored.attrs)),
+    )
     dataset = restore_names(dataset)
     dataset.set_close(close)
     return dataset
@@ -240,7 +324,9 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
 
 def _memory_order(dims: tuple[Any, ...]) -> list[Any]:
     last = [dim for dim in ("tau", "term", "bnds") if dim in dims]
-    return sorted((dim for dim in dims if dim not in last), key=lambda dim: bool(dim != "axis")) + last
+    return (
+        sorted((dim for dim in dims if dim not in last), key=lambda dim: bool(dim != "axis")) + last
+    )
 
 
 def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) -> xr.Variable:
@@ -248,42 +334,84 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
     attrs = variable.attrs if attrs is None else attrs
     if " since " not in str(attrs.get("units", "")):
         return variable
-    step = {f"microseconds since {_EPOCH}": 1000, f"nanoseconds since {_EPOCH}": 1}.get(attrs["units"])
-    if step and variable.dtype.kind == "i":  # as we write them; xarray comes to the same, but takes its time
-        rest = {key: value for key, value in variable.attrs.items() if key not in ("units", "calendar")}
-        return xr.Variable(variable.dims, (np.asarray(variable.values, dtype=np.int64) * step).view("datetime64[ns]"), rest)
+    step = {f"microseconds since {_EPOCH}": 1000, f"nanoseconds since {_EPOCH}": 1}.get(
+        attrs["units"]
+    )
+    if (
+        step and variable.dtype.kind == "i"
+    ):  # as we write them; xarray comes to the same, but takes its time
+        rest = {
+            key: value for key, value in variable.attrs.items() if key not in ("units", "calendar")
+        }
+        return xr.Variable(
+            variable.dims,
+            (np.asarray(variable.values, dtype=np.int64) * step).view("datetime64[ns]"),
+            rest,
+        )
     timed = variable.copy(deep=False)
-    timed.attrs = {**variable.attrs, "units": attrs["units"], "calendar": attrs.get("calendar", "standard")}
+    timed.attrs = {
+        **variable.attrs,
+        "units": attrs["units"],
+        "calendar": attrs.get("calendar", "standard"),
+    }
     decoded: xr.Variable = xr.conventions.decode_cf_variable("time", timed).load()
     return decoded.astype("datetime64[ns]")
 
 
 def declared_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, Any]]:
     """The rules of the computed time axes that a file declares: name of the variable -> rule; `where` is for messages."""
-    declared = {str(name): variable.attrs[GRID] for name, variable in stored.variables.items() if GRID in variable.attrs}
+    declared = {
+        str(name): variable.attrs[GRID]
+        for name, variable in stored.variables.items()
+        if GRID in variable.attrs
+    }
     try:
         return {name: _parse_grid(text) for name, text in declared.items()}
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{where}: the rule of its time axis, attribute {GRID!r}, is damaged ({error}); copy it again") from error
+        raise FormatError(
+            f"{where}: the rule of its time axis, attribute {GRID!r}, is damaged ({error}); copy it again"
+        ) from error
 
 
 def _parse_grid(text: Any) -> dict[str, Any]:
     """The rule of a time axis; `ValueError` when it is not one that `to_disk` writes."""
     rule = json.loads(text)
-    kinds = {"dim": str, "size": int, "start_ns": int, "first": int, "stride": int, "rate_hz": int | float}
-    wrong = [name for name, kind in kinds.items() if not isinstance(rule, dict) or not isinstance(rule.get(name), kind)]
+    kinds = {
+        "dim": str,
+        "size": int,
+        "start_ns": int,
+        "first": int,
+        "stride": int,
+        "rate_hz": int | float,
+    }
+    wrong = [
+        name
+        for name, kind in kinds.items()
+        if not isinstance(rule, dict) or not isinstance(rule.get(name), kind)
+    ]
     if wrong:
         raise ValueError(f"no {' and no '.join(wrong)}")
     first, last = (rule["first"] + rule["stride"] * n for n in (0, max(rule["size"], 1) - 1))
-    spans = (rule["start_ns"] + n * 1e9 / rule["rate_hz"] for n in (first, last)) if rule["rate_hz"] > 0 else ()
-    if not (rule["rate_hz"] > 0 and math.isfinite(rule["rate_hz"]) and rule["size"] >= 0 and rule["stride"] != 0):
+    spans = (
+        (rule["start_ns"] + n * 1e9 / rule["rate_hz"] for n in (first, last))
+        if rule["rate_hz"] > 0
+        else ()
+    )
+    if not (
+        rule["rate_hz"] > 0
+        and math.isfinite(rule["rate_hz"])
+        and rule["size"] >= 0
+        and rule["stride"] != 0
+    ):
         raise ValueError(f"{text}")
     if any(abs(stamp) >= 2.0**63 for stamp in spans):
         raise ValueError("it leaves the years 1678 to 2262")
     return dict(rule)
 
 
-def _axes(stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str) -> dict[str, xr.Coordinates]:
+def _axes(
+    stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str
+) -> dict[str, xr.Coordinates]:
     """The computed time axes: name of the variable that declares one -> coordinate."""
     axes = {}
     for name, rule in grids.items():
@@ -294,7 +422,14 @@ def _axes(stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str) -> d
                 f"{where}: has {size} samples on {index_dim(dim)!r}, but was written with {rule['size']}: some other program has cut it, "
                 "and its times are lost; cut it in Python with gyrostab.open_log(...).isel or .sel, and write it with gyrostab.to_netcdf"
             )
-        axes[name] = time_coordinate(rule["start_ns"], rule["rate_hz"], size, name=dim, first=rule["first"], stride=rule["stride"])
+        axes[name] = time_coordinate(
+            rule["start_ns"],
+            rule["rate_hz"],
+            size,
+            name=dim,
+            first=rule["first"],
+            stride=rule["stride"],
+        )
     return axes
 
 

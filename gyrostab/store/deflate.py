@@ -23,14 +23,28 @@ __all__ = ["append_deflated", "large_variables"]
 _LARGE = 2**15
 
 
-def large_variables(stored: xr.Dataset, encoding: Mapping[Any, Mapping[str, Any]]) -> dict[str, xr.Variable]:
+def large_variables(
+    stored: xr.Dataset, encoding: Mapping[Any, Mapping[str, Any]]
+) -> dict[str, xr.Variable]:
     """Variables of numbers that are large enough for `append_deflated`."""
-    data = {str(name): array.variable for name, array in stored.data_vars.items() if array.size >= _LARGE and array.dtype.kind in "if"}
-    return {name: variable for name, variable in data.items() if encoding[name].get("zlib") and "_FillValue" not in variable.attrs}
+    data = {
+        str(name): array.variable
+        for name, array in stored.data_vars.items()
+        if array.size >= _LARGE and array.dtype.kind in "if"
+    }
+    return {
+        name: variable
+        for name, variable in data.items()
+        if encoding[name].get("zlib") and "_FillValue" not in variable.attrs
+    }
 
 
 def append_deflated(
-    path: Path, large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]], *, progress: Progress | None = None
+    path: Path,
+    large: Mapping[str, xr.Variable],
+    encoding: Mapping[Any, Mapping[str, Any]],
+    *,
+    progress: Progress | None = None,
 ) -> None:
     """Add variables to a NetCDF file that holds the others, and their dimensions, already.
 
@@ -43,7 +57,8 @@ def append_deflated(
     large : mapping of str to xarray.Variable
         Of numbers, in memory or of dask; the latter are computed chunk by chunk.
     encoding : mapping
-        For each of them ``zlib``, ``complevel``, ``shuffle``, ``chunksizes`` and ``_FillValue``, as for xarray.
+        For each of them ``zlib``, ``complevel``, ``shuffle``, ``chunksizes`` and ``_FillValue``, as
+        for xarray.
     progress : callable, optional
         Told the share that is written.
     """
@@ -60,7 +75,11 @@ def append_deflated(
                 if dim not in file.dimensions:
                     file.createDimension(str(dim), size)
             made = file.createVariable(
-                name, variable.dtype, [str(dim) for dim in variable.dims], fill_value=options.pop("_FillValue"), **options
+                name,
+                variable.dtype,
+                [str(dim) for dim in variable.dims],
+                fill_value=options.pop("_FillValue"),
+                **options,
             )
             made.setncatts(variable.attrs)
     total, done = sum(variable.size for variable in large.values()), 0
@@ -83,11 +102,18 @@ def append_deflated(
 _Piece = tuple[str, tuple[int, ...]]
 
 
-def _pieces(large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]]) -> Iterator[_Piece]:
+def _pieces(
+    large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]]
+) -> Iterator[_Piece]:
     """Name and first place of every chunk."""
     for name, variable in large.items():
         steps = encoding[name]["chunksizes"]
-        yield from ((name, begin) for begin in product(*(range(0, size, step) for size, step in zip(variable.shape, steps, strict=True))))
+        yield from (
+            (name, begin)
+            for begin in product(
+                *(range(0, size, step) for size, step in zip(variable.shape, steps, strict=True))
+            )
+        )
 
 
 def _pack(
@@ -96,7 +122,9 @@ def _pack(
     """A chunk as it stands in the file, with its name, place and number of values."""
     name, begin = piece
     options = encoding[name]
-    place = tuple(slice(first, first + step) for first, step in zip(begin, options["chunksizes"], strict=True))
+    place = tuple(
+        slice(first, first + step) for first, step in zip(begin, options["chunksizes"], strict=True)
+    )
     values = read_part(large[name].data, place)
     fill = options["_FillValue"]
     chunk = np.full(options["chunksizes"], 0 if fill is None else fill, values.dtype)

@@ -11,9 +11,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Fill", "can_fill", "cut", "end_to_end", "fill_row", "held", "one_row", "stack_rows", "stretch", "with_fill"]
+__all__ = [
+    "Fill",
+    "can_fill",
+    "cut",
+    "end_to_end",
+    "fill_row",
+    "held",
+    "one_row",
+    "stack_rows",
+    "stretch",
+    "with_fill",
+]
 
-#: ``fill(row, begin, out)`` puts the samples of a row from `begin` on into `out`; the row of an array of one dimension is 0.
+#: ``fill(row, begin, out)`` puts the samples of a row from `begin` on into `out`; the row of an
+#: array of one dimension is 0.
 Fill = Callable[[int, int, NDArray[Any]], None]
 
 
@@ -63,7 +75,9 @@ def stretch(array: Any, begin: int, end: int) -> NDArray[Any]:
         return array[..., begin:end]
     if not can_fill(array):
         part = array[..., begin:end]
-        return np.asarray(part.compute(scheduler="synchronous") if hasattr(part, "compute") else part)
+        return np.asarray(
+            part.compute(scheduler="synchronous") if hasattr(part, "compute") else part
+        )
     out = np.empty((*array.shape[:-1], end - begin), array.dtype)
     for row, line in enumerate(out if array.ndim > 1 else [out]):
         fill_row(array, row, begin, line)
@@ -76,8 +90,14 @@ def held(array: NDArray[Any], chunk: int) -> Any:
 
     name, lead = f"gyrostab-held-{uuid.uuid4().hex}", array.ndim - 1
     begins = range(0, max(array.shape[-1], 1), chunk)
-    tasks = {(name, *(0,) * lead, number): array[..., begin : begin + chunk] for number, begin in enumerate(begins)}
-    chunks = (*((size,) for size in array.shape[:-1]), tuple(min(chunk, array.shape[-1] - begin) for begin in begins))
+    tasks = {
+        (name, *(0,) * lead, number): array[..., begin : begin + chunk]
+        for number, begin in enumerate(begins)
+    }
+    chunks = (
+        *((size,) for size in array.shape[:-1]),
+        tuple(min(chunk, array.shape[-1] - begin) for begin in begins),
+    )
     return with_fill(da.Array(tasks, name, chunks, dtype=array.dtype), partial(fill_row, array))
 
 
@@ -87,14 +107,18 @@ def end_to_end(columns: Sequence[Any], chunk: int) -> Any:
         return np.concatenate(columns)
     import dask.array as da
 
-    joined = da.concatenate([held(column, chunk) if isinstance(column, np.ndarray) else column for column in columns])
+    joined = da.concatenate(
+        [held(column, chunk) if isinstance(column, np.ndarray) else column for column in columns]
+    )
     if not all(can_fill(column) and column.dtype == joined.dtype for column in columns):
         return joined
     edges = np.cumsum([0, *(len(column) for column in columns)]).tolist()
     return with_fill(joined, partial(_fill_pieces, list(columns), edges))
 
 
-def _fill_pieces(columns: Sequence[Any], edges: Sequence[int], row: int, begin: int, out: NDArray[Any]) -> None:
+def _fill_pieces(
+    columns: Sequence[Any], edges: Sequence[int], row: int, begin: int, out: NDArray[Any]
+) -> None:
     done, piece = 0, bisect_right(edges, begin) - 1
     while done < out.size:
         most = edges[piece + 1] - begin - done
@@ -108,7 +132,9 @@ def stack_rows(rows: Sequence[Any]) -> Any:
     import dask.array as da
 
     stacked = da.stack(rows)
-    return with_fill(stacked, partial(_fill_one, list(rows))) if all(map(can_fill, rows)) else stacked
+    return (
+        with_fill(stacked, partial(_fill_one, list(rows))) if all(map(can_fill, rows)) else stacked
+    )
 
 
 def _fill_one(rows: Sequence[Any], row: int, begin: int, out: NDArray[Any]) -> None:
@@ -118,7 +144,9 @@ def _fill_one(rows: Sequence[Any], row: int, begin: int, out: NDArray[Any]) -> N
 def one_row(array: Any, row: int) -> Any:
     """One row of an array as an array of one dimension, which is read directly where the whole can be."""
     line = array[row]
-    return with_fill(line, partial(_fill_of, array, row)) if hasattr(array, "gyrostab_fill") else line
+    return (
+        with_fill(line, partial(_fill_of, array, row)) if hasattr(array, "gyrostab_fill") else line
+    )
 
 
 def _fill_of(array: Any, row: int, _row: int, begin: int, out: NDArray[Any]) -> None:
@@ -128,7 +156,11 @@ def _fill_of(array: Any, row: int, _row: int, begin: int, out: NDArray[Any]) -> 
 def cut(array: Any, begin: int, end: int) -> Any:
     """Return samples `begin` to `end` of an array, along its last dimension, read directly where the whole can be."""
     part = array[..., begin:end]
-    return with_fill(part, partial(_fill_cut, array, begin)) if hasattr(array, "gyrostab_fill") else part
+    return (
+        with_fill(part, partial(_fill_cut, array, begin))
+        if hasattr(array, "gyrostab_fill")
+        else part
+    )
 
 
 def _fill_cut(array: Any, first: int, row: int, begin: int, out: NDArray[Any]) -> None:

@@ -1,7 +1,8 @@
 """What stands in a log beside its long variables, read in one look: attributes, dimensions, small variables.
 
-xarray and what it has around the library below it take two to three times as long, which is felt where an archive has hundreds of
-logs. Only what gyrostab writes is understood here; for all else, damage included, the answer is nothing, and xarray has its say.
+xarray and what it has around the library below it take two to three times as long, which is felt
+where an archive has hundreds of logs. Only what gyrostab writes is understood here; for all else,
+damage included, the answer is nothing, and xarray has its say.
 """
 
 from __future__ import annotations
@@ -47,12 +48,22 @@ def read_header(path: Path) -> Header | None:
         header = _look_zarr(path) if path.is_dir() else _look_netcdf(path)
     except Exception:  # whatever the libraries raise on damaged bytes
         return None
-    if header is None or header.attrs.get("gyrostab_content") != "log" or "gyrostab_version" not in header.attrs:
+    if (
+        header is None
+        or header.attrs.get("gyrostab_content") != "log"
+        or "gyrostab_version" not in header.attrs
+    ):
         return None
     return header if "axis" in header.variables else None
 
 
-def _is_long(dims: tuple[str, ...], attrs: dict[str, Any], dtype: np.dtype[Any], chunks: Any, shape: tuple[int, ...]) -> bool:
+def _is_long(
+    dims: tuple[str, ...],
+    attrs: dict[str, Any],
+    dtype: np.dtype[Any],
+    chunks: Any,
+    shape: tuple[int, ...],
+) -> bool:
     """Whether `gyrostab.store.read` reads the variable chunk by chunk."""
     doubles = dtype.kind == "f" or (dtype.kind in "iu" and "scale_factor" in attrs)
     return bool(dims and dims[-1].startswith("time") and doubles and chunks and 0 not in shape)
@@ -72,13 +83,20 @@ def _look_zarr(folder: Path) -> Header:
         if kind != ".zarray" or not name:
             continue
         attrs = dict(described.get(f"{name}/.zattrs", {}))
-        dims, shape, chunks = (tuple(found) for found in (attrs.pop("_ARRAY_DIMENSIONS"), layout["shape"], layout["chunks"]))
+        dims, shape, chunks = (
+            tuple(found)
+            for found in (attrs.pop("_ARRAY_DIMENSIONS"), layout["shape"], layout["chunks"])
+        )
         dtype = np.dtype(layout["dtype"])
         if layout["order"] != "C":
             raise ValueError("order")
         if layout["fill_value"] is not None:
             attrs["_FillValue"] = dtype.type(layout["fill_value"])
-        encoding = {"chunks": chunks, "preferred_chunks": dict(zip(dims, chunks, strict=True)), "dtype": dtype}
+        encoding = {
+            "chunks": chunks,
+            "preferred_chunks": dict(zip(dims, chunks, strict=True)),
+            "dtype": dtype,
+        }
         if _is_long(dims, attrs, dtype, chunks, shape):
             long.add(name)
             values = _nothing(dtype, shape)
@@ -99,7 +117,12 @@ def _look_netcdf(path: Path) -> Header:
         file.set_auto_maskandscale(False)
         file.set_auto_chartostring(False)
         for name, stored in file.variables.items():
-            dims, shape, dtype, cut = stored.dimensions, stored.shape, stored.dtype, stored.chunking()
+            dims, shape, dtype, cut = (
+                stored.dimensions,
+                stored.shape,
+                stored.dtype,
+                stored.chunking(),
+            )
             if not isinstance(dtype, np.dtype):
                 raise ValueError("type")
             attrs = {key: stored.getncattr(key) for key in stored.ncattrs()}
@@ -117,17 +140,28 @@ def _look_netcdf(path: Path) -> Header:
         return Header(variables, {key: file.getncattr(key) for key in file.ncattrs()}, long)
 
 
-def _values(folder: Path, layout: dict[str, Any], shape: tuple[int, ...], chunks: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+def _values(
+    folder: Path,
+    layout: dict[str, Any],
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    dtype: np.dtype[Any],
+) -> NDArray[Any]:
     if len(shape) > 1:
         raise ValueError("dimensions")
     codecs = zarr_codecs(layout)
     if not shape:
         return decoded_chunk((folder / "0").read_bytes(), codecs, dtype)[:1].reshape(())
-    pieces = [decoded_chunk((folder / str(n)).read_bytes(), codecs, dtype) for n in range(-(-shape[0] // chunks[0]) if shape[0] else 0)]
+    pieces = [
+        decoded_chunk((folder / str(n)).read_bytes(), codecs, dtype)
+        for n in range(-(-shape[0] // chunks[0]) if shape[0] else 0)
+    ]
     return _whole(pieces, shape[0], chunks[0], dtype)
 
 
-def _whole(pieces: list[NDArray[Any]], size: int, length: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+def _whole(
+    pieces: list[NDArray[Any]], size: int, length: int, dtype: np.dtype[Any]
+) -> NDArray[Any]:
     """Chunks of `length` values put together to `size`."""
     if any(piece.size != length for piece in pieces):
         raise ValueError("size")

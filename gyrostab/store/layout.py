@@ -1,7 +1,8 @@
 """Where the chunks of a variable lie on disk, and how their bytes become numbers: NetCDF (HDF5) and Zarr (format 2).
 
-Chunks of NetCDF files are read without its library. That holds a lock over every read, and keeps each chunk for as long as any handle
-of the file is open; the places and filters of the chunks are all that it takes to read them side by side, with no file left open.
+Chunks of NetCDF files are read without its library. That holds a lock over every read, and keeps
+each chunk for as long as any handle of the file is open; the places and filters of the chunks are
+all that it takes to read them side by side, with no file left open.
 """
 
 from __future__ import annotations
@@ -85,7 +86,9 @@ def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:
         return False
 
 
-def read_chunk(path: Path, name: str, place: tuple[int, ...], *, zarr: bool, opened: str) -> NDArray[Any]:
+def read_chunk(
+    path: Path, name: str, place: tuple[int, ...], *, zarr: bool, opened: str
+) -> NDArray[Any]:
     """Read one chunk as it lies on disk, not scaled: all samples that it has room for.
 
     Parameters
@@ -108,10 +111,14 @@ def read_chunk(path: Path, name: str, place: tuple[int, ...], *, zarr: bool, ope
     FormatError
         When there is no such file any more, or it may not be read.
     """
-    return _zarr_chunk(path / name, place, opened) if zarr else _hdf5_chunk(path, name, place, opened)
+    return (
+        _zarr_chunk(path / name, place, opened) if zarr else _hdf5_chunk(path, name, place, opened)
+    )
 
 
-def read_written_chunk(path: Path, name: str, place: tuple[int, ...], *, opened: str) -> NDArray[Any] | None:
+def read_written_chunk(
+    path: Path, name: str, place: tuple[int, ...], *, opened: str
+) -> NDArray[Any] | None:
     """Read one chunk of an HDF5 file as it lies on disk, or return None where nothing was written, which is no damage in general.
 
     Raises
@@ -128,23 +135,33 @@ def read_written_chunk(path: Path, name: str, place: tuple[int, ...], *, opened:
 def _hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> NDArray[Any]:
     layout = _hdf5_layout(path, name, opened)
     if place not in layout.places:
-        raise ChunkDamage(f"is damaged: {layout.damage}" if layout.damage else f"is missing: {name} has no chunk {place}")
+        raise ChunkDamage(
+            f"is damaged: {layout.damage}"
+            if layout.damage
+            else f"is missing: {name} has no chunk {place}"
+        )
     begin, size, mask = layout.places[place]
     try:
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         try:
-            if begin + size > os.fstat(handle).st_size:  # before memory is taken: a damaged index may hold any number
+            if (
+                begin + size > os.fstat(handle).st_size
+            ):  # before memory is taken: a damaged index may hold any number
                 raise ChunkDamage("is missing: the file is cut short")
             data = _bytes_at(handle, begin, size)
         finally:
             os.close(handle)
     except OSError as error:
         if error.errno != errno.EIO:
-            raise FormatError(f"{path}: cannot be opened again ({error.strerror}); has it been moved or changed?") from error
+            raise FormatError(
+                f"{path}: cannot be opened again ({error.strerror}); has it been moved or changed?"
+            ) from error
         raise ChunkDamage(f"is damaged: {error}") from error
     if len(data) < size:
         raise ChunkDamage("is missing: the file is cut short")
-    return decoded_chunk(data, [codec for number, codec in layout.codecs if not mask >> number & 1], layout.dtype)
+    return decoded_chunk(
+        data, [codec for number, codec in layout.codecs if not mask >> number & 1], layout.dtype
+    )
 
 
 def _bytes_at(handle: int, begin: int, size: int) -> bytes:
@@ -166,13 +183,21 @@ def _hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
         try:
             file = h5py.File(path, "r")
         except OSError as error:
-            raise FormatError(f"{path}: cannot be opened again ({error}); has it been moved or changed?") from error
+            raise FormatError(
+                f"{path}: cannot be opened again ({error}); has it been moved or changed?"
+            ) from error
         with file:
             variable = file[name]
-            dtype, codecs, lengths = variable.dtype, _hdf5_codecs(variable.id.get_create_plist()), variable.chunks or ()
+            dtype, codecs, lengths = (
+                variable.dtype,
+                _hdf5_codecs(variable.id.get_create_plist()),
+                variable.chunks or (),
+            )
 
             def note(chunk: Any) -> None:
-                number = tuple(at // length for at, length in zip(chunk.chunk_offset, lengths, strict=True))
+                number = tuple(
+                    at // length for at, length in zip(chunk.chunk_offset, lengths, strict=True)
+                )
                 places[number] = (chunk.byte_offset, chunk.size, chunk.filter_mask)
 
             try:
@@ -190,7 +215,12 @@ def _hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
     for number in reversed(range(plist.get_nfilters())):
         code, _, values, _ = plist.get_filter(number)
         made = {_DEFLATE: Zlib, _FLETCHER32: _Fletcher32, _ZSTD: Zstd}.get(code)
-        codecs.append((number, _Shuffle(values[0]) if code == _SHUFFLE else made() if made else _Unknown(code)))
+        codecs.append(
+            (
+                number,
+                _Shuffle(values[0]) if code == _SHUFFLE else made() if made else _Unknown(code),
+            )
+        )
     return tuple(codecs)
 
 
@@ -213,7 +243,11 @@ class _Shuffle:
         stored = np.frombuffer(data, np.uint8)
         whole = stored.size - stored.size % max(self.width, 1)
         ordered = Shuffle(elementsize=self.width).decode(stored[:whole])
-        return ordered if whole == stored.size else np.concatenate([np.frombuffer(ordered, np.uint8), stored[whole:]])
+        return (
+            ordered
+            if whole == stored.size
+            else np.concatenate([np.frombuffer(ordered, np.uint8), stored[whole:]])
+        )
 
 
 class _Fletcher32:
@@ -222,7 +256,9 @@ class _Fletcher32:
     def decode(self, data: Any) -> NDArray[np.uint8]:
         """The bytes before the checksum."""
         stored = np.frombuffer(data, np.uint8)
-        if stored.size < 4 or fletcher32(stored[:-4]) != int.from_bytes(stored[-4:].tobytes(), "little"):
+        if stored.size < 4 or fletcher32(stored[:-4]) != int.from_bytes(
+            stored[-4:].tobytes(), "little"
+        ):
             raise RuntimeError("its checksum is wrong")
         return stored[:-4]
 
@@ -244,7 +280,9 @@ class _Unknown:
     code: int
 
     def decode(self, data: bytes) -> bytes:
-        raise ChunkDamage(f"cannot be read: it went through filter {self.code} of HDF5, which gyrostab does not know")
+        raise ChunkDamage(
+            f"cannot be read: it went through filter {self.code} of HDF5, which gyrostab does not know"
+        )
 
 
 def _zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]:
@@ -254,7 +292,9 @@ def _zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]
         data = (folder / name).read_bytes()
     except FileNotFoundError as error:
         if not folder.is_dir():
-            raise FormatError(f"{folder}: is not there any more; has it been moved or removed?") from error
+            raise FormatError(
+                f"{folder}: is not there any more; has it been moved or removed?"
+            ) from error
         raise ChunkDamage(f"is missing: no file {folder.name}/{name}") from error
     except OSError as error:
         if error.errno != errno.EIO:
@@ -268,11 +308,19 @@ def _zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
     """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk."""
     try:
         layout = json.loads((folder / ".zarray").read_text())
-        return _ZarrLayout(np.dtype(layout["dtype"]), zarr_codecs(layout), str(layout.get("dimension_separator", ".")))
+        return _ZarrLayout(
+            np.dtype(layout["dtype"]),
+            zarr_codecs(layout),
+            str(layout.get("dimension_separator", ".")),
+        )
     except OSError as error:
-        raise FormatError(f"{folder}: is not there any more ({error.strerror}); has it been moved or removed?") from error
+        raise FormatError(
+            f"{folder}: is not there any more ({error.strerror}); has it been moved or removed?"
+        ) from error
     except Exception as error:  # whatever json, numpy and numcodecs raise on damaged text
-        raise FormatError(f"{folder / '.zarray'}: is damaged ({type(error).__name__}: {error}); copy it again") from error
+        raise FormatError(
+            f"{folder / '.zarray'}: is damaged ({type(error).__name__}: {error}); copy it again"
+        ) from error
 
 
 def zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
@@ -280,11 +328,18 @@ def zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
     import numcodecs
 
     known = {"fletcher32": _Fletcher32, "blosc": _Blosc}
-    described = [item for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item]
-    return tuple(known[item["id"]]() if item["id"] in known else numcodecs.get_codec(item) for item in described)
+    described = [
+        item for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item
+    ]
+    return tuple(
+        known[item["id"]]() if item["id"] in known else numcodecs.get_codec(item)
+        for item in described
+    )
 
 
-def decoded_chunk(data: Any, codecs: Iterable[Any], dtype: np.dtype[Any], *, name: str = "") -> NDArray[Any]:
+def decoded_chunk(
+    data: Any, codecs: Iterable[Any], dtype: np.dtype[Any], *, name: str = ""
+) -> NDArray[Any]:
     """Bytes of a chunk, through the codecs, as numbers.
 
     Raises

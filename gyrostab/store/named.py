@@ -59,7 +59,12 @@ def name_file(opened: xr.Dataset, path: Path) -> xr.Dataset:
         The same dataset, as lazy as it was, not loaded and not of dask.
     """
     named = {
-        name: xr.Variable(variable.dims, LazilyIndexedArray(_NamedArray(variable, path)), variable.attrs, variable.encoding)
+        name: xr.Variable(
+            variable.dims,
+            LazilyIndexedArray(_NamedArray(variable, path)),
+            variable.attrs,
+            variable.encoding,
+        )
         for name, variable in opened.variables.items()
     }
     coords = xr.Coordinates({name: named.pop(name) for name in opened.coords}, indexes={})

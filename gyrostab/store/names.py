@@ -12,9 +12,14 @@ import xarray as xr
 
 __all__ = ["is_storable", "restore_names", "store_names"]
 
-# NetCDF User's Guide, "Permitted characters in netCDF names"; Zarr adds that a name is part of a path, and reserves two underscores.
-_STORABLE = re.compile(r"(?!__)[A-Za-z0-9_\x80-\ud7ff\ue000-\U0010ffff][^/\x00-\x1f\x7f\ud800-\udfff]*(?<! )")
-_MAX_NAME_BYTES = 200  # NetCDF allows 256, a file name 255, and a suffix for the time axis comes on top
+# NetCDF User's Guide, "Permitted characters in netCDF names"; Zarr adds that a name is part of a
+# path, and reserves two underscores.
+_STORABLE = re.compile(
+    r"(?!__)[A-Za-z0-9_\x80-\ud7ff\ue000-\U0010ffff][^/\x00-\x1f\x7f\ud800-\udfff]*(?<! )"
+)
+_MAX_NAME_BYTES = (
+    200  # NetCDF allows 256, a file name 255, and a suffix for the time axis comes on top
+)
 _ORIGINAL = "original_name"
 
 
@@ -56,12 +61,30 @@ def store_names(dataset: xr.Dataset) -> xr.Dataset:
             taken.add(safe[name])
     if not safe:
         return dataset
-    renamed = dataset.rename({**safe, **{f"time_{name}": f"time_{other}" for name, other in safe.items() if f"time_{name}" in taken}})
+    renamed = dataset.rename(
+        {
+            **safe,
+            **{
+                f"time_{name}": f"time_{other}"
+                for name, other in safe.items()
+                if f"time_{name}" in taken
+            },
+        }
+    )
     for name, other in safe.items():
-        shown = name.encode("utf-8", "backslashreplace").decode()  # half a character may stand in a name that was read wrongly
-        renamed[other].attrs = {"long_name": shown, **renamed[other].attrs, _ORIGINAL: json.dumps(name)}
+        shown = name.encode(
+            "utf-8", "backslashreplace"
+        ).decode()  # half a character may stand in a name that was read wrongly
+        renamed[other].attrs = {
+            "long_name": shown,
+            **renamed[other].attrs,
+            _ORIGINAL: json.dumps(name),
+        }
     told = ", ".join(f"{name!a} as {other!r}" for name, other in safe.items())
-    warnings.warn(f"a file cannot hold a channel of this name, so it is stored under another one: {told}", stacklevel=4)
+    warnings.warn(
+        f"a file cannot hold a channel of this name, so it is stored under another one: {told}",
+        stacklevel=4,
+    )
     return renamed
 
 
@@ -73,4 +96,13 @@ def restore_names(dataset: xr.Dataset) -> xr.Dataset:
             own[name] = json.loads(variable.attrs.pop(_ORIGINAL))
     if not own:
         return dataset
-    return dataset.rename({**own, **{f"time_{name}": f"time_{other}" for name, other in own.items() if f"time_{name}" in dataset.dims}})
+    return dataset.rename(
+        {
+            **own,
+            **{
+                f"time_{name}": f"time_{other}"
+                for name, other in own.items()
+                if f"time_{name}" in dataset.dims
+            },
+        }
+    )

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 __all__ = ["Part", "read_part", "transposed", "with_part"]
 
-#: ``part(place)`` gives the values of an array at a tuple of slices, one for each dimension, each with both its ends.
+#: ``part(place)`` gives the values of an array at a tuple of slices, one for each dimension, each
+#: with both its ends.
 Part = Callable[[tuple[slice, ...]], NDArray[Any]]
 
 
@@ -50,4 +51,8 @@ def read_part(array: Any, place: Sequence[slice]) -> NDArray[Any]:
     if part is not None:
         return part(ends)
     found = array[ends]
-    return found if isinstance(found, np.ndarray) else np.asarray(found.compute(scheduler="synchronous"))
+    return (
+        found
+        if isinstance(found, np.ndarray)
+        else np.asarray(found.compute(scheduler="synchronous"))
+    )

@@ -63,22 +63,33 @@ def _open(path: Path, *, strict: bool) -> xr.Dataset:
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
-        stored = xr.open_dataset(path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False)
+        stored = xr.open_dataset(
+            path, engine=engine, chunks=None, decode_times=False, create_default_indexes=False
+        )
     except Exception as error:  # the backends raise errors of many kinds on damaged files
-        raise FormatError(f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again") from error
+        raise FormatError(
+            f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
+        ) from error
     stored = name_file(stored, path)
     is_log = stored.attrs.get("gyrostab_content") == "log"
     long = _long_variables(stored, path, strict=strict) if is_log else {}
     opened = _lazy(stored, long, small=SMALL if is_log else 0)
     if is_log:
-        stored.close()  # opened again where needed: no archive of any length holds more than a few files open
+        # opened again where needed: no archive of any length holds more than a few files open
+        stored.close()
     return opened
 
 
 def _decoded(header: Header) -> xr.Dataset:
     """What xarray makes of a header: text, missing values and factors decoded, times not, no index."""
-    decoded, attrs, names = xr.conventions.decode_cf_variables(header.variables, header.attrs, decode_times=False)
-    coords = {name: variable for name, variable in decoded.items() if name in names or (name,) == variable.dims}
+    decoded, attrs, names = xr.conventions.decode_cf_variables(
+        header.variables, header.attrs, decode_times=False
+    )
+    coords = {
+        name: variable
+        for name, variable in decoded.items()
+        if name in names or (name,) == variable.dims
+    }
     data = {name: variable for name, variable in decoded.items() if name not in coords}
     return xr.Dataset(data, xr.Coordinates(coords, indexes={}), attrs)
 
@@ -87,11 +98,15 @@ def _lazy(stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int) -> xr
     """Load what is small, and make dask arrays, by the chunks on disk, of what is not one yet: making and reading one takes its time."""
     rest = {name: stored.variables[name] for name in stored.data_vars if name not in long}
     ready = {  # text is always small, and dask cannot tell the size of its chunks
-        name: item.load() if item.size < small or item.dtype.kind in "OSU" else item.chunk(item.encoding.get("preferred_chunks") or "auto")
+        name: item.load()
+        if item.size < small or item.dtype.kind in "OSU"
+        else item.chunk(item.encoding.get("preferred_chunks") or "auto")
         for name, item in rest.items()
     }
     coords = xr.Coordinates({name: stored.variables[name] for name in stored.coords}, indexes={})
-    lazy = xr.Dataset({name: long.get(name, ready.get(name)) for name in stored.data_vars}, coords, stored.attrs)
+    lazy = xr.Dataset(
+        {name: long.get(name, ready.get(name)) for name in stored.data_vars}, coords, stored.attrs
+    )
     lazy.encoding = stored.encoding
     lazy.set_close(stored._close)
     return lazy
@@ -109,7 +124,12 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
         dim = str(variable.dims[-1]) if variable.dims else ""
         disk = variable.encoding
         chunks = disk.get("chunks" if path.is_dir() else "chunksizes")
-        if not dim.startswith("time") or variable.dtype.kind != "f" or not variable.size or chunks is None:
+        if (
+            not dim.startswith("time")
+            or variable.dtype.kind != "f"
+            or not variable.size
+            or chunks is None
+        ):
             continue
         own = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name), disk)
         if not own or ("scale_factor" in disk and "_FillValue" not in disk):
@@ -117,7 +137,9 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
         array = _Chunks(
             path=path.absolute(),
             name=str(name),
-            rows=tuple(f"axis {label}" for label in labels) if variable.ndim == 2 else (f"channel {name}",),
+            rows=tuple(f"axis {label}" for label in labels)
+            if variable.ndim == 2
+            else (f"channel {name}",),
             shape=variable.shape,
             dtype=variable.dtype,
             length=int(chunks[-1]),
@@ -130,15 +152,29 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
         )
         meta = np.empty((0,) * variable.ndim, variable.dtype)
         lazy = da.from_array(
-            array, chunks=tuple(chunks), name=f"gyrostab-{name}-{opened}", asarray=False, fancy=False, inline_array=True, meta=meta
+            array,
+            chunks=tuple(chunks),
+            name=f"gyrostab-{name}-{opened}",
+            asarray=False,
+            fancy=False,
+            inline_array=True,
+            meta=meta,
         )
         remember_source(lazy, path.absolute())
-        packing = {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)} if array.scale is not None else {}
-        long[name] = xr.Variable(variable.dims, with_fill(lazy, array.fill), variable.attrs, packing)
+        packing = (
+            {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)}
+            if array.scale is not None
+            else {}
+        )
+        long[name] = xr.Variable(
+            variable.dims, with_fill(lazy, array.fill), variable.attrs, packing
+        )
     return long
 
 
-def _spans(stored: xr.Dataset, dim: str, length: int, path: Path) -> dict[str, Any] | tuple[tuple[int, int], ...]:
+def _spans(
+    stored: xr.Dataset, dim: str, length: int, path: Path
+) -> dict[str, Any] | tuple[tuple[int, int], ...]:
     """The rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
     rules = {index_dim(rule["dim"]): rule for rule in declared_grids(stored, path).values()}
     if dim in rules:
@@ -146,7 +182,10 @@ def _spans(stored: xr.Dataset, dim: str, length: int, path: Path) -> dict[str, A
     if dim not in stored.variables:
         return ()
     stamps = decode_stamps(stored.variables[dim]).values.view(np.int64)
-    return tuple((int(stamps[at]), int(stamps[min(at + length, stamps.size) - 1])) for at in range(0, stamps.size, length))
+    return tuple(
+        (int(stamps[at]), int(stamps[min(at + length, stamps.size) - 1]))
+        for at in range(0, stamps.size, length)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +227,9 @@ class _Chunks:
             place = out[low - begin : high - begin]
             try:
                 whole = low == first and high == min(first + self.length, self.shape[-1])
-                self._decode(self._stored(row, number, whole=whole)[low - first : high - first], place)
+                self._decode(
+                    self._stored(row, number, whole=whole)[low - first : high - first], place
+                )
             except ChunkDamage as damage:
                 self._tell(row, number, str(damage))
                 place[:] = np.nan
@@ -221,10 +262,14 @@ class _Chunks:
             span = grid_times(grid["start_ns"], grid["rate_hz"], ends)
         else:
             span = np.array(self.spans[number] if self.spans else (), dtype=np.int64)
-        when = " to ".join(str(stamp).rstrip("0").rstrip(".") for stamp in span.view("datetime64[ns]"))
+        when = " to ".join(
+            str(stamp).rstrip("0").rstrip(".") for stamp in span.view("datetime64[ns]")
+        )
         what = f"{self.path}: {self.rows[row]}: the chunk from {when} {damage}"
         if self.strict:
-            raise FormatError(f"{what}; copy it again, or leave out --strict to take these samples as missing")
+            raise FormatError(
+                f"{what}; copy it again, or leave out --strict to take these samples as missing"
+            )
         with _TELLING:
             _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
 

@@ -1,7 +1,8 @@
 """Columns of files that other programs wrote, read by ranges of rows, by several threads, without a lock or an open file.
 
-The libraries of NetCDF and HDF5 let one thread in at a time and keep chunks as long as the file is open. A column here knows
-where its numbers lie: at even distances (`EvenRows`), or in chunks (`ChunkedRows`).
+The libraries of NetCDF and HDF5 let one thread in at a time and keep chunks as long as the file is
+open. A column here knows where its numbers lie: at even distances (`EvenRows`), or in chunks
+(`ChunkedRows`).
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ _MOST_CHUNKS = 2**19
 _LARGE_BYTES = 2**24
 #: Small chunks of one column that were not wanted whole: the next part of a run begins in them.
 _EDGES = KeptChunks(2**26, _LARGE_BYTES)
-#: A part of a run has up to 2**24 samples (128 MiB) of all axes, and each of two workers may find all of them in the same chunks.
+#: A part of a run has up to 2**24 samples (128 MiB) of all axes, and each of two workers may find
+#: all of them in the same chunks.
 _KEPT = KeptChunks(3 * 2**27, 2**28)
 _DECODING = threading.Lock()
 
@@ -68,7 +70,9 @@ class EvenRows:
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Return the numbers of some rows as they are stored."""
         out = np.empty(max(stop - start, 0), self.dtype)
-        step = out.size if self.stride == self.dtype.itemsize else max(_SPREAD_BYTES // self.stride, 1)
+        step = (
+            out.size if self.stride == self.dtype.itemsize else max(_SPREAD_BYTES // self.stride, 1)
+        )
         with self.path.open("rb", buffering=0) as file:
             for at in range(0, out.size, max(step, 1)):
                 part = out[at : at + step]
@@ -96,7 +100,8 @@ class ChunkedRows:
     Attributes
     ----------
     load : callable
-        Number of the chunk along each dimension -> chunk (or what there is of it at the end), or None where nothing was written.
+        Number of the chunk along each dimension -> chunk (or what there is of it at the end), or
+        None where nothing was written.
     shape, chunks : tuple of int
         Of the variable.
     dtype : dtype
@@ -128,7 +133,11 @@ class ChunkedRows:
             inside: Any = slice(low - first, high - first)
             if len(self.shape) == 2:
                 across, rest = divmod(self.place, self.chunks[1 - self.along])
-                at, inside = ((number, across), (inside, rest)) if self.along == 0 else ((across, number), (rest, inside))
+                at, inside = (
+                    ((number, across), (inside, rest))
+                    if self.along == 0
+                    else ((across, number), (rest, inside))
+                )
             alone = len(self.shape) == 1 or self.chunks[1 - self.along] == 1
             part = low > first or high < min(first + length, self.shape[self.along])
             chunk = self._chunk(at, alone=alone, part=part)
@@ -171,7 +180,11 @@ class LibraryRows:
         """Return the numbers of some rows as they are stored."""
         if len(self.variable.shape) == 1:
             return np.asarray(self.variable[start:stop])
-        return np.asarray(self.variable[start:stop, self.place] if self.along == 0 else self.variable[self.place, start:stop])
+        return np.asarray(
+            self.variable[start:stop, self.place]
+            if self.along == 0
+            else self.variable[self.place, start:stop]
+        )
 
 
 def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
@@ -187,24 +200,39 @@ def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
     Returns
     -------
     callable or None
-        Dimension of the rows and place along the other -> column; None where only the library knows how to read it.
+        Dimension of the rows and place along the other -> column; None where only the library knows
+        how to read it.
     """
     import h5py
 
     plist = variable.id.get_create_plist()
     shape, dtype = variable.shape, variable.dtype
-    if plist.get_layout() == h5py.h5d.CONTIGUOUS and not plist.get_external_count() and variable.id.get_offset() is not None:
+    if (
+        plist.get_layout() == h5py.h5d.CONTIGUOUS
+        and not plist.get_external_count()
+        and variable.id.get_offset() is not None
+    ):
         return partial(_even_rows, path.absolute(), dtype, variable.id.get_offset(), shape)
     if plist.get_layout() != h5py.h5d.CHUNKED or not has_known_filters(plist):
         return None
-    if np.prod([-(-size // length) for size, length in zip(shape, variable.chunks, strict=True)], dtype=float) > _MOST_CHUNKS:
+    if (
+        np.prod(
+            [-(-size // length) for size, length in zip(shape, variable.chunks, strict=True)],
+            dtype=float,
+        )
+        > _MOST_CHUNKS
+    ):
         return None  # a table of their places would be larger than the chunks
     key = (uuid.uuid4().hex, variable.name)
     load = partial(_load_hdf5, path.absolute(), variable.name, variable.chunks, key[0])
-    return lambda along, place: ChunkedRows(load, shape, variable.chunks, dtype, variable.fillvalue, along, place, key)
+    return lambda along, place: ChunkedRows(
+        load, shape, variable.chunks, dtype, variable.fillvalue, along, place, key
+    )
 
 
-def _even_rows(path: Path, dtype: np.dtype[Any], begin: int, shape: tuple[int, ...], along: int, place: int) -> EvenRows:
+def _even_rows(
+    path: Path, dtype: np.dtype[Any], begin: int, shape: tuple[int, ...], along: int, place: int
+) -> EvenRows:
     wide = dtype.itemsize
     if len(shape) == 1:
         return EvenRows(path, dtype, begin, wide)
@@ -213,14 +241,20 @@ def _even_rows(path: Path, dtype: np.dtype[Any], begin: int, shape: tuple[int, .
     return EvenRows(path, dtype, begin + place * shape[1] * wide, wide)
 
 
-def _load_hdf5(path: Path, name: str, chunks: tuple[int, ...], opened: str, at: tuple[int, ...]) -> NDArray[Any] | None:
+def _load_hdf5(
+    path: Path, name: str, chunks: tuple[int, ...], opened: str, at: tuple[int, ...]
+) -> NDArray[Any] | None:
     try:
         chunk = read_written_chunk(path, name, at, opened=opened)
     except ChunkDamage as damage:
-        raise DamageError(f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {damage}; copy it again") from damage
+        raise DamageError(
+            f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {damage}; copy it again"
+        ) from damage
     if chunk is None:
         return None
     if chunk.size != int(np.prod(chunks)):
         what = f"holds {chunk.size} values in place of {int(np.prod(chunks))}"
-        raise DamageError(f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {what}; copy it again")
+        raise DamageError(
+            f"{path.name}: is damaged, a chunk of {name.strip('/')!r} {what}; copy it again"
+        )
     return chunk.reshape(chunks)

@@ -42,7 +42,9 @@ class Seen(NamedTuple):
     filled: dict[str, int]
 
 
-def look_at_cells(cells: NDArray[np.float64], channels: Mapping[str, NDArray[Any]], begin: int) -> Seen:
+def look_at_cells(
+    cells: NDArray[np.float64], channels: Mapping[str, NDArray[Any]], begin: int
+) -> Seen:
     """Look at every cell of a block once.
 
     Parameters
@@ -55,7 +57,9 @@ def look_at_cells(cells: NDArray[np.float64], channels: Mapping[str, NDArray[Any
         Row of the log with which the block begins.
     """
     present = np.empty(cells.shape[1], dtype=bool)
-    absent, holes, infinities, low, high = look(np.ascontiguousarray(cells, dtype=np.float64), present)
+    absent, holes, infinities, low, high = look(
+        np.ascontiguousarray(cells, dtype=np.float64), present
+    )
     unreadable = _spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NONE
     infinite = _spans(np.isinf(cells).any(axis=0), begin) if infinities else _NONE
     filled = {name: int(np.isfinite(values).sum()) for name, values in channels.items()}

@@ -17,7 +17,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: int | None = None) -> Iterator[Result]:
+def in_order(
+    work: Callable[[Item], Result], items: Iterable[Item], *, workers: int | None = None
+) -> Iterator[Result]:
     """Do the work on the items, a few at a time, and give the results in the order of the items.
 
     Parameters
@@ -37,7 +39,10 @@ def in_order(work: Callable[[Item], Result], items: Iterable[Item], *, workers: 
     workers = workers or min(os.cpu_count() or 1, MOST_WORKERS)
     source = iter(items)
     nothing = object()
-    with ThreadPoolExecutor(1, thread_name_prefix="gyrostab-fetch") as fetcher, ThreadPoolExecutor(workers) as pool:
+    with (
+        ThreadPoolExecutor(1, thread_name_prefix="gyrostab-fetch") as fetcher,
+        ThreadPoolExecutor(workers) as pool,
+    ):
         waiting: deque[Future[Result]] = deque()
         try:
             following = fetcher.submit(next, source, nothing)

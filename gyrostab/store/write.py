@@ -16,7 +16,16 @@ from gyrostab.kernels.encoding.counts import to_counts
 from gyrostab.store.direct import can_fill, fill_row, with_fill
 from gyrostab.store.lock import library_lock
 
-__all__ = ["Misfit", "Progress", "append_netcdf", "append_zarr", "as_counts", "chunk_samples", "common_packing", "long_variables"]
+__all__ = [
+    "Misfit",
+    "Progress",
+    "append_netcdf",
+    "append_zarr",
+    "as_counts",
+    "chunk_samples",
+    "common_packing",
+    "long_variables",
+]
 
 CHUNK_SECONDS = 1200.0
 #: Bounds of the samples in one chunk, for very slow and very fast logs.
@@ -53,22 +62,42 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
     Misfit
         When counts do not give the same doubles; for a lazy variable, only as it is computed.
     """
-    scale, declared = variable.encoding.get("scale_factor"), np.dtype(variable.encoding.get("dtype", "f8"))
-    if not scale or declared.kind not in "iu" or variable.dtype != np.float64 or variable.encoding.get("add_offset"):
+    scale, declared = (
+        variable.encoding.get("scale_factor"),
+        np.dtype(variable.encoding.get("dtype", "f8")),
+    )
+    if (
+        not scale
+        or declared.kind not in "iu"
+        or variable.dtype != np.float64
+        or variable.encoding.get("add_offset")
+    ):
         return xr.Variable(variable.dims, variable.data, variable.attrs)
     dtype = "int16" if declared.itemsize == 1 or declared == np.int16 else "int32"
     pack = partial(_counts, name=name, scale=float(scale), dtype=dtype)
     data = variable.data
     lazy = variable.chunks is not None
-    packed = data.map_blocks(pack, dtype=dtype, meta=np.empty((0,) * variable.ndim, dtype)) if lazy else pack(data)
+    packed = (
+        data.map_blocks(pack, dtype=dtype, meta=np.empty((0,) * variable.ndim, dtype))
+        if lazy
+        else pack(data)
+    )
     if lazy and can_fill(data):
         packed = with_fill(packed, partial(_fill_counts, data, pack))
     return xr.Variable(
-        variable.dims, packed, {**variable.attrs, "scale_factor": float(scale), "_FillValue": np.dtype(dtype).type(FILLS[dtype])}
+        variable.dims,
+        packed,
+        {
+            **variable.attrs,
+            "scale_factor": float(scale),
+            "_FillValue": np.dtype(dtype).type(FILLS[dtype]),
+        },
     )
 
 
-def _counts(values: NDArray[np.float64], *, name: str, scale: float, dtype: str) -> NDArray[np.integer[Any]]:
+def _counts(
+    values: NDArray[np.float64], *, name: str, scale: float, dtype: str
+) -> NDArray[np.integer[Any]]:
     counts = to_counts(values, scale, dtype, FILLS[dtype])
     if counts is None:
         raise Misfit(name)
@@ -76,7 +105,11 @@ def _counts(values: NDArray[np.float64], *, name: str, scale: float, dtype: str)
 
 
 def _fill_counts(
-    data: Any, pack: Callable[[NDArray[np.float64]], NDArray[np.integer[Any]]], row: int, begin: int, out: NDArray[np.integer[Any]]
+    data: Any,
+    pack: Callable[[NDArray[np.float64]], NDArray[np.integer[Any]]],
+    row: int,
+    begin: int,
+    out: NDArray[np.integer[Any]],
 ) -> None:
     """Counts of one row of `data` from `begin` on, read without dask."""
     values = np.empty(out.size)
@@ -99,13 +132,24 @@ def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
     scale = scales.pop() if len(scales) == 1 else None
     if scale is None or not all("dtype" in encoding for encoding in found):
         return {}
-    return {"dtype": np.result_type(*(np.dtype(encoding["dtype"]) for encoding in found)), "scale_factor": float(scale)}
+    return {
+        "dtype": np.result_type(*(np.dtype(encoding["dtype"]) for encoding in found)),
+        "scale_factor": float(scale),
+    }
 
 
 def long_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
     """Lazy variables along time, which are written stretch by stretch."""
-    lazy = {str(name): array.variable for name, array in stored.data_vars.items() if array.chunks is not None and array.size}
-    return {name: variable for name, variable in lazy.items() if str(variable.dims[-1]).startswith("time")}
+    lazy = {
+        str(name): array.variable
+        for name, array in stored.data_vars.items()
+        if array.chunks is not None and array.size
+    }
+    return {
+        name: variable
+        for name, variable in lazy.items()
+        if str(variable.dims[-1]).startswith("time")
+    }
 
 
 def _names(variable: xr.Variable) -> list[str]:
@@ -113,7 +157,11 @@ def _names(variable: xr.Variable) -> list[str]:
 
 
 def append_netcdf(
-    path: Path, long: dict[str, xr.Variable], encoding: dict[Any, dict[str, Any]], *, progress: Progress | None = None
+    path: Path,
+    long: dict[str, xr.Variable],
+    encoding: dict[Any, dict[str, Any]],
+    *,
+    progress: Progress | None = None,
 ) -> None:
     """Add lazy variables to a NetCDF file that holds the others already; `encoding` as for xarray."""
     import netCDF4
@@ -130,8 +178,12 @@ def append_netcdf(
                         file.createDimension(str(dim), size)
                 options = dict(encoding[name])
                 fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
-                targets[name] = file.createVariable(name, variable.dtype, _names(variable), fill_value=fill, **options)
-                targets[name].setncatts({key: value for key, value in variable.attrs.items() if key != "_FillValue"})
+                targets[name] = file.createVariable(
+                    name, variable.dtype, _names(variable), fill_value=fill, **options
+                )
+                targets[name].setncatts(
+                    {key: value for key, value in variable.attrs.items() if key != "_FillValue"}
+                )
                 targets[name].set_auto_maskandscale(False)
 
         def put(name: str, row: tuple[int, ...], part: slice, values: NDArray[Any]) -> None:
@@ -144,7 +196,13 @@ def append_netcdf(
             file.close()
 
 
-def append_zarr(path: Path, long: dict[str, xr.Variable], encoding: dict[Any, dict[str, Any]], *, progress: Progress | None = None) -> None:
+def append_zarr(
+    path: Path,
+    long: dict[str, xr.Variable],
+    encoding: dict[Any, dict[str, Any]],
+    *,
+    progress: Progress | None = None,
+) -> None:
     """Add lazy variables to a Zarr store that holds the others already, every chunk of them, and gather the metadata."""
     import zarr
 
@@ -181,13 +239,17 @@ def _copy(
     import dask
     from dask.system import CPU_COUNT
 
-    def write(parts: list[tuple[str, tuple[int, ...], int]], blocks: Sequence[NDArray[Any]]) -> None:
+    def write(
+        parts: list[tuple[str, tuple[int, ...], int]], blocks: Sequence[NDArray[Any]]
+    ) -> None:
         for (name, row, begin), block in zip(parts, blocks, strict=True):
             for at in range(0, block.shape[-1], lengths[name]):
                 piece = block[..., at : at + lengths[name]]
                 put(name, row, slice(begin + at, begin + at + piece.shape[-1]), piece)
 
-    readers = ThreadPoolExecutor(dask.config.get("num_workers", None) or CPU_COUNT, thread_name_prefix="gyrostab-read")
+    readers = ThreadPoolExecutor(
+        dask.config.get("num_workers", None) or CPU_COUNT, thread_name_prefix="gyrostab-read"
+    )
     with readers, ThreadPoolExecutor(1, thread_name_prefix="gyrostab-write") as pool:
         writing: Future[None] | None = None
         done, total = 0, sum(variable.size for variable in long.values())
@@ -204,18 +266,27 @@ def _copy(
             writing.result()
 
 
-#: Name, row, first sample and number of samples of a part of a variable; arrays by name and row, which stretch after stretch goes through.
+#: Name, row, first sample and number of samples of a part of a variable; arrays by name and row,
+#: which stretch after stretch goes through.
 _Part = tuple[str, tuple[int, ...], int, int]
 _Room = dict[tuple[str, tuple[int, ...]], NDArray[Any]]
 
 
 def _blocks(
-    long: dict[str, xr.Variable], lengths: dict[str, int], parts: list[_Part], readers: ThreadPoolExecutor, room: _Room
+    long: dict[str, xr.Variable],
+    lengths: dict[str, int],
+    parts: list[_Part],
+    readers: ThreadPoolExecutor,
+    room: _Room,
 ) -> list[NDArray[Any]]:
     """Read the parts of a stretch, chunk by chunk where it is known how; dask computes the others, and walks its whole graph each time."""
     import dask
 
-    lazy = [long[name].data[(*row, slice(begin, begin + span))] for name, row, begin, span in parts if not can_fill(long[name].data)]
+    lazy = [
+        long[name].data[(*row, slice(begin, begin + span))]
+        for name, row, begin, span in parts
+        if not can_fill(long[name].data)
+    ]
     blocks: list[NDArray[Any]] = []
     filling: list[Future[None]] = []
     computed = iter(dask.compute(*lazy))
@@ -228,7 +299,15 @@ def _blocks(
             room[name, row] = np.empty(span, data.dtype)
         blocks.append(room[name, row][:span])
         for at in range(0, span, lengths[name]):
-            filling.append(readers.submit(fill_row, data, row[0] if row else 0, begin + at, blocks[-1][at : at + lengths[name]]))
+            filling.append(
+                readers.submit(
+                    fill_row,
+                    data,
+                    row[0] if row else 0,
+                    begin + at,
+                    blocks[-1][at : at + lengths[name]],
+                )
+            )
     try:
         for one in filling:
             one.result()
@@ -241,10 +320,17 @@ def _blocks(
 _NOTHING = np.empty(0)
 
 
-def _stretches(long: dict[str, xr.Variable], lengths: dict[str, int]) -> Iterator[list[tuple[str, tuple[int, ...], int, int]]]:
+def _stretches(
+    long: dict[str, xr.Variable], lengths: dict[str, int]
+) -> Iterator[list[tuple[str, tuple[int, ...], int, int]]]:
     """Stretches of whole chunks, of all variables on one time: name, row, first sample, number of samples of each part."""
     for dim in dict.fromkeys(variable.dims[-1] for variable in long.values()):
-        rows = [(name, row) for name, variable in long.items() if variable.dims[-1] == dim for row in np.ndindex(*variable.shape[:-1])]
+        rows = [
+            (name, row)
+            for name, variable in long.items()
+            if variable.dims[-1] == dim
+            for row in np.ndindex(*variable.shape[:-1])
+        ]
         name = rows[0][0]
         span = lengths[name] * max(1, STRETCH_BYTES // (8 * len(rows) * lengths[name]))
         size = long[name].shape[-1]

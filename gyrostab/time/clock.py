@@ -33,5 +33,7 @@ def time_of_day() -> str:
     try:
         now = datetime.now(UTC) if not given else datetime.fromtimestamp(int(given), UTC)
     except (ValueError, OverflowError, OSError) as error:
-        raise OptionError(f"SOURCE_DATE_EPOCH={given!r} in the environment is no whole number of seconds since 1970; unset it") from error
+        raise OptionError(
+            f"SOURCE_DATE_EPOCH={given!r} in the environment is no whole number of seconds since 1970; unset it"
+        ) from error
     return f"{now:%Y-%m-%dT%H:%M:%SZ}"

@@ -22,7 +22,8 @@ _NUMBER = re.compile(r"^\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECAS
 def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2h") -> float:
     """Seconds of a duration: a number [s], a timedelta, or a string such as ``"10min"`` or ``"0.1s"``; a message names the examples.
 
-    Lengths that may also be counted in samples (window, step and block) are read by `samples`, which takes no bare number.
+    Lengths that may also be counted in samples (window, step and block) are read by `samples`,
+    which takes no bare number.
 
     Raises
     ------
@@ -46,7 +47,9 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
     except OptionError:
         raise
     except (ValueError, TypeError) as error:
-        raise OptionError(f"{option} {value!r} is not a duration; write for instance {example}") from error
+        raise OptionError(
+            f"{option} {value!r} is not a duration; write for instance {example}"
+        ) from error
     if not (np.isfinite(seconds) and seconds > 0):
         raise OptionError(f"{option} {value!r} must be longer than zero")
     return float(seconds)
@@ -76,7 +79,9 @@ def samples(value: Any, rate: float, option: str) -> int:
     """
     if is_bare_number(value):
         text = str(value).strip()
-        raise OptionError(f"{option} {text} has no unit; write '{text}s' for seconds or '{text}samples' for samples")
+        raise OptionError(
+            f"{option} {text} has no unit; write '{text}s' for seconds or '{text}samples' for samples"
+        )
     match = _SAMPLES.match(value) if isinstance(value, str) else None
     if match:
         count = int(match.group(1))
@@ -86,7 +91,9 @@ def samples(value: Any, rate: float, option: str) -> int:
     seconds = duration_seconds(value, option, example="10min, 30s or 2000samples")
     count = round(seconds * rate)
     if count < 1:
-        raise OptionError(f"{option} {value!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more")
+        raise OptionError(
+            f"{option} {value!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more"
+        )
     return count
 
 
@@ -103,7 +110,9 @@ def is_bare_number(value: Any) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, np.timedelta64)
 
 
-def averaging_factors(taus: Any, *, rate: float, window: int, tau_max: Any = None) -> NDArray[np.int64]:
+def averaging_factors(
+    taus: Any, *, rate: float, window: int, tau_max: Any = None
+) -> NDArray[np.int64]:
     """Averaging factors k, rising and distinct, of the averaging times ``k / rate`` asked for.
 
     Parameters
@@ -148,13 +157,21 @@ def averaging_factors(taus: Any, *, rate: float, window: int, tau_max: Any = Non
         taus = int(text) if text.isdigit() else [part for part in text.split(",") if part.strip()]
     if isinstance(taus, (int, np.integer)):
         if taus < 1:
-            raise OptionError(f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' or a list such as 0.1s,1s")
-        return np.unique(np.round(np.geomspace(1, limit, int(taus))).astype(np.int64)) if limit > 1 else np.array([1], dtype=np.int64)
+            raise OptionError(
+                f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' or a list such as 0.1s,1s"
+            )
+        return (
+            np.unique(np.round(np.geomspace(1, limit, int(taus))).astype(np.int64))
+            if limit > 1
+            else np.array([1], dtype=np.int64)
+        )
     ks = []
     for tau in taus:
         k = round(duration_seconds(tau, "tau", example=TAUS) * rate)
         if k < 1:
-            raise OptionError(f"tau {tau!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more")
+            raise OptionError(
+                f"tau {tau!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more"
+            )
         if k > longest:
             raise OptionError(
                 f"tau {tau!r} is longer than half of the window ({longest / rate:g} s), so no second difference fits; "

@@ -1,8 +1,9 @@
 """A uniform time axis that is computed, not stored: ``start + round(n * 1e9 / rate)`` nanoseconds.
 
-Every stamp comes from its integer index, so nothing drifts: the rate is taken as the exact decimal that is written
-(99.3 Hz is 993/10 Hz), the whole nanoseconds of the period are multiplied as integers and only the fraction below one
-nanosecond as a float. 200 h at 300 Hz end on the right nanosecond, and the axis of such a log takes no memory.
+Every stamp comes from its integer index, so nothing drifts: the rate is taken as the exact decimal
+that is written (99.3 Hz is 993/10 Hz), the whole nanoseconds of the period are multiplied as
+integers and only the fraction below one nanosecond as a float. 200 h at 300 Hz end on the right
+nanosecond, and the axis of such a log takes no memory.
 """
 
 from __future__ import annotations
@@ -42,15 +43,20 @@ MAX_RATE_HZ = 1e9
 
 _CLOCK = r"(\d{1,2})(?::(\d{1,2})(?::(\d{1,2})(?:[.,](\d+))?)?)?"
 _ZONE = r"\s*(Z|UTC|GMT|[+-]\d{1,2}(?::?\d{2})?)?"
-_INSTANT = re.compile(rf"(\d{{4}}|1(?=-0?1-))-(\d{{1,2}})-(\d{{1,2}})(?:[T ]\s*{_CLOCK}{_ZONE})?", re.IGNORECASE)
-_COMPACT_INSTANT = re.compile(rf"(\d{{4}})(\d\d)(\d\d)(?:[T ](\d\d)(\d\d)(\d\d)(?:[.,](\d+))?{_ZONE})?", re.IGNORECASE)
+_INSTANT = re.compile(
+    rf"(\d{{4}}|1(?=-0?1-))-(\d{{1,2}})-(\d{{1,2}})(?:[T ]\s*{_CLOCK}{_ZONE})?", re.IGNORECASE
+)
+_COMPACT_INSTANT = re.compile(
+    rf"(\d{{4}})(\d\d)(\d\d)(?:[T ](\d\d)(\d\d)(\d\d)(?:[.,](\d+))?{_ZONE})?", re.IGNORECASE
+)
 
 
 def split_instant(text: str) -> tuple[int, int, int, int] | None:
     """Split a date and time into year, month, day and nanoseconds after its midnight UTC.
 
-    Only texts that can be read in one way are split: the year has four digits and comes first (ISO 8601, or the form
-    ``2026-1-2 3:4:5 UTC`` that UDUNITS reads). The fields are not checked against a calendar.
+    Only texts that can be read in one way are split: the year has four digits and comes first (ISO
+    8601, or the form ``2026-1-2 3:4:5 UTC`` that UDUNITS reads). The fields are not checked against
+    a calendar.
 
     Parameters
     ----------
@@ -116,9 +122,13 @@ def stamp_ns(start: Any, what: str = "start") -> int:
             stamp = int((time.tz_convert(None) if time.tzinfo else time).as_unit("ns").value)
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
         example = "2026-11-20T14:00:00 (UTC)"
-        raise OptionError(f"{what} {start!r} is not a date and time; write for instance {example}") from error
+        raise OptionError(
+            f"{what} {start!r} is not a date and time; write for instance {example}"
+        ) from error
     if abs(stamp) >= 2**63:
-        raise OptionError(f"{what} {start!r} is outside the years 1678 to 2262, which 64-bit nanoseconds hold; give another date")
+        raise OptionError(
+            f"{what} {start!r} is outside the years 1678 to 2262, which 64-bit nanoseconds hold; give another date"
+        )
     return stamp
 
 
@@ -137,7 +147,9 @@ def check_rate(rate: float, what: str) -> None:
     gyrostab.errors.OptionError: --rate 0: give the sampling rate in Hz, a number above 0 and at most 1e+09
     """
     if not 0 < rate <= MAX_RATE_HZ:  # false for nan too
-        raise OptionError(f"{what} {rate:g}: give the sampling rate in Hz, a number above 0 and at most {MAX_RATE_HZ:g}")
+        raise OptionError(
+            f"{what} {rate:g}: give the sampling rate in Hz, a number above 0 and at most {MAX_RATE_HZ:g}"
+        )
 
 
 def check_span(start: int, rate: float, size: int, where: str) -> None:
@@ -217,9 +229,24 @@ def first_stamp(log: xr.Dataset) -> int:
 class _GridTransform(CoordinateTransform):
     """Sample position -> stamp, for sample ``first + stride * position`` of a grid."""
 
-    def __init__(self, start: int, rate: float, size: int, *, first: int = 0, stride: int = 1, name: str = "time", dim: str = "time"):
+    def __init__(
+        self,
+        start: int,
+        rate: float,
+        size: int,
+        *,
+        first: int = 0,
+        stride: int = 1,
+        name: str = "time",
+        dim: str = "time",
+    ):
         super().__init__([name], {dim: size}, dtype=np.dtype("datetime64[ns]"))
-        self.start, self.rate, self.first, self.stride = int(start), float(rate), int(first), int(stride)
+        self.start, self.rate, self.first, self.stride = (
+            int(start),
+            float(rate),
+            int(first),
+            int(stride),
+        )
 
     @property
     def size(self) -> int:
@@ -231,8 +258,12 @@ class _GridTransform(CoordinateTransform):
         return {self.coord_names[0]: stamps.view("datetime64[ns]")}
 
     def reverse(self, coord_labels: dict[Any, Any]) -> dict[str, Any]:
-        stamps = np.asarray(coord_labels[self.coord_names[0]]).astype("datetime64[ns]").view(np.int64)
-        return {self.dims[0]: (grid_index(self.start, self.rate, stamps) - self.first) / self.stride}
+        stamps = (
+            np.asarray(coord_labels[self.coord_names[0]]).astype("datetime64[ns]").view(np.int64)
+        )
+        return {
+            self.dims[0]: (grid_index(self.start, self.rate, stamps) - self.first) / self.stride
+        }
 
     def equals(self, other: CoordinateTransform, *, exclude: frozenset[Any] | None = None) -> bool:
         return isinstance(other, _GridTransform) and self._key() == other._key()
@@ -255,7 +286,9 @@ class _GridTransform(CoordinateTransform):
     def extended(self, size: int) -> _GridTransform:
         """The same grid with so many samples."""
         name, dim = str(self.coord_names[0]), self.dims[0]
-        return _GridTransform(self.start, self.rate, size, first=self.first, stride=self.stride, name=name, dim=dim)
+        return _GridTransform(
+            self.start, self.rate, size, first=self.first, stride=self.stride, name=name, dim=dim
+        )
 
     def has_ends_of(self, other: _GridTransform) -> bool:
         """Whether the other grid, of the same size, has the same first and last stamp."""
@@ -298,7 +331,9 @@ class TimeGridIndex(CoordinateTransformIndex):
         stamps = [index.to_pandas_index() for index in indexes]
         return xr.indexes.PandasIndex(stamps[0].append(stamps[1:]), dim)
 
-    def sel(self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None) -> IndexSelResult:
+    def sel(
+        self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None
+    ) -> IndexSelResult:
         """Positions of stamps, exactly or nearest; of slices of time, both ends included; of a day such as "2026-11-20"."""
         (name,) = self.transform.coord_names
         label = labels[name]
@@ -306,13 +341,17 @@ class TimeGridIndex(CoordinateTransformIndex):
         if isinstance(label, slice):
             return IndexSelResult({dim: self._slice(label)})
         if isinstance(label, str) and method is None and len(label) < len("2000-01-01T00:00:00"):
-            period = pd.Period(label)  # "2026-11-20" or "2026-11-20T14": the whole day or hour, as pandas does
+            period = pd.Period(
+                label
+            )  # "2026-11-20" or "2026-11-20T14": the whole day or hour, as pandas does
             return IndexSelResult({dim: self._slice(slice(period.start_time, period.end_time))})
         stamps = np.asarray(getattr(label, "values", label)).astype("datetime64[ns]")
         position = self.transform.reverse({name: stamps})[dim]
         nearest = np.rint(position).astype(np.int64)
         if method not in (None, "nearest"):
-            raise ValueError(f"a uniform time axis selects with method='nearest' or exactly, not {method!r}")
+            raise ValueError(
+                f"a uniform time axis selects with method='nearest' or exactly, not {method!r}"
+            )
         outside = (nearest < 0) | (nearest >= self.transform.size)
         if method is None:
             exact = self.transform.forward({dim: nearest})[name] == stamps
@@ -333,11 +372,19 @@ class TimeGridIndex(CoordinateTransformIndex):
         def edge(bound: Any, side: str) -> int | None:
             if bound is None:
                 return None
-            whole = side == "right" and isinstance(bound, str) and not re.search(r"(Z|[+-]\d\d:?\d\d)$", bound)
-            stamp = pd.Period(bound).end_time if whole else pd.Timestamp(bound)  # "T12:00:03" ends with that second
+            whole = (
+                side == "right"
+                and isinstance(bound, str)
+                and not re.search(r"(Z|[+-]\d\d:?\d\d)$", bound)
+            )
+            stamp = (
+                pd.Period(bound).end_time if whole else pd.Timestamp(bound)
+            )  # "T12:00:03" ends with that second
             stamp = stamp.tz_convert(None) if stamp.tzinfo else stamp
             guess = int(np.floor(self.transform.reverse({name: np.datetime64(stamp)})[dim])) - 1
-            while guess < self.transform.size:  # at most three steps: the guess is off by rounding only
+            while (
+                guess < self.transform.size
+            ):  # at most three steps: the guess is off by rounding only
                 here = self.transform.forward({dim: guess})[name]
                 if here > np.datetime64(stamp) or (here == np.datetime64(stamp) and side == "left"):
                     break
@@ -349,10 +396,14 @@ class TimeGridIndex(CoordinateTransformIndex):
     def to_pandas_index(self) -> pd.Index:
         """Return the whole axis as a DatetimeIndex, in memory."""
         (dim,) = self.transform.dims
-        return pd.DatetimeIndex(self.transform.generate_coords()[self.transform.coord_names[0]], name=dim)
+        return pd.DatetimeIndex(
+            self.transform.generate_coords()[self.transform.coord_names[0]], name=dim
+        )
 
 
-def time_coordinate(start: int, rate: float, size: int, *, name: str = "time", first: int = 0, stride: int = 1) -> xr.Coordinates:
+def time_coordinate(
+    start: int, rate: float, size: int, *, name: str = "time", first: int = 0, stride: int = 1
+) -> xr.Coordinates:
     """Lazy, exact, uniform time coordinate.
 
     Parameters
@@ -366,7 +417,8 @@ def time_coordinate(start: int, rate: float, size: int, *, name: str = "time", f
     name : str
         Name of the coordinate and of its dimension.
     first, stride : int
-        The axis holds the samples `first`, ``first + stride``, ... of the grid that begins at `start`.
+        The axis holds the samples `first`, ``first + stride``, ... of the grid that begins at
+        `start`.
 
     Returns
     -------
@@ -382,4 +434,8 @@ def time_coordinate(start: int, rate: float, size: int, *, name: str = "time", f
     array(['1970-01-01T00:00:00.000000000', '1970-01-01T00:00:00.005000000'],
           dtype='datetime64[ns]')
     """
-    return xr.Coordinates.from_xindex(TimeGridIndex(_GridTransform(start, rate, size, first=first, stride=stride, name=name, dim=name)))
+    return xr.Coordinates.from_xindex(
+        TimeGridIndex(
+            _GridTransform(start, rate, size, first=first, stride=stride, name=name, dim=name)
+        )
+    )

@@ -37,7 +37,9 @@ def records(draw):
     seed = draw(st.integers(0, 2**32 - 1))
     rng = np.random.default_rng(seed)
     n = draw(st.integers(40, 1500))
-    x = rng.standard_normal(n) * draw(st.sampled_from([1e-3, 1.0, 1e4])) + draw(st.sampled_from([0.0, -15.0, 1e5]))
+    x = rng.standard_normal(n) * draw(st.sampled_from([1e-3, 1.0, 1e4])) + draw(
+        st.sampled_from([0.0, -15.0, 1e5])
+    )
     x += draw(st.sampled_from([0.0, 0.1])) * np.cumsum(rng.standard_normal(n))
     for _ in range(draw(st.integers(0, 5))):
         start = int(rng.integers(0, n))
@@ -63,14 +65,22 @@ class TestAgainstTheDefinition:
         log = log_of(x) if chunk is None else log_of(x).chunk(time=chunk)
         with dask.config.set(scheduler="sync"):
             result = davar(
-                log, window=f"{window}samples", step=f"{step}samples", taus=[k / 100 for k in ks], min_strict=0.0, min_coverage=0.0
+                log,
+                window=f"{window}samples",
+                step=f"{step}samples",
+                taus=[k / 100 for k in ks],
+                min_strict=0.0,
+                min_coverage=0.0,
             ).load()
         x = x.astype(np.float64)
         avar, count = direct_surface(x, window, step, ks)
         np.testing.assert_array_equal(result["count"].values[0], count)
-        # a cell whose few terms happen to be tiny is known to the rounding of the terms, not of their square
+        # a cell whose few terms happen to be tiny is known to the rounding of the terms, not of
+        # their square
         size = np.nanstd(x) if np.isfinite(x).sum() > 1 else 1.0
-        floor = 1e-12 * (size**2 / np.array(ks) ** 2 + np.nanmax(np.abs(x), initial=0.0) ** 2 * 1e-10)
+        floor = 1e-12 * (
+            size**2 / np.array(ks) ** 2 + np.nanmax(np.abs(x), initial=0.0) ** 2 * 1e-10
+        )
         got, want = result["avar"].values[0], avar
         np.testing.assert_array_equal(np.isnan(got), np.isnan(want))
         assert np.all(np.abs(got - want)[count > 0] <= (1e-12 * want + floor)[count > 0])
@@ -85,7 +95,13 @@ class TestAgainstTheDefinition:
         if (x.size - 1 - window) // step > 200:
             x = x[: window + 1 + 200 * step]
         log = make_log(x / 3600, rate=100.0, unit="deg", kind="angle")
-        result = davar(log, window=f"{window}samples", step=f"{step}samples", taus=[k / 100 for k in ks], min_coverage=0.0)
+        result = davar(
+            log,
+            window=f"{window}samples",
+            step=f"{step}samples",
+            taus=[k / 100 for k in ks],
+            min_coverage=0.0,
+        )
         avar, count = direct_angle_surface(x, window, step, ks, 0.01)
         np.testing.assert_array_equal(result["count"].values[0], count)
         floor = 1e-11 * np.nanmax(np.abs(x), initial=1.0) ** 2 * 1e4
@@ -94,7 +110,14 @@ class TestAgainstTheDefinition:
     def test_thinned_terms_are_the_multiples_of_the_stride(self):
         x = np.random.default_rng(2).standard_normal(9000)
         x[3000:3040] = np.nan
-        result = davar(log_of(x), window="4000samples", step="700samples", taus=24, overlap="octave", min_strict=0.0)
+        result = davar(
+            log_of(x),
+            window="4000samples",
+            step="700samples",
+            taus=24,
+            overlap="octave",
+            min_strict=0.0,
+        )
         ks = np.round(result.tau.values * 100).astype(int)
         shifts = np.maximum(np.floor(np.log2(ks)).astype(int) - 3, 0)
         assert np.all(ks % 2**shifts == 0)
@@ -104,7 +127,9 @@ class TestAgainstTheDefinition:
         np.testing.assert_allclose(result["avar"].values[0], avar, rtol=1e-12)
 
     @pytest.mark.parametrize("octave", [False, True])
-    @pytest.mark.parametrize(("window", "step", "longest"), [(3000, 700, 1408), (150_000, 75_000, 20_480)])
+    @pytest.mark.parametrize(
+        ("window", "step", "longest"), [(3000, 700, 1408), (150_000, 75_000, 20_480)]
+    )
     def test_a_unit_that_is_longer_than_the_angle_it_holds(self, window, step, longest, octave):
         rng = np.random.default_rng(5)
         x = rng.standard_normal(350_000) + 7.0
@@ -124,10 +149,14 @@ class TestAgainstPeers:
     def test_agrees_with_allantools_in_every_window(self, window):
         rng = np.random.default_rng(3)
         x = rng.standard_normal(5000) + 0.05 * np.cumsum(rng.standard_normal(5000))
-        result = davar(log_of(x), window=f"{window}samples", step="500samples", taus="all", tau_max=4.0)
+        result = davar(
+            log_of(x), window=f"{window}samples", step="500samples", taus="all", tau_max=4.0
+        )
         for j in (0, 3, result.sizes["time"] - 1):
             part = x[j * 500 : j * 500 + window]
-            tau, deviation, _, n = allantools.oadev(part, rate=100.0, data_type="freq", taus=result.tau.values)
+            tau, deviation, _, n = allantools.oadev(
+                part, rate=100.0, data_type="freq", taus=result.tau.values
+            )
             np.testing.assert_allclose(result.tau, tau, rtol=1e-12)
             np.testing.assert_allclose(result.avar[0, j], deviation**2, rtol=1e-12)
             np.testing.assert_array_equal(result["count"][0, j], n)
@@ -145,11 +174,25 @@ class TestAgainstPeers:
 
     def test_the_papers_convention_counts_fewer_terms_and_windows(self):
         x = np.random.default_rng(5).standard_normal(6000)
-        paper = davar(log_of(x), window="1000samples", step="30samples", taus=[0.1], method="direct", convention="paper")
+        paper = davar(
+            log_of(x),
+            window="1000samples",
+            step="30samples",
+            taus=[0.1],
+            method="direct",
+            convention="paper",
+        )
         ours = davar(log_of(x), window="1000samples", step="30samples", taus=[0.1])
         assert (paper.sizes["time"], ours.sizes["time"]) == (166, 167)
         assert (int(paper["count"][0, 0, 0]), int(ours["count"][0, 0, 0])) == (980, 981)
-        recursive = davar(log_of(x), window="1000samples", step="30samples", taus=[0.1], method="recursive", convention="paper")
+        recursive = davar(
+            log_of(x),
+            window="1000samples",
+            step="30samples",
+            taus=[0.1],
+            method="recursive",
+            convention="paper",
+        )
         np.testing.assert_allclose(recursive.avar, paper.avar, rtol=1e-9)
 
     def test_zero_filling_makes_the_canyon_and_counting_removes_it(self):
@@ -157,7 +200,10 @@ class TestAgainstPeers:
         x = np.random.default_rng(6).standard_normal(40_000)
         x[20_000:20_400] = np.nan
         options = {"window": "2000samples", "step": "200samples", "taus": [0.01]}
-        zero, bridge = (davar(log_of(x), gaps=gaps, **options).isel(axis=0, tau=0) for gaps in ("zero", "bridge"))
+        zero, bridge = (
+            davar(log_of(x), gaps=gaps, **options).isel(axis=0, tau=0)
+            for gaps in ("zero", "bridge")
+        )
         inside = zero.coverage < 0.9
         assert inside.sum() >= 8
         np.testing.assert_allclose(zero.avar / bridge.avar, bridge.coverage, rtol=1e-9)
@@ -177,7 +223,16 @@ class TestInvariance:
         whole = davar(log, **options)
         with dask.config.set(scheduler="sync"):
             lazy = davar(log.chunk(time=chunk), **options)
-            for name in ("avar", "count", "coverage", "edf", "estimator", "window_mean", "temperature", "temperature_rate"):
+            for name in (
+                "avar",
+                "count",
+                "coverage",
+                "edf",
+                "estimator",
+                "window_mean",
+                "temperature",
+                "temperature_rate",
+            ):
                 assert isinstance(lazy[name].data, da.Array), name
                 np.testing.assert_array_equal(lazy[name].values, whole[name].values, err_msg=name)
 
@@ -189,7 +244,10 @@ class TestInvariance:
         log = log.assign(rate=(log.rate.dims, held(rows, 30_000), log.rate.attrs))
         options = {"window": "4000samples", "step": "1000samples", "taus": 20}
         whole, space = davar(log, **options).load(), Workspace()
-        parts = [davar_part(log, part=part, space=space, **options) for part in davar_parts(log, samples=10_000, **options)]
+        parts = [
+            davar_part(log, part=part, space=space, **options)
+            for part in davar_parts(log, samples=10_000, **options)
+        ]
         assert len(parts) > 1
         xr.testing.assert_identical(xr.concat(parts, "time", data_vars="minimal").avar, whole.avar)
         units_together = davar_part(log, part=slice(0, whole.sizes["time"]), space=space, **options)
@@ -206,7 +264,9 @@ class TestInvariance:
         def forbidden(*_, **__):
             raise AssertionError("the log was computed")
 
-        data = da.map_blocks(forbidden, chunks=((1,), (5000,) * 4), dtype=float, meta=np.empty((0, 0)))
+        data = da.map_blocks(
+            forbidden, chunks=((1,), (5000,) * 4), dtype=float, meta=np.empty((0, 0))
+        )
         surface = davar(log_of(data), window="3000samples", step="1000samples")
         assert surface.avar.shape[1] == 18
         with pytest.raises(AssertionError, match="the log was computed"):
@@ -235,7 +295,9 @@ class TestInvariance:
     def test_scaling_and_constant(self):
         x = np.random.default_rng(11).standard_normal(5000)
         base = davar(log_of(x), window="1000samples").avar
-        np.testing.assert_allclose(davar(log_of(1e4 * x + 7e6), window="1000samples").avar, 1e8 * base, rtol=1e-7)
+        np.testing.assert_allclose(
+            davar(log_of(1e4 * x + 7e6), window="1000samples").avar, 1e8 * base, rtol=1e-7
+        )
 
 
 class TestAccuracy:
@@ -248,17 +310,23 @@ class TestAccuracy:
         result = davar(log_of(x), window="2000samples", step="300samples", taus=list(taus))
         starts = np.arange(result.sizes["time"]) * 300
         after = starts >= shock + 200
-        want, _ = direct_surface(x[starts[after][0] :], 2000, 300, list(np.round(taus * 100).astype(int)))
+        want, _ = direct_surface(
+            x[starts[after][0] :], 2000, 300, list(np.round(taus * 100).astype(int))
+        )
         error = np.abs(result.avar.values[0][after][: want.shape[0]] / want - 1)
         assert error.max() <= 1e-9
-        recursive = davar(log_of(x), window="2000samples", step="300samples", taus=list(taus), method="recursive")
+        recursive = davar(
+            log_of(x), window="2000samples", step="300samples", taus=list(taus), method="recursive"
+        )
         assert np.abs(recursive.avar.values[0][after][: want.shape[0]] / want - 1).max() > 1e-4
 
     @pytest.mark.parametrize("turn", [1800.0, 108_000.0])  # deg/s; the second is 300 rev/s
     def test_a_rotating_tool_keeps_its_noise(self, turn):
         noise = 3e-3 * 60 * np.sqrt(400.0) * np.random.default_rng(3).standard_normal(50_000)
         still = davar(log_of(noise, rate=400.0), window="20000samples", step="10000samples")
-        rotating = davar(log_of(noise + turn * 3600, rate=400.0), window="20000samples", step="10000samples")
+        rotating = davar(
+            log_of(noise + turn * 3600, rate=400.0), window="20000samples", step="10000samples"
+        )
         np.testing.assert_allclose(rotating.avar, still.avar, rtol=1e-6)
 
 
@@ -267,7 +335,9 @@ class TestGaps:
         rng = np.random.default_rng(12)
         x = rng.standard_normal(20_000)
         x[rng.random(20_000) < 0.2] = np.nan
-        result = davar(log_of(x), window="20000samples", step="20000samples", taus=[0.01, 0.05, 1.0]).isel(axis=0, time=0)
+        result = davar(
+            log_of(x), window="20000samples", step="20000samples", taus=[0.01, 0.05, 1.0]
+        ).isel(axis=0, time=0)
         assert list(result.estimator.values) == [STRICT, WEIGHTED, WEIGHTED]
         # white noise is seen too high, by exactly what the mask says
         assert float(result.white_response.sel(tau=1.0)) == pytest.approx(1.25, abs=0.02)
@@ -296,8 +366,16 @@ class TestGaps:
         white = np.where(here, rng.standard_normal((trials, n)), np.nan)
         quantization = np.where(here, np.diff(rng.standard_normal((trials, n + 1)), axis=1), np.nan)
         names = [str(i) for i in range(trials)]
-        for x, law, response in ((white, lambda k: 1 / k, "white_response"), (quantization, lambda k: 3 / k**2, "quantization_response")):
-            surface = davar(log_of(x, axis=names), window=f"{n}samples", step=f"{n}samples", taus=[0.01, 0.05, 0.2, 1.0, 3.0]).isel(time=0)
+        for x, law, response in (
+            (white, lambda k: 1 / k, "white_response"),
+            (quantization, lambda k: 3 / k**2, "quantization_response"),
+        ):
+            surface = davar(
+                log_of(x, axis=names),
+                window=f"{n}samples",
+                step=f"{n}samples",
+                taus=[0.01, 0.05, 0.2, 1.0, 3.0],
+            ).isel(time=0)
             k = np.round(surface.tau * 100)
             ratio = surface.avar.mean("axis") / law(k)
             scatter = (surface.avar.std("axis") / law(k)) / np.sqrt(trials)
@@ -325,19 +403,29 @@ class TestLabels:
     def test_windows_say_when_they_are(self):
         x = np.zeros((1, 3000))
         result = davar(log_of(x, rate=300.0, start="2026-01-01"), window="2s", step="1s")
-        np.testing.assert_array_equal(result.time.values[:2], np.array(["2026-01-01T00:00:01", "2026-01-01T00:00:02"], "datetime64[ns]"))
         np.testing.assert_array_equal(
-            result.time_bounds.values[1], np.array(["2026-01-01T00:00:01", "2026-01-01T00:00:03"], "datetime64[ns]")
+            result.time.values[:2],
+            np.array(["2026-01-01T00:00:01", "2026-01-01T00:00:02"], "datetime64[ns]"),
+        )
+        np.testing.assert_array_equal(
+            result.time_bounds.values[1],
+            np.array(["2026-01-01T00:00:01", "2026-01-01T00:00:03"], "datetime64[ns]"),
         )
         assert result.attrs["window_samples"] == 600
-        assert all("units" in result[name].attrs for name in ("avar", "count", "coverage", "edf", "window_mean", "tau"))
+        assert all(
+            "units" in result[name].attrs
+            for name in ("avar", "count", "coverage", "edf", "window_mean", "tau")
+        )
 
     def test_channels_follow_the_windows(self):
         n = 6000
         t = np.arange(n) / 100.0
         temperature = 20 + t / 3600 * 60  # 60 K/h
         temperature[1000:1500] = np.nan
-        log = log_of(np.zeros(n), channels={"temperature": (temperature, "degC"), "vibration": (np.full(n, 2.0), "g")})
+        log = log_of(
+            np.zeros(n),
+            channels={"temperature": (temperature, "degC"), "vibration": (np.full(n, 2.0), "g")},
+        )
         slow_times = np.arange(0, n, 100)
         log["pressure"] = ("time_pressure", 1e5 + slow_times, {"units": "Pa"})
         log = log.assign_coords(time_pressure=log.time.isel(time=slice(0, None, 100)).values)
@@ -391,7 +479,11 @@ def test_published_wavelet_variances_are_ours(recordings):
     table = pd.read_csv(recordings("reference-wavelet-variance/reference_wavelet_variance.csv.gz"))
     frame = pd.read_parquet(recordings("adis16405-static-2h47/adis_16405_imu1.parquet"))
     table = table[table["sensor"].str.contains("ADIS") & table["channel"].str.contains("Gyro")]
-    columns = [name for name in frame.columns if "gyro" in name.lower() or name.lower().startswith(("gx", "gy", "gz"))][:3]
+    columns = [
+        name
+        for name in frame.columns
+        if "gyro" in name.lower() or name.lower().startswith(("gx", "gy", "gz"))
+    ][:3]
     compared = 0
     for column, (_, rows) in zip(columns, table.groupby("channel", sort=True), strict=True):
         rows = rows.sort_values("haar_scale_s")
@@ -399,9 +491,15 @@ def test_published_wavelet_variances_are_ours(recordings):
         x = frame[column].to_numpy().astype(np.float64)
         log = make_log(x, rate=100.0, unit="deg/s")
         surface = davar(
-            log, window=f"{x.size}samples", step=f"{x.size}samples", taus=[tau for tau in taus if tau <= x.size / 200], tau_max=x.size / 200
+            log,
+            window=f"{x.size}samples",
+            step=f"{x.size}samples",
+            taus=[tau for tau in taus if tau <= x.size / 200],
+            tau_max=x.size / 200,
         )
         ours = surface.avar.values[0, 0] / 2 / 3600.0**2
-        np.testing.assert_allclose(ours, rows["haar_wavelet_variance"].to_numpy()[: ours.size], rtol=1e-8)
+        np.testing.assert_allclose(
+            ours, rows["haar_wavelet_variance"].to_numpy()[: ours.size], rtol=1e-8
+        )
         compared += ours.size
     assert compared > 40

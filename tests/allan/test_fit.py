@@ -34,7 +34,12 @@ RATE = 100.0
 def windows_of(x, **options):
     """Surface of independent trials, one window each, laid end to end on one axis."""
     n = x.shape[1]
-    return davar(make_log(x.reshape(-1), rate=RATE, unit="deg/h"), window=f"{n}samples", step=f"{n}samples", **options)
+    return davar(
+        make_log(x.reshape(-1), rate=RATE, unit="deg/h"),
+        window=f"{n}samples",
+        step=f"{n}samples",
+        **options,
+    )
 
 
 def records(kind, rng, trials, n):
@@ -100,7 +105,9 @@ def test_closed_form_of_the_white_pair_sum(k):
         rho = np.zeros(n)
         rho[: min(n, 2 * k)] = correlation[: min(n, 2 * k)]
         lags = np.arange(1, n)
-        assert white_pair_sum(n, k) == pytest.approx(n + 2 * np.sum((n - lags) * rho[1:] ** 2), rel=1e-10)
+        assert white_pair_sum(n, k) == pytest.approx(
+            n + 2 * np.sum((n - lags) * rho[1:] ** 2), rel=1e-10
+        )
 
 
 def test_covariance_between_averaging_times_is_that_of_simulated_noise():
@@ -115,7 +122,9 @@ def test_covariance_between_averaging_times_is_that_of_simulated_noise():
     from gyrostab.noise import sample_squares
 
     squares = np.array([0.2, 0.01, 0.0, 30.0]) ** 2 * sample_squares(RATE)[:4]
-    predicted = np.einsum("a,b,abij->ij", squares, squares, product_tables(600, ks, np.zeros_like(ks))[0])
+    predicted = np.einsum(
+        "a,b,abij->ij", squares, squares, product_tables(600, ks, np.zeros_like(ks))[0]
+    )
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     np.testing.assert_allclose(np.cov(avar.T) / scale, predicted / scale, atol=0.12)
 
@@ -125,7 +134,9 @@ def test_standard_errors_are_right(share, block):
     """z-scores of repeated simulations have a standard deviation of 0.9 to 1.1, also through gaps."""
     rng = np.random.default_rng([4, block])
     truth = {"Q": 0.3, "N": 0.01, "K": 400.0}
-    x = white(rng, 1000, 3000, N=truth["N"], rate=RATE) + quantization(rng, 1000, 3000, Q=truth["Q"], rate=RATE)
+    x = white(rng, 1000, 3000, N=truth["N"], rate=RATE) + quantization(
+        rng, 1000, 3000, Q=truth["Q"], rate=RATE
+    )
     x += random_walk(rng, 1000, 3000, K=truth["K"], rate=RATE)
     surface = windows_of(lose(rng, x, share, block), taus=24)
     product = fit_noise(surface)
@@ -135,7 +146,9 @@ def test_standard_errors_are_right(share, block):
     assert 0.7 < float((product.fit_chi2 / product.fit_dof).mean()) < 1.2
     # B cannot be negative and takes a little from its neighbours; without it they are unbiased
     for term, value in truth.items():
-        assert float(fit_noise(surface, terms="QNK")[term].mean()) == pytest.approx(value, rel=0.03), term
+        assert float(fit_noise(surface, terms="QNK")[term].mean()) == pytest.approx(
+            value, rel=0.03
+        ), term
 
 
 def test_flicker_alone_gives_b():
@@ -150,12 +163,19 @@ def test_flicker_alone_gives_b():
 def test_what_is_not_there_is_rarely_claimed_and_its_limit_holds(share):
     """White noise only: each absent term is called observed in about 1 % of windows; limits cover a small truth."""
     rng = np.random.default_rng([6, int(share * 10)])
-    product = fit_noise(windows_of(lose(rng, white(rng, 2000, 2000, N=0.01, rate=RATE), share, 20), taus=20))
+    product = fit_noise(
+        windows_of(lose(rng, white(rng, 2000, 2000, N=0.01, rate=RATE), share, 20), taus=20)
+    )
     for term in "QBKR":
-        assert float((product.observable.sel(term=term) == OBSERVABLE.index("observed")).mean()) <= 0.025
+        assert (
+            float((product.observable.sel(term=term) == OBSERVABLE.index("observed")).mean())
+            <= 0.025
+        )
     described = fit.is_described(product.fit_chi2, product.fit_dof)
     assert described.mean() > 0.98
-    np.testing.assert_array_equal(product.observable.sel(term="N") == OBSERVABLE.index("observed"), described)
+    np.testing.assert_array_equal(
+        product.observable.sel(term="N") == OBSERVABLE.index("observed"), described
+    )
     rng = np.random.default_rng([7, int(share * 10)])
     x = white(rng, 1000, 2000, N=0.01, rate=RATE) + flicker(rng, 1000, 2000, B=0.4)
     product = fit_noise(windows_of(lose(rng, x, share, 20), taus=20))
@@ -187,7 +207,12 @@ def test_what_is_added_to_the_noise_leaves_the_limits_high_enough():
     rng = np.random.default_rng(22)
     t = np.arange(2000) / RATE
     tone = 60.0 * np.sin(2 * np.pi * 1.3 * t + rng.uniform(0, 2 * np.pi, (600, 1)))
-    product = fit_noise(windows_of(white(rng, 600, 2000, N=0.01, rate=RATE) + flicker(rng, 600, 2000, B=0.4) + tone, taus=30))
+    product = fit_noise(
+        windows_of(
+            white(rng, 600, 2000, N=0.01, rate=RATE) + flicker(rng, 600, 2000, B=0.4) + tone,
+            taus=30,
+        )
+    )
     assert (product.fit_chi2 > 2 * product.fit_dof).mean() > 0.95
     for term, value in (("N", 0.01), ("B", 0.4)):
         limited = product.observable.sel(term=term) == OBSERVABLE.index("upper_limit_only")
@@ -214,7 +239,9 @@ def test_no_term_is_observed_where_the_five_terms_do_not_describe_the_window():
 
 
 def test_a_coefficient_and_its_error_are_missing_where_the_term_is_not_observed():
-    product = fit_noise(windows_of(white(np.random.default_rng(25), 50, 2000, N=0.01, rate=RATE), taus=20))
+    product = fit_noise(
+        windows_of(white(np.random.default_rng(25), 50, 2000, N=0.01, rate=RATE), taus=20)
+    )
     for term in TERMS:
         seen = product.observable.sel(term=term) == OBSERVABLE.index("observed")
         np.testing.assert_array_equal(product[term].notnull(), seen, err_msg=term)
@@ -232,18 +259,24 @@ def test_errors_widen_with_the_misfit_and_only_then():
         flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in fit._inputs(cells)[0]]
         ks = np.round(cells.tau.values * RATE).astype(np.int64)
         tables = fit._tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2000)
-        result, misfit, _ = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 2)
+        result, misfit, _ = fit_windows(
+            *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 2
+        )
         fails = chi2.sf(misfit[:, 0], misfit[:, 1]) < 1e-3
         assert fails.mean() < 0.06 if fits else fails.all()
         scale = np.where(fails, np.sqrt(misfit[:, 0] / misfit[:, 1]), 1.0)
-        expected = result[:, FIT_FIELDS.index("square_stderr"), 1] * scale / (2 * np.sqrt(result[:, 0, 1]))
+        expected = (
+            result[:, FIT_FIELDS.index("square_stderr"), 1] * scale / (2 * np.sqrt(result[:, 0, 1]))
+        )
         np.testing.assert_allclose(product.N_stderr[0], expected, rtol=1e-9)
 
 
 def test_a_pure_ramp_is_r():
     t = np.arange(20_000) / RATE / 3600
     x = 36.0 * t + 1e-3 * np.random.default_rng(8).standard_normal(20_000)
-    product = fit_noise(davar(make_log(x, rate=RATE, unit="deg/h"), window="5000samples"), observed_only=False)
+    product = fit_noise(
+        davar(make_log(x, rate=RATE, unit="deg/h"), window="5000samples"), observed_only=False
+    )
     np.testing.assert_allclose(product.R, 36.0, rtol=2e-3)
 
 
@@ -274,9 +307,15 @@ def test_the_fit_of_deviations_of_the_2015_paper_is_not_additive():
 def test_averaging_times_below_a_disturbance_can_be_left_out():
     """A tone at 5 Hz spoils tau below a second and with it N; from 2 s on the noise is as it was."""
     t = np.arange(300_000) / RATE
-    x = white(np.random.default_rng(17), 1, t.size, N=0.01, rate=RATE)[0] + 40 * np.sin(2 * np.pi * 5.013 * t)
-    surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="100000samples", step="100000samples")
-    spoiled, clean = (fit_noise(surface, tau_min=shortest, observed_only=False) for shortest in (None, "5s"))
+    x = white(np.random.default_rng(17), 1, t.size, N=0.01, rate=RATE)[0] + 40 * np.sin(
+        2 * np.pi * 5.013 * t
+    )
+    surface = davar(
+        make_log(x, rate=RATE, unit="deg/h"), window="100000samples", step="100000samples"
+    )
+    spoiled, clean = (
+        fit_noise(surface, tau_min=shortest, observed_only=False) for shortest in (None, "5s")
+    )
     assert abs(float(clean.N.mean()) / 0.01 - 1) < 0.2
     assert abs(float(spoiled.N.mean()) / 0.01 - 1) > 0.5
     with pytest.raises(OptionError, match="no averaging time"):
@@ -292,9 +331,14 @@ def test_window_without_data_is_said_to_see_nothing():
 
 
 def test_two_averaging_times_cannot_tell_five_terms_apart():
-    product = fit_noise(windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01, 0.1]))
+    product = fit_noise(
+        windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01, 0.1])
+    )
     assert (product.observable == OBSERVABLE.index("not_observable")).any()
-    chosen = fit_noise(windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01, 0.1]), terms="N")
+    chosen = fit_noise(
+        windows_of(np.random.default_rng(11).standard_normal((3, 1000)), taus=[0.01, 0.1]),
+        terms="N",
+    )
     assert (chosen.observable.sel(term="N") == OBSERVABLE.index("observed")).all()
     assert (chosen.observable.sel(term="Q") == OBSERVABLE.index("not_observable")).all()
 
@@ -310,7 +354,11 @@ def test_a_lazy_surface_stays_lazy_and_fits_the_same():
 
 
 def test_many_averaging_times_are_thinned_for_the_fit():
-    surface = davar(make_log(np.random.default_rng(13).standard_normal(6000), rate=RATE, unit="deg/h"), window="3000samples", taus="all")
+    surface = davar(
+        make_log(np.random.default_rng(13).standard_normal(6000), rate=RATE, unit="deg/h"),
+        window="3000samples",
+        taus="all",
+    )
     product = fit_noise(surface)
     assert product.sizes["tau"] == 1000
     assert product.edf.notnull().all()
@@ -333,24 +381,42 @@ def test_nonnegative_solution_beats_every_other_point():
 
 
 @pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])
-@pytest.mark.parametrize("law", [{"N": 0.01}, {"Q": 0.4, "N": 0.01, "K": 200.0}, {"N": 0.01, "K": 40.0, "R": 3000.0}], ids="+".join)
+@pytest.mark.parametrize(
+    "law",
+    [{"N": 0.01}, {"Q": 0.4, "N": 0.01, "K": 200.0}, {"N": 0.01, "K": 40.0, "R": 3000.0}],
+    ids="+".join,
+)
 def test_fast_fit_is_the_plain_fit(law, share, block):
     """Against numpy and scipy, one window at a time; every number that errors and limits are made of."""
     rng = np.random.default_rng([19, block])
-    x = white(rng, 12, 3000, N=law["N"], rate=RATE) + random_walk(rng, 12, 3000, K=law.get("K", 0.0), rate=RATE)
-    x += quantization(rng, 12, 3000, Q=law.get("Q", 0.0), rate=RATE) + law.get("R", 0.0) * np.arange(3000) / RATE / 3600
+    x = white(rng, 12, 3000, N=law["N"], rate=RATE) + random_walk(
+        rng, 12, 3000, K=law.get("K", 0.0), rate=RATE
+    )
+    x += (
+        quantization(rng, 12, 3000, Q=law.get("Q", 0.0), rate=RATE)
+        + law.get("R", 0.0) * np.arange(3000) / RATE / 3600
+    )
     cells, ks, rate, window = fit._inputs(windows_of(lose(rng, x, share, block), taus=21))
     flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells]
     flat[0][3, 5] = np.nan
     tables = fit._tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
-    result, misfit, _ = fit_windows(*flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 31)
+    result, misfit, _ = fit_windows(
+        *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 31
+    )
     for w in range(12):
         plain = fit_window_plainly(*(cell[w] for cell in flat), tables)
         assert misfit[w, 0] == pytest.approx(float(plain.pop("chi2")), rel=1e-5)
         there = plain["square"] > 2.3 * plain["square_stderr"]
         for row, name in enumerate(FIT_FIELDS[:-1]):
-            np.testing.assert_allclose(result[w, row, there], plain[name][there], rtol=1e-6, atol=1e-12 * abs(plain[name]).max())
-            np.testing.assert_allclose(result[w, row], plain[name], rtol=1e-4, atol=1e-7 * abs(plain[name]).max())
+            np.testing.assert_allclose(
+                result[w, row, there],
+                plain[name][there],
+                rtol=1e-6,
+                atol=1e-12 * abs(plain[name]).max(),
+            )
+            np.testing.assert_allclose(
+                result[w, row], plain[name], rtol=1e-4, atol=1e-7 * abs(plain[name]).max()
+            )
 
 
 def cells_of(x, **options):
@@ -380,7 +446,9 @@ def test_a_window_has_the_same_fit_in_any_place_beside_any_other():
     flat, tables = cells_of(lose(rng, mixed_records(rng, 21), 0.2, 20), taus=21)
     expected = fit_windows(*flat, *shared(tables), 31)
     order = rng.permutation(21)
-    for got, want in zip(fit_windows(*[cell[order] for cell in flat], *shared(tables), 31), expected, strict=True):
+    for got, want in zip(
+        fit_windows(*[cell[order] for cell in flat], *shared(tables), 31), expected, strict=True
+    ):
         np.testing.assert_array_equal(got, want[order])
     spoiled = [cell.copy() for cell in flat]
     spoiled[0][3::8] = np.nan
@@ -398,9 +466,13 @@ def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_mus
     """Tables that are wrong by 2e-5 for random walks and right for all else; the plain fit widens window by window."""
     rng = np.random.default_rng(33)
     walks = random_walk(rng, 20, 3000, K=400.0, rate=RATE)
-    flat, tables = cells_of(np.where(np.arange(20)[:, None] % 3 == 1, walks, mixed_records(rng, 20)), taus=21)
+    flat, tables = cells_of(
+        np.where(np.arange(20)[:, None] % 3 == 1, walks, mixed_records(rng, 20)), taus=21
+    )
     pairs = tables.pairs.copy()
-    values, vectors = np.linalg.eigh(pairs[3, 3] / np.sqrt(np.outer(np.diag(pairs[3, 3]), np.diag(pairs[3, 3]))))
+    values, vectors = np.linalg.eigh(
+        pairs[3, 3] / np.sqrt(np.outer(np.diag(pairs[3, 3]), np.diag(pairs[3, 3])))
+    )
     scale = np.sqrt(np.diag(pairs[3, 3]))
     pairs[3, 3] -= (values[0] + 2e-5) * np.outer(vectors[:, 0] * scale, vectors[:, 0] * scale)
     damaged = SimpleNamespace(**{**vars(tables), "pairs": pairs})
@@ -409,7 +481,9 @@ def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_mus
     for w in range(20):
         plain = fit_window_plainly(*(cell[w] for cell in flat), damaged)
         assert misfit[w, 0] == pytest.approx(float(plain["chi2"]), rel=1e-4)
-        np.testing.assert_allclose(result[w, 0], plain["square"], rtol=1e-4, atol=1e-7 * abs(plain["square"]).max())
+        np.testing.assert_allclose(
+            result[w, 0], plain["square"], rtol=1e-4, atol=1e-7 * abs(plain["square"]).max()
+        )
         widened += plain["jitter"] > 1e-6
     assert 2 < widened < 18
 
@@ -439,12 +513,16 @@ def test_interpolated_quantile_is_that_of_scipy(quantile_curve, exponent):
 
 
 @pytest.mark.parametrize("decades", [np.inf, 10.0])
-def test_limit_of_a_cell_is_the_least_that_the_model_promises_among_all_cells(quantile_curve, decades):
+def test_limit_of_a_cell_is_the_least_that_the_model_promises_among_all_cells(
+    quantile_curve, decades
+):
     """Every cell tried with scipy's quantile; a term's own part cannot be more than the cell."""
     rng = np.random.default_rng(34)
     ks = np.round(np.geomspace(1, 1000, 25))
     columns = ks[:, None] ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-    squares = np.array([1.0, 0.3, 0.01, 1e-4, 1e-7]) * rng.choice([0.0, 0.1, 1.0, 10.0, np.nan], (40, 5))
+    squares = np.array([1.0, 0.3, 0.01, 1e-4, 1e-7]) * rng.choice(
+        [0.0, 0.1, 1.0, 10.0, np.nan], (40, 5)
+    )
     own = rng.uniform(0.5, 2.0, (5, 25)) * 3000 / ks
     own[4] = np.inf
     white, quantization, ramp = rng.uniform(0.5, 1.5, (3, 40, 25))
@@ -456,7 +534,21 @@ def test_limit_of_a_cell_is_the_least_that_the_model_promises_among_all_cells(qu
     avar = model * rng.chisquare(dof) / dof
     avar[rng.random((40, 25)) < 0.1] = np.nan
     span = np.array([np.inf, *[decades] * 4])
-    got = cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, own, ks, span, 1e6, *quantile_curve)
+    got = cell_limits(
+        avar,
+        white,
+        quantization,
+        ramp,
+        factor,
+        squares,
+        dof,
+        columns,
+        own,
+        ks,
+        span,
+        1e6,
+        *quantile_curve,
+    )
     freedom = np.minimum(own.T * factor[..., None], 1e6)
     freedom[..., 4] = np.minimum(freedom[..., 4], dof)
     reach = 1.0 / (chi2.ppf(0.05, freedom) / freedom * part)
@@ -474,14 +566,18 @@ def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
     walk = np.tril(np.ones((window, window)))
     differences = []
     for k in ks:
-        rows = [np.concatenate([np.zeros(m), -np.ones(k), np.ones(k), np.zeros(window - m - 2 * k)]) for m in range(window - 2 * k + 1)]
+        rows = [
+            np.concatenate([np.zeros(m), -np.ones(k), np.ones(k), np.zeros(window - m - 2 * k)])
+            for m in range(window - 2 * k + 1)
+        ]
         differences.append(np.array(rows))
     got, _ = product_tables(window, ks, np.zeros_like(ks))
     for i, first in enumerate(differences):
         for j, second in enumerate(differences):
             white_part = first @ second.T / (2.0 * ks[i] * ks[j])
             assert got[1, 1, i, j] == pytest.approx(2 * np.mean(white_part**2), rel=1e-9)
-            # the average over each interval of a Brownian motion: half of the step in it, and a part of its own
+            # the average over each interval of a Brownian motion: half of the step in it, and a
+            # part of its own
             ends = walk - 0.5 * np.eye(window)
             spread = ends @ ends.T + np.eye(window) / 12
             walk_part = first @ spread @ second.T / (2.0 * ks[i] * ks[j])
@@ -520,8 +616,13 @@ def test_a_ramp_far_above_the_noise_fits_through_gaps(block):
     x = white(rng, 100, 4000, N=0.01, rate=RATE) + 3000.0 * np.arange(4000) / RATE / 3600
     surface = windows_of(lose(rng, x, 0.2, block), taus=24)
     bare = surface.assign(ramp_response=xr.ones_like(surface.ramp_response))
-    fails = [float((chi2.sf(one.fit_chi2, one.fit_dof) < 1e-3).mean()) for one in (fit_noise(surface), fit_noise(bare))]
+    fails = [
+        float((chi2.sf(one.fit_chi2, one.fit_dof) < 1e-3).mean())
+        for one in (fit_noise(surface), fit_noise(bare))
+    ]
     assert fails[0] < (0.02 if block == 5 else 0.06)
     assert block == 5 or fails[1] > 0.15
-    old = surface.drop_vars("ramp_response")  # as a version wrote it that took the response of a ramp as 1
+    old = surface.drop_vars(
+        "ramp_response"
+    )  # as a version wrote it that took the response of a ramp as 1
     xr.testing.assert_equal(fit_noise(old), fit_noise(bare).drop_vars("ramp_response"))

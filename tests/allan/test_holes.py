@@ -23,8 +23,15 @@ def test_a_step_inside_of_a_hole_is_in_no_strict_term():
     """The rate is constant before and after: any term that reaches across the hole would see the step."""
     rate = np.repeat([5.0, 9.0], 1000)
     rate[990:1010] = np.nan
-    surface = davar(make_log(rate, rate=100.0, unit="deg/h"), window="2000samples", taus=[0.01, 0.1, 1.0], min_strict=0.0)
+    surface = davar(
+        make_log(rate, rate=100.0, unit="deg/h"),
+        window="2000samples",
+        taus=[0.01, 0.1, 1.0],
+        min_strict=0.0,
+    )
     assert (surface.estimator == 1).all()
     assert float(surface.avar.max()) < 1e-20
-    clusters = davar(make_log(rate, rate=100.0, unit="deg/h"), window="2000samples", taus=[1.0], min_strict=1.0)
+    clusters = davar(
+        make_log(rate, rate=100.0, unit="deg/h"), window="2000samples", taus=[1.0], min_strict=1.0
+    )
     assert float(clusters.avar.max()) > 0.1

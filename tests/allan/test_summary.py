@@ -85,7 +85,12 @@ def test_single_outliers_are_counted_and_louder_noise_is_not():
     assert count_outliers(values, starts, 10_000).tolist() == [0, 0, 0, 0]
     values[[5, 9_000, 25_000, 25_004]] += [40.0, -40.0, 60.0, 60.0]
     assert count_outliers(values, starts, 10_000).tolist() == [2, 0, 2, 0]
-    assert count_outliers(np.round(100 * values).astype(np.int32), starts, 10_000).tolist() == [2, 0, 2, 0]
+    assert count_outliers(np.round(100 * values).astype(np.int32), starts, 10_000).tolist() == [
+        2,
+        0,
+        2,
+        0,
+    ]
     values[24_000:24_990] = np.nan
     assert count_outliers(values, starts, 10_000).tolist() == [2, 0, 2, 0]
 

@@ -40,9 +40,21 @@ from gyrostab.schema import check_log
 EVERY = CATALOGUE | STRANGE
 
 
-def small(name: str | None, *, seed: int = 21, strength: float = 3.0, rate: float = 10.0, seconds: float = 900, **more) -> dict:
+def small(
+    name: str | None,
+    *,
+    seed: int = 21,
+    strength: float = 3.0,
+    rate: float = 10.0,
+    seconds: float = 900,
+    **more,
+) -> dict:
     names = [name] if name else []
-    base = plan_case(4, seed=seed) | {"kind": "single" if name else "null", "names": names, "strengths": [strength] * len(names)}
+    base = plan_case(4, seed=seed) | {
+        "kind": "single" if name else "null",
+        "names": names,
+        "strengths": [strength] * len(names),
+    }
     return base | {"rate": rate, "seconds": seconds, "gaps": 0.1, "severing": None} | more
 
 
@@ -66,7 +78,11 @@ def test_nearest_follower_of_a_driver_has_the_sensitivity_at_rest_and_its_lag(si
     world = replace(white_world(), missing=np.arange(20_000) % 7 < 2)
     step = np.where(np.arange(world.temperature.size) >= 600, 1.5, 0.0)
     since = np.maximum(np.arange(world.size) / world.rate - 600.0, 0.0)
-    mean = 1.5 * size * (1.0 - np.exp(-since / time)) if time else 1.5 * size * np.interp(since, [0, 1e-9], [0, 1])
+    mean = (
+        1.5 * size * (1.0 - np.exp(-since / time))
+        if time
+        else 1.5 * size * np.interp(since, [0, 1e-9], [0, 1])
+    )
     found = following(world, np.asarray(mean), step, axis=0)
     assert found[0] == pytest.approx(size, rel=0.01)
     assert found[1] == pytest.approx(time, abs=1.5)  # the driver has one value a second
@@ -75,7 +91,11 @@ def test_nearest_follower_of_a_driver_has_the_sensitivity_at_rest_and_its_lag(si
 def test_true_numbers_of_a_slow_supply_leave_next_to_nothing_of_it():
     """What follows the voltage at once leaves a tenth and more of it."""
     world = white_world()
-    slow = [e for s in range(12) if (e := CATALOGUE["supply_bias"].make(world, stream(s, "slow"), strength=4.0)).differs]
+    slow = [
+        e
+        for s in range(12)
+        if (e := CATALOGUE["supply_bias"].make(world, stream(s, "slow"), strength=4.0)).differs
+    ]
     volt = np.repeat(world.supply, 10)[: world.size]
     assert len(slow) >= 4
     for effect in slow:
@@ -94,22 +114,36 @@ def test_latitude_is_that_of_the_rate_across_the_tool_wherever_it_rests():
     for seed in range(4):
         effect = CATALOGUE["earth_rate"].make(world, stream(seed, "rest"), strength=4.0)
         across = np.median(np.hypot(effect.mean[0], effect.mean[1]))
-        assert math.cos(math.radians(effect.parameters["latitude"]["value"])) * 15.041 == pytest.approx(across, rel=1e-6)
+        assert math.cos(
+            math.radians(effect.parameters["latitude"]["value"])
+        ) * 15.041 == pytest.approx(across, rel=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("name", "term"), [("temperature_bias", "quadratic"), ("vibration_rectification", "quartic"), ("scale_factor", "cubic")]
+    ("name", "term"),
+    [
+        ("temperature_bias", "quadratic"),
+        ("vibration_rectification", "quartic"),
+        ("scale_factor", "cubic"),
+    ],
 )
 def test_a_bent_response_is_not_compared_with_one_term_of_several(name, term):
     world = draw_world(np.random.default_rng(3), rate=10.0, seconds=900.0)
-    world = replace(world, rotation=np.maximum(world.rotation, 1e-3 * np.arange(world.rotation.size)))
+    world = replace(
+        world, rotation=np.maximum(world.rotation, 1e-3 * np.arange(world.rotation.size))
+    )
     made = [CATALOGUE[name].make(world, stream(s, "bend"), strength=4.0) for s in range(12)]
-    marks = {effect.differs: [one.get("unless", ()) for one in effect.parameters.values()] for effect in made}
+    marks = {
+        effect.differs: [one.get("unless", ()) for one in effect.parameters.values()]
+        for effect in made
+    }
     assert any(term in one for one in marks[True])
     assert not any(marks[False])
 
 
-@pytest.mark.parametrize(("frequency", "least", "most"), [(0.5, 0.8, 1.0), (1 / 4000, 0.0, 0.2)], ids=["fast", "slow"])
+@pytest.mark.parametrize(
+    ("frequency", "least", "most"), [(0.5, 0.8, 1.0), (1 / 4000, 0.0, 0.2)], ids=["fast", "slow"]
+)
 def test_noise_that_is_learned_takes_in_a_slow_mean_and_no_fast_one(frequency, least, most):
     world = white_world()
     mean = np.zeros((3, world.size))
@@ -121,7 +155,9 @@ def test_noise_that_is_learned_takes_in_a_slow_mean_and_no_fast_one(frequency, l
 
 
 def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
-    world = replace(white_world(), noise=tuple({"N": 0.003, "B": 0.002, "K": 0.02, "Q": 0.0} for _ in AXES))
+    world = replace(
+        white_world(), noise=tuple({"N": 0.003, "B": 0.002, "K": 0.02, "Q": 0.0} for _ in AXES)
+    )
     t = np.arange(world.size) / world.rate
     mean = np.zeros((3, world.size))
     mean[0] = np.cos(2 * math.pi * t / 700)
@@ -139,7 +175,9 @@ def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
     ratios = []
     for seed in range(100):
         noise = base_noise(world, np.random.default_rng(seed))[0]
-        ratios.append(float((lines * (fft.dct(noise, norm="ortho")[1:] + lines / 2) / density).sum()))
+        ratios.append(
+            float((lines * (fft.dct(noise, norm="ortho")[1:] + lines / 2) / density).sum())
+        )
     nats = NATS * 4.0
     assert np.mean(ratios) == pytest.approx(nats, abs=4 * math.sqrt(2 * nats / 100))
     assert np.var(ratios) == pytest.approx(2 * nats, rel=0.5)
@@ -149,7 +187,9 @@ def test_limits_of_noise_are_the_closed_forms():
     world = white_world()
     n = world.size
     step = np.ones((3, world.temperature.size))
-    step[0, :1000] = math.exp(2 * math.sqrt(NATS / n) * 2)  # half of the time: T_eff is a quarter of T
+    step[0, :1000] = math.exp(
+        2 * math.sqrt(NATS / n) * 2
+    )  # half of the time: T_eff is a quarter of T
     assert variance_size(world, step) == pytest.approx(1.0, rel=0.01)
     always = np.full((3, 1, 10), 1.0)
     always[1] = math.exp(2 * math.sqrt(NATS / n))
@@ -181,7 +221,9 @@ def test_a_case_is_the_same_again_and_another_is_not():
     (one, truth), (again, same) = make_case(plan), make_case(plan)
     xr.testing.assert_identical(one, again)
     assert truth_text(truth) == truth_text(same)
-    assert not np.array_equal(one.rate.values, make_case(plan | {"index": 5})[0].rate.values, equal_nan=True)
+    assert not np.array_equal(
+        one.rate.values, make_case(plan | {"index": 5})[0].rate.values, equal_nan=True
+    )
 
 
 def test_an_effect_on_the_mean_is_the_difference_to_the_bare_noise():
@@ -201,7 +243,9 @@ def test_shaking_adds_the_variance_that_its_size_was_reckoned_from(name):
     v = np.log1p(np.mean(effect.extra[row][busy] ** 2) / sd**2)
     n = busy.sum() * (1 - busy.mean())
     alone = math.sqrt(n * v**2 / 4 / NATS)
-    assert 0.3 < alone / effect.size < 1.1  # a flat density is the weakest of all of this power, and other axes may add
+    assert (
+        0.3 < alone / effect.size < 1.1
+    )  # a flat density is the weakest of all of this power, and other axes may add
 
 
 def test_rounding_of_the_rate_stands_alone_and_adds_its_white_noise():
@@ -216,7 +260,9 @@ def test_an_angle_counter_is_noise_and_no_effect():
     """A log of angle steps stands on a lattice as well; the truth says Q of that step, and names nothing."""
     world = draw_world(np.random.default_rng(0), rate=10.0, seconds=600.0)
     world = replace(world, noise=tuple(noise | {"Q": 0.3} for noise in world.noise))
-    counts = signal(world, [], seed=1) / (0.3 * math.degrees(1e-6) * 3600 * math.sqrt(12) * world.rate)
+    counts = signal(world, [], seed=1) / (
+        0.3 * math.degrees(1e-6) * 3600 * math.sqrt(12) * world.rate
+    )
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
 
 
@@ -237,10 +283,15 @@ def test_what_is_lost_on_the_way_is_shorter_than_a_power_cut_where_starts_matter
 
 
 def test_random_bias_has_the_size_that_the_spectrum_says():
-    world = replace(white_world(seconds=4000), noise=tuple({"N": 0.003, "B": 0.0, "K": 0.0, "Q": 0.0} for _ in AXES))
+    world = replace(
+        white_world(seconds=4000),
+        noise=tuple({"N": 0.003, "B": 0.0, "K": 0.0, "Q": 0.0} for _ in AXES),
+    )
     size, nats = wander_size(world, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.003)
     larger, more = wander_size(world, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.006)
-    assert larger / size == pytest.approx(4.0, rel=0.1)  # faint: the log variance goes with the square
+    assert larger / size == pytest.approx(
+        4.0, rel=0.1
+    )  # faint: the log variance goes with the square
     f = np.arange(1, world.size) / (2 * world.seconds)
     ratio = 2 * 0.003**2 * 50 / (1 + (2 * math.pi * f * 50) ** 2) / (60 * 0.003) ** 2
     assert size == pytest.approx(math.sqrt((ratio**2).sum() / 4 / NATS), rel=0.05)
@@ -254,7 +305,9 @@ def test_buried_cases_are_seen_by_neither_eye():
     assert truth["effects"][0]["size"] <= 1.5
     noise = truth["noise"][truth["effects"][0]["axes"][0]]["N"]
     wave = truth["effects"][0]["parameters"]["peak"]["value"] / math.sqrt(2)
-    assert wave / (60 * noise) < FAINT * 1.01 / math.sqrt(0.5)  # a mean over 1 s can only be smaller than the line itself
+    assert wave / (60 * noise) < FAINT * 1.01 / math.sqrt(
+        0.5
+    )  # a mean over 1 s can only be smaller than the line itself
     assert truth["buried"]["sample"] < FAINT
     assert truth["buried"]["second"] < FAINT
     assert all(share < 1 for share in truth["buried"]["allan"].values())
@@ -266,27 +319,58 @@ def test_a_loud_effect_is_never_called_buried():
 
     world = white_world(seconds=900)
     effect = CATALOGUE["spectral_line"].make(world, np.random.default_rng(0), strength=30.0)
-    assert not is_buried(world, [effect], signal(world, [effect], seed=1), rng=np.random.default_rng(0))["buried"]
+    assert not is_buried(
+        world, [effect], signal(world, [effect], seed=1), rng=np.random.default_rng(0)
+    )["buried"]
 
 
 def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
-    words = [*EVERY, "strength", "concealed", "buried", "severed", "withheld", "decoy", "truth", "effect", "seed", "sealed"]
+    words = [
+        *EVERY,
+        "strength",
+        "concealed",
+        "buried",
+        "severed",
+        "withheld",
+        "decoy",
+        "truth",
+        "effect",
+        "seed",
+        "sealed",
+    ]
     plans = [small(name, index=i) for i, name in enumerate(EVERY)] + [small(None, index=90)]
     plans += [
-        small("shupe", index=91 + i, kind="severed", severing=how) for i, how in enumerate(("withheld", "decoy", "lagged", "confounded"))
+        small("shupe", index=91 + i, kind="severed", severing=how)
+        for i, how in enumerate(("withheld", "decoy", "lagged", "confounded"))
     ]
     attributes, dimensions = set(), set()
     for plan in plans:
         log, truth = make_case(plan)
         digest = commit_case(log, truth, tmp_path, name=f"{plan['index']:04d}")
-        assert open_truth(tmp_path / "truth" / f"{plan['index']:04d}.json", sha256=digest)["plan"]["names"] == plan["names"]
+        assert (
+            open_truth(tmp_path / "truth" / f"{plan['index']:04d}.json", sha256=digest)["plan"][
+                "names"
+            ]
+            == plan["names"]
+        )
         attributes.add(tuple(sorted(log.attrs)))
         dimensions |= set(map(str, log.variables))
     assert attributes == {("kind", "sampling_rate_hz")}
     for path in (tmp_path / "recordings").iterdir():
         held = path.read_bytes().lower() + path.name.encode()
         assert [word for word in words if word.encode() in held] == [], path
-    known = {"axis", "time", "rate", "temperature", "vibration", "rotation_rate", "supply_voltage", "light_power", "ramp", "accel_x"}
+    known = {
+        "axis",
+        "time",
+        "rate",
+        "temperature",
+        "vibration",
+        "rotation_rate",
+        "supply_voltage",
+        "light_power",
+        "ramp",
+        "accel_x",
+    }
     assert {name.removeprefix("time_") for name in dimensions} - known <= {"accel_y", "accel_z"} | {
         n for n in dimensions if n.startswith("gap_")
     }
@@ -317,10 +401,18 @@ def test_a_sealed_recording_is_read_as_a_log(tmp_path):
 def test_severed_driver(how):
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.normal(size=1000))
-    channels = sever({"temperature": (values, 1.0), "vibration": (np.ones(1000), 1.0)}, "temperature", how=how, rng=rng)
+    channels = sever(
+        {"temperature": (values, 1.0), "vibration": (np.ones(1000), 1.0)},
+        "temperature",
+        how=how,
+        rng=rng,
+    )
     assert ("temperature" in channels) == (how not in ("withheld", "decoy"))
     if how == "lagged":
-        lags = [np.corrcoef(values[: 1000 - k], channels["temperature"][0][k:])[0, 1] for k in range(0, 181)]
+        lags = [
+            np.corrcoef(values[: 1000 - k], channels["temperature"][0][k:])[0, 1]
+            for k in range(0, 181)
+        ]
         assert np.argmax(lags) >= 30
     if how == "confounded":
         assert abs(np.corrcoef(values, channels["supply_voltage"][0])[0, 1]) > 0.8
@@ -354,7 +446,11 @@ def test_composition_of_a_benchmark():
 def test_a_third_of_the_forms_are_none_of_a_fitter():
     world = replace(white_world(seconds=600), cuts=np.array([[200.0, 220.0]]))
     world = replace(world, light=np.linspace(1.0, 0.9, world.temperature.size))
-    flags = [entry.make(world, stream(s, name), strength=2.0).differs for name, entry in CATALOGUE.items() for s in range(2)]
+    flags = [
+        entry.make(world, stream(s, name), strength=2.0).differs
+        for name, entry in CATALOGUE.items()
+        for s in range(2)
+    ]
     assert np.mean(flags) > 1 / 3
 
 
@@ -401,12 +497,17 @@ def test_salt_on_a_log_of_counts_is_counted_and_keeps_its_mean():
     log, _ = make_case(small(None, rate=10.0, seconds=1200))
     counted = np.rint(log.rate.values / 0.5) * 0.5
     copies = inject_effect(
-        log.assign(rate=(log.rate.dims, counted, log.rate.attrs)), "vibration_rectification", 8.0, np.random.default_rng(2)
+        log.assign(rate=(log.rate.dims, counted, log.rate.attrs)),
+        "vibration_rectification",
+        8.0,
+        np.random.default_rng(2),
     )
     salted, truth = copies["salted"]
     seen = np.isfinite(counted)
     assert counts_of(counted[0]) == pytest.approx(0.5)
-    np.testing.assert_allclose(np.remainder(salted.rate.values[seen] / 0.5 + 0.25, 1.0), 0.25, atol=1e-6)
+    np.testing.assert_allclose(
+        np.remainder(salted.rate.values[seen] / 0.5 + 0.25, 1.0), 0.25, atol=1e-6
+    )
     sent = {axis: np.array(values) for axis, values in truth["effects"][0]["waveform_10s"].items()}
     axis, expected = max(sent.items(), key=lambda one: np.ptp(one[1]))
     row = list(salted.axis.values).index(axis)
@@ -421,7 +522,9 @@ def test_salt_on_a_real_gyro(recordings):
     from gyrostab.ingest.make_log import make_log
 
     table = pd.read_csv(recordings("rlg-static-30min/lasergyro.csv.gz"), nrows=60_000)
-    gyros = [column for column in table.columns if column.lower().startswith(("gyro", "w", "g"))][:3]
+    gyros = [column for column in table.columns if column.lower().startswith(("gyro", "w", "g"))][
+        :3
+    ]
     log = make_log(table[gyros].to_numpy().T, rate=100.0, unit="deg/h")
     copies = inject_effect(log, "spectral_line", 5.0, np.random.default_rng(4))
     added = copies["salted"][0].rate.values - log.rate.values

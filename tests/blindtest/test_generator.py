@@ -13,14 +13,22 @@ from scipy import signal
 
 from gyrostab.blindtest.generator import coil, electronics, light, loop, telemetry, tool, vibration
 from gyrostab.blindtest.generator import noise_floor as floor
-from gyrostab.blindtest.scoring.baseline_detectors import allan_band, allan_variance, band_excess, log_allan, octaves
+from gyrostab.blindtest.scoring.baseline_detectors import (
+    allan_band,
+    allan_variance,
+    band_excess,
+    log_allan,
+    octaves,
+)
 
 
 @pytest.mark.parametrize(("thickness", "diffusivity"), [(0.012, 2.2e-7), (0.007, 3e-7)])
 def test_coil_forgets_a_step_with_the_slowest_mode(thickness, diffusivity):
     tau = coil.diffusion_time(thickness, diffusivity)
     face = np.r_[20.0, np.full(round(8 * tau), 30.0)]
-    inner = coil.layer_temperatures(face, dt=1.0, layers=48, thickness=thickness, diffusivity=diffusivity)[-1]
+    inner = coil.layer_temperatures(
+        face, dt=1.0, layers=48, thickness=thickness, diffusivity=diffusivity
+    )[-1]
     late = slice(round(3 * tau), round(6 * tau))
     slope = np.polyfit(np.arange(face.size)[late], np.log(30.0 - inner[late]), 1)[0]
     assert -1 / slope == pytest.approx(tau, rel=5e-3)
@@ -28,7 +36,9 @@ def test_coil_forgets_a_step_with_the_slowest_mode(thickness, diffusivity):
 
 def test_coil_lags_behind_a_steady_ramp_by_a_parabola():
     d, kappa, speed, layers = 0.012, 2.2e-7, 1 / 60, 48
-    layer = coil.layer_temperatures(speed * np.arange(4000.0), dt=1.0, layers=layers, thickness=d, diffusivity=kappa)[:, -1]
+    layer = coil.layer_temperatures(
+        speed * np.arange(4000.0), dt=1.0, layers=layers, thickness=d, diffusivity=kappa
+    )[:, -1]
     x = (np.arange(layers) + 0.5) * d / layers
     behind = speed * (d * x - x**2 / 2) / kappa
     np.testing.assert_allclose(speed * 3999 - layer, behind, rtol=0.01, atol=2e-3)
@@ -38,7 +48,9 @@ def test_heat_that_enters_a_coil_is_the_heat_that_it_holds():
     d, kappa, layers = 0.012, 2.2e-7, 24
     face = 20 + 5 * np.sin(np.arange(2000) / 150.0)
     layer = coil.layer_temperatures(face, dt=1.0, layers=layers, thickness=d, diffusivity=kappa)
-    into = kappa * (face - layer[0]) / (d / layers / 2)  # through half a cell, per unit of area and heat capacity
+    into = (
+        kappa * (face - layer[0]) / (d / layers / 2)
+    )  # through half a cell, per unit of area and heat capacity
     entered = np.sum(0.5 * (into[1:] + into[:-1]))
     assert entered == pytest.approx((layer[:, -1] - layer[:, 0]).sum() * d / layers, rel=1e-9)
 
@@ -48,7 +60,9 @@ def test_quadrupole_cancels_what_a_trim_error_lets_in():
     even = coil.coil_rate(ramp, dt=1.0, weights=coil.layer_weights(24))[-1]
     trimmed = coil.coil_rate(ramp, dt=1.0, weights=coil.layer_weights(24, trim=1e-3))[-1]
     # half to half asymmetry of 2 trim: n / (D L) (dn/dT + n alpha) 2 trim L^2 dT/dt
-    expected = 1.45 / (0.04 * 500) * (8.6e-6 + 1.45 * 0.55e-6) * 2e-3 * 500**2 / 60 * coil.DEG_PER_HOUR
+    expected = (
+        1.45 / (0.04 * 500) * (8.6e-6 + 1.45 * 0.55e-6) * 2e-3 * 500**2 / 60 * coil.DEG_PER_HOUR
+    )
     assert abs(even) < 1e-3 * expected
     assert trimmed == pytest.approx(expected, rel=1e-3)
 
@@ -61,13 +75,20 @@ def test_each_part_of_the_detector_noise_has_its_own_power_law():
     assert shot[0] / shot[1] == pytest.approx(4.0, rel=1e-3)
     assert thermal[0] / thermal[1] == pytest.approx(16.0, rel=1e-3)
     assert excess[0] / excess[1] == pytest.approx(1.0, rel=1e-3)
-    assert light.detector_psd(np.array([1e-5]))["shot"][0] == pytest.approx(2 * 1.602176634e-19 * 0.9e-5)
+    assert light.detector_psd(np.array([1e-5]))["shot"][0] == pytest.approx(
+        2 * 1.602176634e-19 * 0.9e-5
+    )
 
 
 def test_shot_limited_level_is_the_textbook_one():
     power, depth = 20e-6, math.pi / 2
     seen = power * (1 + math.cos(depth))
-    phase = math.sqrt(2 * light.CHARGE / (0.9 * seen)) * (1 + math.cos(depth)) / math.sin(depth) / math.sqrt(2)
+    phase = (
+        math.sqrt(2 * light.CHARGE / (0.9 * seen))
+        * (1 + math.cos(depth))
+        / math.sin(depth)
+        / math.sqrt(2)
+    )
     rate = phase * 1.55e-6 * light.LIGHT_SPEED / (2 * math.pi * 500 * 0.04)
     level = light.rate_noise(np.array([power]), rin=0.0, load=1e12, depth=depth)[0]
     assert level == pytest.approx(math.degrees(rate) * 3600, rel=1e-3)
@@ -102,7 +123,9 @@ def test_mount_is_a_damped_spring():
     _, got = signal.freqz(*vibration.mount_filter(120.0, quality=8.0), worN=f, fs=vibration.FAST)
     x = f / 120.0
     expected = np.sqrt((1 + (x / 8) ** 2) / ((1 - x**2) ** 2 + (x / 8) ** 2))
-    np.testing.assert_allclose(np.abs(got), expected, rtol=0.12)  # the bilinear rule bends the upper end
+    np.testing.assert_allclose(
+        np.abs(got), expected, rtol=0.12
+    )  # the bilinear rule bends the upper end
 
 
 @pytest.mark.parametrize(("kind", "power"), [("point", 0), ("dump", 1), ("cic2", 2), ("cic3", 3)])
@@ -111,7 +134,9 @@ def test_a_line_above_nyquist_folds_down_with_the_factor_of_its_filter(kind, pow
     x = np.sqrt(2) * np.sin(2 * np.pi * f * np.arange(200_000) / vibration.FAST)
     logged = vibration.decimate(x, rate=rate, kind=kind)[50:]
     m = vibration.FAST / rate
-    factor = abs(math.sin(math.pi * f / rate) / (m * math.sin(math.pi * f / vibration.FAST))) ** power
+    factor = (
+        abs(math.sin(math.pi * f / rate) / (m * math.sin(math.pi * f / vibration.FAST))) ** power
+    )
     assert logged.std() == pytest.approx(factor, rel=2e-3)
     freq, density = signal.periodogram(logged, fs=rate)
     assert freq[np.argmax(density)] == pytest.approx(800.0 - f, abs=0.1)
@@ -123,7 +148,9 @@ def test_folded_density_is_what_the_decimator_gives():
     x = signal.lfilter(*mount, vibration.band_noise(rng, 800_000, low=600, high=800))
     logged = vibration.decimate(x, rate=400.0, kind="dump")
     freq, measured = signal.welch(logged, fs=400.0, nperseg=256)
-    expected = 2 * vibration.folded_psd(freq[2:-2], rate=400.0, kind="dump", low=600, high=800, mount=mount)
+    expected = 2 * vibration.folded_psd(
+        freq[2:-2], rate=400.0, kind="dump", low=600, high=800, mount=mount
+    )
     assert np.median(measured[2:-2] / expected) == pytest.approx(1.0, abs=0.03)
     assert logged.var() == pytest.approx(np.trapezoid(expected, freq[2:-2]), rel=0.05)
 
@@ -141,15 +168,29 @@ def test_noise_floor_has_the_allan_deviation_of_its_coefficients(method):
     rng = np.random.default_rng(3)
     tau = np.array([1.0, 8.0, 64.0, 512.0])
     terms = {
-        "N": (lambda: floor.white_level(0.01) * math.sqrt(rate) * rng.standard_normal(size), 0.01**2 * 3600 / tau),
-        "B": (lambda: floor.flicker(rng, size, b=0.3, rate=rate, method=method), np.full(4, 2 * math.log(2) / math.pi * 0.3**2)),
+        "N": (
+            lambda: floor.white_level(0.01) * math.sqrt(rate) * rng.standard_normal(size),
+            0.01**2 * 3600 / tau,
+        ),
+        "B": (
+            lambda: floor.flicker(rng, size, b=0.3, rate=rate, method=method),
+            np.full(4, 2 * math.log(2) / math.pi * 0.3**2),
+        ),
         "K": (lambda: floor.random_walk(rng, size, k=0.5, rate=rate), 0.5**2 * tau / 3600 / 3),
     }
     for name, (draw, expected) in terms.items():
         records = 8
-        got = np.mean([allantools.oadev(draw(), rate=rate, data_type="freq", taus=tau)[1] ** 2 for _ in range(records)], axis=0)
+        got = np.mean(
+            [
+                allantools.oadev(draw(), rate=rate, data_type="freq", taus=tau)[1] ** 2
+                for _ in range(records)
+            ],
+            axis=0,
+        )
         freedom = records * size / rate / tau
-        np.testing.assert_array_less(np.abs(got / expected - 1), 0.04 + 5 / np.sqrt(freedom), err_msg=name)
+        np.testing.assert_array_less(
+            np.abs(got / expected - 1), 0.04 + 5 / np.sqrt(freedom), err_msg=name
+        )
 
 
 def test_steps_of_the_angle_have_the_quantization_law():
@@ -186,11 +227,15 @@ def test_noise_leaves_its_own_allan_band_in_one_of_a_hundred(size, bands, record
     for _ in range(bands):
         band = allan_band(noise=noise, rate=rate, missing=missing, rng=rng)
         for _ in range(records):
-            x = floor.white_level(0.003) * math.sqrt(rate) * rng.standard_normal(size) + floor.flicker(rng, size, b=0.004, rate=rate)
+            x = floor.white_level(0.003) * math.sqrt(rate) * rng.standard_normal(
+                size
+            ) + floor.flicker(rng, size, b=0.004, rate=rate)
             x += floor.random_walk(rng, size, k=0.05, rate=rate)
             x[missing] = np.nan
             out += band_excess(x, band) > band["limit"]
-    assert 0.0015 * bands * records <= out + (size > 2000) <= 0.03 * bands * records + 2  # the tail of a chi-square is longer than normal
+    assert (
+        0.0015 * bands * records <= out + (size > 2000) <= 0.03 * bands * records + 2
+    )  # the tail of a chi-square is longer than normal
 
 
 def test_long_records_have_the_allan_variance_of_short_ones():

@@ -10,7 +10,12 @@ import pytest
 from scipy import fft
 from scipy.signal import lfilter
 
-from gyrostab.blindtest.generator.detection_limits import NATS, mean_size, shared_size, variance_size
+from gyrostab.blindtest.generator.detection_limits import (
+    NATS,
+    mean_size,
+    shared_size,
+    variance_size,
+)
 from gyrostab.blindtest.generator.measured_noise import _slope, line_density, own_noise
 from gyrostab.blindtest.generator.record import make_log
 from gyrostab.blindtest.generator.scenario import draw_world
@@ -56,12 +61,16 @@ def test_in_white_noise_the_measured_limits_are_the_closed_ones():
 
 @pytest.mark.parametrize("frequency", [0.05, 1.0, 8.0])
 def test_a_wave_in_coloured_noise_is_worth_its_power_over_the_density_there(frequency):
-    record = lfilter([1.0, -0.9], [1.0], white(1))  # steps of an angle, nearly: hundreds of times louder at the end of the band
+    record = lfilter(
+        [1.0, -0.9], [1.0], white(1)
+    )  # steps of an angle, nearly: hundreds of times louder at the end of the band
     _, real = both(record)
     wave = np.zeros((3, real.size))
     wave[0] = 0.05 * np.sin(2 * math.pi * frequency * np.arange(real.size) / RATE)
     density = 0.8**2 / RATE * abs(1 - 0.9 * np.exp(-2j * math.pi * frequency / RATE)) ** 2
-    assert mean_size(real, wave) == pytest.approx(math.sqrt(0.05**2 * SECONDS / 4 / density / NATS), rel=0.2)
+    assert mean_size(real, wave) == pytest.approx(
+        math.sqrt(0.05**2 * SECONDS / 4 / density / NATS), rel=0.2
+    )
 
 
 def test_slow_noise_counts_at_its_slowest_lines():
@@ -76,13 +85,17 @@ def test_the_slope_is_the_most_likely_one_also_beside_a_loud_line(loud):
     """No white noise, flicker and random walk of a fine grid suit the lines better."""
     rng = np.random.default_rng(2)
     number = np.arange(1.0, 61.0)
-    sizes = np.stack(np.meshgrid(*[np.exp(np.linspace(-12.0, 12.0, 33))] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    sizes = np.stack(
+        np.meshgrid(*[np.exp(np.linspace(-12.0, 12.0, 33))] * 3, indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     tried = sizes @ np.stack([number**0, 1.0 / number, number**-2])
     for truth in np.exp(rng.normal(0.0, 3.0, (8, 3))):
         lines = (truth[0] + truth[1] / number + truth[2] / number**2) * rng.exponential(size=60)
         lines[rng.integers(60)] *= loud
         found = _slope(lines)(number)
-        mine, others = ((np.log(density) + lines / density).sum(axis=-1) for density in (found, tried))
+        mine, others = (
+            (np.log(density) + lines / density).sum(axis=-1) for density in (found, tried)
+        )
         assert mine < others.min() + 1e-6
 
 
@@ -113,13 +126,20 @@ def test_noise_that_is_added_counts_where_the_recording_is_quiet_only():
 
 
 def test_the_size_of_salt_is_that_in_the_noise_of_the_recording():
-    record = lfilter([1.0], [1.0, -0.98], white(5))  # its slow noise is 50 times that of the shortest times
+    record = lfilter(
+        [1.0], [1.0, -0.98], white(5)
+    )  # its slow noise is 50 times that of the shortest times
     log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
-    made, truth = inject_effect(log, "vibration_rectification", 6.0, np.random.default_rng(6))["salted"]
+    made, truth = inject_effect(log, "vibration_rectification", 6.0, np.random.default_rng(6))[
+        "salted"
+    ]
     mean = np.asarray(made.rate.values) - record
     f = np.arange(1, record.shape[1]) * RATE / 2 / record.shape[1]
     density = 0.8**2 / RATE / abs(1 - 0.98 * np.exp(-2j * math.pi * f / RATE)) ** 2
-    nats = sum(0.5 * float((fft.dct(row - row.mean(), norm="ortho")[1:] ** 2 / RATE / density).sum()) for row in mean)
+    nats = sum(
+        0.5 * float((fft.dct(row - row.mean(), norm="ortho")[1:] ** 2 / RATE / density).sum())
+        for row in mean
+    )
     assert math.sqrt(nats / NATS) == pytest.approx(6.0, rel=0.3)
     assert truth["effects"][0]["size"] == 6.0
 
@@ -129,7 +149,9 @@ def test_a_source_that_axes_share_is_salted_with_its_signs_and_on_its_axes_only(
     log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
     two = 0
     for seed in range(12):
-        made, truth = inject_effect(log, "shared_source", 8.0, np.random.default_rng(seed))["salted"]
+        made, truth = inject_effect(log, "shared_source", 8.0, np.random.default_rng(seed))[
+            "salted"
+        ]
         added = np.asarray(made.rate.values) - record
         has = added.std(axis=1) > 0
         assert [str(axis) for axis in made.axis.values[has]] == truth["effects"][0]["axes"]
@@ -148,5 +170,10 @@ def test_a_spike_is_salted_above_what_the_recording_throws_by_itself():
     calm, loud = (own_noise(record, rate=RATE).jump for record in (white(8), wild))
     np.testing.assert_allclose(calm, 0.8, rtol=0.1)
     assert (loud > 1.8).all()
-    _, truth = inject_effect(make_log(wild, {}, start=1_700_000_000 * 10**9, rate=RATE), "spikes", 4.0, np.random.default_rng(9))["salted"]
+    _, truth = inject_effect(
+        make_log(wild, {}, start=1_700_000_000 * 10**9, rate=RATE),
+        "spikes",
+        4.0,
+        np.random.default_rng(9),
+    )["salted"]
     assert truth["effects"][0]["parameters"]["spike"]["value"] > 9.0

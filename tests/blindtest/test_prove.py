@@ -39,7 +39,11 @@ def small_plans(number: int, *, seed: int) -> list[dict]:
     for index, drawn in zip(range(number), CASES, strict=False):
         names, strengths = ([drawn[0]], [drawn[1]]) if drawn else ([], [])
         kind = "single" if drawn else "null"
-        plans.append(plan_case(index, seed=seed) | SMALL | {"kind": kind, "names": names, "strengths": strengths})
+        plans.append(
+            plan_case(index, seed=seed)
+            | SMALL
+            | {"kind": kind, "names": names, "strengths": strengths}
+        )
     return plans
 
 
@@ -79,11 +83,28 @@ def test_the_truths_are_sealed_and_told_before_the_first_diagnosis(finished):
 def test_nothing_of_the_truth_is_in_name_or_content_of_a_recording(finished):
     folder, *_ = finished
     recordings = sorted((folder / "recordings").iterdir())
-    assert sorted(path.stem for path in recordings) == sorted(case_name(5, index) for index in range(2))
+    assert sorted(path.stem for path in recordings) == sorted(
+        case_name(5, index) for index in range(2)
+    )
     for path in recordings:
         with xr.open_dataset(path) as log:
-            said = json.dumps([str(log.attrs), *(str(log[name].attrs) for name in log.variables), *map(str, log.variables)])
-        for word in ("spectral", "ageing", "null", "single", "seed", "strength", "concealed", "plan"):
+            said = json.dumps(
+                [
+                    str(log.attrs),
+                    *(str(log[name].attrs) for name in log.variables),
+                    *map(str, log.variables),
+                ]
+            )
+        for word in (
+            "spectral",
+            "ageing",
+            "null",
+            "single",
+            "seed",
+            "strength",
+            "concealed",
+            "plan",
+        ):
             assert word not in said.lower()
 
 
@@ -96,7 +117,9 @@ def test_every_case_is_counted(finished):
     assert bool(line["detected"])
     found = json.loads((folder / "diagnoses" / f"{line['name']}.json").read_text())
     assert line["verdict"] == found["verdict"]
-    assert [name for name, _ in json.loads(line["claims"])] == [effect["name"] for effect in found["effects"]]
+    assert [name for name, _ in json.loads(line["claims"])] == [
+        effect["name"] for effect in found["effects"]
+    ]
     assert {"Allan plot", "correlation with channels"} == set(json.loads(line["naive"]))
     assert proof.failed == {}
     text = (folder / "table.md").read_text()
@@ -148,12 +171,16 @@ class Stopped(Exception):
     pass
 
 
-def test_a_stopped_run_goes_on_and_comes_to_what_an_unbroken_one_does(finished, small, tmp_path, monkeypatch):
+def test_a_stopped_run_goes_on_and_comes_to_what_an_unbroken_one_does(
+    finished, small, tmp_path, monkeypatch
+):
     unbroken, _, _ = finished
     folder, calls = tmp_path / "proof", []
 
     def real(recording, target, failed, nulls):
-        shutil.copy(unbroken / "diagnoses" / target.name, target)  # the same recording, so the same diagnosis
+        shutil.copy(
+            unbroken / "diagnoses" / target.name, target
+        )  # the same recording, so the same diagnosis
         return True
 
     def stop_at_the_second(*job):
@@ -179,7 +206,10 @@ def test_a_stopped_run_goes_on_and_comes_to_what_an_unbroken_one_does(finished, 
     assert not leftover.exists()
     assert (folder / "SHA256SUMS").read_bytes() == sums == (unbroken / "SHA256SUMS").read_bytes()
     for recording in (unbroken / "recordings").iterdir():
-        with xr.open_dataset(recording) as one, xr.open_dataset(folder / "recordings" / recording.name) as other:
+        with (
+            xr.open_dataset(recording) as one,
+            xr.open_dataset(folder / "recordings" / recording.name) as other,
+        ):
             xr.testing.assert_identical(one, other)
     assert (folder / "scores.csv").read_bytes() == (unbroken / "scores.csv").read_bytes()
 
@@ -196,18 +226,37 @@ def test_a_diagnosis_that_fails_is_shown_and_tried_again(small, tmp_path, monkey
 
     class Found:
         def to_json(self) -> str:
-            return json.dumps({"verdict": "unknown", "mismatches": [], "effects": [], "unexplained": [], "held_out": {}})
+            return json.dumps(
+                {
+                    "verdict": "unknown",
+                    "mismatches": [],
+                    "effects": [],
+                    "unexplained": [],
+                    "held_out": {},
+                }
+            )
 
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: Found())
     again = gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
     assert again.failed == {}
     assert not list((tmp_path / "proof" / "failed").iterdir())
-    assert again.table.set_index("quantity").loc["detected at 1.5 times the limit and more", "value"] == 1.0
+    assert (
+        again.table.set_index("quantity").loc["detected at 1.5 times the limit and more", "value"]
+        == 1.0
+    )
 
 
 class NothingFound:
     def to_json(self) -> str:
-        return json.dumps({"verdict": "no mismatch", "mismatches": [], "effects": [], "unexplained": [], "held_out": {}})
+        return json.dumps(
+            {
+                "verdict": "no mismatch",
+                "mismatches": [],
+                "effects": [],
+                "unexplained": [],
+                "held_out": {},
+            }
+        )
 
 
 def test_real_recordings_are_salted_sealed_and_told_apart(small, tmp_path, monkeypatch, recordings):
@@ -215,19 +264,32 @@ def test_real_recordings_are_salted_sealed_and_told_apart(small, tmp_path, monke
     monkeypatch.setattr(core, "_SALTED", 1)
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
     said: list[str] = []
-    proof = gyrostab.prove(tmp_path / "proof", cases=2, seed=8, nulls=100, workers=0, real=real, say=said.append)
+    proof = gyrostab.prove(
+        tmp_path / "proof", cases=2, seed=8, nulls=100, workers=0, real=real, say=said.append
+    )
     assert "2 real recordings" in said[0]
     sums, _ = read_sums(tmp_path / "proof")
     assert len(sums) == 2 + 2 * 4
     for path in (tmp_path / "proof" / "recordings").iterdir():
         with xr.open_dataset(path) as log:
             words = json.dumps([path.name, str(log.attrs), *map(str, log.variables)]).lower()
-        assert not [word for word in ("salt", "copy", "flipped", "reversed", "untouched", "mems", "laser", "fog") if word in words]
+        assert not [
+            word
+            for word in ("salt", "copy", "flipped", "reversed", "untouched", "mems", "laser", "fog")
+            if word in words
+        ]
     scores = pd.read_csv(tmp_path / "proof" / "scores.csv", keep_default_na=False, na_values=[""])
-    assert sorted(scores["kind"].value_counts().to_dict().items()) == [("control", 6), ("null", 1), ("salted", 2), ("single", 1)]
+    assert sorted(scores["kind"].value_counts().to_dict().items()) == [
+        ("control", 6),
+        ("null", 1),
+        ("salted", 2),
+        ("single", 1),
+    ]
     assert set(scores["copy"].dropna()) == {"salted", "untouched", "flipped", "reversed"}
     counted = proof.table.set_index("quantity")
-    assert counted.loc["false alarms: a name on a null", "n"] == 1  # a copy of a real recording is no null
+    assert (
+        counted.loc["false alarms: a name on a null", "n"] == 1
+    )  # a copy of a real recording is no null
     page = (tmp_path / "proof" / "table.md").read_text()
     assert "| turning the sign brings a name | 0 |" in page
 
@@ -237,19 +299,30 @@ def test_a_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
     said: list[str] = []
     gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, say=said.append)
     assert "no real recordings are salted" in said[0]
-    assert "the folder of the real recordings was not given" in (tmp_path / "proof" / "table.md").read_text()
+    assert (
+        "the folder of the real recordings was not given"
+        in (tmp_path / "proof" / "table.md").read_text()
+    )
 
 
 def test_real_recordings_that_went_away_before_the_draw(small, tmp_path, monkeypatch):
     monkeypatch.setattr(core, "_SALTED", 1)
     with pytest.raises(FormatError, match="nowhere"):
-        gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, real=tmp_path / "nowhere")
+        gyrostab.prove(
+            tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, real=tmp_path / "nowhere"
+        )
     with pytest.raises(ResumeError, match="say again where they are"):
         gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
 
 
 def test_wrong_names_on_noise_are_listed():
-    truth = {"effects": [], "accepted": [], "plan": {"index": 0, "kind": "null"}, "sampling_rate_hz": 10.0, "seconds": 600.0}
+    truth = {
+        "effects": [],
+        "accepted": [],
+        "plan": {"index": 0, "kind": "null"},
+        "sampling_rate_hz": 10.0,
+        "seconds": 600.0,
+    }
     truth |= {"missing_share": 0.0}
     claim = {
         "verdict": "explained",
@@ -259,7 +332,14 @@ def test_wrong_names_on_noise_are_listed():
         "effects": [{"name": "shupe", "alternatives": []}],
     }
     rows = score_rows({"abc": claim}, {"abc": truth}, {"abc": {}})
-    job = {"cases": 1, "seed": TUNING + 1, "nulls": 100, "code": ["a", "b"], "begun": "now", "machine": "any"}
+    job = {
+        "cases": 1,
+        "seed": TUNING + 1,
+        "nulls": 100,
+        "code": ["a", "b"],
+        "begun": "now",
+        "machine": "any",
+    }
     table = score_table(rows)
     text = page_text(rows, table, job=job, sealed="0" * 64, failed={})
     assert "abc (null, 10 Hz, 10 min, 0 % lost): nothing; named shupe" in text
@@ -268,11 +348,16 @@ def test_wrong_names_on_noise_are_listed():
     assert "false alarms: a name on a null: 1 " in text
 
 
-# ------------------------------------------------------------------------------------------------------------------- manners
+# -------------------------------------------------------------------------------------------------------------------
+# manners
 
 
 def test_options_that_make_no_sense_leave_nothing_behind(tmp_path):
-    for options, complaint in (({"cases": 0}, "cases=0"), ({"seed": -1}, "seed=-1"), ({"nulls": 20}, "nulls=20")):
+    for options, complaint in (
+        ({"cases": 0}, "cases=0"),
+        ({"seed": -1}, "seed=-1"),
+        ({"nulls": 20}, "nulls=20"),
+    ):
         with pytest.raises(OptionError, match=complaint):
             gyrostab.prove(tmp_path / "proof", **options)
     with pytest.raises(OutputError, match="there is no directory"):
@@ -297,7 +382,9 @@ def test_overwrite_forgets_what_was_there(small, tmp_path, monkeypatch):
     second = gyrostab.prove(tmp_path / "proof", cases=1, workers=0, overwrite=True)
     assert second.seed >= TUNING != first.seed
     assert list(read_sums(tmp_path / "proof")[0]) == [case_name(second.seed, 0)]
-    assert [path.stem for path in (tmp_path / "proof" / "recordings").iterdir()] == [case_name(second.seed, 0)]
+    assert [path.stem for path in (tmp_path / "proof" / "recordings").iterdir()] == [
+        case_name(second.seed, 0)
+    ]
 
 
 def test_only_one_run_works_in_a_folder(small, tmp_path):
@@ -306,7 +393,9 @@ def test_only_one_run_works_in_a_folder(small, tmp_path):
     (tmp_path / "proof").mkdir()
     code = f"import gyrostab; gyrostab.prove({str(tmp_path / 'proof')!r}, cases=1, seed=1)"
     with hold(tmp_path / "proof"):
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=60
+        )
     assert "ResumeError" in done.stderr
     assert [path.name for path in (tmp_path / "proof").iterdir()] == ["lock"]
 
@@ -321,13 +410,16 @@ def test_the_command_warns_of_a_tuning_seed_and_says_what_is_wrong(tmp_path, cap
     assert "tuning" not in capfd.readouterr().err
 
 
-# ----------------------------------------------------------------------------------------------------------------- processes
+# -----------------------------------------------------------------------------------------------------------------
+# processes
 
 
 def test_processes_keep_the_order_and_use_one_thread():
     told: list[int] = []
     before = os.environ.get("OMP_NUM_THREADS")
-    done = each_in_processes(os.path.join, [("a", str(number)) for number in range(5)], workers=2, told=told.append)
+    done = each_in_processes(
+        os.path.join, [("a", str(number)) for number in range(5)], workers=2, told=told.append
+    )
     assert done == [os.path.join("a", str(number)) for number in range(5)]
     assert told == [1, 2, 3, 4, 5]
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -344,7 +436,13 @@ def test_a_process_that_dies_is_told_with_what_to_do():
 def test_no_process_outlives_a_killed_parent():
     work = "each_in_processes(time.sleep, [(300,), (300,)], workers=2)"
     code = f"import time\nfrom gyrostab.blindtest.runner.pool import each_in_processes\n{work}\n"
-    parent = subprocess.Popen([sys.executable, "-c", f"if __name__ == '__main__':\n    {code.replace(chr(10), chr(10) + '    ')}"])
+    parent = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            f"if __name__ == '__main__':\n    {code.replace(chr(10), chr(10) + '    ')}",
+        ]
+    )
     try:
         children = wait_for(lambda: working(parent.pid))
     finally:
@@ -355,8 +453,12 @@ def test_no_process_outlives_a_killed_parent():
 
 def working(parent: int) -> list[int]:
     """Its two working processes, once both have loaded what they need and sleep."""
-    children = [int(number) for number in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
-    children = [child for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
+    children = [
+        int(number) for number in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    ]
+    children = [
+        child for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()
+    ]
     ready = [child for child in children if len(list(Path(f"/proc/{child}/task").iterdir())) > 1]
     return ready if len(ready) == 2 else []
 

@@ -1,6 +1,7 @@
 """A small benchmark with a seed that nobody has seen: what must hold of any cases whatever.
 
-The seed is printed; `GYROSTAB_PROVE_SEED=... python -m pytest tests/blindtest/test_prove_fresh.py` does the same again.
+The seed is printed; `GYROSTAB_PROVE_SEED=... python -m pytest tests/blindtest/test_prove_fresh.py`
+does the same again.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ NUMBER = 5
 def short_plans(number: int, *, seed: int) -> list[dict]:
     """The drawn cases, each as it is but short and slow; a buried effect needs a record that is long enough to bury it in."""
     plans = [plan_case(index, seed=seed) for index in range(number)]
-    return [plan | {"rate": 10.0, "seconds": 3000.0 if plan["kind"] == "buried" else 600.0} for plan in plans]
+    return [
+        plan | {"rate": 10.0, "seconds": 3000.0 if plan["kind"] == "buried" else 600.0}
+        for plan in plans
+    ]
 
 
 @pytest.mark.timeout(1800)
@@ -57,11 +61,17 @@ def test_any_cases_are_diagnosed_sealed_and_counted(tmp_path, monkeypatch, capsy
         truth = json.loads((folder / "truth" / f"{name}.json").read_text())
         mine = rows[rows["name"] == name]
         assert len(mine) == max(1, len(truth["effects"]))
-        assert sorted(mine["effect"].dropna()) == sorted(effect["name"] for effect in truth["effects"])
+        assert sorted(mine["effect"].dropna()) == sorted(
+            effect["name"] for effect in truth["effects"]
+        )
         assert set(mine["verdict"]) == {found["verdict"]}
-        assert {claim[0] for claim in json.loads(mine.iloc[0]["claims"])} == {effect["name"] for effect in found["effects"]}
+        assert {claim[0] for claim in json.loads(mine.iloc[0]["claims"])} == {
+            effect["name"] for effect in found["effects"]
+        }
 
-    assert list(proof.table["quantity"][:10]) == list(score_table([])["quantity"][:10])  # every figure has its line
+    assert list(proof.table["quantity"][:10]) == list(
+        score_table([])["quantity"][:10]
+    )  # every figure has its line
     assert set(proof.table["state"]) <= {"", "met", "missed", "not shown"}
     counted = proof.table.set_index("quantity")
     assert counted.loc["false alarms: a name on a null", "n"] == (rows["kind"] == "null").sum()

@@ -23,10 +23,18 @@ def docs(tmp_path):
 def run(folder: Path, docs: Path, *, seed: int = 2_000_003) -> subprocess.CompletedProcess[str]:
     folder.mkdir(exist_ok=True)
     (folder / "benchmark.json").write_text(json.dumps({"seed": seed}))
-    (folder / "table.md").write_text(f"Seed {seed}, to be repeated.\n\n| quantity | value |\n|---|---|\n| detected | 0.123 |\n")
+    (folder / "table.md").write_text(
+        f"Seed {seed}, to be repeated.\n\n| quantity | value |\n|---|---|\n| detected | 0.123 |\n"
+    )
     for name in ("completeness", "reliability"):
         (folder / f"{name}.png").write_bytes(name.encode())
-    command = [sys.executable, str(ROOT / "benchmarks" / "publish_proof.py"), str(folder), "--docs", str(docs)]
+    command = [
+        sys.executable,
+        str(ROOT / "benchmarks" / "publish_proof.py"),
+        str(folder),
+        "--docs",
+        str(docs),
+    ]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 

@@ -22,7 +22,9 @@ from tests.support.command_line import RATE, WINDOW, call, stopped, write_log
 
 def _without_stamps(*options: object):
     def make(folder: Path) -> list[object]:
-        (folder / "bad.csv").write_text("gyro_x [deg/h]\n" + "\n".join(str(n % 7) for n in range(100)))
+        (folder / "bad.csv").write_text(
+            "gyro_x [deg/h]\n" + "\n".join(str(n % 7) for n in range(100))
+        )
         return [folder / "bad.csv", "-o", folder / "out.nc", *options, "--window", "4samples"]
 
     return make
@@ -44,7 +46,12 @@ def _bad_text(text: bytes, name: str = "bad.csv"):
 
 def _bad_log(*options: object, **spoil):
     def make(folder: Path) -> list[object]:
-        return [write_log(folder / "bad.csv", **spoil), "-o", folder / "out.nc", *(options or WINDOW)]
+        return [
+            write_log(folder / "bad.csv", **spoil),
+            "-o",
+            folder / "out.nc",
+            *(options or WINDOW),
+        ]
 
     return make
 
@@ -57,7 +64,11 @@ def _truncated_gzip(folder: Path) -> list[object]:
 
 
 def _truncated_netcdf(folder: Path) -> list[object]:
-    values = xr.DataArray(np.random.default_rng(1).standard_normal((1, 5000)), dims=("axis", "time"), attrs={"units": "degree hour-1"})
+    values = xr.DataArray(
+        np.random.default_rng(1).standard_normal((1, 5000)),
+        dims=("axis", "time"),
+        attrs={"units": "degree hour-1"},
+    )
     xr.Dataset({"rate": values}).to_netcdf(folder / "bad.nc")
     whole = (folder / "bad.nc").read_bytes()
     (folder / "bad.nc").write_bytes(whole[: len(whole) // 2])
@@ -107,15 +118,29 @@ BAD_INPUT = {
     "one sample": (_bad_log(seconds=0.01), "."),
     "rate declared wrongly by 10 %": (_bad_log("--rate", "110", *WINDOW), "110"),
     "duplicate columns": (_bad_log(header="time [s],gyro_x [deg/h],gyro_x [deg/h]"), "gyro_x"),
-    "binary junk named csv": (_bad_text(bytes(np.random.default_rng(3).integers(0, 256, 5000, dtype=np.uint8))), "text|binary"),
+    "binary junk named csv": (
+        _bad_text(bytes(np.random.default_rng(3).integers(0, 256, 5000, dtype=np.uint8))),
+        "text|binary",
+    ),
     "truncated gzip": (_truncated_gzip, "bad.csv.gz"),
     "truncated NetCDF": (_truncated_netcdf, "bad.nc"),
     "window longer than the record": (_bad_log("--window", "2min", "--step", "10s"), "window"),
     "step longer than the window": (_bad_log("--window", "10s", "--step", "20s"), "step"),
-    "tau longer than the window": (_bad_log("--window", "20s", "--step", "5s", "--taus", "1s,30s"), "tau|30"),
-    "all averaging times too long": (_bad_log("--window", "20s", "--tau-max", "15s"), "15s.*half of the window of 20s"),
+    "tau longer than the window": (
+        _bad_log("--window", "20s", "--step", "5s", "--taus", "1s,30s"),
+        "tau|30",
+    ),
+    "all averaging times too long": (
+        _bad_log("--window", "20s", "--tau-max", "15s"),
+        "15s.*half of the window of 20s",
+    ),
     "output is a directory": (
-        lambda folder: [write_log(folder / "good.csv"), "-o", _folder(folder / "out.nc"), "--overwrite"],
+        lambda folder: [
+            write_log(folder / "good.csv"),
+            "-o",
+            _folder(folder / "out.nc"),
+            "--overwrite",
+        ],
         "out.nc' is a directory",
     ),
     "damaged log of ours": (_damaged_log, r"bad\.nc: .*is damaged"),
@@ -125,17 +150,35 @@ BAD_INPUT = {
     "more than half unreadable": (_bad_log(change=_words), "unreadable"),
     "no such file": (lambda folder: [folder / "none.csv", "-o", folder / "out.nc"], "none.csv"),
     "output exists": (_existing_output, "--overwrite"),
-    "output is the input": (lambda folder: [write_log(folder / "out.nc"), "-o", folder / "out.nc", "--overwrite"], "input"),
-    "output of the wrong kind": (lambda folder: [write_log(folder / "good.csv"), "-o", folder / "out.csv"], r"must end in \.nc"),
+    "output is the input": (
+        lambda folder: [write_log(folder / "out.nc"), "-o", folder / "out.nc", "--overwrite"],
+        "input",
+    ),
+    "output of the wrong kind": (
+        lambda folder: [write_log(folder / "good.csv"), "-o", folder / "out.csv"],
+        r"must end in \.nc",
+    ),
     "folder that cannot be written to": (_unwritable_folder, "out.nc"),
-    "folder that is not there": (lambda folder: [write_log(folder / "good.csv"), "-o", folder / "no" / "out.nc"], "out.nc"),
+    "folder that is not there": (
+        lambda folder: [write_log(folder / "good.csv"), "-o", folder / "no" / "out.nc"],
+        "out.nc",
+    ),
     "map without a name": (_bad_log("--map", "wx"), "--map"),
     "config that is not there": (_bad_log("--config", "/nonexistent/run.toml"), "run.toml"),
     "option that is not there": (_bad_log("--begin-again"), "--begin-again"),
     "value that is no number": (_bad_log("--rate", "fast"), "--rate"),
-    "rate above a stamp per nanosecond": (_without_stamps("--rate", "1e308"), r"--rate 1e\+308: .* at most 1e\+09"),
-    "rate of which one sample takes ages": (_without_stamps("--rate", "1e-300"), "bad.csv: 100 samples at 1e-300 Hz .* years 1678 to 2262"),
-    "start near the end of time": (_without_stamps("--rate", "1", "--start", "2262-04-11T23:47:10"), "years 1678 to 2262"),
+    "rate above a stamp per nanosecond": (
+        _without_stamps("--rate", "1e308"),
+        r"--rate 1e\+308: .* at most 1e\+09",
+    ),
+    "rate of which one sample takes ages": (
+        _without_stamps("--rate", "1e-300"),
+        "bad.csv: 100 samples at 1e-300 Hz .* years 1678 to 2262",
+    ),
+    "start near the end of time": (
+        _without_stamps("--rate", "1", "--start", "2262-04-11T23:47:10"),
+        "years 1678 to 2262",
+    ),
     "no worker": (_bad_log("--workers", "0"), "--workers"),
 }
 
@@ -148,7 +191,9 @@ def test_bad_input_is_one_message_and_nothing_left_behind(case, tmp_path, capfd)
     assert call("run", *arguments, "--quiet-progress") == 2
     shown = capfd.readouterr()
     assert shown.out == ""
-    messages = [line for line in shown.err.splitlines() if not line.startswith(("note: ", "zstd: "))]  # zstd speaks for itself
+    messages = [
+        line for line in shown.err.splitlines() if not line.startswith(("note: ", "zstd: "))
+    ]  # zstd speaks for itself
     assert len(messages) == 1, shown.err
     assert messages[0].startswith("gyrostab: ")
     assert re.search(expected, messages[0]), messages[0]
@@ -171,7 +216,12 @@ def test_full_standard_output_is_explained(log):
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run([sys.executable, "-m", "gyrostab", "scan", str(log)], stdout=full, stderr=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            [sys.executable, "-m", "gyrostab", "scan", str(log)],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
     assert done.returncode == 2
     assert "the standard output: cannot be written" in done.stderr
 
@@ -179,13 +229,18 @@ def test_full_standard_output_is_explained(log):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_no_room_for_the_columns_of_a_long_log(monkeypatch):
     full = Path("/dev/full").open("wb")  # noqa: SIM115
-    monkeypatch.setattr("gyrostab.ingest.columns.pieces.tempfile.TemporaryFile", lambda **options: full)
+    monkeypatch.setattr(
+        "gyrostab.ingest.columns.pieces.tempfile.TemporaryFile", lambda **options: full
+    )
     with pytest.raises(OutputError, match=r"cannot be written.*TMPDIR"):
         Buffers({0: np.float64}, limit=100).add({0: np.zeros(1000)})
 
 
 def test_the_reading_options_stand_in_the_history(log, tmp_path):
-    assert call("ingest", log, "-o", tmp_path / "log.nc", "--epoch", "2026-03-01", "--map", "gyro_y=-") == 0
+    assert (
+        call("ingest", log, "-o", tmp_path / "log.nc", "--epoch", "2026-03-01", "--map", "gyro_y=-")
+        == 0
+    )
     with open_log(tmp_path / "log.nc") as stored:
         assert "(read with epoch: 2026-03-01; map: gyro_y=-)" in stored.attrs["history"]
 
@@ -197,14 +252,21 @@ def test_options_that_do_not_fit_a_regular_log(log, tmp_path, capfd):
     assert call("ingest", log, "-o", regular) == 0
     assert call("run", regular, "-o", tmp_path / "a.nc", *WINDOW, "--rate", RATE / 2) == 2
     assert "regular log of 100 Hz, not of 50 Hz" in capfd.readouterr().err
-    assert call("run", regular, "-o", tmp_path / "a.nc", *WINDOW, "--rate", RATE, "--unit", "gyro=deg/s") == 0
+    assert (
+        call(
+            "run", regular, "-o", tmp_path / "a.nc", *WINDOW, "--rate", RATE, "--unit", "gyro=deg/s"
+        )
+        == 0
+    )
     assert "--unit is not used" in capfd.readouterr().err
     assert call("run", regular, "-o", tmp_path / "b.nc", *WINDOW, "--channel", far) == 0
     assert "none of its 2 values" in capfd.readouterr().err
 
 
 def test_constant_signal_runs_with_a_note(tmp_path, capfd):
-    path = write_log(tmp_path / "flat.csv", change=lambda rows: [f"{row.split(',')[0]},5.0,5.0" for row in rows])
+    path = write_log(
+        tmp_path / "flat.csv", change=lambda rows: [f"{row.split(',')[0]},5.0,5.0" for row in rows]
+    )
     assert call("run", path, "-o", tmp_path / "out.nc", *WINDOW) == 0
     assert re.search("note: .*constant", capfd.readouterr().err)
     assert float(open_product(tmp_path / "out.nc")["avar"].max()) == pytest.approx(0.0, abs=1e-12)

@@ -23,7 +23,19 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import open_log, open_product, open_surface, to_netcdf
 from tests.support.command_line import N_TRUE, WINDOW, call, stopped, write_log
 
-COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "report", "plot", "export", "simulate", "diagnose")
+COMMANDS = (
+    "demo",
+    "scan",
+    "ingest",
+    "run",
+    "davar",
+    "fit",
+    "report",
+    "plot",
+    "export",
+    "simulate",
+    "diagnose",
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +43,8 @@ def log(tmp_path_factory) -> Path:
     return write_log(tmp_path_factory.mktemp("log") / "tool.csv")
 
 
-# ------------------------------------------------------------------------------------------------------------ good input
+# ------------------------------------------------------------------------------------------------------------
+# good input
 
 
 @pytest.fixture(scope="module")
@@ -51,15 +64,23 @@ def test_run_finds_the_noise_that_was_put_in(product):
 
 def test_davar_takes_any_log_and_no_product(log, product, tmp_path, capfd):
     assert call("davar", log, "-o", tmp_path / "davar.nc", *WINDOW) == 0
-    np.testing.assert_array_equal(open_surface(tmp_path / "davar.nc")["avar"], open_product(product)["avar"])
+    np.testing.assert_array_equal(
+        open_surface(tmp_path / "davar.nc")["avar"], open_product(product)["avar"]
+    )
     capfd.readouterr()
     for none, what in ((product, "a product"), (tmp_path / "davar.nc", "a dynamic Allan variance")):
         assert call("davar", none, "-o", tmp_path / "again.nc", *WINDOW) == 2
-        assert f"{none.name}: is {what} that gyrostab wrote, and no log; give the log" in capfd.readouterr().err
+        assert (
+            f"{none.name}: is {what} that gyrostab wrote, and no log; give the log"
+            in capfd.readouterr().err
+        )
 
 
 def test_the_fit_can_start_at_a_longer_averaging_time(log, tmp_path):
-    assert call("run", log, "-o", tmp_path / "late.nc", *WINDOW, "--fit-from", "0.1s", "--terms", "N") == 0
+    assert (
+        call("run", log, "-o", tmp_path / "late.nc", *WINDOW, "--fit-from", "0.1s", "--terms", "N")
+        == 0
+    )
     late = open_product(tmp_path / "late.nc")
     assert (late["observable"].sel(term="Q") == 0).all()
     assert float(late["N"][0, 0]) == pytest.approx(N_TRUE, rel=0.2)
@@ -78,27 +99,44 @@ def test_the_stages_one_by_one_give_the_same_product(log, product, tmp_path):
 def test_ingest_to_zarr_holds_the_same_log(log, tmp_path):
     assert call("ingest", log, "-o", tmp_path / "log.nc") == 0
     assert call("ingest", log, "-o", tmp_path / "log.zarr") == 0
-    xr.testing.assert_equal(open_log(tmp_path / "log.zarr")["rate"], open_log(tmp_path / "log.nc")["rate"])
+    xr.testing.assert_equal(
+        open_log(tmp_path / "log.zarr")["rate"], open_log(tmp_path / "log.nc")["rate"]
+    )
 
 
 def test_one_axis_only(log, product, tmp_path):
     assert call("run", log, "-o", tmp_path / "y.nc", *WINDOW, "--axis", "y") == 0
     one = open_product(tmp_path / "y.nc")
     assert list(one["axis"].values) == ["y"]
-    np.testing.assert_allclose(one["avar"].values[0], open_product(product)["avar"].sel(axis="y").values)
+    np.testing.assert_allclose(
+        one["avar"].values[0], open_product(product)["avar"].sel(axis="y").values
+    )
 
 
 def test_window_in_samples_is_the_window_in_seconds(log, product, tmp_path):
-    assert call("run", log, "-o", tmp_path / "out.nc", "--window", "2000samples", "--step", "500samples") == 0
-    np.testing.assert_array_equal(open_product(tmp_path / "out.nc")["avar"].values, open_product(product)["avar"].values)
+    assert (
+        call(
+            "run", log, "-o", tmp_path / "out.nc", "--window", "2000samples", "--step", "500samples"
+        )
+        == 0
+    )
+    np.testing.assert_array_equal(
+        open_product(tmp_path / "out.nc")["avar"].values, open_product(product)["avar"].values
+    )
 
 
 def test_map_and_unit_make_a_strange_log_readable(log, product, tmp_path):
     strange = tmp_path / "strange.csv"
-    strange.write_text(log.read_text().replace("gyro_x [deg/h]", "wx").replace("gyro_y [deg/h]", "wy"))
+    strange.write_text(
+        log.read_text().replace("gyro_x [deg/h]", "wx").replace("gyro_y [deg/h]", "wy")
+    )
     options = ("--map", "wx=gyro_x", "--map", "wy=gyro_y", "--unit", "gyro=0.5 deg/h")
     assert call("run", strange, "-o", tmp_path / "out.nc", *WINDOW, *options) == 0
-    np.testing.assert_allclose(open_product(tmp_path / "out.nc")["avar"].values, open_product(product)["avar"].values / 4.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        open_product(tmp_path / "out.nc")["avar"].values,
+        open_product(product)["avar"].values / 4.0,
+        rtol=1e-6,
+    )
 
 
 def test_map_from_a_file(log, tmp_path):
@@ -118,13 +156,20 @@ def test_config_gives_defaults_and_the_command_line_wins(log, tmp_path):
     assert call("run", log, "-o", tmp_path / "b.nc", f"--config={config}", "--step", "5s") == 0
     first, second = open_product(tmp_path / "a.nc"), open_product(tmp_path / "b.nc")
     assert list(first["axis"].values) == ["x"]
-    steps = [np.diff(dataset["time"].values)[0] / np.timedelta64(1, "s") for dataset in (first, second)]
+    steps = [
+        np.diff(dataset["time"].values)[0] / np.timedelta64(1, "s") for dataset in (first, second)
+    ]
     assert steps == [10.0, 5.0]
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [('[run]\nwindw = "20s"\n', "windw"), ("[rum]\n", r"\[rum\]"), ("[run\n", "not a TOML file"), ("[run]\nrate = 'x'\n", "rate")],
+    [
+        ('[run]\nwindw = "20s"\n', "windw"),
+        ("[rum]\n", r"\[rum\]"),
+        ("[run\n", "not a TOML file"),
+        ("[run]\nrate = 'x'\n", "rate"),
+    ],
 )
 def test_config_with_a_slip_of_the_pen(text, expected, log, tmp_path, capfd):
     (tmp_path / "run.toml").write_text(text)
@@ -145,7 +190,8 @@ def test_report_is_one_page(product, tmp_path):
     assert not re.search(r"""(src|href)=["']https?://""", page)
 
 
-# ------------------------------------------------------------------------------------------------------ help, exit codes
+# ------------------------------------------------------------------------------------------------------
+# help, exit codes
 
 
 def test_help_names_every_command(capsys):
@@ -158,7 +204,10 @@ def test_help_names_every_command(capsys):
 def test_help_of_a_command_has_an_example_that_parses(command, capsys):
     assert call(command, "--help") == 0
     text = re.sub(r"\s+", " ", capsys.readouterr().out)
-    example = re.search(rf"gyrostab {command} (?!-)[^╭]*?(?=╭)|gyrostab {command} -o \S+", text.split("Example", 1)[1])
+    example = re.search(
+        rf"gyrostab {command} (?!-)[^╭]*?(?=╭)|gyrostab {command} -o \S+",
+        text.split("Example", 1)[1],
+    )
     assert example, text
     app[command].parse_args(example.group().split()[2:], exit_on_error=False, print_error=False)
 
@@ -250,8 +299,19 @@ def test_progress_is_one_plain_line_away_from_a_terminal(log, tmp_path, capfd):
 
 def test_progress_is_a_bar_on_a_terminal(log, tmp_path):
     leader, follower = pty.openpty()
-    command = [sys.executable, "-m", "gyrostab", "run", str(log), "-o", str(tmp_path / "out.nc"), *WINDOW]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=follower, env={**os.environ, "COLUMNS": "120"}) as running:
+    command = [
+        sys.executable,
+        "-m",
+        "gyrostab",
+        "run",
+        str(log),
+        "-o",
+        str(tmp_path / "out.nc"),
+        *WINDOW,
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=follower, env={**os.environ, "COLUMNS": "120"}
+    ) as running:
         os.close(follower)
         shown = b""
         deadline = time.monotonic() + 100.0
@@ -269,7 +329,8 @@ def test_progress_is_a_bar_on_a_terminal(log, tmp_path):
     assert b"Msamples/s" in shown
 
 
-# ------------------------------------------------------------------------------------------------------------------ scan
+# ------------------------------------------------------------------------------------------------------------------
+# scan
 
 
 def test_scan_in_a_pipe_is_a_plain_table(log, capsys):
@@ -277,7 +338,12 @@ def test_scan_in_a_pipe_is_a_plain_table(log, capsys):
     head, row = (line.split("\t") for line in capsys.readouterr().out.splitlines())
     table = dict(zip(head, row, strict=True))
     assert table["file"] == str(log)
-    assert (float(table["rate_hz"]), table["axes"], int(table["rows"]), int(table["gaps"])) == (100.0, "x y", 6000, 0)
+    assert (float(table["rate_hz"]), table["axes"], int(table["rows"]), int(table["gaps"])) == (
+        100.0,
+        "x y",
+        6000,
+        0,
+    )
     assert float(table["span_s"]) == pytest.approx(59.99)
 
 

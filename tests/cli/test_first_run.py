@@ -27,7 +27,10 @@ print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())
 def test_the_process_that_compiles_fits_to_the_same_bits_as_those_that_load(tmp_path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     first, second = (
-        subprocess.run([sys.executable, "-c", FIT], env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
+        subprocess.run(
+            [sys.executable, "-c", FIT], env=environment, capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
     )
     assert any(tmp_path.rglob("*.nbi"))
     assert first == second

@@ -17,7 +17,15 @@ import gyrostab
 from gyrostab.cli import main
 from gyrostab.correlate.judge import VERDICTS
 from gyrostab.errors import OptionError, TimeError
-from gyrostab.kernels.regression.coupling import averages, beside, calibrated, decompose, fit_lags, slope_interval, uncalibrated
+from gyrostab.kernels.regression.coupling import (
+    averages,
+    beside,
+    calibrated,
+    decompose,
+    fit_lags,
+    slope_interval,
+    uncalibrated,
+)
 from tests.support import coupled, synthetic
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,22 +40,34 @@ def test_slope_and_lag_are_found_and_quiet_axes_are_not_accused():
     place = {"axis": "x", "variable": "window_mean", "driver": "temperature"}
     assert verdict(found, **place) == "coupled"
     assert abs(float(found["coupling_lag"].sel(place)) - 120) <= 60
-    assert float(found["window_mean_per_temperature_low"][0]) < 0.3 < float(found["window_mean_per_temperature_high"][0])
+    assert (
+        float(found["window_mean_per_temperature_low"][0])
+        < 0.3
+        < float(found["window_mean_per_temperature_high"][0])
+    )
     assert (found["coupling_verdict"].sel(axis=["y", "z"]) == VERDICTS.index("none_seen")).all()
     assert "follows temperature" in str(found["statement"].sel(place).values)
 
 
 def test_rate_of_change_is_found():
-    found = gyrostab.correlate(coupled.product(pace=0.05, noises="white"), variables="window_mean", max_lag=0)
+    found = gyrostab.correlate(
+        coupled.product(pace=0.05, noises="white"), variables="window_mean", max_lag=0
+    )
     assert verdict(found, axis="x", variable="window_mean", driver="temperature_rate") == "coupled"
-    low, high = (float(found[f"window_mean_per_temperature_rate_{end}"][0]) for end in ("low", "high"))
+    low, high = (
+        float(found[f"window_mean_per_temperature_rate_{end}"][0]) for end in ("low", "high")
+    )
     assert low < 0.05 < high
 
 
 def test_ramps_are_fitted_apart():
-    found = gyrostab.correlate(coupled.product(slope=0.3, noises="white", windows=240), variables="window_mean", max_lag=0)
+    found = gyrostab.correlate(
+        coupled.product(slope=0.3, noises="white", windows=240), variables="window_mean", max_lag=0
+    )
     for way in ("rising", "falling"):
-        slope, error = (float(found[f"window_mean_per_temperature_{way}{end}"][0]) for end in ("", "_stderr"))
+        slope, error = (
+            float(found[f"window_mean_per_temperature_{way}{end}"][0]) for end in ("", "_stderr")
+        )
         assert abs(slope - 0.3) < 4 * error < 0.2
 
 
@@ -60,7 +80,9 @@ def test_white_law_is_ordinary_least_squares():
     assert fit.slope[0, 0, 0] == pytest.approx(solved[1, 0])
     error = np.sqrt(rest[0] / 38 * np.linalg.inv(design.T @ design)[1, 1])
     assert fit.stderr[0, 0, 0] == pytest.approx(error)
-    assert slope_interval(fit, 0, 0, 0.05)[3] == pytest.approx(solved[1, 0] + 2.024394 * error, rel=1e-5)
+    assert slope_interval(fit, 0, 0, 0.05)[3] == pytest.approx(
+        solved[1, 0] + 2.024394 * error, rel=1e-5
+    )
 
 
 def test_overlap_of_windows_is_counted():
@@ -70,7 +92,9 @@ def test_overlap_of_windows_is_counted():
     windows = 0.5 * (cells[:, 1:] + cells[:, :-1])[:, :12]
     mean, _, white = averages(np.repeat(np.arange(3), 4), np.arange(12) * 30.0, 60.0, np.ones(12))
     blocks = windows @ mean.toarray().T
-    np.testing.assert_allclose(np.cov(blocks.T) * 2, white, atol=0.02)  # a full window of two cells has variance 1/2
+    np.testing.assert_allclose(
+        np.cov(blocks.T) * 2, white, atol=0.02
+    )  # a full window of two cells has variance 1/2
 
 
 def test_a_share_of_simulated_noise_and_its_p_value_belong_together():
@@ -80,17 +104,35 @@ def test_a_share_of_simulated_noise_and_its_p_value_belong_together():
         assert uncalibrated(calibrated(p, chance), chance) == pytest.approx(p, rel=1e-6)
 
 
-@pytest.mark.parametrize(("noises", "heat", "gap"), [("white", "sine", True), ("flicker", "sine", False), ("walk", "ramps", True)])
+@pytest.mark.parametrize(
+    ("noises", "heat", "gap"),
+    [("white", "sine", True), ("flicker", "sine", False), ("walk", "ramps", True)],
+)
 def test_intervals_hold_and_agree_with_the_p_values(noises, heat, gap):
     hold = []
     for seed in range(8):
-        product = coupled.product(seed=40_000 + seed, noises=noises, heat=heat, slope=0.5, windows=80, terms=False, gap=gap)
+        product = coupled.product(
+            seed=40_000 + seed,
+            noises=noises,
+            heat=heat,
+            slope=0.5,
+            windows=80,
+            terms=False,
+            gap=gap,
+        )
         found = gyrostab.correlate(product, max_lag=0)
-        low, high = found["window_mean_per_temperature_low"].values, found["window_mean_per_temperature_high"].values
+        low, high = (
+            found["window_mean_per_temperature_low"].values,
+            found["window_mean_per_temperature_high"].values,
+        )
         hold += list((low < [0.5, 0, 0]) & (high > [0.5, 0, 0]))
         p = found["p_value"].sel(variable="window_mean", driver="temperature").values
         np.testing.assert_array_equal((low > 0) | (high < 0), p < 0.05)
-        assert (found["p_value_adjusted"] >= found["p_value"]).where(found["p_value"].notnull(), True).all()
+        assert (
+            (found["p_value_adjusted"] >= found["p_value"])
+            .where(found["p_value"].notnull(), True)
+            .all()
+        )
     assert np.mean(hold) > 0.80  # 0.95 less three standard errors of 24 shares
 
 
@@ -98,8 +140,15 @@ def test_intervals_hold_and_agree_with_the_p_values(noises, heat, gap):
 def test_nothing_is_invented(noises, heat):
     claims = 0
     for seed in range(8):
-        product = coupled.product(seed=50_000 + seed, noises=noises, heat=heat, windows=80, terms=False)
-        claims += bool((gyrostab.correlate(product, max_lag="8min")["coupling_verdict"] == VERDICTS.index("coupled")).any())
+        product = coupled.product(
+            seed=50_000 + seed, noises=noises, heat=heat, windows=80, terms=False
+        )
+        claims += bool(
+            (
+                gyrostab.correlate(product, max_lag="8min")["coupling_verdict"]
+                == VERDICTS.index("coupled")
+            ).any()
+        )
     assert claims <= 2  # of 8 at the rate of 5 %: more happens once in 170
 
 
@@ -107,18 +156,28 @@ def test_the_search_is_paid_for():
     """The p-value for the whole search against that of the chosen lag: 12 lags of a driver without memory are worth many tests."""
     product = coupled.product(noises="white", terms=False, axes="x")
     rng = np.random.default_rng(7)
-    product["temperature"] = product["temperature"].copy(data=30 + rng.normal(size=120).cumsum() * 0.2 + rng.normal(size=120))
+    product["temperature"] = product["temperature"].copy(
+        data=30 + rng.normal(size=120).cumsum() * 0.2 + rng.normal(size=120)
+    )
     found = gyrostab.correlate(product).sel(axis="x", variable="window_mean", driver="temperature")
     both = gyrostab.correlate(product, max_lag=0).sel(axis="x", variable="window_mean")
     assert float(found["p_value_adjusted"]) > 4 * float(found["p_value"])
     smaller = both["p_value"].min()
-    assert float(both["p_value_adjusted"].min()) == pytest.approx(min(1.0, 2 * float(smaller)))  # two drivers, Holm
+    assert float(both["p_value_adjusted"].min()) == pytest.approx(
+        min(1.0, 2 * float(smaller))
+    )  # two drivers, Holm
 
 
 def test_autocorrelated_samples_count_less():
-    many = gyrostab.correlate(coupled.product(noises="white", terms=False), max_lag=0)["effective_samples"].sel(driver="temperature")
-    few = gyrostab.correlate(coupled.product(noises="walk", terms=False), max_lag=0)["effective_samples"].sel(driver="temperature")
-    assert 20 < float(many.median()) <= 60  # 108 windows that overlap by half, in blocks of a window
+    many = gyrostab.correlate(coupled.product(noises="white", terms=False), max_lag=0)[
+        "effective_samples"
+    ].sel(driver="temperature")
+    few = gyrostab.correlate(coupled.product(noises="walk", terms=False), max_lag=0)[
+        "effective_samples"
+    ].sel(driver="temperature")
+    assert (
+        20 < float(many.median()) <= 60
+    )  # 108 windows that overlap by half, in blocks of a window
     assert float(few.median()) < 20
 
 
@@ -128,7 +187,9 @@ def test_a_record_that_cannot_tell_says_why():
     assert "temperature is constant" in str(flat["statement"].values[0, 0, 0])
     few = gyrostab.correlate(coupled.product(windows=16), variables="window_mean")
     assert "too few independent windows" in str(few["statement"].values[0, 0, 0])
-    rise = gyrostab.correlate(coupled.product(heat="rise", slope=1.0, noises="white"), variables="window_mean", max_lag=0)
+    rise = gyrostab.correlate(
+        coupled.product(heat="rise", slope=1.0, noises="white"), variables="window_mean", max_lag=0
+    )
     assert verdict(rise, axis="x", variable="window_mean", driver="temperature") == "not_told_apart"
     assert "never turns" in str(rise["statement"].values[0, 0, 0])
 
@@ -137,19 +198,31 @@ def test_two_clusters_across_a_gap_are_no_slope():
     product = coupled.product(windows=160, noises="white", gap=False)
     late = np.arange(160) >= 80
     rng = np.random.default_rng(5)
-    product["temperature"] = product["temperature"].copy(data=26 + 6.0 * late + rng.normal(0, 0.05, 160))
+    product["temperature"] = product["temperature"].copy(
+        data=26 + 6.0 * late + rng.normal(0, 0.05, 160)
+    )
     product["window_mean"] = product["window_mean"] + 30.0 * late
     product["window_mean"][:, 50:110] = np.nan
     found = gyrostab.correlate(product, variables="window_mean", max_lag=0)
-    assert set(found["coupling_verdict"].sel(driver="temperature").values.ravel()) == {VERDICTS.index("cannot_tell")}
+    assert set(found["coupling_verdict"].sel(driver="temperature").values.ravel()) == {
+        VERDICTS.index("cannot_tell")
+    }
     assert "a gap parts" in str(found["statement"].values[0, 0, 0])
 
 
 def test_channel_of_a_file_is_averaged_and_never_extrapolated(tmp_path):
     product = coupled.product(slope=0.3, noises="white", gap=False)
-    stamps = product["time_bounds"].values[0, 0] + (np.arange(2400) * 1_000_000_000).astype("timedelta64[ns]")
+    stamps = product["time_bounds"].values[0, 0] + (np.arange(2400) * 1_000_000_000).astype(
+        "timedelta64[ns]"
+    )
     seconds = np.arange(2400.0)
-    probe = xr.DataArray(20 + 5 * np.sin(seconds / 300), dims="t", coords={"t": stamps}, name="probe", attrs={"units": "degree_Celsius"})
+    probe = xr.DataArray(
+        20 + 5 * np.sin(seconds / 300),
+        dims="t",
+        coords={"t": stamps},
+        name="probe",
+        attrs={"units": "degree_Celsius"},
+    )
     found = gyrostab.correlate(product, channel=probe, variables="window_mean", max_lag=0)
     np.testing.assert_allclose(found["probe"][3], probe[90:150].mean())
     assert np.isnan(found["probe"].values[80:]).all()
@@ -158,8 +231,12 @@ def test_channel_of_a_file_is_averaged_and_never_extrapolated(tmp_path):
 
 
 def hours(values, product, every):
-    stamps = product["time_bounds"].values[0, 0] + (np.arange(values.size) * int(every * 1e9)).astype("timedelta64[ns]")
-    return xr.DataArray(values, dims="t", coords={"t": stamps}, name="probe", attrs={"units": "degree_Celsius"})
+    stamps = product["time_bounds"].values[0, 0] + (
+        np.arange(values.size) * int(every * 1e9)
+    ).astype("timedelta64[ns]")
+    return xr.DataArray(
+        values, dims="t", coords={"t": stamps}, name="probe", attrs={"units": "degree_Celsius"}
+    )
 
 
 def test_short_holes_of_a_channel_are_bridged_and_long_ones_are_not():
@@ -169,7 +246,9 @@ def test_short_holes_of_a_channel_are_bridged_and_long_ones_are_not():
     holed = course.copy()
     holed[600:655] = np.nan  # less than a window of 60 s
     holed[2000:2300] = np.nan  # five windows, a twelfth of the record
-    seen = gyrostab.correlate(product, channel=hours(holed, product, 1.0), variables="window_mean", max_lag=0)["probe"].values
+    seen = gyrostab.correlate(
+        product, channel=hours(holed, product, 1.0), variables="window_mean", max_lag=0
+    )["probe"].values
     whole = np.array([course[30 * i : 30 * i + 60].mean() for i in range(120)])
     inside = np.flatnonzero((np.arange(120) * 30 >= 1990) & (np.arange(120) * 30 + 60 <= 2310))
     assert inside.size > 5
@@ -181,7 +260,9 @@ def test_short_holes_of_a_channel_are_bridged_and_long_ones_are_not():
 def test_a_slow_channel_is_interpolated_between_its_values_only():
     product = coupled.product(noises="white", gap=False, terms=False)
     at = np.arange(0.0, 3300.0, 150.0)
-    seen = gyrostab.correlate(product, channel=hours(20 + at / 100, product, 150.0), variables="window_mean", max_lag=0)["probe"].values
+    seen = gyrostab.correlate(
+        product, channel=hours(20 + at / 100, product, 150.0), variables="window_mean", max_lag=0
+    )["probe"].values
     middle = np.arange(120) * 30 + 30.0
     known = middle <= at[-1]
     np.testing.assert_allclose(seen[known], 20 + middle[known] / 100, rtol=1e-12)
@@ -207,12 +288,29 @@ def test_errors_say_what_to_do():
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory) -> Path:
-    return gyrostab.to_netcdf(coupled.product(slope=0.3, noises="white"), tmp_path_factory.mktemp("coupled") / "product.nc")
+    return gyrostab.to_netcdf(
+        coupled.product(slope=0.3, noises="white"),
+        tmp_path_factory.mktemp("coupled") / "product.nc",
+    )
 
 
 def test_command_writes_legal_units_and_a_figure(stored, tmp_path, capsys):
     target = tmp_path / "out.nc"
-    assert main(["correlate", str(stored), "--with", "temperature", "--max-lag", "5min", "-o", str(target)]) == 0
+    assert (
+        main(
+            [
+                "correlate",
+                str(stored),
+                "--with",
+                "temperature",
+                "--max-lag",
+                "5min",
+                "-o",
+                str(target),
+            ]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     assert "Window mean of axis x follows temperature" in printed
     assert target.with_suffix(".png").stat().st_size > 10_000
@@ -220,20 +318,42 @@ def test_command_writes_legal_units_and_a_figure(stored, tmp_path, capsys):
         units = found["window_mean_per_temperature"].attrs["units"]
         assert cf_units.Unit(units) == cf_units.Unit("degree hour-1") / cf_units.Unit("K")
     checker = Path(sys.executable).with_name("compliance-checker")
-    offline = {**os.environ, "http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
-    done = subprocess.run([checker, "-t", "cf:1.11", "-c", "strict", target], capture_output=True, text=True, check=False, env=offline)
+    offline = {
+        **os.environ,
+        "http_proxy": "http://127.0.0.1:9",
+        "https_proxy": "http://127.0.0.1:9",
+    }
+    done = subprocess.run(
+        [checker, "-t", "cf:1.11", "-c", "strict", target],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=offline,
+    )
     assert "All tests passed!" in done.stdout, done.stdout
 
 
 def test_pipeline_joins_another_teams_file(stored, tmp_path):
-    plan = tomllib.loads((ROOT / "pipelines" / "temperature_chain.toml").read_text(encoding="utf-8"))
+    plan = tomllib.loads(
+        (ROOT / "pipelines" / "temperature_chain.toml").read_text(encoding="utf-8")
+    )
     product = gyrostab.open_product(stored)
     (tmp_path / plan["product"]).write_bytes(stored.read_bytes())
-    lines = [f"{t},{v:.4f}" for t, v in zip(product["time"].values, product["temperature"].values, strict=True)]
-    (tmp_path / plan["channel"]["file"]).write_text("\n".join(["time,T_probe", *lines]), encoding="utf-8")
-    (tmp_path / "plan.toml").write_bytes((ROOT / "pipelines" / "temperature_chain.toml").read_bytes())
+    lines = [
+        f"{t},{v:.4f}"
+        for t, v in zip(product["time"].values, product["temperature"].values, strict=True)
+    ]
+    (tmp_path / plan["channel"]["file"]).write_text(
+        "\n".join(["time,T_probe", *lines]), encoding="utf-8"
+    )
+    (tmp_path / "plan.toml").write_bytes(
+        (ROOT / "pipelines" / "temperature_chain.toml").read_bytes()
+    )
     done = subprocess.run(
-        [sys.executable, ROOT / "pipelines" / "temperature_chain.py", tmp_path / "plan.toml"], capture_output=True, text=True, check=False
+        [sys.executable, ROOT / "pipelines" / "temperature_chain.py", tmp_path / "plan.toml"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert "Window mean of axis x follows temperature of file" in done.stdout
@@ -263,12 +383,24 @@ def test_real_recordings(recordings, name, read, window, step, following, quiet)
     whole = gyrostab.correlate(product, variables="window_mean")
     found = whole["coupling_verdict"].sel(variable="window_mean")
     for axis in following:
-        assert VERDICTS[int(found.sel(axis=axis, driver="temperature"))] in ("coupled", "not_told_apart")
-        said = str(whole["statement"].sel(variable="window_mean", axis=axis, driver="temperature").values)
+        assert VERDICTS[int(found.sel(axis=axis, driver="temperature"))] in (
+            "coupled",
+            "not_told_apart",
+        )
+        said = str(
+            whole["statement"].sel(variable="window_mean", axis=axis, driver="temperature").values
+        )
         assert "temperature never turns" in said
-        assert "change together" in said or float(whole["p_value"].sel(variable="window_mean", axis=axis, driver="temperature")) < 0.05
+        assert (
+            "change together" in said
+            or float(whole["p_value"].sel(variable="window_mean", axis=axis, driver="temperature"))
+            < 0.05
+        )
     for axis in quiet:
-        assert set(found.sel(axis=axis).values) <= {VERDICTS.index("cannot_tell"), VERDICTS.index("none_seen")}
+        assert set(found.sel(axis=axis).values) <= {
+            VERDICTS.index("cannot_tell"),
+            VERDICTS.index("none_seen"),
+        }
 
 
 def test_a_term_seen_in_scattered_windows_only_is_no_ground_for_a_verdict():
@@ -279,4 +411,7 @@ def test_a_term_seen_in_scattered_windows_only_is_no_ground_for_a_verdict():
     seen = product["observable"].sel(axis="x", term="Q").values == 2
     assert 12 < seen.sum() < 20
     assert not (seen[1:] & seen[:-1]).any()  # enough windows, but none beside another
-    assert VERDICTS[int(found["coupling_verdict"].sel(axis="x", variable="Q").values[0])] == "cannot_tell"
+    assert (
+        VERDICTS[int(found["coupling_verdict"].sel(axis="x", variable="Q").values[0])]
+        == "cannot_tell"
+    )

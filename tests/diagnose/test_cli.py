@@ -25,18 +25,41 @@ from gyrostab.simulate import simulate
 from tests.support.command_line import call
 
 LOUD = {
-    "log": {"axes": ["x"], "rate": 20.0, "duration": "16min", "start": "2026-03-14T08:00:00", "seed": 5},
+    "log": {
+        "axes": ["x"],
+        "rate": 20.0,
+        "duration": "16min",
+        "start": "2026-03-14T08:00:00",
+        "seed": 5,
+    },
     "noise": {"N": 0.003},
     "environment": [
-        {"profile": "vibration", "points": [[0, 0.02], [399, 0.02], [400, 6.0], [640, 6.0], [641, 0.02]]},
-        {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": [[0, 28]], "sensor_rate": 0.5},
-        {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 20], [960, 24]], "sensor_rate": 0.2},
+        {
+            "profile": "vibration",
+            "points": [[0, 0.02], [399, 0.02], [400, 6.0], [640, 6.0], [641, 0.02]],
+        },
+        {
+            "profile": "steps",
+            "channel": "supply_voltage",
+            "unit": "V",
+            "points": [[0, 28]],
+            "sensor_rate": 0.5,
+        },
+        {
+            "profile": "ramps",
+            "channel": "temperature",
+            "unit": "degC",
+            "points": [[0, 20], [960, 24]],
+            "sensor_rate": 0.2,
+        },
     ],
     "effect": [{"name": "vibration_noise", "axes": ["x"], "white": 0.0006}],
 }
 
 
-def white(axes: int = 1, *, seconds: float = 600.0, rate: float = 10.0, seed: int = 1) -> xr.Dataset:
+def white(
+    axes: int = 1, *, seconds: float = 600.0, rate: float = 10.0, seed: int = 1
+) -> xr.Dataset:
     values = np.random.default_rng(seed).standard_normal((axes, round(seconds * rate)))
     return make_log(values, rate=rate, unit="deg/h", start="2026-03-14T08:00:00")
 
@@ -45,14 +68,19 @@ def white(axes: int = 1, *, seconds: float = 600.0, rate: float = 10.0, seed: in
 def recording(tmp_path_factory) -> Path:
     """Noise that rises with vibration, a channel that stands still, and one that falls silent for a third of the time."""
     log = simulate(LOUD).compute()
-    log["temperature"] = log["temperature"].where((np.arange(log.sizes["time_temperature"]) // 20) % 3 != 1)
+    log["temperature"] = log["temperature"].where(
+        (np.arange(log.sizes["time_temperature"]) // 20) % 3 != 1
+    )
     return to_netcdf(log, tmp_path_factory.mktemp("recording") / "log.nc")
 
 
 @pytest.fixture(scope="module")
 def folder(recording, tmp_path_factory) -> Path:
     found = tmp_path_factory.mktemp("found") / "diagnosis"
-    assert call("diagnose", recording, "-o", found, "--nulls", 100, "--seed", 1, "--quiet-progress") == 0
+    assert (
+        call("diagnose", recording, "-o", found, "--nulls", 100, "--seed", 1, "--quiet-progress")
+        == 0
+    )
     return found
 
 
@@ -61,7 +89,9 @@ def test_the_command_writes_the_four_files(folder: Path):
     assert [path.name for path in folder.parent.iterdir()] == ["diagnosis"]
 
 
-def test_what_was_put_in_is_named_on_one_axis_beside_a_constant_channel_and_one_with_gaps(folder: Path):
+def test_what_was_put_in_is_named_on_one_axis_beside_a_constant_channel_and_one_with_gaps(
+    folder: Path,
+):
     content = json.loads((folder / "diagnosis.json").read_text())
     check_diagnosis(content)
     assert content["recording"]["axes"] == ["x"]
@@ -82,8 +112,16 @@ def test_what_was_put_in_is_named_on_one_axis_beside_a_constant_channel_and_one_
 
 def test_the_model_simulates_what_was_recorded(folder: Path, recording: Path, tmp_path: Path):
     again = tmp_path / "again.nc"
-    assert call("simulate", folder / "model.toml", "--like", recording, "-o", again, "--quiet-progress") == 0
-    now, before = gyrostab.open_log(again).rate.values[0], gyrostab.open_log(recording).rate.values[0]
+    assert (
+        call(
+            "simulate", folder / "model.toml", "--like", recording, "-o", again, "--quiet-progress"
+        )
+        == 0
+    )
+    now, before = (
+        gyrostab.open_log(again).rate.values[0],
+        gyrostab.open_log(recording).rate.values[0],
+    )
     loud = slice(8100, 12700)
     assert now[loud].std() == pytest.approx(before[loud].std(), rel=0.1)
     assert now[:7900].std() == pytest.approx(before[:7900].std(), rel=0.06)
@@ -93,23 +131,45 @@ def test_python_opens_what_the_command_wrote(folder: Path):
     found = gyrostab.open_diagnosis(folder)
     assert found.effects
     assert list(found.surfaces["case"].values) == ["recording", "before", "after"]
-    assert set(found.surfaces.data_vars) >= {"avar", "mean", "block_mean", "density", "line_density", "channel_vibration"}
+    assert set(found.surfaces.data_vars) >= {
+        "avar",
+        "mean",
+        "block_mean",
+        "density",
+        "line_density",
+        "channel_vibration",
+    }
     assert found.model["noise"].keys() == {"x"}
-    assert tomllib.loads((folder / "model.toml").read_text())["effect"][0]["name"] == found.effects[0]["name"]
+    assert (
+        tomllib.loads((folder / "model.toml").read_text())["effect"][0]["name"]
+        == found.effects[0]["name"]
+    )
 
 
 def test_noise_alone_is_no_mismatch_without_any_channel():
     told: list[str] = []
-    found = diagnose(white(seconds=600.0, seed=2), nulls=100, block="20s", progress=lambda label, *rest, **more: told.append(label))
+    found = diagnose(
+        white(seconds=600.0, seed=2),
+        nulls=100,
+        block="20s",
+        progress=lambda label, *rest, **more: told.append(label),
+    )
     check_diagnosis(found.content)
     assert found.verdict == "no mismatch"
     assert found.effects == []
     assert found.content["recording"]["channels"] == []
     assert found.content["not_found"]["shupe"]["upper_limit"] is None
-    assert list(dict.fromkeys(told)) == ["reducing", "calibrating", "comparing", "naming", "fitting"]
+    assert list(dict.fromkeys(told)) == [
+        "reducing",
+        "calibrating",
+        "comparing",
+        "naming",
+        "fitting",
+    ]
 
 
-# ------------------------------------------------------------------------------------------------------------------ manners
+# ------------------------------------------------------------------------------------------------------------------
+# manners
 
 
 def test_an_axis_that_never_changes_is_left_out():
@@ -123,7 +183,9 @@ def test_an_axis_that_never_changes_is_left_out():
         diagnose(log.isel(axis=[1]), nulls=100)
 
 
-def test_an_existing_folder_is_kept(folder: Path, recording: Path, capfd: pytest.CaptureFixture[str]):
+def test_an_existing_folder_is_kept(
+    folder: Path, recording: Path, capfd: pytest.CaptureFixture[str]
+):
     before = (folder / "diagnosis.json").read_bytes()
     capfd.readouterr()
     assert call("diagnose", recording, "-o", folder) == 2
@@ -131,7 +193,9 @@ def test_an_existing_folder_is_kept(folder: Path, recording: Path, capfd: pytest
     assert (folder / "diagnosis.json").read_bytes() == before
 
 
-def test_a_short_recording_is_told_how_long_it_must_be(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_a_short_recording_is_told_how_long_it_must_be(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
     to_netcdf(white(seconds=60.0), tmp_path / "short.nc")
     assert call("diagnose", tmp_path / "short.nc", "-o", tmp_path / "found") == 2
     said = capfd.readouterr().err
@@ -144,9 +208,15 @@ def test_a_short_recording_is_told_how_long_it_must_be(tmp_path: Path, capfd: py
     ("change", "complaint"),
     [
         (lambda log: white(rate=20.0), "another sampling rate (20 Hz) than the recording (10 Hz)"),
-        (lambda log: log.isel(time=slice(0, 5000)), "another number of samples (5000) than the recording (6000)"),
+        (
+            lambda log: log.isel(time=slice(0, 5000)),
+            "another number of samples (5000) than the recording (6000)",
+        ),
         (lambda log: white(axes=2), "another axes (x, y) than the recording (x)"),
-        (lambda log: make_log(log.rate.values, rate=10.0, unit="deg/h", start="2027-01-01"), "another start (2027-01-01"),
+        (
+            lambda log: make_log(log.rate.values, rate=10.0, unit="deg/h", start="2027-01-01"),
+            "another start (2027-01-01",
+        ),
     ],
 )
 def test_a_simulation_on_other_stamps_is_refused_with_what_to_do(change, complaint: str):
@@ -172,20 +242,35 @@ def test_options_that_make_no_sense_are_refused(tmp_path: Path, capfd: pytest.Ca
     with pytest.raises(SchemaError):
         diagnose(xr.Dataset())
     to_netcdf(log, tmp_path / "log.nc")
-    assert call("diagnose", tmp_path / "log.nc", "--quiet", "morning", "-o", tmp_path / "found") == 2
+    assert (
+        call("diagnose", tmp_path / "log.nc", "--quiet", "morning", "-o", tmp_path / "found") == 2
+    )
     assert "START/END" in capfd.readouterr().err
-    assert call("diagnose", tmp_path / "log.nc", "--simulation", tmp_path / "no.toml", "-o", tmp_path / "found") == 2
+    assert (
+        call(
+            "diagnose",
+            tmp_path / "log.nc",
+            "--simulation",
+            tmp_path / "no.toml",
+            "-o",
+            tmp_path / "found",
+        )
+        == 2
+    )
     assert "no.toml" in capfd.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["log.nc"]
 
 
-@pytest.mark.parametrize("text", ["", "1h", "0s/", "0s/1h/2h", "dawn/dusk", "2026-13-40/2026-14-50"])
+@pytest.mark.parametrize(
+    "text", ["", "1h", "0s/", "0s/1h/2h", "dawn/dusk", "2026-13-40/2026-14-50"]
+)
 def test_quiet_stretches_that_cannot_be_read(text: str):
     with pytest.raises(OptionError, match="quiet"):
         parse_quiescent_span(text)
 
 
-# ------------------------------------------------------------------------------------------------------------------- pieces
+# -------------------------------------------------------------------------------------------------------------------
+# pieces
 
 
 def test_times_of_an_effect_are_few_or_the_whole_record():
@@ -199,15 +284,45 @@ def test_times_of_an_effect_are_few_or_the_whole_record():
 
 
 def test_a_line_explains_a_line_at_its_own_frequency_only():
-    line = Component(Candidate("spectral_line", "line", (), ()), Variant({}, ("amplitude",), np.empty(0)), ("x",), 50.0, place=116)
+    line = Component(
+        Candidate("spectral_line", "line", (), ()),
+        Variant({}, ("amplitude",), np.empty(0)),
+        ("x",),
+        50.0,
+        place=116,
+    )
     reduced = xr.Dataset(coords={"line_frequency": ("line", np.arange(1, 400) * 0.25)})
-    box = {"view": "spectrum", "what": "line", "frequency": 29.25, "tau_min_s": 0.017, "tau_max_s": 0.017}
+    box = {
+        "view": "spectrum",
+        "what": "line",
+        "frequency": 29.25,
+        "tau_min_s": 0.017,
+        "tau_max_s": 0.017,
+    }
     assert _can_show(line, box, reduced)
     assert not _can_show(line, box | {"frequency": 12.5}, reduced)
     assert not _can_show(line, box | {"what": "ramp phase", "frequency": np.nan}, reduced)
-    assert _can_show(line, {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 0.01, "tau_max_s": 0.02}, reduced)
-    assert not _can_show(line, {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0}, reduced)
-    assert not _can_show(line, {"view": "mean", "what": "mean", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0}, reduced)
+    assert _can_show(
+        line,
+        {
+            "view": "davar",
+            "what": "avar",
+            "frequency": np.nan,
+            "tau_min_s": 0.01,
+            "tau_max_s": 0.02,
+        },
+        reduced,
+    )
+    assert not _can_show(
+        line,
+        {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0},
+        reduced,
+    )
+    assert not _can_show(
+        line,
+        {"view": "mean", "what": "mean", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0},
+        reduced,
+    )
 
 
 def test_the_chance_of_a_gain_goes_on_beyond_the_null_records():

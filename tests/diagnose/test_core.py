@@ -21,19 +21,31 @@ def found() -> Diagnosis:
             {"name": "vibration_noise", "white": 0.002, "axes": ["x"]},
             {"name": "spikes", "kind": "outlier", "per_hour": 60.0, "size": 60.0, "axes": ["y"]},
         ],
-        "environment": [{"profile": "vibration", "points": [[0, 3.0], [600, 3.0], [601, 5.0], [1200, 5.0], [1201, 8.0], [1800, 8.0]]}],
+        "environment": [
+            {
+                "profile": "vibration",
+                "points": [[0, 3.0], [600, 3.0], [601, 5.0], [1200, 5.0], [1201, 8.0], [1800, 8.0]],
+            }
+        ],
         "log": {"axes": ["x", "y"]},
     }
     return diagnose(simulate(model, duration="30min", rate=10.0, seed=5).compute(), nulls=100)
 
 
 def test_both_are_named(found: Diagnosis) -> None:
-    assert {one["name"]: one["axes"] for one in found.effects} == {"vibration_noise": ["x"], "spikes": ["y"]}
+    assert {one["name"]: one["axes"] for one in found.effects} == {
+        "vibration_noise": ["x"],
+        "spikes": ["y"],
+    }
 
 
 def test_the_model_has_the_noise_beside_the_effects(found: Diagnosis) -> None:
-    assert found.content["baseline"]["noise"]["x"]["N"]["value"] > 1.5 * N  # that of the first calibration, which knows of none
-    assert found.model["noise"]["x"]["N"] == pytest.approx(N, rel=0.3)  # three other records give 0.95 to 1.07 of it
+    assert (
+        found.content["baseline"]["noise"]["x"]["N"]["value"] > 1.5 * N
+    )  # that of the first calibration, which knows of none
+    assert found.model["noise"]["x"]["N"] == pytest.approx(
+        N, rel=0.3
+    )  # three other records give 0.95 to 1.07 of it
     assert found.model["noise"]["y"]["N"] == pytest.approx(N, rel=0.1)
 
 
@@ -42,7 +54,9 @@ def test_the_surface_with_the_effects_is_that_of_the_recording(found: Diagnosis)
     short = found.surfaces["avar"].isel(tau=0)
     recorded, after = (short.sel(case=case) for case in ("recording", "after"))
     np.testing.assert_allclose((recorded / after).sel(axis="x").mean(), 1.0, atol=0.05)
-    np.testing.assert_allclose(recorded.sel(axis="y").mean() / after.sel(axis="y").mean(), 1.0, atol=0.3)
+    np.testing.assert_allclose(
+        recorded.sel(axis="y").mean() / after.sel(axis="y").mean(), 1.0, atol=0.3
+    )
 
 
 def test_what_is_held_out_is_told_without_the_blocks_of_spikes(found: Diagnosis) -> None:

@@ -22,7 +22,9 @@ RESETS_PER_S = 1502 / 360  # counted in the recording by its publisher's notes
 
 
 @pytest.fixture
-def log_of(recordings: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+def log_of(
+    recordings: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Any]:
     """A recording of the plan, cut to so many seconds; skipped where it is absent."""
 
     def read(name: str, **cut: float) -> Any:

@@ -10,7 +10,10 @@ import gyrostab
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
-SHAKE = {"profile": "vibration", "points": [[0, 0.02], [700, 0.02], [720, 6.0], [1000, 6.0], [1020, 0.02], [1500, 0.02]]}
+SHAKE = {
+    "profile": "vibration",
+    "points": [[0, 0.02], [700, 0.02], [720, 6.0], [1000, 6.0], [1020, 0.02], [1500, 0.02]],
+}
 
 
 @cache
@@ -44,14 +47,20 @@ BUMP = {"name": "spectral_line", "amplitude": 0.5, "frequency": 2.6, "quality": 
 @cache
 def axes_log(seed: int, *names: str):
     effects = {"shared_source": SHARED, "line": LINE, "bump": BUMP}
-    model = {"noise": NOISE, "effect": [effects[name] for name in names], "log": {"axes": ["x", "y"]}}
+    model = {
+        "noise": NOISE,
+        "effect": [effects[name] for name in names],
+        "log": {"axes": ["x", "y"]},
+    }
     return simulate(model, duration="25min", rate=10.0, seed=seed).compute()
 
 
 @pytest.mark.parametrize("seed", [11, 12])
 def test_what_a_simulation_shows_all_the_time_is_no_mismatch(seed):
     names = ("shared_source", "line", "bump")
-    found = gyrostab.diagnose(axes_log(seed, *names), simulation=axes_log(seed + 100, *names), nulls=100)
+    found = gyrostab.diagnose(
+        axes_log(seed, *names), simulation=axes_log(seed + 100, *names), nulls=100
+    )
     assert found.verdict == "no mismatch"
 
 
@@ -60,4 +69,6 @@ def test_what_a_simulation_lacks_beside_what_it_shows_is_named(lacking):
     names = ("shared_source", "line", "bump")
     simulation = axes_log(111, *(name for name in names if name != lacking))
     found = gyrostab.diagnose(axes_log(11, *names), simulation=simulation, nulls=100)
-    assert [effect["name"] for effect in found.effects] == [{"line": "spectral_line"}.get(lacking, lacking)]
+    assert [effect["name"] for effect in found.effects] == [
+        {"line": "spectral_line"}.get(lacking, lacking)
+    ]

@@ -1,7 +1,8 @@
 """Run a campaign and write its table: ``python -m tests.fuzz --count 100000 --seed 1 --jobs 2 --output docs/fuzzing.md``.
 
-A campaign that is stopped goes on where it was when it is started again with the same seed and the same code; ``--fresh`` forgets it.
-``--replay FOLDER`` tries the inputs again that failed and were kept.
+A campaign that is stopped goes on where it was when it is started again with the same seed and the
+same code; ``--fresh`` forgets it. ``--replay FOLDER`` tries the inputs again that failed and were
+kept.
 """
 
 from __future__ import annotations
@@ -16,7 +17,15 @@ from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 
 from gyrostab.store.output import replace_file
-from tests.fuzz.campaign import BATCH, FORMATS, Tally, ignore_interrupts, load_input, run_batch, server
+from tests.fuzz.campaign import (
+    BATCH,
+    FORMATS,
+    Tally,
+    ignore_interrupts,
+    load_input,
+    run_batch,
+    server,
+)
 from tests.fuzz.table import page, table
 
 ROOT = Path(__file__).parents[2]
@@ -25,7 +34,9 @@ ROOT = Path(__file__).parents[2]
 def state_of_code() -> str:
     """Digest of the package and of the harness: results of other code are not taken over."""
     digest = hashlib.sha256()
-    for path in sorted([*(ROOT / "gyrostab").rglob("*.py"), *(ROOT / "tests" / "fuzz").glob("*.py")]):
+    for path in sorted(
+        [*(ROOT / "gyrostab").rglob("*.py"), *(ROOT / "tests" / "fuzz").glob("*.py")]
+    ):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -39,7 +50,9 @@ def batches(count: int, formats: Sequence[str], size: int) -> Iterator[tuple[str
                 yield form, first, min(size, total - first)
 
 
-def run(count: int, seed: int, jobs: int, formats: Sequence[str], *, work: Path, fresh: bool) -> tuple[dict[str, Tally], float, bool]:
+def run(
+    count: int, seed: int, jobs: int, formats: Sequence[str], *, work: Path, fresh: bool
+) -> tuple[dict[str, Tally], float, bool]:
     """Try `count` inputs; the tallies by format, the seconds it took, and whether all were tried."""
     work.mkdir(parents=True, exist_ok=True)
     key = f"{state_of_code()} {seed}"
@@ -58,13 +71,17 @@ def run(count: int, seed: int, jobs: int, formats: Sequence[str], *, work: Path,
     left = [batch for batch in planned if batch not in done]
     begun, complete = time.monotonic(), True
     failures = str(work / "failures")
-    pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=ignore_interrupts)
+    pool = ProcessPoolExecutor(
+        jobs, mp_context=multiprocessing.get_context("spawn"), initializer=ignore_interrupts
+    )
     try:
         pending = {}
         queue = iter(left)
         while True:
             while len(pending) < 2 * jobs and (batch := next(queue, None)):
-                pending[pool.submit(run_batch, batch[0], seed, batch[1], batch[2], failures)] = batch
+                pending[pool.submit(run_batch, batch[0], seed, batch[1], batch[2], failures)] = (
+                    batch
+                )
             if not pending:
                 break
             for future in wait(pending, return_when=FIRST_COMPLETED).done:
@@ -77,7 +94,11 @@ def run(count: int, seed: int, jobs: int, formats: Sequence[str], *, work: Path,
                     file.write(json.dumps(entry) + "\n")
                 tried = sum(tally.codes.total() for tally in done.values())
                 failed = sum(len(tally.failures) for tally in done.values())
-                print(f"\r{tried} of {count} inputs, {failed} failures, {tried / max(seconds, 1e-9):.0f} inputs/s ", end="", flush=True)
+                print(
+                    f"\r{tried} of {count} inputs, {failed} failures, {tried / max(seconds, 1e-9):.0f} inputs/s ",
+                    end="",
+                    flush=True,
+                )
     except KeyboardInterrupt:
         complete = False
         for process in list(pool._processes.values()):
@@ -110,21 +131,37 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=2000, help="inputs in all")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--formats", nargs="*", default=list(FORMATS), choices=FORMATS, metavar="FORMAT")
+    parser.add_argument(
+        "--formats", nargs="*", default=list(FORMATS), choices=FORMATS, metavar="FORMAT"
+    )
     parser.add_argument("--output", type=Path, help="Markdown page for the result table")
-    parser.add_argument("--work", type=Path, default=ROOT / "fuzz-output", help="folder for the state and the failing inputs")
-    parser.add_argument("--fresh", action="store_true", help="forget what an earlier call of the same campaign did")
+    parser.add_argument(
+        "--work",
+        type=Path,
+        default=ROOT / "fuzz-output",
+        help="folder for the state and the failing inputs",
+    )
+    parser.add_argument(
+        "--fresh", action="store_true", help="forget what an earlier call of the same campaign did"
+    )
     parser.add_argument("--replay", type=Path, help="folder of kept inputs to try again")
     given = parser.parse_args()
     if given.replay:
         return min(replay(given.replay), 1)
-    totals, seconds, complete = run(given.count, given.seed, given.jobs, given.formats, work=given.work, fresh=given.fresh)
+    totals, seconds, complete = run(
+        given.count, given.seed, given.jobs, given.formats, work=given.work, fresh=given.fresh
+    )
     print(table(totals))
     for failure in [failure for tally in totals.values() for failure in tally.failures]:
-        print(f"{failure['format']}-{failure['name']} {failure['command']}: {failure['code']} {failure['text']}")
+        print(
+            f"{failure['format']}-{failure['name']} {failure['command']}: {failure['code']} {failure['text']}"
+        )
     if given.output:
         with replace_file(given.output) as part:
-            part.write_text(page(totals, count=given.count, seed=given.seed, jobs=given.jobs, seconds=seconds), encoding="utf-8")
+            part.write_text(
+                page(totals, count=given.count, seed=given.seed, jobs=given.jobs, seconds=seconds),
+                encoding="utf-8",
+            )
     return int(not complete or any(tally.failures for tally in totals.values()))
 
 

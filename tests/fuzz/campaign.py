@@ -98,18 +98,25 @@ def ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def run_batch(form: str, seed: int, first: int, count: int, folder: str | None) -> tuple[str, int, Tally]:
+def run_batch(
+    form: str, seed: int, first: int, count: int, folder: str | None
+) -> tuple[str, int, Tally]:
     """Try some inputs of one format; those that fail are kept in `folder`."""
     tally = Tally()
     if form in STRUCTURED:
-        inputs = (Input(form, *parts) for parts in draw_inputs(form, f"{seed} {form} {first}", count))
+        inputs = (
+            Input(form, *parts) for parts in draw_inputs(form, f"{seed} {form} {first}", count)
+        )
     else:
         inputs = (make_input(form, seed, number) for number in range(first, first + count))
     for item in inputs:
         outcome = server().try_input(item.files, item.command, item.main, item.options)
         tally.codes[str(outcome.code)] += 1
         tally.seconds += outcome.worked
-        tally.slowest, tally.bytes = max(tally.slowest, outcome.seconds), max(tally.bytes, outcome.bytes)
+        tally.slowest, tally.bytes = (
+            max(tally.slowest, outcome.seconds),
+            max(tally.bytes, outcome.bytes),
+        )
         if not outcome.is_right(may_be_interrupted=form == "checkpoint"):
             tally.failures.append(report(item, outcome, folder))
     return form, first, tally
@@ -117,10 +124,18 @@ def run_batch(form: str, seed: int, first: int, count: int, folder: str | None) 
 
 def report(item: Input, outcome: Outcome, folder: str | None) -> dict[str, Any]:
     """A failure in a few words; its input goes to `folder`."""
-    name = hashlib.sha256(repr(sorted(item.files.items())).encode() + item.command.encode()).hexdigest()[:12]
+    name = hashlib.sha256(
+        repr(sorted(item.files.items())).encode() + item.command.encode()
+    ).hexdigest()[:12]
     if folder is not None:
         keep_input(item, Path(folder) / f"{item.format}-{name}")
-    return {"format": item.format, "name": name, "command": item.command, "code": outcome.code, "text": outcome.text[-300:]}
+    return {
+        "format": item.format,
+        "name": name,
+        "command": item.command,
+        "code": outcome.code,
+        "text": outcome.text[-300:],
+    }
 
 
 def keep_input(item: Input, place: Path) -> None:
@@ -128,7 +143,12 @@ def keep_input(item: Input, place: Path) -> None:
     for name, data in item.files.items():
         (place / "files" / name).parent.mkdir(parents=True, exist_ok=True)
         (place / "files" / name).write_bytes(data)
-    call = {"format": item.format, "main": item.main, "options": item.options, "command": item.command}
+    call = {
+        "format": item.format,
+        "main": item.main,
+        "options": item.options,
+        "command": item.command,
+    }
     place.mkdir(parents=True, exist_ok=True)
     (place / "call.json").write_text(json.dumps(call, indent=1) + "\n")
 
@@ -136,5 +156,9 @@ def keep_input(item: Input, place: Path) -> None:
 def load_input(place: Path) -> Input:
     """An input that `keep_input` wrote."""
     call = json.loads((place / "call.json").read_text())
-    files = {str(path.relative_to(place / "files")): path.read_bytes() for path in sorted((place / "files").rglob("*")) if path.is_file()}
+    files = {
+        str(path.relative_to(place / "files")): path.read_bytes()
+        for path in sorted((place / "files").rglob("*"))
+        if path.is_file()
+    }
     return Input(call["format"], files, call["main"], tuple(call["options"]), call["command"])

@@ -1,7 +1,8 @@
 """A process that serves many calls of the command line, one after the other: nothing is imported or compiled twice.
 
-Each line of its standard input is the arguments of a call as JSON; each line of its answer says what became of it.
-It shares the limits of memory and time with nobody: its parent stops and replaces it.
+Each line of its standard input is the arguments of a call as JSON; each line of its answer says
+what became of it. It shares the limits of memory and time with nobody: its parent stops and
+replaces it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ def own_fault(error: BaseException | None, package: str) -> str:
         if (
             isinstance(error, DamageError)
             and cause is not None
-            and not isinstance(cause, MemoryError | SystemError | ChunkDamage)  # a SystemError comes out of compiled code
+            and not isinstance(
+                cause, MemoryError | SystemError | ChunkDamage
+            )  # a SystemError comes out of compiled code
             and innermost_is_ours(cause, package)
         ):
             last = traceback.extract_tb(cause.__traceback__)[-1]
@@ -52,7 +55,10 @@ def unexpected(error: BaseException | None) -> str:
     """The last frames of what ended with exit code 1."""
     if error is None:
         return ""
-    frames = [f"{Path(frame.filename).name}:{frame.name}:{frame.lineno}" for frame in traceback.extract_tb(error.__traceback__)[-3:]]
+    frames = [
+        f"{Path(frame.filename).name}:{frame.name}:{frame.lineno}"
+        for frame in traceback.extract_tb(error.__traceback__)[-3:]
+    ]
     return f"{type(error).__name__}: {str(error)[:200]} ({' > '.join(frames)})"
 
 
@@ -97,7 +103,8 @@ def call(arguments: list[str], seen: dict[str, Any]) -> dict[str, Any]:
         "seconds": seconds,
         "worked": time.process_time() - worked,
         "bytes": max(0, peak_bytes() - before),
-        "fault": own_fault(error, package) or (unexpected(error) if code in (1, "traceback") else ""),
+        "fault": own_fault(error, package)
+        or (unexpected(error) if code in (1, "traceback") else ""),
         "said": text[-400:],
     }
 

@@ -8,7 +8,24 @@ import re
 from tests.fuzz.seeds import Seed
 
 #: Numbers at which counters, sizes and signs break.
-INTEGERS = (0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 2**40, 2**63 - 1, 2**63, 2**64 - 1)
+INTEGERS = (
+    0,
+    1,
+    2,
+    0x7F,
+    0x80,
+    0xFF,
+    0x7FFF,
+    0x8000,
+    0xFFFF,
+    0x7FFFFFFF,
+    0x80000000,
+    0xFFFFFFFF,
+    2**40,
+    2**63 - 1,
+    2**63,
+    2**64 - 1,
+)
 #: Texts at which parsers break.
 TOKENS = (
     b"", b"nan", b"-nan", b"inf", b"1e999", b"-1e-320", b"-0", b"0", b"1", b"-1", b"9" * 5000, b"1e300", b"0x10", b"1_0", b"+", b"-", b".",
@@ -37,15 +54,24 @@ def damage(seed: Seed, others: list[Seed], draw: random.Random) -> dict[str, byt
             continue
         other = draw.choice(others)
         spare = other.files[draw.choice(list(other.files))]
-        textual = seed.format in TEXT or (name in files and name.endswith((".json", ".zarray", ".zattrs", ".zmetadata", ".zgroup")))
-        files[name] = damage_bytes(files.get(name, b""), spare, draw, textual=textual and not name.endswith(".gz"))
+        textual = seed.format in TEXT or (
+            name in files
+            and name.endswith((".json", ".zarray", ".zattrs", ".zmetadata", ".zgroup"))
+        )
+        files[name] = damage_bytes(
+            files.get(name, b""), spare, draw, textual=textual and not name.endswith(".gz")
+        )
     return files
 
 
 def damage_bytes(data: bytes, spare: bytes, draw: random.Random, *, textual: bool) -> bytes:
     """Some bytes, damaged in one to a few ways."""
     for _ in range(draw.choice((1, 1, 1, 2, 3, 8))):
-        data = replace_token(data, draw) if textual and draw.random() < 0.6 else damage_once(bytearray(data), spare, draw)
+        data = (
+            replace_token(data, draw)
+            if textual and draw.random() < 0.6
+            else damage_once(bytearray(data), spare, draw)
+        )
     return data
 
 
@@ -91,7 +117,15 @@ def replace_token(data: bytes, draw: random.Random) -> bytes:
     tokens = list(_TOKEN.finditer(data))
     if not tokens:
         return draw.choice(TOKENS)
-    chosen = tokens[draw.randrange(min(len(tokens), 60))] if draw.random() < 0.5 else draw.choice(tokens)
+    chosen = (
+        tokens[draw.randrange(min(len(tokens), 60))] if draw.random() < 0.5 else draw.choice(tokens)
+    )
     kind = draw.random()
-    new = draw.choice(TOKENS) if kind < 0.7 else draw.choice(tokens)[0] if kind < 0.9 else chosen[0] * 2
+    new = (
+        draw.choice(TOKENS)
+        if kind < 0.7
+        else draw.choice(tokens)[0]
+        if kind < 0.9
+        else chosen[0] * 2
+    )
     return data[: chosen.start()] + new + data[chosen.end() :]

@@ -73,26 +73,56 @@ def text_seeds() -> Iterator[Seed]:
     names = "gyro_x [deg/h],gyro_y [deg/h],temperature [degC]"
     rows = [f"{a},{b},{t:.2f}" for a, b, t in zip(x, y, temperature, strict=True)]
     stamp = [f"2026-03-01T12:00:{index / RATE:06.3f}Z" for index in range(ROWS)]
-    iso = "\n".join(["time," + names, *(f"{s},{row}" for s, row in zip(stamp, rows, strict=True))]) + "\n"
-    numeric = "\n".join(["# tool 7", "time [s]," + names, *(f"{i / RATE:.1f},{row}" for i, row in enumerate(rows))]) + "\n"
+    iso = (
+        "\n".join(["time," + names, *(f"{s},{row}" for s, row in zip(stamp, rows, strict=True))])
+        + "\n"
+    )
+    numeric = (
+        "\n".join(
+            [
+                "# tool 7",
+                "time [s]," + names,
+                *(f"{i / RATE:.1f},{row}" for i, row in enumerate(rows)),
+            ]
+        )
+        + "\n"
+    )
     semicolon = "\n".join(
         [
             "time [ms];gyro_x [deg/s];gyro_y [deg/s]",
-            *(f"{i * 100};{a / 7:.3f};{b / 7:.3f}".replace(".", ",") for i, (a, b) in enumerate(zip(x, y, strict=True))),
+            *(
+                f"{i * 100};{a / 7:.3f};{b / 7:.3f}".replace(".", ",")
+                for i, (a, b) in enumerate(zip(x, y, strict=True))
+            ),
         ]
     )
     bare = "\n".join(f"{i * 100} {a} {b}" for i, (a, b) in enumerate(zip(x, y, strict=True)))
-    angle = "\n".join(["time [s]\tangle_x [arcsec]", *(f"{i / RATE}\t{a}" for i, a in enumerate(np.cumsum(x)))])
-    quoted = "\n".join(['"time [us]","gyro_x [rad/s]"', *(f'"{i * 100000}","{a * 1e-6:.3e}"' for i, a in enumerate(x))])
+    angle = "\n".join(
+        ["time [s]\tangle_x [arcsec]", *(f"{i / RATE}\t{a}" for i, a in enumerate(np.cumsum(x)))]
+    )
+    quoted = "\n".join(
+        [
+            '"time [us]","gyro_x [rad/s]"',
+            *(f'"{i * 100000}","{a * 1e-6:.3e}"' for i, a in enumerate(x)),
+        ]
+    )
     yield Seed("text", {"log.csv": iso.encode()}, "log.csv")
     yield Seed("text", {"log.csv": numeric.encode()}, "log.csv")
     yield Seed("text", {"log.txt": semicolon.encode()}, "log.txt")
     yield Seed(
-        "text", {"log.dat": bare.encode()}, "log.dat", ("--map", "0=time", "--map", "1=gyro_x", "--unit", "gyro=deg/h", "--unit", "time=ms")
+        "text",
+        {"log.dat": bare.encode()},
+        "log.dat",
+        ("--map", "0=time", "--map", "1=gyro_x", "--unit", "gyro=deg/h", "--unit", "time=ms"),
     )
     yield Seed("text", {"log.tsv": angle.encode()}, "log.tsv", ("--kind", "angle"))
     yield Seed("text", {"log.csv": quoted.encode()}, "log.csv")
-    yield Seed("text", {"log.csv": "\n".join([names, *rows]).encode()}, "log.csv", ("--rate", "10", "--start", "2026-03-01"))
+    yield Seed(
+        "text",
+        {"log.csv": "\n".join([names, *rows]).encode()},
+        "log.csv",
+        ("--rate", "10", "--start", "2026-03-01"),
+    )
     yield Seed("text", {"log.csv.gz": gzip.compress(iso.encode(), mtime=0)}, "log.csv.gz")
 
 
@@ -135,7 +165,13 @@ def foreign_netcdf(path: Path, form: str) -> None:
     with netCDF4.Dataset(path, "w", format=form) as file:
         file.createDimension("obs", ROWS)
         for name, (unit, values) in columns().items():
-            kind = "f8" if form.startswith("NETCDF3") and values.dtype.kind == "i" and values.dtype.itemsize == 8 else values.dtype
+            kind = (
+                "f8"
+                if form.startswith("NETCDF3")
+                and values.dtype.kind == "i"
+                and values.dtype.itemsize == 8
+                else values.dtype
+            )
             variable = file.createVariable(name, kind, ("obs",))
             variable.units = "microseconds since 2026-03-01T12:00:00Z" if name == "time" else unit
             variable[:] = values
@@ -146,14 +182,20 @@ def regular_log() -> Any:
     from gyrostab.ingest.make_log import make_log
 
     (x, _), temperature = signals()
-    return make_log(x * 0.5, rate=RATE, unit="deg/h", channels={"temperature": (temperature, "degC")})
+    return make_log(
+        x * 0.5, rate=RATE, unit="deg/h", channels={"temperature": (temperature, "degC")}
+    )
 
 
 def netcdf_seeds() -> Iterator[Seed]:
     from gyrostab.io.datasets import to_netcdf
     from gyrostab.jobs.run import load_log
 
-    for form, row in (("NETCDF3_CLASSIC", "netcdf3"), ("NETCDF3_64BIT_OFFSET", "netcdf3"), ("NETCDF4", "netcdf4")):
+    for form, row in (
+        ("NETCDF3_CLASSIC", "netcdf3"),
+        ("NETCDF3_64BIT_OFFSET", "netcdf3"),
+        ("NETCDF4", "netcdf4"),
+    ):
         with folder() as place:
             foreign_netcdf(place / "log.nc", form)
             yield Seed(row, contents(place / "log.nc", place), "log.nc")
@@ -165,7 +207,12 @@ def netcdf_seeds() -> Iterator[Seed]:
         regular_log().to_netcdf(place / "xarray.nc", engine="netcdf4")
         yield Seed("netcdf4", contents(place / "xarray.nc", place), "xarray.nc")
         to_netcdf(regular_log(), place / "zlib.nc", compression="zlib")
-        yield Seed("netcdf4", contents(place / "zlib.nc", place), "zlib.nc", commands=("scan", "ingest", "run", "davar"))
+        yield Seed(
+            "netcdf4",
+            contents(place / "zlib.nc", place),
+            "zlib.nc",
+            commands=("scan", "ingest", "run", "davar"),
+        )
 
 
 def zarr_seeds() -> Iterator[Seed]:
@@ -179,7 +226,9 @@ def zarr_seeds() -> Iterator[Seed]:
         (place / seed.main).write_bytes(seed.files[seed.main])
         to_zarr(load_log([place / seed.main]), place / "log.zarr")
         yield Seed("zarr2", contents(place / "log.zarr", place), "log.zarr")
-        foreign = xr.Dataset({name: ("obs", values, {"units": unit}) for name, (unit, values) in columns().items()})
+        foreign = xr.Dataset(
+            {name: ("obs", values, {"units": unit}) for name, (unit, values) in columns().items()}
+        )
         for form in (2, 3):
             regular_log().to_zarr(place / f"regular{form}.zarr", zarr_format=form)
             foreign.to_zarr(place / f"foreign{form}.zarr", zarr_format=form)
@@ -191,12 +240,19 @@ def hdf5_seeds() -> Iterator[Seed]:
     import h5py
 
     with folder() as place:
-        for name, filters in (("plain.h5", {}), ("deflated.h5", {"compression": "gzip", "chunks": (40,)})):
+        for name, filters in (
+            ("plain.h5", {}),
+            ("deflated.h5", {"compression": "gzip", "chunks": (40,)}),
+        ):
             with h5py.File(place / name, "w") as file:
                 group = file.create_group("imu") if filters else file
                 for label, (unit, values) in columns().items():
                     group.create_dataset(label, data=values, **filters).attrs["units"] = unit
-            mapping = [item for label in columns() for item in ("--map", f"imu.{label}={label}")] if filters else []
+            mapping = (
+                [item for label in columns() for item in ("--map", f"imu.{label}={label}")]
+                if filters
+                else []
+            )
             yield Seed("hdf5", contents(place / name, place), name, (*mapping, *UNITS))
 
 
@@ -217,18 +273,45 @@ def matlab_seeds() -> Iterator[Seed]:
         for number, packed in enumerate((False, True)):
             savemat(place / f"v{number}.mat", found, do_compression=packed)
             undate(place / f"v{number}.mat")
-            yield Seed("matlab5", contents(place / f"v{number}.mat", place), f"v{number}.mat", UNITS)
-        savemat(place / "s.mat", {"log": {"t": found["time"], "DATA": table}, "note": "text", "cells": np.array(["a", 1.0], dtype=object)})
+            yield Seed(
+                "matlab5", contents(place / f"v{number}.mat", place), f"v{number}.mat", UNITS
+            )
+        savemat(
+            place / "s.mat",
+            {
+                "log": {"t": found["time"], "DATA": table},
+                "note": "text",
+                "cells": np.array(["a", 1.0], dtype=object),
+            },
+        )
         undate(place / "s.mat")
-        names = [item for place_, name in enumerate(fields) for item in ("--map", f"log.DATA/{place_}={name}")]
-        yield Seed("matlab5", contents(place / "s.mat", place), "s.mat", ("--map", "log.t=time", *names, *UNITS))
+        names = [
+            item
+            for place_, name in enumerate(fields)
+            for item in ("--map", f"log.DATA/{place_}={name}")
+        ]
+        yield Seed(
+            "matlab5",
+            contents(place / "s.mat", place),
+            "s.mat",
+            ("--map", "log.t=time", *names, *UNITS),
+        )
         with h5py.File(place / "hdf.mat", "w", userblock_size=512) as file:
             file["DATA"] = table
             file["stamp"] = found["time"].reshape(1, -1)
         with (place / "hdf.mat").open("r+b") as raw:
             raw.write(b"MATLAB 7.3 MAT-file, Platform: none".ljust(124) + b"\x00\x02IM")
-        names = [item for place_, name in enumerate(fields) for item in ("--map", f"DATA/{place_}={name}")]
-        yield Seed("matlab7.3", contents(place / "hdf.mat", place), "hdf.mat", ("--map", "stamp=time", *names, *UNITS))
+        names = [
+            item
+            for place_, name in enumerate(fields)
+            for item in ("--map", f"DATA/{place_}={name}")
+        ]
+        yield Seed(
+            "matlab7.3",
+            contents(place / "hdf.mat", place),
+            "hdf.mat",
+            ("--map", "stamp=time", *names, *UNITS),
+        )
 
 
 def miniseed_seeds() -> Iterator[Seed]:
@@ -246,7 +329,9 @@ def miniseed_seeds() -> Iterator[Seed]:
                 ):
                     traces = MS3TraceList()
                     traces.add_data(f"FDSN:XX_TOOL__{code}", values, kind, rate, starttime=start)
-                    for record in traces.generate(max_record_length=256, encoding=packing, format_version=version):
+                    for record in traces.generate(
+                        max_record_length=256, encoding=packing, format_version=version
+                    ):
                         file.write(record)
             mapping = (
                 "--map",
@@ -273,17 +358,31 @@ def ulog_seeds() -> Iterator[Seed]:
     parts.append(message(b"I", bytes([14]) + b"char[4] sys_id" + b"tool"))
     parts.append(message(b"A", struct.pack("<BH", 0, 1) + b"imu"))
     for index in range(ROWS):
-        parts.append(message(b"D", struct.pack("<HQ3f", 1, 100_000 * index, x[index] * 1e-5, y[index] * 1e-5, 0.001)))
+        parts.append(
+            message(
+                b"D",
+                struct.pack("<HQ3f", 1, 100_000 * index, x[index] * 1e-5, y[index] * 1e-5, 0.001),
+            )
+        )
         if index == 40:
             parts.append(message(b"O", struct.pack("<H", 20)))
-    mapping = [item for place, axis in enumerate("xyz") for item in ("--map", f"gyro_rad[{place}]=gyro_{axis}")]
+    mapping = [
+        item
+        for place, axis in enumerate("xyz")
+        for item in ("--map", f"gyro_rad[{place}]=gyro_{axis}")
+    ]
     yield Seed("ulog", {"log.ulg": b"".join(parts)}, "log.ulg", (*mapping, "--unit", "gyro=rad/s"))
 
 
 def las_seeds() -> Iterator[Seed]:
     (x, y), temperature = signals()
-    rows = "\n".join(f"{k / RATE:.2f} {a} {b} {t}" for k, (a, b, t) in enumerate(zip(x, y, temperature, strict=True)))
-    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 7.9 :\nSTEP.S 0.1 :\nNULL. -999.25 :\n"
+    rows = "\n".join(
+        f"{k / RATE:.2f} {a} {b} {t}"
+        for k, (a, b, t) in enumerate(zip(x, y, temperature, strict=True))
+    )
+    head = (
+        "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 7.9 :\nSTEP.S 0.1 :\nNULL. -999.25 :\n"
+    )
     curves = "~C\nTIME.S : time\nGYRO_X.deg/h : rate\nGYRO_Y.deg/h : rate\nTEMPERATURE.degC : in the tool\n~A\n"
     yield Seed("las", {"log.las": (head + curves + rows + "\n").encode()}, "log.las")
 
@@ -295,16 +394,29 @@ def tdms_seeds() -> Iterator[Seed]:
     start = np.datetime64("2026-03-01T12:00:00", "us")
     stamps = start + (np.arange(ROWS) * 100_000).astype("timedelta64[us]")
     for waveform in (True, False):
-        clock = {"wf_increment": 1 / RATE, "wf_start_time": start, "wf_start_offset": 0.0} if waveform else {}
+        clock = (
+            {"wf_increment": 1 / RATE, "wf_start_time": start, "wf_start_offset": 0.0}
+            if waveform
+            else {}
+        )
         axes = [
-            ChannelObject("imu", f"gyro_{axis}", values.astype(np.int32), {"unit_string": "deg/h", **clock})
+            ChannelObject(
+                "imu", f"gyro_{axis}", values.astype(np.int32), {"unit_string": "deg/h", **clock}
+            )
             for axis, values in zip("xy", (x, y), strict=True)
         ]
         own = [] if waveform else [ChannelObject("imu", "stamp", stamps)]
         slow = {"unit_string": "degC", "wf_increment": 1.0, "wf_start_time": start}
         with folder() as place:
             with TdmsWriter(str(place / "log.tdms")) as writer:
-                writer.write_segment([RootObject(), *axes, *own, ChannelObject("probe", "temperature", temperature[:8], slow)])
+                writer.write_segment(
+                    [
+                        RootObject(),
+                        *axes,
+                        *own,
+                        ChannelObject("probe", "temperature", temperature[:8], slow),
+                    ]
+                )
             yield Seed("tdms", contents(place / "log.tdms", place), "log.tdms")
 
 
@@ -322,7 +434,9 @@ fields = [
 
 def binary_seeds() -> Iterator[Seed]:
     (x, y), temperature = signals()
-    table = np.zeros(ROWS, dtype=[("t", "<u4"), ("", "V2"), ("x", "<i2"), ("y", "<i4"), ("T", "<f4")])
+    table = np.zeros(
+        ROWS, dtype=[("t", "<u4"), ("", "V2"), ("x", "<i2"), ("y", "<i4"), ("T", "<f4")]
+    )
     table["t"], table["x"], table["y"], table["T"] = np.arange(ROWS) * 100, x, y, temperature
     files = {"log.bin": b"HEADER OF 16 BYT" + table.tobytes(), "log.bin.toml": LAYOUT.encode()}
     yield Seed("binary", files, "log.bin", keep=("log.bin.toml",))
@@ -397,7 +511,13 @@ MODELS = (NOISE, VIBRATION, JUMPS, LOSSES)
 
 def model_seeds() -> Iterator[Seed]:
     for text in MODELS:
-        yield Seed("model", {"model.toml": text.encode()}, "model.toml", ("--duration", "4s", "--rate", "10"), ("simulate",))
+        yield Seed(
+            "model",
+            {"model.toml": text.encode()},
+            "model.toml",
+            ("--duration", "4s", "--rate", "10"),
+            ("simulate",),
+        )
 
 
 CONFIG = """
@@ -422,7 +542,12 @@ T = "temperature [degC]"
 
 def option_seeds() -> Iterator[Seed]:
     (x, _), temperature = signals()
-    log = "\n".join(["tick,wx,T", *(f"{i * 100},{a},{t}" for i, (a, t) in enumerate(zip(x, temperature, strict=True)))]).encode()
+    log = "\n".join(
+        [
+            "tick,wx,T",
+            *(f"{i * 100},{a},{t}" for i, (a, t) in enumerate(zip(x, temperature, strict=True))),
+        ]
+    ).encode()
     config = (
         "--config",
         f"{FOLDER}/options.toml",
@@ -435,9 +560,21 @@ def option_seeds() -> Iterator[Seed]:
         "--map",
         "wx=gyro_x [deg/h]",
     )
-    yield Seed("options", {"log.csv": log, "options.toml": CONFIG.encode()}, "log.csv", config, ("scan", "run"), ("log.csv",))
     yield Seed(
-        "options", {"log.csv": log, "names.toml": MAP.encode()}, "log.csv", ("--map", f"{FOLDER}/names.toml"), ("scan",), ("log.csv",)
+        "options",
+        {"log.csv": log, "options.toml": CONFIG.encode()},
+        "log.csv",
+        config,
+        ("scan", "run"),
+        ("log.csv",),
+    )
+    yield Seed(
+        "options",
+        {"log.csv": log, "names.toml": MAP.encode()},
+        "log.csv",
+        ("--map", f"{FOLDER}/names.toml"),
+        ("scan",),
+        ("log.csv",),
     )
 
 
@@ -450,7 +587,9 @@ def move_job(data: bytes, old: str, new: str) -> bytes:
         before, after = json.loads(data), json.loads(moved)
         if before.pop("sha256") != _hash_json(before):
             return moved
-        after["sha256"] = _hash_json({key: value for key, value in after.items() if key != "sha256"})
+        after["sha256"] = _hash_json(
+            {key: value for key, value in after.items() if key != "sha256"}
+        )
         return json.dumps(after, indent=1).encode()
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return moved
@@ -475,11 +614,26 @@ def checkpoint_seeds() -> Iterator[Seed]:
         with folder() as place, contextlib.redirect_stderr(io.StringIO()):
             (place / "log.csv").write_bytes(log)
             os.utime(place / "log.csv", ns=(CHANGED_NS, CHANGED_NS))
-            assert main(["run", str(place / "log.csv"), "-o", str(place / "out.nc"), *WINDOWS, "--workers", "1"]) == 3
+            assert (
+                main(
+                    [
+                        "run",
+                        str(place / "log.csv"),
+                        "-o",
+                        str(place / "out.nc"),
+                        *WINDOWS,
+                        "--workers",
+                        "1",
+                    ]
+                )
+                == 3
+            )
             files = {"log.csv": log}
             for name, data in contents(place / ".out.nc.job", place).items():
                 if not name.endswith("/lock"):
-                    files[name] = move_job(data, str(place), FOLDER) if name.endswith(".json") else data
+                    files[name] = (
+                        move_job(data, str(place), FOLDER) if name.endswith(".json") else data
+                    )
     finally:
         core._write = written
     yield Seed("checkpoint", files, "log.csv", (), ("resume",), ("log.csv",))

@@ -17,13 +17,15 @@ from pathlib import Path
 
 from tests.fuzz.seeds import CHANGED_NS, FOLDER, WINDOWS, move_job, text_seeds
 
-#: Of the processor; on the clock it is `PATIENCE` times as much, for a child that waits for something.
+#: Of the processor; on the clock it is `PATIENCE` times as much, for a child that waits for
+#: something.
 LIMIT_SECONDS = 20.0
 PATIENCE = 6
 LIMIT_BYTES = 2**30
 #: Calls after which a child is replaced, so that what libraries keep does not add up.
 CALLS = 4000
-#: The windows of the harness are a second apart: a gap of days, which a damaged stamp easily makes, would hold a million of them.
+#: The windows of the harness are a second apart: a gap of days, which a damaged stamp easily makes,
+#: would hold a million of them.
 MAX_GAP = ("--max-gap", "1h")
 
 
@@ -46,7 +48,11 @@ class Server:
     """A child that answers calls of the command line."""
 
     def __init__(self) -> None:
-        self.folder = Path(tempfile.mkdtemp(prefix="gyrostab-fuzz-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
+        self.folder = Path(
+            tempfile.mkdtemp(
+                prefix="gyrostab-fuzz-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+            )
+        )
         self.child: subprocess.Popen[bytes] | None = None
         self.calls = 0
         self.number = 0
@@ -67,7 +73,12 @@ class Server:
 
     def _start(self) -> None:
         threads = ("OMP", "NUMBA", "OPENBLAS", "MKL", "NUMEXPR", "BLOSC")
-        environment = {**os.environ, **{f"{name}_NUM_THREADS": "1" for name in threads}, "MALLOC_ARENA_MAX": "2", "PYTHONHASHSEED": "0"}
+        environment = {
+            **os.environ,
+            **{f"{name}_NUM_THREADS": "1" for name in threads},
+            "MALLOC_ARENA_MAX": "2",
+            "PYTHONHASHSEED": "0",
+        }
         self.child = subprocess.Popen(
             [sys.executable, "-W", "ignore", "-m", "tests.fuzz.child", str(self.folder / "crash")],
             stdin=subprocess.PIPE,
@@ -84,7 +95,17 @@ class Server:
             place = warm / f"{number}-{seed.main}"
             place.write_bytes(seed.files[seed.main])
             calls.append(["scan", str(place), *seed.options])
-            calls.append(["run", str(place), "-o", str(warm / "warm.nc"), "--overwrite", *WINDOWS, *seed.options])
+            calls.append(
+                [
+                    "run",
+                    str(place),
+                    "-o",
+                    str(warm / "warm.nc"),
+                    "--overwrite",
+                    *WINDOWS,
+                    *seed.options,
+                ]
+            )
         self.calls = 0
         if self._ask(calls, 300.0) is None:
             raise RuntimeError("the child does not start")
@@ -100,7 +121,9 @@ class Server:
         except BrokenPipeError:
             return None
         begun, ready = self._worked(), []
-        for _ in range(int(4 * PATIENCE)):  # a machine with other work gives the child little of its time
+        for _ in range(
+            int(4 * PATIENCE)
+        ):  # a machine with other work gives the child little of its time
             ready, _, _ = select.select([self.child.stdout], [], [], seconds / 4)
             if ready or self._worked() - begun > seconds:
                 break
@@ -130,15 +153,35 @@ class Server:
                 self.child.wait(0.5)
             status = self.child.poll()
             self._stop()
-            what = "hang" if status is None else f"signal {-status}" if status < 0 else f"exit {status}"
+            what = (
+                "hang"
+                if status is None
+                else f"signal {-status}"
+                if status < 0
+                else f"exit {status}"
+            )
             crash = (self.folder / "crash").read_text()[:600]
-            return Outcome(what, LIMIT_SECONDS if status is None else 0.0, LIMIT_SECONDS if status is None else 0.0, 0, crash)
+            return Outcome(
+                what,
+                LIMIT_SECONDS if status is None else 0.0,
+                LIMIT_SECONDS if status is None else 0.0,
+                0,
+                crash,
+            )
         if answer["bytes"] > LIMIT_BYTES:
             self._stop()
-            return Outcome("memory", answer["seconds"], answer["worked"], answer["bytes"], answer["said"])
+            return Outcome(
+                "memory", answer["seconds"], answer["worked"], answer["bytes"], answer["said"]
+            )
         ours = answer["fault"] and answer["code"] == 2
         code = "own fault" if ours else answer["code"]
-        return Outcome(code, answer["seconds"], answer["worked"], answer["bytes"], answer["fault"] or answer["said"])
+        return Outcome(
+            code,
+            answer["seconds"],
+            answer["worked"],
+            answer["bytes"],
+            answer["fault"] or answer["said"],
+        )
 
     @contextlib.contextmanager
     def written(self, files: dict[str, bytes]) -> Iterator[Path]:
@@ -150,14 +193,18 @@ class Server:
         for name, data in files.items():
             path = place / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(move_job(data, FOLDER, str(place)) if name.endswith("job.json") else data)
+            path.write_bytes(
+                move_job(data, FOLDER, str(place)) if name.endswith("job.json") else data
+            )
             os.utime(path, ns=(CHANGED_NS, CHANGED_NS))
         try:
             yield place
         finally:
             shutil.rmtree(place, ignore_errors=True)
 
-    def try_input(self, files: dict[str, bytes], command: str, main: str, options: Sequence[str] = ()) -> Outcome:
+    def try_input(
+        self, files: dict[str, bytes], command: str, main: str, options: Sequence[str] = ()
+    ) -> Outcome:
         """Give an input to a command."""
         with self.written(files) as place:
             return self.call(arguments_of(command, place, main, options))
@@ -170,11 +217,27 @@ def arguments_of(command: str, place: Path, main: str, options: Sequence[str]) -
     if command == "scan":
         return ["scan", path, *given]
     if command in ("ingest", "simulate"):
-        gap = MAX_GAP if command == "ingest" and not any("max-gap" in option for option in given) else ()
+        gap = (
+            MAX_GAP
+            if command == "ingest" and not any("max-gap" in option for option in given)
+            else ()
+        )
         return [command, path, "-o", output, "--quiet-progress", *given, *gap]
     if command == "davar":
         return ["davar", path, "-o", output, "--quiet-progress", "--workers", "1", *WINDOWS]
     resume = ["--resume"] if command == "resume" else []
     windows = [] if "--config" in given else WINDOWS
     gap = () if any("max-gap" in option for option in given) or resume else MAX_GAP
-    return ["run", path, "-o", output, "--quiet-progress", "--workers", "1", *windows, *given, *gap, *resume]
+    return [
+        "run",
+        path,
+        "-o",
+        output,
+        "--quiet-progress",
+        "--workers",
+        "1",
+        *windows,
+        *given,
+        *gap,
+        *resume,
+    ]

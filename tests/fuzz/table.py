@@ -31,8 +31,12 @@ def page(totals: Mapping[str, Tally], *, count: int, seed: int, jobs: int, secon
     """The page on damaged inputs, in Markdown."""
     tried = sum(tally.codes.total() for tally in totals.values())
     failures = [failure for tally in totals.values() for failure in tally.failures]
-    kinds = Counter(f"{failure['format']}, `{failure['command']}`: {failure['code']}" for failure in failures)
-    listed = "\n".join(f"- {kind} ({number} inputs)" for kind, number in kinds.most_common()) or "None."
+    kinds = Counter(
+        f"{failure['format']}, `{failure['command']}`: {failure['code']}" for failure in failures
+    )
+    listed = (
+        "\n".join(f"- {kind} ({number} inputs)" for kind, number in kinds.most_common()) or "None."
+    )
     done = "" if tried == count else f"\nThe campaign was stopped after {tried} of {count} inputs."
     return PAGE.format(
         tried=tried, count=count, seed=seed, jobs=jobs, minutes=seconds / 60.0, speed=tried / max(seconds, 1e-9), table=table(totals),

@@ -50,13 +50,17 @@ def kept() -> list[Path]:
 
 
 @pytest.mark.parametrize("place", kept(), ids=lambda place: place.name)
-def test_an_input_that_once_failed(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_input_that_once_failed(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from gyrostab import cli
 
     item: Input = load_input(place)
     for name, data in item.files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes(move_job(data, "@FOLDER@", str(tmp_path)) if name.endswith("job.json") else data)
+        (tmp_path / name).write_bytes(
+            move_job(data, "@FOLDER@", str(tmp_path)) if name.endswith("job.json") else data
+        )
     seen: dict = {"error": None}
     explain = cli.explain
 

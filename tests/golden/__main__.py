@@ -3,9 +3,10 @@
     python -m tests.golden record FOLDER [NAME ...]
     python -m tests.golden compare FOLDER [NAME ...] [--rtol 1e-9]
 
-`compare` makes the outputs of the present code in a temporary folder and compares every number bit for bit (or within `--rtol`),
-every dimension and unit, and every exit code. Text (statements, help, history) may differ; how much of it does is shown. Both runs
-must be made on the same machine. The exit code is 1 where a number differs or an output is missing.
+`compare` makes the outputs of the present code in a temporary folder and compares every number bit
+for bit (or within `--rtol`), every dimension and unit, and every exit code. Text (statements, help,
+history) may differ; how much of it does is shown. Both runs must be made on the same machine. The
+exit code is 1 where a number differs or an output is missing.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from tests.golden.outputs import make_outputs
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("action", choices=["record", "compare"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", help="parts of names; all outputs when absent")
@@ -31,9 +34,13 @@ def main() -> int:
         return 0
     with tempfile.TemporaryDirectory(prefix="golden-") as name:
         made = make_outputs(Path(name), given.names)
-        differences, texts = compare_folders(given.folder.resolve(), Path(name), made, rtol=given.rtol)
+        differences, texts = compare_folders(
+            given.folder.resolve(), Path(name), made, rtol=given.rtol
+        )
     print(*differences, sep="\n")
-    print(f"{len(made)} outputs, {len(differences)} differences in numbers or structure, {texts} differences in text")
+    print(
+        f"{len(made)} outputs, {len(differences)} differences in numbers or structure, {texts} differences in text"
+    )
     return int(bool(differences))
 
 

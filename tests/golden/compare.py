@@ -13,7 +13,16 @@ import numpy as np
 import xarray as xr
 
 #: Attributes that decide what a number means.
-ATTRIBUTES = ("units", "scale_factor", "add_offset", "flag_values", "sampling_rate_hz", "tau_ref", "kind", "calendar")
+ATTRIBUTES = (
+    "units",
+    "scale_factor",
+    "add_offset",
+    "flag_values",
+    "sampling_rate_hz",
+    "tau_ref",
+    "kind",
+    "calendar",
+)
 #: Keys of diagnosis.json that hold prose.
 PROSE = ("statement", "reason")
 
@@ -30,7 +39,9 @@ def same(a: Any, b: Any, rtol: float) -> bool:
     if a.dtype.kind not in "fc" or not rtol:
         return bool(np.array_equal(a, b, equal_nan=a.dtype.kind in "fcmM"))
     finite = np.abs(a[np.isfinite(a)])
-    return bool(np.allclose(a, b, rtol=rtol, atol=rtol * float(finite.max(initial=0.0)), equal_nan=True))
+    return bool(
+        np.allclose(a, b, rtol=rtol, atol=rtol * float(finite.max(initial=0.0)), equal_nan=True)
+    )
 
 
 def compare_datasets(a: xr.Dataset, b: xr.Dataset, rtol: float) -> Iterator[str]:
@@ -41,7 +52,9 @@ def compare_datasets(a: xr.Dataset, b: xr.Dataset, rtol: float) -> Iterator[str]
         one, two = a[name], b[name]
         if one.dims != two.dims or not same(one.values, two.values, rtol):
             yield f"{name}: values"
-        if any(not np.array_equal(one.attrs.get(key, ""), two.attrs.get(key, "")) for key in ATTRIBUTES):
+        if any(
+            not np.array_equal(one.attrs.get(key, ""), two.attrs.get(key, "")) for key in ATTRIBUTES
+        ):
             yield f"{name}: attributes"
         if one.attrs != two.attrs:
             yield Text(name)
@@ -59,7 +72,11 @@ def compare_trees(a: Any, b: Any, rtol: float, path: str = "") -> Iterator[str]:
         for number, (one, two) in enumerate(zip(a, b, strict=True)):
             yield from compare_trees(one, two, rtol, f"{path}[{number}]")
     elif isinstance(a, float) and isinstance(b, float):
-        if not (a == b or (math.isnan(a) and math.isnan(b)) or (rtol and math.isclose(a, b, rel_tol=rtol))):
+        if not (
+            a == b
+            or (math.isnan(a) and math.isnan(b))
+            or (rtol and math.isclose(a, b, rel_tol=rtol))
+        ):
             yield f"{path}: {a} became {b}"
     elif a != b or type(a) is not type(b):
         yield f"{path}: {a!r} became {b!r}"
@@ -67,7 +84,9 @@ def compare_trees(a: Any, b: Any, rtol: float, path: str = "") -> Iterator[str]:
 
 def open_any(path: Path) -> xr.Dataset:
     """A NetCDF file or a Zarr store as it lies on disk."""
-    with xr.open_dataset(path, engine="zarr" if path.is_dir() else "netcdf4", decode_cf=False) as data:
+    with xr.open_dataset(
+        path, engine="zarr" if path.is_dir() else "netcdf4", decode_cf=False
+    ) as data:
         return data.load()
 
 
@@ -76,9 +95,13 @@ def compare_items(a: Path, b: Path, rtol: float) -> Iterator[str]:
     if a.suffix in (".nc", ".zarr"):
         yield from compare_datasets(open_any(a), open_any(b), rtol)
     elif a.suffix == ".json":
-        yield from compare_trees(json.loads(a.read_text("utf-8")), json.loads(b.read_text("utf-8")), rtol)
+        yield from compare_trees(
+            json.loads(a.read_text("utf-8")), json.loads(b.read_text("utf-8")), rtol
+        )
     elif a.suffix == ".toml":
-        yield from compare_trees(tomllib.loads(a.read_text("utf-8")), tomllib.loads(b.read_text("utf-8")), rtol)
+        yield from compare_trees(
+            tomllib.loads(a.read_text("utf-8")), tomllib.loads(b.read_text("utf-8")), rtol
+        )
     elif a.suffix == ".txt":
         one, two = a.read_text("utf-8").split("\n", 1), b.read_text("utf-8").split("\n", 1)
         if one[0] != two[0]:
@@ -94,14 +117,18 @@ def items(folder: Path) -> set[str]:
     found = set()
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)
-        if relative.parts[0] == "input" or any(part.endswith(".zarr") for part in relative.parts[:-1]):
+        if relative.parts[0] == "input" or any(
+            part.endswith(".zarr") for part in relative.parts[:-1]
+        ):
             continue
         if path.is_file() or path.suffix == ".zarr":
             found.add(str(relative))
     return found
 
 
-def compare_folders(reference: Path, made: Path, names: list[str], *, rtol: float) -> tuple[list[str], int]:
+def compare_folders(
+    reference: Path, made: Path, names: list[str], *, rtol: float
+) -> tuple[list[str], int]:
     """All differences in numbers and structure, and how many there are in text alone."""
     differences, texts = [], 0
     for name in names:

@@ -17,10 +17,30 @@ from gyrostab.cli import main
 from tests.fuzz.seeds import FOLDER, WINDOWS, Seed, make_seeds
 
 ROOT = Path(__file__).resolve().parents[2]
-RECORDINGS = Path(os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings")).resolve()
-COMMANDS = ("demo", "scan", "ingest", "run", "davar", "fit", "correlate", "simulate", "diagnose", "report", "plot", "prove")
+RECORDINGS = Path(
+    os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings")
+).resolve()
+COMMANDS = (
+    "demo",
+    "scan",
+    "ingest",
+    "run",
+    "davar",
+    "fit",
+    "correlate",
+    "simulate",
+    "diagnose",
+    "report",
+    "plot",
+    "prove",
+)
 #: Models that are simulated and then diagnosed: duration and sampling rate [Hz].
-SIMULATED = {"x2": ("2000s", "10"), "p16_vibration": ("1500s", "20"), "l13_temperature": ("9000s", "2"), "mwd_24h": ("3h", "5")}
+SIMULATED = {
+    "x2": ("2000s", "10"),
+    "p16_vibration": ("1500s", "20"),
+    "l13_temperature": ("9000s", "2"),
+    "mwd_24h": ("3h", "5"),
+}
 NULLS = 100  # the fewest allowed: the outputs are compared with themselves, not with the truth
 
 Job = Callable[[], None]
@@ -36,7 +56,9 @@ def call(*arguments: str) -> None:
             code = int(ended.code or 0)
     name = "-".join(word.strip("-") for word in arguments[:2]).replace("/", "_")
     count = len(list(Path.cwd().glob("*.txt")))
-    Path(f"{count:02d}-{name}.txt").write_text(f"exit {code}\n{printed.getvalue()}", encoding="utf-8")
+    Path(f"{count:02d}-{name}.txt").write_text(
+        f"exit {code}\n{printed.getvalue()}", encoding="utf-8"
+    )
 
 
 def read_seed(seed: Seed) -> Job:
@@ -63,15 +85,28 @@ def demo() -> None:
     log = str(ROOT / "data" / "mwd_sample.csv.gz")
     for ending in ("nc", "zarr"):
         call("ingest", log, "-o", f"log.{ending}")
-        call("run", f"log.{ending}", "-o", f"product-{ending}.nc", "--window", "2min", "--step", "30s")
-    call("davar", "log.nc", "-o", "davar.nc", "--window", "2min", "--step", "30s", "--taus", "octave")
+        call(
+            "run",
+            f"log.{ending}",
+            "-o",
+            f"product-{ending}.nc",
+            "--window",
+            "2min",
+            "--step",
+            "30s",
+        )
+    call(
+        "davar", "log.nc", "-o", "davar.nc", "--window", "2min", "--step", "30s", "--taus", "octave"
+    )
     call("fit", "davar.nc", "-o", "fitted.nc")
     call("correlate", "product-nc.nc", "--with", "temperature", "-o", "correlation.nc")
 
 
 def archive() -> None:
     """The shipped log in five files: one is missing, two overlap, one holds unreadable cells."""
-    head, *rows = gzip.decompress((ROOT / "data" / "mwd_sample.csv.gz").read_bytes()).decode().splitlines()
+    head, *rows = (
+        gzip.decompress((ROOT / "data" / "mwd_sample.csv.gz").read_bytes()).decode().splitlines()
+    )
     comments = [head]
     while rows[0].startswith("#") or not rows[0][:1].isdigit():
         comments.append(rows.pop(0))
@@ -93,7 +128,18 @@ def archive() -> None:
         "--max-gap",
         "1day",
     )
-    call("run", *(f"part{number}.csv" for number in (0, 1)), "-o", "fine.nc", "--window", "30s", "--step", "1s", "--taus", "all")
+    call(
+        "run",
+        *(f"part{number}.csv" for number in (0, 1)),
+        "-o",
+        "fine.nc",
+        "--window",
+        "30s",
+        "--step",
+        "1s",
+        "--taus",
+        "all",
+    )
 
 
 def simulated(name: str) -> Job:
@@ -102,7 +148,9 @@ def simulated(name: str) -> Job:
 
     def job() -> None:
         model = str(ROOT / "data" / "models" / f"{name}.toml")
-        call("simulate", model, "-o", "log.nc", "--duration", duration, "--rate", rate, "--seed", "3")
+        call(
+            "simulate", model, "-o", "log.nc", "--duration", duration, "--rate", rate, "--seed", "3"
+        )
         call("run", "log.nc", "-o", "product.nc")
         call("diagnose", "log.nc", "-o", "diagnosis", "--nulls", str(NULLS), "--seed", "1")
 
@@ -113,7 +161,9 @@ def recording(entry: dict[str, Any]) -> Job:
     """A real recording and its diagnosis."""
 
     def job() -> None:
-        log = gyrostab.regularise(gyrostab.read_log([RECORDINGS / name for name in entry["files"]], **entry["read"]))
+        log = gyrostab.regularise(
+            gyrostab.read_log([RECORDINGS / name for name in entry["files"]], **entry["read"])
+        )
         gyrostab.write_diagnosis(gyrostab.diagnose(log, nulls=NULLS, seed=1), "diagnosis")
 
     return job
@@ -136,7 +186,9 @@ def jobs() -> Iterator[tuple[str, Job]]:
     yield "archive", archive
     for name in SIMULATED:
         yield f"simulated-{name}", simulated(name)
-    plan = tomllib.loads((ROOT / "pipelines" / "diagnose_recordings.toml").read_text(encoding="utf-8"))
+    plan = tomllib.loads(
+        (ROOT / "pipelines" / "diagnose_recordings.toml").read_text(encoding="utf-8")
+    )
     for name, entry in plan["recording"].items():
         if all((RECORDINGS / file).exists() for file in entry["files"]):
             yield f"recording-{name}", recording(entry)

@@ -21,7 +21,17 @@ from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.io import datasets as export
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import TimeGridIndex, grid_times
-from tests.support.regular_logs import RATE, SIZE, START, cut, log_of, nan_runs, rechunked, said, signal
+from tests.support.regular_logs import (
+    RATE,
+    SIZE,
+    START,
+    cut,
+    log_of,
+    nan_runs,
+    rechunked,
+    said,
+    signal,
+)
 
 
 def names(logs: list[xr.Dataset]) -> list[str]:
@@ -37,7 +47,10 @@ def table_of(log: xr.Dataset) -> np.ndarray:
     table = gap_table(log)
     index = log.xindexes["time"]
     assert isinstance(index, TimeGridIndex)
-    first, end = (np.rint((table[name].to_numpy().astype(np.int64) - index.start) * RATE / 1e9) for name in ("start", "end"))
+    first, end = (
+        np.rint((table[name].to_numpy().astype(np.int64) - index.start) * RATE / 1e9)
+        for name in ("start", "end")
+    )
     return np.stack([first, end, table["samples"]], axis=1).astype(np.int64)
 
 
@@ -47,7 +60,9 @@ def test_stored_pieces_in_any_order_give_back_the_whole(tmp_path: Path, suffix: 
     values[:, 1999:2001] = values[:, 4799] = 1.0  # pieces begin and end with a sample
     paths = []
     for place, (a, b) in enumerate([(4300, 6000), (0, 2000), (1900, 4000)]):
-        log = log_of(values[:, a:b], a).assign(vibration=("time", np.arange(a, b) * 1.0, {"units": "g"}))
+        log = log_of(values[:, a:b], a).assign(
+            vibration=("time", np.arange(a, b) * 1.0, {"units": "g"})
+        )
         log.attrs["source_files"] = [f"tool_{place}.csv"]
         write = export.to_netcdf if suffix == ".nc" else export.to_zarr
         paths.append(write(log, tmp_path / f"{place}{suffix}"))
@@ -55,8 +70,13 @@ def test_stored_pieces_in_any_order_give_back_the_whole(tmp_path: Path, suffix: 
     expected = np.where((np.arange(SIZE) >= 4000) & (np.arange(SIZE) < 4300), np.nan, values)
     assert joined.rate.chunks is not None
     np.testing.assert_array_equal(joined.rate, expected)
-    np.testing.assert_array_equal(joined.vibration, np.where((np.arange(SIZE) >= 4000) & (np.arange(SIZE) < 4300), np.nan, np.arange(SIZE)))
-    np.testing.assert_array_equal(joined.time.values.astype(np.int64), grid_times(START, RATE, np.arange(SIZE)))
+    np.testing.assert_array_equal(
+        joined.vibration,
+        np.where((np.arange(SIZE) >= 4000) & (np.arange(SIZE) < 4300), np.nan, np.arange(SIZE)),
+    )
+    np.testing.assert_array_equal(
+        joined.time.values.astype(np.int64), grid_times(START, RATE, np.arange(SIZE))
+    )
     np.testing.assert_array_equal(table_of(joined), nan_runs(expected)[:, :3])
     assert set(gap_table(joined)["cause"]) == {"missing"}
     assert joined.attrs["source_files"] == ["tool_1.csv", "tool_2.csv", "tool_0.csv"]
@@ -69,7 +89,10 @@ def test_every_sample_that_some_piece_has_is_there_once(data: st.DataObject) -> 
     size = data.draw(st.integers(300, 900), label="samples")
     values = signal(size, seed=data.draw(st.integers(0, 99), label="seed"))
     spans = data.draw(
-        st.lists(st.tuples(st.integers(0, size - 50), st.integers(50, 400)), min_size=2, max_size=6), label="begin and length"
+        st.lists(
+            st.tuples(st.integers(0, size - 50), st.integers(50, 400)), min_size=2, max_size=6
+        ),
+        label="begin and length",
     )
     pieces = []
     expected = np.full_like(values, np.nan)
@@ -83,7 +106,9 @@ def test_every_sample_that_some_piece_has_is_there_once(data: st.DataObject) -> 
     joined = join(*pieces)
     first, last = min(a for a, _ in spans), max(min(a + n, size) for a, n in spans)
     np.testing.assert_array_equal(joined.rate, expected[:, first:last])
-    np.testing.assert_array_equal(joined.time[[0]].values.astype(np.int64), grid_times(START, RATE, [first]))
+    np.testing.assert_array_equal(
+        joined.time[[0]].values.astype(np.int64), grid_times(START, RATE, [first])
+    )
     missing = np.zeros(last - first, dtype=bool)
     for begin, end, samples in table_of(joined):
         assert samples == end - begin
@@ -110,7 +135,9 @@ def test_joining_gives_what_reading_all_source_files_gives(tmp_path: Path) -> No
     values = np.round(rng.normal(size=3000), 4)
     paths = []
     for place, (a, b) in enumerate([(0, 1000), (990, 1800), (2100, 3000)]):
-        rows = "".join(f"{stamp},{value}\n" for stamp, value in zip(stamps[a:b], values[a:b], strict=True))
+        rows = "".join(
+            f"{stamp},{value}\n" for stamp, value in zip(stamps[a:b], values[a:b], strict=True)
+        )
         paths.append(tmp_path / f"{place}.csv")
         paths[-1].write_text("time [ns],gyro_z [deg/h]\n" + rows)
     together = regularise(read_log(paths))
@@ -128,7 +155,16 @@ def test_it_is_lazy_and_its_graph_is_small(tmp_path: Path) -> None:
         return part
 
     logs = cut(values, (0, 2000), (2000, 4000), (4500, 6000))
-    lazy = [log.assign(rate=(log.rate.dims, log.rate.data.map_blocks(block, meta=np.empty((0, 0))), log.rate.attrs)) for log in logs]
+    lazy = [
+        log.assign(
+            rate=(
+                log.rate.dims,
+                log.rate.data.map_blocks(block, meta=np.empty((0, 0))),
+                log.rate.attrs,
+            )
+        )
+        for log in logs
+    ]
     joined = join(*lazy)
     assert not read
     joined.rate[:1, :10].compute()
@@ -142,11 +178,15 @@ def test_it_is_lazy_and_its_graph_is_small(tmp_path: Path) -> None:
 
 def test_chunks_lie_on_a_raster() -> None:
     values = np.zeros((2, 400_000))
-    joined = join(*(rechunked(log, 70_000) for log in cut(values, (0, 140_000), (140_300, 400_000))))
+    joined = join(
+        *(rechunked(log, 70_000) for log in cut(values, (0, 140_000), (140_300, 400_000)))
+    )
     assert joined.rate.chunks == ((1, 1), (70_000,) * 5 + (50_000,))
 
 
-@pytest.mark.parametrize(("shift", "sample"), [(100_000, 0), (7_000_000, 0), (-9_000_000, 0), (13_000_000, 1)])
+@pytest.mark.parametrize(
+    ("shift", "sample"), [(100_000, 0), (7_000_000, 0), (-9_000_000, 0), (13_000_000, 1)]
+)
 def test_a_log_between_the_samples_goes_to_the_nearest(shift: int, sample: int) -> None:
     values = signal(1000, holes=0)
     first, second = *cut(values, (0, 500)), *cut(values, (600, 1000), shift=shift)
@@ -164,7 +204,10 @@ def test_a_slightly_different_clock_is_followed_sample_by_sample(ppm: float) -> 
     rate = RATE * (1 + ppm * 1e-6)
     size = 60_000
     values = np.arange(2.0 * size).reshape(2, size) + 1
-    first, second = log_of(values[:, :100]), log_of(values, 0, rate=rate, start=START + 4_000_000_000)
+    first, second = (
+        log_of(values[:, :100]),
+        log_of(values, 0, rate=rate, start=START + 4_000_000_000),
+    )
     joined = join(first, second)
     position = 200 + np.arange(size) * RATE / rate
     taken = np.rint(position).astype(int)
@@ -178,7 +221,10 @@ def test_a_slightly_different_clock_is_followed_sample_by_sample(ppm: float) -> 
 
 @settings(max_examples=100, deadline=None)
 @given(
-    off=st.floats(-0.5, 0.5), ratio=st.floats(-1e-2, 1e-2).map(lambda part: 1 + part), size=st.integers(1, 2000), first=st.integers(-9, 9)
+    off=st.floats(-0.5, 0.5),
+    ratio=st.floats(-1e-2, 1e-2).map(lambda part: 1 + part),
+    size=st.integers(1, 2000),
+    first=st.integers(-9, 9),
 )
 def test_runs_are_the_nearest_samples(off: float, ratio: float, size: int, first: int) -> None:
     runs = runs_of(first, off, size, ratio)
@@ -186,7 +232,10 @@ def test_runs_are_the_nearest_samples(off: float, ratio: float, size: int, first
     assume(ratio != 1.0 and np.abs(position % 1 - 0.5).min() > 1e-9)
     taken: list[int] = []
     for sample, own, length in runs:
-        assert np.abs(np.arange(sample, sample + length) - position[own : own + length]).max() <= 0.5 + 1e-6
+        assert (
+            np.abs(np.arange(sample, sample + length) - position[own : own + length]).max()
+            <= 0.5 + 1e-6
+        )
         taken += range(sample, sample + length)
     assert sorted(taken) == sorted(set(np.rint(position).astype(int)))
 
@@ -198,13 +247,17 @@ def test_logs_of_other_rates_and_kinds_are_refused_by_name() -> None:
         join(first, second)
     angle = log_of(values, 400).rename(rate="angle").assign_attrs(kind="angle")
     angle["angle"].attrs["units"] = "degree"
-    with pytest.raises(UnitError, match=r"a.nc holds a gyro signal of kind 'rate', b.nc of kind 'angle'"):
+    with pytest.raises(
+        UnitError, match=r"a.nc holds a gyro signal of kind 'rate', b.nc of kind 'angle'"
+    ):
         join(first, angle)
 
 
 def test_samples_in_common_tell_where_a_log_lies() -> None:
     values = signal(3000)
-    joined = join(*cut(values, (0, 2000)), *cut(values, (1500, 3000), shift=70_000_000))  # the second one's first stamp came late
+    joined = join(
+        *cut(values, (0, 2000)), *cut(values, (1500, 3000), shift=70_000_000)
+    )  # the second one's first stamp came late
     np.testing.assert_array_equal(joined.rate, values)
     assert "10.0 s from" in said(joined)
 
@@ -223,9 +276,14 @@ def test_a_copy_that_differs_here_and_there_is_still_a_copy() -> None:
 def test_a_clock_that_begins_again_is_no_overlap() -> None:
     first, second = signal(1000, seed=1, holes=0), signal(800, seed=2, holes=0)
     joined = join(log_of(first), log_of(second, 3))
-    np.testing.assert_array_equal(joined.rate, np.concatenate([first, np.full((2, 1), np.nan), second], axis=1))
+    np.testing.assert_array_equal(
+        joined.rate, np.concatenate([first, np.full((2, 1), np.nan), second], axis=1)
+    )
     assert gap_table(joined)[["samples", "cause"]].to_numpy().tolist() == [[1, "restart"]]
-    assert "b.nc: time restarts: from 2026-03-01T10:00:19.980 to 2026-03-01T10:00:00.060, 19.9 s back" in said(joined)
+    assert (
+        "b.nc: time restarts: from 2026-03-01T10:00:19.980 to 2026-03-01T10:00:00.060, 19.9 s back"
+        in said(joined)
+    )
 
 
 def test_a_long_pause_is_a_step_of_the_clock() -> None:
@@ -250,34 +308,51 @@ def test_a_few_samples_on_top_of_others_are_no_step_of_the_clock() -> None:
 
 def test_axes_and_channels_that_some_logs_lack_are_missing_there() -> None:
     values = signal(1000, holes=0)
-    first = log_of(values[:1, :500], axes="x").assign(vibration=("time", np.ones(500), {"units": "g"}))
+    first = log_of(values[:1, :500], axes="x").assign(
+        vibration=("time", np.ones(500), {"units": "g"})
+    )
     second = log_of(values[1:, 400:], 400, axes="y")
     joined = join(first, second)
-    np.testing.assert_array_equal(joined.rate[0], np.where(np.arange(1000) < 500, values[0], np.nan))
-    np.testing.assert_array_equal(joined.rate[1], np.where(np.arange(1000) >= 400, values[1], np.nan))
+    np.testing.assert_array_equal(
+        joined.rate[0], np.where(np.arange(1000) < 500, values[0], np.nan)
+    )
+    np.testing.assert_array_equal(
+        joined.rate[1], np.where(np.arange(1000) >= 400, values[1], np.nan)
+    )
     np.testing.assert_array_equal(joined.vibration, np.where(np.arange(1000) < 500, 1.0, np.nan))
     assert "axis y is not in a.nc" in said(joined)
     assert "channel vibration is not in b.nc" in said(joined)
     wrong = second.assign(vibration=("time", np.ones(600), {"units": "m s-2"}))
-    with pytest.raises(UnitError, match=r"'vibration' has different units: 'm s-2' in b.nc, 'g' in a.nc"):
+    with pytest.raises(
+        UnitError, match=r"'vibration' has different units: 'm s-2' in b.nc, 'g' in a.nc"
+    ):
         join(first, wrong)
 
 
 def with_temperature(log: xr.Dataset, seconds: np.ndarray) -> xr.Dataset:
     """A temperature that says its own second, on its own stamps."""
     stamps = (START + seconds * 10**9).view("datetime64[ns]")
-    return log.assign_coords(time_temperature=stamps).assign(temperature=("time_temperature", seconds * 1.0, {"units": "degree_Celsius"}))
+    return log.assign_coords(time_temperature=stamps).assign(
+        temperature=("time_temperature", seconds * 1.0, {"units": "degree_Celsius"})
+    )
 
 
 @pytest.mark.parametrize("lazy", [False, True])
 def test_channels_on_their_own_stamps_are_joined_once(lazy: bool) -> None:
     values = signal(3000, holes=0)
-    spans, seconds = [(0, 1500), (1000, 2000), (2500, 3000)], [np.arange(0, 30), np.r_[20:25, 28:40], np.arange(5, 60)]
-    logs = [with_temperature(log, own) for log, own in zip(cut(values, *spans), seconds, strict=True)]
+    spans, seconds = (
+        [(0, 1500), (1000, 2000), (2500, 3000)],
+        [np.arange(0, 30), np.r_[20:25, 28:40], np.arange(5, 60)],
+    )
+    logs = [
+        with_temperature(log, own) for log, own in zip(cut(values, *spans), seconds, strict=True)
+    ]
     logs = [log.chunk(time_temperature=7) for log in logs] if lazy else logs
     joined = join(*logs)
     assert (joined.temperature.chunks is not None) == lazy
-    np.testing.assert_array_equal(joined.time_temperature.values.astype(np.int64), START + np.arange(60) * 10**9)
+    np.testing.assert_array_equal(
+        joined.time_temperature.values.astype(np.int64), START + np.arange(60) * 10**9
+    )
     np.testing.assert_array_equal(joined.temperature, np.arange(60.0))
     assert joined.temperature.dims == ("time_temperature",)
 
@@ -309,7 +384,8 @@ def test_two_hundred_logs_open_without_being_read() -> None:
     np.testing.assert_array_equal(joined.rate, values)
 
 
-# --- memory ------------------------------------------------------------------------------------------------------
+# --- memory
+# ------------------------------------------------------------------------------------------------------
 
 READ_THROUGH = """
 import sys, warnings
@@ -334,7 +410,10 @@ print(few, through(files))
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells the peak of the memory this way")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(),
+    reason="only Linux tells the peak of the memory this way",
+)
 def test_memory_does_not_grow_with_the_number_of_files(tmp_path: Path) -> None:
     """Each file has six chunks of 256 KiB, the last of each axis short, and shares some samples with the next."""
     size, paths = 70_000, []
@@ -344,7 +423,14 @@ def test_memory_does_not_grow_with_the_number_of_files(tmp_path: Path) -> None:
         log = log_of(np.concatenate([values, values[:1]]), place * (size - 100), axes="xyz")
         log["rate"].encoding = {"dtype": np.dtype("i4"), "scale_factor": 1.0}
         paths.append(export.to_netcdf(log.load(), tmp_path / f"{place:02d}.nc"))
-    done = subprocess.run([sys.executable, "-c", READ_THROUGH, *map(str, paths)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", READ_THROUGH, *map(str, paths)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     few, many = map(int, done.stdout.split())
-    assert (many - few) / 16 < 800, f"{few / 1024:.0f} MiB with 16 files, {many / 1024:.0f} MiB with 32"  # [KiB a file]
+    assert (many - few) / 16 < 800, (
+        f"{few / 1024:.0f} MiB with 16 files, {many / 1024:.0f} MiB with 32"
+    )  # [KiB a file]

@@ -56,7 +56,11 @@ def test_a_damaged_raw_file_becomes_a_gap(archive: list[Path], damage) -> None:
     log = regularise(raw)
     np.testing.assert_array_equal(log.rate[:, :1050], whole.rate[:, :1050])
     np.testing.assert_array_equal(log.rate[:, 1650:], whole.rate[:, 1650:])
-    assert gap_table(log)[["samples", "cause"]].to_numpy().tolist() == [[50, "missing"], [600, "unreadable"], [50, "missing"]]
+    assert gap_table(log)[["samples", "cause"]].to_numpy().tolist() == [
+        [50, "missing"],
+        [600, "unreadable"],
+        [50, "missing"],
+    ]
     assert log.attrs["unreadable_files"] == ["run_10.csv"]
     assert log.attrs["source_files"] == ["run_8.csv", "run_9.csv", "run_11.csv", "run_12.csv"]
     note = next(note for note in log.attrs["notes"] if "run_10.csv" in note)
@@ -71,13 +75,18 @@ def test_the_first_and_the_last_file_leave_no_gap(archive: list[Path]) -> None:
     empty(archive[0])
     log = load_log(archive)
     assert gap_table(log)["cause"].tolist() == ["missing"] * 3
-    assert "run_8.csv: the file is empty; copy it again; the file is left out: where no other file has its time" in said(log)
+    assert (
+        "run_8.csv: the file is empty; copy it again; the file is left out: where no other file has its time"
+        in said(log)
+    )
 
 
 def test_more_than_half_is_no_damage(archive: list[Path]) -> None:
     for path in archive[:3]:
         empty(path)
-    with pytest.raises(FormatError, match=r"run_8.csv.*3 of 5 files cannot be read.*reading options"):
+    with pytest.raises(
+        FormatError, match=r"run_8.csv.*3 of 5 files cannot be read.*reading options"
+    ):
         read_log(archive)
     with pytest.raises(FormatError, match="there is no such file"):
         read_log([path.with_suffix(".txt") for path in archive])
@@ -109,7 +118,8 @@ def test_a_damaged_regular_log_becomes_a_gap(tmp_path: Path, suffix: str) -> Non
     values = signal(4000, holes=0)
     write = export.to_netcdf if suffix == ".nc" else export.to_zarr
     paths = [
-        write(log, tmp_path / f"{place}{suffix}") for place, log in enumerate(cut(values, *((a, a + 1000) for a in range(0, 4000, 1000))))
+        write(log, tmp_path / f"{place}{suffix}")
+        for place, log in enumerate(cut(values, *((a, a + 1000) for a in range(0, 4000, 1000))))
     ]
     if suffix == ".nc":
         paths[1].write_bytes(paths[1].read_bytes()[:3000])
@@ -127,18 +137,24 @@ def test_a_damaged_regular_log_becomes_a_gap(tmp_path: Path, suffix: str) -> Non
 
 def test_raw_files_and_regular_logs_do_not_mix(archive: list[Path], tmp_path: Path) -> None:
     path = export.to_netcdf(log_of(signal(500)), tmp_path / "log.nc")
-    with pytest.raises(OptionError, match=r"log.nc is a regular log already and run_8.csv is not.*gyrostab ingest"):
+    with pytest.raises(
+        OptionError, match=r"log.nc is a regular log already and run_8.csv is not.*gyrostab ingest"
+    ):
         read_log([path, archive[0]])
 
 
 def test_each_file_is_told_as_it_is_read(archive: list[Path]) -> None:
     told: list[tuple[int, int, str]] = []
-    log = load_log(archive, on_file=lambda number, total, path: told.append((number, total, path.name)))
+    log = load_log(
+        archive, on_file=lambda number, total, path: told.append((number, total, path.name))
+    )
     assert told == [(number, 5, f"run_{number + 7}.csv") for number in range(1, 6)]
     assert "on_file" not in log.attrs["history"]
 
 
-def test_the_command_line_goes_on_unless_strict(archive: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_goes_on_unless_strict(
+    archive: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     binary(archive[2])
     command = ["ingest", *map(str, archive), "--quiet-progress"]
     assert main([*command, "-o", str(tmp_path / "log.nc")]) == 0

@@ -26,7 +26,13 @@ def truth(axis: str) -> np.ndarray:
 
 
 def write(
-    path: Path, axis: str, *, samples: np.ndarray | None = None, skew: float = 0.0, stamped: bool = True, extra: bool = False
+    path: Path,
+    axis: str,
+    *,
+    samples: np.ndarray | None = None,
+    skew: float = 0.0,
+    stamped: bool = True,
+    extra: bool = False,
 ) -> Path:
     """One axis at some samples of the grid, its stamps `skew` samples late."""
     kept = np.arange(N) if samples is None else samples
@@ -48,7 +54,8 @@ def write(
                 variable[:] = values
     else:
         rows = "\n".join(
-            ",".join(repr(value) for value in row) for row in zip(*(column.tolist() for column in columns.values()), strict=True)
+            ",".join(repr(value) for value in row)
+            for row in zip(*(column.tolist() for column in columns.values()), strict=True)
         )
         path.write_text(",".join(columns) + "\n" + rows + "\n")
     return path
@@ -70,7 +77,9 @@ def test_three_files_of_one_axis_are_one_log(tmp_path, suffix):
 
 @pytest.mark.parametrize(("skew", "shift"), [(1 / 3, 0), (-0.2, 0), (3.3, 3), (-2.0, -2)])
 def test_a_skew_is_stated_and_each_sample_is_the_nearest(tmp_path, skew, shift):
-    log = regularise(read_log([write(tmp_path / "x.csv", "x"), write(tmp_path / "y.csv", "y", skew=skew)]))
+    log = regularise(
+        read_log([write(tmp_path / "x.csv", "x"), write(tmp_path / "y.csv", "y", skew=skew)])
+    )
     begin = min(shift, 0)
     assert log.sizes["time"] == N + abs(shift)
     for axis, first in (("x", -begin), ("y", shift - begin)):
@@ -78,7 +87,10 @@ def test_a_skew_is_stated_and_each_sample_is_the_nearest(tmp_path, skew, shift):
         np.testing.assert_array_equal(values[first : first + N], truth(axis))
         assert np.isnan(np.delete(values, np.arange(first, first + N))).all()
     late = "y" if skew > 0 else "x"
-    assert any(f"{late} in {late}.csv (begins {abs(skew):.3g} samples later)" in note for note in log.attrs["notes"])
+    assert any(
+        f"{late} in {late}.csv (begins {abs(skew):.3g} samples later)" in note
+        for note in log.attrs["notes"]
+    )
     said = [note for note in log.attrs["notes"] if "between two samples" in note]
     if skew == shift:
         assert not said
@@ -90,9 +102,13 @@ def test_a_skew_is_stated_and_each_sample_is_the_nearest(tmp_path, skew, shift):
 
 def test_what_one_axis_lacks_is_missing_in_that_axis_and_a_gap(tmp_path):
     kept = np.setdiff1d(np.arange(N), np.arange(500, 520))
-    log = regularise(read_log([write(tmp_path / "x.csv", "x"), write(tmp_path / "y.csv", "y", samples=kept)]))
+    log = regularise(
+        read_log([write(tmp_path / "x.csv", "x"), write(tmp_path / "y.csv", "y", samples=kept)])
+    )
     np.testing.assert_array_equal(log.rate.sel(axis="x").values, truth("x"))
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(log.rate.sel(axis="y").values)), np.arange(500, 520))
+    np.testing.assert_array_equal(
+        np.flatnonzero(np.isnan(log.rate.sel(axis="y").values)), np.arange(500, 520)
+    )
     table = gap_table(log)
     assert table[["samples", "cause"]].values.tolist() == [[20, "missing"]]
 
@@ -128,7 +144,10 @@ def test_regular_logs_of_one_axis_are_one_log(tmp_path):
 
 
 def test_axes_recorded_one_after_the_other_stay_pieces_in_time(tmp_path):
-    paths = [write(tmp_path / "x.csv", "x", samples=np.arange(900)), write(tmp_path / "y.csv", "y", samples=np.arange(1000, N))]
+    paths = [
+        write(tmp_path / "x.csv", "x", samples=np.arange(900)),
+        write(tmp_path / "y.csv", "y", samples=np.arange(1000, N)),
+    ]
     log = regularise(read_log(paths))
     assert log.sizes["time"] == N
     assert [100, "missing"] in gap_table(log)[["samples", "cause"]].values.tolist()
@@ -154,7 +173,9 @@ def test_logs_are_grouped_by_the_axes_they_share():
     assert group_axes([["z"], ["x"], ["y"], ["x"]]) == [[1, 3], [2], [0]]
 
 
-def write_miniseed(path: Path, codes: dict[str, str], *, skew: dict[str, float], start: int = 0, size: int = N) -> Path:
+def write_miniseed(
+    path: Path, codes: dict[str, str], *, skew: dict[str, float], start: int = 0, size: int = N
+) -> Path:
     """Codes of channels and the axes that they hold, in 100 counts a deg/h; stamps in microseconds, as miniSEED 2 has them."""
     from pymseed import MS3TraceList
 
@@ -174,11 +195,22 @@ SKEW = {"y": 0.3, "z": -0.2}
 
 
 def test_miniseed_files_of_one_channel_are_one_log(tmp_path):
-    paths = [write_miniseed(tmp_path / f"{axis}.mseed", {code: axis}, skew=SKEW) for code, axis in CODES.items()]
+    paths = [
+        write_miniseed(tmp_path / f"{axis}.mseed", {code: axis}, skew=SKEW)
+        for code, axis in CODES.items()
+    ]
     log = regularise(read_log(paths, unit={"gyro": "0.01 deg/h"}))
-    np.testing.assert_allclose(log.rate.values, [np.round(truth(axis), 2) for axis in "xyz"], atol=1e-9)
-    assert log.attrs["source_files"] == ["z.mseed", "x.mseed", "y.mseed"]  # in the order of their first stamps
-    assert any("y.mseed" in note and "0.5 of a sample" in note for note in log.attrs["notes"])  # from z, which begins first
+    np.testing.assert_allclose(
+        log.rate.values, [np.round(truth(axis), 2) for axis in "xyz"], atol=1e-9
+    )
+    assert log.attrs["source_files"] == [
+        "z.mseed",
+        "x.mseed",
+        "y.mseed",
+    ]  # in the order of their first stamps
+    assert any(
+        "y.mseed" in note and "0.5 of a sample" in note for note in log.attrs["notes"]
+    )  # from z, which begins first
 
 
 def test_channels_of_one_file_with_a_skew_are_one_log(tmp_path):
@@ -187,12 +219,17 @@ def test_channels_of_one_file_with_a_skew_are_one_log(tmp_path):
         write_miniseed(tmp_path / "b.mseed", CODES, skew=SKEW, start=800, size=N - 800),
     ]
     log = regularise(read_log(paths, unit={"gyro": "0.01 deg/h"}))
-    np.testing.assert_allclose(log.rate.values, [np.round(truth(axis), 2) for axis in "xyz"], atol=1e-9)
+    np.testing.assert_allclose(
+        log.rate.values, [np.round(truth(axis), 2) for axis in "xyz"], atol=1e-9
+    )
     assert scan_file(paths[0], ReadOptions(unit={"gyro": "0.01 deg/h"})).axes == ("x", "y", "z")
 
 
 def test_axes_of_other_rates_are_refused_by_name(tmp_path):
-    x, y = write(tmp_path / "x.csv", "x"), write(tmp_path / "y.csv", "y", samples=np.arange(0, N, 2))
+    x, y = (
+        write(tmp_path / "x.csv", "x"),
+        write(tmp_path / "y.csv", "y", samples=np.arange(0, N, 2)),
+    )
     with pytest.raises(TimeError, match=r"x.csv is a log of 100 Hz and y.csv one of 50 Hz"):
         regularise(read_log([x, y]))
 

@@ -51,12 +51,18 @@ def peak_of(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def test_foreign_netcdf_takes_less_memory_than_its_stamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_foreign_netcdf_takes_less_memory_than_its_stamps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(arrays, "BATCH_ROWS", 2**16)
     rows = 1_500_000
     path = write_stamped_netcdf(tmp_path / "log.nc", rows)
-    netcdf_reader.read(write_stamped_netcdf(tmp_path / "short.nc", 3000), ReadOptions(), limit=1000)  # loads modules
-    assert peak_of(lambda: netcdf_reader.read(path, ReadOptions(), limit=2**20)) < 8 * rows  # the stamps alone have that many
+    netcdf_reader.read(
+        write_stamped_netcdf(tmp_path / "short.nc", 3000), ReadOptions(), limit=1000
+    )  # loads modules
+    assert (
+        peak_of(lambda: netcdf_reader.read(path, ReadOptions(), limit=2**20)) < 8 * rows
+    )  # the stamps alone have that many
 
 
 def write_csv(path: Path, stamps_ns: np.ndarray) -> Path:
@@ -75,7 +81,8 @@ def test_stamp_days_ahead_at_10_khz_is_named_before_the_grid_is_laid_out(tmp_pat
     stamps[-1] += 9 * DAY_NS
     path = write_csv(tmp_path / "log.csv", stamps)
     with pytest.raises(
-        TimeError, match=r"log\.csv: from 2026-05-28T20:26:40.499 \(row 4998\) to 2026-06-06.*--max-gap .*--limit grid_samp"
+        TimeError,
+        match=r"log\.csv: from 2026-05-28T20:26:40.499 \(row 4998\) to 2026-06-06.*--max-gap .*--limit grid_samp",
     ):
         regularise(read_log(path))
     stepped = regularise(read_log(path), max_gap="1h")  # as the message advises
@@ -83,8 +90,12 @@ def test_stamp_days_ahead_at_10_khz_is_named_before_the_grid_is_laid_out(tmp_pat
 
 
 def test_stamps_a_nanosecond_apart_are_refused_before_the_grid_is_laid_out(tmp_path: Path) -> None:
-    stamps = START_NS + np.sort(np.concatenate([np.arange(3000) * 2_500_000, np.arange(3000) * 2_500_000 + 1]))
-    with pytest.raises(TimeError, match=r"row 1\).*row 2\).*1e-06 ms apart.*--limit grid_samples=7.5e\+09"):
+    stamps = START_NS + np.sort(
+        np.concatenate([np.arange(3000) * 2_500_000, np.arange(3000) * 2_500_000 + 1])
+    )
+    with pytest.raises(
+        TimeError, match=r"row 1\).*row 2\).*1e-06 ms apart.*--limit grid_samples=7.5e\+09"
+    ):
         scan(write_csv(tmp_path / "log.csv", stamps))
 
 
@@ -98,8 +109,14 @@ def test_gap_of_eight_days_at_400_hz_stays_a_gap(tmp_path: Path) -> None:
 
 def test_logs_years_apart_are_refused_before_the_grid_is_laid_out(tmp_path: Path) -> None:
     for number, start in enumerate(("2026-01-01", "2026-01-09T12:00:00")):
-        to_netcdf(make_log(np.arange(2000.0) % 5, rate=1e4, unit="deg/h", start=start), tmp_path / f"{number}.nc")
-    with pytest.raises(TimeError, match=r"0\.nc ends at 2026-01-01.*1\.nc begins at 2026-01-09.*--max-gap.*--limit grid_samples="):
+        to_netcdf(
+            make_log(np.arange(2000.0) % 5, rate=1e4, unit="deg/h", start=start),
+            tmp_path / f"{number}.nc",
+        )
+    with pytest.raises(
+        TimeError,
+        match=r"0\.nc ends at 2026-01-01.*1\.nc begins at 2026-01-09.*--max-gap.*--limit grid_samples=",
+    ):
         read_log(tmp_path / "?.nc")
 
 
@@ -128,7 +145,9 @@ def test_limits_have_names_and_are_above_zero() -> None:
 
 
 ROWS = 5000
-STAMPS = START_NS + np.arange(ROWS) * 10_000_000 + np.random.default_rng(2).integers(-9000, 9000, ROWS)  # no even steps
+STAMPS = (
+    START_NS + np.arange(ROWS) * 10_000_000 + np.random.default_rng(2).integers(-9000, 9000, ROWS)
+)  # no even steps
 RATES = np.random.default_rng(3).integers(-900, 900, (3, ROWS)).astype(float)
 SINCE = "nanoseconds since 1970-01-01"
 
@@ -139,10 +158,14 @@ def write_netcdf(path: Path, kind: str, layout: str) -> None:
         file.createDimension("axis", 3)
         options = {"zlib": True, "shuffle": True, "fletcher32": True} if layout == "chunks" else {}
         chunks = {"chunksizes": (700,)} if layout == "chunks" else {}
-        time = file.createVariable("time", "i8" if kind != "NETCDF3_CLASSIC" else "f8", ("time",), **options, **chunks)
+        time = file.createVariable(
+            "time", "i8" if kind != "NETCDF3_CLASSIC" else "f8", ("time",), **options, **chunks
+        )
         time.units = SINCE
         dims = ("axis", "time") if layout == "axis first" else ("time", "axis")
-        gyro = file.createVariable("gyro", "i2", dims, **options, **({"chunksizes": (700, 2)} if options else {}))
+        gyro = file.createVariable(
+            "gyro", "i2", dims, **options, **({"chunksizes": (700, 2)} if options else {})
+        )
         gyro.units, gyro.scale_factor = "deg/h", 0.5
         gyro.set_auto_scale(False)
         time[:] = STAMPS
@@ -155,7 +178,10 @@ def write_zarr(path: Path, version: int) -> None:
         dims = ["time", "axis"][: values.ndim]
         named = {"dimension_names": dims} if version == 3 else {}
         array = group.create_array(name, data=values, chunks=chunks, **named)
-        array.attrs.update({"units": "deg/h" if values.ndim == 2 else SINCE} | ({} if named else {"_ARRAY_DIMENSIONS": dims}))
+        array.attrs.update(
+            {"units": "deg/h" if values.ndim == 2 else SINCE}
+            | ({} if named else {"_ARRAY_DIMENSIONS": dims})
+        )
 
 
 def write_hdf5(path: Path, layout: str) -> None:
@@ -163,7 +189,9 @@ def write_hdf5(path: Path, layout: str) -> None:
         options = {"chunks": (700, 1), "compression": "gzip"} if layout == "chunks" else {}
         file.create_dataset("time", data=STAMPS[:, None], **options).attrs["units"] = SINCE
         for axis, values in zip("xyz", RATES, strict=True):
-            file.create_dataset(f"gyro_{axis}", data=0.5 * values[:, None], **options).attrs["units"] = "deg/h"
+            file.create_dataset(f"gyro_{axis}", data=0.5 * values[:, None], **options).attrs[
+                "units"
+            ] = "deg/h"
 
 
 FOREIGN = {
@@ -180,11 +208,15 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_values_of_foreign_files_stay_in_the_file(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_of_foreign_files_stay_in_the_file(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / name
     FOREIGN[name](path)
     monkeypatch.setattr(arrays, "BATCH_ROWS", 1024)
-    monkeypatch.setattr(Spool, "add", lambda *_: pytest.fail("a column was moved to a temporary file"))
+    monkeypatch.setattr(
+        Spool, "add", lambda *_: pytest.fail("a column was moved to a temporary file")
+    )
     reader = matlab if path.suffix in (".h5", ".mat") else netcdf_reader
     whole, lazy = (reader.read(path, ReadOptions(), limit=limit) for limit in (2**27, 1000))
     assert whole["rate"].chunks is None
@@ -195,7 +227,9 @@ def test_values_of_foreign_files_stay_in_the_file(name: str, tmp_path: Path, mon
     np.testing.assert_array_equal(regularise(lazy)["rate"], regularise(whole)["rate"])
 
 
-def test_windows_of_a_file_whose_values_stay_there_are_those_of_values_in_memory(tmp_path: Path) -> None:
+def test_windows_of_a_file_whose_values_stay_there_are_those_of_values_in_memory(
+    tmp_path: Path,
+) -> None:
     path = write_stamped_netcdf(tmp_path / "log.nc", 300_000)
     raw = netcdf_reader.read(path, ReadOptions(), limit=1000)
     log = regularise(raw)
@@ -211,7 +245,8 @@ def test_store_that_claims_samples_it_never_held_is_refused(tmp_path: Path) -> N
     group["time"].resize((10**11,))
     group["gyro"].resize((10**11, 3))
     with pytest.raises(
-        FormatError, match=r"log\.zarr: it claims 1e\+11 samples in each of 4 columns, but holds .* bytes.*--limit stored_samples=4e\+11"
+        FormatError,
+        match=r"log\.zarr: it claims 1e\+11 samples in each of 4 columns, but holds .* bytes.*--limit stored_samples=4e\+11",
     ):
         read_log(path)
 
@@ -237,7 +272,9 @@ def test_own_log_that_claims_samples_it_never_held_is_refused(tmp_path: Path) ->
     for name in (".zmetadata", "rate/.zarray"):
         file = path / name
         file.write_text(file.read_text().replace("200000", "100000000000"))
-    with pytest.raises(FormatError, match=r"log\.zarr: it claims 1e\+11 samples .*--limit stored_samples"):
+    with pytest.raises(
+        FormatError, match=r"log\.zarr: it claims 1e\+11 samples .*--limit stored_samples"
+    ):
         read_log(path)
 
 
@@ -247,12 +284,16 @@ def test_chunk_of_a_terabyte_is_refused_before_it_is_allocated(name: str, tmp_pa
     if name == "log.zarr":
         group = zarr.open_group(path, mode="w", zarr_format=2)
         for column in ("time", "gyro_x"):
-            group.create_array(column, shape=(1000,), chunks=(10**11,), dtype="f8").attrs["_ARRAY_DIMENSIONS"] = ["time"]
+            group.create_array(column, shape=(1000,), chunks=(10**11,), dtype="f8").attrs[
+                "_ARRAY_DIMENSIONS"
+            ] = ["time"]
     else:
         with h5py.File(path, "w") as file:
             for column in ("time", "gyro_x"):  # HDF5 itself allows 4 GiB
                 file.create_dataset(column, (1000,), "f8", chunks=(2**28,), maxshape=(None,))
-    with pytest.raises(FormatError, match=r"a chunk of '(time|gyro_x)' has .* bytes.*--limit chunk_bytes="):
+    with pytest.raises(
+        FormatError, match=r"a chunk of '(time|gyro_x)' has .* bytes.*--limit chunk_bytes="
+    ):
         read_log(path)
 
 
@@ -288,7 +329,9 @@ def write_wide_csv(path: Path, header: str, columns: int) -> Path:
 
 
 @pytest.mark.parametrize(("header", "kept"), [("c{} [V]", 200), ("c{}", 0), ("c", 0)])
-def test_table_of_20_000_columns_is_read_for_those_that_are_used(header: str, kept: int, tmp_path: Path) -> None:
+def test_table_of_20_000_columns_is_read_for_those_that_are_used(
+    header: str, kept: int, tmp_path: Path
+) -> None:
     path = write_wide_csv(tmp_path / "log.csv", header, 20_000)
     begun = time.process_time()
     raw = read_log(path)
@@ -297,7 +340,10 @@ def test_table_of_20_000_columns_is_read_for_those_that_are_used(header: str, ke
     np.testing.assert_array_equal(raw["rate"], np.full((1, 6), 2.5))
     assert any("left out" in note for note in raw.attrs["notes"])
     if kept:
-        assert any("the limit is 200 channels, and --limit channels=2e+04 lifts it" in note for note in raw.attrs["notes"])
+        assert any(
+            "the limit is 200 channels, and --limit channels=2e+04 lifts it" in note
+            for note in raw.attrs["notes"]
+        )
 
 
 def test_limit_of_channels_is_lifted_by_its_option(tmp_path: Path) -> None:
@@ -311,7 +357,10 @@ def test_limit_of_channels_is_lifted_by_its_option(tmp_path: Path) -> None:
 def test_table_of_100_000_columns_is_refused_at_once(header: str, tmp_path: Path) -> None:
     path = write_wide_csv(tmp_path / "log.csv", header, 100_000)
     begun = time.process_time()
-    with pytest.raises(FormatError, match=r"it has 100,002 columns.* the limit is 3e\+04 columns, and --limit columns=1.1e\+05 lifts it"):
+    with pytest.raises(
+        FormatError,
+        match=r"it has 100,002 columns.* the limit is 3e\+04 columns, and --limit columns=1.1e\+05 lifts it",
+    ):
         read_log(path)
     assert time.process_time() - begun < 10.0
 
@@ -350,19 +399,29 @@ def test_log_of_values_that_stay_in_the_file_is_the_log_of_values_in_memory(
     stamps = START_NS + np.arange(20_000) * 2_500_000
     stamps[10_000:] += 0 if even else 7_500_000
     path = write_gappy_netcdf(tmp_path / "log.nc", 20_000, stamps)
-    whole, lazy = (regularise(netcdf_reader.read(path, ReadOptions(), limit=limit)) for limit in (2**27, 1000))
+    whole, lazy = (
+        regularise(netcdf_reader.read(path, ReadOptions(), limit=limit)) for limit in (2**27, 1000)
+    )
     xr.testing.assert_identical(whole.drop_attrs(deep=False), lazy.load().drop_attrs(deep=False))
     assert whole.attrs["notes"] == lazy.attrs["notes"]
 
 
-def test_even_stamps_are_placed_by_a_look_at_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_even_stamps_are_placed_by_a_look_at_the_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(regularise_module, "_EVEN_ROWS", 2**14)
     path = write_stamped_netcdf(tmp_path / "log.nc", 100_000)
     whole, lazy = (netcdf_reader.read(path, ReadOptions(), limit=limit) for limit in (2**27, 1000))
     seen = []
     rate = regularise_module.estimate_rate
-    monkeypatch.setattr(regularise_module, "estimate_rate", lambda stamps, **where: seen.append(list(stamps())) or rate(stamps, **where))
+    monkeypatch.setattr(
+        regularise_module,
+        "estimate_rate",
+        lambda stamps, **where: seen.append(list(stamps())) or rate(stamps, **where),
+    )
     logs = [regularise(raw) for raw in (whole, lazy)]
     assert [sum(len(rows) for rows, _ in blocks) for blocks in seen] == [100_000, 2**14]
-    xr.testing.assert_identical(logs[0].drop_attrs(deep=False), logs[1].load().drop_attrs(deep=False))
+    xr.testing.assert_identical(
+        logs[0].drop_attrs(deep=False), logs[1].load().drop_attrs(deep=False)
+    )
     assert logs[0].attrs["sampling_rate_hz"] == logs[1].attrs["sampling_rate_hz"] == 400.0

@@ -26,7 +26,14 @@ def values(seed: int = 2) -> np.ndarray:
 
 
 def make(**options) -> xr.Dataset:
-    return make_log(values(), rate=RATE, unit="deg/h", start=START, channels={"temperature": (np.arange(SIZE) / 100, "degC")}, **options)
+    return make_log(
+        values(),
+        rate=RATE,
+        unit="deg/h",
+        start=START,
+        channels={"temperature": (np.arange(SIZE) / 100, "degC")},
+        **options,
+    )
 
 
 def stored(log: xr.Dataset, path) -> str:
@@ -39,13 +46,18 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cut")
     log = make()
     stamps = pd.DatetimeIndex(log.time.values).strftime("%Y-%m-%dT%H:%M:%S.%f")
-    table = pd.DataFrame({"time": stamps, "gyro_x [deg/h]": log.rate[0], "gyro_y [deg/h]": log.rate[1]}).dropna()
+    table = pd.DataFrame(
+        {"time": stamps, "gyro_x [deg/h]": log.rate[0], "gyro_y [deg/h]": log.rate[1]}
+    ).dropna()
     table.to_csv(folder / "log.csv", index=False, float_format="%.17g")
     slow = pd.DataFrame({"time": stamps[::50], "temperature [degC]": np.arange(0, SIZE, 50) / 100})
     slow.to_csv(folder / "probe.csv", index=False)
     return {
         "own": [stored(log, folder / "log.nc")],
-        "two": [stored(log.isel(time=slice(0, 1000)), folder / "a.nc"), stored(log.isel(time=slice(1000, None)), folder / "b.nc")],
+        "two": [
+            stored(log.isel(time=slice(0, 1000)), folder / "a.nc"),
+            stored(log.isel(time=slice(1000, None)), folder / "b.nc"),
+        ],
         "text": [str(folder / "log.csv")],
         "probe": str(folder / "probe.csv"),
     }
@@ -63,7 +75,11 @@ def expected(low: int, high: int, *spans: tuple[int, int]) -> np.ndarray:
 def test_every_way_to_a_log(files, kind):
     for given in (
         {"time_from": "1min", "time_to": "4min", "exclude": ["90s/100s"]},
-        {"time_from": "2026-03-01T10:01", "time_to": "2026-03-01T10:04Z", "exclude": ["2026-03-01T10:01:30/2026-03-01T11:01:40+01:00"]},
+        {
+            "time_from": "2026-03-01T10:01",
+            "time_to": "2026-03-01T10:04Z",
+            "exclude": ["2026-03-01T10:01:30/2026-03-01T11:01:40+01:00"],
+        },
     ):
         log = load_log(files[kind], **given)
         np.testing.assert_array_equal(log.rate.values, expected(600, 2400, (900, 1000)))
@@ -77,7 +93,10 @@ def test_every_way_to_a_log(files, kind):
 
 def test_the_ends_are_half_open_and_on_the_sample():
     log = make()
-    assert cut_log(log, time_from="1s", time_to="2s").time.values[[0, -1]].tolist() == log.time.values[[10, 19]].tolist()
+    assert (
+        cut_log(log, time_from="1s", time_to="2s").time.values[[0, -1]].tolist()
+        == log.time.values[[10, 19]].tolist()
+    )
     assert cut_log(log, time_from="1.05s").sizes["time"] == SIZE - 11
     assert cut_log(log, time_to="1.05s").sizes["time"] == 11
     assert cut_log(log, time_from="0s", time_to="300s").sizes["time"] == SIZE
@@ -101,7 +120,13 @@ def test_excluded_spans_are_merged_and_the_table_of_gaps_follows():
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_channels_of_another_file_are_cut_too(files):
-    log = load_log(files["text"], channel=[files["probe"]], time_from="1min", time_to="2min", exclude=["70s/80s"])
+    log = load_log(
+        files["text"],
+        channel=[files["probe"]],
+        time_from="1min",
+        time_to="2min",
+        exclude=["70s/80s"],
+    )
     (name,) = [name for name in log.data_vars if str(name).startswith("temperature")]
     dim = log[name].dims[0]
     seconds = (log[dim].values - np.datetime64(START)) / np.timedelta64(1, "s")
@@ -139,7 +164,10 @@ def test_what_is_lazy_stays_lazy():
         ),
         ({"time_from": "2026-02-01T00:00"}, "outside the record"),
         ({"time_to": "2027-02-01T00:00"}, "--to 2027-02-01T00:00 lies outside the record"),
-        ({"time_from": "3min", "time_to": "2min"}, "nothing is left between --from 3min and --to 2min"),
+        (
+            {"time_from": "3min", "time_to": "2min"},
+            "nothing is left between --from 3min and --to 2min",
+        ),
         ({"time_from": "10:05:00"}, "neither a time nor a duration; write 2026-11-20T14:00"),
         ({"time_from": "60"}, "neither a time nor a duration"),
         ({"time_from": "soon"}, "neither a time nor a duration"),
@@ -176,7 +204,19 @@ def test_commands_take_them(files, tmp_path, capsys):
     assert main(["ingest", *files["own"], "-o", str(tmp_path / "none.nc"), "--from", "1h"]) == 2
     assert "outside the record" in capsys.readouterr().err
     (tmp_path / "some.toml").write_text('[ingest]\nfrom = "1min"\nexclude = ["90s/100s"]\n')
-    assert main(["ingest", *files["own"], "-o", str(tmp_path / "some.nc"), "--config", str(tmp_path / "some.toml")]) == 0
+    assert (
+        main(
+            [
+                "ingest",
+                *files["own"],
+                "-o",
+                str(tmp_path / "some.nc"),
+                "--config",
+                str(tmp_path / "some.toml"),
+            ]
+        )
+        == 0
+    )
     with gyrostab.open_log(tmp_path / "some.nc") as log:
         np.testing.assert_array_equal(log.rate.values, expected(600, SIZE, (900, 1000)))
 
@@ -186,7 +226,9 @@ def test_a_run_is_not_continued_with_another_part(files, tmp_path):
     from gyrostab.jobs.run import _describe
 
     names = {
-        _describe(files["own"], tmp_path / "p.nc", {"reading": r, "windows": {}, "fitting": {}}).name
+        _describe(
+            files["own"], tmp_path / "p.nc", {"reading": r, "windows": {}, "fitting": {}}
+        ).name
         for r in ({}, {"time_from": "1min"}, {"exclude": ["1s/2s"]})
     }
     assert len(names) == 3

@@ -1,7 +1,8 @@
 """One log in many files: formats, packing, units, epochs and calendars never change what is read, or the file is refused.
 
-The truth is a grid of known samples. Each example draws how a file holds it; what comes back through `read_log` and `regularise`
-is the grid to 1e-9, or an error that names the file. A file is never read differently in silence.
+The truth is a grid of known samples. Each example draws how a file holds it; what comes back
+through `read_log` and `regularise` is the grid to 1e-9, or an error that names the file. A file is
+never read differently in silence.
 """
 
 from __future__ import annotations
@@ -41,8 +42,16 @@ VOID = np.array([7, 200])  # rows whose x has no value
 KEPT = np.setdiff1d(np.arange(N), LOST)
 STAMPS = START.astype(np.int64) + PERIOD_NS * KEPT
 
-#: Epochs that can be read in one way only, and how many seconds before the start they are in the standard calendar.
-EPOCHS = ["2026-03-01 06:00:00", "2026-3-1", "2026-03-01T00:00:00Z", "1970-01-01", "2026-03-01 01:00 +01:00", "20260301T000000"]
+#: Epochs that can be read in one way only, and how many seconds before the start they are in the
+#: standard calendar.
+EPOCHS = [
+    "2026-03-01 06:00:00",
+    "2026-3-1",
+    "2026-03-01T00:00:00Z",
+    "1970-01-01",
+    "2026-03-01 01:00 +01:00",
+    "20260301T000000",
+]
 GUESSED = ["now", "01-03-2026", "1/3/2026", "2026", "yesterday", "2026-02-30"]
 
 
@@ -76,7 +85,9 @@ class Law:
 def check(paths: Path | list[Path], law: Law, *, within_ns: int = 1000, **options: Any) -> None:
     """Compare what is read with the truth."""
     log = regularise(read_log(paths, **options))
-    np.testing.assert_allclose(log.rate.sel(axis=["x", "y"]).values, law.rates(), rtol=1e-9, atol=1e-12 * law.per_hour)
+    np.testing.assert_allclose(
+        log.rate.sel(axis=["x", "y"]).values, law.rates(), rtol=1e-9, atol=1e-12 * law.per_hour
+    )
     assert log.attrs["sampling_rate_hz"] == pytest.approx(RATE, rel=1e-9)
     begin = log.time.values[0].astype(np.int64)
     assert abs(begin - START.astype(np.int64)) <= within_ns
@@ -87,7 +98,18 @@ laws = st.builds(
     Law,
     scale=st.sampled_from([1.0, 0.25, 0.1, -0.5, 3.0]),
     offset=st.sampled_from([0.0, 100.0, -7.5]),
-    unit=st.sampled_from(["deg/h", "deg/s", "Degree/Second", "rad s-1", "rad.s^-1", "arcsec/s", "mrad/s", "radian per hour"]),
+    unit=st.sampled_from(
+        [
+            "deg/h",
+            "deg/s",
+            "Degree/Second",
+            "rad s-1",
+            "rad.s^-1",
+            "arcsec/s",
+            "mrad/s",
+            "radian per hour",
+        ]
+    ),
 )
 
 
@@ -102,7 +124,12 @@ def values_of(law: Law) -> np.ndarray:
 
 
 def write_text(path: Path, law: Law, form: str) -> dict[str, Any]:
-    names = {"iso": "time", "s": "time [s]", "us": "time [us]", "h": "time [Hours Since 2026-03-01]"}
+    names = {
+        "iso": "time",
+        "s": "time [s]",
+        "us": "time [us]",
+        "h": "time [Hours Since 2026-03-01]",
+    }
     since = STAMPS - np.datetime64("2026-03-01", "ns").astype(np.int64)
     cells = {
         "iso": [f"{stamp}Z" for stamp in STAMPS.view("M8[ns]")],
@@ -147,7 +174,9 @@ def test_parquet(law, stamps, group, compression, nulls):
     }.get(stamps, lambda: pa.array(dates.astype(f"M8[{stamps}]"), pa.timestamp(stamps)))()
     columns = {"time [us]" if stamps == "int" else "time": time}
     for name, values in zip("xy", values_of(law), strict=True):
-        columns[f"gyro_{name} [{law.unit}]"] = pa.array(values, mask=np.isnan(values) if nulls else None)
+        columns[f"gyro_{name} [{law.unit}]"] = pa.array(
+            values, mask=np.isnan(values) if nulls else None
+        )
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.parquet"
         parquet.write_table(pa.table(columns), path, row_group_size=group, compression=compression)
@@ -172,13 +201,26 @@ class Packed:
     def store(self) -> tuple[np.ndarray, Any]:
         """Stored numbers of both axes at the rows that are kept, and the one that means "no value"."""
         stored = counts()
-        void = {"i1": -127, "i2": -32000, "i4": -(2**30), "f4": -999.0, "f8": -999.0, "unsigned": 250}[self.dtype]
+        void = {
+            "i1": -127,
+            "i2": -32000,
+            "i4": -(2**30),
+            "f4": -999.0,
+            "f8": -999.0,
+            "unsigned": 250,
+        }[self.dtype]
         if self.is_unsigned:
             stored = stored + 100
         stored[0, VOID] = void
-        kind = np.dtype("u1" if self.is_unsigned else self.dtype).newbyteorder(">" if self.big else "<")
+        kind = np.dtype("u1" if self.is_unsigned else self.dtype).newbyteorder(
+            ">" if self.big else "<"
+        )
         array = stored[:, KEPT].astype(kind)
-        return (array.view("i1"), np.uint8(void).view("i1")) if self.is_unsigned else (array, kind.type(void))
+        return (
+            (array.view("i1"), np.uint8(void).view("i1"))
+            if self.is_unsigned
+            else (array, kind.type(void))
+        )
 
     def attributes(self, law: Law, void: Any) -> dict[str, Any]:
         """Attributes by the CF conventions."""
@@ -190,8 +232,16 @@ class Packed:
             attributes["add_offset"] = offset
         if self.is_unsigned:
             attributes["_Unsigned"] = "true"
-        low, high = (np.uint8(5).view("i1"), np.uint8(195).view("i1")) if self.is_unsigned else (type(void)(-95), type(void)(95))
-        others = np.array([197, 198], "u1").view("i1") if self.is_unsigned else np.array([97, 98], type(void))
+        low, high = (
+            (np.uint8(5).view("i1"), np.uint8(195).view("i1"))
+            if self.is_unsigned
+            else (type(void)(-95), type(void)(95))
+        )
+        others = (
+            np.array([197, 198], "u1").view("i1")
+            if self.is_unsigned
+            else np.array([97, 98], type(void))
+        )
         marks = {
             "_FillValue": {"_FillValue": void},
             "missing_value": {"missing_value": void},
@@ -200,7 +250,9 @@ class Packed:
             "valid_min": {"valid_min": low} if not self.is_unsigned else {"valid_max": high},
             "unpacked": {"valid_range": np.sort(np.array([-95.0, 95.0]) * law.scale + law.offset)},
         }
-        if self.void == "unpacked" and (self.dtype in ("f4", "f8") or "scale_factor" not in attributes):
+        if self.void == "unpacked" and (
+            self.dtype in ("f4", "f8") or "scale_factor" not in attributes
+        ):
             return attributes | marks["valid_range"]
         return attributes | marks[self.void]
 
@@ -241,7 +293,11 @@ class Clock:
             attributes["calendar"] = self.calendar
         if self.packed:  # counts of the period, from the first row on
             scale, offset = PERIOD_NS / step, float(since[0]) / step
-            attributes |= {"scale_factor": scale, "add_offset": offset, "valid_range": np.array([0, N], "i4")}
+            attributes |= {
+                "scale_factor": scale,
+                "add_offset": offset,
+                "valid_range": np.array([0, N], "i4"),
+            }
             return ((since - since[0]) // PERIOD_NS).astype("i4"), attributes
         if self.dtype == "f8" or step > PERIOD_NS:
             return since / step, attributes
@@ -251,14 +307,27 @@ class Clock:
 packings = st.builds(
     Packed,
     dtype=st.sampled_from(["i1", "i2", "i4", "f4", "f8", "unsigned"]),
-    void=st.sampled_from(["_FillValue", "missing_value", "several", "valid_range", "valid_min", "unpacked"]),
+    void=st.sampled_from(
+        ["_FillValue", "missing_value", "several", "valid_range", "valid_min", "unpacked"]
+    ),
     big=st.booleans(),
 )
 clocks = st.builds(
     Clock,
     unit=st.sampled_from(["s", "ms", "us", "ns", "hours"]),
     epoch=st.sampled_from([*EPOCHS, *EPOCHS, *GUESSED]),
-    calendar=st.sampled_from(["", "standard", "Gregorian", "proleptic_gregorian", "julian", "noleap", "360_day", "all_leap"]),
+    calendar=st.sampled_from(
+        [
+            "",
+            "standard",
+            "Gregorian",
+            "proleptic_gregorian",
+            "julian",
+            "noleap",
+            "360_day",
+            "all_leap",
+        ]
+    ),
     dtype=st.sampled_from(["i8", "f8"]),
     packed=st.booleans(),
 )
@@ -269,7 +338,9 @@ def tolerance(clock: Clock) -> int:
     return 2000 if clock.unit == "hours" or clock.dtype == "f8" or clock.packed else 1
 
 
-def write_netcdf(path: Path, law: Law, packed: Packed, clock: Clock, *, form: str, chunk: int, level: int) -> None:
+def write_netcdf(
+    path: Path, law: Law, packed: Packed, clock: Clock, *, form: str, chunk: int, level: int
+) -> None:
     stamps, time_attributes = clock.store()
     stored, void = packed.store()
     if form.startswith("NETCDF3") and stamps.dtype.kind == "i":
@@ -278,21 +349,37 @@ def write_netcdf(path: Path, law: Law, packed: Packed, clock: Clock, *, form: st
         file.createDimension("obs", KEPT.size)
         for name, values, attributes in (
             ("time", stamps, time_attributes),
-            *((f"gyro_{axis}", row, packed.attributes(law, void)) for axis, row in zip("xy", stored, strict=True)),
+            *(
+                (f"gyro_{axis}", row, packed.attributes(law, void))
+                for axis, row in zip("xy", stored, strict=True)
+            ),
         ):
             extra: dict[str, Any] = {}
             big = values.dtype.str[0] == ">"
             if form == "NETCDF4":
-                extra = {"chunksizes": (chunk,), "zlib": level > 0, "complevel": max(level, 1), "endian": "big" if big else "little"}
+                extra = {
+                    "chunksizes": (chunk,),
+                    "zlib": level > 0,
+                    "complevel": max(level, 1),
+                    "endian": "big" if big else "little",
+                }
             kind = values.dtype if form == "NETCDF4" else values.dtype.newbyteorder("=")
-            variable = file.createVariable(name, kind, ("obs",), fill_value=attributes.pop("_FillValue", None), **extra)
+            variable = file.createVariable(
+                name, kind, ("obs",), fill_value=attributes.pop("_FillValue", None), **extra
+            )
             variable.set_auto_maskandscale(False)
             variable.setncatts(attributes)
             variable[:] = values.astype(kind)
 
 
 @pytest.mark.parametrize("form", ["NETCDF4", "NETCDF3_CLASSIC", "NETCDF3_64BIT_DATA"])
-@given(law=laws, packed=packings, clock=clocks, chunk=st.sampled_from([1, 37, 294]), level=st.sampled_from([0, 4]))
+@given(
+    law=laws,
+    packed=packings,
+    clock=clocks,
+    chunk=st.sampled_from([1, 37, 294]),
+    level=st.sampled_from([0, 4]),
+)
 @settings(max_examples=15, deadline=None, phases=PHASES)
 def test_netcdf(form, law, packed, clock, chunk, level):
     with TemporaryDirectory() as folder:
@@ -305,7 +392,13 @@ def test_netcdf(form, law, packed, clock, chunk, level):
             check(path, law, within_ns=2000 if form.startswith("NETCDF3") else tolerance(clock))
 
 
-@given(law=laws, packed=packings, clock=clocks, chunk=st.sampled_from([1, 37, 294]), level=st.sampled_from([None, 4]))
+@given(
+    law=laws,
+    packed=packings,
+    clock=clocks,
+    chunk=st.sampled_from([1, 37, 294]),
+    level=st.sampled_from([None, 4]),
+)
 @settings(max_examples=15, deadline=None, phases=PHASES)
 def test_hdf5(law, packed, clock, chunk, level):
     stamps, time_attributes = clock.store()
@@ -315,9 +408,14 @@ def test_hdf5(law, packed, clock, chunk, level):
         with h5py.File(path, "w") as file:
             for name, values, attributes in (
                 ("imu/time", stamps, time_attributes),
-                *((f"imu/gyro_{axis}", row, packed.attributes(law, void)) for axis, row in zip("xy", stored, strict=True)),
+                *(
+                    (f"imu/gyro_{axis}", row, packed.attributes(law, void))
+                    for axis, row in zip("xy", stored, strict=True)
+                ),
             ):
-                file.create_dataset(name, data=values, chunks=(chunk,), compression=level).attrs.update(attributes)
+                file.create_dataset(
+                    name, data=values, chunks=(chunk,), compression=level
+                ).attrs.update(attributes)
         names = {f"imu.{name}": name for name in ("time", "gyro_x", "gyro_y")}
         if clock.is_refused:
             with pytest.raises(GyrostabError, match=r"log\.h5: .*time"):
@@ -327,9 +425,13 @@ def test_hdf5(law, packed, clock, chunk, level):
 
 
 @pytest.mark.parametrize("version", [2, 3])
-@given(law=laws, packed=packings, clock=clocks, chunk=st.sampled_from([37, 294]), matrix=st.booleans())
+@given(
+    law=laws, packed=packings, clock=clocks, chunk=st.sampled_from([37, 294]), matrix=st.booleans()
+)
 @settings(max_examples=10, deadline=None, phases=PHASES)
-@pytest.mark.filterwarnings("ignore:The data type", "ignore:variable .* has multiple fill", "ignore:Consolidated metadata")
+@pytest.mark.filterwarnings(
+    "ignore:The data type", "ignore:variable .* has multiple fill", "ignore:Consolidated metadata"
+)
 def test_zarr(version, law, packed, clock, chunk, matrix):
     stamps, time_attributes = clock.store()
     stored, void = packed.store()
@@ -338,9 +440,18 @@ def test_zarr(version, law, packed, clock, chunk, matrix):
         gyro = xr.Variable(("obs", "axis"), stored.T, packed.attributes(law, void))
         raw = xr.Dataset({"gyro": gyro}, {"axis": ["x", "y"]})
     else:
-        raw = xr.Dataset({f"gyro_{axis}": ("obs", row, packed.attributes(law, void)) for axis, row in zip("xy", stored, strict=True)})
+        raw = xr.Dataset(
+            {
+                f"gyro_{axis}": ("obs", row, packed.attributes(law, void))
+                for axis, row in zip("xy", stored, strict=True)
+            }
+        )
     raw["time"] = time
-    encoding = {name: {"chunks": (chunk, *variable.shape[1:])} for name, variable in raw.variables.items() if name != "axis"}
+    encoding = {
+        name: {"chunks": (chunk, *variable.shape[1:])}
+        for name, variable in raw.variables.items()
+        if name != "axis"
+    }
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.zarr"
         raw.to_zarr(path, zarr_format=version, consolidated=False, encoding=encoding)
@@ -360,7 +471,9 @@ def test_matlab(version, law, matrix, whole):
     if matrix:
         data["w"] = values_of(law).T
     else:
-        data |= {f"gyro_{axis}": row[:, None] for axis, row in zip("xy", values_of(law), strict=True)}
+        data |= {
+            f"gyro_{axis}": row[:, None] for axis, row in zip("xy", values_of(law), strict=True)
+        }
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.mat"
         if version == "5":
@@ -371,8 +484,13 @@ def test_matlab(version, law, matrix, whole):
                     file[name] = array.T  # MATLAB writes columns first
             with path.open("r+b") as raw:
                 raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
-        options: dict[str, Any] = {"unit": {"gyro": law.unit, "time": "us" if whole else "s"}, "epoch": "2026-03-01T06:00:00Z"}
-        check(path, law, **options, **({"map": {"w/0": "gyro_x", "w/1": "gyro_y"}} if matrix else {}))
+        options: dict[str, Any] = {
+            "unit": {"gyro": law.unit, "time": "us" if whole else "s"},
+            "epoch": "2026-03-01T06:00:00Z",
+        }
+        check(
+            path, law, **options, **({"map": {"w/0": "gyro_x", "w/1": "gyro_y"}} if matrix else {})
+        )
 
 
 # Regular logs, of gyrostab and of others.
@@ -387,7 +505,9 @@ def test_matlab(version, law, matrix, whole):
     epoch=st.sampled_from(EPOCHS),
 )
 @settings(max_examples=10, deadline=None, phases=PHASES)
-@pytest.mark.filterwarnings("ignore:The data type", "ignore:Consolidated metadata", "ignore:variable .* has multiple fill")
+@pytest.mark.filterwarnings(
+    "ignore:The data type", "ignore:Consolidated metadata", "ignore:variable .* has multiple fill"
+)
 def test_regular_logs(law, own, store, packed, chunk, epoch):
     with TemporaryDirectory() as folder:
         path = Path(folder) / ("log.nc" if store == "nc" else "log.zarr")
@@ -400,11 +520,18 @@ def test_regular_logs(law, own, store, packed, chunk, epoch):
             law = Law(law.scale, law.offset, "degree hour-1")
             write_regular(path, law, packed, Clock("ms", epoch), store, chunk)
         opened = read_log(path)
-        np.testing.assert_allclose(opened.rate.sel(axis=["x", "y"]).values, law.rates(), rtol=1e-9, atol=1e-12 * law.per_hour)
+        np.testing.assert_allclose(
+            opened.rate.sel(axis=["x", "y"]).values,
+            law.rates(),
+            rtol=1e-9,
+            atol=1e-12 * law.per_hour,
+        )
         np.testing.assert_array_equal(opened.time.values, START + PERIOD_NS * np.arange(N))
 
 
-def write_regular(path: Path, law: Law, packed: Packed, clock: Clock, store: str, chunk: int) -> None:
+def write_regular(
+    path: Path, law: Law, packed: Packed, clock: Clock, store: str, chunk: int
+) -> None:
     """A regular log as another program writes it, with rows for the samples that are lost."""
     stored, void = packed.store()
     whole = np.full((2, N), void)
@@ -412,7 +539,10 @@ def write_regular(path: Path, law: Law, packed: Packed, clock: Clock, store: str
     attributes = packed.attributes(law, void)
     since = (START.astype(np.int64) + PERIOD_NS * np.arange(N) - clock.zero()) // 10**6
     log = xr.Dataset(
-        {"rate": (("axis", "sample"), whole, attributes), "clock": ("sample", since, {"units": f"ms since {clock.epoch}"})},
+        {
+            "rate": (("axis", "sample"), whole, attributes),
+            "clock": ("sample", since, {"units": f"ms since {clock.epoch}"}),
+        },
         coords={"axis": ["x", "y"]},
         attrs={"sampling_rate_hz": RATE},
     ).rename(sample="time", clock="time")
@@ -423,7 +553,12 @@ def write_regular(path: Path, law: Law, packed: Packed, clock: Clock, store: str
             encoding["_FillValue"] = None
         log.to_netcdf(path, encoding={"rate": encoding})
     else:
-        log.to_zarr(path, zarr_format=int(store[-1]), consolidated=False, encoding={"rate": {"chunks": (1, chunk)}})
+        log.to_zarr(
+            path,
+            zarr_format=int(store[-1]),
+            consolidated=False,
+            encoding={"rate": {"chunks": (1, chunk)}},
+        )
 
 
 def test_the_surface_of_every_format_is_the_same(tmp_path):
@@ -434,8 +569,19 @@ def test_the_surface_of_every_format_is_the_same(tmp_path):
         logs[name] = tmp_path / name
     for form in ("NETCDF4", "NETCDF3_CLASSIC"):
         logs[form] = tmp_path / f"{form}.nc"
-        write_netcdf(logs[form], law, Packed("unsigned", "valid_range"), Clock("s", packed=True), form=form, chunk=37, level=4)
-    surfaces = [gyrostab.davar(regularise(read_log(path)), window="1s", step="0.5s") for path in logs.values()]
+        write_netcdf(
+            logs[form],
+            law,
+            Packed("unsigned", "valid_range"),
+            Clock("s", packed=True),
+            form=form,
+            chunk=37,
+            level=4,
+        )
+    surfaces = [
+        gyrostab.davar(regularise(read_log(path)), window="1s", step="0.5s")
+        for path in logs.values()
+    ]
     for surface in surfaces[1:]:
         np.testing.assert_allclose(surface.avar.values, surfaces[0].avar.values, rtol=1e-9)
         np.testing.assert_array_equal(surface["count"].values, surfaces[0]["count"].values)

@@ -29,7 +29,10 @@ def write_rows(path: Path, rows: np.ndarray, *, unit: str = "ns", zone: str = ""
     else:
         scale, header = UNITS[unit], f"time [{unit}]"
         digits = len(str(scale)) - 1
-        cells = [f"{stamp // scale}.{stamp % scale:0{digits}d}" if digits else str(stamp) for stamp in STAMPS[rows].tolist()]
+        cells = [
+            f"{stamp // scale}.{stamp % scale:0{digits}d}" if digits else str(stamp)
+            for stamp in STAMPS[rows].tolist()
+        ]
     lines = [f"{cell},{x},{y}" for cell, x, y in zip(cells, *VALUES[:, rows].tolist(), strict=True)]
     path.write_text("\n".join([f"{header},gyro_x [deg/h],gyro_y [deg/h]", *lines]) + "\n")
     return path
@@ -64,7 +67,9 @@ def test_units_of_time(whole, tmp_path, unit):
 
 @pytest.mark.parametrize("zone", ["", "Z", "+02:00", "-05:00"])
 def test_zones(whole, tmp_path, zone):
-    assert_same(whole, regular([write_rows(tmp_path / "log.csv", np.arange(ROWS), unit="iso", zone=zone)]))
+    assert_same(
+        whole, regular([write_rows(tmp_path / "log.csv", np.arange(ROWS), unit="iso", zone=zone)])
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -73,7 +78,10 @@ def test_pieces_in_any_order(whole, tmp_path, seed):
     cuts = np.sort(random.choice(np.arange(20, ROWS - 20), random.integers(1, 7), replace=False))
     pieces = np.split(np.arange(ROWS), cuts)
     units = random.choice([*UNITS, "iso"], len(pieces))
-    paths = [write_rows(tmp_path / f"{i}.csv", rows, unit=unit) for i, (rows, unit) in enumerate(zip(pieces, units, strict=True))]
+    paths = [
+        write_rows(tmp_path / f"{i}.csv", rows, unit=unit)
+        for i, (rows, unit) in enumerate(zip(pieces, units, strict=True))
+    ]
     random.shuffle(paths)
     assert_same(whole, regular(paths))
 
@@ -99,7 +107,10 @@ def test_the_same_file_under_two_names(whole, tmp_path):
 @pytest.mark.parametrize("seed", range(3))
 def test_rows_given_twice_one_by_one(whole, tmp_path, seed):
     again = np.sort(np.random.default_rng(seed).choice(np.arange(50, ROWS - 50), 20, replace=False))
-    assert_same(whole, regular([write_rows(tmp_path / "log.csv", np.insert(np.arange(ROWS), again + 1, again))]))
+    assert_same(
+        whole,
+        regular([write_rows(tmp_path / "log.csv", np.insert(np.arange(ROWS), again + 1, again))]),
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))

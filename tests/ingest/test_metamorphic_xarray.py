@@ -12,7 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gyrostab
-from gyrostab.errors import GyrostabError, MissingUnitError, OptionError, SchemaError, TimeError, UnitError
+from gyrostab.errors import (
+    GyrostabError,
+    MissingUnitError,
+    OptionError,
+    SchemaError,
+    TimeError,
+    UnitError,
+)
 from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.time.grid import TimeGridIndex
@@ -33,7 +40,14 @@ def record(seed: int = 3, *, size: int = SIZE, lost: float = 0.0) -> np.ndarray:
 def make(x: np.ndarray | None = None, *, rate: float = RATE, **options) -> xr.Dataset:
     values = record() if x is None else x
     temperature = 20.0 + np.arange(values.shape[-1]) / 1000
-    return make_log(values, rate=rate, unit="deg/h", start=START, channels={"temperature": (temperature, "degC")}, **options)
+    return make_log(
+        values,
+        rate=rate,
+        unit="deg/h",
+        start=START,
+        channels={"temperature": (temperature, "degC")},
+        **options,
+    )
 
 
 def stamped(log: xr.Dataset) -> xr.Dataset:
@@ -51,7 +65,9 @@ def surface_of(log, *, rate: float, window: int = 800, **options) -> xr.Dataset:
     return made
 
 
-def check_against(log, x: np.ndarray, *, rate: float, rtol: float = 1e-9, window: int = 800) -> None:
+def check_against(
+    log, x: np.ndarray, *, rate: float, rtol: float = 1e-9, window: int = 800
+) -> None:
     """The surface of a log is that of the samples `x`, by the definition."""
     made = surface_of(log, rate=rate, window=window)
     for row, values in enumerate(np.atleast_2d(x)):
@@ -67,8 +83,12 @@ def test_a_stride(explicit, chunked, stride):
     x = record(lost=0.05)
     log = stamped(make(x)) if explicit else make(x)
     log = log.chunk(time=999) if chunked else log
-    check_against(log.isel(time=slice(None, None, stride)), x[:, ::stride], rate=RATE / stride, window=400)
-    check_against(log.isel(time=np.arange(0, SIZE, stride)), x[:, ::stride], rate=RATE / stride, window=400)
+    check_against(
+        log.isel(time=slice(None, None, stride)), x[:, ::stride], rate=RATE / stride, window=400
+    )
+    check_against(
+        log.isel(time=np.arange(0, SIZE, stride)), x[:, ::stride], rate=RATE / stride, window=400
+    )
 
 
 @pytest.mark.parametrize("explicit", [False, True])
@@ -102,7 +122,9 @@ def test_means_of_groups_have_their_own_rate():
     seconds = x.reshape(2, -1, 100).mean(axis=2)
     with pytest.raises(OptionError, match="longer than the record"):
         gyrostab.davar(make(x).resample(time="1s").mean(), window="10min")
-    made = gyrostab.davar(make(x).resample(time="1s").mean(), window="60s", taus=[1.0, 3.0], min_strict=0.0).load()
+    made = gyrostab.davar(
+        make(x).resample(time="1s").mean(), window="60s", taus=[1.0, 3.0], min_strict=0.0
+    ).load()
     avar, _ = direct_surface(seconds[0], 60, 6, [1, 3])
     np.testing.assert_allclose(made.avar[0], avar, rtol=1e-9)
 
@@ -119,9 +141,15 @@ ORDER = {
     "reversed": lambda log: log.isel(time=slice(None, None, -1)),
     "reversed by sorting": lambda log: log.sortby("time", ascending=False),
     "shuffled": lambda log: log.isel(time=np.random.default_rng(1).permutation(SIZE)),
-    "an overlap": lambda log: xr.concat([log.isel(time=slice(0, 900)), log.isel(time=slice(800, 2000))], "time"),
-    "the second half first": lambda log: xr.concat([log.isel(time=slice(3000, 6000)), log.isel(time=slice(0, 3000))], "time"),
-    "a sample twice": lambda log: xr.concat([log.isel(time=slice(0, 900)), log.isel(time=slice(899, 2000))], "time"),
+    "an overlap": lambda log: xr.concat(
+        [log.isel(time=slice(0, 900)), log.isel(time=slice(800, 2000))], "time"
+    ),
+    "the second half first": lambda log: xr.concat(
+        [log.isel(time=slice(3000, 6000)), log.isel(time=slice(0, 3000))], "time"
+    ),
+    "a sample twice": lambda log: xr.concat(
+        [log.isel(time=slice(0, 900)), log.isel(time=slice(899, 2000))], "time"
+    ),
     "padded": lambda log: log.pad(time=5),
     "irregular": lambda log: log.assign_coords(
         time=log.time.values + (1e6 * np.random.default_rng(1).uniform(0, 9, SIZE)).astype("m8[ns]")
@@ -129,7 +157,9 @@ ORDER = {
     "half a sample apart": lambda log: xr.concat(
         [
             log.isel(time=slice(0, 900)),
-            log.isel(time=slice(1000, 2000)).pipe(lambda one: one.assign_coords(time=one.time.values + np.timedelta64(5, "ms"))),
+            log.isel(time=slice(1000, 2000)).pipe(
+                lambda one: one.assign_coords(time=one.time.values + np.timedelta64(5, "ms"))
+            ),
         ],
         "time",
     ),
@@ -182,7 +212,10 @@ def test_a_hole_between_two_pieces(explicit):
 
 
 KEEPS = {
-    "a part of the time": (lambda log: log.sel(time=slice("2026-03-01T10:00:10", "2026-03-01T10:00:39.99")), lambda x: x[:, 1000:4000]),
+    "a part of the time": (
+        lambda log: log.sel(time=slice("2026-03-01T10:00:10", "2026-03-01T10:00:39.99")),
+        lambda x: x[:, 1000:4000],
+    ),
     "one axis": (lambda log: log.isel(axis=0), lambda x: x[:1]),
     "one axis by list": (lambda log: log.sel(axis=["y"]), lambda x: x[1:]),
     "axes turned round": (lambda log: log.isel(axis=[1, 0]), lambda x: x[::-1]),
@@ -196,18 +229,28 @@ KEEPS = {
     "a mask": (lambda log: log.where(log.rate > 0), lambda x: np.where(x > 0, x, np.nan)),
     "a mask that drops": (
         lambda log: log.where((log.rate > -1).all("axis"), drop=True),
-        lambda x: np.where((x > -1).all(axis=0), x, np.nan)[:, slice(*(np.flatnonzero((x > -1).all(axis=0))[[0, -1]] + [0, 1]))],
+        lambda x: np.where((x > -1).all(axis=0), x, np.nan)[
+            :, slice(*(np.flatnonzero((x > -1).all(axis=0))[[0, -1]] + [0, 1]))
+        ],
     ),
     "a moving mean": (
         lambda log: log.rolling(time=3).mean(),
-        lambda x: np.pad((x[:, 2:] + x[:, 1:-1] + x[:, :-2]) / 3, ((0, 0), (2, 0)), constant_values=np.nan),
+        lambda x: np.pad(
+            (x[:, 2:] + x[:, 1:-1] + x[:, :-2]) / 3, ((0, 0), (2, 0)), constant_values=np.nan
+        ),
     ),
     "differences": (lambda log: log.diff("time"), lambda x: np.diff(x, axis=1)),
     "the head": (lambda log: log.head(time=3000), lambda x: x[:, :3000]),
-    "shifted": (lambda log: log.shift(time=4), lambda x: np.pad(x[:, :-4], ((0, 0), (4, 0)), constant_values=np.nan)),
+    "shifted": (
+        lambda log: log.shift(time=4),
+        lambda x: np.pad(x[:, :-4], ((0, 0), (4, 0)), constant_values=np.nan),
+    ),
     "single precision": (lambda log: log.astype(np.float32), lambda x: x),
     "without attributes of the dataset": (lambda log: log.drop_attrs(deep=False), lambda x: x),
-    "false attributes": (lambda log: log.assign_attrs(sampling_rate_hz=7.0, kind="angle"), lambda x: x),
+    "false attributes": (
+        lambda log: log.assign_attrs(sampling_rate_hz=7.0, kind="angle"),
+        lambda x: x,
+    ),
 }
 
 
@@ -217,7 +260,9 @@ def test_what_keeps_the_rate(name, explicit):
     change, truth = KEEPS[name]
     x = record()
     log = stamped(make(x)) if explicit else make(x)
-    check_against(change(log), truth(x), rate=RATE, rtol=1e-4 if name == "single precision" else 1e-9)
+    check_against(
+        change(log), truth(x), rate=RATE, rtol=1e-4 if name == "single precision" else 1e-9
+    )
 
 
 @pytest.mark.parametrize("keep", [True, False])
@@ -241,7 +286,9 @@ def test_a_log_of_angles():
     np.testing.assert_allclose(made["avar"][0], avar * 3600**2, rtol=1e-6)
     theta[1000:1200] = np.nan
     avar, count = direct_angle_surface(theta, 800, 800, KS, 1 / RATE)
-    made = surface_of(make_log(theta, rate=RATE, unit="deg", kind="angle", start=START).dropna("time"), rate=RATE)
+    made = surface_of(
+        make_log(theta, rate=RATE, unit="deg", kind="angle", start=START).dropna("time"), rate=RATE
+    )
     np.testing.assert_array_equal(made["count"][0], count)
 
 
@@ -259,9 +306,9 @@ def test_the_grid_of_any_samples(rate, size, stride, lost, resolution, declared,
     """Every kept sample lies where it was, and the rate is that of the grid or a whole part of it."""
     rng = np.random.default_rng(seed)
     log = make_log(np.arange(float(size)), rate=rate, unit="deg/h", start=START)
-    log = log.assign_coords(time=log.time.values.astype(np.int64) // resolution * resolution).assign_coords(
-        time=lambda one: ("time", one.time.values.astype("datetime64[ns]"))
-    )
+    log = log.assign_coords(
+        time=log.time.values.astype(np.int64) // resolution * resolution
+    ).assign_coords(time=lambda one: ("time", one.time.values.astype("datetime64[ns]")))
     if not declared:
         del log.attrs["sampling_rate_hz"]
     kept = np.flatnonzero(rng.random(size) >= lost)
@@ -276,9 +323,14 @@ def test_the_grid_of_any_samples(rate, size, stride, lost, resolution, declared,
     present = ~np.isnan(back.rate.values[0])
     np.testing.assert_array_equal(back.rate.values[0][present], kept)
     stamps = log.time.values[kept]
-    assert np.abs((back.time.values[present] - stamps).astype(np.int64)).max() <= 0.1e9 / back.attrs["sampling_rate_hz"]
+    assert (
+        np.abs((back.time.values[present] - stamps).astype(np.int64)).max()
+        <= 0.1e9 / back.attrs["sampling_rate_hz"]
+    )
     ratio = rate / back.attrs["sampling_rate_hz"]
-    if declared:  # two stamps, each cut to the resolution, bound the rate by one step of it over their span
+    if (
+        declared
+    ):  # two stamps, each cut to the resolution, bound the rate by one step of it over their span
         rounding = resolution / float(np.ptp(stamps.astype(np.int64)))
         assert ratio == pytest.approx(np.gcd.reduce(np.diff(kept)), rel=max(1.001 * rounding, 1e-7))
 
@@ -293,7 +345,9 @@ def test_the_table_of_gaps_follows_the_samples(explicit, tmp_path):
     x = signal(3000, holes=0.0)
     x[:, 1000:1100] = x[:, 2000:2001] = np.nan  # at 20 s and 40 s
     first = log_of(x)
-    log = make_log(x, rate=50.0, unit="deg/h", start="2026-03-01T10:00").assign({name: first[name] for name in first if "gap" in str(name)})
+    log = make_log(x, rate=50.0, unit="deg/h", start="2026-03-01T10:00").assign(
+        {name: first[name] for name in first if "gap" in str(name)}
+    )
     assert gap_rows(log) == [["20.00", 100, "missing"], ["40.00", 1, "missing"]]
     log = stamped(log) if explicit else log
     path = tmp_path / "log.nc"
@@ -302,17 +356,30 @@ def test_the_table_of_gaps_follows_the_samples(explicit, tmp_path):
         return gap_rows(gyrostab.open_log(gyrostab.to_netcdf(changed, path, overwrite=True)))
 
     assert written(log) == [["20.00", 100, "missing"], ["40.00", 1, "missing"]]
-    assert written(log.isel(time=slice(1050, None))) == [["21.00", 50, "missing"], ["40.00", 1, "missing"]]
+    assert written(log.isel(time=slice(1050, None))) == [
+        ["21.00", 50, "missing"],
+        ["40.00", 1, "missing"],
+    ]
     assert written(log.isel(time=slice(0, 900))) == []
     dropped = log.dropna("time", subset=["rate"])
     assert written(dropped) == [["20.00", 100, "missing"], ["40.00", 1, "missing"]]
-    more = dropped.isel(time=np.setdiff1d(np.arange(dropped.sizes["time"]), np.r_[500:510, 990:1000]))
-    assert written(more) == [["10.00", 10, "missing"], ["19.80", 10, "missing"], ["20.00", 100, "missing"], ["40.00", 1, "missing"]]
+    more = dropped.isel(
+        time=np.setdiff1d(np.arange(dropped.sizes["time"]), np.r_[500:510, 990:1000])
+    )
+    assert written(more) == [
+        ["10.00", 10, "missing"],
+        ["19.80", 10, "missing"],
+        ["20.00", 100, "missing"],
+        ["40.00", 1, "missing"],
+    ]
     if explicit:
         with pytest.raises(SchemaError, match="no table of gaps"):
             written(log.coarsen(time=10).mean())
     else:
-        assert written(log.isel(time=slice(0, None, 10))) == [["20.00", 10, "missing"], ["40.00", 1, "missing"]]
+        assert written(log.isel(time=slice(0, None, 10))) == [
+            ["20.00", 10, "missing"],
+            ["40.00", 1, "missing"],
+        ]
         assert written(log.isel(time=slice(1, None, 10))) == [["20.02", 10, "missing"]]
     spoilt = log.drop_vars("gap_start")
     assert "gap_samples" not in as_log(spoilt)
@@ -343,7 +410,9 @@ def test_a_dask_log_is_not_loaded_whole():
     import dask.array as da
 
     data = da.map_blocks(block, chunks=((1,), (1000,) * 500), dtype=float, meta=np.zeros((0, 0)))
-    log = stamped(make_log(data, rate=100.0, unit="deg/h", start=START)).isel(time=np.r_[0:1000, 1300:500_000])
+    log = stamped(make_log(data, rate=100.0, unit="deg/h", start=START)).isel(
+        time=np.r_[0:1000, 1300:500_000]
+    )
     back = as_log(log)
     assert not held
     assert back.sizes["time"] == 500_000
@@ -368,7 +437,9 @@ class TestDataArray:
         radians = make(x).rate.copy(data=x * np.pi / 180 / 3600).assign_attrs(units="rad/s")
         check_against(radians, x, rate=RATE)
         check_against(gyrostab.from_dataarray(make(x).rate / 3600, units="deg/s"), x, rate=RATE)
-        with pytest.raises(MissingUnitError, match=r"gyrostab\.from_dataarray\(da, units='deg/s'\)"):
+        with pytest.raises(
+            MissingUnitError, match=r"gyrostab\.from_dataarray\(da, units='deg/s'\)"
+        ):
             gyrostab.davar(make(x).rate.drop_attrs(), window="8s")
         with pytest.raises(UnitError, match="unit of temperature"):
             gyrostab.davar(make(x).temperature, window="8s")
@@ -378,7 +449,9 @@ class TestDataArray:
     def test_angles(self):
         theta = np.cumsum(record()[0]) / 3600 / RATE
         log = make_log(theta, rate=RATE, unit="deg", kind="angle", start=START)
-        xr.testing.assert_identical(gyrostab.from_dataarray(log.angle).angle.drop_attrs(), log.angle.drop_attrs())
+        xr.testing.assert_identical(
+            gyrostab.from_dataarray(log.angle).angle.drop_attrs(), log.angle.drop_attrs()
+        )
         with pytest.raises(OptionError, match="kind='angle' if they are cumulative"):
             gyrostab.from_dataarray(log.angle.rename("theta"))
         steps = gyrostab.from_dataarray(log.angle.diff("time").rename("theta"), kind="rate")
@@ -411,16 +484,24 @@ class TestDataArray:
 
 class TestDataFrame:
     def frame(self, x: np.ndarray, names=("gyro_x", "gyro_y")) -> pd.DataFrame:
-        return pd.DataFrame(dict(zip(names, x, strict=True)), pd.date_range(START, periods=x.shape[1], freq="10ms"))
+        return pd.DataFrame(
+            dict(zip(names, x, strict=True)), pd.date_range(START, periods=x.shape[1], freq="10ms")
+        )
 
     @pytest.mark.filterwarnings("ignore::UserWarning")
     def test_columns_and_units(self):
         x = record()
         check_against(gyrostab.from_dataframe(self.frame(x), units="deg/h"), x, rate=RATE)
-        check_against(gyrostab.from_dataframe(self.frame(x, ("x", "y")), units="deg/h"), x, rate=RATE)
+        check_against(
+            gyrostab.from_dataframe(self.frame(x, ("x", "y")), units="deg/h"), x, rate=RATE
+        )
         check_against(self.frame(x, ("gyro_x [deg/h]", "gyro_y [deg/h]")), x, rate=RATE)
         check_against(
-            gyrostab.from_dataframe(self.frame(x, ("wx", "wy")), units="deg/h", map={"wx": "gyro_x", "wy": "gyro_y"}), x, rate=RATE
+            gyrostab.from_dataframe(
+                self.frame(x, ("wx", "wy")), units="deg/h", map={"wx": "gyro_x", "wy": "gyro_y"}
+            ),
+            x,
+            rate=RATE,
         )
         series = self.frame(x)["gyro_x"] / 3600
         series.attrs["units"] = "deg/s"
@@ -461,7 +542,9 @@ class TestSurface:
     def test_parts_of_it_are_fitted(self):
         surface = self.surface()
         whole = gyrostab.fit_noise(surface)
-        xr.testing.assert_allclose(gyrostab.fit_noise(surface.isel(time=slice(None, None, 2))).N, whole.N[:, ::2])
+        xr.testing.assert_allclose(
+            gyrostab.fit_noise(surface.isel(time=slice(None, None, 2))).N, whole.N[:, ::2]
+        )
         xr.testing.assert_allclose(gyrostab.fit_noise(surface.sel(axis=["y"])).N, whole.N[1:])
 
     @pytest.mark.parametrize(
@@ -482,7 +565,16 @@ class TestSurface:
             gyrostab.fit_noise(change(self.surface()))
 
     @pytest.mark.parametrize(
-        "function", ["fit_noise", "plot_davar", "plot_davar_3d", "plot_coefficients", "to_kalibr", "correlate", "confidence_interval"]
+        "function",
+        [
+            "fit_noise",
+            "plot_davar",
+            "plot_davar_3d",
+            "plot_coefficients",
+            "to_kalibr",
+            "correlate",
+            "confidence_interval",
+        ],
     )
     def test_an_array_is_no_surface(self, function, tmp_path):
         extra = (tmp_path / "imu.yaml",) if function == "to_kalibr" else ()
@@ -500,10 +592,14 @@ class TestSurface:
         with gyrostab.open_product(path) as back:
             assert back.avar.dims == ("axis", "time", "tau")
             for name in ("avar", "N", "B_upper", "observable", "edf"):
-                np.testing.assert_array_equal(back[name].values, product[name].transpose(*back[name].dims).values)
+                np.testing.assert_array_equal(
+                    back[name].values, product[name].transpose(*back[name].dims).values
+                )
             np.testing.assert_array_equal(back.time.values, product.time.values)
             np.testing.assert_array_equal(back.time_bounds.values, product.time_bounds.values)
-            xr.testing.assert_allclose(gyrostab.fit_noise(gyrostab.open_surface(path)).compute().N, product.N)
+            xr.testing.assert_allclose(
+                gyrostab.fit_noise(gyrostab.open_surface(path)).compute().N, product.N
+            )
 
     @pytest.mark.parametrize("form", ["nc", "zarr"])
     @pytest.mark.parametrize("reader", [gyrostab.open_log, gyrostab.read_log])

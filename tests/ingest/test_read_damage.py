@@ -30,7 +30,9 @@ def matlab(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         "cells": np.array([1.0, "a", np.arange(3)], dtype=object), "long_name_of_a_variable": np.zeros((2, 2, 2)),
     }  # fmt: skip
     for packed in (False, True):
-        savemat(folder / f"packed{packed}.mat", content, do_compression=packed, long_field_names=True)
+        savemat(
+            folder / f"packed{packed}.mat", content, do_compression=packed, long_field_names=True
+        )
     savemat(folder / "four.mat", {"x": np.arange(3.0)}, format="4")
     return sorted(folder.iterdir())
 
@@ -42,10 +44,14 @@ def test_the_structure_of_whole_matlab_files_is_accepted(matlab: list[Path]) -> 
 
 @settings(max_examples=200, deadline=None, derandomize=True, database=None)
 @given(data=st.data())
-def test_a_matlab_file_that_passes_the_check_is_read_or_refused(matlab: list[Path], data: st.DataObject) -> None:
+def test_a_matlab_file_that_passes_the_check_is_read_or_refused(
+    matlab: list[Path], data: st.DataObject
+) -> None:
     whole = matlab[1].read_bytes()
     place = data.draw(st.integers(128, len(whole) - 4))
-    number = data.draw(st.one_of(st.sampled_from([0, 1, 2**31 - 1, 2**31, 2**32 - 1]), st.integers(0, 2**32 - 1)))
+    number = data.draw(
+        st.one_of(st.sampled_from([0, 1, 2**31 - 1, 2**31, 2**32 - 1]), st.integers(0, 2**32 - 1))
+    )
     path = matlab[0].with_name("damaged.mat")
     path.write_bytes(whole[:place] + struct.pack("<I", number) + whole[place + 4 :])
     try:
@@ -57,7 +63,9 @@ def test_a_matlab_file_that_passes_the_check_is_read_or_refused(matlab: list[Pat
 
 
 @pytest.mark.parametrize("size", [129, 200, 1000])
-def test_a_matlab_file_that_is_cut_off_is_refused(matlab: list[Path], tmp_path: Path, size: int) -> None:
+def test_a_matlab_file_that_is_cut_off_is_refused(
+    matlab: list[Path], tmp_path: Path, size: int
+) -> None:
     (tmp_path / "cut.mat").write_bytes(matlab[1].read_bytes()[:size])
     with pytest.raises(FormatError, match=r"cut\.mat: this MATLAB file is damaged or cut off"):
         check_structure(tmp_path / "cut.mat")

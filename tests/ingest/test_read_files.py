@@ -38,7 +38,9 @@ def test_files_are_joined_in_the_order_of_their_stamps(pair: list[Path]) -> None
     check_raw(raw)
     assert raw.attrs["source_files"] == ["b.csv", "a.csv"]
     assert raw.attrs["row_start"] == [0, 2]
-    np.testing.assert_array_equal(raw.time.values, np.array([0, 1, 10, 11, 12], dtype="datetime64[s]"))
+    np.testing.assert_array_equal(
+        raw.time.values, np.array([0, 1, 10, 11, 12], dtype="datetime64[s]")
+    )
     nan = np.nan
     np.testing.assert_array_equal(raw.rate, [[3600, 7200, 1, 3, nan], [nan, nan, 2, 4, 5]])
     np.testing.assert_array_equal(raw.temperature, [nan, nan, 20, nan, 21])
@@ -59,9 +61,14 @@ def test_patterns_and_repeated_paths(pair: list[Path]) -> None:
         read_log(folder / "nothing.csv")
     with pytest.raises(OptionError, match="at least one"):
         read_log([])
-    with pytest.raises(FormatError, match=r"no reader takes this file with the suffix '.xyz'.*text"):
+    with pytest.raises(
+        FormatError, match=r"no reader takes this file with the suffix '.xyz'.*text"
+    ):
         read_log(write(folder / "log.xyz", "?"))
-    with pytest.raises(FormatError, match=r"no reader takes this directory; name the files in it, for instance .*\*\.csv"):
+    with pytest.raises(
+        FormatError,
+        match=r"no reader takes this directory; name the files in it, for instance .*\*\.csv",
+    ):
         read_log(folder)
 
 
@@ -90,7 +97,10 @@ def values() -> np.ndarray:
         [slice(40, 60), slice(0, 25), slice(22, 45)],
         [slice(0, 60), slice(10, 20), slice(30, 60)],
         [slice(0, 60), slice(0, 60)],
-        [np.r_[0:20, 25:30], slice(15, 60)],  # the earlier file has lost rows that the later one has
+        [
+            np.r_[0:20, 25:30],
+            slice(15, 60),
+        ],  # the earlier file has lost rows that the later one has
         [slice(0, 30), np.r_[15:20, 24:60]],  # and the other way round
         [slice(5, 30), slice(5, 60), slice(0, 10)],
     ],
@@ -101,24 +111,39 @@ def test_rows_that_two_files_hold_count_once(
     whole = read_log(write(tmp_path / "whole.csv", HEADER + _rows(values, slice(None))))
     if spilled:
         monkeypatch.setattr(files, "SPILL_BYTES", 100)
-    paths = [write(tmp_path / f"{place}.csv", HEADER + _rows(values, piece)) for place, piece in enumerate(pieces)]
+    paths = [
+        write(tmp_path / f"{place}.csv", HEADER + _rows(values, piece))
+        for place, piece in enumerate(pieces)
+    ]
     raw = read_log(paths)
     np.testing.assert_array_equal(raw.time, whole.time)
     np.testing.assert_array_equal(raw.rate, whole.rate)
-    assert any("and were left out here" in note or "that file was left out" in note for note in raw.attrs["notes"])
+    assert any(
+        "and were left out here" in note or "that file was left out" in note
+        for note in raw.attrs["notes"]
+    )
     assert len(raw.attrs["row_start"]) == len(raw.attrs["source_files"])
 
 
-def test_a_copy_in_another_unit_and_with_damage_is_a_copy(tmp_path: Path, values: np.ndarray) -> None:
+def test_a_copy_in_another_unit_and_with_damage_is_a_copy(
+    tmp_path: Path, values: np.ndarray
+) -> None:
     first = write(tmp_path / "a.csv", HEADER + _rows(values, slice(None)))
-    rows = "".join(f"{n * 1000},{'****' if n == 7 else f'{value / 3600:.12g}'}\n" for n, value in enumerate(np.round(values, 3)))
+    rows = "".join(
+        f"{n * 1000},{'****' if n == 7 else f'{value / 3600:.12g}'}\n"
+        for n, value in enumerate(np.round(values, 3))
+    )
     second = write(tmp_path / "b.csv", "time [ms],gyro_x [deg/s]\n" + rows)
     raw = read_log([first, second])
     np.testing.assert_array_equal(raw.rate, read_log(first).rate)
-    assert any(note.startswith("a.csv: all 60 rows of b.csv are here too") for note in raw.attrs["notes"])
+    assert any(
+        note.startswith("a.csv: all 60 rows of b.csv are here too") for note in raw.attrs["notes"]
+    )
 
 
-def test_a_clock_that_begins_again_in_the_next_file_is_no_overlap(tmp_path: Path, values: np.ndarray) -> None:
+def test_a_clock_that_begins_again_in_the_next_file_is_no_overlap(
+    tmp_path: Path, values: np.ndarray
+) -> None:
     first = write(tmp_path / "a.csv", HEADER + _rows(values, slice(None)))
     second = write(tmp_path / "b.csv", HEADER + _rows(values[::-1], slice(None)))
     raw = read_log([first, second])
@@ -133,7 +158,10 @@ def test_text_is_read_whatever_its_name_is(pair: list[Path], name: str) -> None:
 
 
 def test_files_without_stamps_keep_their_order_and_do_not_mix(tmp_path: Path) -> None:
-    first, second = (write(tmp_path / name, f"gyro_x [deg/h]\n{value}\n{value}\n") for name, value in (("z.csv", 1), ("a.csv", 2)))
+    first, second = (
+        write(tmp_path / name, f"gyro_x [deg/h]\n{value}\n{value}\n")
+        for name, value in (("z.csv", 1), ("a.csv", 2))
+    )
     raw = read_log([first, second], rate=10, start="2026-01-01")
     np.testing.assert_array_equal(raw.rate[0], [1, 1, 2, 2])
     assert raw.attrs["start"] == "2026-01-01"
@@ -146,7 +174,10 @@ def test_kinds_and_channel_units_must_agree(tmp_path: Path) -> None:
     rate = write(tmp_path / "rate.csv", "time [s],gyro_x [deg/h],flow [l/min]\n0,1,1\n1,2,1\n")
     angle = write(tmp_path / "angle.csv", "time [s],angle_x [deg]\n2,1\n3,2\n")
     other = write(tmp_path / "other.csv", "time [s],gyro_x [deg/h],flow [m3/h]\n2,1,1\n3,2,1\n")
-    with pytest.raises(UnitError, match=r"rate.csv holds a gyro signal of kind 'rate', angle.csv of kind 'increment'"):
+    with pytest.raises(
+        UnitError,
+        match=r"rate.csv holds a gyro signal of kind 'rate', angle.csv of kind 'increment'",
+    ):
         read_log([rate, angle], kind="rate")
     with pytest.raises(UnitError, match=r"channel 'flow' has different units"):
         read_log([rate, other])
@@ -160,14 +191,24 @@ def test_a_map_that_fits_one_of_the_files_is_no_slip(pair: list[Path]) -> None:
 
 
 def test_channels_of_another_file_keep_their_own_time(tmp_path: Path) -> None:
-    log = write(tmp_path / "log.csv", "time [s],gyro_x [deg/h]\n" + "".join(f"{n},{n}\n" for n in range(10)))
-    rows = "1970-01-01T00:00:00,20,\n1970-01-01T00:00:04,,101325\nnever,21,1\n1970-01-01T00:00:08,22,\n" + "1970-01-01T00:00:09,,\n" * 5
-    slow = write(tmp_path / "slow.csv", "time,temperature [degC],pressure [Pa],gyro_x [deg/h]\n" + rows.replace("\n", ",1\n"))
+    log = write(
+        tmp_path / "log.csv", "time [s],gyro_x [deg/h]\n" + "".join(f"{n},{n}\n" for n in range(10))
+    )
+    rows = (
+        "1970-01-01T00:00:00,20,\n1970-01-01T00:00:04,,101325\nnever,21,1\n1970-01-01T00:00:08,22,\n"
+        + "1970-01-01T00:00:09,,\n" * 5
+    )
+    slow = write(
+        tmp_path / "slow.csv",
+        "time,temperature [degC],pressure [Pa],gyro_x [deg/h]\n" + rows.replace("\n", ",1\n"),
+    )
     raw = read_log(log, channel=slow)
     check_raw(raw)
     assert raw.temperature.dims == ("time_temperature",)
     np.testing.assert_array_equal(raw.temperature, [20, 22])
-    np.testing.assert_array_equal(raw.time_temperature.values, np.array([0, 8], dtype="datetime64[s]"))
+    np.testing.assert_array_equal(
+        raw.time_temperature.values, np.array([0, 8], dtype="datetime64[s]")
+    )
     np.testing.assert_array_equal(raw.pressure, [101325])
     assert raw.temperature.attrs["units"] == "degree_Celsius"
     np.testing.assert_array_equal(raw.rate[0], np.arange(10))
@@ -180,7 +221,10 @@ def test_channels_of_another_file_keep_their_own_time(tmp_path: Path) -> None:
 def test_channel_files_that_cannot_serve_are_explained(tmp_path: Path) -> None:
     log = write(tmp_path / "log.csv", HEADER + "0,1,1,20\n1,1,1,20\n")
     doubled = write(tmp_path / "slow.csv", "time [s],temperature [degC]\n0,1\n1,1\n")
-    with pytest.raises(OptionError, match=r"channel 'temperature' of slow.csv is in the log too.*--map temperature=temperature_2"):
+    with pytest.raises(
+        OptionError,
+        match=r"channel 'temperature' of slow.csv is in the log too.*--map temperature=temperature_2",
+    ):
         read_log(log, channel=doubled)
     with pytest.raises(OptionError, match=r"no channel with a unit"):
         read_log(log, channel=write(tmp_path / "bare.csv", "time [s],speed\n0,1\n1,1\n"))
@@ -198,10 +242,13 @@ def test_channels_from_netcdf(tmp_path: Path) -> None:
         pressure = file.createVariable("pressure", "f4", ("time",))
         pressure.units = "kPa"
         pressure[:] = [1, 2, 3]
-    np.testing.assert_array_equal(read_log(log, channel=tmp_path / "slow.nc").pressure, [1000, 2000, 3000])
+    np.testing.assert_array_equal(
+        read_log(log, channel=tmp_path / "slow.nc").pressure, [1000, 2000, 3000]
+    )
 
 
-# --- logs that gyrostab wrote ------------------------------------------------------------------------------------
+# --- logs that gyrostab wrote
+# ------------------------------------------------------------------------------------
 
 
 def regular_log(size: int = 5000, rate: float = 300.0) -> xr.Dataset:
@@ -220,12 +267,18 @@ def regular_log(size: int = 5000, rate: float = 300.0) -> xr.Dataset:
 
 
 def store(log: xr.Dataset, path: Path) -> Path:
-    plain = log.assign_coords(time=("time", log.time.values)).drop_indexes("time") if "time" in log.xindexes else log
+    plain = (
+        log.assign_coords(time=("time", log.time.values)).drop_indexes("time")
+        if "time" in log.xindexes
+        else log
+    )
     encoding = {"time": {"units": "nanoseconds since 2026-01-01", "dtype": "int64"}}
     if path.suffix == ".zarr":
         plain.chunk(time=1000).to_zarr(path, encoding=encoding, consolidated=False)
     else:
-        plain.to_netcdf(path, encoding={**encoding, "axis": {"dtype": "S1"}})  # netCDF-C crashes on strings of a file opened twice
+        plain.to_netcdf(
+            path, encoding={**encoding, "axis": {"dtype": "S1"}}
+        )  # netCDF-C crashes on strings of a file opened twice
     return path
 
 
@@ -245,7 +298,9 @@ def test_a_log_of_gyrostab_comes_back_lazily_on_its_exact_grid(tmp_path: Path, n
     assert back.temperature.dims == ("time_temperature",)
     summary = scan_file(path)
     assert (summary.format, summary.axes, summary.n_rows) == ("gyrostab log", ("x", "z"), 5000)
-    assert summary.channels == (("vibration", "temperature") if path.suffix == ".nc" else ("temperature", "vibration"))
+    assert summary.channels == (
+        ("vibration", "temperature") if path.suffix == ".nc" else ("temperature", "vibration")
+    )
     assert (summary.first, summary.last) == (log.time.values[0], log.time.values[-1])
 
 
@@ -254,7 +309,10 @@ def test_channels_of_a_zarr_store_come_in_the_order_of_their_names(tmp_path: Pat
     """Its directory keeps no order."""
     names = [f"channel_{letter}" for letter in "gbhdafce"]
     log = regular_log(100)
-    path = store(log.assign({name: ("time", log.vibration.values, {"units": "g"}) for name in names}), tmp_path / "log.zarr")
+    path = store(
+        log.assign({name: ("time", log.vibration.values, {"units": "g"}) for name in names}),
+        tmp_path / "log.zarr",
+    )
     assert scan_file(path).channels == (*sorted(names), "temperature", "vibration")
     assert list(read_log(path).data_vars) == [*sorted(names), "rate", "temperature", "vibration"]
 
@@ -291,11 +349,19 @@ def test_stored_stamps_off_the_grid_are_kept_as_rows(tmp_path: Path) -> None:
 
 def test_a_log_takes_channels_and_gives_its_own(tmp_path: Path) -> None:
     path = store(regular_log(), tmp_path / "log.nc")
-    extra = write(tmp_path / "extra.csv", "time,pressure [Pa]\n2026-01-01T00:00:01,5\n2026-01-01T00:00:02,6\n")
+    extra = write(
+        tmp_path / "extra.csv", "time,pressure [Pa]\n2026-01-01T00:00:01,5\n2026-01-01T00:00:02,6\n"
+    )
     log = read_log(path, channel=extra)
     check_log(log)
     np.testing.assert_array_equal(log.pressure, [5, 6])
-    raw = read_log(write(tmp_path / "raw.csv", "time,gyro_x [deg/h]\n2026-01-01T00:00:00,5\n2026-01-01T00:00:02,6\n"), channel=path)
+    raw = read_log(
+        write(
+            tmp_path / "raw.csv",
+            "time,gyro_x [deg/h]\n2026-01-01T00:00:00,5\n2026-01-01T00:00:02,6\n",
+        ),
+        channel=path,
+    )
     assert raw.vibration.sizes["time_vibration"] == 5000
     assert raw.temperature.sizes["time_temperature"] == 4
 
@@ -307,7 +373,8 @@ def test_a_log_in_wrong_units_is_refused(tmp_path: Path) -> None:
         read_log(store(log, tmp_path / "log.nc"))
 
 
-# --- registry ----------------------------------------------------------------------------------------------------
+# --- registry
+# ----------------------------------------------------------------------------------------------------
 
 
 class _Point:
@@ -335,7 +402,9 @@ class _Point:
         return Counts
 
 
-def test_a_format_of_another_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_format_of_another_package_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     points = {**files._registered(), "counts": _Point()}
     monkeypatch.setattr(files, "_registered", lambda: points)
     path = write(tmp_path / "log.counts", "1\n2\n3\n")
@@ -345,8 +414,6 @@ def test_a_format_of_another_package_is_found(tmp_path: Path, monkeypatch: pytes
 
 
 def test_heavy_libraries_load_when_they_are_used() -> None:
-    code = (
-        "import sys, gyrostab.ingest; print([m for m in ('pyarrow.csv', 'netCDF4', 'h5py', 'scipy.io', 'dask.array') if m in sys.modules])"
-    )
+    code = "import sys, gyrostab.ingest; print([m for m in ('pyarrow.csv', 'netCDF4', 'h5py', 'scipy.io', 'dask.array') if m in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

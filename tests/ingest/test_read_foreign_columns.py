@@ -54,7 +54,17 @@ def test_a_header_with_parentheses_needs_no_units_from_the_user(tmp_path: Path) 
     assert raw.temperature.values.tolist() == [20, 21]
 
 
-@pytest.mark.parametrize("header", ["temperature", "temperature [furlong]", "temperature [x8103]", "mag_x", "pressure [V]", "accel_z"])
+@pytest.mark.parametrize(
+    "header",
+    [
+        "temperature",
+        "temperature [furlong]",
+        "temperature [x8103]",
+        "mag_x",
+        "pressure [V]",
+        "accel_z",
+    ],
+)
 def test_a_channel_that_nobody_asked_for_stops_no_run(tmp_path: Path, header: str) -> None:
     path = write(tmp_path, f"time [s],gyro_x [deg/h],{header}\n0,1,2\n1,2,3\n")
     raw = read_log(path)
@@ -62,11 +72,20 @@ def test_a_channel_that_nobody_asked_for_stops_no_run(tmp_path: Path, header: st
     assert has_note(raw, "left out", header)
 
 
-@pytest.mark.parametrize(("header", "unit"), [("temperature", "degC"), ("temperature [furlong]", "degC"), ("pressure [x8103]", "Pa")])
-def test_a_note_says_how_to_keep_a_channel_and_that_works(tmp_path: Path, header: str, unit: str) -> None:
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [("temperature", "degC"), ("temperature [furlong]", "degC"), ("pressure [x8103]", "Pa")],
+)
+def test_a_note_says_how_to_keep_a_channel_and_that_works(
+    tmp_path: Path, header: str, unit: str
+) -> None:
     path = write(tmp_path, f"time [s],gyro_x [deg/h],{header}\n0,1,2\n1,2,3\n")
     name = header.split(" ")[0]
-    advice = next(found[1] for note in read_log(path).attrs["notes"] if (found := re.search(r"--unit (\S+?=[^\s,;)]+)", note)))
+    advice = next(
+        found[1]
+        for note in read_log(path).attrs["notes"]
+        if (found := re.search(r"--unit (\S+?=[^\s,;)]+)", note))
+    )
     assert advice.startswith(f"{name}=")
     key, _, value = advice.partition("=")
     kept = read_log(path, unit={key: unit if value == "UNIT" else value})
@@ -91,7 +110,9 @@ def test_a_note_says_how_to_keep_a_channel_and_that_works(tmp_path: Path, header
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"kind": "angle"}),
     ],
 )
-def test_the_advice_of_a_message_works_when_it_is_followed(tmp_path: Path, text: str, options: dict) -> None:
+def test_the_advice_of_a_message_works_when_it_is_followed(
+    tmp_path: Path, text: str, options: dict
+) -> None:
     path = write(tmp_path, text)
     with pytest.raises(GyrostabError) as caught:
         read_log(path, **options)
@@ -132,8 +153,17 @@ def test_columns_of_one_name_are_kept_apart(tmp_path: Path) -> None:
     header = "time [s],gyro_x [deg/h],Flags [x8103],Flags [x8108],temperature [degC],temperature [degF],load [%],load [%]"
     path = write(tmp_path, header + "\n0,1,3,4,20,68,5,6\n1,2,3,4,20,68,5,6\n")
     raw = read_log(path)
-    expected = {"Flags": 3, "Flags_2": 4, "temperature": 20, "temperature_2": 20, "load": 5, "load_2": 6}
-    assert {name: float(raw[name][0]) for name in raw.data_vars if name != "rate"} == pytest.approx(expected)
+    expected = {
+        "Flags": 3,
+        "Flags_2": 4,
+        "temperature": 20,
+        "temperature_2": 20,
+        "load": 5,
+        "load_2": 6,
+    }
+    assert {name: float(raw[name][0]) for name in raw.data_vars if name != "rate"} == pytest.approx(
+        expected
+    )
     assert has_note(raw, "kept apart", "'Flags [x8108]' is 'Flags_2'")
     assert "load_2" not in read_log(path, map={"load_2": "-"})
     assert "Flags_2" not in read_log(path, map={"Flags [x8108]": "-"})
@@ -152,11 +182,21 @@ def test_a_mapped_axis_wins_over_a_column_of_its_name(tmp_path: Path) -> None:
         ("time [s],timestamp [us],gyro_x [deg/h]\n0,0,1\n1,1000000,2\n", "time [s]", [0, 1]),
         ("time [s],timestamp [us],gyro_x [deg/h]\n0,0,1\n0,1000000,2\n", "timestamp [us]", [0, 1]),
         ("Time [s],time (ms),gyro_x [deg/h]\n7,0,1\n6,1000,2\n", "time (ms)", [0, 1]),
-        ("time,timestamp [ms],gyro_x [deg/h]\n1970-01-01T00:00:03,0,1\n1970-01-01T00:00:04,1000,2\n", "time", [3, 4]),
-        ("n,When,gyro_x [deg/h]\n7,1970-01-01T00:00:03,1\n8,1970-01-01T00:00:04,2\n", "When", [3, 4]),
+        (
+            "time,timestamp [ms],gyro_x [deg/h]\n1970-01-01T00:00:03,0,1\n1970-01-01T00:00:04,1000,2\n",
+            "time",
+            [3, 4],
+        ),
+        (
+            "n,When,gyro_x [deg/h]\n7,1970-01-01T00:00:03,1\n8,1970-01-01T00:00:04,2\n",
+            "When",
+            [3, 4],
+        ),
     ],
 )
-def test_the_time_column_is_chosen_and_named(tmp_path: Path, text: str, used: str, stamps: list[float]) -> None:
+def test_the_time_column_is_chosen_and_named(
+    tmp_path: Path, text: str, used: str, stamps: list[float]
+) -> None:
     raw = read_log(write(tmp_path, text))
     assert seconds(raw) == stamps
     assert has_note(raw, f"{used!r}", "time")
@@ -164,7 +204,9 @@ def test_the_time_column_is_chosen_and_named(tmp_path: Path, text: str, used: st
 
 
 def test_another_time_column_can_be_named(tmp_path: Path) -> None:
-    path = write(tmp_path, "Time [s],Time::TimeStartup [ns],gyro_x [deg/h]\n0,0,1\n1,2000000000,2\n")
+    path = write(
+        tmp_path, "Time [s],Time::TimeStartup [ns],gyro_x [deg/h]\n0,0,1\n1,2000000000,2\n"
+    )
     assert seconds(read_log(path)) == [0, 1]
     assert seconds(read_log(path, map={"Time::TimeStartup": "time"})) == [0, 2]
 
@@ -179,5 +221,8 @@ def test_durations_as_matlab_writes_them_are_the_time(tmp_path: Path) -> None:
 
 def test_aligned_columns_without_a_header_are_mapped_by_number(tmp_path: Path) -> None:
     rows = "".join(f"{n / 100:12.4f}{n:10.3f}{-n:10.3f}   \n" for n in range(5))
-    raw = read_log(write(tmp_path, rows, "log.txt"), map={"0": "time [s]", "1": "gyro_x [deg/h]", "2": "gyro_y [deg/h]"})
+    raw = read_log(
+        write(tmp_path, rows, "log.txt"),
+        map={"0": "time [s]", "1": "gyro_x [deg/h]", "2": "gyro_y [deg/h]"},
+    )
     assert raw.rate.values.tolist() == [[0, 1, 2, 3, 4], [0, -1, -2, -3, -4]]

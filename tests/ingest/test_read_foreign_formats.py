@@ -25,8 +25,16 @@ def write_miniseed(path: Path, codes: str = "ENZ", band: str = "H") -> bytes:
     with path.open("wb") as file:
         for code, values in zip(codes, VALUES, strict=True):
             traces = MS3TraceList()
-            traces.add_data(f"FDSN:XX_TOOL__{band}_J_{code}", values, "i", RATE, starttime=int(START.astype(np.int64)))
-            for record in traces.generate(max_record_length=512, encoding=DataEncoding.STEIM2, format_version=2):
+            traces.add_data(
+                f"FDSN:XX_TOOL__{band}_J_{code}",
+                values,
+                "i",
+                RATE,
+                starttime=int(START.astype(np.int64)),
+            )
+            for record in traces.generate(
+                max_record_length=512, encoding=DataEncoding.STEIM2, format_version=2
+            ):
                 file.write(record)
     return path.read_bytes()
 
@@ -40,7 +48,9 @@ def test_rotation_channels_of_miniseed_are_axes(tmp_path: Path, codes: str, band
     raw = read_log(path, unit={"gyro": "0.5 deg/h"})
     assert raw.axis.values.tolist() == sorted(codes.lower())
     assert np.array_equal(raw.rate.values, VALUES * 0.5)
-    assert any(f"{band}J{codes[0]} is gyro_{codes[0].lower()}" in note for note in raw.attrs["notes"])
+    assert any(
+        f"{band}J{codes[0]} is gyro_{codes[0].lower()}" in note for note in raw.attrs["notes"]
+    )
     mapped = read_log(path, map={f"{band}J{codes[2]}": "gyro_w"}, unit={"gyro": "0.5 deg/h"})
     assert mapped.axis.values.tolist() == ["w"]
 
@@ -82,9 +92,14 @@ def write_las(path: Path, date: str, clock: str, rows: list[str]) -> Path:
         ("", "", ["14/03/2026 23:59:59", "15/03/2026 00:00:00.500"]),
     ],
 )
-def test_date_and_time_curves_of_las_are_the_time(tmp_path: Path, date: str, clock: str, rows: list[str]) -> None:
+def test_date_and_time_curves_of_las_are_the_time(
+    tmp_path: Path, date: str, clock: str, rows: list[str]
+) -> None:
     raw = read_log(write_las(tmp_path / "a.las", date, clock, rows))
-    assert raw.time.values.astype(str).tolist() == ["2026-03-14T23:59:59.000000000", "2026-03-15T00:00:00.500000000"]
+    assert raw.time.values.astype(str).tolist() == [
+        "2026-03-14T23:59:59.000000000",
+        "2026-03-15T00:00:00.500000000",
+    ]
     assert raw.rate[0].values.tolist() == [1.5, 1.5]
     assert list(raw.data_vars) == ["rate", "temperature"]
 
@@ -102,10 +117,20 @@ def matlab_element(kind: int, data: bytes) -> bytes:
 
 def write_timeseries(path: Path) -> None:
     """A MATLAB 5 file with a timeseries `ts`: an object, whose values are where MATLAB alone finds them."""
-    inner = matlab_element(6, struct.pack("<II", 13, 0)) + matlab_element(5, struct.pack("<ii", 6, 1)) + matlab_element(1, b"")
+    inner = (
+        matlab_element(6, struct.pack("<II", 13, 0))
+        + matlab_element(5, struct.pack("<ii", 6, 1))
+        + matlab_element(1, b"")
+    )
     inner += matlab_element(6, struct.pack("<6I", 0xDD000000, 2, 1, 1, 1, 1))
-    body = matlab_element(6, struct.pack("<II", 17, 0)) + b"".join(matlab_element(1, text) for text in (b"ts", b"MCOS", b"timeseries"))
-    head = b"MATLAB 5.0 MAT-file, made by hand".ljust(116) + b"\0" * 8 + struct.pack("<HH", 0x0100, 0x4D49)
+    body = matlab_element(6, struct.pack("<II", 17, 0)) + b"".join(
+        matlab_element(1, text) for text in (b"ts", b"MCOS", b"timeseries")
+    )
+    head = (
+        b"MATLAB 5.0 MAT-file, made by hand".ljust(116)
+        + b"\0" * 8
+        + struct.pack("<HH", 0x0100, 0x4D49)
+    )
     path.write_bytes(head + matlab_element(14, body + matlab_element(14, inner)))
 
 
@@ -142,7 +167,11 @@ def test_fields_of_a_structure_are_known_by_their_own_names(tmp_path: Path) -> N
     from scipy.io import savemat
 
     time, rates = np.arange(5) / 10, np.arange(15.0).reshape(3, 5)
-    fields = {"time_ms": time * 1e3, "temperature": 20 + time, **dict(zip(("gyro_x", "gyro_y", "gyro_z"), rates, strict=True))}
+    fields = {
+        "time_ms": time * 1e3,
+        "temperature": 20 + time,
+        **dict(zip(("gyro_x", "gyro_y", "gyro_z"), rates, strict=True)),
+    }
     savemat(tmp_path / "s.mat", {"S": fields})
     raw = read_log(tmp_path / "s.mat", unit={"gyro": "deg/h", "temperature": "degC"})
     assert np.array_equal(raw.rate.values, rates)
@@ -156,11 +185,28 @@ def test_fields_of_a_structure_are_known_by_their_own_names(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [
-        ("flight.bin", b"\xa3\x95\x80\x80\x59FMT\0" + bytes(80), r"ArduPilot DataFlash.*mavlogdump.*GyrX=gyro_x"),
-        ("flight.log", b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\nIMU, 1, 2, 3\n", "ArduPilot DataFlash"),
-        ("log.xml", b'<?xml version="1.0"?>\n<logs xmlns="http://www.witsml.org/schemas/1series" version="1.4.1.1">', "WITSML.*LAS or CSV"),
+        (
+            "flight.bin",
+            b"\xa3\x95\x80\x80\x59FMT\0" + bytes(80),
+            r"ArduPilot DataFlash.*mavlogdump.*GyrX=gyro_x",
+        ),
+        (
+            "flight.log",
+            b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\nIMU, 1, 2, 3\n",
+            "ArduPilot DataFlash",
+        ),
+        (
+            "log.xml",
+            b'<?xml version="1.0"?>\n<logs xmlns="http://www.witsml.org/schemas/1series" version="1.4.1.1">',
+            "WITSML.*LAS or CSV",
+        ),
         ("a.gps", b"\xaa\x44\x12\x1c" + bytes(100), "NovAtel.*RAWIMU"),
-        ("a.log", b"#RAWIMUSA,COM1,0,0.0,FINESTEERING,1936,1.0,0,0,0;1936,1.0,77,1,2,3,4,5,6*00000000\r\n" * 3, "NovAtel"),
+        (
+            "a.log",
+            b"#RAWIMUSA,COM1,0,0.0,FINESTEERING,1936,1.0,0,0,0;1936,1.0,77,1,2,3,4,5,6*00000000\r\n"
+            * 3,
+            "NovAtel",
+        ),
         ("a.txt", b"%RAWIMUSA,1936,1.002;1936,1.0,77,1,2,3,4,5,6*00000000\r\n" * 3, "NovAtel"),
         ("x.rda", gzip.compress(b"RDX3\nX\n" + bytes(200), mtime=0), r"R data.*write\.csv"),
         ("x.csv", b"RDX2\nX\n" + bytes(200), "R data"),
@@ -169,7 +215,9 @@ def test_fields_of_a_structure_are_known_by_their_own_names(tmp_path: Path) -> N
         ("a.db3", b"SQLite format 3\0" + bytes(100), "SQLite"),
     ],
 )
-def test_known_formats_that_are_not_read_are_named(tmp_path: Path, name: str, data: bytes, message: str) -> None:
+def test_known_formats_that_are_not_read_are_named(
+    tmp_path: Path, name: str, data: bytes, message: str
+) -> None:
     (tmp_path / name).write_bytes(data)
     for look in (read_log, scan_file):
         with pytest.raises(FormatError, match=message):

@@ -41,7 +41,10 @@ def columns() -> list[np.ndarray]:
 def as_text(path: Path, separator: str = ",") -> dict[str, Any]:
     void = "nan" if separator == " " else ""
     rows = [
-        separator.join(str(int(v)) if i == 0 else void if np.isnan(v) else repr(float(v)) for i, v in enumerate(row))
+        separator.join(
+            str(int(v)) if i == 0 else void if np.isnan(v) else repr(float(v))
+            for i, v in enumerate(row)
+        )
         for row in zip(*columns(), strict=True)
     ]
     text = "# tool 7\n" + separator.join(HEADERS) + "\n" + "\n".join(rows) + "\n"
@@ -53,13 +56,18 @@ def as_text(path: Path, separator: str = ",") -> dict[str, Any]:
 
 
 def as_parquet(path: Path) -> dict[str, Any]:
-    parquet.write_table(pa.table(dict(zip(HEADERS, columns(), strict=True))), path, row_group_size=170)
+    parquet.write_table(
+        pa.table(dict(zip(HEADERS, columns(), strict=True))), path, row_group_size=170
+    )
     return {}
 
 
 def _bare() -> dict[str, tuple[str, np.ndarray]]:
     names = [header.split(" [") for header in HEADERS]
-    return {name: (unit.rstrip("]"), values) for (name, unit), values in zip(names, columns(), strict=True)}
+    return {
+        name: (unit.rstrip("]"), values)
+        for (name, unit), values in zip(names, columns(), strict=True)
+    }
 
 
 def as_netcdf(path: Path) -> dict[str, Any]:
@@ -101,7 +109,10 @@ def as_mat5_matrix(path: Path) -> dict[str, Any]:
     names = list(bare)
     table = np.stack([bare[name][1] for name in names[1:]])
     savemat(path, {"log": {"t": bare["time"][1], "DATA": table}, "note": "text", "scalar": 3.0})
-    return {"unit": UNITS, "map": {"log.t": "time", **{f"log.DATA/{i}": name for i, name in enumerate(names[1:])}}}
+    return {
+        "unit": UNITS,
+        "map": {"log.t": "time", **{f"log.DATA/{i}": name for i, name in enumerate(names[1:])}},
+    }
 
 
 def as_mat73(path: Path) -> dict[str, Any]:
@@ -112,7 +123,10 @@ def as_mat73(path: Path) -> dict[str, Any]:
         file["stamp"] = bare["time"][1].reshape(1, -1)
     with path.open("r+b") as raw:
         raw.write(b"MATLAB 7.3 MAT-file, Platform: none".ljust(124) + b"\x00\x02IM")
-    return {"unit": UNITS, "map": {"stamp": "time", **{f"DATA/{i}": name for i, name in enumerate(names[1:])}}}
+    return {
+        "unit": UNITS,
+        "map": {"stamp": "time", **{f"DATA/{i}": name for i, name in enumerate(names[1:])}},
+    }
 
 
 #: file name -> maker; the maker returns the reading options that the format needs.
@@ -132,7 +146,9 @@ CONTRACT: dict[str, Callable[[Path], dict[str, Any]]] = {
 
 
 @pytest.fixture(params=CONTRACT, scope="module")
-def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def made(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, Any]]:
     path = tmp_path_factory.mktemp("contract") / request.param
     return path, CONTRACT[request.param](path)
 
@@ -146,7 +162,9 @@ def test_the_raw_log_is_the_same_in_every_format(made: tuple[Path, dict[str, Any
     raw = read_log(path, **options)
     check_raw(raw)
     stamps, gyro_y, gyro_x, temperature, humidity = columns()
-    np.testing.assert_array_equal(raw.time.values, stamps.astype("datetime64[us]").astype("datetime64[ns]"))
+    np.testing.assert_array_equal(
+        raw.time.values, stamps.astype("datetime64[us]").astype("datetime64[ns]")
+    )
     assert raw.time.dtype == "datetime64[ns]"
     assert list(raw.axis.values) == ["x", "y"]
     np.testing.assert_array_equal(raw.rate.sel(axis="x"), gyro_x * 3600.0)
@@ -177,7 +195,9 @@ def test_a_scan_agrees_with_the_reading(made: tuple[Path, dict[str, Any]]) -> No
     assert roles["time"][0] == "time"
 
 
-def test_columns_on_disk_hold_what_columns_in_memory_hold(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_columns_on_disk_hold_what_columns_in_memory_hold(
+    made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, options = made
     in_memory = read_log(path, **options)
     module = __import__(f"gyrostab.ingest.{scan_file(path).format}", fromlist=["read"])
@@ -203,15 +223,24 @@ def test_float32_rates_convert_in_float64(tmp_path: Path) -> None:
     path = tmp_path / "single.parquet"
     parquet.write_table(pa.table({"gyro_x [rad/s]": values}), path)
     raw = read_log(path, rate=10)
-    np.testing.assert_allclose(raw.rate[0], np.rad2deg(values.astype(np.float64)) * 3600, rtol=1e-14)
+    np.testing.assert_allclose(
+        raw.rate[0], np.rad2deg(values.astype(np.float64)) * 3600, rtol=1e-14
+    )
 
 
 def test_parquet_dates_and_field_units(tmp_path: Path) -> None:
-    stamps = np.datetime64("2026-01-01T00:00:00.000000001", "ns") + np.arange(5) * np.timedelta64(10_000_000, "ns")
+    stamps = np.datetime64("2026-01-01T00:00:00.000000001", "ns") + np.arange(5) * np.timedelta64(
+        10_000_000, "ns"
+    )
     field = pa.field("gyro_z", pa.int16(), metadata={"units": "deg/h"})
     schema = pa.schema([pa.field("Time", pa.timestamp("ns", tz="UTC")), field])
     path = tmp_path / "dates.parquet"
-    parquet.write_table(pa.Table.from_arrays([pa.array(stamps), pa.array([1, None, 3, 4, 5], pa.int16())], schema=schema), path)
+    parquet.write_table(
+        pa.Table.from_arrays(
+            [pa.array(stamps), pa.array([1, None, 3, 4, 5], pa.int16())], schema=schema
+        ),
+        path,
+    )
     raw = read_log(path)
     np.testing.assert_array_equal(raw.time, stamps)
     np.testing.assert_array_equal(raw.rate[0], [1, np.nan, 3, 4, 5])
@@ -220,7 +249,9 @@ def test_parquet_dates_and_field_units(tmp_path: Path) -> None:
 
 def test_float32_stamps_are_pointed_out(tmp_path: Path) -> None:
     path = tmp_path / "single.parquet"
-    parquet.write_table(pa.table({"time [s]": np.arange(5, dtype=np.float32), "gyro_x [deg/h]": np.ones(5)}), path)
+    parquet.write_table(
+        pa.table({"time [s]": np.arange(5, dtype=np.float32), "gyro_x [deg/h]": np.ones(5)}), path
+    )
     assert "float32" in " ".join(read_log(path).attrs["notes"])
 
 
@@ -231,7 +262,9 @@ def test_netcdf_attribute_units_give_way_to_the_option(tmp_path: Path) -> None:
         variable = file.createVariable("BJZ", "i4", ("time",))
         variable.units = "counts"
         variable[:] = [1, 2, 3, 4]
-    with pytest.raises(Exception, match=r"'counts', which is a unit of number, not of rate.*--unit"):
+    with pytest.raises(
+        Exception, match=r"'counts', which is a unit of number, not of rate.*--unit"
+    ):
         read_log(path, rate=20, map={"BJZ": "gyro_z"})
     raw = read_log(path, rate=20, map={"BJZ": "gyro_z"}, unit={"gyro": "0.5 deg/h"})
     np.testing.assert_array_equal(raw.rate[0], [0.5, 1.0, 1.5, 2.0])
@@ -288,7 +321,10 @@ def test_damage_in_the_midst_of_the_data_is_no_fault_of_ours(tmp_path: Path, suf
 def test_plain_hdf5_with_units_as_attributes(tmp_path: Path) -> None:
     path = tmp_path / "log.h5"
     with h5py.File(path, "w") as file:
-        for name, data, units in (("time", [0.0, 0.5, 1.0], "s"), ("gyro_x", [1.0, 2.0, 3.0], "deg/s")):
+        for name, data, units in (
+            ("time", [0.0, 0.5, 1.0], "s"),
+            ("gyro_x", [1.0, 2.0, 3.0], "deg/s"),
+        ):
             file[name] = np.array(data)
             file[name].attrs["units"] = units
     raw = read_log(path)
@@ -330,8 +366,15 @@ def test_buffers_spill_and_give_back() -> None:
         rows = np.array([4, 5, 6, 42])
         np.testing.assert_array_equal(take(found["b"], rows), expected["b"][rows])
         put(found["b"], rows, -1)
-        np.testing.assert_array_equal(found["b"][:], np.where(np.isin(np.arange(43), rows), -1, expected["b"]))
+        np.testing.assert_array_equal(
+            found["b"][:], np.where(np.isin(np.arange(43), rows), -1, expected["b"])
+        )
     spool = Spool()
-    first, second = spool.store(np.arange(5.0)), spool.store(np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]"))
+    first, second = (
+        spool.store(np.arange(5.0)),
+        spool.store(np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]")),
+    )
     np.testing.assert_array_equal(first[1:3], [1, 2])
-    np.testing.assert_array_equal(second[:], np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]"))
+    np.testing.assert_array_equal(
+        second[:], np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]")
+    )

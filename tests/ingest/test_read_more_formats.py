@@ -26,9 +26,14 @@ DEG_H = 3600.0 * np.rad2deg(1e-9)  # of a nanoradian per second
 
 
 def test_blueseis_is_what_its_text_says(recordings: Find) -> None:
-    path, ramp = recordings("fog-blueseis-ramp/FOG.mseed"), recordings("fog-blueseis-ramp/RAMP.mseed")
+    path, ramp = (
+        recordings("fog-blueseis-ramp/FOG.mseed"),
+        recordings("fog-blueseis-ramp/RAMP.mseed"),
+    )
     text = pd.read_csv(recordings("fog-blueseis-ramp/fog_ramp.csv.gz"))
-    log = read_log(path, map={"HJ3": "gyro_z", "YR3": "ramp"}, unit={"gyro": "1 nrad/s"}, channel=ramp)
+    log = read_log(
+        path, map={"HJ3": "gyro_z", "YR3": "ramp"}, unit={"gyro": "1 nrad/s"}, channel=ramp
+    )
     assert np.allclose(log.rate.values[0], text.rate_counts * DEG_H, rtol=1e-7)
     assert np.array_equal(log.ramp.values, text.ramp_counts)
     assert np.array_equal(log.time.values, log.time_ramp.values)
@@ -56,7 +61,9 @@ def test_ring_laser_is_what_its_netcdf_says(recordings: Find) -> None:
     path = recordings("ringlaser-g-3h/romy_eventM7.0.mseed")
     log = read_log(path, map={"BJZ": "gyro_z"}, unit={"gyro": "1 rad/s"})
     with xr.open_dataset(recordings("ringlaser-g-3h/ringlaser_g_3h.nc")) as other:
-        counts = other[next(name for name in other.data_vars if "BJZ" in str(name) or "gyro" in str(name))].values.ravel()
+        counts = other[
+            next(name for name in other.data_vars if "BJZ" in str(name) or "gyro" in str(name))
+        ].values.ravel()
     ours = log.rate.values[0]
     assert np.corrcoef(ours, counts)[0, 1] > 1 - 1e-9
     assert regularise(log).attrs["sampling_rate_hz"] == 20.0
@@ -66,22 +73,40 @@ def test_px4_log_is_what_its_text_says(recordings: Find) -> None:
     axes = {f"gyro_rad[{place}]": f"gyro_{axis}" for place, axis in enumerate("xyz")}
     path = recordings("px4-bench-dropouts/sample.ulg")
     log = read_log(path, map={**axes, "load": "cpu [1]"}, unit={"gyro": "rad/s"})
-    text = read_log(recordings("px4-bench-dropouts/sensor_combined.csv.gz"), map=axes, unit={"gyro": "rad/s", "time": "us"})
+    text = read_log(
+        recordings("px4-bench-dropouts/sensor_combined.csv.gz"),
+        map=axes,
+        unit={"gyro": "rad/s", "time": "us"},
+    )
     assert np.allclose(log.rate.values, text.rate.values, rtol=1e-6)
     assert np.array_equal(log.time.values, text.time.values)
     assert log.cpu.dims == ("time_cpu",)
     assert log.cpu.size == 69
     assert any("lost data 4 times" in note for note in log.attrs["notes"])
     summary = scan_file(path, ReadOptions(map=axes, unit={"gyro": "rad/s"}))
-    assert (summary.axes, summary.n_rows, summary.first) == (("x", "y", "z"), 17070, log.time.values[0])
+    assert (summary.axes, summary.n_rows, summary.first) == (
+        ("x", "y", "z"),
+        17070,
+        log.time.values[0],
+    )
 
 
 def write_miniseed(path: Path, *, gap: int = 0) -> None:
     from pymseed import DataEncoding, MS3TraceList
 
-    def add(file: IO[bytes], code: str, values: Any, kind: str, rate: float, begin: np.datetime64, encoding: Any) -> None:
+    def add(
+        file: IO[bytes],
+        code: str,
+        values: Any,
+        kind: str,
+        rate: float,
+        begin: np.datetime64,
+        encoding: Any,
+    ) -> None:
         traces = MS3TraceList()
-        traces.add_data(f"FDSN:XX_TOOL__{code}", values, kind, rate, starttime=int(begin.astype(np.int64)))
+        traces.add_data(
+            f"FDSN:XX_TOOL__{code}", values, kind, rate, starttime=int(begin.astype(np.int64))
+        )
         for record in traces.generate(max_record_length=512, encoding=encoding):
             file.write(record)
 
@@ -91,10 +116,21 @@ def write_miniseed(path: Path, *, gap: int = 0) -> None:
             begin = STAMPS[first] + np.timedelta64(20_000_000 * gap * (first > 0), "ns")
             for code, values in zip(("H_J_1", "H_J_2"), VALUES.astype(np.int32), strict=True):
                 add(file, code, values[first : first + half], "i", RATE, begin, DataEncoding.STEIM2)
-        add(file, "L_K_O", np.arange(10, dtype=np.float64), "d", 1.0, STAMPS[0], DataEncoding.FLOAT64)
+        add(
+            file,
+            "L_K_O",
+            np.arange(10, dtype=np.float64),
+            "d",
+            1.0,
+            STAMPS[0],
+            DataEncoding.FLOAT64,
+        )
 
 
-MINISEED = {"map": {"HJ1": "gyro_x", "HJ2": "gyro_y", "LKO": "temperature"}, "unit": {"gyro": "0.5 deg/h", "temperature": "degC"}}
+MINISEED = {
+    "map": {"HJ1": "gyro_x", "HJ2": "gyro_y", "LKO": "temperature"},
+    "unit": {"gyro": "0.5 deg/h", "temperature": "degC"},
+}
 
 
 def test_pieces_of_miniseed_leave_a_gap(tmp_path: Path) -> None:
@@ -118,7 +154,9 @@ def test_several_files_with_slow_channels_are_one_log(tmp_path: Path) -> None:
 
 @pytest.fixture
 def las(tmp_path: Path) -> Path:
-    rows = "\n".join(f"{k / RATE:.2f} {x} {-999.25 if k == 3 else y} 21.5" for k, (x, y) in enumerate(VALUES.T))
+    rows = "\n".join(
+        f"{k / RATE:.2f} {x} {-999.25 if k == 3 else y} 21.5" for k, (x, y) in enumerate(VALUES.T)
+    )
     head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 9.98 :\nSTEP.S 0.02 :\nNULL. -999.25 :\n"
     curves = "~C\nTIME.S : time\nGYRO_X.deg/h : rate\nGYRO_Y.deg/h : rate\nTEMPERATURE.degC : in the tool\n~A\n"
     path = tmp_path / "run.las"
@@ -134,20 +172,34 @@ def test_las(las: Path) -> None:
     assert np.array_equal(log.time.values, STAMPS)
     assert (log.temperature.values == 21.5).all()
     summary = scan_file(las, ReadOptions(epoch="2026-03-01T12:00:00"))
-    assert (summary.format, summary.axes, summary.n_rows, summary.last) == ("las", ("x", "y"), ROWS, STAMPS[-1])
+    assert (summary.format, summary.axes, summary.n_rows, summary.last) == (
+        "las",
+        ("x", "y"),
+        ROWS,
+        STAMPS[-1],
+    )
 
 
 def write_tdms(path: Path, *, waveform: bool) -> None:
     from nptdms import ChannelObject, RootObject, TdmsWriter
 
-    clock = {"wf_increment": 1 / RATE, "wf_start_time": STAMPS[0].astype("datetime64[us]"), "wf_start_offset": 0.0}
+    clock = {
+        "wf_increment": 1 / RATE,
+        "wf_start_time": STAMPS[0].astype("datetime64[us]"),
+        "wf_start_offset": 0.0,
+    }
     properties = {"unit_string": "deg/h", **(clock if waveform else {})}
     channels = [
-        ChannelObject("imu", f"gyro_{axis}", values.astype(np.int32), properties) for axis, values in zip("xy", VALUES, strict=True)
+        ChannelObject("imu", f"gyro_{axis}", values.astype(np.int32), properties)
+        for axis, values in zip("xy", VALUES, strict=True)
     ]
     if not waveform:
         channels.append(ChannelObject("imu", "stamp", STAMPS.astype("datetime64[us]")))
-    slow = {"unit_string": "degC", "wf_increment": 1.0, "wf_start_time": STAMPS[0].astype("datetime64[us]")}
+    slow = {
+        "unit_string": "degC",
+        "wf_increment": 1.0,
+        "wf_start_time": STAMPS[0].astype("datetime64[us]"),
+    }
     channels.append(ChannelObject("probe", "temperature", np.arange(10.0), slow))
     with TdmsWriter(str(path)) as writer:
         writer.write_segment([RootObject(), *channels])
@@ -163,7 +215,12 @@ def test_tdms(tmp_path: Path, waveform: bool) -> None:
     assert np.array_equal(log.temperature.values, np.arange(10.0))
     assert np.array_equal(log.time_temperature.values, STAMPS[:ROWS:50])
     summary = scan_file(path)
-    assert (summary.format, summary.axes, summary.channels, summary.n_rows) == ("tdms", ("x", "y"), ("temperature",), ROWS)
+    assert (summary.format, summary.axes, summary.channels, summary.n_rows) == (
+        "tdms",
+        ("x", "y"),
+        ("temperature",),
+        ROWS,
+    )
     assert (summary.first, summary.last) == (STAMPS[0], STAMPS[-1])
 
 
@@ -182,7 +239,9 @@ fields = [
 
 def write_binary(path: Path, order: str, *, tail: bytes = b"") -> None:
     sign = "<" if order == "little" else ">"
-    record = np.dtype([("t", f"{sign}u4"), ("", "V2"), ("x", f"{sign}i2"), ("y", f"{sign}i4"), ("T", f"{sign}f4")])
+    record = np.dtype(
+        [("t", f"{sign}u4"), ("", "V2"), ("x", f"{sign}i2"), ("y", f"{sign}i4"), ("T", f"{sign}f4")]
+    )
     table = np.zeros(ROWS, dtype=record)
     table["t"], table["x"], table["y"], table["T"] = np.arange(ROWS) * 20, *VALUES, 21.5
     path.write_bytes(b"HEADER OF 16 BYT" + table.tobytes() + tail)
@@ -244,12 +303,20 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes) -> N
 
 @pytest.mark.parametrize(
     ("module", "name", "extra"),
-    [("pymseed", "a.mseed", "miniseed"), ("pyulog", "a.ulg", "ulog"), ("nptdms", "a.tdms", "tdms"), ("lasio", "a.las", "las")],
+    [
+        ("pymseed", "a.mseed", "miniseed"),
+        ("pyulog", "a.ulg", "ulog"),
+        ("nptdms", "a.tdms", "tdms"),
+        ("lasio", "a.las", "las"),
+    ],
 )
 def test_a_library_that_is_not_installed_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, name: str, extra: str
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / name).write_bytes(b"~A\n")
-    with pytest.raises(OptionError, match=rf"{name}: reading it needs {module}; install it with pip install 'gyrostab\[{extra}\]'"):
+    with pytest.raises(
+        OptionError,
+        match=rf"{name}: reading it needs {module}; install it with pip install 'gyrostab\[{extra}\]'",
+    ):
         read_log(tmp_path / name)

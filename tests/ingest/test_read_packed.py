@@ -17,7 +17,13 @@ from gyrostab.ingest.columns import buffers
 from gyrostab.ingest.columns.pieces import Counts, Pieces, Spool, Steps, Words
 from gyrostab.ingest.combine import memory
 from gyrostab.ingest.formats import text
-from gyrostab.kernels.encoding.decimals import decimals_of, even_steps, from_decimals, to_decimals, unroll_steps
+from gyrostab.kernels.encoding.decimals import (
+    decimals_of,
+    even_steps,
+    from_decimals,
+    to_decimals,
+    unroll_steps,
+)
 from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
 from gyrostab.store.threads import in_order
 
@@ -34,8 +40,16 @@ def bits(values: np.ndarray) -> np.ndarray:
 )
 @settings(max_examples=150, deadline=None)
 def test_decimals_come_back_as_a_parser_reads_them(wholes, digits, law, missing):
-    texts = [f"{'-' * (n < 0)}{abs(n) // 10**digits}.{abs(n) % 10**digits:0{digits}d}" if digits else str(n) for n in wholes]
-    values = np.array([float(text) for text in texts if float(text) or not text.startswith("-")] + ([] if missing is None else [missing]))
+    texts = [
+        f"{'-' * (n < 0)}{abs(n) // 10**digits}.{abs(n) % 10**digits:0{digits}d}"
+        if digits
+        else str(n)
+        for n in wholes
+    ]
+    values = np.array(
+        [float(text) for text in texts if float(text) or not text.startswith("-")]
+        + ([] if missing is None else [missing])
+    )
     counts, (factor, offset) = np.empty(values.size, np.int32), law
     fits, absent, low, high, whole = to_decimals(values, 10.0**digits, counts)
     known = values[np.isfinite(values)]
@@ -47,7 +61,9 @@ def test_decimals_come_back_as_a_parser_reads_them(wholes, digits, law, missing)
     back = np.empty(values.size)
     from_decimals(counts, 10.0**digits, factor, offset, back)
     wanted = np.where(np.isfinite(values), values, np.nan) * factor + offset
-    np.testing.assert_array_equal(bits(back[np.isfinite(values)]), bits(wanted[np.isfinite(values)]))
+    np.testing.assert_array_equal(
+        bits(back[np.isfinite(values)]), bits(wanted[np.isfinite(values)])
+    )
     assert np.isnan(back[~np.isfinite(values)]).all()
 
 
@@ -85,7 +101,10 @@ def test_uneven_steps_are_not_packed():
 def test_pieces_of_every_kind_in_memory_and_on_disk(where):
     spool = Spool()
     floats = np.array([0.5, np.nan, 1 / 3])
-    pieces = Pieces(np.float64, [Counts(np.array([15, -(2**31), 7], np.int32), 10.0, 3600.0, 1.0), Words(bits(floats))])
+    pieces = Pieces(
+        np.float64,
+        [Counts(np.array([15, -(2**31), 7], np.int32), 10.0, 3600.0, 1.0), Words(bits(floats))],
+    )
     wanted = np.array([1.5 * 3600 + 1, np.nan, 0.7 * 3600 + 1, *floats])
     stamps = np.array([5, 10, 15, 20, 100, 200])
     times = Pieces("datetime64[ns]", [Steps(np.array([[0, 5, 5]]), 4), Words(stamps[4:].copy())])
@@ -113,7 +132,9 @@ def text_log(path: Path, first: int, rows: int, *, decimals: int) -> Path:
     for n in range(rows):
         x, y = rng.normal(scale=30), rng.integers(-500, 500)
         temperature = f"{20 + n / 1000:.2f}" if n % 10 == 0 else ""
-        lines.append(f"{(first + n + 40 * (n > 700)) * 10},{x:.{decimals}f},{'****' if n == 333 else y},{temperature}")
+        lines.append(
+            f"{(first + n + 40 * (n > 700)) * 10},{x:.{decimals}f},{'****' if n == 333 else y},{temperature}"
+        )
     lines[500] = "@@@@,,,"
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -122,7 +143,10 @@ def text_log(path: Path, first: int, rows: int, *, decimals: int) -> Path:
 @pytest.mark.parametrize("limit", [100, 10**9])
 @pytest.mark.parametrize("decimals", [3, 12])
 def test_a_log_that_is_packed_is_the_log(tmp_path, monkeypatch, limit, decimals):
-    paths = [text_log(tmp_path / f"{number}.csv", 1100 * number, 1000, decimals=decimals) for number in range(3)]
+    paths = [
+        text_log(tmp_path / f"{number}.csv", 1100 * number, 1000, decimals=decimals)
+        for number in range(3)
+    ]
     plain = read_log(paths)
     assert isinstance(plain.rate.data, np.ndarray)
     monkeypatch.setattr(buffers, "_SMALL", 0)
@@ -134,7 +158,9 @@ def test_a_log_that_is_packed_is_the_log(tmp_path, monkeypatch, limit, decimals)
 
 
 def test_reading_ahead_ends_with_what_stops_it(tmp_path, monkeypatch):
-    paths = [text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)]
+    paths = [
+        text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)
+    ]
     taken: list[int] = []
     take = text._take
 
@@ -165,14 +191,20 @@ def test_even_stamps_are_placed_as_those_that_are_not_quite():
     """A nanosecond of jitter takes the rows another way through the kernel; more rows than it remembers samples of."""
     rng = np.random.default_rng(5)
     kept = np.sort(rng.choice(50_000, 49_900, replace=False))
-    rows = np.concatenate([kept[:30_000], kept[30_001:30_006], kept[30_000:30_001], kept[30_006:]])  # one row comes late
+    rows = np.concatenate(
+        [kept[:30_000], kept[30_001:30_006], kept[30_000:30_001], kept[30_006:]]
+    )  # one row comes late
     stamps = 7_000_000_000 + rows * 2_500_000
     stamps[123] = NO_STAMP
     found = []
     for jitter in (0, 1):
         state, ring = new_state()
-        shaken = np.where(stamps == NO_STAMP, stamps, stamps + jitter * (np.arange(stamps.size) % 3))
-        runs, events = place(np.arange(stamps.size), shaken, stamps.size, 2_500_000.0, 0.75, 1e9, state, ring)
+        shaken = np.where(
+            stamps == NO_STAMP, stamps, stamps + jitter * (np.arange(stamps.size) % 3)
+        )
+        runs, events = place(
+            np.arange(stamps.size), shaken, stamps.size, 2_500_000.0, 0.75, 1e9, state, ring
+        )
         found.append((runs, events[:, :3], state[:3], np.array(ring)))
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)

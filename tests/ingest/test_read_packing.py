@@ -19,21 +19,36 @@ from gyrostab.ingest.formats.packing import Packing
 ROWS = 60
 
 
-def write(path: Path, stored: np.ndarray, attributes: dict[str, Any], *, time: dict[str, Any] | None = None, form: str = "NETCDF4") -> Path:
+def write(
+    path: Path,
+    stored: np.ndarray,
+    attributes: dict[str, Any],
+    *,
+    time: dict[str, Any] | None = None,
+    form: str = "NETCDF4",
+) -> Path:
     """One gyro axis of the given stored numbers; the fill value goes in with the other attributes."""
     time = {"units": "s", **(time or {})}
     if path.suffix == ".h5":
         with h5py.File(path, "w") as file:
-            for name, values, attrs in (("time", np.arange(ROWS, dtype="i4"), time), ("gyro_x", stored, {"units": "deg/h", **attributes})):
+            for name, values, attrs in (
+                ("time", np.arange(ROWS, dtype="i4"), time),
+                ("gyro_x", stored, {"units": "deg/h", **attributes}),
+            ):
                 file[name] = values
                 file[name].attrs.update(attrs)
         return path
     with netCDF4.Dataset(path, "w", format=form) as file:
         file.createDimension("obs", ROWS)
-        for name, values, attrs in (("time", np.arange(ROWS, dtype="i4"), time), ("gyro_x", stored, {"units": "deg/h", **attributes})):
+        for name, values, attrs in (
+            ("time", np.arange(ROWS, dtype="i4"), time),
+            ("gyro_x", stored, {"units": "deg/h", **attributes}),
+        ):
             endian = "big" if values.dtype.str[0] == ">" and form == "NETCDF4" else "native"
             kind = values.dtype if endian == "big" else values.dtype.newbyteorder("=")
-            variable = file.createVariable(name, kind, ("obs",), fill_value=attrs.pop("_FillValue", None), endian=endian)
+            variable = file.createVariable(
+                name, kind, ("obs",), fill_value=attrs.pop("_FillValue", None), endian=endian
+            )
             variable.set_auto_maskandscale(False)
             variable.setncatts(attrs)
             variable[:] = values
@@ -99,7 +114,9 @@ def test_packed_numbers_become_the_values_that_the_conventions_give(tmp_path, ca
 
 
 @pytest.mark.filterwarnings("ignore:variable 'gyro_x' has multiple fill values")
-@pytest.mark.parametrize("case", ["scale and offset", "several missing", "unsigned, packed", "signed"])
+@pytest.mark.parametrize(
+    "case", ["scale and offset", "several missing", "unsigned, packed", "signed"]
+)
 def test_packed_numbers_become_the_values_that_xarray_gives(tmp_path, case):
     stored, attributes, _ = CASES[case]
     path = write(tmp_path / "log.nc", stored, dict(attributes))
@@ -110,9 +127,21 @@ def test_packed_numbers_become_the_values_that_xarray_gives(tmp_path, case):
 
 TIMES = {
     "counts": ({"scale_factor": 0.5}, 0.5, 0.0),
-    "range in packed units": ({"scale_factor": 0.01, "valid_range": np.array([0, ROWS - 1], "i4")}, 0.01, 0.0),
-    "range in unpacked units": ({"scale_factor": 0.01, "valid_range": np.array([0.0, 0.59])}, 0.01, 0.0),
-    "offset": ({"scale_factor": 0.01, "add_offset": 1_767_225_600.0, "units": "Seconds Since 1970-01-01"}, 0.01, 1_767_225_600.0),
+    "range in packed units": (
+        {"scale_factor": 0.01, "valid_range": np.array([0, ROWS - 1], "i4")},
+        0.01,
+        0.0,
+    ),
+    "range in unpacked units": (
+        {"scale_factor": 0.01, "valid_range": np.array([0.0, 0.59])},
+        0.01,
+        0.0,
+    ),
+    "offset": (
+        {"scale_factor": 0.01, "add_offset": 1_767_225_600.0, "units": "Seconds Since 1970-01-01"},
+        0.01,
+        1_767_225_600.0,
+    ),
     "no whole nanoseconds": ({"scale_factor": 1 / 3, "add_offset": 10.0}, 1 / 3, 10.0),
 }
 
@@ -123,19 +152,35 @@ def test_packed_stamps_keep_every_row(tmp_path, case, suffix):
     attributes, step, start = TIMES[case]
     raw = read_log(write(tmp_path / f"log{suffix}", COUNTS, {}, time=dict(attributes)))
     wanted = np.rint((start + step * np.arange(ROWS)) * 1e9)
-    np.testing.assert_allclose(raw.time.values.astype(np.int64), wanted, atol=300.0 if start > 1e9 else 1.0, rtol=0.0)
+    np.testing.assert_allclose(
+        raw.time.values.astype(np.int64), wanted, atol=300.0 if start > 1e9 else 1.0, rtol=0.0
+    )
 
 
 def test_whole_counts_stay_whole_on_the_grid(tmp_path):
-    raw = read_log(write(tmp_path / "log.nc", BYTES.view("i1"), {"_Unsigned": "true", "scale_factor": 0.5, "_FillValue": np.int8(-97)}))
+    raw = read_log(
+        write(
+            tmp_path / "log.nc",
+            BYTES.view("i1"),
+            {"_Unsigned": "true", "scale_factor": 0.5, "_FillValue": np.int8(-97)},
+        )
+    )
     assert raw.rate.encoding == {"dtype": np.dtype("int16"), "scale_factor": 0.5}
 
 
 @pytest.mark.parametrize(
-    "attributes", [{"scale_factor": 0.0}, {"scale_factor": "0.1"}, {"add_offset": np.nan}, {"valid_range": np.arange(3)}]
+    "attributes",
+    [
+        {"scale_factor": 0.0},
+        {"scale_factor": "0.1"},
+        {"add_offset": np.nan},
+        {"valid_range": np.arange(3)},
+    ],
 )
 def test_an_attribute_without_a_usable_value_is_refused_by_name(tmp_path, attributes):
-    with pytest.raises(FormatError, match=rf"log.nc: variable 'gyro_x': .*{next(iter(attributes))}"):
+    with pytest.raises(
+        FormatError, match=rf"log.nc: variable 'gyro_x': .*{next(iter(attributes))}"
+    ):
         read_log(write(tmp_path / "log.nc", COUNTS, attributes))
 
 
@@ -145,7 +190,9 @@ def test_counts_beyond_the_digits_of_a_float_are_compared_exactly():
     assert np.ma.getmaskarray(packing.read_counts(large)).tolist() == [True, False]
 
 
-def write_regular(path: Path, stored: np.ndarray, attributes: dict[str, Any], *, zarr_format: int = 3, **time: Any) -> Path:
+def write_regular(
+    path: Path, stored: np.ndarray, attributes: dict[str, Any], *, zarr_format: int = 3, **time: Any
+) -> Path:
     """A regular log of some other program: axis, a stamp for each sample, the sampling rate as an attribute."""
     stamps = (["time"], np.arange(ROWS) * 10, {"units": "milliseconds since 2026-01-01", **time})
     log = xr.Dataset(
@@ -163,7 +210,17 @@ def write_regular(path: Path, stored: np.ndarray, attributes: dict[str, Any], *,
 
 @pytest.mark.filterwarnings("ignore:The data type")
 @pytest.mark.parametrize("suffix", [".nc", ".zarr"])
-@pytest.mark.parametrize("case", ["plain", "scale and offset", "several missing", "valid range, packed", "valid max", "unsigned, packed"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "plain",
+        "scale and offset",
+        "several missing",
+        "valid range, packed",
+        "valid max",
+        "unsigned, packed",
+    ],
+)
 def test_a_regular_log_of_another_program_is_decoded_alike(tmp_path, case, suffix):
     stored, attributes, wanted = CASES[case]
     log = read_log(write_regular(tmp_path / f"log{suffix}", stored, attributes))
@@ -172,7 +229,9 @@ def test_a_regular_log_of_another_program_is_decoded_alike(tmp_path, case, suffi
     assert log.time.values[5] == np.datetime64("2026-01-01T00:00:00.05")
 
 
-@pytest.mark.parametrize(("attribute", "value"), [("calendar", "noleap"), ("units", "seconds since now")])
+@pytest.mark.parametrize(
+    ("attribute", "value"), [("calendar", "noleap"), ("units", "seconds since now")]
+)
 def test_a_regular_log_with_dates_of_no_recording_is_refused(tmp_path, attribute, value):
     with pytest.raises(UnitError, match=f"log.nc: variable 'time': .*{value}"):
         read_log(write_regular(tmp_path / "log.nc", COUNTS, {}, **{attribute: value}))

@@ -28,13 +28,18 @@ class Sample(NamedTuple):
     channels: Mapping[str, float] = MappingProxyType({})  # first row, inner units
 
 
-XSENS = "PacketCounter\tSampleTimeFine\tAcc_X\tAcc_Y\tAcc_Z\tGyr_X\tGyr_Y\tGyr_Z\tMag_X\tMag_Y\tMag_Z\n"
+XSENS = (
+    "PacketCounter\tSampleTimeFine\tAcc_X\tAcc_Y\tAcc_Z\tGyr_X\tGyr_Y\tGyr_Z\tMag_X\tMag_Y\tMag_Z\n"
+)
 SAMPLES = {
     "xsens-mt-manager": Sample(
         "MT_001-000.txt",
         "// General information: \n//  MT Manager version: 2022.2.0 \n// Coordinate system: ENU\n"
         + XSENS
-        + "".join(f"{n}\t{1000 + 100 * n}\t0.1\t0.2\t9.80665\t0.001\t-0.002\t0.003\t0.4\t0.5\t0.6\n" for n in range(4)),
+        + "".join(
+            f"{n}\t{1000 + 100 * n}\t0.1\t0.2\t9.80665\t0.001\t-0.002\t0.003\t0.4\t0.5\t0.6\n"
+            for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.01,
         {"accel_z": 1.0},
@@ -43,7 +48,9 @@ SAMPLES = {
         "MT_001-001.txt",
         "// Start Time: Unknown\n// Update Rate: 50.0Hz\n// Filter Profile: human (46.1)\n"
         + XSENS
-        + "".join(f"{n}\t\t0.1\t0.2\t9.80665\t0.001\t-0.002\t0.003\t0.4\t0.5\t0.6\n" for n in range(4)),
+        + "".join(
+            f"{n}\t\t0.1\t0.2\t9.80665\t0.001\t-0.002\t0.003\t0.4\t0.5\t0.6\n" for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         None,
         {"accel_z": 1.0},
@@ -52,7 +59,9 @@ SAMPLES = {
         "dot.csv",
         "DeviceTag:,D1\nFirmwareVersion:,1.6.0\nOutputRate:,60Hz\n\n"
         "PacketCounter,SampleTimeFine,Euler_X,Euler_Y,Euler_Z,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z,Status\n"
-        + "".join(f"{n},{7 + 16667 * n},1,2,3,0.1,0.2,9.80665,0.5,-0.25,0.125,0\n" for n in range(4)),
+        + "".join(
+            f"{n},{7 + 16667 * n},1,2,3,0.1,0.2,9.80665,0.5,-0.25,0.125,0\n" for n in range(4)
+        ),
         (1800, -900, 450),
         0.016667,
         {"accel_z": 1.0},
@@ -63,7 +72,9 @@ SAMPLES = {
         "DEVICE_INFO\nModelName,3DM\nSerialNumber,6225-1\nFirmwareVersion,1.1.19\n\nDATA_START\n"
         "GPS TFlags,GPS Week,GPS TOW,X Accel [x8004],Y Accel [x8004],Z Accel [x8004],X Gyro [x8005],Y Gyro [x8005],Z Gyro [x8005],"
         "Lat [x8103],Flags [x8103],Flags [x8108]\n"
-        + "".join(f"5,1936,{494410 + n / 50:.6f},0.1,0.2,1.0,0.001,-0.002,0.003,,,\n" for n in range(4)),
+        + "".join(
+            f"5,1936,{494410 + n / 50:.6f},0.1,0.2,1.0,0.001,-0.002,0.003,,,\n" for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.02,
         {"accel_z": 1.0},
@@ -73,7 +84,10 @@ SAMPLES = {
         "Time [s],GpsCycle,GpsWeek,GpsToW [s],TimeStartup [ns],UnCompMagX [Gauss],UnCompMagY [Gauss],UnCompMagZ [Gauss],"
         "UnCompAccX [m/s^2],UnCompAccY [m/s^2],UnCompAccZ [m/s^2],UnCompGyroX [rad/s],UnCompGyroY [rad/s],UnCompGyroZ [rad/s],"
         "Temperature [Celsius]\n"
-        + "".join(f"{n / 100},,,,{n * 10**7 + 5},1,2,3,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5\n" for n in range(4)),
+        + "".join(
+            f"{n / 100},,,,{n * 10**7 + 5},1,2,3,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5\n"
+            for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.01,
         {"accel_z": 1.0, "temperature": 21.5, "mag_x": 100.0},
@@ -83,7 +97,10 @@ SAMPLES = {
         "Time [s],GpsCycle,GpsWeek,GpsToW [s],Time::TimeStartup [ns],IMU::UncompMag::X [Gauss],IMU::UncompAccel::X [m/s^2],"
         "IMU::UncompAccel::Y [m/s^2],IMU::UncompAccel::Z [m/s^2],IMU::UncompGyro::X [rad/s],IMU::UncompGyro::Y [rad/s],"
         "IMU::UncompGyro::Z [rad/s],IMU::Temp [Celsius],IMU::Pres [kPa]\n"
-        + "".join(f",,,,{n * 10**7 + 5},1,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5,101.3\n" for n in range(4)),
+        + "".join(
+            f",,,,{n * 10**7 + 5},1,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5,101.3\n"
+            for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.01,
         {"accel_z": 1.0, "temperature": 21.5, "mag_x": 100.0, "pressure": 101300.0},
@@ -115,7 +132,10 @@ SAMPLES = {
     ),
     "sensor-logger": Sample(
         "Gyroscope.csv",
-        "time,seconds_elapsed,z,y,x\n" + "".join(f"{1767620467350470700 + n * 10**7},{n / 100},0.003,-0.002,0.001\n" for n in range(4)),
+        "time,seconds_elapsed,z,y,x\n"
+        + "".join(
+            f"{1767620467350470700 + n * 10**7},{n / 100},0.003,-0.002,0.001\n" for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.01,
     ),
@@ -123,7 +143,10 @@ SAMPLES = {
         "data.csv",
         "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
         "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
-        + "".join(f"{1403636579758555392 + n * 5 * 10**6},0.001,-0.002,0.003,0.1,0.2,9.80665\n" for n in range(4)),
+        + "".join(
+            f"{1403636579758555392 + n * 5 * 10**6},0.001,-0.002,0.003,0.1,0.2,9.80665\n"
+            for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.005,
         {"accel_z": 1.0},
@@ -146,7 +169,10 @@ SAMPLES = {
         "log_sensor_combined_0.csv",
         "timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],gyro_integral_dt,accelerometer_timestamp_relative,"
         "accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2],accelerometer_integral_dt\n"
-        + "".join(f"{n * 4000 + 112574307},0.001,-0.002,0.003,4000,0,0.1,0.2,9.80665,4000\n" for n in range(4)),
+        + "".join(
+            f"{n * 4000 + 112574307},0.001,-0.002,0.003,4000,0,0.1,0.2,9.80665,4000\n"
+            for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.004,
         {"accel_z": 1.0},
@@ -154,7 +180,10 @@ SAMPLES = {
     "px4-sensor-gyro": Sample(
         "log_sensor_gyro_0.csv",
         "timestamp,timestamp_sample,device_id,x,y,z,temperature,error_count,samples\n"
-        + "".join(f"{n * 4000 + 112574307},{n * 4000 + 112574100},42,0.001,-0.002,0.003,41.5,0,8\n" for n in range(4)),
+        + "".join(
+            f"{n * 4000 + 112574307},{n * 4000 + 112574100},42,0.001,-0.002,0.003,41.5,0,8\n"
+            for n in range(4)
+        ),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.004,
         {"temperature": 41.5},
@@ -210,7 +239,9 @@ def test_what_the_user_says_is_stronger_than_a_preset(tmp_path: Path) -> None:
 
 def test_names_that_are_ours_are_taken_for_no_other_program(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
-    path.write_text("time [s],gyro_x [deg/h],gyro_rad[0],gyro_rad[1],gyro_rad[2]\n0,1,0,0,0\n1,2,0,0,0\n")
+    path.write_text(
+        "time [s],gyro_x [deg/h],gyro_rad[0],gyro_rad[1],gyro_rad[2]\n0,1,0,0,0\n1,2,0,0,0\n"
+    )
     raw = read_log(path)
     assert raw.rate[0].values.tolist() == [1, 2]
     assert not any("preset" in note for note in raw.attrs["notes"])

@@ -33,7 +33,10 @@ def write_stamped(path: Path, stamps: np.ndarray, **attributes: Any) -> Path:
         return path
     with netCDF4.Dataset(path, "w") as file:
         file.createDimension("obs", ROWS)
-        for name, values, attrs in (("time", stamps, attributes), ("gyro_x", np.arange(ROWS), {"units": "deg/h"})):
+        for name, values, attrs in (
+            ("time", stamps, attributes),
+            ("gyro_x", np.arange(ROWS), {"units": "deg/h"}),
+        ):
             variable = file.createVariable(name, values.dtype, ("obs",))
             variable.setncatts(attrs)
             variable[:] = values
@@ -41,7 +44,9 @@ def write_stamped(path: Path, stamps: np.ndarray, **attributes: Any) -> Path:
 
 
 def dates(year: int, unit: str = "us") -> np.ndarray:
-    return np.datetime64(f"{year}-05-06", unit) + np.arange(ROWS) * np.timedelta64(10**6, "us").astype(f"timedelta64[{unit}]")
+    return np.datetime64(f"{year}-05-06", unit) + np.arange(ROWS) * np.timedelta64(
+        10**6, "us"
+    ).astype(f"timedelta64[{unit}]")
 
 
 def write_dates(path: Path, stamps: np.ndarray, unit: str = "us") -> Path:
@@ -49,7 +54,15 @@ def write_dates(path: Path, stamps: np.ndarray, unit: str = "us") -> Path:
         rows = "\n".join(f"{stamp}Z,{row}" for row, stamp in enumerate(stamps))
         path.write_text(f"time,gyro_x [deg/h]\n{rows}\n")
     else:
-        parquet.write_table(pa.table({"time": pa.array(stamps, pa.timestamp(unit)), "gyro_x [deg/h]": np.arange(len(stamps))}), path)
+        parquet.write_table(
+            pa.table(
+                {
+                    "time": pa.array(stamps, pa.timestamp(unit)),
+                    "gyro_x [deg/h]": np.arange(len(stamps)),
+                }
+            ),
+            path,
+        )
     return path
 
 
@@ -73,15 +86,21 @@ def test_dates_of_every_unit_of_parquet(tmp_path, unit):
     raw = read_log(write_dates(tmp_path / "log.parquet", stamps, unit))
     np.testing.assert_array_equal(raw.time.values, stamps)
     zoned = pa.array(stamps, pa.timestamp(unit, tz="Europe/Berlin"))  # the stored numbers are UTC
-    parquet.write_table(pa.table({"time": zoned, "gyro_x [deg/h]": np.arange(ROWS)}), tmp_path / "zoned.parquet")
+    parquet.write_table(
+        pa.table({"time": zoned, "gyro_x [deg/h]": np.arange(ROWS)}), tmp_path / "zoned.parquet"
+    )
     np.testing.assert_array_equal(read_log(tmp_path / "zoned.parquet").time.values, stamps)
 
 
 @pytest.mark.parametrize("unit", ["D", "s", "ms", "us", "ns", "Y"])
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_dates_are_never_wrapped_around(unit, order):
-    stamps = np.array(["1500-01-01", "2026-01-01", "2300-01-01", "NaT"], dtype="datetime64[s]").astype(f"{order}M8[{unit}]")
-    wanted = [NAT, 1_767_225_600 * 10**9, NAT, NAT] if unit != "ns" else dates_to_ns(stamps)[:].tolist()
+    stamps = np.array(
+        ["1500-01-01", "2026-01-01", "2300-01-01", "NaT"], dtype="datetime64[s]"
+    ).astype(f"{order}M8[{unit}]")
+    wanted = (
+        [NAT, 1_767_225_600 * 10**9, NAT, NAT] if unit != "ns" else dates_to_ns(stamps)[:].tolist()
+    )
     assert dates_to_ns(stamps).tolist() == wanted
 
 
@@ -95,12 +114,19 @@ SAME_INSTANT = [
 def test_epochs_are_read_as_udunits_reads_them(text):
     unit = parse_time_unit(text)
     assert unit.epoch == stamp_ns("2026-01-02T03:04:05")
-    assert cf_units.Unit(text).convert(0.0, cf_units.Unit("seconds since 1970-01-01")) == unit.epoch / 1e9
+    assert (
+        cf_units.Unit(text).convert(0.0, cf_units.Unit("seconds since 1970-01-01"))
+        == unit.epoch / 1e9
+    )
 
 
-@pytest.mark.parametrize("text", ["week", "days", "Hours", "min", "msec", "microseconds", "0.25 s", "1e-3 minutes"])
+@pytest.mark.parametrize(
+    "text", ["week", "days", "Hours", "min", "msec", "microseconds", "0.25 s", "1e-3 minutes"]
+)
 def test_units_of_time_are_those_of_udunits(text):
-    assert float(parse_time_unit(text).ns) == pytest.approx(cf_units.Unit(text.lower()).convert(1e9, "s"), rel=1e-14)
+    assert float(parse_time_unit(text).ns) == pytest.approx(
+        cf_units.Unit(text.lower()).convert(1e9, "s"), rel=1e-14
+    )
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".h5"])
@@ -111,7 +137,10 @@ def test_units_of_time_are_those_of_udunits(text):
 )  # fmt: skip
 def test_an_epoch_that_must_be_guessed_is_refused(tmp_path, units, suffix):
     path = write_stamped(tmp_path / f"log{suffix}", np.arange(ROWS), units=units)
-    with pytest.raises(UnitError, match=rf"log{suffix}: column 'time': time unit '{units}'.*--unit \"time=seconds since"):
+    with pytest.raises(
+        UnitError,
+        match=rf"log{suffix}: column 'time': time unit '{units}'.*--unit \"time=seconds since",
+    ):
         read_log(path)
     assert any("time unit" in note for note in scan_file(path).notes)
     given = read_log(path, unit={"time": "seconds since 2026-01-02"})
@@ -119,11 +148,17 @@ def test_an_epoch_that_must_be_guessed_is_refused(tmp_path, units, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".h5"])
-@pytest.mark.parametrize("calendar", ["noleap", "365_day", "all_leap", "366_day", "360_day", "none", "tai"])
+@pytest.mark.parametrize(
+    "calendar", ["noleap", "365_day", "all_leap", "366_day", "360_day", "none", "tai"]
+)
 def test_calendars_without_real_dates_are_refused(tmp_path, calendar, suffix):
     stamps = np.cumsum(np.random.default_rng(1).uniform(0.9, 1.1, ROWS))
-    path = write_stamped(tmp_path / f"log{suffix}", stamps, units="seconds since 2026-02-28", calendar=calendar)
-    with pytest.raises(UnitError, match=f"log{suffix}: column 'time': .*{calendar}.*standard calendar"):
+    path = write_stamped(
+        tmp_path / f"log{suffix}", stamps, units="seconds since 2026-02-28", calendar=calendar
+    )
+    with pytest.raises(
+        UnitError, match=f"log{suffix}: column 'time': .*{calendar}.*standard calendar"
+    ):
         read_log(path)
 
 
@@ -135,14 +170,37 @@ def test_calendars_of_real_dates_are_converted(tmp_path, calendar, epoch):
     end = cftime.datetime(2026, 3, 1, 6, calendar="standard")
     days = end.toordinal(fractional=True) - begin.toordinal(fractional=True)
     microseconds = np.rint(days * 86400).astype(np.int64) * 10**6 + 10_000 * np.arange(ROWS)
-    raw = read_log(write_stamped(tmp_path / "log.nc", microseconds, units=f"microseconds since {epoch}", calendar=calendar))
-    np.testing.assert_array_equal(raw.time.values, np.datetime64("2026-03-01T06", "us") + microseconds - microseconds[0])
+    raw = read_log(
+        write_stamped(
+            tmp_path / "log.nc",
+            microseconds,
+            units=f"microseconds since {epoch}",
+            calendar=calendar,
+        )
+    )
+    np.testing.assert_array_equal(
+        raw.time.values, np.datetime64("2026-03-01T06", "us") + microseconds - microseconds[0]
+    )
 
 
-@pytest.mark.parametrize("unit", ["ns", "us", "7 us", "0.1 s", "0.5 ns", "d", "seconds since 0001-01-01", "days since 9000-01-01"])
+@pytest.mark.parametrize(
+    "unit",
+    [
+        "ns",
+        "us",
+        "7 us",
+        "0.1 s",
+        "0.5 ns",
+        "d",
+        "seconds since 0001-01-01",
+        "days since 9000-01-01",
+    ],
+)
 def test_whole_numbers_become_exact_stamps_or_none(unit):
     parsed = parse_time_unit(unit)
-    counts = np.array([0, 1, -1, 2**31, -(2**40), 62_900_000_000, 2**62, -(2**62), 2**63 - 1, -(2**63) + 1])
+    counts = np.array(
+        [0, 1, -1, 2**31, -(2**40), 62_900_000_000, 2**62, -(2**62), 2**63 - 1, -(2**63) + 1]
+    )
     zero = parsed.epoch or 0
     found = integers_to_ns(counts, parsed, 0)
     for count, stamp in zip(counts.tolist(), found.tolist(), strict=True):
@@ -155,7 +213,18 @@ def test_whole_numbers_become_exact_stamps_or_none(unit):
 
 @pytest.mark.parametrize("option", ["start", "epoch"])
 @pytest.mark.parametrize(
-    "text", ["now", "today", "01-02-2026", "01/02/2026", "Jan 2 2026", "1500-01-01", "2300-01-01", "2026-02-30", "2026"]
+    "text",
+    [
+        "now",
+        "today",
+        "01-02-2026",
+        "01/02/2026",
+        "Jan 2 2026",
+        "1500-01-01",
+        "2300-01-01",
+        "2026-02-30",
+        "2026",
+    ],
 )
 def test_start_and_epoch_are_not_guessed(tmp_path, option, text):
     path = tmp_path / "log.csv"
@@ -165,13 +234,18 @@ def test_start_and_epoch_are_not_guessed(tmp_path, option, text):
 
 
 def test_an_epoch_that_is_not_used_is_said(tmp_path):
-    raw = read_log(write_stamped(tmp_path / "log.nc", np.arange(ROWS), units="seconds since 2026-01-02"), epoch="2020-01-01")
+    raw = read_log(
+        write_stamped(tmp_path / "log.nc", np.arange(ROWS), units="seconds since 2026-01-02"),
+        epoch="2020-01-01",
+    )
     assert raw.time.values[0] == np.datetime64("2026-01-02")
     assert any("--epoch is not used" in note for note in raw.attrs["notes"])
 
 
 def test_dates_of_las_files_are_counted_or_read(tmp_path):
-    rows = "\n".join(f"{1500 if row == 7 else 2026}-05-06 00:00:{row:02d} {row}" for row in range(ROWS))
+    rows = "\n".join(
+        f"{1500 if row == 7 else 2026}-05-06 00:00:{row:02d} {row}" for row in range(ROWS)
+    )
     head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nNULL. -999.25 :\n~C\nDATE. : date\nTIME. : time\nGYRO_X.deg/h : rate\n~A\n"
     path = tmp_path / "log.las"
     path.write_text(head + rows + "\n")
@@ -182,8 +256,14 @@ def test_dates_of_las_files_are_counted_or_read(tmp_path):
 
 def test_a_tdms_waveform_that_begins_after_2262_is_refused(tmp_path):
     nptdms = pytest.importorskip("nptdms")
-    begin = {"wf_increment": 0.01, "wf_start_time": np.datetime64("2300-01-01", "us"), "unit_string": "deg/h"}
+    begin = {
+        "wf_increment": 0.01,
+        "wf_start_time": np.datetime64("2300-01-01", "us"),
+        "unit_string": "deg/h",
+    }
     with nptdms.TdmsWriter(tmp_path / "log.tdms") as writer:
-        writer.write_segment([nptdms.ChannelObject("imu", "gyro_x", np.arange(40.0), properties=begin)])
+        writer.write_segment(
+            [nptdms.ChannelObject("imu", "gyro_x", np.arange(40.0), properties=begin)]
+        )
     with pytest.raises(FormatError, match=r"log\.tdms: .*2262"):
         read_log(tmp_path / "log.tdms")

@@ -36,7 +36,12 @@ DEGREES_AND_HOURS = {
 def product() -> xr.Dataset:
     """Whole microseconds, as of nearly every logger, for programs that know no nanoseconds."""
     whole = synthetic.product()
-    return whole.assign_coords({name: whole[name].astype("M8[us]").astype("M8[ns]").assign_attrs(whole[name].attrs) for name in TIMES})
+    return whole.assign_coords(
+        {
+            name: whole[name].astype("M8[us]").astype("M8[ns]").assign_attrs(whole[name].attrs)
+            for name in TIMES
+        }
+    )
 
 
 TIMES = ("time", "time_bounds")
@@ -58,7 +63,10 @@ def log() -> xr.Dataset:
 
 def as_stored(log: xr.Dataset) -> xr.Dataset:
     """What other programs find of a log: in place of each computed time axis its start."""
-    starts = {f"{name}_start": log[name][0].drop_vars(name).variable for name in ("time", "time_temperature")}
+    starts = {
+        f"{name}_start": log[name][0].drop_vars(name).variable
+        for name in ("time", "time_temperature")
+    }
     return log.drop_vars(["time", "time_temperature"]).assign(starts)
 
 
@@ -66,14 +74,18 @@ def as_stored(log: xr.Dataset) -> xr.Dataset:
 def case(request, tmp_path_factory) -> tuple[xr.Dataset, Path, xr.Dataset]:
     """What is to be found, the file, and what was written. zlib, as the other programs seldom have zstd."""
     made = {"product": product, "log": log, "correlation": correlation}[request.param]()
-    path = to_netcdf(made, tmp_path_factory.mktemp("interop") / f"{request.param}.nc", compression="zlib")
+    path = to_netcdf(
+        made, tmp_path_factory.mktemp("interop") / f"{request.param}.nc", compression="zlib"
+    )
     return (as_stored(made) if request.param == "log" else made), path, made
 
 
 def disk_order(variable: xr.DataArray) -> np.ndarray:
     order = [dim for dim in ("axis", "term", "tau") if dim in variable.dims]
     last = [dim for dim in ("time", "bnds") if dim in variable.dims]
-    return variable.transpose(*order, *[dim for dim in variable.dims if dim not in (*order, *last)], *last).values
+    return variable.transpose(
+        *order, *[dim for dim in variable.dims if dim not in (*order, *last)], *last
+    ).values
 
 
 def names(dataset: xr.Dataset) -> list[str]:
@@ -82,7 +94,9 @@ def names(dataset: xr.Dataset) -> list[str]:
 
 def since_1970(values: np.ndarray, unit: str) -> np.ndarray:
     """Whole units since 1970; the odd nanoseconds of the synthetic log are kept by ``ns``."""
-    return values.astype("M8[ns]").astype(np.int64) // {"nanoseconds": 1, "microseconds": 1000}[unit]
+    return (
+        values.astype("M8[ns]").astype(np.int64) // {"nanoseconds": 1, "microseconds": 1000}[unit]
+    )
 
 
 def test_the_cases_hold_missing_values():
@@ -95,7 +109,9 @@ def test_xarray_alone(case):
     with xr.open_dataset(path) as seen:
         for name in names(made):
             if made[name].dtype.kind == "M":
-                np.testing.assert_array_equal(disk_order(seen[name]).astype("M8[ns]"), disk_order(made[name]))
+                np.testing.assert_array_equal(
+                    disk_order(seen[name]).astype("M8[ns]"), disk_order(made[name])
+                )
             else:
                 np.testing.assert_array_equal(disk_order(seen[name]), disk_order(made[name]))
 
@@ -117,9 +133,15 @@ def test_zarr_alone(case, tmp_path):
             found = group[name][:]
             if "scale_factor" in group[name].attrs:
                 assert found.dtype.kind == "i"
-                found = np.where(found == group[name].fill_value, np.nan, found * group[name].attrs["scale_factor"])
+                found = np.where(
+                    found == group[name].fill_value,
+                    np.nan,
+                    found * group[name].attrs["scale_factor"],
+                )
             np.testing.assert_array_equal(found, disk_order(made[name]))
-            assert group[name].attrs.get("units", "") == DEGREES_AND_HOURS.get(name, group[name].attrs.get("units", ""))
+            assert group[name].attrs.get("units", "") == DEGREES_AND_HOURS.get(
+                name, group[name].attrs.get("units", "")
+            )
 
 
 def test_netcdf4_python_alone(case):
@@ -146,28 +168,47 @@ def test_netcdf4_python_dates(tmp_path):
 
     made = product()
     with netCDF4.Dataset(to_netcdf(made, tmp_path / "product.nc")) as file:
-        dates = netCDF4.num2date(file["time"][:], file["time"].units, file["time"].calendar, only_use_cftime_datetimes=False)
-    assert [np.datetime64(date, "us") for date in dates] == list(made["time"].values.astype("M8[us]"))
+        dates = netCDF4.num2date(
+            file["time"][:],
+            file["time"].units,
+            file["time"].calendar,
+            only_use_cftime_datetimes=False,
+        )
+    assert [np.datetime64(date, "us") for date in dates] == list(
+        made["time"].values.astype("M8[us]")
+    )
 
 
 def test_ncdump(case):
     if shutil.which("ncdump") is None:
         pytest.skip("ncdump is absent; on Debian: apt-get install netcdf-bin")
     made, path, _ = case
-    text = subprocess.run(["ncdump", "-p", "9,17", str(path)], capture_output=True, text=True, check=True).stdout
+    text = subprocess.run(
+        ["ncdump", "-p", "9,17", str(path)], capture_output=True, text=True, check=True
+    ).stdout
     head, data = text.split("\ndata:\n")
     for name in names(made):
         (found,) = re.findall(rf"^ {name} =\s(.*?) ;$", data, re.M | re.S)
         wanted = disk_order(made[name]).ravel()
         if wanted.dtype.kind == "f":
-            factor = [float(number) for number in re.findall(rf"^\t\t{name}:scale_factor = (\S+) ;", head, re.M)]
-            numbers = [np.nan if number == "_" else float(number) for number in re.split(r",\s*", found.strip())]
+            factor = [
+                float(number)
+                for number in re.findall(rf"^\t\t{name}:scale_factor = (\S+) ;", head, re.M)
+            ]
+            numbers = [
+                np.nan if number == "_" else float(number)
+                for number in re.split(r",\s*", found.strip())
+            ]
             np.testing.assert_array_equal(np.array(numbers) * (factor or [1.0])[0], wanted)
         elif wanted.dtype.kind in "iu":
             assert [int(number) for number in re.split(r",\s*", found.strip())] == wanted.tolist()
         elif wanted.dtype.kind == "M":
-            (unit,) = re.findall(r'time(?:_start)?:units = "(\w+) since 1970-01-01T00:00:00"', head)[:1]
-            assert [int(number) for number in re.split(r",\s*", found.strip())] == since_1970(wanted, unit).tolist()
+            (unit,) = re.findall(
+                r'time(?:_start)?:units = "(\w+) since 1970-01-01T00:00:00"', head
+            )[:1]
+            assert [int(number) for number in re.split(r",\s*", found.strip())] == since_1970(
+                wanted, unit
+            ).tolist()
         elif wanted.dtype.kind == "U":
             assert re.findall(r'"(.*?)"', found) in (wanted.tolist(), ["".join(wanted)])
     for name in DEGREES_AND_HOURS.keys() & set(names(made)):
@@ -179,13 +220,26 @@ def octave() -> str:
     program = shutil.which("octave")
     if program is None:
         pytest.skip("Octave is absent; on Debian: apt-get install octave octave-netcdf")
-    if "netcdf" not in run_octave(program, "--eval", "pkg list netcdf; disp(pkg('list', 'netcdf'){1}.name)").stdout:
-        pytest.skip("Octave is there, but not its package netcdf; on Debian: apt-get install octave-netcdf")
+    if (
+        "netcdf"
+        not in run_octave(
+            program, "--eval", "pkg list netcdf; disp(pkg('list', 'netcdf'){1}.name)"
+        ).stdout
+    ):
+        pytest.skip(
+            "Octave is there, but not its package netcdf; on Debian: apt-get install octave-netcdf"
+        )
     return program
 
 
 def run_octave(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([program, "--no-gui", "--norc", "-q", *arguments], capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(
+        [program, "--no-gui", "--norc", "-q", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
 
 
 def test_octave(case, octave, tmp_path):
@@ -193,7 +247,10 @@ def test_octave(case, octave, tmp_path):
     done = run_octave(octave, str(HERE / "read_all.m"), str(path), str(tmp_path / "seen.txt"))
     assert (tmp_path / "seen.txt").exists(), done.stderr
     lines = (tmp_path / "seen.txt").read_text().splitlines()
-    seen = {head.split("|")[0]: (*head.split("|")[1:], values) for head, values in zip(lines[::2], lines[1::2], strict=True)}
+    seen = {
+        head.split("|")[0]: (*head.split("|")[1:], values)
+        for head, values in zip(lines[::2], lines[1::2], strict=True)
+    }
     assert set(seen) == set(names(made))
     for name, (kind, units, text) in seen.items():
         wanted = disk_order(made[name]).ravel()
@@ -205,8 +262,16 @@ def test_octave(case, octave, tmp_path):
             assert text.replace("\0", "") == "".join(wanted)  # strings are padded to one length
         else:
             numbers = (
-                [int(whole) * 10**9 + int(rest) for whole, rest in (pair.split(":") for pair in text.split())] if ":" in text else None
+                [
+                    int(whole) * 10**9 + int(rest)
+                    for whole, rest in (pair.split(":") for pair in text.split())
+                ]
+                if ":" in text
+                else None
             )
             numbers = numbers or [int(number) for number in text.split()]
             unit = (units or (seen.get("time") or seen["time_start"])[1]).split(" ")[0]
-            assert numbers == (since_1970(wanted, unit) if wanted.dtype.kind == "M" else wanted).tolist()
+            assert (
+                numbers
+                == (since_1970(wanted, unit) if wanted.dtype.kind == "M" else wanted).tolist()
+            )

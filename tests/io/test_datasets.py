@@ -24,7 +24,14 @@ from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.io import datasets as export
-from gyrostab.io.datasets import open_dataset, open_log, open_product, open_surface, to_netcdf, to_zarr
+from gyrostab.io.datasets import (
+    open_dataset,
+    open_log,
+    open_product,
+    open_surface,
+    to_netcdf,
+    to_zarr,
+)
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
 from gyrostab.store import deflate
@@ -67,15 +74,27 @@ def test_comes_back_as_it_was(tmp_path, kind, write):
         again = write(after, tmp_path / "again")
         with OPEN[kind](again) as twice:
             assert_same(before, twice)
-            assert len(twice.attrs["history"].splitlines()) == len(before.attrs["history"].splitlines()) + 2
+            assert (
+                len(twice.attrs["history"].splitlines())
+                == len(before.attrs["history"].splitlines()) + 2
+            )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_cf_checker_has_no_remark(files, kind):
     checker = Path(sys.executable).with_name("compliance-checker")
-    offline = {**os.environ, "http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+    offline = {
+        **os.environ,
+        "http_proxy": "http://127.0.0.1:9",
+        "https_proxy": "http://127.0.0.1:9",
+    }
     done = subprocess.run(
-        [checker, "-t", "cf:1.11", "-c", "strict", files[kind]], capture_output=True, text=True, check=False, timeout=120, env=offline
+        [checker, "-t", "cf:1.11", "-c", "strict", files[kind]],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        env=offline,
     )
     assert "All tests passed!" in done.stdout, done.stdout
     assert "WARNING" not in done.stderr, done.stderr
@@ -95,7 +114,9 @@ def test_layout_seen_by_plain_netcdf4(files):
                 assert np.isfinite(variable._FillValue)
                 assert variable.filters()["zlib"]
                 assert variable.filters()["shuffle"]
-            assert not any(isinstance(variable.getncattr(key), bool | type(None)) for key in variable.ncattrs())
+            assert not any(
+                isinstance(variable.getncattr(key), bool | type(None)) for key in variable.ncattrs()
+            )
         assert file["time"].dtype == np.int64
         assert file["time"].units_metadata == "leap_seconds: none"
         assert file["estimator"].flag_meanings == "none strict_runs weighted_clusters"
@@ -108,7 +129,10 @@ def test_layout_seen_by_plain_netcdf4(files):
 
 def test_plain_xarray_selects_an_axis(files):
     with xr.open_dataset(files["product"]) as plain:
-        np.testing.assert_array_equal(plain.avar.sel(axis="y").transpose("time", "tau"), synthetic.product().avar.sel(axis="y"))
+        np.testing.assert_array_equal(
+            plain.avar.sel(axis="y").transpose("time", "tau"),
+            synthetic.product().avar.sel(axis="y"),
+        )
         np.testing.assert_array_equal(plain.time, synthetic.product().time)
 
 
@@ -116,7 +140,9 @@ def test_ncdump_reads_it(files):
     ncdump = shutil.which("ncdump")
     if ncdump is None:
         pytest.skip("ncdump (netcdf-bin) is not installed")
-    text = subprocess.run([ncdump, "-h", files["product"]], capture_output=True, text=True, check=True).stdout
+    text = subprocess.run(
+        [ncdump, "-h", files["product"]], capture_output=True, text=True, check=True
+    ).stdout
     assert "double avar(axis, tau, time) ;" in text
     assert 'N:unit_label = "deg/sqrt(h)" ;' in text
 
@@ -144,7 +170,9 @@ def test_udunits_reads_the_number(files, name, to, number):
     with netCDF4.Dataset(files["product"]) as file:
         for variable in [name, f"{name}_stderr", f"{name}_upper"]:
             if variable in file.variables:
-                assert cf_units.Unit(file[variable].units).convert(1.0, to) == pytest.approx(number, rel=1e-12)
+                assert cf_units.Unit(file[variable].units).convert(1.0, to) == pytest.approx(
+                    number, rel=1e-12
+                )
 
 
 def test_every_unit_written_is_read_rightly(files):
@@ -156,10 +184,17 @@ def test_every_unit_written_is_read_rightly(files):
                 if " since " not in units:
                     assert cf_units.Unit(units).is_convertible(cf_units.Unit(units))
                     assert "." not in units.replace("9.80665", "")
-    assert cf_units.Unit("degree2 hour-2").convert(1.0, "radian2 s-2") == pytest.approx(powers["degree2 hour-2"])
-    for units in {INNER[q] for q in INNER} - {"g"} | {a["units"] for a in VARIABLES.values() if "units" in a}:
+    assert cf_units.Unit("degree2 hour-2").convert(1.0, "radian2 s-2") == pytest.approx(
+        powers["degree2 hour-2"]
+    )
+    for units in {INNER[q] for q in INNER} - {"g"} | {
+        a["units"] for a in VARIABLES.values() if "units" in a
+    }:
         frame = xr.Dataset({"it": ("time", np.ones(2), {"units": units})})
-        with tempfile.TemporaryDirectory() as folder, netCDF4.Dataset(to_netcdf(frame, Path(folder) / "u.nc")) as file:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            netCDF4.Dataset(to_netcdf(frame, Path(folder) / "u.nc")) as file,
+        ):
             assert file["it"].units == units  # none of ours is banished to source_units
 
 
@@ -173,11 +208,23 @@ def test_stored_coefficient_is_the_allan_deviation_at_its_reading_point(files, s
         np.testing.assert_allclose(stored, deviation, rtol=1e-12)
         np.testing.assert_allclose(file[f"{symbol}_squared"][:].compressed(), stored**2)
         assert file[symbol].unit_label == LAWS[symbol].label
-    assert np.sqrt(model_avar(hours * 3600.0, dict.fromkeys(TERMS, 0.0) | {symbol: 2.5})) == pytest.approx(2.5)
+    assert np.sqrt(
+        model_avar(hours * 3600.0, dict.fromkeys(TERMS, 0.0) | {symbol: 2.5})
+    ) == pytest.approx(2.5)
 
 
 @pytest.mark.parametrize(
-    "units", ["deg/h", "degree hour-0.5", "degree hour^-0.5", "dph", "gal/min", "degree/sqrt(hour)", "0.1 arcsec/s", "K-1.5"]
+    "units",
+    [
+        "deg/h",
+        "degree hour-0.5",
+        "degree hour^-0.5",
+        "dph",
+        "gal/min",
+        "degree/sqrt(hour)",
+        "0.1 arcsec/s",
+        "K-1.5",
+    ],
 )
 def test_a_unit_that_udunits_refuses_or_misreads_is_not_written_as_units(tmp_path, units):
     frame = xr.Dataset({"it": ("time", np.ones(2), {"units": units})})
@@ -188,38 +235,63 @@ def test_a_unit_that_udunits_refuses_or_misreads_is_not_written_as_units(tmp_pat
     assert open_dataset(path)["it"].attrs["units"] == units
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     values=hnp.arrays(
-        np.float64, hnp.array_shapes(min_dims=3, max_dims=3, max_side=4), elements=st.floats(allow_nan=True, allow_infinity=True)
+        np.float64,
+        hnp.array_shapes(min_dims=3, max_dims=3, max_side=4),
+        elements=st.floats(allow_nan=True, allow_infinity=True),
     ),
     units=st.sampled_from([*INNER.values(), "degree2 hour-2", "rpm", "m s-2"]),
     stamps=st.lists(st.integers(-(2**62), 2**62), min_size=4, max_size=4, unique=True),
-    notes=st.lists(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8), max_size=3),
+    notes=st.lists(
+        st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8),
+        max_size=3,
+    ),
     write=st.sampled_from([to_netcdf, to_zarr]),
 )
 def test_round_trip_of_anything(tmp_path, values, units, stamps, notes, write):
     times = np.sort(np.array(stamps[: values.shape[1]], dtype=np.int64)).view("datetime64[ns]")
     before = xr.Dataset(
-        {"avar": (("axis", "time", "tau"), values, {"units": units}), "single": ("time", np.arange(values.shape[1], dtype=np.float32))},
+        {
+            "avar": (("axis", "time", "tau"), values, {"units": units}),
+            "single": ("time", np.arange(values.shape[1], dtype=np.float32)),
+        },
         coords={"time": times, "axis": [f"a{i}" for i in range(values.shape[0])]},
-        attrs={"notes": notes, "arguments": {"window": 600.0, "gaps": None, "on": True}, "samples": 5},
+        attrs={
+            "notes": notes,
+            "arguments": {"window": 600.0, "gaps": None, "on": True},
+            "samples": 5,
+        },
     )
     assert_same(before, open_dataset(write(before, tmp_path / write.__name__, overwrite=True)))
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
     start=st.integers(-(2**60), 2**60),
     rate=st.sampled_from([300.0, 400.0, 99.3, 1.0, 1000 / 3, 0.1]),
     part=st.tuples(st.integers(0, 20), st.integers(30, 60), st.integers(1, 7)),
 )
 def test_computed_time_axis_comes_back_to_the_nanosecond(tmp_path, start, rate, part):
-    whole = xr.Dataset({"rate": (("axis", "time"), np.zeros((1, 60)), {"units": "degree hour-1"})}, coords={"axis": ["x"]})
-    before = whole.assign_coords(time_coordinate(start, rate, 60)).assign_attrs(sampling_rate_hz=rate).isel(time=slice(*part))
+    whole = xr.Dataset(
+        {"rate": (("axis", "time"), np.zeros((1, 60)), {"units": "degree hour-1"})},
+        coords={"axis": ["x"]},
+    )
+    before = (
+        whole.assign_coords(time_coordinate(start, rate, 60))
+        .assign_attrs(sampling_rate_hz=rate)
+        .isel(time=slice(*part))
+    )
     after = open_log(to_netcdf(before, tmp_path / "grid.nc", overwrite=True))
     assert isinstance(after.xindexes["time"], TimeGridIndex)
-    np.testing.assert_array_equal(after.time.values.view(np.int64), grid_times(start, rate, np.arange(60)[slice(*part)]))
+    np.testing.assert_array_equal(
+        after.time.values.view(np.int64), grid_times(start, rate, np.arange(60)[slice(*part)])
+    )
     np.testing.assert_array_equal(after.time, before.time)
 
 
@@ -227,12 +299,16 @@ def test_a_log_cut_by_another_program_is_refused(tmp_path):
     path = to_netcdf(synthetic.log(), tmp_path / "log.nc")
     with xr.open_dataset(path, decode_times=False) as plain:
         plain.isel(time_index=slice(100, 200)).to_netcdf(tmp_path / "cut.nc")
-    with pytest.raises(FormatError, match=r"cut\.nc: has 100 samples on 'time_index', but was written with 3000"):
+    with pytest.raises(
+        FormatError, match=r"cut\.nc: has 100 samples on 'time_index', but was written with 3000"
+    ):
         open_log(tmp_path / "cut.nc")
 
 
 def test_whole_microseconds_are_readable_by_num2date(tmp_path):
-    path = to_netcdf(synthetic.log(rate=400.0, start=1_790_000_000_000_002_000), tmp_path / "log.nc")
+    path = to_netcdf(
+        synthetic.log(rate=400.0, start=1_790_000_000_000_002_000), tmp_path / "log.nc"
+    )
     with netCDF4.Dataset(path) as file:
         assert "time" not in file.variables
         start = file["time_start"]
@@ -269,8 +345,12 @@ def test_a_lazy_log_is_never_held_whole(tmp_path):
         return np.full(shape, float(len(blocks)))
 
     size = 9_000_000
-    rate = da.map_blocks(block, chunks=((1, 1, 1), (450_000,) * 20), dtype=float, meta=np.empty((0, 0)))
-    log = xr.Dataset({"rate": (("axis", "time"), rate, {"units": "degree hour-1"})}, coords={"axis": list("xyz")})
+    rate = da.map_blocks(
+        block, chunks=((1, 1, 1), (450_000,) * 20), dtype=float, meta=np.empty((0, 0))
+    )
+    log = xr.Dataset(
+        {"rate": (("axis", "time"), rate, {"units": "degree hour-1"})}, coords={"axis": list("xyz")}
+    )
     log = log.assign_coords(time_coordinate(0, 300.0, size)).assign_attrs(sampling_rate_hz=300.0)
     import dask
 
@@ -298,20 +378,30 @@ def test_a_file_can_be_rewritten_from_itself(tmp_path):
 
 def test_foreign_and_damaged_files(tmp_path, files):
     (tmp_path / "words.nc").write_text("time, gyro_x\n")
-    (tmp_path / "half.nc").write_bytes(files["product"].read_bytes()[: files["product"].stat().st_size // 2])
+    (tmp_path / "half.nc").write_bytes(
+        files["product"].read_bytes()[: files["product"].stat().st_size // 2]
+    )
     (tmp_path / "store.zarr").mkdir()
     for name in ("words.nc", "half.nc", "store.zarr"):
-        with pytest.raises(FormatError, match=rf"{name}: is not (NetCDF|Zarr), or is damaged or cut short"):
+        with pytest.raises(
+            FormatError, match=rf"{name}: is not (NetCDF|Zarr), or is damaged or cut short"
+        ):
             open_product(tmp_path / name)
     xr.Dataset({"sst": ("x", [1.0])}).to_netcdf(tmp_path / "sea.nc")
-    for opener, what in ((open_product, "a product"), (open_surface, "a DAVAR surface"), (open_log, "a regular log")):
+    for opener, what in (
+        (open_product, "a product"),
+        (open_surface, "a DAVAR surface"),
+        (open_log, "a regular log"),
+    ):
         with pytest.raises(FormatError, match=f"sea.nc: does not hold {what}"):
             opener(tmp_path / "sea.nc")
     with pytest.raises(FormatError, match=r"nothing\.nc: there is no such file"):
         open_log(tmp_path / "nothing.nc")
 
 
-@pytest.mark.parametrize(("kind", "opener"), [("surface", open_product), ("log", open_surface), ("product", open_log)])
+@pytest.mark.parametrize(
+    ("kind", "opener"), [("surface", open_product), ("log", open_surface), ("product", open_log)]
+)
 def test_the_wrong_kind_is_named(files, kind, opener):
     with pytest.raises(FormatError, match=r"does not hold a .*make one with 'gyrostab"):
         opener(files[kind])
@@ -329,12 +419,21 @@ def test_provenance(files):
         assert json.loads(file.source_files) == ["bore_run_4a.csv", "bore_run_4b.csv"]
         assert file.title.startswith("Dynamic Allan variance")
         assert file.window_samples == 1800
-        assert {"date_created", "gyrostab_version", "time_coverage_start", "time_coverage_end"} <= set(file.ncattrs())
+        assert {
+            "date_created",
+            "gyrostab_version",
+            "time_coverage_start",
+            "time_coverage_end",
+        } <= set(file.ncattrs())
 
 
 def test_a_product_of_a_stored_surface_has_its_own_title(tmp_path, files):
     product = synthetic.product().assign_attrs(open_surface(files["surface"]).attrs)
-    assert open_product(to_netcdf(product, tmp_path / "p.nc")).attrs["title"].endswith("Q, N, B, K and R of every window")
+    assert (
+        open_product(to_netcdf(product, tmp_path / "p.nc"))
+        .attrs["title"]
+        .endswith("Q, N, B, K and R of every window")
+    )
     named = to_netcdf(product.assign_attrs(title="Run 7"), tmp_path / "n.nc")
     assert open_product(named).attrs["title"] == "Run 7"
 
@@ -355,7 +454,10 @@ def test_a_flipped_bit_is_noticed(tmp_path):
     for chunk in chunks:
         place = chunk.byte_offset + chunk.size // 2
         path.write_bytes(data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :])
-        with open_product(path) as copy, pytest.raises(FormatError, match=r"product\.nc: is damaged"):
+        with (
+            open_product(path) as copy,
+            pytest.raises(FormatError, match=r"product\.nc: is damaged"),
+        ):
             copy.load()
 
 
@@ -367,13 +469,21 @@ def test_chunks_that_threads_compress_are_those_of_the_library(tmp_path, monkeyp
     monkeypatch.setattr(deflate, "_LARGE", 10**9)
     by_library = to_netcdf(product, tmp_path / "library.nc")
     monkeypatch.setattr(deflate, "_LARGE", 1)
-    by_threads = to_netcdf(product.chunk({"axis": 1, "time": 3}) if lazy else product, tmp_path / "threads.nc")
+    by_threads = to_netcdf(
+        product.chunk({"axis": 1, "time": 3}) if lazy else product, tmp_path / "threads.nc"
+    )
     with netCDF4.Dataset(by_library) as wanted, netCDF4.Dataset(by_threads) as found:
         assert set(found.variables) == set(wanted.variables)
         for name, one in wanted.variables.items():
             other = found[name]
-            assert str({key: one.getncattr(key) for key in one.ncattrs()}) == str({key: other.getncattr(key) for key in other.ncattrs()})
-            assert (one.dtype, one.dimensions, one.chunking()) == (other.dtype, other.dimensions, other.chunking())
+            assert str({key: one.getncattr(key) for key in one.ncattrs()}) == str(
+                {key: other.getncattr(key) for key in other.ncattrs()}
+            )
+            assert (one.dtype, one.dimensions, one.chunking()) == (
+                other.dtype,
+                other.dimensions,
+                other.chunking(),
+            )
             assert one.filters() == other.filters()
     several = 0
     with h5py.File(by_library) as wanted, h5py.File(by_threads) as found:
@@ -383,6 +493,8 @@ def test_chunks_that_threads_compress_are_those_of_the_library(tmp_path, monkeyp
                 continue
             several += one.get_num_chunks() > 1
             assert one.get_num_chunks() == other.get_num_chunks()
-            for place in (one.get_chunk_info(number).chunk_offset for number in range(one.get_num_chunks())):
+            for place in (
+                one.get_chunk_info(number).chunk_offset for number in range(one.get_num_chunks())
+            ):
                 assert one.read_direct_chunk(place) == other.read_direct_chunk(place)
     assert several > 5

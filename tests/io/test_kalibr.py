@@ -15,8 +15,10 @@ from gyrostab.io.kalibr import KEYS, kalibr_noise, to_kalibr
 from gyrostab.schema import OBSERVABLE
 from tests.support import synthetic
 
-# By hand. 1 deg/sqrt(h) = 0.017453292519943 rad / sqrt(3600 s) = 0.017453292519943 / 60 rad/sqrt(s), and rad/sqrt(s) = rad/s/sqrt(Hz).
-# 1 deg/h^1.5 = 0.017453292519943 rad / (3600 s)^1.5 = 0.017453292519943 / 216000; rad/s^1.5 = rad/s^2/sqrt(Hz).
+# By hand. 1 deg/sqrt(h) = 0.017453292519943 rad / sqrt(3600 s) = 0.017453292519943 / 60
+# rad/sqrt(s), and rad/sqrt(s) = rad/s/sqrt(Hz).
+# 1 deg/h^1.5 = 0.017453292519943 rad / (3600 s)^1.5 = 0.017453292519943 / 216000; rad/s^1.5 =
+# rad/s^2/sqrt(Hz).
 # 1 deg/h = 0.017453292519943 rad / 3600 s.
 BY_HAND = {
     "gyroscope_noise_density": 2.908882086657e-4,
@@ -60,7 +62,11 @@ def parse(path) -> dict:
 
 def test_units_are_those_worked_out_by_hand(product):
     found = kalibr_noise(product)["x"]
-    for key, value in {"gyroscope_noise_density": 2.0, "gyroscope_random_walk": 3.0, "gyroscope_bias_instability": 5.0}.items():
+    for key, value in {
+        "gyroscope_noise_density": 2.0,
+        "gyroscope_random_walk": 3.0,
+        "gyroscope_bias_instability": 5.0,
+    }.items():
         assert found[key].value == pytest.approx(value * BY_HAND[key], rel=1e-12)
     assert KEYS["gyroscope_random_walk"][2] == "rad/s^2/sqrt(Hz)"
 
@@ -71,7 +77,9 @@ def test_density_gives_the_scatter_of_the_samples():
     density = 0.02 * BY_HAND["gyroscope_noise_density"]  # N = 0.02 deg/sqrt(h)
     rates = np.random.default_rng(3).normal(0.0, density * math.sqrt(rate), samples)  # rad/s
     means = rates.reshape(-1, int(rate)).mean(axis=1)
-    allan = math.sqrt(np.mean(np.diff(means) ** 2) / 2.0) * 180.0 / math.pi * 3600.0  # deg/h at tau = 1 s
+    allan = (
+        math.sqrt(np.mean(np.diff(means) ** 2) / 2.0) * 180.0 / math.pi * 3600.0
+    )  # deg/h at tau = 1 s
     assert allan / 60.0 == pytest.approx(0.02, rel=0.05)  # N^2 / tau at tau = 1/3600 h
 
 
@@ -88,8 +96,14 @@ def test_file_has_the_worst_axis_at_the_top_and_every_axis_below(product, tmp_pa
     assert float(text["update_rate"]) == 300.0
     for key, factor in BY_HAND.items():
         symbol = KEYS[key][0]
-        assert float(text[key]) == float(text["axes"]["y"][key]) == pytest.approx(float(product[symbol][1, 0]) * factor, rel=1e-6)
-        assert float(text["axes"]["x"][key]) == pytest.approx(float(product[symbol][0, 0]) * factor, rel=1e-6)
+        assert (
+            float(text[key])
+            == float(text["axes"]["y"][key])
+            == pytest.approx(float(product[symbol][1, 0]) * factor, rel=1e-6)
+        )
+        assert float(text["axes"]["x"][key]) == pytest.approx(
+            float(product[symbol][0, 0]) * factor, rel=1e-6
+        )
         assert text[f"{key}_meaning"] == "observed"
 
 
@@ -99,13 +113,20 @@ def test_limit_is_said_to_be_one(product, tmp_path):
     path = to_kalibr(product, tmp_path / "imu.yaml")
     text = parse(path)
     assert text["gyroscope_random_walk_meaning"] == "upper_limit_only"
-    assert float(text["gyroscope_random_walk"]) == pytest.approx(8.0 * BY_HAND["gyroscope_random_walk"], rel=1e-6)
-    assert "95 % UPPER LIMIT" in next(line for line in path.read_text().splitlines() if line.startswith("gyroscope_random_walk:"))
+    assert float(text["gyroscope_random_walk"]) == pytest.approx(
+        8.0 * BY_HAND["gyroscope_random_walk"], rel=1e-6
+    )
+    assert "95 % UPPER LIMIT" in next(
+        line for line in path.read_text().splitlines() if line.startswith("gyroscope_random_walk:")
+    )
 
 
 def test_worst_axis_may_be_one_with_a_limit_only(product, tmp_path):
     limit_only(product, "K", 0, upper=50.0)
-    assert parse(to_kalibr(product, tmp_path / "imu.yaml"))["gyroscope_random_walk_meaning"] == "upper_limit_only"
+    assert (
+        parse(to_kalibr(product, tmp_path / "imu.yaml"))["gyroscope_random_walk_meaning"]
+        == "upper_limit_only"
+    )
 
 
 def test_what_no_window_shows_is_null(product, tmp_path):
@@ -115,7 +136,9 @@ def test_what_no_window_shows_is_null(product, tmp_path):
     assert text["gyroscope_random_walk_meaning"] == "not_observable"
     product["observable"].loc[{"term": "K"}][0] = OBSERVABLE.index("observed")
     text = parse(to_kalibr(product, tmp_path / "two.yaml"))
-    assert float(text["gyroscope_random_walk"]) == pytest.approx(3.0 * BY_HAND["gyroscope_random_walk"], rel=1e-6)
+    assert float(text["gyroscope_random_walk"]) == pytest.approx(
+        3.0 * BY_HAND["gyroscope_random_walk"], rel=1e-6
+    )
 
 
 def test_yaml_readers_see_numbers(product, tmp_path):
@@ -142,6 +165,8 @@ def test_command(tmp_path, capsys):
     assert main(["export", source, "-o", str(tmp_path / "imu.yaml"), "--format", "kalibr"]) == 0
     assert set(BY_HAND) <= set(parse(tmp_path / "imu.yaml"))
     assert main(["export", source, "-o", str(tmp_path / "product.zarr"), "--format", "zarr"]) == 0
-    xr.testing.assert_equal(xr.open_zarr(tmp_path / "product.zarr")["N"], xr.open_dataset(source)["N"])
+    xr.testing.assert_equal(
+        xr.open_zarr(tmp_path / "product.zarr")["N"], xr.open_dataset(source)["N"]
+    )
     assert main(["export", source, "-o", str(tmp_path / "imu.txt"), "--format", "kalibr"]) == 2
     assert ".yaml" in capsys.readouterr().err

@@ -36,7 +36,13 @@ def formula_log(formula: str) -> xr.Dataset:
     """Noise of one axis, and a channel, all called like a formula."""
     rng = np.random.default_rng(2)
     values = rng.standard_normal((1, 6000))
-    log = make_log(values, rate=20.0, unit="deg/h", start="2026-05-01", channels={"temperature": (values[0], "degC")})
+    log = make_log(
+        values,
+        rate=20.0,
+        unit="deg/h",
+        start="2026-05-01",
+        channels={"temperature": (values[0], "degC")},
+    )
     log = log.assign_coords(axis=[formula])
     log[formula] = log["temperature"].assign_attrs(units=formula)
     return log
@@ -47,7 +53,11 @@ def test_figures_show_names_and_units_as_they_are(tmp_path):
     log = formula_log(formula)
     product = fit_noise(davar(log, window="1min", step="20s", taus=8)).compute()
     found = correlate(product, channel=formula, max_lag="20s")
-    figures = [plot.plot_correlation(found), plot.plot_signal(log), plot.plot_adev(product, formula)]
+    figures = [
+        plot.plot_correlation(found),
+        plot.plot_signal(log),
+        plot.plot_adev(product, formula),
+    ]
     for figure in (*figures, *(draw() for draw in product_figures(product).values())):
         save_png(figure, tmp_path / "figure.png")
         shown = [text.get_text() for text in figure.findobj(Text) if formula in text.get_text()]
@@ -108,4 +118,15 @@ def test_a_name_that_no_file_can_hold_goes_all_the_way(tmp_path, capfd):
     )
     assert call("run", log, "-o", tmp_path / "product.nc", *WINDOW, "--quiet-progress") == 0
     assert "'<svg_onload=x>' as 'svg_onload_x'" in capfd.readouterr().err
-    assert call("correlate", tmp_path / "product.nc", "--with", "<svg_onload=x>", "--max-lag", "5s", "--quiet-progress") == 0
+    assert (
+        call(
+            "correlate",
+            tmp_path / "product.nc",
+            "--with",
+            "<svg_onload=x>",
+            "--max-lag",
+            "5s",
+            "--quiet-progress",
+        )
+        == 0
+    )

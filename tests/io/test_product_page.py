@@ -34,20 +34,34 @@ def table(path: Path) -> str:
     """The table of the page, from the file; channels of the log are left to the text."""
     import netCDF4
 
-    rows = ["| variable | dimensions | type | unit | missing | meaning |", "|---|---|---|---|---|---|"]
+    rows = [
+        "| variable | dimensions | type | unit | missing | meaning |",
+        "|---|---|---|---|---|---|",
+    ]
     with netCDF4.Dataset(path) as file:
         stored = [name for name in file.variables if name in VARIABLES or name == "time_bounds"]
         assert set(VARIABLES) <= set(stored), "a product has every variable of the schema"
-        for name in sorted(stored, key=[*list(VARIABLES)[:1], "time_bounds", *list(VARIABLES)[1:]].index):
+        for name in sorted(
+            stored, key=[*list(VARIABLES)[:1], "time_bounds", *list(VARIABLES)[1:]].index
+        ):
             variable = file[name]
             kind = "text" if variable.dtype == "S1" else variable.dtype.name
             dims = ", ".join(dim for dim in variable.dimensions if not dim.startswith("string"))
             unit = getattr(variable, "units", "")
-            unit = "micro- or nanoseconds since 1970-01-01" if "since" in unit or name == "time_bounds" else unit
+            unit = (
+                "micro- or nanoseconds since 1970-01-01"
+                if "since" in unit or name == "time_bounds"
+                else unit
+            )
             label = getattr(variable, "unit_label", None)
             missing = "fill" if "_FillValue" in variable.ncattrs() else "never"
             meaning = getattr(variable, "long_name", "start and end of the window")
-            unit = f"`{unit}`" + (f" (reads {label})" if label in (LAWS["N"].label, LAWS["K"].label) else "") if unit else "–"
+            unit = (
+                f"`{unit}`"
+                + (f" (reads {label})" if label in (LAWS["N"].label, LAWS["K"].label) else "")
+                if unit
+                else "–"
+            )
             rows.append(f"| `{name}` | {dims} | {kind} | {unit} | {missing} | {meaning} |")
     return "\n".join(rows) + "\n"
 
@@ -56,7 +70,9 @@ def remake() -> None:
     with tempfile.TemporaryDirectory() as folder:
         rows = table(write_product(Path(folder, "product.nc")))
     text = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(text[: text.index(BEGIN) + len(BEGIN)] + rows + text[text.index(END) :], encoding="utf-8")
+    PAGE.write_text(
+        text[: text.index(BEGIN) + len(BEGIN)] + rows + text[text.index(END) :], encoding="utf-8"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -111,14 +127,21 @@ def folder(tmp_path) -> Path:
 
 def test_the_python_reader(folder, text):
     code = snippet(text, "python")
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True
+    )
     assert float(done.stdout) == pytest.approx(wanted(folder / "product.nc"))
 
 
 @pytest.mark.parametrize(
     ("program", "language", "command", "before"),
     [
-        ("octave", "matlab", ["--no-gui", "--norc", "-q", "--eval"], "pkg load netcdf\nformat long\n"),
+        (
+            "octave",
+            "matlab",
+            ["--no-gui", "--norc", "-q", "--eval"],
+            "pkg load netcdf\nformat long\n",
+        ),
         ("Rscript", "r", ["-e"], ""),
         ("julia", "julia", ["-e"], ""),
     ],
@@ -131,7 +154,9 @@ def test_the_other_readers(program, language, command, before, folder, text):
 def printed_by(program: str, arguments: list[str], folder: Path) -> float:
     if shutil.which(program) is None:
         pytest.skip(f"{program} is absent")
-    done = subprocess.run([program, *arguments], cwd=folder, capture_output=True, text=True, timeout=200, check=False)
+    done = subprocess.run(
+        [program, *arguments], cwd=folder, capture_output=True, text=True, timeout=200, check=False
+    )
     if not done.stdout and re.search("netcdf|ncdf4|NCDatasets", done.stderr):
         pytest.skip(f"{program} has no package for NetCDF")
     return float(re.findall(r"[-+.\deE]+\s*$", done.stdout.strip())[0])
@@ -151,13 +176,20 @@ def log_folder(tmp_path) -> tuple[Path, float]:
     ("program", "language", "command", "before"),
     [
         (sys.executable, "python", ["-c"], ""),
-        ("octave", "matlab", ["--no-gui", "--norc", "-q", "--eval"], "pkg load netcdf\nformat long\n"),
+        (
+            "octave",
+            "matlab",
+            ["--no-gui", "--norc", "-q", "--eval"],
+            "pkg load netcdf\nformat long\n",
+        ),
         ("Rscript", "r", ["-e"], ""),
     ],
 )
 def test_the_readers_of_a_log(program, language, command, before, log_folder, text):
     folder, mean = log_folder
-    assert printed_by(program, [*command, before + snippet(text, language, "log.nc")], folder) == pytest.approx(mean, rel=1e-5)
+    assert printed_by(
+        program, [*command, before + snippet(text, language, "log.nc")], folder
+    ) == pytest.approx(mean, rel=1e-5)
 
 
 if __name__ == "__main__":

@@ -47,7 +47,10 @@ def folder(demo) -> Path:
 def test_the_shipped_log_is_what_its_script_writes(tmp_path):
     shutil.copy(DATA / "make_mwd_sample.py", tmp_path)
     runpy.run_path(str(tmp_path / "make_mwd_sample.py"), run_name="__main__")
-    digest = [hashlib.sha256(gzip.decompress((place / "mwd_sample.csv.gz").read_bytes())).hexdigest() for place in (DATA, tmp_path)]
+    digest = [
+        hashlib.sha256(gzip.decompress((place / "mwd_sample.csv.gz").read_bytes())).hexdigest()
+        for place in (DATA, tmp_path)
+    ]
     assert digest[0] == digest[1]
     assert (DATA / "README.md").read_text() == (tmp_path / "README.md").read_text()
 
@@ -59,7 +62,9 @@ def test_the_shipped_log_is_found_and_small():
 def test_parts_come_from_the_vibration_channel(folder):
     parts = find_parts(open_log(folder / "log.nc")["vibration"])
     start = pd.Timestamp("2026-03-14T08:00:00")
-    seconds = {name: [(stamp - start).total_seconds() for stamp in span] for name, span in parts.items()}
+    seconds = {
+        name: [(stamp - start).total_seconds() for stamp in span] for name, span in parts.items()
+    }
     assert seconds["still"][1] == pytest.approx(329.5, abs=1.0)
     assert seconds["vibrating"] == pytest.approx([330.5, 629.5], abs=1.0)
     assert seconds["after"][0] == pytest.approx(630.5, abs=1.0)
@@ -74,9 +79,15 @@ def test_a_vibration_that_does_not_rise_and_fall_is_refused(levels):
 
 def test_demo_finds_what_was_put_in(folder, truth):
     product = open_product(folder / "product.nc").load()
-    second = (product["time"].values - np.datetime64("2026-03-14T08:00:00")) / np.timedelta64(1, "s")
+    second = (product["time"].values - np.datetime64("2026-03-14T08:00:00")) / np.timedelta64(
+        1, "s"
+    )
     for axis, true in truth.items():
-        for inside, vibrating in (((second < 220), False), ((second > 480) & (second < 600), True), ((second > 660), False)):
+        for inside, vibrating in (
+            ((second < 220), False),
+            ((second > 480) & (second < 600), True),
+            ((second > 660), False),
+        ):
             part = product.sel(axis=axis).isel(time=np.flatnonzero(inside))
             n_true = true["N"] * (true["N_factor"] if vibrating else 1.0)
             q_true = np.hypot(true["Q"], true["theta"] if vibrating else 0.0)

@@ -39,10 +39,29 @@ def address(tmp_path_factory):
     where = folder / "scheduler.json"
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
     scheduler = ["scheduler", "--host", "127.0.0.1", "--port", "0"]
-    worker = ["worker", "--host", "127.0.0.1", "--nworkers", "2", "--nthreads", "1", "--memory-limit", "0"]
+    worker = [
+        "worker",
+        "--host",
+        "127.0.0.1",
+        "--nworkers",
+        "2",
+        "--nthreads",
+        "1",
+        "--memory-limit",
+        "0",
+    ]
     with ExitStack() as stack:
         for command in (scheduler, [*worker, "--local-directory", str(folder)]):
-            stack.enter_context(_program("dask", *command, "--scheduler-file", str(where), "--no-dashboard", env=environment))
+            stack.enter_context(
+                _program(
+                    "dask",
+                    *command,
+                    "--scheduler-file",
+                    str(where),
+                    "--no-dashboard",
+                    env=environment,
+                )
+            )
         _wait_for(where)
         with distributed.Client(scheduler_file=str(where)) as client:
             client.wait_for_workers(2, timeout=60)
@@ -51,10 +70,18 @@ def address(tmp_path_factory):
 
 
 @contextmanager
-def _program(module: str, *arguments: str, env: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+def _program(
+    module: str, *arguments: str, env: dict[str, str]
+) -> Iterator[subprocess.Popen[bytes]]:
     """A program that runs beside the tests, and ends with all that it has started."""
     command = [sys.executable, "-m", module, *arguments]
-    started = subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    started = subprocess.Popen(
+        command,
+        env=env,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
     try:
         yield started
     finally:
@@ -107,7 +134,9 @@ def test_two_worker_processes_make_the_same_bytes(address, log, whole, tmp_path)
         seen = client.run(_what_a_worker_knows)
         assert len(seen) == 2
         assert all("gyrostab.allan.davar" in loaded for loaded, _ in seen.values())
-        assert all(threads is None for _, threads in seen.values()), "a kernel has started threads of its own"
+        assert all(threads is None for _, threads in seen.values()), (
+            "a kernel has started threads of its own"
+        )
 
 
 def _what_a_worker_knows():
@@ -132,7 +161,13 @@ def test_zarr_store_and_text_on_workers(address, tmp_path):
     for source in (store, text):
         for scheduler in ("threads", address):
             output = tmp_path / f"{source.suffix[1:]}-{scheduler[:3]}.nc"
-            run([source], output, windows=WINDOW, reading={"epoch": "2026-05-01"} if source == text else {}, scheduler=scheduler)
+            run(
+                [source],
+                output,
+                windows=WINDOW,
+                reading={"epoch": "2026-05-01"} if source == text else {},
+                scheduler=scheduler,
+            )
             made[source.suffix, scheduler] = open_arrays(output)
     for suffix in (".zarr", ".csv"):
         one, other = made[suffix, "threads"], made[suffix, address]
@@ -196,12 +231,23 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
     assert max(sizes[1_270_000]) < 2000
 
 
-# ------------------------------------------------------------------------------------------------------- what goes wrong
+# -------------------------------------------------------------------------------------------------------
+# what goes wrong
 
 
 def test_no_scheduler_there(log, tmp_path, capfd, monkeypatch):
     monkeypatch.setattr("gyrostab.jobs.schedule._TIMEOUT", 1.0)
-    arguments = ["run", str(log), "-o", str(tmp_path / "p.nc"), "--window", "40s", "--scheduler", "127.0.0.1:9", "--quiet-progress"]
+    arguments = [
+        "run",
+        str(log),
+        "-o",
+        str(tmp_path / "p.nc"),
+        "--window",
+        "40s",
+        "--scheduler",
+        "127.0.0.1:9",
+        "--quiet-progress",
+    ]
     assert main(arguments) == 2
     shown = capfd.readouterr().err
     assert "no dask scheduler answers there" in shown
@@ -210,7 +256,9 @@ def test_no_scheduler_there(log, tmp_path, capfd, monkeypatch):
 
 
 def test_a_worker_that_does_not_see_the_files(address, tmp_path):
-    with pytest.raises(WorkerError, match=r"does not see .*nowhere\.csv; all workers need the same file system"):
+    with pytest.raises(
+        WorkerError, match=r"does not see .*nowhere\.csv; all workers need the same file system"
+    ):
         _open(address, tmp_path / "nowhere.csv")
 
 
@@ -227,8 +275,14 @@ def _open(address: str, path: Path) -> None:
 
 def test_a_scheduler_without_workers(monkeypatch):
     monkeypatch.setattr("gyrostab.jobs.schedule._TIMEOUT", 3.0)
-    cluster = distributed.LocalCluster(n_workers=0, dashboard_address=":0", processes=True, silence_logs=50)
-    with cluster, pytest.raises(WorkerError, match="has no workers; start some with 'dask worker"), open_pool(cluster.scheduler_address):
+    cluster = distributed.LocalCluster(
+        n_workers=0, dashboard_address=":0", processes=True, silence_logs=50
+    )
+    with (
+        cluster,
+        pytest.raises(WorkerError, match="has no workers; start some with 'dask worker"),
+        open_pool(cluster.scheduler_address),
+    ):
         pass
 
 
@@ -242,17 +296,55 @@ def test_distributed_is_not_installed(log, tmp_path):
     assert "pip install 'gyrostab[distributed]'" in done.stderr
 
 
-def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(log, whole, tmp_path, monkeypatch, capfd):
+def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
+    log, whole, tmp_path, monkeypatch, capfd
+):
     """The scheduler is killed while parts are on their way; what is finished is kept, and threads do the rest."""
     where = tmp_path / "scheduler.json"
-    options = ["--window", WINDOW["window"], "--step", WINDOW["step"], "--taus", WINDOW["taus"], "--quiet-progress"]
+    options = [
+        "--window",
+        WINDOW["window"],
+        "--step",
+        WINDOW["step"],
+        "--taus",
+        WINDOW["taus"],
+        "--quiet-progress",
+    ]
     common = ["--scheduler-file", str(where), "--no-dashboard"]
-    worker = ["worker", "--host", "127.0.0.1", "--nworkers", "1", "--nthreads", "1", "--local-directory", str(tmp_path / "worker")]
+    worker = [
+        "worker",
+        "--host",
+        "127.0.0.1",
+        "--nworkers",
+        "1",
+        "--nthreads",
+        "1",
+        "--local-directory",
+        str(tmp_path / "worker"),
+    ]
     output = tmp_path / "out" / "product.nc"
     output.parent.mkdir()
     with ExitStack() as stack:
-        scheduler = stack.enter_context(_program("dask", "scheduler", "--host", "127.0.0.1", "--port", "0", *common, env=dict(os.environ)))
-        stack.enter_context(_program("dask", *worker, *common, env={**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}))
+        scheduler = stack.enter_context(
+            _program(
+                "dask",
+                "scheduler",
+                "--host",
+                "127.0.0.1",
+                "--port",
+                "0",
+                *common,
+                env=dict(os.environ),
+            )
+        )
+        stack.enter_context(
+            _program(
+                "dask",
+                *worker,
+                *common,
+                env={**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"},
+            )
+        )
         _wait_for(where)
         found = json.loads(where.read_text())["address"]
 
@@ -289,12 +381,18 @@ def test_a_scheduler_that_is_no_scheduler(name):
 
 
 def test_a_worker_process_that_dies_is_explained():
-    with open_pool("processes", workers=1) as pool, pytest.raises(WorkerError, match="a worker process has died"):
+    with (
+        open_pool("processes", workers=1) as pool,
+        pytest.raises(WorkerError, match="a worker process has died"),
+    ):
         list(in_any_order(pool, [(os._exit, 3)]))
 
 
 def test_a_part_that_kills_every_worker_is_explained(address):
-    with open_pool(address) as pool, pytest.raises(WorkerError, match="died again and again on the same part"):
+    with (
+        open_pool(address) as pool,
+        pytest.raises(WorkerError, match="died again and again on the same part"),
+    ):
         list(in_any_order(pool, [(os._exit, 3)]))
 
 

@@ -10,7 +10,14 @@ import pytest
 
 from gyrostab import make_log, to_zarr
 from gyrostab.errors import OutputError
-from gyrostab.jobs.job import begin_job, check_job_folder, make_fingerprint, read_job, remove_damage, seal_store
+from gyrostab.jobs.job import (
+    begin_job,
+    check_job_folder,
+    make_fingerprint,
+    read_job,
+    remove_damage,
+    seal_store,
+)
 
 
 def flip(content: bytes, place: int, bit: int) -> bytes:
@@ -30,7 +37,9 @@ def test_a_flipped_bit_in_the_description_of_a_run_is_noticed(tmp_path):
     assert read_job(tmp_path) is None
 
 
-@pytest.mark.parametrize("damage", ["none", "flipped", "cut", "gone", "never sealed", "seal damaged"])
+@pytest.mark.parametrize(
+    "damage", ["none", "flipped", "cut", "gone", "never sealed", "seal damaged"]
+)
 def test_a_damaged_store_of_a_run_is_removed(tmp_path, damage):
     store = to_zarr(make_log(np.arange(100.0)[None], rate=1.0, unit="deg/h"), tmp_path / "log.zarr")
     if damage != "never sealed":
@@ -47,7 +56,9 @@ def test_a_damaged_store_of_a_run_is_removed(tmp_path, damage):
         (tmp_path / "log.sha256").write_bytes(b"\xff")
     (tmp_path / ".windows-0000000000.block.gyrostab-0123abcd.part").write_text("half")
     remove_damage(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == ({"log.zarr", "log.sha256"} if damage == "none" else set())
+    assert {path.name for path in tmp_path.iterdir()} == (
+        {"log.zarr", "log.sha256"} if damage == "none" else set()
+    )
 
 
 def test_what_a_run_leaves_is_known_at_every_stage(tmp_path):
@@ -67,7 +78,13 @@ def test_what_a_run_leaves_is_known_at_every_stage(tmp_path):
 
 
 def test_the_published_table_has_no_loss():
-    page = (Path(__file__).resolve().parents[2] / "docs" / "durability.md").read_text(encoding="utf-8")
-    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ") and line.split(" | ")[1].strip().isdigit()]
+    page = (Path(__file__).resolve().parents[2] / "docs" / "durability.md").read_text(
+        encoding="utf-8"
+    )
+    rows = [
+        line.strip("| ").split(" | ")
+        for line in page.splitlines()
+        if line.startswith("| ") and line.split(" | ")[1].strip().isdigit()
+    ]
     assert len(rows) == 11
     assert all(trials == good for _, trials, _, good in rows)

@@ -25,7 +25,15 @@ from gyrostab.time.grid import time_coordinate
 from tests.support.crashing import WINDOW
 
 pytestmark = pytest.mark.xdist_group("resume")
-OPTIONS = ("--window", WINDOW["window"], "--step", WINDOW["step"], "--taus", WINDOW["taus"], "--quiet-progress")
+OPTIONS = (
+    "--window",
+    WINDOW["window"],
+    "--step",
+    WINDOW["step"],
+    "--taus",
+    WINDOW["taus"],
+    "--quiet-progress",
+)
 PARTS = 5
 
 
@@ -37,7 +45,11 @@ def write_log(path: Path) -> Path:
     log = make_log(rate, rate=100.0, unit="deg/h", start="2026-05-01")
     stamps = log["time"].values[::100]
     log = log.assign_coords(time_temperature=stamps)
-    log["temperature"] = ("time_temperature", 20.0 + np.arange(stamps.size) / 1000.0, {"units": "degree_Celsius"})
+    log["temperature"] = (
+        "time_temperature",
+        20.0 + np.arange(stamps.size) / 1000.0,
+        {"units": "degree_Celsius"},
+    )
     return to_netcdf(log, path)
 
 
@@ -124,7 +136,8 @@ def stopped(log, after_two, tmp_path, capfd, monkeypatch) -> Path:
     return output
 
 
-# ------------------------------------------------------------------------------------------------------------- the parts
+# -------------------------------------------------------------------------------------------------------------
+# the parts
 
 
 def test_parts_are_cuts_of_the_whole_bit_for_bit():
@@ -132,7 +145,13 @@ def test_parts_are_cuts_of_the_whole_bit_for_bit():
     values = rng.standard_normal((2, 700_000)).cumsum(axis=1)
     values[0, 100_000:180_000] = np.nan
     values[1, 555_555] = np.nan
-    log = make_log(values, rate=300.0, unit="deg/h", start="2026-05-01T00:00:00.1", channels={"temperature": (values[0] / 1e4, "degC")})
+    log = make_log(
+        values,
+        rate=300.0,
+        unit="deg/h",
+        start="2026-05-01T00:00:00.1",
+        channels={"temperature": (values[0] / 1e4, "degC")},
+    )
     options = {"window": "1500samples", "step": "700samples", "taus": 9}
     surface = davar(log.chunk({"time": 99_999}), **options).compute()
     parts = davar_parts(log, samples=1, **options)
@@ -167,18 +186,23 @@ def test_a_run_makes_what_the_functions_make(log, whole, tmp_path):
         assert made.attrs["gyrostab_job"].startswith("sha256:")
         assert set(made.variables) == set(product.variables)
         for name in product.variables:
-            np.testing.assert_array_equal(made[name].values, product[name].values, err_msg=str(name))
+            np.testing.assert_array_equal(
+                made[name].values, product[name].values, err_msg=str(name)
+            )
             assert made[name].dims == product[name].dims
 
 
-@pytest.mark.parametrize("options", [("--workers", 1), ("--workers", 3), ("--scheduler", "processes", "--workers", 2)])
+@pytest.mark.parametrize(
+    "options", [("--workers", 1), ("--workers", 3), ("--scheduler", "processes", "--workers", 2)]
+)
 def test_workers_do_not_change_a_byte(log, whole, tmp_path, options):
     assert call(log, "-o", tmp_path / "product.nc", *options) == 0
     assert (tmp_path / "product.nc").read_bytes() == whole
     assert [path.name for path in tmp_path.iterdir()] == ["product.nc"]
 
 
-# -------------------------------------------------------------------------------------------------- stopped and continued
+# --------------------------------------------------------------------------------------------------
+# stopped and continued
 
 
 def test_resume_computes_the_rest_only(stopped, log, whole, computed):
@@ -210,7 +234,9 @@ def test_a_damaged_block_is_computed_again(stopped, log, whole, computed, damage
     assert stopped.read_bytes() == whole
 
 
-def test_resume_of_nothing_begins_and_of_the_complete_does_nothing(log, whole, computed, tmp_path, capfd):
+def test_resume_of_nothing_begins_and_of_the_complete_does_nothing(
+    log, whole, computed, tmp_path, capfd
+):
     output = tmp_path / "product.nc"
     assert call(log, "-o", output, "--resume") == 0
     assert (len(computed), output.read_bytes()) == (PARTS, whole)
@@ -225,7 +251,9 @@ def test_resume_of_nothing_begins_and_of_the_complete_does_nothing(log, whole, c
     assert "exists already" in capfd.readouterr().err
 
 
-def test_resume_remembers_that_the_old_product_may_go(log, whole, after_two, tmp_path, monkeypatch, capfd):
+def test_resume_remembers_that_the_old_product_may_go(
+    log, whole, after_two, tmp_path, monkeypatch, capfd
+):
     output = tmp_path / "product.nc"
     output.write_text("old")
     after_two(stop)
@@ -236,7 +264,8 @@ def test_resume_remembers_that_the_old_product_may_go(log, whole, after_two, tmp
     assert output.read_bytes() == whole
 
 
-# ------------------------------------------------------------------------------------------------------ what has changed
+# ------------------------------------------------------------------------------------------------------
+# what has changed
 
 
 def _touched(path: Path) -> None:
@@ -287,14 +316,18 @@ def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
     store = to_zarr(open_log(log), tmp_path / "run7.zarr")
     before = make_fingerprint([store], {})
     assert differences(before, make_fingerprint([store], {})) == ""
-    chunk = next(path for path in sorted((store / "rate").iterdir()) if not path.name.startswith("."))
+    chunk = next(
+        path for path in sorted((store / "rate").iterdir()) if not path.name.startswith(".")
+    )
     while chunk.is_dir():
         chunk = next(chunk.iterdir())
     _touched(chunk)
     assert "run7.zarr has changed" in differences(before, make_fingerprint([store], {}))
 
 
-def test_an_input_that_vanishes_meanwhile(log, whole, tmp_path, after_two, monkeypatch, computed, capfd):
+def test_an_input_that_vanishes_meanwhile(
+    log, whole, tmp_path, after_two, monkeypatch, computed, capfd
+):
     own, aside = tmp_path / log.name, tmp_path / "aside"
     own.write_bytes(log.read_bytes())
     os.utime(own, ns=(log.stat().st_atime_ns, log.stat().st_mtime_ns))
@@ -314,11 +347,14 @@ def test_an_input_that_vanishes_meanwhile(log, whole, tmp_path, after_two, monke
     assert output.read_bytes() == whole
 
 
-# ---------------------------------------------------------------------------------------------------------- no more room
+# ----------------------------------------------------------------------------------------------------------
+# no more room
 
 
 def limit_file_size(bytes_: int) -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    resource.setrlimit(
+        resource.RLIMIT_FSIZE, (bytes_, resource.getrlimit(resource.RLIMIT_FSIZE)[1])
+    )
 
 
 @pytest.fixture
@@ -334,7 +370,9 @@ def test_no_room_for_the_first_block(log, tmp_path, free_again, capfd):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_no_room_for_a_later_block(log, whole, tmp_path, after_two, monkeypatch, free_again, computed, capfd):
+def test_no_room_for_a_later_block(
+    log, whole, tmp_path, after_two, monkeypatch, free_again, computed, capfd
+):
     after_two(lambda: limit_file_size(8192))
     assert call(log, "-o", tmp_path / "product.nc") == 2
     message = one_message(capfd.readouterr())
@@ -368,7 +406,8 @@ def test_no_room_for_the_product(log, whole, tmp_path, monkeypatch, free_again, 
     assert (tmp_path / "product.nc").read_bytes() == whole
 
 
-# ------------------------------------------------------------------------------------------------- two at once, and kills
+# -------------------------------------------------------------------------------------------------
+# two at once, and kills
 
 
 def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
@@ -385,8 +424,19 @@ def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
 def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path):
     seed = random.SystemRandom().randrange(10**6)
     print(f"seed {seed}")
-    command = [sys.executable, "-m", "tests.support.crashing", str(tmp_path), str(log), str(seed), "8", "4"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=250, cwd=Path(__file__).parents[2])
+    command = [
+        sys.executable,
+        "-m",
+        "tests.support.crashing",
+        str(tmp_path),
+        str(log),
+        str(seed),
+        "8",
+        "4",
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=250, cwd=Path(__file__).parents[2]
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     print(result)

@@ -17,7 +17,16 @@ from tests.support.effect_bench import random_cuts, run, same_whatever_the_cuts
 EFFECTS = list(effects().values())
 SIZE, RATE = 3000, 10.0
 each = pytest.mark.parametrize("kind", EFFECTS, ids=lambda kind: kind.name)
-_TYPICAL = {"degree_Celsius": 60.0, "g": 1.0, "degree s-1": 360.0, "V": 24.0, "W": 1e-4, "uT": 30.0, "Pa": 1e7, "1": 0.5}
+_TYPICAL = {
+    "degree_Celsius": 60.0,
+    "g": 1.0,
+    "degree s-1": 360.0,
+    "V": 24.0,
+    "W": 1e-4,
+    "uT": 30.0,
+    "Pa": 1e7,
+    "1": 0.5,
+}
 
 
 def drivers(kind: type[Effect]) -> dict[str, np.ndarray]:
@@ -36,7 +45,10 @@ def options(kind: type[Effect]) -> dict:
         "size": SIZE,
         "rate": RATE,
         "drivers": drivers(kind),
-        "true": {axis: 15.0 * np.sin(np.arange(SIZE) / 90.0 + number) for number, axis in enumerate("xyz")},
+        "true": {
+            axis: 15.0 * np.sin(np.arange(SIZE) / 90.0 + number)
+            for number, axis in enumerate("xyz")
+        },
         "signal": rng.normal(0.0, 3.0, (3, SIZE)) + 5.0,
         "noise": {"Q": 0.5, "N": 0.003, "B": 0.004, "K": 0.02, "R": 0.0},
         "gaps": np.array([[700, 760], [1500, 1900]]),
@@ -122,7 +134,9 @@ def test_explains_reduced_data(kind):
     names = {item.name for item in kind.parameters()}
     found = effect.explain(windows)
     assert isinstance(found, Prediction)
-    assert set(found.mean) | set(found.spectrum) | {parameter for _, parameter in found.level} <= names
+    assert (
+        set(found.mean) | set(found.spectrum) | {parameter for _, parameter in found.level} <= names
+    )
     for design in [*found.mean.values(), *found.level.values()]:
         assert np.shape(design)[-1] == 15
         assert np.isfinite(design).all()
@@ -154,23 +168,42 @@ def test_units_and_ranges_are_kept(kind):
 def test_without_its_channel_it_says_which(kind):
     effect = kind.example()
     needs = effect.needs()
-    table = {item.name: list(value) if isinstance(value := getattr(effect, item.name), tuple) else value for item in effect.parameters()}
-    model = {"effect": [{"name": kind.name} | table], "noise": {}, "log": {"rate": 10, "duration": "1s"}}
+    table = {
+        item.name: list(value) if isinstance(value := getattr(effect, item.name), tuple) else value
+        for item in effect.parameters()
+    }
+    model = {
+        "effect": [{"name": kind.name} | table],
+        "noise": {},
+        "log": {"rate": 10, "duration": "1s"},
+    }
     if not needs:
         assert simulate(model).sizes["time"] == 10
         return
-    with pytest.raises(SchemaError, match=f"effect '{kind.name}' needs the channel '{needs[0]}' .*add it to the environment"):
+    with pytest.raises(
+        SchemaError,
+        match=f"effect '{kind.name}' needs the channel '{needs[0]}' .*add it to the environment",
+    ):
         simulate(model)
 
 
 @each
 def test_sizes_are_sourced_and_the_text_names_what_it_is_confused_with(kind):
-    for word in ("*DAVAR*", "*Window mean*", "*Spectrum*", "*Axes*", "Confused with", "References", "Examples"):
+    for word in (
+        "*DAVAR*",
+        "*Window mean*",
+        "*Spectrum*",
+        "*Axes*",
+        "Confused with",
+        "References",
+        "Examples",
+    ):
         assert word in " ".join(kind.__doc__.split())
     assert all(item.source for item in kind.parameters())
 
 
-# ---------------------------------------------------------------------------------------------------------------- models
+# ----------------------------------------------------------------------------------------------------------------
+# models
 
 
 @pytest.mark.parametrize(
@@ -178,14 +211,26 @@ def test_sizes_are_sourced_and_the_text_names_what_it_is_confused_with(kind):
     [
         ({}, "has no name"),
         ({"name": "shupi"}, "there is no effect 'shupi'"),
-        ({"name": "temperature_bias"}, r"lacks the parameter 'sensitivity' \(bias per degree\); give a number in deg/h/degC"),
-        ({"name": "temperature_bias", "sensitivty": 1}, "did you mean 'sensitivity'.*it has sensitivity .deg/h/degC.*reference"),
-        ({"name": "temperature_bias", "sensitivity": "3 K"}, "the unit 'K' is not known here; give the number in deg/h/degC"),
+        (
+            {"name": "temperature_bias"},
+            r"lacks the parameter 'sensitivity' \(bias per degree\); give a number in deg/h/degC",
+        ),
+        (
+            {"name": "temperature_bias", "sensitivty": 1},
+            "did you mean 'sensitivity'.*it has sensitivity .deg/h/degC.*reference",
+        ),
+        (
+            {"name": "temperature_bias", "sensitivity": "3 K"},
+            "the unit 'K' is not known here; give the number in deg/h/degC",
+        ),
         ({"name": "temperature_bias", "sensitivity": "much"}, "not a number with a unit"),
         ({"name": "temperature_bias", "sensitivity": True}, "True is not a number"),
         ({"name": "temperature_bias", "sensitivity": [1.0, 2.0]}, "give one number"),
         ({"name": "temperature_bias", "sensitivity": 99}, "outside of the allowed range -10 to 10"),
-        ({"name": "temperature_bias", "sensitivity": 1, "driver": ["a", "b"]}, "driver names 2 channels; it takes temperature"),
+        (
+            {"name": "temperature_bias", "sensitivity": 1, "driver": ["a", "b"]},
+            "driver names 2 channels; it takes temperature",
+        ),
     ],
 )
 def test_a_wrong_table_is_explained(table, words):
@@ -195,24 +240,29 @@ def test_a_wrong_table_is_explained(table, words):
 
 
 def test_units_are_converted():
-    assert make_effect({"name": "temperature_bias", "sensitivity": "0.1 deg/h/degC", "reference": "300 K"}).reference == pytest.approx(
-        26.85
-    )
+    assert make_effect(
+        {"name": "temperature_bias", "sensitivity": "0.1 deg/h/degC", "reference": "300 K"}
+    ).reference == pytest.approx(26.85)
 
 
 def test_table_lists_every_parameter_of_every_effect():
     table = effect_table()
     assert set(table["effect"]) == set(effects())
-    row = table[(table["effect"] == "temperature_bias") & (table["parameter"] == "sensitivity")].iloc[0]
+    row = table[
+        (table["effect"] == "temperature_bias") & (table["parameter"] == "sensitivity")
+    ].iloc[0]
     assert row["unit"] == "deg/h/degC"
     assert row["required"]
 
 
-# -------------------------------------------------------------------------------------------------------- the two examples
+# --------------------------------------------------------------------------------------------------------
+# the two examples
 
 
 def test_temperature_bias_is_its_polynomial():
-    effect = effects()["temperature_bias"](sensitivity=0.002, quadratic=1e-4, cubic=-1e-6, reference=20.0)
+    effect = effects()["temperature_bias"](
+        sensitivity=0.002, quadratic=1e-4, cubic=-1e-6, reference=20.0
+    )
     bias = run(effect, size=3, drivers={"temperature": [20.0, 30.0, 70.0]})
     np.testing.assert_allclose(bias[1], [0.0, 0.02 + 0.01 - 0.001, 0.1 + 0.25 - 0.125], rtol=1e-12)
 
@@ -222,4 +272,7 @@ def test_g_sensitivity_is_its_scalar_product_and_needs_only_what_it_uses():
     assert effect.needs() == ("accel_x", "accel_z")
     bias = run(effect, size=2, drivers={"accel_x": [1.0, 0.0], "accel_z": [0.0, 1.0]})
     np.testing.assert_allclose(bias, [[0.01, -0.02]], rtol=1e-12)
-    assert effect.say() == "The bias follows the acceleration on axis y, by 0.01 deg/h/g along x, -0.02 deg/h/g along z."
+    assert (
+        effect.say()
+        == "The bias follows the acceleration on axis y, by 0.01 deg/h/g along x, -0.02 deg/h/g along z."
+    )

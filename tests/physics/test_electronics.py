@@ -15,21 +15,37 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.lorentz import lorentz_density
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import avar, band_powers, random_cuts, run, said_density, same_whatever_the_cuts, windows_of
+from tests.support.effect_bench import (
+    avar,
+    band_powers,
+    random_cuts,
+    run,
+    said_density,
+    same_whatever_the_cuts,
+    windows_of,
+)
 
 NRAD_PER_S = math.degrees(1e-9) * 3600.0  # deg/h
 
 
-# ---------------------------------------------------------------------------------------------------------------- optics
+# ----------------------------------------------------------------------------------------------------------------
+# optics
 
 
 def test_a_dead_zone_cuts_the_middle_out():
     signal = np.array([[-0.5, -0.2, -0.05, 0.0, 0.15, 0.5]])
     kept = run(make_effect({"name": "dead_zone", "width": 0.2}), size=6, axes="x", signal=signal)
     np.testing.assert_allclose(kept, [[-0.3, 0.0, 0.0, 0.0, 0.0, 0.3]], atol=1e-15)
-    jump = run(make_effect({"name": "dead_zone", "width": 0.2, "edge": "jump", "centre": 0.1}), size=6, axes="x", signal=signal)
+    jump = run(
+        make_effect({"name": "dead_zone", "width": 0.2, "edge": "jump", "centre": 0.1}),
+        size=6,
+        axes="x",
+        signal=signal,
+    )
     np.testing.assert_allclose(jump, [[-0.5, -0.2, 0.1, 0.1, 0.1, 0.5]], atol=1e-15)
-    said = make_effect({"name": "dead_zone", "width": 0.2}).explain(windows_of(30, 1.0, 10.0, own={"x": np.array([-3.0, 0.0, 3.0])}))
+    said = make_effect({"name": "dead_zone", "width": 0.2}).explain(
+        windows_of(30, 1.0, 10.0, own={"x": np.array([-3.0, 0.0, 3.0])})
+    )
     np.testing.assert_array_equal(said.mean["width"], [[1.0, 0.0, -1.0]])
 
 
@@ -46,7 +62,19 @@ def test_noise_dithers_a_dead_zone_unless_the_loop_is_slow():
 
 def test_a_sweep_through_a_dead_zone_has_odd_harmonics():
     wave = np.sin(2 * np.pi * np.arange(4000) / 400.0)[None]
-    amplitude = np.abs(np.fft.rfft(run(make_effect({"name": "dead_zone", "width": 0.3}), size=4000, axes="x", signal=wave)[0])) / 2000
+    amplitude = (
+        np.abs(
+            np.fft.rfft(
+                run(
+                    make_effect({"name": "dead_zone", "width": 0.3}),
+                    size=4000,
+                    axes="x",
+                    signal=wave,
+                )[0]
+            )
+        )
+        / 2000
+    )
     assert amplitude[30] > 0.03
     assert amplitude[50] > 0.005
     assert amplitude[[20, 40, 60]].max() < 1e-12
@@ -63,7 +91,9 @@ def reset_truth(effect, w, rate, size, fine=400):
     rates = resets * effect.kick * NRAD_PER_S / step
     for place in np.flatnonzero(resets):
         after = t[place:] - t[place]
-        rates[place:] += resets[place] * effect.tail * NRAD_PER_S / effect.decay * np.exp(-after / effect.decay)
+        rates[place:] += (
+            resets[place] * effect.tail * NRAD_PER_S / effect.decay * np.exp(-after / effect.decay)
+        )
     phase = angle[:-1] % 1.0
     return (rates + effect.sawtooth * (1 - 2 * phase)).reshape(size, fine).mean(axis=1)
 
@@ -74,7 +104,9 @@ def test_resets_add_their_angles_whichever_way_it_turns(part):
     turn = effect.turn * NRAD_PER_S
     assert effect.turn == pytest.approx(1.45 * 1550e-9 / 0.2 * 1e9)
     t = np.arange(300) / 50.0
-    w = turn * (9.3 * np.cos(2 * np.pi * t / 4.1) + 1.7)  # up to eleven resets in a second, forth and back
+    w = turn * (
+        9.3 * np.cos(2 * np.pi * t / 4.1) + 1.7
+    )  # up to eleven resets in a second, forth and back
     found = run(effect, size=300, rate=50.0, axes="x", signal=w)[0] - w
     truth = reset_truth(effect, w, 50.0, 300)
     np.testing.assert_allclose(found, truth, atol=0.012 * np.abs(truth).max())
@@ -82,12 +114,16 @@ def test_resets_add_their_angles_whichever_way_it_turns(part):
 
 
 def test_resets_faster_than_samples_are_a_scale_factor():
-    effect = make_effect({"name": "feedback_reset", "kick": 5.0, "tail": 8.0, "decay": 0.001, "sawtooth": 1.0})
+    effect = make_effect(
+        {"name": "feedback_reset", "kick": 5.0, "tail": 8.0, "decay": 0.001, "sawtooth": 1.0}
+    )
     w = 1e6 * effect.turn * NRAD_PER_S  # a million resets in a second
     error = run(effect, size=2000, rate=100.0, axes="x", signal=w)[0] - w
     np.testing.assert_allclose(error[5:], w * 13.0 / effect.turn, rtol=1e-4)
     said = effect.explain(windows_of(2000, 100.0, 10.0, own={"x": np.full(2, w)})).mean
-    np.testing.assert_allclose(5 * said["kick"] + 8 * said["tail"], w * 13 / effect.turn, rtol=1e-12)
+    np.testing.assert_allclose(
+        5 * said["kick"] + 8 * said["tail"], w * 13 / effect.turn, rtol=1e-12
+    )
 
 
 def test_the_comb_of_resets_moves_with_the_rate():
@@ -101,7 +137,9 @@ def test_the_comb_of_resets_moves_with_the_rate():
         said = effect.explain(windows_of(20_000, 100.0, 200.0, edges, own={"x": np.full(1, w)}))
         places.append(f[spectrum.argmax()])
         assert places[-1] == pytest.approx(said.line[0, 0], rel=0.01)
-        total = sum(size**2 * said.spectrum[name][0] for name, size in (("sawtooth", 0.4), ("kick", 3.0)))
+        total = sum(
+            size**2 * said.spectrum[name][0] for name, size in (("sawtooth", 0.4), ("kick", 3.0))
+        )
         assert edges[total.argmax()] == pytest.approx(places[-1], rel=0.07)
     assert places[1] / places[0] == pytest.approx(2.5, rel=0.01)
 
@@ -116,15 +154,29 @@ def test_the_comb_has_the_power_that_is_said():
         near = np.abs(f - line) < 0.1
         bands = np.array([line / 1.05, line, line * 1.05])
         said = effect.explain(windows_of(60_000, 100.0, 600.0, bands, own={"x": np.full(1, 11.15)}))
-        (name, size), width = next(iter(part.items())), line * (math.sqrt(1.05) - 1 / math.sqrt(1.05))
-        assert power[near].sum() == pytest.approx(2 * width * size**2 * said.spectrum[name][0, 1], rel=0.02)
+        (name, size), width = (
+            next(iter(part.items())),
+            line * (math.sqrt(1.05) - 1 / math.sqrt(1.05)),
+        )
+        assert power[near].sum() == pytest.approx(
+            2 * width * size**2 * said.spectrum[name][0, 1], rel=0.02
+        )
 
 
 def test_the_resets_of_a_real_gyro_are_of_this_kind_and_size(recordings):
     with gzip.open(recordings("fog-blueseis-ramp/fog_ramp.csv.gz"), "rt") as file:
         columns = np.loadtxt(file, delimiter=",", skiprows=1)
     measured, ramp = columns[:, 1] * NRAD_PER_S, columns[:, 2]
-    effect = make_effect({"name": "feedback_reset", "kick": 11.5, "tail": 18, "decay": 0.012, "phase": "channel", "full": -32768})
+    effect = make_effect(
+        {
+            "name": "feedback_reset",
+            "kick": 11.5,
+            "tail": 18,
+            "decay": 0.012,
+            "phase": "channel",
+            "full": -32768,
+        }
+    )
     assert effect.needs() == ("ramp",)
     model = run(effect, size=ramp.size, rate=200.0, axes="z", drivers={"ramp": ramp})[0]
     moved = -np.diff(ramp) / 32768
@@ -133,17 +185,29 @@ def test_the_resets_of_a_real_gyro_are_of_this_kind_and_size(recordings):
     assert (11.5 + 18) * turns * NRAD_PER_S == pytest.approx(model.mean(), rel=0.01)
     parts = []
     for name in ("kick", "tail"):
-        one = make_effect({"name": "feedback_reset", name: 1.0, "decay": 0.012, "phase": "channel", "full": -32768})
+        one = make_effect(
+            {
+                "name": "feedback_reset",
+                name: 1.0,
+                "decay": 0.012,
+                "phase": "channel",
+                "full": -32768,
+            }
+        )
         parts.append(run(one, size=ramp.size, rate=200.0, axes="z", drivers={"ramp": ramp})[0])
     design = np.column_stack([*parts, np.ones(ramp.size)])
     kick, tail, _ = np.linalg.lstsq(design, measured, rcond=None)[0]
     assert kick == pytest.approx(11.5, rel=0.06)
     assert tail == pytest.approx(18.0, rel=0.08)
     before, after = avar([measured, measured - model], 200.0, [0.005, 0.02, 0.1, 1.0])
-    np.testing.assert_allclose((after / before)[:2], [0.69, 0.18], rtol=0.05)  # the rest of the first is noise of its own
+    np.testing.assert_allclose(
+        (after / before)[:2], [0.69, 0.18], rtol=0.05
+    )  # the rest of the first is noise of its own
 
     def by_phase(rates):
-        return np.array([rates[(ramp >= low) & (ramp < low + 2048)].mean() for low in range(0, 32768, 2048)])
+        return np.array(
+            [rates[(ramp >= low) & (ramp < low + 2048)].mean() for low in range(0, 32768, 2048)]
+        )
 
     assert np.ptp(by_phase(measured)) > 0.2
     assert np.ptp(by_phase(measured - model)) < 0.02
@@ -157,31 +221,49 @@ def test_own_rate_and_channel_agree():
     w = np.full(500, 0.013 * 100 * own.turn * NRAD_PER_S)
     expected = run(own, size=500, rate=100.0, axes="x", signal=w)[0] - w
     ramp = 7.0 * ((0.013 * np.arange(1, 501)) % 1.0)
-    found = run(make_effect(common | {"phase": "channel", "full": 7.0}), size=500, rate=100.0, axes="x", signal=w, drivers={"ramp": ramp})[
-        0
-    ]
+    found = run(
+        make_effect(common | {"phase": "channel", "full": 7.0}),
+        size=500,
+        rate=100.0,
+        axes="x",
+        signal=w,
+        drivers={"ramp": ramp},
+    )[0]
     np.testing.assert_allclose(found[1:] - w[1:], expected[1:], atol=1e-9)
     with pytest.raises(SchemaError, match="'feedback_reset' needs the channel 'ramp'"):
-        simulate({"effect": [common | {"phase": "channel"}], "noise": {}, "log": {"rate": 1, "duration": "9s"}})
+        simulate(
+            {
+                "effect": [common | {"phase": "channel"}],
+                "noise": {},
+                "log": {"rate": 1, "duration": "9s"},
+            }
+        )
     with pytest.raises(OptionError, match="0 is no ramp"):
         make_effect(common | {"full": 0})
 
 
 def test_shared_noise_shows_in_the_cross_axis_covariance_only():
     effect = {"name": "shared_source", "N": [0.004, -0.003, 0.0], "axes": ["x", "y", "z"]}
-    log = simulate({"effect": [effect], "noise": {"N": 0.005}, "log": {"rate": 20, "duration": "3h"}}, seed=5)
+    log = simulate(
+        {"effect": [effect], "noise": {"N": 0.005}, "log": {"rate": 20, "duration": "3h"}}, seed=5
+    )
     x, y, z = log.rate.values
     taus = np.array([0.05, 0.5, 5.0])
     own = avar([x, y, z], 20.0, taus) * taus / 3600
-    np.testing.assert_allclose(own[:, :2], np.tile([[0.005**2 + r**2] for r in (0.004, 0.003, 0)], (1, 2)), rtol=0.04)
+    np.testing.assert_allclose(
+        own[:, :2], np.tile([[0.005**2 + r**2] for r in (0.004, 0.003, 0)], (1, 2)), rtol=0.04
+    )
     plus, minus = avar([x + y, x - y], 20.0, taus) * taus / 3600
-    np.testing.assert_allclose((plus - minus)[:2] / 4, 0.004 * -0.003, rtol=0.12)  # negative: the modulation of y is turned
+    np.testing.assert_allclose(
+        (plus - minus)[:2] / 4, 0.004 * -0.003, rtol=0.12
+    )  # negative: the modulation of y is turned
     plus, minus = avar([x + z, x - z], 20.0, taus) * taus / 3600
     assert np.all(np.abs(plus - minus)[:2] / 4 < 0.1 * 0.004 * 0.003)
     assert make_effect(effect).explain(windows_of(100, 20.0, 1.0)).coherent
 
 
-# ----------------------------------------------------------------------------------------------------- means that are said
+# -----------------------------------------------------------------------------------------------------
+# means that are said
 
 
 @pytest.mark.parametrize(
@@ -205,27 +287,45 @@ def test_window_means_are_those_that_are_said(table):
     done = run(effect, size=6000, rate=50.0, axes="xy", drivers=drivers, signal=signal)
     done = done - signal if effect.stage != "rate" else done
     means = {name: values.reshape(12, 500).mean(axis=1) for name, values in drivers.items()}
-    own = {axis: values.reshape(12, 500).mean(axis=1) for axis, values in zip("xy", signal, strict=True)}
-    said = effect.explain(windows_of(6000, 50.0, 10.0, axes=("x", "y"), drivers=means, own=own)).mean
+    own = {
+        axis: values.reshape(12, 500).mean(axis=1)
+        for axis, values in zip("xy", signal, strict=True)
+    }
+    said = effect.explain(
+        windows_of(6000, 50.0, 10.0, axes=("x", "y"), drivers=means, own=own)
+    ).mean
     total = sum(np.atleast_1d(getattr(effect, name))[0] * design for name, design in said.items())
     found = done.reshape(2, 12, 500).mean(axis=2)
-    tolerance = 0.04 if effect.name in ("feedback_reset", "rate_quantization", "clock_error") else 1e-6  # parts of a turn, a step, a sample
-    np.testing.assert_allclose(found, np.broadcast_to(total, (2, 12)), rtol=1e-3, atol=tolerance * np.abs(total).max())
+    tolerance = (
+        0.04 if effect.name in ("feedback_reset", "rate_quantization", "clock_error") else 1e-6
+    )  # parts of a turn, a step, a sample
+    np.testing.assert_allclose(
+        found, np.broadcast_to(total, (2, 12)), rtol=1e-3, atol=tolerance * np.abs(total).max()
+    )
 
 
 def test_what_has_a_memory_begins_as_if_it_had_been_there_long():
     many = [f"a{number}" for number in range(2500)]
-    first = run(make_effect({"name": "telegraph", "step": 1.0, "low": 300, "high": 100}), size=1, axes=many)
+    first = run(
+        make_effect({"name": "telegraph", "step": 1.0, "low": 300, "high": 100}), size=1, axes=many
+    )
     assert (first > 0.5).mean() == pytest.approx(0.25, abs=0.03)
-    first = run(make_effect({"name": "gauss_markov", "rms": 2.0, "correlation_time": 50}), size=1, axes=many)
+    first = run(
+        make_effect({"name": "gauss_markov", "rms": 2.0, "correlation_time": 50}), size=1, axes=many
+    )
     assert first.std() == pytest.approx(2.0, rel=0.05)
-    steady = run(make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=2.0)
+    steady = run(
+        make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=2.0
+    )
     np.testing.assert_allclose(steady, 1.7, rtol=1e-12)
-    stuck = run(make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=0.25)
+    stuck = run(
+        make_effect({"name": "dead_zone", "width": 0.3, "bandwidth": 0.05}), size=3, signal=0.25
+    )
     np.testing.assert_allclose(stuck, 0.0, atol=1e-15)
 
 
-# -------------------------------------------------------------------------------------------------- densities that are said
+# --------------------------------------------------------------------------------------------------
+# densities that are said
 
 
 @pytest.mark.parametrize(
@@ -244,7 +344,9 @@ def test_a_random_rate_has_the_density_that_it_says(table, parameter, size):
     rates = run(effect, size=60_000, rate=10.0)
     edges = np.array([0.02, 0.1, 0.5, 2.0, 4.0, 4.95])
     found = band_powers(rates, 10.0, edges)
-    np.testing.assert_allclose(found, size**2 * said_density(effect, 10.0, edges, parameter), rtol=0.12)
+    np.testing.assert_allclose(
+        found, size**2 * said_density(effect, 10.0, edges, parameter), rtol=0.12
+    )
     total = np.array([rates.var()])
     f = np.linspace(1e-4, 5.0, 40_000)
     said = effect.explain(windows_of(100, 10.0, 1.0, f)).spectrum[parameter][0]
@@ -264,26 +366,46 @@ def test_what_the_logger_adds_has_the_density_that_it_says(table, parameter, siz
     signal = np.random.default_rng(4).normal(0.3, 4.0, (3, 60_000))
     edges = np.array([0.02, 1.0, 2.0, 3.0, 4.0, 4.95])
     found = band_powers(run(effect, size=60_000, rate=10.0, signal=signal) - signal, 10.0, edges)
-    np.testing.assert_allclose(found, size**2 * said_density(effect, 10.0, edges, parameter), rtol=0.12)
+    np.testing.assert_allclose(
+        found, size**2 * said_density(effect, 10.0, edges, parameter), rtol=0.12
+    )
 
 
 def test_lorentz_density_folds_the_continuous_one():
     f, order = np.linspace(0.1, 4.9, 9), np.arange(-4000, 4001)
     for time in (0.003, 0.3, 30.0):
         every = f[:, None] + 10.0 * order
-        folded = (2 * time / (1 + (2 * np.pi * every * time) ** 2) * np.sinc(every / 10.0) ** 2).sum(axis=1)
+        folded = (
+            2 * time / (1 + (2 * np.pi * every * time) ** 2) * np.sinc(every / 10.0) ** 2
+        ).sum(axis=1)
         np.testing.assert_allclose(lorentz_density(f, time, 10.0), folded, rtol=1e-3)
 
 
-# ---------------------------------------------------------------------------------------------------------------- chunks
+# ----------------------------------------------------------------------------------------------------------------
+# chunks
 
 VARIANTS = [
     {"name": "dead_zone", "width": 2.0, "bandwidth": 0.3, "edge": "jump"},
     {"name": "feedback_reset", "kick": 3.0, "tail": 40.0, "decay": 0.5, "sawtooth": 0.3},
-    {"name": "feedback_reset", "kick": 3.0, "tail": 40.0, "decay": 0.5, "sawtooth": 0.3, "phase": "channel", "full": 1.5},
+    {
+        "name": "feedback_reset",
+        "kick": 3.0,
+        "tail": 40.0,
+        "decay": 0.5,
+        "sawtooth": 0.3,
+        "phase": "channel",
+        "full": 1.5,
+    },
     {"name": "fringe_hop", "per_hour": 600, "hold": 5},
     {"name": "fringe_hop", "at": 33.33, "hold": 5},
-    {"name": "bias_jump", "restart": 0.2, "shock": 0.1, "shocks_per_hour": 900, "step": [0.1, 0.0, -0.1], "at": 71.23},
+    {
+        "name": "bias_jump",
+        "restart": 0.2,
+        "shock": 0.1,
+        "shocks_per_hour": 900,
+        "step": [0.1, 0.0, -0.1],
+        "at": 71.23,
+    },
     {"name": "telegraph", "step": 0.2, "low": 0.05, "high": 3.0},
     {"name": "shared_source", "N": [0.1, 0.2, -0.1], "bandwidth": 0.5},
     {"name": "supply_bias", "voltage": 0.1, "ripple": 0.2, "frequency": 17.0},
@@ -302,19 +424,50 @@ VARIANTS = [
 def test_how_time_is_cut_does_not_matter(table, seed):
     size = 1200
     signal = np.random.default_rng(5).normal(4.0, 3.0, (3, size))
-    drivers = {"ramp": np.arange(size) * 0.031 % 1.5, "supply_voltage": 24 + np.sin(np.arange(size) / 30)}
+    drivers = {
+        "ramp": np.arange(size) * 0.031 % 1.5,
+        "supply_voltage": 24 + np.sin(np.arange(size) / 30),
+    }
     restarts = np.array([[300, 340], [700, 720]])
     same_whatever_the_cuts(
-        make_effect(table), random_cuts(seed, size), size=size, signal=signal, drivers=drivers, restarts=restarts, gaps=restarts, seed=seed
+        make_effect(table),
+        random_cuts(seed, size),
+        size=size,
+        signal=signal,
+        drivers=drivers,
+        restarts=restarts,
+        gaps=restarts,
+        seed=seed,
     )
 
 
 def test_a_chain_of_the_electronics_is_the_same_in_any_blocks():
-    names = ["feedback_reset", "fringe_hop", "clock_error", "logger_filter", "rate_quantization", "spikes", "held_samples"]
-    sizes = [{"kick": 11.5, "tail": 18}, {"per_hour": 100, "hold": 3}, {"error": 900}, {"cutoff": 30, "pick": 1}, {"step": 0.5}]
+    names = [
+        "feedback_reset",
+        "fringe_hop",
+        "clock_error",
+        "logger_filter",
+        "rate_quantization",
+        "spikes",
+        "held_samples",
+    ]
+    sizes = [
+        {"kick": 11.5, "tail": 18},
+        {"per_hour": 100, "hold": 3},
+        {"error": 900},
+        {"cutoff": 30, "pick": 1},
+        {"step": 0.5},
+    ]
     sizes += [{"per_hour": 1000}, {"per_hour": 2000}]
     effects = [{"name": name, **size} for name, size in zip(names, sizes, strict=True)]
-    model = {"noise": {"N": 0.01}, "effect": effects, "log": {"rate": 50, "duration": "40s", "oversampling": 4}}
-    whole, blocks = simulate(model, seed=9).rate.values, simulate(model, seed=9, chunk=173).rate.values
+    model = {
+        "noise": {"N": 0.01},
+        "effect": effects,
+        "log": {"rate": 50, "duration": "40s", "oversampling": 4},
+    }
+    whole, blocks = (
+        simulate(model, seed=9).rate.values,
+        simulate(model, seed=9, chunk=173).rate.values,
+    )
     np.testing.assert_array_equal(blocks, whole)
     assert np.isfinite(whole).all()

@@ -23,18 +23,32 @@ def sinusoid_avar(amplitude, f, tau):
 
 
 def test_a_steady_line_has_the_allan_variance_of_a_sinusoid():
-    effect = make_effect({"name": "spectral_line", "amplitude": [0.2, -0.1, 0.0], "frequency": 0.53, "phase": [30, 0, 0]})
+    effect = make_effect(
+        {
+            "name": "spectral_line",
+            "amplitude": [0.2, -0.1, 0.0],
+            "frequency": 0.53,
+            "phase": [30, 0, 0],
+        }
+    )
     rates = run(effect, size=40_000, rate=20.0)
     taus = np.array([0.05, 0.25, 0.7, 1.0, 2.3, 5.0])
     for row, amplitude in ((0, 0.2), (1, 0.1)):
-        np.testing.assert_allclose(sigma(rates[row], 20.0, taus)[0] ** 2, sinusoid_avar(amplitude, 0.53, taus), rtol=0.01)
+        np.testing.assert_allclose(
+            sigma(rates[row], 20.0, taus)[0] ** 2, sinusoid_avar(amplitude, 0.53, taus), rtol=0.01
+        )
     assert not rates[2].any()
     fine = np.arange(1, 40) * 0.05
     found = sigma(rates[0], 20.0, fine)[0]
     assert fine[found.argmax()] == pytest.approx(0.371 / 0.53, abs=0.026)
     assert found.max() == pytest.approx(0.7246 * 0.2, rel=0.005)
     t = np.arange(3) / 20.0
-    expected = [0.2 * quad(lambda s: math.sin(2 * math.pi * 0.53 * s + math.pi / 6), one, one + 0.05)[0] / 0.05 for one in t]
+    expected = [
+        0.2
+        * quad(lambda s: math.sin(2 * math.pi * 0.53 * s + math.pi / 6), one, one + 0.05)[0]
+        / 0.05
+        for one in t
+    ]
     np.testing.assert_allclose(rates[0][:3], expected, rtol=1e-9)
 
 
@@ -49,11 +63,21 @@ def test_a_line_above_nyquist_folds_with_the_response_of_the_mean():
 
 
 def test_a_resonance_has_the_allan_variance_of_its_density_and_one_motion():
-    effect = make_effect({"name": "spectral_line", "amplitude": [0.2, -0.4], "axes": ["x", "z"], "frequency": 3.0, "quality": 10})
+    effect = make_effect(
+        {
+            "name": "spectral_line",
+            "amplitude": [0.2, -0.4],
+            "axes": ["x", "z"],
+            "frequency": 3.0,
+            "quality": 10,
+        }
+    )
     x, z = run(effect, size=200_000, rate=20.0)
     np.testing.assert_allclose(z, -2.0 * x, rtol=1e-12)
     taus = [0.05, 0.1, 0.2, 0.5, 1.0]
-    expected = [allan_of_density(lambda f: 0.02 * oscillator_psd(f, 3.0, 10.0), tau, 200.0) for tau in taus]
+    expected = [
+        allan_of_density(lambda f: 0.02 * oscillator_psd(f, 3.0, 10.0), tau, 200.0) for tau in taus
+    ]
     np.testing.assert_allclose(sigma(x, 20.0, taus)[0] ** 2, expected, rtol=0.08)
 
 
@@ -62,7 +86,14 @@ def test_lines_lock_to_a_changing_rotation():
     speed = 90.0 + 6.0 * (np.arange(60 * fast) // factor) / 50  # held inside each sample
     turns = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) / fast / 360.0 + speed / fast / 720.0
     effect = make_effect(
-        {"name": "rotation_line", "amplitude": [0.5, 1.0], "axes": ["x", "y"], "order": 2, "harmonics": 3, "phase": [0.0, 90.0]}
+        {
+            "name": "rotation_line",
+            "amplitude": [0.5, 1.0],
+            "axes": ["x", "y"],
+            "order": 2,
+            "harmonics": 3,
+            "phase": [0.0, 90.0],
+        }
     )
     rates = run(effect, size=3000, rate=50.0, drivers={"rotation_rate": speed[::factor]})
     for row, (amplitude, phase) in enumerate(((0.5, 0.0), (1.0, math.pi / 2))):
@@ -79,7 +110,10 @@ def test_a_pump_is_another_channel():
     strokes = env.rotation([[0, 720.0]], duration=100, accelerations=False)[["rotation_rate"]]
     strokes = strokes.rename(rotation_rate="pump", time_rotation_rate="time_pump")
     effect = {"name": "rotation_line", "amplitude": 0.3, "driver": "pump", "axes": ["x"]}
-    log = simulate({"effect": [effect], "noise": {}, "log": {"rate": 40, "duration": "100s"}}, environment=strokes)
+    log = simulate(
+        {"effect": [effect], "noise": {}, "log": {"rate": 40, "duration": "100s"}},
+        environment=strokes,
+    )
     taus = [0.1, 0.371 / 2, 0.4]
     taus = [round(tau * 40) / 40 for tau in taus]
     found = sigma(log.rate.sel(axis="x").values, 40.0, taus)[0] ** 2

@@ -16,14 +16,17 @@ from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import avar, band_powers, run, windows_of
 
-# ---------------------------------------------------------------------------------------------------------------- logger
+# ----------------------------------------------------------------------------------------------------------------
+# logger
 
 
 def test_a_low_pass_has_the_response_of_its_design():
     effect = make_effect({"name": "logger_filter", "cutoff": 12.0, "order": 3})
     signal = np.random.default_rng(1).normal(size=(3, 100_000))
     edges = np.array([0.5, 4.0, 8.0, 12.0, 16.0, 20.0, 30.0, 45.0])
-    found = band_powers(run(effect, size=100_000, rate=100.0, signal=signal), 100.0, edges) / band_powers(signal, 100.0, edges)
+    found = band_powers(
+        run(effect, size=100_000, rate=100.0, signal=signal), 100.0, edges
+    ) / band_powers(signal, 100.0, edges)
     fine = np.stack([np.linspace(low, high, 50) for low, high in pairwise(edges)])
     _, response = sosfreqz(butter(3, 12.0, fs=100.0, output="sos"), fine.ravel(), fs=100.0)
     expected = (np.abs(response) ** 2).reshape(fine.shape).mean(axis=1)
@@ -34,45 +37,78 @@ def test_a_low_pass_has_the_response_of_its_design():
 
 def test_a_moving_average_takes_noise_from_short_times_only():
     noise = np.random.default_rng(6).normal(size=(1, 200_000))
-    done = run(make_effect({"name": "logger_filter", "length": 0.08}), size=200_000, rate=100.0, axes="x", signal=noise)
-    np.testing.assert_allclose(done[0, 7:], np.convolve(noise[0], np.full(8, 1 / 8), "valid"), rtol=1e-9, atol=1e-12)
+    done = run(
+        make_effect({"name": "logger_filter", "length": 0.08}),
+        size=200_000,
+        rate=100.0,
+        axes="x",
+        signal=noise,
+    )
+    np.testing.assert_allclose(
+        done[0, 7:], np.convolve(noise[0], np.full(8, 1 / 8), "valid"), rtol=1e-9, atol=1e-12
+    )
     ratio = avar(done, 100.0, [0.01, 0.08, 4.0])[0] / avar(noise, 100.0, [0.01, 0.08, 4.0])[0]
-    np.testing.assert_allclose(ratio[0], 1 / 64, rtol=0.03)  # difference of neighbours: 2 / 64 instead of 2
+    np.testing.assert_allclose(
+        ratio[0], 1 / 64, rtol=0.03
+    )  # difference of neighbours: 2 / 64 instead of 2
     weights = np.convolve(np.repeat([1.0, -1.0], 8), np.full(8, 1 / 8))
     assert ratio[1] == pytest.approx((weights**2).sum() / 16, rel=0.03)
     assert ratio[2] == pytest.approx(1.0, abs=0.03)
 
 
 def test_picking_without_a_filter_folds_and_means_do_not():
-    common = {"noise": {"N": 0.01}, "log": {"rate": 20, "duration": "1000s", "oversampling": 8, "axes": ["x"]}}
+    common = {
+        "noise": {"N": 0.01},
+        "log": {"rate": 20, "duration": "1000s", "oversampling": 8, "axes": ["x"]},
+    }
     means = simulate(common).rate.values
     picked = simulate(common | {"effect": [{"name": "logger_filter", "pick": 1}]}).rate.values
     taus = [0.05, 0.5, 5.0]
     np.testing.assert_allclose(avar(means, 20, taus)[0][:2] * taus[:2] / 3600, 1e-4, rtol=0.08)
     np.testing.assert_allclose(avar(picked, 20, taus)[0][:2] * taus[:2] / 3600, 8e-4, rtol=0.08)
     line = {"name": "spectral_line", "amplitude": 1.0, "frequency": 53.0}
-    folded = simulate(common | {"noise": {}, "effect": [line, {"name": "logger_filter", "pick": 1}]}).rate.values[0]
+    folded = simulate(
+        common | {"noise": {}, "effect": [line, {"name": "logger_filter", "pick": 1}]}
+    ).rate.values[0]
     f = np.fft.rfftfreq(folded.size, 0.05)
     spectrum = np.abs(np.fft.rfft(folded)) / folded.size * 2
     assert f[spectrum.argmax()] == pytest.approx(7.0)  # 53 - 3 * 20
-    assert spectrum.max() == pytest.approx(np.sinc(53 / 160), rel=1e-3)  # the instrument averages over a 160th of a second
+    assert spectrum.max() == pytest.approx(
+        np.sinc(53 / 160), rel=1e-3
+    )  # the instrument averages over a 160th of a second
 
 
-@pytest.mark.parametrize("table", [{"cutoff": 6.0, "order": 2}, {"cutoff": 14.0, "pick": 1}, {"length": 0.04, "pick": 1}, {"length": 0.1}])
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"cutoff": 6.0, "order": 2},
+        {"cutoff": 14.0, "pick": 1},
+        {"length": 0.04, "pick": 1},
+        {"length": 0.1},
+    ],
+)
 def test_a_filter_shapes_the_spectrum_as_it_says(table):
     effect = {"name": "logger_filter", **table}
-    common = {"noise": {"N": 0.01}, "log": {"rate": 20, "duration": "4000s", "oversampling": 20, "axes": ["x"]}}
+    common = {
+        "noise": {"N": 0.01},
+        "log": {"rate": 20, "duration": "4000s", "oversampling": 20, "axes": ["x"]},
+    }
     rates = simulate(common | {"effect": [effect]}).rate.values
     edges = np.array([0.1, 2.0, 4.0, 6.0, 8.0, 9.9])
     centre = [np.linspace(low, high, 40) for low, high in pairwise(edges)]
-    said = [make_effect(effect).explain(windows_of(100, 20.0, 1.0, f)).response.mean() for f in centre]
+    said = [
+        make_effect(effect).explain(windows_of(100, 20.0, 1.0, f)).response.mean() for f in centre
+    ]
     np.testing.assert_allclose(band_powers(rates, 20.0, edges), 0.36 * np.array(said), rtol=0.08)
 
 
 def test_a_filter_that_cannot_be_is_refused():
     setup = Setup(rate=10.0, size=100, start=0, axes=("x",))
     rng = np.random.default_rng(1)
-    with pytest.raises(OptionError, match="a cutoff of 5 Hz is not below half of the instrument's 10 Hz; raise oversampling"):
+    with pytest.raises(
+        OptionError,
+        match="a cutoff of 5 Hz is not below half of the instrument's 10 Hz; raise oversampling",
+    ):
         make_effect({"name": "logger_filter", "cutoff": 5}).begin(setup, rng)
     with pytest.raises(OptionError, match="20000 samples of the instrument; give at most 10000"):
         make_effect({"name": "logger_filter", "length": 2000}).begin(setup, rng)
@@ -82,21 +118,48 @@ def test_a_filter_that_cannot_be_is_refused():
 
 def test_the_lattice_adds_a_twelfth_of_its_square_or_swallows_all():
     signal = np.random.default_rng(7).normal(0.3, 1.0, (1, 100_000))
-    done = run(make_effect({"name": "rate_quantization", "step": 2.0}), size=100_000, axes="x", signal=signal)
+    done = run(
+        make_effect({"name": "rate_quantization", "step": 2.0}),
+        size=100_000,
+        axes="x",
+        signal=signal,
+    )
     assert set(np.unique(done / 2.0 % 1.0)) == {0.0}
     added = avar(done - signal, 10.0, [0.1, 1.0, 10.0])[0]
     np.testing.assert_allclose(added[:2], [4 / 12, 4 / 120], rtol=0.06)
-    assert not run(make_effect({"name": "rate_quantization", "step": 20.0}), size=100_000, axes="x", signal=signal).any()
-    below = run(make_effect({"name": "rate_quantization", "step": 2.0, "mode": "floor"}), size=100_000, axes="x", signal=signal)
+    assert not run(
+        make_effect({"name": "rate_quantization", "step": 20.0}),
+        size=100_000,
+        axes="x",
+        signal=signal,
+    ).any()
+    below = run(
+        make_effect({"name": "rate_quantization", "step": 2.0, "mode": "floor"}),
+        size=100_000,
+        axes="x",
+        signal=signal,
+    )
     assert (below - signal).mean() == pytest.approx(-1.0, abs=0.02)
-    assert make_effect({"name": "rate_quantization", "step": 2.0, "mode": "floor"}).explain(windows_of(9, 1.0, 3.0)).mean["step"][0] == -0.5
+    assert (
+        make_effect({"name": "rate_quantization", "step": 2.0, "mode": "floor"})
+        .explain(windows_of(9, 1.0, 3.0))
+        .mean["step"][0]
+        == -0.5
+    )
 
 
 def test_a_real_gyro_stands_on_its_lattice(recordings):
     with gzip.open(recordings("mems-static-53min/ch104.csv.gz"), "rt") as file:
-        measured = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(0, 1, 2), max_rows=5000).T * 3600
+        measured = (
+            np.loadtxt(file, delimiter=",", skiprows=1, usecols=(0, 1, 2), max_rows=5000).T * 3600
+        )
     for step, stands in ((36.0, True), (72.0, False)):
-        done = run(make_effect({"name": "rate_quantization", "step": step}), size=5000, rate=100.0, signal=measured)
+        done = run(
+            make_effect({"name": "rate_quantization", "step": step}),
+            size=5000,
+            rate=100.0,
+            signal=measured,
+        )
         assert np.allclose(done, measured, atol=1e-6) == stands
 
 
@@ -120,7 +183,9 @@ def test_bit_errors_are_bits():
 
 def test_held_samples_are_runs_that_raise_n_at_long_times():
     noise = np.random.default_rng(9).normal(size=(2, 400_000))
-    effect = make_effect({"name": "held_samples", "per_hour": 720, "length": 0.4})  # at 10 Hz: every 50 samples, for 4
+    effect = make_effect(
+        {"name": "held_samples", "per_hour": 720, "length": 0.4}
+    )  # at 10 Hz: every 50 samples, for 4
     done = run(effect, size=400_000, axes="xy", signal=noise)
     same = np.diff(done, axis=1) == 0
     np.testing.assert_array_equal(same[0], same[1])
@@ -130,7 +195,9 @@ def test_held_samples_are_runs_that_raise_n_at_long_times():
     assert same[0].sum() / starts == pytest.approx(4.0, rel=0.05)
     ratio = (avar(done, 10.0, [0.1, 20.0]) / avar(noise, 10.0, [0.1, 20.0])).mean(axis=0)
     assert ratio[0] == pytest.approx(1 - share, rel=0.02)
-    exact = (1 + 0.02 * (2 * 4 + 28)) / (1 + 0.02 * 4)  # E[(1 + h)^2] / E[1 + h], h geometric of mean 4 with the chance 1/50
+    exact = (1 + 0.02 * (2 * 4 + 28)) / (
+        1 + 0.02 * 4
+    )  # E[(1 + h)^2] / E[1 + h], h geometric of mean 4 with the chance 1/50
     assert ratio[1] == pytest.approx(exact, rel=0.08)
     said = effect.explain(windows_of(1000, 10.0, 10.0)).level[("N", "per_hour")][0]
     assert 720 * said == pytest.approx(2 * 0.02 * 16, rel=1e-9)
@@ -148,7 +215,12 @@ def test_zeros_pull_the_mean_down():
 
 def test_clipping_cuts_the_tails():
     noise = np.random.default_rng(10).normal(2.0, 1.0, (1, 200_000))
-    done = run(make_effect({"name": "clipping", "limit": 1.5, "centre": 2.0}), size=200_000, axes="x", signal=noise)
+    done = run(
+        make_effect({"name": "clipping", "limit": 1.5, "centre": 2.0}),
+        size=200_000,
+        axes="x",
+        signal=noise,
+    )
     assert done.min() == 0.5
     assert done.max() == 3.5
     assert (done == 3.5).mean() == pytest.approx(norm.sf(1.5), rel=0.03)
@@ -156,29 +228,44 @@ def test_clipping_cuts_the_tails():
     assert done.var() == pytest.approx(inside + 2 * 1.5**2 * norm.sf(1.5), rel=0.01)
 
 
-# ----------------------------------------------------------------------------------------------------------------- clock
+# -----------------------------------------------------------------------------------------------------------------
+# clock
 
 
 def test_a_fast_clock_reads_too_little_on_all_axes():
     effect = make_effect({"name": "clock_error", "error": 100})
     w = np.array([[3.888e6], [-1e6], [0.0]])
     done = run(effect, size=1000, signal=w)
-    np.testing.assert_allclose(done - w, -1e-4 * np.broadcast_to(w, done.shape), rtol=1e-9)  # 100 ppm of 180 r/min: 388.8 deg/h
+    np.testing.assert_allclose(
+        done - w, -1e-4 * np.broadcast_to(w, done.shape), rtol=1e-9
+    )  # 100 ppm of 180 r/min: 388.8 deg/h
     own = {axis: np.full(10, value) for axis, value in zip("xyz", w[:, 0], strict=True)}
     said = effect.explain(windows_of(1000, 10.0, 10.0, axes=("x", "y", "z"), own=own)).mean["error"]
     np.testing.assert_allclose(100 * said[:, 0], -1e-4 * w[:, 0])
-    rated = run(make_effect({"name": "clock_error", "error": 100, "output": "rate"}), size=1000, signal=w)
+    rated = run(
+        make_effect({"name": "clock_error", "error": 100, "output": "rate"}), size=1000, signal=w
+    )
     np.testing.assert_allclose(rated - w, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("reading", ["latest", "average"])
-@pytest.mark.parametrize(("error", "drift"), [(2000, 0), (-2000, 0), (-3000, 1e4), (0, 8000), (1000, -1e4)])
+@pytest.mark.parametrize(
+    ("error", "drift"), [(2000, 0), (-2000, 0), (-3000, 1e4), (0, 8000), (1000, -1e4)]
+)
 def test_the_log_holds_what_was_there_at_the_time_of_the_clock(error, drift, reading):
     def motion(t):
         return 50.0 * np.sin(2 * np.pi * t / 60.0) + 0.2 * t
 
     rate, size = 100.0, 180_000  # half an hour
-    effect = make_effect({"name": "clock_error", "error": error, "drift": drift, "output": "rate", "reading": reading})
+    effect = make_effect(
+        {
+            "name": "clock_error",
+            "error": error,
+            "drift": drift,
+            "output": "rate",
+            "reading": reading,
+        }
+    )
     t = np.arange(size) / rate
     done = run(effect, size=size, rate=rate, axes="x", signal=motion(t))[0]
     ahead = (error * t + drift * t**2 / 7200) * 1e-6
@@ -194,15 +281,33 @@ def test_the_log_holds_what_was_there_at_the_time_of_the_clock(error, drift, rea
 def test_a_line_moves_by_the_error_of_the_clock():
     wave = np.sin(2 * np.pi * 7.0 * np.arange(100_000) / 100.0)
     for error in (5000, -5000):
-        done = run(make_effect({"name": "clock_error", "error": error}), size=100_000, rate=100.0, axes="x", signal=wave)[0][1000:]
+        done = run(
+            make_effect({"name": "clock_error", "error": error}),
+            size=100_000,
+            rate=100.0,
+            axes="x",
+            signal=wave,
+        )[0][1000:]
         spectrum = np.abs(np.fft.rfft(done * np.hanning(done.size)))
-        assert np.fft.rfftfreq(done.size, 0.01)[spectrum.argmax()] == pytest.approx(7.0 * (1 - error * 1e-6), abs=0.0012)
+        assert np.fft.rfftfreq(done.size, 0.01)[spectrum.argmax()] == pytest.approx(
+            7.0 * (1 - error * 1e-6), abs=0.0012
+        )
 
 
 def test_a_sample_is_skipped_or_doubled_as_often_as_the_error_says():
     count = np.arange(40_000.0)
-    fast = run(make_effect({"name": "clock_error", "error": 1000, "output": "rate"}), size=40_000, axes="x", signal=count)[0]
-    slow = run(make_effect({"name": "clock_error", "error": -1000, "output": "rate"}), size=40_000, axes="x", signal=count)[0]
+    fast = run(
+        make_effect({"name": "clock_error", "error": 1000, "output": "rate"}),
+        size=40_000,
+        axes="x",
+        signal=count,
+    )[0]
+    slow = run(
+        make_effect({"name": "clock_error", "error": -1000, "output": "rate"}),
+        size=40_000,
+        axes="x",
+        signal=count,
+    )[0]
     assert (np.diff(fast) == 0).sum() == pytest.approx(40, abs=1)
     assert (np.diff(slow) == 2).sum() == pytest.approx(40, abs=1)
     assert set(np.unique(np.diff(fast))) == {0.0, 1.0}
@@ -211,9 +316,16 @@ def test_a_sample_is_skipped_or_doubled_as_often_as_the_error_says():
 def test_the_clock_leaves_white_noise_as_it_is():
     noise = np.random.default_rng(11).normal(size=(3, 200_000))
     for reading, share in (("latest", 0.0), ("average", 1.0)):
-        done = run(make_effect({"name": "clock_error", "error": 300, "reading": reading}), size=200_000, signal=noise)
-        ratio = (avar(done, 10.0, [0.1, 1.0, 4.0]) / avar(noise, 10.0, [0.1, 1.0, 4.0])).mean(axis=0)
-        # a jump of the weights between two samples, 1, 2 and 1 high, loses its square times f (1 - f), 1 / 6 on average over the place f
+        done = run(
+            make_effect({"name": "clock_error", "error": 300, "reading": reading}),
+            size=200_000,
+            signal=noise,
+        )
+        ratio = (avar(done, 10.0, [0.1, 1.0, 4.0]) / avar(noise, 10.0, [0.1, 1.0, 4.0])).mean(
+            axis=0
+        )
+        # a jump of the weights between two samples, 1, 2 and 1 high, loses its square times f (1 -
+        # f), 1 / 6 on average over the place f
         np.testing.assert_allclose(ratio, 1.0 - share / (2 * np.array([1, 10, 40])), rtol=0.02)
 
 

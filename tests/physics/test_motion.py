@@ -15,12 +15,17 @@ from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import allan_of_density, run, sigma
 
-# ------------------------------------------------------------------------------------------------------------------- rotation
+# -------------------------------------------------------------------------------------------------------------------
+# rotation
 
 
 def test_scale_factor_errors_are_those_of_the_catalogue():
     speed = 6 * 180.0  # 180 r/min in deg/s
-    one = run(make_effect({"name": "scale_factor", "linear": 100}), size=1, drivers={"rotation_rate": speed})
+    one = run(
+        make_effect({"name": "scale_factor", "linear": 100}),
+        size=1,
+        drivers={"rotation_rate": speed},
+    )
     np.testing.assert_allclose(one, 388.8, rtol=1e-12)
     both = {"rotation_rate": [speed, -speed], "temperature": [35.0, 35.0]}
     linear, lopsided, cubic, thermal = (
@@ -36,11 +41,20 @@ def test_scale_factor_errors_are_those_of_the_catalogue():
 def test_a_ramp_of_rotation_is_a_rate_ramp_through_the_scale_factor():
     world = [{"profile": "rotation", "points": [[0, 0.0], [600, 60.0]], "accelerations": False}]
     effect = {"name": "scale_factor", "linear": 100, "axes": ["z"]}
-    log = simulate({"environment": world, "effect": [effect], "noise": {}, "log": {"rate": 10, "duration": "600s"}})
+    log = simulate(
+        {
+            "environment": world,
+            "effect": [effect],
+            "noise": {},
+            "log": {"rate": 10, "duration": "600s"},
+        }
+    )
     ramp = 1e-4 * 60 * 3600 / (600 / 3600)  # deg/h^2
     taus = [1.0, 10.0, 100.0]
     expected = ramp * np.array(taus) / 3600 / math.sqrt(2)
-    np.testing.assert_allclose(sigma(log.rate.sel(axis="z").values, 10.0, taus)[0], expected, rtol=1e-3)
+    np.testing.assert_allclose(
+        sigma(log.rate.sel(axis="z").values, 10.0, taus)[0], expected, rtol=1e-3
+    )
 
 
 def test_scale_factor_of_the_true_rate_needs_no_channel():
@@ -54,14 +68,25 @@ def test_misalignment_leaks_the_true_rate_of_other_axes_only():
     effect = make_effect({"name": "misalignment", "z": 0.5, "y": -1.0})
     found = run(effect, size=2, true={"x": 7.0, "y": [100.0, 0.0], "z": [2000.0, 1000.0]})
     np.testing.assert_allclose(found, [[1.0 - 0.1, 0.5], [1.0, 0.5], [-0.1, 0.0]], rtol=1e-12)
-    with pytest.raises(SchemaError, match="needs the rate of axis 'z', which the log does not have; it has x, y"):
+    with pytest.raises(
+        SchemaError, match="needs the rate of axis 'z', which the log does not have; it has x, y"
+    ):
         run(effect, size=2, axes=("x", "y"))
 
 
 def test_misalignment_sees_the_turning_of_the_tool():
-    world = [{"profile": "rotation", "points": [[0, 6 * 180.0]], "axis": "z", "accelerations": False}]
+    world = [
+        {"profile": "rotation", "points": [[0, 6 * 180.0]], "axis": "z", "accelerations": False}
+    ]
     effect = {"name": "misalignment", "z": 1.0, "axes": ["x"]}
-    log = simulate({"environment": world, "effect": [effect], "noise": {}, "log": {"rate": 10, "duration": "10s"}})
+    log = simulate(
+        {
+            "environment": world,
+            "effect": [effect],
+            "noise": {},
+            "log": {"rate": 10, "duration": "10s"},
+        }
+    )
     np.testing.assert_allclose(log.rate.isel(time=5).values, [3888.0, 0.0, 3.888e6], rtol=1e-9)
 
 
@@ -70,15 +95,27 @@ def tool_axes(inclination, azimuth, toolface):
 
     def about(axis, angle):
         c, s = math.cos(angle), math.sin(angle)
-        return np.array({"y": [[c, 0, s], [0, 1, 0], [-s, 0, c]], "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}[axis])
+        return np.array(
+            {"y": [[c, 0, s], [0, 1, 0], [-s, 0, c]], "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}[axis]
+        )
 
     return about("z", azimuth) @ about("y", inclination) @ about("z", toolface)
 
 
 @given(st.floats(-90, 90), st.floats(0, 180), st.floats(-360, 360), st.floats(-360, 360))
 @settings(max_examples=60, deadline=None)
-def test_earth_rate_of_a_standing_tool_is_the_rotated_vector(latitude, inclination, azimuth, toolface):
-    effect = make_effect({"name": "earth_rate", "latitude": latitude, "inclination": inclination, "azimuth": azimuth, "toolface": toolface})
+def test_earth_rate_of_a_standing_tool_is_the_rotated_vector(
+    latitude, inclination, azimuth, toolface
+):
+    effect = make_effect(
+        {
+            "name": "earth_rate",
+            "latitude": latitude,
+            "inclination": inclination,
+            "azimuth": azimuth,
+            "toolface": toolface,
+        }
+    )
     seen = run(effect, size=2, drivers={"rotation_rate": 0.0})[:, 1]
     lat = math.radians(latitude)
     earth = 15.041067 * np.array([math.cos(lat), 0.0, -math.sin(lat)])
@@ -107,43 +144,76 @@ def test_earth_rate_and_gravity_share_the_frame_of_the_tool():
     """Inclination 90, pointing north at the pole: the earth turns about the plumb line, so its rate is along the measured gravity."""
     world = [{"profile": "rotation", "points": [[0, 30.0]], "inclination": 90.0, "toolface": 25.0}]
     effect = {"name": "earth_rate", "latitude": 90, "inclination": 90, "toolface": 25}
-    log = simulate({"environment": world, "effect": [effect], "noise": {}, "log": {"rate": 10, "duration": "30s"}})
+    log = simulate(
+        {
+            "environment": world,
+            "effect": [effect],
+            "noise": {},
+            "log": {"rate": 10, "duration": "30s"},
+        }
+    )
     middle = (
         log.accel_x.interp(time_accel_x=log.time + np.timedelta64(50, "ms")),
         log.accel_y.interp(time_accel_y=log.time + np.timedelta64(50, "ms")),
     )
     for axis, acceleration in zip("xy", middle, strict=True):
-        np.testing.assert_allclose(log.rate.sel(axis=axis).values[:-1], 15.041067 * acceleration.values[:-1], atol=0.02)
+        np.testing.assert_allclose(
+            log.rate.sel(axis=axis).values[:-1], 15.041067 * acceleration.values[:-1], atol=0.02
+        )
 
 
 def test_axes_of_other_names_say_where_they_look():
-    with pytest.raises(OptionError, match="axis 'north' is not x, y or z; say where it looks with off and around"):
-        run(make_effect({"name": "earth_rate", "latitude": 45}), size=2, axes=("north",), drivers={"rotation_rate": 0.0})
+    with pytest.raises(
+        OptionError, match="axis 'north' is not x, y or z; say where it looks with off and around"
+    ):
+        run(
+            make_effect({"name": "earth_rate", "latitude": 45}),
+            size=2,
+            axes=("north",),
+            drivers={"rotation_rate": 0.0},
+        )
     across = make_effect({"name": "earth_rate", "latitude": 30, "around": [0, 180]})
     seen = run(across, size=1, axes=("a", "b"), drivers={"rotation_rate": 0.0})[:, 0]
     np.testing.assert_allclose(seen, 15.041067 * np.array([0.8660254, -0.8660254]), rtol=1e-6)
-    effect = make_effect({"name": "earth_rate", "latitude": 30, "off": [90, 0, 45], "around": [0, 0, 0]})
+    effect = make_effect(
+        {"name": "earth_rate", "latitude": 30, "off": [90, 0, 45], "around": [0, 0, 0]}
+    )
     seen = run(effect, size=1, axes=("a", "b", "c"), drivers={"rotation_rate": 0.0})[:, 0]
-    np.testing.assert_allclose(seen, 15.041067 * np.array([0.8660254, -0.5, (0.8660254 - 0.5) / math.sqrt(2)]), rtol=1e-6)
+    np.testing.assert_allclose(
+        seen, 15.041067 * np.array([0.8660254, -0.5, (0.8660254 - 0.5) / math.sqrt(2)]), rtol=1e-6
+    )
 
 
-# ---------------------------------------------------------------------------------------------------------------- real motion
+# ----------------------------------------------------------------------------------------------------------------
+# real motion
 
 
 def test_sway_is_one_motion_in_its_direction_with_no_floor():
-    effect = make_effect({"name": "real_motion", "sway": 10, "frequency": 0.5, "quality": 5, "direction": [0.6, -0.8, 0.0]})
+    effect = make_effect(
+        {
+            "name": "real_motion",
+            "sway": 10,
+            "frequency": 0.5,
+            "quality": 5,
+            "direction": [0.6, -0.8, 0.0],
+        }
+    )
     x, y, z = run(effect, size=200_000, rate=10.0)
     np.testing.assert_allclose(y, -0.8 / 0.6 * x, rtol=1e-9)
     assert not z.any()
     taus = [0.2, 0.7, 2.0]
-    expected = [allan_of_density(lambda f: 36.0 * oscillator_psd(f, 0.5, 5.0), tau, 60.0) for tau in taus]
+    expected = [
+        allan_of_density(lambda f: 36.0 * oscillator_psd(f, 0.5, 5.0), tau, 60.0) for tau in taus
+    ]
     np.testing.assert_allclose(sigma(x, 10.0, taus)[0] ** 2, expected, rtol=0.1)
     angle = np.cumsum(x) / 10.0 / 3600  # deg; an oscillator's is bounded: rms rate over 2 pi f
     assert (angle - angle.mean()).std() == pytest.approx(6.0 / (2 * math.pi * 0.5 * 3600), rel=0.1)
 
 
 def test_tilt_of_the_mounting_turns_by_what_the_acceleration_changed():
-    effect = make_effect({"name": "real_motion", "x": 2.0, "y": -1.0, "direction": 1.0, "axes": ["y"]})
+    effect = make_effect(
+        {"name": "real_motion", "x": 2.0, "y": -1.0, "direction": 1.0, "axes": ["y"]}
+    )
     accel = {"accel_x": [0.5, 0.5, 1.5, 1.0], "accel_y": [0.0, 0.0, 0.0, 1.0]}
     rates = run(effect, size=4, rate=10.0, drivers=accel)[0]
     angle = np.radians(np.cumsum(rates) / 10.0 / 3600) * 1e3  # mrad
@@ -153,7 +223,13 @@ def test_tilt_of_the_mounting_turns_by_what_the_acceleration_changed():
 def test_motion_is_true_and_leaks_through_misalignment():
     motion = {"name": "real_motion", "sway": 1000, "frequency": 0.5, "direction": [0.0, 0.0, 1.0]}
     leak = {"name": "misalignment", "z": 2.0, "axes": ["x"]}
-    log = simulate({"effect": [leak, motion], "noise": {}, "log": {"rate": 10, "duration": "60s", "axes": ["x", "y", "z"]}})
+    log = simulate(
+        {
+            "effect": [leak, motion],
+            "noise": {},
+            "log": {"rate": 10, "duration": "60s", "axes": ["x", "y", "z"]},
+        }
+    )
     x, y, z = log.rate.values
     assert z.std() > 300
     np.testing.assert_allclose(x, 2e-3 * z, rtol=1e-9)
@@ -163,4 +239,6 @@ def test_motion_is_true_and_leaks_through_misalignment():
 def test_spin_is_a_share_of_the_rotation():
     effect = make_effect({"name": "real_motion", "spin": 0.5, "direction": [0.0, 0.0, 1.0]})
     assert effect.needs() == ("rotation_rate",)
-    np.testing.assert_allclose(run(effect, size=2, drivers={"rotation_rate": 2.0})[2], 3600.0, rtol=1e-12)
+    np.testing.assert_allclose(
+        run(effect, size=2, drivers={"rotation_rate": 2.0})[2], 3600.0, rtol=1e-12
+    )

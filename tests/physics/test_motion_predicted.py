@@ -18,9 +18,16 @@ def windows_of(rates, rate, length, drivers, own=None, frequency=None):
     edges = np.arange(n + 1) * length / rate
 
     def mean(values):
-        return np.broadcast_to(np.asarray(values, float), rates.shape[1])[: n * length].reshape(n, length).mean(axis=1)
+        return (
+            np.broadcast_to(np.asarray(values, float), rates.shape[1])[: n * length]
+            .reshape(n, length)
+            .mean(axis=1)
+        )
 
-    reduced = {name: np.sqrt(mean(np.square(values))) if name == "vibration" else mean(values) for name, values in drivers.items()}
+    reduced = {
+        name: np.sqrt(mean(np.square(values))) if name == "vibration" else mean(values)
+        for name, values in drivers.items()
+    }
     windows = Windows(
         begin=edges[:-1],
         end=edges[1:],
@@ -66,13 +73,18 @@ def test_window_means_are_the_design_times_the_parameters(table):
     windows, means = windows_of(rates, 10.0, 400, DRIVERS, own=TRUE)
     design = effect.explain(windows).mean
     each = {name: np.atleast_1d(getattr(effect, name)) for name in design}
-    total = sum(np.broadcast_to(values, means.shape) * each[name].reshape(-1, 1) for name, values in design.items())
+    total = sum(
+        np.broadcast_to(values, means.shape) * each[name].reshape(-1, 1)
+        for name, values in design.items()
+    )
     assert np.abs(means).max() > 1e-3
     np.testing.assert_allclose(total, means, atol=2e-3 * np.abs(means).max())
 
 
 def test_tilt_leaves_the_slope_of_the_acceleration_in_the_means():
-    effect = make_effect({"name": "real_motion", "x": 0.5, "z": -0.2, "direction": [1.0, -0.5, 0.2]})
+    effect = make_effect(
+        {"name": "real_motion", "x": 0.5, "z": -0.2, "direction": [1.0, -0.5, 0.2]}
+    )
     rates = run(effect, size=4000, rate=10.0, drivers=DRIVERS)
     windows, means = windows_of(rates, 10.0, 100, DRIVERS)
     design = effect.explain(windows).mean
@@ -84,7 +96,15 @@ def test_tilt_leaves_the_slope_of_the_acceleration_in_the_means():
     "table",
     [
         {"name": "aliased_vibration", "sensitivity": 0.5, "low": 11.0, "high": 13.0},
-        {"name": "aliased_vibration", "sensitivity": 2.0, "low": 11.0, "high": 13.0, "resonance": 9.0, "quality": 6, "sampling": "average"},
+        {
+            "name": "aliased_vibration",
+            "sensitivity": 2.0,
+            "low": 11.0,
+            "high": 13.0,
+            "resonance": 9.0,
+            "quality": 6,
+            "sampling": "average",
+        },
         {"name": "spectral_line", "amplitude": 0.5, "frequency": 3.0, "quality": 4.0},
         {"name": "spectral_line", "amplitude": 0.5, "frequency": 17.7},
         {"name": "rotation_line", "amplitude": 0.5, "harmonics": 3},
@@ -99,11 +119,15 @@ def test_spectra_are_those_that_are_predicted(table):
     rates = run(effect, size=length * count, rate=rate, drivers=drivers, axes=("x", "y", "z"))
     centres = np.arange(1, 100) * 0.05
     windows, _ = windows_of(rates, rate, length, drivers, frequency=centres)
-    power = np.abs(np.fft.rfft(rates[0].reshape(count, length) * np.sqrt(8 / 3) * np.hanning(length), axis=1)) ** 2 / (length * rate)
+    power = np.abs(
+        np.fft.rfft(rates[0].reshape(count, length) * np.sqrt(8 / 3) * np.hanning(length), axis=1)
+    ) ** 2 / (length * rate)
     f = np.fft.rfftfreq(length, 1 / rate)
     prediction = effect.explain(windows)
     (name,) = prediction.spectrum
-    predicted = float(np.atleast_1d(getattr(effect, name))[0]) ** 2 * np.broadcast_to(prediction.spectrum[name], (count, 99)).mean(axis=0)
+    predicted = float(np.atleast_1d(getattr(effect, name))[0]) ** 2 * np.broadcast_to(
+        prediction.spectrum[name], (count, 99)
+    ).mean(axis=0)
     found = power[:, 3:498].mean(axis=0).reshape(99, 5).mean(axis=1)
     for bands in (9, 11):
         wide = [values.reshape(-1, bands).sum(axis=1) for values in (predicted, found)]
@@ -114,16 +138,44 @@ def test_spectra_are_those_that_are_predicted(table):
         assert place == pytest.approx(f[power.mean(axis=0).argmax()], abs=0.15)
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from(["bent", "band", "resonance", "lines", "earth", "errors"]))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(["bent", "band", "resonance", "lines", "earth", "errors"]),
+)
 @settings(max_examples=24, deadline=None)
 def test_chunks_never_matter(seed, which):
     table = {
-        "bent": {"name": "real_motion", "sway": 3, "spin": 0.2, "x": 0.1, "z": -0.3, "direction": [1.0, 0.5, -0.5]},
-        "band": {"name": "aliased_vibration", "sensitivity": [1, 2, 3], "resonance": 650, "sampling": "average"},
+        "bent": {
+            "name": "real_motion",
+            "sway": 3,
+            "spin": 0.2,
+            "x": 0.1,
+            "z": -0.3,
+            "direction": [1.0, 0.5, -0.5],
+        },
+        "band": {
+            "name": "aliased_vibration",
+            "sensitivity": [1, 2, 3],
+            "resonance": 650,
+            "sampling": "average",
+        },
         "resonance": {"name": "spectral_line", "amplitude": 1, "frequency": 3.3, "quality": 30},
-        "lines": {"name": "rotation_line", "amplitude": [1, 2, 3], "harmonics": 4, "phase": [1, 2, 3]},
+        "lines": {
+            "name": "rotation_line",
+            "amplitude": [1, 2, 3],
+            "harmonics": 4,
+            "phase": [1, 2, 3],
+        },
         "earth": {"name": "earth_rate", "latitude": 30, "inclination": 50, "azimuth": 70},
-        "errors": {"name": "scale_factor", "linear": 30, "asymmetry": -10, "cubic": 0.5, "thermal": 2},
+        "errors": {
+            "name": "scale_factor",
+            "linear": 30,
+            "asymmetry": -10,
+            "cubic": 0.5,
+            "thermal": 2,
+        },
     }[which]
     drivers = {name: values[:700] for name, values in DRIVERS.items()}
-    same_whatever_the_cuts(make_effect(table), random_cuts(seed, 700), size=700, drivers=drivers, seed=seed)
+    same_whatever_the_cuts(
+        make_effect(table), random_cuts(seed, 700), size=700, drivers=drivers, seed=seed
+    )

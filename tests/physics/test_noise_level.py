@@ -18,7 +18,13 @@ HOUR = 3600.0
 
 
 def level(table, *, drivers=None, size=5, rate=10.0, **noise):
-    return run(make_effect(table), size=size, rate=rate, drivers=drivers, noise={"Q": 0.0, "N": 0.0, "B": 0.0, "K": 0.0} | noise)
+    return run(
+        make_effect(table),
+        size=size,
+        rate=rate,
+        drivers=drivers,
+        noise={"Q": 0.0, "N": 0.0, "B": 0.0, "K": 0.0} | noise,
+    )
 
 
 def test_squared_noise_is_a_polynomial_of_temperature():
@@ -38,7 +44,11 @@ def test_squared_noise_is_that_of_a_detector_in_weak_light():
     table = {"name": "light_power_noise", "thermal": thermal / 1e-8 / at, "shot": shot / 1e-4 / at}
     found = level(table, drivers={"light_power": power}, N=math.sqrt(at))["N"][0]
     np.testing.assert_allclose(found, thermal / power**2 + shot / power + excess, rtol=1e-12)
-    only = level({"name": "light_power_noise", "thermal": 1.0, "nominal": "10 uW"}, drivers={"light_power": [1e-5, 5e-6] * 2 + [1e-5]}, N=1)
+    only = level(
+        {"name": "light_power_noise", "thermal": 1.0, "nominal": "10 uW"},
+        drivers={"light_power": [1e-5, 5e-6] * 2 + [1e-5]},
+        N=1,
+    )
     np.testing.assert_allclose(only["N"][0, :2], [1.0, 4.0], rtol=1e-12)
 
 
@@ -49,38 +59,66 @@ def test_light_power_of_blin_gives_the_typical_share():
 
 
 def test_light_power_that_makes_no_sense_is_refused():
-    with pytest.raises(OptionError, match=r"thermal \+ shot are 1.2 of N\^2; give shares that are together 1 or less"):
+    with pytest.raises(
+        OptionError,
+        match=r"thermal \+ shot are 1.2 of N\^2; give shares that are together 1 or less",
+    ):
         make_effect({"name": "light_power_noise", "thermal": 0.7, "shot": 0.5})
     dark = {"name": "light_power_noise", "thermal": 0.5, "driver": "pd"}
-    with pytest.raises(SchemaError, match=r"the channel 'pd' is 0 W 0.2 s after the start; it must be above 0"):
+    with pytest.raises(
+        SchemaError, match=r"the channel 'pd' is 0 W 0.2 s after the start; it must be above 0"
+    ):
         level(dark, drivers={"light_power": [1e-4, 1e-4, 0, 1e-4, 1e-4]}, N=1)
 
 
 def test_excess_noise_does_not_depend_on_the_light():
-    found = level({"name": "light_power_noise", "thermal": 0.0}, drivers={"light_power": [1e-4, 1e-5, 1e-6, 1e-3, 1.0]}, N=0.3)["N"]
+    found = level(
+        {"name": "light_power_noise", "thermal": 0.0},
+        drivers={"light_power": [1e-4, 1e-5, 1e-6, 1e-3, 1.0]},
+        N=0.3,
+    )["N"]
     np.testing.assert_array_equal(found, 0.3**2)
 
 
 def test_squared_noise_ages_with_a_power_of_time():
-    found = level({"name": "ageing_noise", "growth": 0.5, "exponent": 2}, size=4, rate=1 / HOUR, N=[1.0, 2.0, 0.0])["N"]
-    np.testing.assert_allclose(found, np.outer([1.0, 4.0, 0.0], 1 + 0.5 * np.array([0.5, 1.5, 2.5, 3.5]) ** 2), rtol=1e-12)
+    found = level(
+        {"name": "ageing_noise", "growth": 0.5, "exponent": 2},
+        size=4,
+        rate=1 / HOUR,
+        N=[1.0, 2.0, 0.0],
+    )["N"]
+    np.testing.assert_allclose(
+        found, np.outer([1.0, 4.0, 0.0], 1 + 0.5 * np.array([0.5, 1.5, 2.5, 3.5]) ** 2), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
     ("table", "world", "share"),
     [
         ({"name": "temperature_noise", "linear": 0.03}, steady("temperature", "degC", 125), 4.0),
-        ({"name": "light_power_noise", "thermal": 0.5, "shot": 0.5}, steady("light_power", "uW", 50), 3.0),
+        (
+            {"name": "light_power_noise", "thermal": 0.5, "shot": 0.5},
+            steady("light_power", "uW", 50),
+            3.0,
+        ),
     ],
     ids=["temperature", "light"],
 )
 def test_the_same_noise_gets_stronger_as_a_whole(table, world, share):
-    model = {"environment": [world], "noise": {"N": 0.01, "K": 0.5}, "log": {"rate": 50, "duration": "400s", "axes": ["x"]}}
-    plain, loud = (simulate(model | {"effect": made}, seed=3).rate.values[0] for made in ([], [table]))
+    model = {
+        "environment": [world],
+        "noise": {"N": 0.01, "K": 0.5},
+        "log": {"rate": 50, "duration": "400s", "axes": ["x"]},
+    }
+    plain, loud = (
+        simulate(model | {"effect": made}, seed=3).rate.values[0] for made in ([], [table])
+    )
     walk = simulate(model | {"noise": {"K": 0.5}}, seed=3).rate.values[0]
     np.testing.assert_allclose(loud - walk, math.sqrt(share) * (plain - walk), atol=1e-9)
     taus = np.array([0.02, 0.2, 1.0])
-    np.testing.assert_allclose(avar(loud, 50.0, taus)[0] / LAWS["N"].avar(taus, 0.01), share, rtol=0.08)
+    np.testing.assert_allclose(
+        avar(loud, 50.0, taus)[0] / LAWS["N"].avar(taus, 0.01), share, rtol=0.08
+    )
 
 
 def test_noise_that_ages_rises_over_the_windows():
@@ -89,22 +127,30 @@ def test_noise_that_ages_rises_over_the_windows():
         "effect": [{"name": "ageing_noise", "growth": 1.5}],
         "log": {"rate": 10, "duration": "2h", "axes": ["x"]},
     }
-    surface = davar(simulate(model, seed=5), window="0.5h", step="0.5h", taus=[0.1, 0.3]).sel(axis="x")
+    surface = davar(simulate(model, seed=5), window="0.5h", step="0.5h", taus=[0.1, 0.3]).sel(
+        axis="x"
+    )
     expected = 1 + 1.5 * np.array([0.25, 0.75, 1.25, 1.75])
-    np.testing.assert_allclose(surface.avar.values[:, 0] / LAWS["N"].avar(0.1, 0.01), expected, rtol=0.05)
+    np.testing.assert_allclose(
+        surface.avar.values[:, 0] / LAWS["N"].avar(0.1, 0.01), expected, rtol=0.05
+    )
 
 
 def shaken(effect, *, noise, duration=900, rate=50, seed=8):
     world = [{"profile": "vibration", "points": [[0, 0.0], [300, 4.0], [600, 0.0]]}]
     log = {"rate": rate, "duration": duration, "axes": ["x", "y"]}
-    return simulate({"environment": world, "noise": noise, "effect": [effect], "log": log}, seed=seed)
+    return simulate(
+        {"environment": world, "noise": noise, "effect": [effect], "log": log}, seed=seed
+    )
 
 
 def test_vibration_adds_noise_in_squares_while_it_lasts_on_each_axis_by_itself():
     log = shaken({"name": "vibration_noise", "white": 0.01, "exponent": 1.0}, noise={"N": 0.03})
     surface = davar(log, window="300s", step="300s", taus=[0.02, 0.2, 2.0])
     ratio = surface.avar.values / LAWS["N"].avar(surface.tau.values, 1.0)
-    np.testing.assert_allclose(ratio[:, :, 0], np.tile([0.03**2, 0.03**2 + 0.04**2, 0.03**2], (2, 1)), rtol=0.05)
+    np.testing.assert_allclose(
+        ratio[:, :, 0], np.tile([0.03**2, 0.03**2 + 0.04**2, 0.03**2], (2, 1)), rtol=0.05
+    )
     np.testing.assert_allclose(ratio[:, 1, 1], 0.03**2 + 0.04**2, rtol=0.15)
     np.testing.assert_allclose(ratio[:, 1, 2], 0.03**2 + 0.04**2, rtol=0.4)
     x, y = log.rate.values[:, 15_000:30_000]
@@ -126,14 +172,20 @@ def test_a_walk_is_inside_the_windows_and_stays_where_rectification_is_at_the_ed
     taus = [0.02, 0.1, 1.0]
     inside = davar(walk, window="200s", step="50s", taus=taus)
     law = LAWS["K"].avar(inside.tau.values, 2.0 * 4.0)
-    np.testing.assert_allclose(inside.avar.values[:, 7, :2], np.tile(law[:2], (2, 1)), rtol=0.1)  # 350 to 550 s
+    np.testing.assert_allclose(
+        inside.avar.values[:, 7, :2], np.tile(law[:2], (2, 1)), rtol=0.1
+    )  # 350 to 550 s
     np.testing.assert_allclose(inside.avar.values[:, 7, 2], law[2], rtol=0.35)
     assert np.all(inside.avar.values[:, [0, 2, 12, 14]] < 1e-12)
     other = davar(step, window="200s", step="50s", taus=taus)
     assert np.all(other.avar.values[:, 7] < 1e-12)
     tau = other.tau.values
-    edge = 0.8**2 * tau / (3 * (200 - 2 * tau)) * (1 + 0.5 / (tau * 50) ** 2)  # a step between two samples is sharper than one of a walk
-    np.testing.assert_allclose(other.avar.values[:, 3], np.tile(edge, (2, 1)), rtol=1e-3)  # 150 to 350 s
+    edge = (
+        0.8**2 * tau / (3 * (200 - 2 * tau)) * (1 + 0.5 / (tau * 50) ** 2)
+    )  # a step between two samples is sharper than one of a walk
+    np.testing.assert_allclose(
+        other.avar.values[:, 3], np.tile(edge, (2, 1)), rtol=1e-3
+    )  # 150 to 350 s
     assert math.sqrt(3 * other.avar.values[0, 3, 2] / tau[2] * HOUR) == pytest.approx(3.4, rel=0.01)
     ends = walk.rate.values[:, -1]
     assert np.all(ends == walk.rate.values[:, 31_000])
@@ -144,7 +196,12 @@ def test_a_walk_is_inside_the_windows_and_stays_where_rectification_is_at_the_ed
 def test_a_walk_spreads_as_fast_as_its_k_says():
     effect = {"name": "vibration_random_walk", "sensitivity": 3.0}
     log = {"rate": 1, "duration": 900, "axes": [f"a{i}" for i in range(400)]}
-    model = {"environment": [steady("vibration", "g", 2.0)], "noise": {}, "effect": [effect], "log": log}
+    model = {
+        "environment": [steady("vibration", "g", 2.0)],
+        "noise": {},
+        "effect": [effect],
+        "log": log,
+    }
     rates = simulate(model, seed=2).rate.values
     expected = 36.0 * (900 - 0.5 - 1 / 6) / HOUR  # variance of the mean over the last second
     assert rates[:, -1].var() == pytest.approx(expected, rel=0.2)
@@ -157,7 +214,13 @@ def test_the_order_of_noise_effects_does_not_matter():
         {"name": "ageing_noise", "growth": 2.0},
         {"name": "light_power_noise", "thermal": 0.5},
     ]
-    world = [steady("temperature", "degC", 60), steady("vibration", "g", 2), steady("light_power", "uW", 70)]
+    world = [
+        steady("temperature", "degC", 60),
+        steady("vibration", "g", 2),
+        steady("light_power", "uW", 70),
+    ]
     model = {"environment": world, "noise": {"N": 0.01}, "log": {"rate": 10, "duration": "60s"}}
-    forth, back = (simulate(model | {"effect": order}).rate.values for order in (tables, tables[::-1]))
+    forth, back = (
+        simulate(model | {"effect": order}).rate.values for order in (tables, tables[::-1])
+    )
     np.testing.assert_allclose(forth, back, rtol=1e-9)

@@ -31,7 +31,8 @@ def ramp_record(rate, *, begin, end, total, speed):
     return 20.0 + speed / 60.0 * (np.clip(t, begin, end) - begin)
 
 
-# -------------------------------------------------------------------------------------------------------------------- diffusion
+# --------------------------------------------------------------------------------------------------------------------
+# diffusion
 
 
 def heated_slab(surface, dt, lag, cells=200):
@@ -65,9 +66,13 @@ def test_shupe_is_the_heat_that_goes_through_a_winding():
     away = np.min([np.abs(np.arange(2500) - edge) for edge in (100, 1300)], axis=0) > 5
     np.testing.assert_allclose(found[away], truth[away], atol=0.004)
     assert abs(truth).max() > 0.25
-    assert found[1290] == pytest.approx(0.2 * 1.5, rel=0.03)  # the plateau, where the halves climb alike
+    assert found[1290] == pytest.approx(
+        0.2 * 1.5, rel=0.03
+    )  # the plateau, where the halves climb alike
     late = found[1700:2300]  # only the slowest mode is left
-    assert -1.0 / np.polyfit(np.arange(late.size), np.log(abs(late)), 1)[0] == pytest.approx(lag, rel=1e-3)
+    assert -1.0 / np.polyfit(np.arange(late.size), np.log(abs(late)), 1)[0] == pytest.approx(
+        lag, rel=1e-3
+    )
 
 
 @given(st.integers(2, 30), st.floats(1.0, 1e4))
@@ -81,7 +86,9 @@ def test_modes_of_a_winding_share_all_of_the_ramp(count, lag):
 
 
 def test_lag_follows_from_thickness_and_diffusivity():
-    assert 4 * 0.012**2 / (math.pi**2 * 2.2e-7) == pytest.approx(effects()["shupe"].example().lag, rel=2e-3)
+    assert 4 * 0.012**2 / (math.pi**2 * 2.2e-7) == pytest.approx(
+        effects()["shupe"].example().lag, rel=2e-3
+    )
 
 
 def test_one_mode_of_shupe_is_a_simple_lag_odd_in_direction_and_free_of_the_rate():
@@ -98,9 +105,23 @@ def test_one_mode_of_shupe_is_a_simple_lag_odd_in_direction_and_free_of_the_rate
 
 
 def test_shupe_is_invisible_at_a_steady_ramp_and_a_step_where_it_begins():
-    world = [{"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 20], [2000, 20], [8000, 120]]}]
+    world = [
+        {
+            "profile": "ramps",
+            "channel": "temperature",
+            "unit": "degC",
+            "points": [[0, 20], [2000, 20], [8000, 120]],
+        }
+    ]
     effect = {"name": "shupe", "sensitivity": 0.2, "lag": 10, "axes": ["x"]}
-    log = simulate({"environment": world, "effect": [effect], "noise": {}, "log": {"rate": 1, "duration": "8000s"}})
+    log = simulate(
+        {
+            "environment": world,
+            "effect": [effect],
+            "noise": {},
+            "log": {"rate": 1, "duration": "8000s"},
+        }
+    )
     surface = davar(log, window="2000s", step="1000s", taus=[50.0, 100.0, 300.0]).sel(axis="x")
     step, tau = 0.2, surface.tau.values
     expected = step**2 * tau / (3 * (2000 - 2 * tau))
@@ -124,7 +145,10 @@ def test_a_bias_that_follows_the_temperature_late_is_two_effects_together():
             {"name": "temperature_bias", "sensitivity": a, "reference": 20.0},
             {"name": "shupe", "sensitivity": -a * lag / 60.0, "lag": lag, "modes": 1},
         )
-        found = sum(run(make_effect(table), size=t.size, drivers={"temperature": warm})[0] for table in tables)
+        found = sum(
+            run(make_effect(table), size=t.size, drivers={"temperature": warm})[0]
+            for table in tables
+        )
         np.testing.assert_allclose(found, a * (late - 20.0), atol=1e-3 * a * 7.0)
 
 
@@ -135,7 +159,12 @@ def test_a_ramp_seen_through_a_late_sensor_is_felt_when_it_begins():
     seen = 20.0 + v / 60.0 * (t - late * -np.expm1(-t / late))
     table = {"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": lag}
     expected = 0.4 * v * -np.expm1(-t / lag)
-    found = run(make_effect(table | {"sensor_lag": late}), size=t.size, rate=rate, drivers={"temperature": seen})[0]
+    found = run(
+        make_effect(table | {"sensor_lag": late}),
+        size=t.size,
+        rate=rate,
+        drivers={"temperature": seen},
+    )[0]
     np.testing.assert_allclose(found, expected, atol=0.002 * expected.max())
     without = run(make_effect(table), size=t.size, rate=rate, drivers={"temperature": seen})[0]
     assert np.abs(without - expected).max() > 0.2 * expected.max()
@@ -146,7 +175,9 @@ def test_a_step_seen_through_a_late_sensor_is_a_step_of_the_surface():
     rate, lag, late, step = 20.0, 60.0, 40.0, 5.0
     t = np.arange(12_000) / rate
     seen = 20.0 - step * np.expm1(-np.maximum(t - 100.0, 0.0) / late)
-    effect = make_effect({"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": lag, "sensor_lag": late})
+    effect = make_effect(
+        {"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": lag, "sensor_lag": late}
+    )
     found = run(effect, size=t.size, rate=rate, drivers={"temperature": seen})[0]
     expected = 0.4 * 60.0 * step / lag * np.exp(-(t - 100.0) / lag) * (t > 100.0)
     away = np.abs(t - 100.0) > 0.2
@@ -174,48 +205,92 @@ def test_a_ramp_of_temperature_is_a_rate_ramp_up_and_down_alike_and_shupe_only_m
         {"name": "temperature_bias", "sensitivity": 0.01, "axes": ["x"]},
         {"name": "shupe", "sensitivity": 0.1, "lag": 5, "axes": ["y"]},
     ]
-    log = simulate({"environment": world, "effect": tables, "noise": {}, "log": {"rate": 2, "duration": "60 min"}})
+    log = simulate(
+        {
+            "environment": world,
+            "effect": tables,
+            "noise": {},
+            "log": {"rate": 2, "duration": "60 min"},
+        }
+    )
     surface = davar(log, window="5min", step="5min", taus=[5.0, 50.0])
     ramp = 0.01 * 2 * 60  # deg/h^2
     up, down = 3, 9  # 15 to 20 min and 45 to 50 min
     for row in (up, down):
-        np.testing.assert_allclose(surface.avar.sel(axis="x").values[row], LAWS["R"].avar(surface.tau.values, ramp), rtol=1e-6)
+        np.testing.assert_allclose(
+            surface.avar.sel(axis="x").values[row],
+            LAWS["R"].avar(surface.tau.values, ramp),
+            rtol=1e-6,
+        )
         assert np.all(surface.avar.sel(axis="y").values[row] < 1e-12)
-    np.testing.assert_allclose(surface.window_mean.sel(axis="y").values[[up, 7, down]], [0.2, 0.0, -0.2], atol=1e-6)
-    np.testing.assert_allclose(surface.window_mean.sel(axis="x").values[[up, down]], 0.01 * (np.array([15, 25]) - 25), atol=1e-3)
+    np.testing.assert_allclose(
+        surface.window_mean.sel(axis="y").values[[up, 7, down]], [0.2, 0.0, -0.2], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        surface.window_mean.sel(axis="x").values[[up, down]],
+        0.01 * (np.array([15, 25]) - 25),
+        atol=1e-3,
+    )
 
 
-# --------------------------------------------------------------------------------------------------------------------- gradient
+# ---------------------------------------------------------------------------------------------------------------------
+# gradient
 
 
 def test_gradient_is_the_difference_of_two_sensors_and_its_change():
     t = np.arange(6000) / 10.0
     drivers = {"temperature": 50 + t / 30, "temperature_2": 48 - t / 60}
-    still = run(make_effect({"name": "thermal_gradient", "sensitivity": -0.05}), size=t.size, drivers=drivers)[0]
+    still = run(
+        make_effect({"name": "thermal_gradient", "sensitivity": -0.05}),
+        size=t.size,
+        drivers=drivers,
+    )[0]
     np.testing.assert_allclose(still, -0.05 * (2 + t / 20), rtol=1e-12)
-    moving = run(make_effect({"name": "thermal_gradient", "change": 0.1, "lag": 20}), size=t.size, drivers=drivers)[2]
+    moving = run(
+        make_effect({"name": "thermal_gradient", "change": 0.1, "lag": 20}),
+        size=t.size,
+        drivers=drivers,
+    )[2]
     np.testing.assert_allclose(moving, 0.1 * 3.0 * -np.expm1(-t / 20), atol=1e-9)  # 3 degC/min
     same = {"temperature": drivers["temperature"], "temperature_2": drivers["temperature"]}
     assert not run(effects()["thermal_gradient"].example(), size=t.size, drivers=same).any()
 
 
 def test_gradient_takes_channels_of_any_name_and_is_a_ramp_while_it_builds_up():
-    world = env.ramps("inside", "degC", [[0, 20], [1200, 32]], duration=1200).merge(env.steps("outside", "degC", [[0, 20]], duration=1200))
-    effect = {"name": "thermal_gradient", "sensitivity": 0.5, "driver": ["inside", "outside"], "axes": ["x"]}
-    log = simulate({"effect": [effect], "noise": {}, "log": {"rate": 10, "duration": "1200s"}}, environment=world)
+    world = env.ramps("inside", "degC", [[0, 20], [1200, 32]], duration=1200).merge(
+        env.steps("outside", "degC", [[0, 20]], duration=1200)
+    )
+    effect = {
+        "name": "thermal_gradient",
+        "sensitivity": 0.5,
+        "driver": ["inside", "outside"],
+        "axes": ["x"],
+    }
+    log = simulate(
+        {"effect": [effect], "noise": {}, "log": {"rate": 10, "duration": "1200s"}},
+        environment=world,
+    )
     taus = np.array([1.0, 10.0, 100.0])
     slope = 0.5 * 12 / (1200 / HOUR)  # deg/h^2
-    np.testing.assert_allclose(avar(log.rate.sel(axis="x").values, 10.0, taus)[0], LAWS["R"].avar(taus, slope), rtol=2e-3)
+    np.testing.assert_allclose(
+        avar(log.rate.sel(axis="x").values, 10.0, taus)[0], LAWS["R"].avar(taus, slope), rtol=2e-3
+    )
 
 
-# ---------------------------------------------------------------------------------------------------------------------- warm-up
+# ----------------------------------------------------------------------------------------------------------------------
+# warm-up
 
 
 def test_warm_up_is_an_exponential_averaged_over_each_sample():
-    effect = make_effect({"name": "warm_up", "amplitude": 0.3, "time": 7, "slow_amplitude": -0.1, "slow_time": 50})
+    effect = make_effect(
+        {"name": "warm_up", "amplitude": 0.3, "time": 7, "slow_amplitude": -0.1, "slow_time": 50}
+    )
     found = run(effect, size=40, rate=0.5)[1]
     for i in (0, 1, 7, 39):
-        truth = quad(lambda t: 0.3 * math.exp(-t / 7) - 0.1 * math.exp(-t / 50), 2 * i, 2 * i + 2)[0] / 2
+        truth = (
+            quad(lambda t: 0.3 * math.exp(-t / 7) - 0.1 * math.exp(-t / 50), 2 * i, 2 * i + 2)[0]
+            / 2
+        )
         assert found[i] == pytest.approx(truth, rel=1e-9)
 
 
@@ -248,16 +323,26 @@ def test_a_short_loss_of_power_brings_back_only_what_cooled():
 def test_warm_up_looks_like_a_rate_ramp_that_fades_after_every_restart():
     world = [{"profile": "power_cuts", "cuts": [[3000, 3060]]}]
     effect = {"name": "warm_up", "amplitude": 0.3, "time": 600, "axes": ["x"]}
-    log = simulate({"environment": world, "effect": [effect], "noise": {}, "log": {"rate": 2, "duration": "6000s"}})
+    log = simulate(
+        {
+            "environment": world,
+            "effect": [effect],
+            "noise": {},
+            "log": {"rate": 2, "duration": "6000s"},
+        }
+    )
     surface = davar(log, window="100s", step="20s", taus=[5.0, 20.0]).sel(axis="x")
     t = np.arange(surface.sizes["time"]) * 20 + 50.0
     for begin, rows in ((0.0, (t > 0) & (t < 2900)), (3060.0, t > 3120)):
         slope = 0.3 / (600 / HOUR) * np.exp(-(t[rows] - begin) / 600)  # deg/h^2
-        expected = np.stack([LAWS["R"].avar(5.0, 1.0) * slope**2, LAWS["R"].avar(20.0, 1.0) * slope**2], axis=1)
+        expected = np.stack(
+            [LAWS["R"].avar(5.0, 1.0) * slope**2, LAWS["R"].avar(20.0, 1.0) * slope**2], axis=1
+        )
         np.testing.assert_allclose(surface.avar.values[rows], expected, rtol=0.01)
 
 
-# ------------------------------------------------------------------------------------------------------------------- hysteresis
+# -------------------------------------------------------------------------------------------------------------------
+# hysteresis
 
 
 def test_hysteresis_opens_a_loop_of_known_area():
@@ -266,8 +351,13 @@ def test_hysteresis_opens_a_loop_of_known_area():
     temperature = np.tile(way[:-1], 3)
     bias = run(effect, size=temperature.size, drivers={"temperature": temperature})[0]
     period = way.size - 1
-    last_t, last_b = np.append(temperature[-period:], -40.0), np.append(bias[-period:], bias[-period])
-    assert abs(np.trapezoid(last_b, last_t)) == pytest.approx(2 * 0.002 * 4 * (100 - 2 * 4), rel=1e-6)
+    last_t, last_b = (
+        np.append(temperature[-period:], -40.0),
+        np.append(bias[-period:], bias[-period]),
+    )
+    assert abs(np.trapezoid(last_b, last_t)) == pytest.approx(
+        2 * 0.002 * 4 * (100 - 2 * 4), rel=1e-6
+    )
     up, down = bias[500], bias[1500]
     assert (up, down) == pytest.approx((0.008, -0.008), rel=1e-9)
     assert temperature[500] == pytest.approx(temperature[1500])
@@ -275,8 +365,18 @@ def test_hysteresis_opens_a_loop_of_known_area():
 
 def test_hysteresis_stays_on_a_plateau_where_shupe_goes_back():
     world = ramp_record(1.0, begin=0, end=1800, total=9000, speed=1.0)
-    play_left = run(make_effect({"name": "thermal_hysteresis", "sensitivity": 0.01}), size=9000, rate=1.0, drivers={"temperature": world})
-    lag_left = run(make_effect({"name": "shupe", "sensitivity": 0.03}), size=9000, rate=1.0, drivers={"temperature": world})
+    play_left = run(
+        make_effect({"name": "thermal_hysteresis", "sensitivity": 0.01}),
+        size=9000,
+        rate=1.0,
+        drivers={"temperature": world},
+    )
+    lag_left = run(
+        make_effect({"name": "shupe", "sensitivity": 0.03}),
+        size=9000,
+        rate=1.0,
+        drivers={"temperature": world},
+    )
     assert (play_left[0, 1700], play_left[0, -1]) == pytest.approx((0.03, 0.03))
     assert lag_left[0, 1700] == pytest.approx(0.03, rel=0.01)
     assert abs(lag_left[0, -1]) < 1e-8
@@ -297,7 +397,8 @@ def test_play_does_not_depend_on_speed_and_forgets_what_was_overrun(values, widt
     assert play(np.array([*values, high]), width, values[0])[1] == pytest.approx(high - width)
 
 
-# ----------------------------------------------------------------------------------------------------------------------- ageing
+# -----------------------------------------------------------------------------------------------------------------------
+# ageing
 
 
 def test_a_bias_that_ages_steadily_is_a_rate_ramp():
@@ -305,12 +406,16 @@ def test_a_bias_that_ages_steadily_is_a_rate_ramp():
     log = simulate({"effect": [effect], "noise": {}, "log": {"rate": 1, "duration": "2h"}})
     taus = np.array([1.0, 60.0, 600.0])
     found = avar(log.rate.sel(axis="x").values, 1.0, taus)[0]
-    np.testing.assert_allclose(found, LAWS["R"].avar(taus, 1.0), rtol=1e-6)  # 24 deg/h/day are 1 deg/h^2
+    np.testing.assert_allclose(
+        found, LAWS["R"].avar(taus, 1.0), rtol=1e-6
+    )  # 24 deg/h/day are 1 deg/h^2
     assert float(log.rate.sel(axis="x")[-1]) == pytest.approx(2.0, abs=3e-4)
 
 
 def test_a_bias_that_settles_is_a_logarithm():
     effect = make_effect({"name": "ageing_bias", "logarithmic": 0.3, "time": 2})
     found = run(effect, size=361, rate=1 / 60)[0]
-    np.testing.assert_allclose(found[[119, 359]], 0.3 * np.log([1 + (119.5 / 60) / 2, 1 + (359.5 / 60) / 2]), rtol=1e-9)
+    np.testing.assert_allclose(
+        found[[119, 359]], 0.3 * np.log([1 + (119.5 / 60) / 2, 1 + (359.5 / 60) / 2]), rtol=1e-9
+    )
     assert make_effect({"name": "ageing_bias", "logarithmic": 0.3, "time": "1 d"}).time == 24.0

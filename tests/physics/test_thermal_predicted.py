@@ -15,7 +15,13 @@ from gyrostab.noise import LAWS
 from gyrostab.physics.base import Windows
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import allan_of_samples, random_cuts, run, same_whatever_the_cuts, steady
+from tests.support.effect_bench import (
+    allan_of_samples,
+    random_cuts,
+    run,
+    same_whatever_the_cuts,
+    steady,
+)
 
 RATE, LENGTH = 2.0, 7200
 _T = np.arange(int(LENGTH * RATE)) / RATE
@@ -36,13 +42,22 @@ def windows_of(kind, length=60.0, step=30.0):
     means = {name: np.array([RECORD[name][row].mean() for row in rows]) for name in kind.channels}
     frequency = np.geomspace(0.02, 0.9, 9)
     gaps = {"gaps": HOLES, "restarts": OFF}
-    return rows, Windows(begin, begin + length, frequency, RATE, ("x", "y", "z"), drivers=means, **gaps)
+    return rows, Windows(
+        begin, begin + length, frequency, RATE, ("x", "y", "z"), drivers=means, **gaps
+    )
 
 
 def generated(effect, **noise):
     tables = {"gaps": (HOLES * RATE).astype(int), "restarts": (OFF * RATE).astype(int)}
     drivers = {name: RECORD[name] for name in effect.channels}
-    return run(effect, size=_T.size, rate=RATE, drivers=drivers, noise={"Q": 0, "N": 0, "B": 0, "K": 0} | noise, **tables)
+    return run(
+        effect,
+        size=_T.size,
+        rate=RATE,
+        drivers=drivers,
+        noise={"Q": 0, "N": 0, "B": 0, "K": 0} | noise,
+        **tables,
+    )
 
 
 @pytest.mark.parametrize(
@@ -57,7 +72,15 @@ def generated(effect, **noise):
         {"name": "thermal_gradient", "sensitivity": 1.0},
         {"name": "thermal_gradient", "change": 1.0, "lag": 120},
         {"name": "warm_up", "amplitude": 1.0, "time": 300},
-        {"name": "warm_up", "amplitude": 0.0, "slow_amplitude": 1.0, "slow_time": 900, "cooling": 200, "gap": 20, "cold": 0.5},
+        {
+            "name": "warm_up",
+            "amplitude": 0.0,
+            "slow_amplitude": 1.0,
+            "slow_time": 900,
+            "cooling": 200,
+            "gap": 20,
+            "cold": 0.5,
+        },
         {"name": "thermal_hysteresis", "sensitivity": 1.0},
         {"name": "ageing_bias", "slope": 1.0},
         {"name": "ageing_bias", "logarithmic": 1.0, "time": 0.5},
@@ -80,11 +103,19 @@ def test_predicted_window_means_are_the_generated_ones(table):
     if table["name"] not in ("warm_up",):  # the windows' mean temperature has no holes here
         found = np.array([bias[row].mean() for row in rows])
         good[:] = True
-    good[0] = table["name"] == "warm_up"  # what happened before the middle of the first window is not known to the prediction
-    good[-1] = "sensor_lag" not in table  # nor how the change goes on after the middle of the last one
+    good[0] = (
+        table["name"] == "warm_up"
+    )  # what happened before the middle of the first window is not known to the prediction
+    good[-1] = (
+        "sensor_lag" not in table
+    )  # nor how the change goes on after the middle of the last one
     spread = np.ptp(found[good])
     assert spread > 0
-    np.testing.assert_allclose(predicted[good], found[good], atol=(0.05 if effect.name == "thermal_hysteresis" else 0.02) * spread)
+    np.testing.assert_allclose(
+        predicted[good],
+        found[good],
+        atol=(0.05 if effect.name == "thermal_hysteresis" else 0.02) * spread,
+    )
 
 
 @pytest.mark.parametrize(
@@ -98,30 +129,42 @@ def test_predicted_window_means_are_the_generated_ones(table):
     ],
 )
 def test_predicted_levels_are_the_generated_ones(name, parameter):
-    size = {"linear": 0.01, "quadratic": 1e-4, "thermal": 0.4, "shot": 0.4, "growth": 0.7}[parameter]
+    size = {"linear": 0.01, "quadratic": 1e-4, "thermal": 0.4, "shot": 0.4, "growth": 0.7}[
+        parameter
+    ]
     effect = effects()[name].example().switched_off()
     effect = replace(effect, **{parameter: size})
     rows, windows = windows_of(effect)
     found = generated(effect, N=0.1)["N"][0]
     share = np.array([found[row].mean() for row in rows]) / 0.01 - 1
-    np.testing.assert_allclose(size * effect.explain(windows).level["N", parameter], share, atol=0.01 * np.ptp(share))
+    np.testing.assert_allclose(
+        size * effect.explain(windows).level["N", parameter], share, atol=0.01 * np.ptp(share)
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "parameter", "law"),
-    [("vibration_noise", "white", "N"), ("vibration_noise", "quantization", "Q"), ("vibration_random_walk", "sensitivity", "K")],
+    [
+        ("vibration_noise", "white", "N"),
+        ("vibration_noise", "quantization", "Q"),
+        ("vibration_random_walk", "sensitivity", "K"),
+    ],
 )
 def test_predicted_spectra_have_the_allan_variance_of_the_law(name, parameter, law):
     effect = make_effect({"name": name, parameter: 1.0, "exponent": 1.5})
 
     def density(f):
-        windows = Windows(np.zeros(1), np.ones(1), f, 4.0, ("x",), drivers={"vibration": np.array([3.0])})
+        windows = Windows(
+            np.zeros(1), np.ones(1), f, 4.0, ("x",), drivers={"vibration": np.array([3.0])}
+        )
         prediction = effect.explain(windows)
         assert not prediction.coherent
         return prediction.spectrum[parameter][0]
 
     for k in (1, 2, 10, 60):
-        assert allan_of_samples(density, k, 4.0) == pytest.approx(float(LAWS[law].avar(k / 4.0, 3.0**1.5)), rel=1e-3)
+        assert allan_of_samples(density, k, 4.0) == pytest.approx(
+            float(LAWS[law].avar(k / 4.0, 3.0**1.5)), rel=1e-3
+        )
 
 
 @given(st.floats(1.0, 500.0), st.integers(3, 40), st.integers(0, 2**31))
@@ -139,12 +182,20 @@ def test_delayed_changes_add_up_to_what_the_lag_let_through(lag, count, seed):
     assert np.sum(means * (end - begin)) == pytest.approx(values[-1] - values[0], abs=1e-6)
 
 
-@pytest.mark.parametrize("table", [{"lag": 300, "sensor_lag": 40}, {"lag": 300}, {"lag": 30, "modes": 1, "sensor_lag": 60}], ids=str)
+@pytest.mark.parametrize(
+    "table",
+    [{"lag": 300, "sensor_lag": 40}, {"lag": 300}, {"lag": 30, "modes": 1, "sensor_lag": 60}],
+    ids=str,
+)
 def test_fine_values_sharpen_what_the_change_of_temperature_does(table):
     """Windows of 60 s see a corner of the temperature between two of them only in values inside of them."""
     warm = 20.0 + 2.0 / 60.0 * np.clip(_T - 3000.0, 0.0, 1200.0)
     effect = make_effect({"name": "shupe", "sensitivity": 1.0} | table)
-    found = run(effect, size=_T.size, rate=RATE, drivers={"temperature": warm})[0].reshape(-1, 120).mean(axis=1)
+    found = (
+        run(effect, size=_T.size, rate=RATE, drivers={"temperature": warm})[0]
+        .reshape(-1, 120)
+        .mean(axis=1)
+    )
     begin = np.arange(0.0, LENGTH, 60.0)
     means = {"temperature": warm.reshape(-1, 120).mean(axis=1)}
     blunt = Windows(begin, begin + 60.0, np.ones(1), RATE, ("x",), drivers=means)
@@ -156,7 +207,15 @@ def test_fine_values_sharpen_what_the_change_of_temperature_does(table):
 
 def test_windows_that_overlap_know_only_their_means():
     begin, means = np.array([0.0, 30.0]), np.array([1.0, 2.0])
-    windows = Windows(begin, begin + 60.0, np.ones(1), RATE, ("x",), drivers={"a": means}, fine={"a": np.ones((2, 4))})
+    windows = Windows(
+        begin,
+        begin + 60.0,
+        np.ones(1),
+        RATE,
+        ("x",),
+        drivers={"a": means},
+        fine={"a": np.ones((2, 4))},
+    )
     at, values = windows.course("a")
     np.testing.assert_array_equal(at, [30.0, 60.0])
     np.testing.assert_array_equal(values, means)
@@ -192,10 +251,21 @@ def test_time_may_be_cut_anywhere(table, seed, rate):
         "light_power": rng.uniform(1e-5, 1e-4, size),
     }
     effect = make_effect(table)
-    tables = {"gaps": np.array([[50, 80], [200, 300], [420, 421]]), "restarts": np.array([[200, 300]])}
+    tables = {
+        "gaps": np.array([[50, 80], [200, 300], [420, 421]]),
+        "restarts": np.array([[200, 300]]),
+    }
     noise = {"Q": 0.1, "N": [0.1, 0.2, 0.3], "B": 0.0, "K": 0.3}
     given_drivers = {name: drivers[name] for name in effect.channels}
-    same_whatever_the_cuts(effect, random_cuts(seed, size), size=size, rate=rate, drivers=given_drivers, noise=noise, **tables)
+    same_whatever_the_cuts(
+        effect,
+        random_cuts(seed, size),
+        size=size,
+        rate=rate,
+        drivers=given_drivers,
+        noise=noise,
+        **tables,
+    )
 
 
 def test_a_simulated_log_does_not_depend_on_its_chunks():
@@ -206,7 +276,12 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
         steady("temperature_2", "degC", 10),
         {"profile": "power_cuts", "cuts": [[500, 540]]},
     ]
-    model = {"environment": world, "effect": CASES, "noise": {"N": 0.01}, "log": {"rate": 2, "duration": "1500s"}}
+    model = {
+        "environment": world,
+        "effect": CASES,
+        "noise": {"N": 0.01},
+        "log": {"rate": 2, "duration": "1500s"},
+    }
     one, many = (simulate(model, seed=9, chunk=chunk).rate.values for chunk in (3000, 371))
     np.testing.assert_array_equal(one, many)
     assert np.isnan(one[:, 1000:1080]).all()
@@ -215,13 +290,31 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"name": "shupe", "sensitivity": 0.1, "transient": 0.2}, r"0.2 deg/h/\(degC/min\) while heat goes through the winding"),
-        ({"name": "shupe", "sensitivity": 0.1, "sensor_lag": 40}, "with a lag of 265 s, seen by a sensor that is 40 s late"),
-        ({"name": "shupe", "sensitivity": 0.0, "transient": 0.2}, r"temperature on all axes, by 0.2 deg/h/\(degC/min\) while heat goes"),
-        ({"name": "temperature_bias", "sensitivity": 0.0, "cubic": 1e-6}, r"on all axes, by 1e-06 deg/h/degC\^3 around 25 degC"),
-        ({"name": "temperature_bias", "sensitivity": 0.1, "cubic": 1e-6}, r"by 0.1 deg/h/degC, 1e-06 deg/h/degC\^3 around 25 degC"),
+        (
+            {"name": "shupe", "sensitivity": 0.1, "transient": 0.2},
+            r"0.2 deg/h/\(degC/min\) while heat goes through the winding",
+        ),
+        (
+            {"name": "shupe", "sensitivity": 0.1, "sensor_lag": 40},
+            "with a lag of 265 s, seen by a sensor that is 40 s late",
+        ),
+        (
+            {"name": "shupe", "sensitivity": 0.0, "transient": 0.2},
+            r"temperature on all axes, by 0.2 deg/h/\(degC/min\) while heat goes",
+        ),
+        (
+            {"name": "temperature_bias", "sensitivity": 0.0, "cubic": 1e-6},
+            r"on all axes, by 1e-06 deg/h/degC\^3 around 25 degC",
+        ),
+        (
+            {"name": "temperature_bias", "sensitivity": 0.1, "cubic": 1e-6},
+            r"by 0.1 deg/h/degC, 1e-06 deg/h/degC\^3 around 25 degC",
+        ),
         ({"name": "temperature_bias", "sensitivity": 0.0}, r"by 0 deg/h/degC around 25 degC"),
-        ({"name": "temperature_noise", "linear": 0.0, "quadratic": 1e-5}, r"N\^2 changes by 1e-05 1/degC\^2 of itself around 25 degC"),
+        (
+            {"name": "temperature_noise", "linear": 0.0, "quadratic": 1e-5},
+            r"N\^2 changes by 1e-05 1/degC\^2 of itself around 25 degC",
+        ),
         (
             {"name": "vibration_rectification", "sensitivity": 0.0, "quartic": 1e-6},
             r"of 1e-06 deg/h/g\^4 times the fourth power of the rms vib",
@@ -230,11 +323,26 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
             {"name": "vibration_rectification", "sensitivity": 1e-3, "quartic": 1e-6},
             r"of the rms vibration, and of 1e-06 deg/h/g\^4 times its",
         ),
-        ({"name": "thermal_gradient", "change": 0.1, "driver": ["a", "b"]}, "difference of a and b on all axes, by 0.1 deg/h/"),
-        ({"name": "warm_up", "amplitude": 0.1, "slow_amplitude": 0.2}, "settles with 600 s, and 0.2 deg/h with 3600 s"),
-        ({"name": "ageing_bias", "logarithmic": 0.2}, "by 0.2 deg/h times the logarithm of time over 24 h"),
-        ({"name": "vibration_noise", "white": 1, "quantization": 2, "exponent": 0.9}, "of N and 2 urad/g of Q, added in squares, with the"),
-        ({"name": "vibration_random_walk", "sensitivity": 1, "exponent": 2}, "with the power 2 of the vibration"),
+        (
+            {"name": "thermal_gradient", "change": 0.1, "driver": ["a", "b"]},
+            "difference of a and b on all axes, by 0.1 deg/h/",
+        ),
+        (
+            {"name": "warm_up", "amplitude": 0.1, "slow_amplitude": 0.2},
+            "settles with 600 s, and 0.2 deg/h with 3600 s",
+        ),
+        (
+            {"name": "ageing_bias", "logarithmic": 0.2},
+            "by 0.2 deg/h times the logarithm of time over 24 h",
+        ),
+        (
+            {"name": "vibration_noise", "white": 1, "quantization": 2, "exponent": 0.9},
+            "of N and 2 urad/g of Q, added in squares, with the",
+        ),
+        (
+            {"name": "vibration_random_walk", "sensitivity": 1, "exponent": 2},
+            "with the power 2 of the vibration",
+        ),
     ],
 )
 def test_the_sentence_has_all_its_numbers(table, words):

@@ -16,7 +16,8 @@ from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import allan_of_samples, run, sigma
 
-# ------------------------------------------------------------------------------------------------- processes in continuous time
+# -------------------------------------------------------------------------------------------------
+# processes in continuous time
 
 
 def density_of_reading(reading, f, rate):
@@ -25,7 +26,9 @@ def density_of_reading(reading, f, rate):
     noise = reading.kick @ reading.kick.T
     found = []
     for one in f:
-        gain = reading.read @ np.linalg.inv(np.exp(2j * np.pi * one / rate) * np.eye(size) - reading.step)
+        gain = reading.read @ np.linalg.inv(
+            np.exp(2j * np.pi * one / rate) * np.eye(size) - reading.step
+        )
         through = np.append(gain, 1.0)
         found.append((through @ noise @ through.conj()).real / rate)
     return np.array(found)
@@ -33,11 +36,15 @@ def density_of_reading(reading, f, rate):
 
 @pytest.mark.parametrize("average", [False, True], ids=["point", "average"])
 @pytest.mark.parametrize("rate", [7.0, 400.0, 1900.0, 30_000.0])
-@pytest.mark.parametrize("mount", [{}, {"resonance": 620.0, "quality": 8.0}], ids=["rigid", "mount"])
+@pytest.mark.parametrize(
+    "mount", [{}, {"resonance": 620.0, "quality": 8.0}], ids=["rigid", "mount"]
+)
 def test_samples_of_a_band_have_its_folded_density(mount, rate, average):
     reading = band(700.0, 800.0, rate, **mount, average=average)
     f = np.linspace(0.02, 0.48, 12) * rate
-    expected = folded_psd(lambda g: band_psd(g, 700.0, 800.0, **mount), f, rate, 20_000.0, average=average)
+    expected = folded_psd(
+        lambda g: band_psd(g, 700.0, 800.0, **mount), f, rate, 20_000.0, average=average
+    )
     found = density_of_reading(reading, f, rate)
     strong = expected > 1e-6 * expected.max()
     np.testing.assert_allclose(found[strong], expected[strong], rtol=2e-3)
@@ -45,15 +52,21 @@ def test_samples_of_a_band_have_its_folded_density(mount, rate, average):
 
 
 @pytest.mark.parametrize("average", [False, True], ids=["point", "average"])
-@pytest.mark.parametrize(("frequency", "quality", "rate"), [(27.0, 12.0, 10.0), (27.0, 0.7, 100.0), (0.3, 20.0, 400.0)])
+@pytest.mark.parametrize(
+    ("frequency", "quality", "rate"), [(27.0, 12.0, 10.0), (27.0, 0.7, 100.0), (0.3, 20.0, 400.0)]
+)
 def test_samples_of_an_oscillator_have_its_folded_density(frequency, quality, rate, average):
     reading = oscillator(frequency, quality, rate, average=average)
     f = np.linspace(0.02, 0.48, 15) * rate
-    expected = folded_psd(lambda g: oscillator_psd(g, frequency, quality), f, rate, 1e5, average=average)
+    expected = folded_psd(
+        lambda g: oscillator_psd(g, frequency, quality), f, rate, 1e5, average=average
+    )
     np.testing.assert_allclose(density_of_reading(reading, f, rate), expected, rtol=2e-3)
 
 
-@pytest.mark.parametrize("density", [lambda f: band_psd(f, 700.0, 800.0), lambda f: oscillator_psd(f, 700.0, 9.0)])
+@pytest.mark.parametrize(
+    "density", [lambda f: band_psd(f, 700.0, 800.0), lambda f: oscillator_psd(f, 700.0, 9.0)]
+)
 def test_densities_have_unit_power(density):
     near = quad(density, 500.0, 1000.0, limit=400, epsabs=1e-12)[0]
     far = quad(density, 1e-9, 500.0)[0] + quad(density, 1000.0, 1e7, limit=2000)[0]
@@ -73,28 +86,43 @@ def test_a_mount_amplifies_at_its_resonance_only():
     np.testing.assert_allclose(gain, expected, rtol=1e-9)
 
 
-# ------------------------------------------------------------------------------------------------------------------ vibration
+# ------------------------------------------------------------------------------------------------------------------
+# vibration
 
 
 def vibrating(**effect):
     """White noise of 0.003 deg/sqrt(h) at 400 Hz, with and without 50 deg/h rms of vibration at 700 to 800 Hz."""
     world = [{"profile": "vibration", "points": [[0, 13.39]], "sensor_rate": 1}]
-    model = {"noise": {"N": 0.0031}, "environment": world, "log": {"rate": 400, "duration": "150s", "axes": ["x"]}}
+    model = {
+        "noise": {"N": 0.0031},
+        "environment": world,
+        "log": {"rate": 400, "duration": "150s", "axes": ["x"]},
+    }
     loud = model | {"effect": [{"name": "aliased_vibration", "sensitivity": 50 / 13.39, **effect}]}
     return [simulate(one, seed=3).rate.values for one in (model, loud)]
 
 
 @pytest.mark.parametrize(
     ("sampling", "taus", "times"),
-    [("point", [0.0025, 0.04, 0.4, 2.0], [8, 19, 19, 19]), ("average", [0.0025, 0.01, 0.04, 1.0], [1.3, 1.4, 1.1, 1.0])],
+    [
+        ("point", [0.0025, 0.04, 0.4, 2.0], [8, 19, 19, 19]),
+        ("average", [0.0025, 0.01, 0.04, 1.0], [1.3, 1.4, 1.1, 1.0]),
+    ],
 )
 def test_a_band_on_a_multiple_of_the_sampling_rate_looks_like_n_or_q(sampling, taus, times):
     quiet, loud = vibrating(sampling=sampling)
     effect = make_effect({"name": "aliased_vibration", "sensitivity": 1, "sampling": sampling})
     f = np.linspace(1e-3, 200, 20_001)
-    windows = Windows(np.zeros(1), np.ones(1), f, 400.0, ("x",), drivers={"vibration": np.full(1, 50.0)})
+    windows = Windows(
+        np.zeros(1), np.ones(1), f, 400.0, ("x",), drivers={"vibration": np.full(1, 50.0)}
+    )
     folded = effect.explain(windows).spectrum["sensitivity"][0]
-    added = np.array([allan_of_samples(lambda g: np.interp(g, f, folded), round(tau * 400), 400.0) for tau in taus])
+    added = np.array(
+        [
+            allan_of_samples(lambda g: np.interp(g, f, folded), round(tau * 400), 400.0)
+            for tau in taus
+        ]
+    )
     expected = np.sqrt(1 + added / ((60 * 0.0031) ** 2 / np.array(taus)))
     np.testing.assert_allclose(expected, times, rtol=0.05)
     found = sigma(loud, 400.0, taus[:3])[0] / sigma(quiet, 400.0, taus[:3])[0]
@@ -103,14 +131,24 @@ def test_a_band_on_a_multiple_of_the_sampling_rate_looks_like_n_or_q(sampling, t
 
 
 def test_a_band_folds_where_it_must():
-    effect = make_effect({"name": "aliased_vibration", "sensitivity": [1.0, -0.5], "axes": ["x", "y"], "low": 700, "high": 800})
+    effect = make_effect(
+        {
+            "name": "aliased_vibration",
+            "sensitivity": [1.0, -0.5],
+            "axes": ["x", "y"],
+            "low": 700,
+            "high": 800,
+        }
+    )
     x, y = run(effect, size=2**17, rate=400.0, drivers={"vibration": 2.0})
     np.testing.assert_allclose(y, -0.5 * x, rtol=1e-12)
     assert x.std() == pytest.approx(2.0, rel=0.02)
     power = np.abs(np.fft.rfft(x)) ** 2
     f = np.fft.rfftfreq(x.size, 1 / 400.0)
     assert power[(f > 2) & (f < 97)].sum() / power.sum() > 0.93
-    slower, _ = run(effect, size=2**17, rate=500.0, drivers={"vibration": 2.0})  # now it lies at 200 to 250 Hz
+    slower, _ = run(
+        effect, size=2**17, rate=500.0, drivers={"vibration": 2.0}
+    )  # now it lies at 200 to 250 Hz
     power = np.abs(np.fft.rfft(slower)) ** 2
     f = np.fft.rfftfreq(slower.size, 1 / 500.0)
     assert power[f > 195].sum() / power.sum() > 0.95
@@ -119,12 +157,30 @@ def test_a_band_folds_where_it_must():
 def test_a_faster_instrument_and_a_mean_make_integrate_and_dump():
     common = {"environment": [{"profile": "vibration", "points": [[0, 1.0]]}], "noise": {"N": 0.0}}
     effect = {"name": "aliased_vibration", "sensitivity": 50.0}
-    fast = simulate(common | {"effect": [effect], "log": {"rate": 400, "duration": "30s", "oversampling": 25, "axes": ["x"]}})
-    slow = simulate(common | {"effect": [effect | {"sampling": "average"}], "log": {"rate": 400, "duration": "30s", "axes": ["x"]}})
+    fast = simulate(
+        common
+        | {
+            "effect": [effect],
+            "log": {"rate": 400, "duration": "30s", "oversampling": 25, "axes": ["x"]},
+        }
+    )
+    slow = simulate(
+        common
+        | {
+            "effect": [effect | {"sampling": "average"}],
+            "log": {"rate": 400, "duration": "30s", "axes": ["x"]},
+        }
+    )
     taus = [0.0025, 0.005, 0.01, 0.02]
-    np.testing.assert_allclose(sigma(fast.rate.values, 400, taus), sigma(slow.rate.values, 400, taus), rtol=0.04)
-    inside = np.sqrt(np.mean(np.sinc(np.linspace(700.0, 800.0, 1001) / 400.0) ** 2))  # of the mean over a sample, in the default band
-    assert fast.rate.values.std() == pytest.approx(50.0 * inside, rel=0.06)  # 3.74; seeds scatter by 2 %
+    np.testing.assert_allclose(
+        sigma(fast.rate.values, 400, taus), sigma(slow.rate.values, 400, taus), rtol=0.04
+    )
+    inside = np.sqrt(
+        np.mean(np.sinc(np.linspace(700.0, 800.0, 1001) / 400.0) ** 2)
+    )  # of the mean over a sample, in the default band
+    assert fast.rate.values.std() == pytest.approx(
+        50.0 * inside, rel=0.06
+    )  # 3.74; seeds scatter by 2 %
 
 
 def test_an_empty_band_is_refused():
@@ -133,26 +189,53 @@ def test_an_empty_band_is_refused():
 
 
 def test_rectified_vibration_steps_the_mean_and_looks_like_k_at_its_edges_only():
-    world = [{"profile": "vibration", "points": [[0, 0.0], [300, 10.0], [900, 20.0], [1200, 0.0]], "sensor_rate": 10}]
+    world = [
+        {
+            "profile": "vibration",
+            "points": [[0, 0.0], [300, 10.0], [900, 20.0], [1200, 0.0]],
+            "sensor_rate": 10,
+        }
+    ]
     effect = {"name": "vibration_rectification", "sensitivity": 1e-3, "axes": ["x"]}
-    log = simulate({"environment": world, "effect": [effect], "noise": {}, "log": {"rate": 10, "duration": "1500s"}})
-    assert np.unique(np.round(log.rate.sel(axis="x").values, 9)).tolist() == [0.0, 0.1, 0.4]  # g^2 of 10 and 20 g
+    log = simulate(
+        {
+            "environment": world,
+            "effect": [effect],
+            "noise": {},
+            "log": {"rate": 10, "duration": "1500s"},
+        }
+    )
+    assert np.unique(np.round(log.rate.sel(axis="x").values, 9)).tolist() == [
+        0.0,
+        0.1,
+        0.4,
+    ]  # g^2 of 10 and 20 g
     assert not np.any(log.rate.sel(axis=["y", "z"]).values)
     surface = davar(log, window="200s", step="50s", taus=[1.0, 5.0, 20.0])
     step, tau, length = 0.1, surface.tau.values, 200.0
-    across = surface.sel(axis="x").isel(time=slice(3, 6)).avar.values  # 150..350, 200..400, 250..450: the edge is 50 s inside or more
-    np.testing.assert_allclose(across, np.tile(step**2 * tau / (3 * (length - 2 * tau)), (3, 1)), rtol=0.02)
+    across = (
+        surface.sel(axis="x").isel(time=slice(3, 6)).avar.values
+    )  # 150..350, 200..400, 250..450: the edge is 50 s inside or more
+    np.testing.assert_allclose(
+        across, np.tile(step**2 * tau / (3 * (length - 2 * tau)), (3, 1)), rtol=0.02
+    )
     k = np.sqrt(3 * across[1] / tau * 3600)  # deg/h^1.5
     np.testing.assert_allclose(k[:2], step / math.sqrt(length / 3600), rtol=0.06)
     inside = surface.sel(axis="x").isel(time=slice(6, 15)).avar.values  # wholly in 300..900
     assert np.all(inside < 1e-12)
     mean = surface.window_mean.sel(axis="x").values
-    np.testing.assert_allclose([mean[0], mean[8], mean[19], mean[-1]], [0.0, 0.1, 0.4, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        [mean[0], mean[8], mean[19], mean[-1]], [0.0, 0.1, 0.4, 0.0], atol=1e-9
+    )
 
 
 def test_vibration_rectification_is_even_and_acceleration_odd():
-    rectified = make_effect({"name": "vibration_rectification", "sensitivity": 2e-3, "quartic": 1e-5})
-    np.testing.assert_allclose(run(rectified, size=2, drivers={"vibration": [-10.0, 10.0]})[0], 0.2 + 0.1, rtol=1e-12)
+    rectified = make_effect(
+        {"name": "vibration_rectification", "sensitivity": 2e-3, "quartic": 1e-5}
+    )
+    np.testing.assert_allclose(
+        run(rectified, size=2, drivers={"vibration": [-10.0, 10.0]})[0], 0.2 + 0.1, rtol=1e-12
+    )
     odd = make_effect({"name": "g_sensitivity", "x": 0.01, "y": -0.02, "z": 0.5})
     drivers = {"accel_x": [1.0, -1.0], "accel_y": [0.5, -0.5], "accel_z": [0.1, -0.1]}
     np.testing.assert_allclose(run(odd, size=2, drivers=drivers)[2], [0.05, -0.05], rtol=1e-12)
@@ -161,12 +244,23 @@ def test_vibration_rectification_is_even_and_acceleration_odd():
 def test_magnetic_bias_is_its_scalar_product_and_needs_only_what_it_uses():
     effect = make_effect({"name": "magnetic", "y": 0.002, "z": -0.01, "axes": ["z"]})
     assert effect.needs() == ("mag_y", "mag_z")
-    np.testing.assert_allclose(run(effect, size=2, drivers={"mag_y": [50, 0], "mag_z": [0, 20]}), [[0.1, -0.2]], rtol=1e-12)
+    np.testing.assert_allclose(
+        run(effect, size=2, drivers={"mag_y": [50, 0], "mag_z": [0, 20]}), [[0.1, -0.2]], rtol=1e-12
+    )
 
 
 def test_gravity_in_a_turning_tool_is_a_line_of_its_amplitude():
     world = [{"profile": "rotation", "points": [[0, 72.0]], "inclination": 30.0}]
     effect = {"name": "g_sensitivity", "x": 0.4, "axes": ["y"]}
-    log = simulate({"environment": world, "effect": [effect], "noise": {}, "log": {"rate": 50, "duration": "400s"}})
+    log = simulate(
+        {
+            "environment": world,
+            "effect": [effect],
+            "noise": {},
+            "log": {"rate": 50, "duration": "400s"},
+        }
+    )
     top = 0.371 / 0.2
-    assert sigma(log.rate.sel(axis="y").values, 50, [top])[0, 0] == pytest.approx(0.7246 * 0.4 * 0.5, rel=0.01)
+    assert sigma(log.rate.sel(axis="y").values, 50, [top])[0, 0] == pytest.approx(
+        0.7246 * 0.4 * 0.5, rel=0.01
+    )

@@ -26,7 +26,9 @@ def write_day(folder: Path, number: int, day: str, *, hours: float = 20.0) -> No
     stamps = pd.date_range(day, periods=samples, freq=pd.Timedelta(seconds=1 / HERTZ))
     columns = {"time": stamps.strftime("%Y-%m-%dT%H:%M:%S")}
     for axis, n in N_TRUE.items():
-        columns[f"gyro_{axis} [deg/h]"] = np.round(10.0 + rng.normal(0.0, n * np.sqrt(3600.0 * HERTZ), samples), 4)
+        columns[f"gyro_{axis} [deg/h]"] = np.round(
+            10.0 + rng.normal(0.0, n * np.sqrt(3600.0 * HERTZ), samples), 4
+        )
     columns["temperature [degC]"] = np.round(60.0 + 5.0 * np.sin(np.arange(samples) / 5000.0), 2)
     # the names run against the order of time
     pd.DataFrame(columns).to_csv(folder / f"run_{9 - number}.csv", index=False)
@@ -39,10 +41,14 @@ def archive(tmp_path_factory) -> tuple[Path, str]:
     (folder / "logs").mkdir()
     for number, day in enumerate(DAYS):
         write_day(folder / "logs", number, day)
-    (folder / "logs" / "run_0.csv").write_text("")  # damaged; it comes first by its name, where it leaves no gap
+    (folder / "logs" / "run_0.csv").write_text(
+        ""
+    )  # damaged; it comes first by its name, where it leaves no gap
     for name in ("archive.py", "archive.toml"):
         shutil.copy(ROOT / "pipelines" / name, folder)
-    done = subprocess.run([sys.executable, "archive.py"], cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "archive.py"], cwd=folder, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
 
@@ -63,7 +69,9 @@ def test_product_spans_the_days_and_finds_the_noise(archive):
             seen = part["N"].where(part["observable"].sel(term="N") == 2)
             assert float(seen.median()) == pytest.approx(n, rel=0.03)
             assert f"axis {axis}: " in said
-        night = product.sel(time=slice(f"{DAYS[0]}T21:05", f"{DAYS[0]}T22:55"))  # windows wholly in the gap
+        night = product.sel(
+            time=slice(f"{DAYS[0]}T21:05", f"{DAYS[0]}T22:55")
+        )  # windows wholly in the gap
         assert night.sizes["time"] > 3
         assert np.isnan(night["avar"]).all()
         assert (night["window_coverage"] == 0).all()
@@ -73,8 +81,19 @@ def test_product_spans_the_days_and_finds_the_noise(archive):
 def test_everything_else_is_there(archive):
     folder, said = archive
     results = folder / "results"
-    assert {path.name for path in results.iterdir()} == {"log.nc", "product.nc", "report.html", "figures", "imu.yaml"}
-    assert {path.name for path in (results / "figures").iterdir()} >= {"coefficients.png", "davar.png", "adev_x.png", "davar_3d_y.png"}
+    assert {path.name for path in results.iterdir()} == {
+        "log.nc",
+        "product.nc",
+        "report.html",
+        "figures",
+        "imu.yaml",
+    }
+    assert {path.name for path in (results / "figures").iterdir()} >= {
+        "coefficients.png",
+        "davar.png",
+        "adev_x.png",
+        "davar_3d_y.png",
+    }
     assert "3 files" in (results / "report.html").read_text()
     assert all(f"run_{9 - number}.csv" in said for number in range(3))
     with gyrostab.open_log(results / "log.nc") as log:
@@ -92,7 +111,9 @@ def test_a_second_start_keeps_what_is_complete(archive):
     folder, _ = archive
     results = [folder / "results" / name for name in ("log.nc", "product.nc")]
     before = [path.stat().st_mtime_ns for path in results]
-    done = subprocess.run([sys.executable, "archive.py"], cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "archive.py"], cwd=folder, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "product.nc is complete already" in done.stderr
     assert [path.stat().st_mtime_ns for path in results] == before
@@ -101,7 +122,9 @@ def test_a_second_start_keeps_what_is_complete(archive):
 def test_no_logs_is_said_plainly(tmp_path):
     for name in ("archive.py", "archive.toml"):
         shutil.copy(ROOT / "pipelines" / name, tmp_path)
-    done = subprocess.run([sys.executable, "archive.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "archive.py"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 1
     assert "holds no file *.csv" in done.stderr
     assert "Traceback" not in done.stderr

@@ -26,7 +26,12 @@ SCRIPT = load_script("pipelines/effect_figures.py")
 def section(name: str) -> str:
     """The section of an effect; there is one, on one page."""
     texts = [page.read_text(encoding="utf-8") for page in PAGES.glob("*.md")]
-    found = [part for text in texts for part in re.split(r"(?m)^## ", text)[1:] if part.startswith(f"{name}\n")]
+    found = [
+        part
+        for text in texts
+        for part in re.split(r"(?m)^## ", text)[1:]
+        if part.startswith(f"{name}\n")
+    ]
     assert len(found) == 1, name
     return found[0]
 
@@ -60,9 +65,13 @@ def test_the_table_of_confusions_names_effects() -> None:
 @pytest.mark.parametrize("name", ["shared_source", "earth_rate"])
 def test_the_script_draws_an_effect(name: str, tmp_path: Path) -> None:
     shown = np.asarray(Image.open(SCRIPT.draw(name, tmp_path)).convert("L"), float)
-    kept = np.asarray(Image.open(ROOT / "docs" / "figures" / "effects" / f"{name}.png").convert("L"), float)
+    kept = np.asarray(
+        Image.open(ROOT / "docs" / "figures" / "effects" / f"{name}.png").convert("L"), float
+    )
     assert shown.shape == kept.shape
-    assert np.sqrt(np.mean((shown - kept) ** 2)) < 40  # of 255; other fonts make less, another panel more
+    assert (
+        np.sqrt(np.mean((shown - kept) ** 2)) < 40
+    )  # of 255; other fonts make less, another panel more
 
 
 def test_the_panels_show_what_the_closed_forms_say() -> None:
@@ -85,8 +94,14 @@ def test_the_panels_show_what_the_closed_forms_say() -> None:
 
 
 def test_coherency_tells_quadrature_and_its_sign() -> None:
-    turn, noise = 2.0 * np.pi * 0.5 * np.arange(6000) / 10.0, 0.1 * np.random.default_rng(3).standard_normal((2, 6000))
-    logs = [make_log(noise + size * np.stack([np.cos(turn), -np.sin(turn)]), rate=10.0, unit="deg/h") for size in (0.0, 1.0)]
+    turn, noise = (
+        2.0 * np.pi * 0.5 * np.arange(6000) / 10.0,
+        0.1 * np.random.default_rng(3).standard_normal((2, 6000)),
+    )
+    logs = [
+        make_log(noise + size * np.stack([np.cos(turn), -np.sin(turn)]), rate=10.0, unit="deg/h")
+        for size in (0.0, 1.0)
+    ]
     panel = plot_comparison(*logs, window="1min", coherency=True).axes[3]
     lines = panel.get_lines()[2:]
     at = np.abs(np.asarray(lines[0].get_xdata(), float) - 0.5).argmin()

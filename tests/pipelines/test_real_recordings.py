@@ -28,7 +28,9 @@ Outcome = tuple[xr.Dataset, xr.Dataset, dict[str, float]]
 
 
 @pytest.fixture
-def there(recordings: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> Callable[[str], dict[str, Any]]:
+def there(
+    recordings: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], dict[str, Any]]:
     """Go to the directory of the recordings, where the paths of an entry hold; skip when its files are not there."""
 
     def go(name: str) -> dict[str, Any]:
@@ -47,7 +49,9 @@ def kept() -> dict[str, Outcome]:
 
 @pytest.fixture
 def examine(
-    there: Callable[[str], dict[str, Any]], kept: dict[str, Outcome], tmp_path_factory: pytest.TempPathFactory
+    there: Callable[[str], dict[str, Any]],
+    kept: dict[str, Outcome],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[str], Outcome]:
     """Log, product as read back from disk, and the numbers of the page; each recording is processed once."""
 
@@ -82,7 +86,9 @@ def test_every_recording_gives_a_product(examine, name):
     assert ((product["count"] > 0) | product["avar"].isnull()).all()
     bounds = product["time_bounds"].values
     assert bounds[0, 0] == log["time"].values[0]
-    assert bounds[-1, 1] <= log["time"].values[-1] + np.timedelta64(round(1e9 / found["hertz"]) + 1, "ns")
+    assert bounds[-1, 1] <= log["time"].values[-1] + np.timedelta64(
+        round(1e9 / found["hertz"]) + 1, "ns"
+    )
     assert "{" not in ENTRIES[name]["text"].format_map(found | {"refusal": ""})
 
 
@@ -94,7 +100,9 @@ def test_published_haar_wavelet_variance_at_every_scale(there, recordings, tmp_p
     assert main([*words[1:], "--quiet-progress"]) == 0
     product = gyrostab.open_product(tmp_path / "product.nc")
     for axis in "xyz":
-        rows = table[table["sensor"].str.startswith("ADIS") & (table["channel"] == f"Gyro. {axis.upper()}")]
+        rows = table[
+            table["sensor"].str.startswith("ADIS") & (table["channel"] == f"Gyro. {axis.upper()}")
+        ]
         assert len(rows) == product.sizes["tau"] == 18
         np.testing.assert_allclose(product["tau"], rows["haar_scale_s"] / 2)
         ours = product["avar"].sel(axis=axis).values[0] / 2 / 3600**2
@@ -116,13 +124,19 @@ def test_adis16405_is_stationary(examine):
 
 def test_ring_laser_gyros_sway_on_and_off(examine):
     log, product, found = examine("rlg-static-30min")
-    pieces = deviation(product, "y", 1.0, "deg/h")[::6]  # a window every 30 s, so every sixth one is the next 3 min
+    pieces = deviation(product, "y", 1.0, "deg/h")[
+        ::6
+    ]  # a window every 30 s, so every sixth one is the next 3 min
     np.testing.assert_allclose(pieces, [121, 92, 74, 6, 5, 82, 7, 13, 20, 47], atol=0.6)
     rate = log["rate"].sel(axis="y").values
-    np.testing.assert_allclose(pieces, [overlapped(rate[18_000 * i : 18_000 * (i + 1)], 100) for i in range(10)], rtol=1e-9)
+    np.testing.assert_allclose(
+        pieces, [overlapped(rate[18_000 * i : 18_000 * (i + 1)], 100) for i in range(10)], rtol=1e-9
+    )
     assert found["low"] < 5.5
     assert 115 < found["high"] < 125
-    np.testing.assert_allclose([found[f"mean_{axis}"] for axis in "xyz"], [-12.27, 0.44, 8.36], atol=0.02)
+    np.testing.assert_allclose(
+        [found[f"mean_{axis}"] for axis in "xyz"], [-12.27, 0.44, 8.36], atol=0.02
+    )
 
 
 def test_blueseis_ramp_resets_and_white_noise(examine, recordings):
@@ -136,16 +150,22 @@ def test_blueseis_ramp_resets_and_white_noise(examine, recordings):
     assert found["at_10"] == pytest.approx(4.9, rel=0.05)
     assert found["excess"] > 2
     assert log["ramp"].attrs["units"] == "1"
-    assert found["mean"] == pytest.approx(15.041067 * np.sin(np.deg2rad(47.9)), rel=2e-3)  # vertical Earth rate
+    assert found["mean"] == pytest.approx(
+        15.041067 * np.sin(np.deg2rad(47.9)), rel=2e-3
+    )  # vertical Earth rate
 
 
 def test_blueseis_angle_random_walk_from_one_second_on(examine):
     product, found = examine("fog-blueseis-from-1s")[1:]
-    white = np.rad2deg(19e-9) * 60  # 19 nrad/s/sqrt(Hz) in deg/sqrt(h): 6.5e-5, or 0.0039 deg/h/sqrt(Hz)
+    white = (
+        np.rad2deg(19e-9) * 60
+    )  # 19 nrad/s/sqrt(Hz) in deg/sqrt(h): 6.5e-5, or 0.0039 deg/h/sqrt(Hz)
     assert found["n"] == pytest.approx(white, rel=0.1)
     assert found["n_hz"] == pytest.approx(0.004, rel=0.1)
     assert (product["observable"].sel(term="N") == 2).all()
-    whole, found_below = examine("fog-blueseis-ramp")[1:]  # the resets of the ramp bend the curve below 1 s
+    whole, found_below = examine("fog-blueseis-ramp")[
+        1:
+    ]  # the resets of the ramp bend the curve below 1 s
     assert found_below["misfit"] > 100
     assert not (whole["observable"] == 2).any()
     assert (whole["N_upper"] > white).all()
@@ -164,7 +184,9 @@ def test_earthquake_in_the_ring_laser(examine):
     product, found = examine("ringlaser-g-3h")[1:]
     for tau, known in ((0.05, 1.6e-10), (0.5, 2.9e-11), (5.0, 1.3e-11), (10.0, 9.3e-12)):
         assert deviation(product, "z", tau, "rad/s")[0] == pytest.approx(known, rel=0.1)
-    minutes = (product["time"].values - product["time_bounds"].values[0, 0]) / np.timedelta64(1, "m")
+    minutes = (product["time"].values - product["time_bounds"].values[0, 0]) / np.timedelta64(
+        1, "m"
+    )
     at_10 = deviation(product, "z", 10.0, "nrad/s")
     quiet = at_10[minutes < 31]  # these windows end before the waves arrive
     assert at_10[(minutes > 41) & (minutes < 85)].min() > 5 * np.median(quiet)
@@ -174,12 +196,17 @@ def test_earthquake_in_the_ring_laser(examine):
 
 
 def test_bursts_of_the_mpu6050(examine):
-    text, matlab = examine("mpu6050-static-temperature"), examine("mpu6050-static-temperature-matlab")
+    text, matlab = (
+        examine("mpu6050-static-temperature"),
+        examine("mpu6050-static-temperature-matlab"),
+    )
     for log, product, found in (text, matlab):
         assert 99.2 < found["hertz"] < 100.05
         assert np.isfinite(log["rate"]).sum() == 3 * 65_067
         assert 25.2 < found["cold"] < found["warm"] - 0.1 < 25.4
-        assert float(product["temperature"][0] - product["temperature"][-1]) == pytest.approx(0.15, abs=0.1)
+        assert float(product["temperature"][0] - product["temperature"][-1]) == pytest.approx(
+            0.15, abs=0.1
+        )
     assert {"accel_x", "accel_y", "accel_z"} <= set(matlab[1].data_vars)
     assert matlab[2]["n_x"] == pytest.approx(text[2]["n_x"], rel=0.01)
     assert any("bursts" in note for note in text[0].attrs["notes"])
@@ -216,13 +243,20 @@ def test_rocket_that_did_not_wait(examine):
 
 def test_autopilot_with_dropouts(examine, recordings):
     log, product, found = examine("px4-bench-dropouts")
-    stamps = pd.read_csv(recordings("px4-bench-dropouts/sensor_combined.csv.gz"))["timestamp"].to_numpy() * 1e-6
+    stamps = (
+        pd.read_csv(recordings("px4-bench-dropouts/sensor_combined.csv.gz"))["timestamp"].to_numpy()
+        * 1e-6
+    )
     steps = np.diff(stamps)
     assert found["holes"] == np.sum(steps > 0.0081) == 8
-    assert found["lost"] == np.sum(np.rint(steps[steps > 0.0081] * log.attrs["sampling_rate_hz"]) - 1)
+    assert found["lost"] == np.sum(
+        np.rint(steps[steps > 0.0081] * log.attrs["sampling_rate_hz"]) - 1
+    )
     assert found["during"] > 1000 * found["before"]
     assert found["after"] == pytest.approx(found["before"], rel=0.3)
-    seconds = (product["time"].values - product["time_bounds"].values[0, 0]) / np.timedelta64(1, "s")
+    seconds = (product["time"].values - product["time_bounds"].values[0, 0]) / np.timedelta64(
+        1, "s"
+    )
     shaken = seconds[deviation(product, "x", 0.1, "rad/s") > 0.01]
     assert shaken.max() < 30
     assert shaken.max() - shaken.min() < 4 + 2 * 2 + 1  # 4 s of handling, seen by windows of 2 s
@@ -235,15 +269,24 @@ def test_micro_air_vehicle_after_a_spreadsheet(examine):
     (note,) = [note for note in log.attrs["notes"] if "unreadable" in note]
     assert "7 of 36827 rows" in note
     assert all(str(line) in note for line in range(36_822, 36_829))
-    assert found["quiet"] == pytest.approx(1.6968e-4, rel=0.15)  # the noise density of imu0_sensor.yaml, at 1 s
+    assert found["quiet"] == pytest.approx(
+        1.6968e-4, rel=0.15
+    )  # the noise density of imu0_sensor.yaml, at 1 s
     assert found["flight"] > 100 * found["quiet"]
 
 
-@pytest.mark.parametrize(("name", "rows"), [("fog-hybrid-warmup-static", [5818]), ("fog-hybrid-warmup-turn", [1341, 1960, 2550])])
+@pytest.mark.parametrize(
+    ("name", "rows"),
+    [("fog-hybrid-warmup-static", [5818]), ("fog-hybrid-warmup-turn", [1341, 1960, 2550])],
+)
 def test_restarts_of_the_hybrid_unit(examine, name, rows):
     log, product, found = examine(name)
     assert found["restarts"] == len(rows)
-    named = [int(match.group(1)) for note in log.attrs["notes"] if (match := re.search(r"time restarts at row (\d+):", note))]
+    named = [
+        int(match.group(1))
+        for note in log.attrs["notes"]
+        if (match := re.search(r"time restarts at row (\d+):", note))
+    ]
     assert named == rows
     assert {"temperature", "temperature_rate"} <= set(product.data_vars)
 
@@ -265,10 +308,17 @@ def test_fibre_optic_rotation_sensor_in_an_earthquake(examine):
 def test_drill_string_without_a_gyro(examine, there, recordings):
     log, product, found = examine("drill-rig-stick-slip")
     message = SCRIPT.refusal(there("drill-rig-stick-slip"))
-    assert re.search(r"^drill_rig\.csv\.gz: no gyro column .*bit_speed, top_speed.*--map \"bit_speed=gyro_x\" --unit", message)
+    assert re.search(
+        r"^drill_rig\.csv\.gz: no gyro column .*bit_speed, top_speed.*--map \"bit_speed=gyro_x\" --unit",
+        message,
+    )
     table = pd.read_csv(recordings("drill-rig-stick-slip/drill_rig.csv.gz"))
-    assert (found["low"], found["high"]) == pytest.approx((table["bit_speed"].min(), table["bit_speed"].max()))
-    assert float(log["rotation_rate"].mean()) == pytest.approx(6 * table["top_speed"].mean())  # rpm in deg/s
+    assert (found["low"], found["high"]) == pytest.approx(
+        (table["bit_speed"].min(), table["bit_speed"].max())
+    )
+    assert float(log["rotation_rate"].mean()) == pytest.approx(
+        6 * table["top_speed"].mean()
+    )  # rpm in deg/s
     assert product["rotation_rate"].attrs["units"] == "degree s-1"
     assert found["at_slip"] > 3 * found["at_full"]  # a line at 2.7 Hz vanishes at its own period
 
@@ -295,6 +345,12 @@ def test_the_page_has_a_row_for_every_recording_and_no_path():
 def test_sources_and_licences_are_those_of_the_recordings(recordings):
     lines = recordings("README.md").read_text(encoding="utf-8").splitlines()
     for entry in ENTRIES.values():
-        folder = entry["licence"] if entry["source"] == "SMAC-Group/wv" else entry["files"][0].split("/")[0]
+        folder = (
+            entry["licence"]
+            if entry["source"] == "SMAC-Group/wv"
+            else entry["files"][0].split("/")[0]
+        )
         rows = [line for line in lines if line.startswith("| ") and f"| {entry['source']}" in line]
-        assert any(entry["licence"] in row.split("|")[-2] and folder in row for row in rows), entry["source"]
+        assert any(entry["licence"] in row.split("|")[-2] and folder in row for row in rows), entry[
+            "source"
+        ]

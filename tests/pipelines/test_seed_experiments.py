@@ -27,7 +27,11 @@ def cells(text: str) -> dict[str, list[str]]:
 
 
 def on_the_page(name: str) -> str:
-    return PAGE.read_text(encoding="utf-8").split(f"<!-- {name}: begin -->\n")[1].split(f"\n<!-- {name}: end -->")[0]
+    return (
+        PAGE.read_text(encoding="utf-8")
+        .split(f"<!-- {name}: begin -->\n")[1]
+        .split(f"\n<!-- {name}: end -->")[0]
+    )
 
 
 @pytest.fixture
@@ -46,7 +50,8 @@ def slips():
     return ERRATA.errata()
 
 
-# ---------------------------------------------------------------------------------------------------------------- experiments
+# ----------------------------------------------------------------------------------------------------------------
+# experiments
 
 
 def test_x1_has_the_windows_and_the_noise_of_its_law(plan, tmp_path):
@@ -70,11 +75,15 @@ def test_the_canyon_is_the_share_of_what_is_lost(plan, tmp_path):
     rows = cells(SCRIPT.experiment("x3", tmp_path))
     _, printed, counted = next(row for label, row in rows.items() if "195-205" in label)
     k = 10
-    assert (float(printed) / float(counted)) ** 2 == pytest.approx((500 - 2 * k) / (1000 - 2 * k), rel=0.03)
+    assert (float(printed) / float(counted)) ** 2 == pytest.approx(
+        (500 - 2 * k) / (1000 - 2 * k), rel=0.03
+    )
     assert float(counted) == pytest.approx(math.sqrt(0.1), rel=0.2)
 
 
-def test_folded_vibration_is_white_noise_from_20_ms_on_and_everything_when_deviations_are_added(plan):
+def test_folded_vibration_is_white_noise_from_20_ms_on_and_everything_when_deviations_are_added(
+    plan,
+):
     made = {}
     for name in ("long", "sums"):
         run = plan["p16_vibration"]["run"][name] | {"from": 300, "to": 400}
@@ -83,7 +92,9 @@ def test_folded_vibration_is_white_noise_from_20_ms_on_and_everything_when_devia
     def median(name, of, **where):
         return SCRIPT.number({"run": name, "of": of, **where}, made)
 
-    folded = math.sqrt(50**2 / (2 * 100) / 3600)  # 50 deg/h rms, white up to 100 Hz; N^2 is half of the one-sided density
+    folded = math.sqrt(
+        50**2 / (2 * 100) / 3600
+    )  # 50 deg/h rms, white up to 100 Hz; N^2 is half of the one-sided density
     assert float(median("long", "N", **{"from": 30})) == pytest.approx(folded, rel=0.1)
     assert median("long", "K", **{"from": 30}).startswith("< ")
     for of in "QNK":
@@ -95,28 +106,49 @@ def test_l13_vibration_has_the_coefficients_that_were_asked_for(plan, tmp_path):
     titles = [column["title"] for column in plan["l13_vibration"]["columns"]]
     at = {title: number for number, title in enumerate(titles)}
     for title, tolerance in (("static, ours", 0.05), ("vibrating, ours", 0.1), ("max, ours", 0.2)):
-        assert float(rows["N [deg/√h]"][at[title]]) == pytest.approx(float(rows["N [deg/√h]"][at[title] - 1]), rel=tolerance)
+        assert float(rows["N [deg/√h]"][at[title]]) == pytest.approx(
+            float(rows["N [deg/√h]"][at[title] - 1]), rel=tolerance
+        )
     assert float(rows["Q [µrad]"][at["max, ours"]]) == pytest.approx(26.85, rel=0.1)
     assert rows["R [deg/h²]"][at["max, ours"]].startswith("< ")
 
 
-# --------------------------------------------------------------------------------------------------------------------- errata
+# ---------------------------------------------------------------------------------------------------------------------
+# errata
 
 TRUTHS = {
     "Allan variance of x1 at 0.1 s [deg²/h²]; 1/k = 0.1": (10.0, 0.1),
-    "Allan variance of a ramp of 1 deg/h a sample, k = 10 [deg²/h²]; k²/2 = 50": (sum(m**2 for m in range(981)) / 981 / 2, 50.0),
-    "Allan variance of N = 1 at τ = 10 s, integrated over u = π f τ and over f; N²/τ = 0.1": (math.pi, 0.1),
+    "Allan variance of a ramp of 1 deg/h a sample, k = 10 [deg²/h²]; k²/2 = 50": (
+        sum(m**2 for m in range(981)) / 981 / 2,
+        50.0,
+    ),
+    "Allan variance of N = 1 at τ = 10 s, integrated over u = π f τ and over f; N²/τ = 0.1": (
+        math.pi,
+        0.1,
+    ),
     "Q of an angle rounded to 1 arcsec rms, in arcsec": (math.pi / 180 / 3600 * 1e6, 1.0),
     "Eq. 7 over K² τ/3 at τ = 1 s": (2 * math.pi, 1.0),
-    "Allan deviation of the second term at 1 s for its Table 1 at rest [deg/h]": (0.13814101, 60 * 0.01657046),
+    "Allan deviation of the second term at 1 s for its Table 1 at rest [deg/h]": (
+        0.13814101,
+        60 * 0.01657046,
+    ),
     "variance of the last 30 s of x2 [deg²/h²], with a scatter of 3": (11.0, 10.975**2),
     "Allan variance of x1 at 0.1 s, half of it lost [deg²/h²]; 0.1": (0.05, 0.1),
     "windows of 1000 in 6000 samples, step 30": (166, 5000 // 30 + 1),
     "windows of 2000 in 600000 samples, step 300": (1993, 598000 // 300 + 1),
-    "end of the first window with a loss, and of the first with twice the Allan deviation [s]": (432.5, 330.5),
+    "end of the first window with a loss, and of the first with twice the Allan deviation [s]": (
+        432.5,
+        330.5,
+    ),
     "share of the power below 100 Hz: in the vibration, in its samples": (0.0, 1.0),
-    "K fitted to white noise with such a step, and its true K [deg/h^1.5]": (0.27 / math.sqrt(5 / 3600), 0.0),
-    "centrifugal acceleration 2 cm off the axis [g]": ((600 * math.pi) ** 2 * 0.02 / 9.80665, (10 * math.pi) ** 2 * 0.02 / 9.80665),
+    "K fitted to white noise with such a step, and its true K [deg/h^1.5]": (
+        0.27 / math.sqrt(5 / 3600),
+        0.0,
+    ),
+    "centrifugal acceleration 2 cm off the axis [g]": (
+        (600 * math.pi) ** 2 * 0.02 / 9.80665,
+        (10 * math.pi) ** 2 * 0.02 / 9.80665,
+    ),
 }
 
 
@@ -134,17 +166,24 @@ def test_deviations_add_to_too_much_and_angles_do_not_cross_a_gap(slips):
     assert crossed.in_truth == pytest.approx(1.0, abs=0.3)
 
 
-# ----------------------------------------------------------------------------------------------------------------------- page
+# -----------------------------------------------------------------------------------------------------------------------
+# page
 
 
 def test_the_page_holds_the_errata_of_now(slips):
     written = [line.strip("|").split("|")[-2:] for line in on_the_page("errata").splitlines()[2:]]
-    assert np.array(written, dtype=float) == pytest.approx(np.array([slip[-2:] for slip in slips]), rel=2e-3, abs=1e-6)
+    assert np.array(written, dtype=float) == pytest.approx(
+        np.array([slip[-2:] for slip in slips]), rel=2e-3, abs=1e-6
+    )
 
 
 def test_the_page_has_every_experiment_and_figure():
     text = PAGE.read_text(encoding="utf-8")
-    figures = {f"figures/seeds-{name}.png" for entry in SCRIPT.PLAN["experiment"].values() for name in entry.get("figure", {})}
+    figures = {
+        f"figures/seeds-{name}.png"
+        for entry in SCRIPT.PLAN["experiment"].values()
+        for name in entry.get("figure", {})
+    }
     assert set(re.findall(r"\((figures/[^)]*)\)", text)) == figures
     assert all((PAGE.parent / figure).exists() for figure in figures)
     for name, entry in SCRIPT.PLAN["experiment"].items():
@@ -159,4 +198,7 @@ def test_a_table_replaces_what_stands_between_its_marks():
 
 
 def test_the_script_stays_short():
-    assert len((ROOT / "pipelines" / "seed_experiments.py").read_text(encoding="utf-8").splitlines()) <= 80
+    assert (
+        len((ROOT / "pipelines" / "seed_experiments.py").read_text(encoding="utf-8").splitlines())
+        <= 80
+    )

@@ -1,6 +1,7 @@
 """Figures look as they did: compared with small pictures in ``baseline/``, which were looked at one by one.
 
-Make them anew, after a figure was changed on purpose, with ``python -m tests.plot.test_figures`` (or ``make baseline``), and look at them.
+Make them anew, after a figure was changed on purpose, with ``python -m tests.plot.test_figures``
+(or ``make baseline``), and look at them.
 """
 
 from __future__ import annotations
@@ -24,13 +25,20 @@ from gyrostab.plot.style import save_png
 from tests.support import synthetic
 
 BASELINE = Path(__file__).parent / "baseline"
-WIDTH = 240  # pixels of a baseline; fonts and their hinting vanish in the downscaling, lines and colours stay
-TOLERANCE = 8.0  # root mean square difference, of 255; another hinting of the letters makes 2 to 5, a gap that is filled 25
+# pixels of a baseline; fonts and their hinting vanish in the downscaling, lines and colours stay
+WIDTH = 240
+# root mean square difference, of 255; another hinting of the letters makes 2 to 5, a gap that is
+# filled 25
+TOLERANCE = 8.0
 
 
 def drawings() -> dict[str, Callable[[], Figure]]:
     product = synthetic.product()
-    chosen = {name: draw for name, draw in product_figures(product).items() if not name.endswith(("_y", "_z"))}
+    chosen = {
+        name: draw
+        for name, draw in product_figures(product).items()
+        if not name.endswith(("_y", "_z"))
+    }
     return {"signal": lambda: plot_signal(synthetic.log()), **chosen}
 
 
@@ -44,7 +52,12 @@ def picture(figure: Figure) -> Image.Image:
 def difference(one: Image.Image, other: Image.Image) -> float:
     """Root mean square difference, after a blur of three pixels that forgives a shift of a fraction of one."""
     assert one.size == other.size
-    small = [np.asarray(image.resize((one.width // 3, one.height // 3), Image.Resampling.BOX), dtype=float) for image in (one, other)]
+    small = [
+        np.asarray(
+            image.resize((one.width // 3, one.height // 3), Image.Resampling.BOX), dtype=float
+        )
+        for image in (one, other)
+    ]
     return float(np.sqrt(np.mean((small[0] - small[1]) ** 2)))
 
 
@@ -65,9 +78,13 @@ def test_figure_looks_as_it_did(name):
 
 def test_the_comparison_sees_a_change_of_content():
     product = synthetic.product()
-    filled = product.assign(avar=product["avar"].where(product["estimator"] > 0, product["avar"][:, 0]))  # no gap
+    filled = product.assign(
+        avar=product["avar"].where(product["estimator"] > 0, product["avar"][:, 0])
+    )  # no gap
     assert difference(picture(plot_davar(filled)), baseline("davar")) > 2 * TOLERANCE
-    noisier = product.assign(avar=product["avar"] * np.where(np.arange(product.sizes["time"]) > 30, 9.0, 1.0)[:, None])
+    noisier = product.assign(
+        avar=product["avar"] * np.where(np.arange(product.sizes["time"]) > 30, 9.0, 1.0)[:, None]
+    )
     assert difference(picture(plot_davar(noisier)), baseline("davar")) > 2 * TOLERANCE
 
 
@@ -88,7 +105,9 @@ def test_no_cell_without_estimate_no_word_of_it():
         "estimated from incomplete (weighted) clusters",
     ]
     gap = product.isel(time=slice(0, 23))  # the gap without the weighted stretch
-    assert [text.get_text() for text in plot_davar(gap).legends[0].get_texts()] == ["no estimate (gap, or too few terms)"]
+    assert [text.get_text() for text in plot_davar(gap).legends[0].get_texts()] == [
+        "no estimate (gap, or too few terms)"
+    ]
 
 
 @pytest.mark.parametrize("spread", [1.0, 20.0, 1e4])
@@ -96,13 +115,21 @@ def test_labels_stand_clear_of_the_ticks_and_every_panel_has_some(spread):
     product = synthetic.product(axes="x")
     for symbol in LAWS:  # linear scale, a log scale of little more than a decade, one of many
         product[symbol] = product[symbol] * np.geomspace(1.0, spread, product.sizes["time"])
-    for figure in (plot_coefficients(product), plot_davar(product), plot_davar(product.isel(tau=slice(4, 7)))):
+    for figure in (
+        plot_coefficients(product),
+        plot_davar(product),
+        plot_davar(product.isel(tau=slice(4, 7))),
+    ):
         renderer = figure.canvas.get_renderer()
         figure.draw(renderer)
         for panel in figure.axes:
             if panel.get_position().x0 > 0.5:  # the colour bar
                 continue
-            ticks = [label.get_window_extent(renderer) for label in panel.get_yticklabels(which="both") if label.get_text()]
+            ticks = [
+                label.get_window_extent(renderer)
+                for label in panel.get_yticklabels(which="both")
+                if label.get_text()
+            ]
             label = panel.yaxis.label.get_window_extent(renderer)
             assert len(ticks) >= 2
             assert label.x0 > 0.0
@@ -113,7 +140,14 @@ def test_all_figures_of_a_product(tmp_path, capsys):
     source = str(to_netcdf(synthetic.product(axes="x"), tmp_path / "product.nc"))
     target = tmp_path / "new" / "figures"
     assert main(["plot", source, "-o", str(target)]) == 0
-    names = ["adev_x.png", "coefficients.png", "davar.png", "davar_3d_x.png", "davar_change.png", "temperature.png"]
+    names = [
+        "adev_x.png",
+        "coefficients.png",
+        "davar.png",
+        "davar_3d_x.png",
+        "davar_change.png",
+        "temperature.png",
+    ]
     assert sorted(path.name for path in target.iterdir()) == names
     assert sorted(Path(line).name for line in capsys.readouterr().out.splitlines()) == names
     for path in target.iterdir():
@@ -127,7 +161,10 @@ def test_all_figures_of_a_product(tmp_path, capsys):
 
 def test_axes_with_odd_names_and_single_windows_are_drawn(tmp_path):
     product = synthetic.product(axes="x").isel(time=[0]).assign_coords(axis=["gyro 1/a"])
-    assert [path.name for path in save_figures(product, tmp_path, dpi=50)][3:] == ["temperature.png", "adev_gyro_1_a.png"]
+    assert [path.name for path in save_figures(product, tmp_path, dpi=50)][3:] == [
+        "temperature.png",
+        "adev_gyro_1_a.png",
+    ]
 
 
 def test_refusals(tmp_path):

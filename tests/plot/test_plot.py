@@ -74,7 +74,11 @@ def test_thinning_keeps_the_extremes_of_every_column(values, columns):
     assert first.size <= max(2 * columns, 1)
     for start, stop, lowest, highest in zip(edges[:-1], edges[1:], low, high, strict=True):
         part = [value for value in values[start:stop] if not np.isnan(value)]
-        assert (lowest, highest) == (min(part), max(part)) if part else np.isnan([lowest, highest]).all()
+        assert (
+            (lowest, highest) == (min(part), max(part))
+            if part
+            else np.isnan([lowest, highest]).all()
+        )
 
 
 @pytest.mark.parametrize("table", [True, False])
@@ -118,7 +122,11 @@ def test_davar_draws_the_deviation_and_leaves_gaps_blank(product):
 
 
 def test_davar_marks_weighted_cells_only(product):
-    (dots,) = [item for item in plot_davar(product, axis="x").axes[0].collections if isinstance(item, PathCollection)]
+    (dots,) = [
+        item
+        for item in plot_davar(product, axis="x").axes[0].collections
+        if isinstance(item, PathCollection)
+    ]
     marked = {(x, y) for x, y in np.round(dots.get_offsets().data, 4)}
     times, taus = date2num(product.time.values), product.tau.values
     cells = product.estimator.sel(axis="x").values
@@ -126,7 +134,11 @@ def test_davar_marks_weighted_cells_only(product):
     assert marked
     assert marked <= weighted
     strict = product.assign(estimator=product.estimator.where(product.estimator != 2, 1))
-    assert not [item for item in plot_davar(strict, axis="x").axes[0].collections if isinstance(item, PathCollection)]
+    assert not [
+        item
+        for item in plot_davar(strict, axis="x").axes[0].collections
+        if isinstance(item, PathCollection)
+    ]
 
 
 def test_davar_of_very_many_windows_is_averaged_in_variance():
@@ -192,15 +204,24 @@ def test_values_limits_and_blind_stretches_of_the_coefficients(windows):
         assert set(np.round(drawn, 9)) <= set(np.round(known[np.isfinite(known)], 9))
         assert bool(drawn.size) is bool(np.isfinite(known).any())
         assert len(shaded(ax)) == 1
-    lone = [line for line in figure.axes[0].lines if line.get_linestyle() == "None" and line.get_marker() == "s"]
-    assert windows == 40 or lone  # Q is observed in every other window only: its points stand alone and are still drawn
+    lone = [
+        line
+        for line in figure.axes[0].lines
+        if line.get_linestyle() == "None" and line.get_marker() == "s"
+    ]
+    assert (
+        windows == 40 or lone
+    )  # Q is observed in every other window only: its points stand alone and are still drawn
 
 
 def test_standard_errors_are_drawn(product):
     panel = plot_coefficients(product, axis="x").axes[1]
     bars = next(item for item in panel.collections if item.__class__.__name__ == "LineCollection")
     segment = bars.get_segments()[0]
-    expected = product.N.sel(axis="x").values[0] + np.array([-1, 1]) * product.N_stderr.sel(axis="x").values[0]
+    expected = (
+        product.N.sel(axis="x").values[0]
+        + np.array([-1, 1]) * product.N_stderr.sel(axis="x").values[0]
+    )
     np.testing.assert_allclose(sorted(segment[:, 1]), expected)
 
 
@@ -219,7 +240,12 @@ def test_band_is_the_chi_square_band(edf, avar):
 
 def test_band_covers_the_truth_as_often_as_it_says(product):
     low, high = band(product.avar.values, product.edf.values)
-    truth = np.stack([[model_avar(product.tau.values, _truth(a, t, product.sizes["time"])) for t in range(40)] for a in range(3)])
+    truth = np.stack(
+        [
+            [model_avar(product.tau.values, _truth(a, t, product.sizes["time"])) for t in range(40)]
+            for a in range(3)
+        ]
+    )
     known = np.isfinite(low)
     share = ((low <= truth) & (truth <= high))[known].mean()
     assert share == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / known.sum()))
@@ -227,7 +253,10 @@ def test_band_covers_the_truth_as_often_as_it_says(product):
 
 def _truth(axis: int, window: int, windows: int) -> dict[str, float]:
     growth = 1.0 + 2.0 * window / (windows - 1)
-    return {s: value * (1 + 0.5 * axis) * (growth if s == "N" else 1.0) for s, value in synthetic.COEFFICIENTS.items()}
+    return {
+        s: value * (1 + 0.5 * axis) * (growth if s == "N" else 1.0)
+        for s, value in synthetic.COEFFICIENTS.items()
+    }
 
 
 def test_adev_draws_the_window_asked_for(product):
@@ -242,7 +271,11 @@ def test_adev_draws_the_window_asked_for(product):
     np.testing.assert_allclose(lines["axis y, measured"].get_ydata(), np.sqrt(window.avar.values))
     estimates = refit(product.sel(axis=["y"]).isel(time=[7])).squeeze()
     fitted = {s: float(estimates[s]) for s in LAWS}
-    (curve,) = (line for label, line in lines.items() if label.startswith("sum of the fitted terms, χ²/dof = "))
+    (curve,) = (
+        line
+        for label, line in lines.items()
+        if label.startswith("sum of the fitted terms, χ²/dof = ")
+    )
     np.testing.assert_allclose(curve.get_ydata(), np.sqrt(model_avar(window.tau.values, fitted)))
     words = [text.get_text() for text in ax.get_legend().get_texts()]
     assert any(word.startswith("N = ") and "deg/sqrt(h)" in word for word in words)
@@ -255,7 +288,9 @@ def test_adev_without_a_time_avoids_the_gap(product):
     assert np.isfinite(ax.lines[0].get_ydata()).any()
 
 
-@pytest.mark.parametrize(("when", "words"), [("2031-01-01", "outside the record"), ("noon", "not understood")])
+@pytest.mark.parametrize(
+    ("when", "words"), [("2031-01-01", "outside the record"), ("noon", "not understood")]
+)
 def test_adev_at_an_impossible_time(product, when, words):
     with pytest.raises(OptionError, match=words):
         plot_adev(product, "x", when=when)
@@ -264,7 +299,14 @@ def test_adev_at_an_impossible_time(product, when, words):
 @pytest.mark.parametrize("windows", [1, 2])
 def test_shortest_products_can_be_drawn(tmp_path, windows):
     short = synthetic.product(windows=40, axes="x").isel(time=slice(0, windows))
-    for number, figure in enumerate([plot_davar(short), plot_davar(short, relative=True), plot_coefficients(short), plot_adev(short, "x")]):
+    for number, figure in enumerate(
+        [
+            plot_davar(short),
+            plot_davar(short, relative=True),
+            plot_coefficients(short),
+            plot_adev(short, "x"),
+        ]
+    ):
         figure.savefig(tmp_path / f"{number}.png", dpi=40)
     if windows > 1:
         plot_davar_3d(short).savefig(tmp_path / "3d.png", dpi=40)
@@ -276,7 +318,14 @@ def test_shortest_products_can_be_drawn(tmp_path, windows):
 def test_a_product_of_nothing_but_gaps_can_be_drawn(tmp_path):
     product = synthetic.product(axes="x")
     blind = product.isel(time=slice(20, 24))
-    for number, figure in enumerate([plot_davar(blind), plot_davar(blind, relative=True), plot_coefficients(blind), plot_adev(blind, "x")]):
+    for number, figure in enumerate(
+        [
+            plot_davar(blind),
+            plot_davar(blind, relative=True),
+            plot_coefficients(blind),
+            plot_adev(blind, "x"),
+        ]
+    ):
         figure.savefig(tmp_path / f"{number}.png", dpi=40)
 
 
@@ -295,7 +344,11 @@ def test_a_variance_below_zero_has_no_deviation(product):
     assert np.isfinite(product.avar.sel(cell))
     spoiled["avar"].loc[cell] = -1e-18
     before, after = (
-        next(np.ma.filled(item.get_array(), np.nan) for item in plot_davar(one, axis="x").axes[0].collections if isinstance(item, QuadMesh))
+        next(
+            np.ma.filled(item.get_array(), np.nan)
+            for item in plot_davar(one, axis="x").axes[0].collections
+            if isinstance(item, QuadMesh)
+        )
         for one in (product, spoiled)
     )
     assert np.isnan(after).sum() == np.isnan(before).sum() + 1

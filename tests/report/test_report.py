@@ -62,7 +62,9 @@ def page(tmp_path_factory) -> _Page:
 
 def test_the_page_needs_nothing_beside_it(page):
     assert all(link.startswith("data:image/png;base64,") for link in page.links)
-    assert len(page.images) == 8  # signal, coefficients, two maps, one window for each of three axes, surface
+    assert (
+        len(page.images) == 8
+    )  # signal, coefficients, two maps, one window for each of three axes, surface
     for image in page.images:
         assert base64.b64decode(image.split(",")[1]).startswith(b"\x89PNG")
 
@@ -80,12 +82,16 @@ def test_the_coefficient_table_holds_medians_ranges_and_shares(page):
     assert n_of_y[4:] == ["deg/sqrt(h)", "90 %", "0 %", "–"]
     q_of_x = rows[0]
     seen = product.observable.sel(axis="x", term="Q") == 2
-    assert float(q_of_x[2]) == pytest.approx(float(product.Q.sel(axis="x").where(seen).median()), rel=0.01)
+    assert float(q_of_x[2]) == pytest.approx(
+        float(product.Q.sel(axis="x").where(seen).median()), rel=0.01
+    )
     assert q_of_x[5:7] == ["45 %", "45 %"]
     r_of_z = rows[14]
     assert r_of_z[2:4] == ["–", "–"]
     assert r_of_z[5:7] == ["0 %", "90 %"]
-    assert float(r_of_z[7].removeprefix("< ")) == pytest.approx(synthetic.COEFFICIENTS["R"] * 2 * 1.6, rel=0.01)
+    assert float(r_of_z[7].removeprefix("< ")) == pytest.approx(
+        synthetic.COEFFICIENTS["R"] * 2 * 1.6, rel=0.01
+    )
 
 
 def test_the_summary_is_in_plain_words(page):
@@ -94,9 +100,14 @@ def test_the_summary_is_in_plain_words(page):
     assert "2026-09-21 14:13:20" in text
     assert "looked at in 40 windows" in text
     n = synthetic.product().N.sel(axis="y")
-    said = re.search(r"Axis y:.*?Angle random walk varies from (\S+) to (\S+) deg/sqrt\(h\) and is highest around (\S+ \S+)\.", text)
+    said = re.search(
+        r"Axis y:.*?Angle random walk varies from (\S+) to (\S+) deg/sqrt\(h\) and is highest around (\S+ \S+)\.",
+        text,
+    )
     assert said is not None
-    assert [float(said[1]), float(said[2])] == pytest.approx(n.quantile([0.05, 0.95]).values, rel=0.01)
+    assert [float(said[1]), float(said[2])] == pytest.approx(
+        n.quantile([0.05, 0.95]).values, rel=0.01
+    )
     assert said[3] == str(n.time[n.argmax("time")].values)[:19].replace("T", " ")
     assert "urad (observed in 45 % of the windows only)" in text
     assert "R = " not in text

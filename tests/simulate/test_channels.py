@@ -36,14 +36,26 @@ def test_a_long_channel_does_not_depend_on_the_chunks(cuts, rate, held, seed):
     values[rng.random(values.size) < 0.2] = np.nan
     values[rng.integers(values.size)] = 1.0
     good = ~np.isnan(values)
-    source = drivers.Source("a", "1", held, None, values, start=0, rate=rate, first=float(values[good][0]), size=values.size)
+    source = drivers.Source(
+        "a",
+        "1",
+        held,
+        None,
+        values,
+        start=0,
+        rate=rate,
+        first=float(values[good][0]),
+        size=values.size,
+    )
     instants = np.rint(np.arange(400) * 1e9 / 20.0).astype(np.int64)
 
     def run(edges: list[int]) -> np.ndarray:
         carry, parts = None, []
         for first, end in itertools.pairwise(edges):
             stretch = source.stretch(int(instants[max(first - 1, 0)]), int(instants[end - 1]))
-            piece, carry = source.at(instants[first:end], (stretch, values[stretch.low : stretch.high]), carry)
+            piece, carry = source.at(
+                instants[first:end], (stretch, values[stretch.low : stretch.high]), carry
+            )
             parts.append(piece)
         return np.concatenate(parts)
 
@@ -56,7 +68,9 @@ def test_a_long_channel_does_not_depend_on_the_chunks(cuts, rate, held, seed):
         filled[number] = last
     position = instants * rate / 1e9
     plain = (
-        filled[np.minimum((position + 1e-6).astype(int), filled.size - 1)] if held else np.interp(position, np.arange(filled.size), filled)
+        filled[np.minimum((position + 1e-6).astype(int), filled.size - 1)]
+        if held
+        else np.interp(position, np.arange(filled.size), filled)
     )
     np.testing.assert_allclose(whole, plain, atol=1e-5)
 
@@ -64,7 +78,9 @@ def test_a_long_channel_does_not_depend_on_the_chunks(cuts, rate, held, seed):
 def test_long_channels_drive_as_short_ones(monkeypatch):
     before = simulate(model(), seed=1).rate.values
     monkeypatch.setattr(drivers, "SHORT", 100)
-    np.testing.assert_allclose(simulate(model(), seed=1, chunk=170).rate.values, before, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        simulate(model(), seed=1, chunk=170).rate.values, before, rtol=0, atol=1e-9
+    )
 
 
 def test_a_log_like_a_recording_has_its_stamps_gaps_and_channels():
@@ -74,18 +90,29 @@ def test_a_log_like_a_recording_has_its_stamps_gaps_and_channels():
     values[:, 1500] = np.nan
     full = 40.0 + np.arange(2000) / 100
     recorded = make_log(
-        values, rate=33.3, unit="deg/h", start="2025-05-05T05:05:05.123456789", axis=["u", "v"], channels={"temperature": (full, "degC")}
+        values,
+        rate=33.3,
+        unit="deg/h",
+        start="2025-05-05T05:05:05.123456789",
+        axis=["u", "v"],
+        channels={"temperature": (full, "degC")},
     )
     slow = time_coordinate(1_746_421_505_000_000_000, 0.5, 40, name="time_vibration")
-    recorded = recorded.assign(vibration=("time_vibration", np.ones(40), {"units": "g"})).assign_coords(slow)
+    recorded = recorded.assign(
+        vibration=("time_vibration", np.ones(40), {"units": "g"})
+    ).assign_coords(slow)
     effect = [{"name": "temperature_bias", "sensitivity": 1.0, "reference": 40.0, "axes": ["v"]}]
     log = simulate({"noise": {"N": 0.01}, "effect": effect}, like=recorded, chunk=333)
     assert (log.time.values == recorded.time.values).all()
     np.testing.assert_array_equal(np.isnan(log.rate), np.isnan(recorded.rate))
-    xr.testing.assert_identical(log.temperature.drop_vars("axis", errors="ignore"), recorded.temperature)
+    xr.testing.assert_identical(
+        log.temperature.drop_vars("axis", errors="ignore"), recorded.temperature
+    )
     xr.testing.assert_identical(log.vibration, recorded.vibration)
     plain = simulate({"noise": {"N": 0.01}}, like=recorded)
-    np.testing.assert_allclose((log.rate - plain.rate).sel(axis="v").dropna("time"), np.delete(full - 40, 1500), atol=1e-6)
+    np.testing.assert_allclose(
+        (log.rate - plain.rate).sel(axis="v").dropna("time"), np.delete(full - 40, 1500), atol=1e-6
+    )
     with pytest.raises(OptionError, match="rate is taken from the recording"):
         simulate({"noise": {"N": 0.01}}, like=recorded, rate=10.0)
     with pytest.raises(OptionError, match="no axis 'x' in this log; it has u, v"):
@@ -99,11 +126,18 @@ def test_like_a_real_recording(recordings, tmp_path):
     units = {"gyro": "deg/s", "time": "s", "temperature": "degC"}
     recorded = load_log([path], map=names, unit=units)
     toml = tmp_path / "m.toml"
-    toml.write_text("[noise]\nN = 0.01\n[[effect]]\nname = 'temperature_bias'\nsensitivity = 2\naxes = 'z'\n")
+    toml.write_text(
+        "[noise]\nN = 0.01\n[[effect]]\nname = 'temperature_bias'\nsensitivity = 2\naxes = 'z'\n"
+    )
     out = tmp_path / "twin.nc"
     given = [word for key, value in names.items() for word in ("--map", f"{key}={value}")]
     given += [word for key, value in units.items() for word in ("--unit", f"{key}={value}")]
-    assert main(["simulate", str(toml), "-o", str(out), "--like", str(path), *given, "--quiet-progress"]) == 0
+    assert (
+        main(
+            ["simulate", str(toml), "-o", str(out), "--like", str(path), *given, "--quiet-progress"]
+        )
+        == 0
+    )
     twin = open_log(out)
     np.testing.assert_array_equal(twin.time.values, recorded.time.values)
     np.testing.assert_array_equal(np.isnan(twin.rate.values), np.isnan(recorded.rate.values))
@@ -111,4 +145,6 @@ def test_like_a_real_recording(recordings, tmp_path):
     restarts = gap_table(recorded).query("cause == 'restart'")
     assert gap_table(twin).query("cause == 'restart'").start.tolist() == restarts.start.tolist()
     bias = davar(twin, window="20s", step="20s", taus=[1.0])
-    np.testing.assert_allclose(bias.window_mean.sel(axis="z"), 2 * (bias.temperature - 25), atol=1.0)
+    np.testing.assert_allclose(
+        bias.window_mean.sel(axis="z"), 2 * (bias.temperature - 25), atol=1.0
+    )

@@ -23,22 +23,40 @@ def test_chamber_is_the_test_of_li_et_al():
 def test_a_lag_is_that_of_a_first_order_response():
     """On a ramp of r the response trails by r times the lag, once the start is forgotten: exactly, with the known transient."""
     lag, t = 300.0, np.arange(6000.0)
-    felt = env.chamber(duration="130min", low=-40, high=60, hold=1, lag=lag).temperature.values[1:6001]
-    np.testing.assert_allclose(felt, -40 + (t - lag * (1 - np.exp(-t / lag))) / 60, rtol=0, atol=1e-9)
+    felt = env.chamber(duration="130min", low=-40, high=60, hold=1, lag=lag).temperature.values[
+        1:6001
+    ]
+    np.testing.assert_allclose(
+        felt, -40 + (t - lag * (1 - np.exp(-t / lag))) / 60, rtol=0, atol=1e-9
+    )
 
 
 def test_trip_reaches_the_rock_and_circulation_cools_it():
-    down = env.trip([[0, 0], [36000, 3000]], duration="40h", gradient=30, surface=15, circulation=[[90000, 144000]], cooling=0.4)
+    down = env.trip(
+        [[0, 0], [36000, 3000]],
+        duration="40h",
+        gradient=30,
+        surface=15,
+        circulation=[[90000, 144000]],
+        cooling=0.4,
+    )
     assert down.temperature.values[89999] == pytest.approx(105.0, abs=0.01)
     assert down.temperature.values[-1] == pytest.approx(15 + 0.6 * 90, abs=0.01)
     middle = down.temperature.values[18000:30000]
-    np.testing.assert_allclose(np.diff(middle) * 60, 300 * 0.03 / 60, rtol=1e-6)  # 300 m/h: 0.15 degC/min
+    np.testing.assert_allclose(
+        np.diff(middle) * 60, 300 * 0.03 / 60, rtol=1e-6
+    )  # 300 m/h: 0.15 degC/min
 
 
 @pytest.mark.parametrize("stick_slip", [0.0, 1.0])
 def test_toolface_is_the_integral_of_the_rate(stick_slip):
     turning = env.rotation(
-        [[0, 0], [3, 40], [8, 400], [10, 400]], duration=15.0, stick_slip=stick_slip, period=2.7, sensor_rate=2000, inclination=90
+        [[0, 0], [3, 40], [8, 400], [10, 400]],
+        duration=15.0,
+        stick_slip=stick_slip,
+        period=2.7,
+        sensor_rate=2000,
+        inclination=90,
     )
     rate = turning.rotation_rate.values
     angle = np.concatenate([[0], np.cumsum((rate[1:] + rate[:-1]) / 2) / 2000])
@@ -55,7 +73,9 @@ def test_a_tool_that_hangs_plumb_feels_gravity_on_its_axis():
 
 
 def test_light_power_is_a_loss_in_decibel():
-    light = env.light_power(duration="1000h", power=1e-4, loss=3.0, sensor_rate=0.01).light_power.values
+    light = env.light_power(
+        duration="1000h", power=1e-4, loss=3.0, sensor_rate=0.01
+    ).light_power.values
     assert 10 * np.log10(light[0] / light[-1]) == pytest.approx(3.0, abs=1e-3)
 
 

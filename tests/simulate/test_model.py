@@ -18,7 +18,8 @@ from gyrostab.simulate.model import PROFILES
 from tests.conftest import ROOT
 from tests.support.simulated import BIASED, LOG, WORLD, model
 
-# ----------------------------------------------------------------------------------------------------------------- models
+# -----------------------------------------------------------------------------------------------------------------
+# models
 
 
 @pytest.mark.parametrize(
@@ -27,21 +28,39 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
         ({"effects": []}, r"no section 'effects' \(did you mean 'effect'\?\); there are \[log\]"),
         ({"effect": {"name": "shupe"}}, r"write effect as \[\[effect\]\]"),
         ({"noise": {"W": 1}}, r"no noise term 'W'; there are Q \[urad\], N \[deg/sqrt\(h\)\]"),
-        ({"noise": {"N": "3 m"}}, r"the unit 'm' is not known here; give the number in deg/sqrt\(h\)"),
+        (
+            {"noise": {"N": "3 m"}},
+            r"the unit 'm' is not known here; give the number in deg/sqrt\(h\)",
+        ),
         ({"noise": {"x": {"N": -1}}}, r"\[noise.x\]: N = -1 is not a number from 0 up"),
         ({"noise": {"flicker_band": 3}}, "flicker_band is 3; write"),
-        ({"log": {"rat": 10}}, r"\[log\]: there is no 'rat' \(did you mean 'rate'\?\); there are rate, duration"),
+        (
+            {"log": {"rat": 10}},
+            r"\[log\]: there is no 'rat' \(did you mean 'rate'\?\); there are rate, duration",
+        ),
         ({"log": LOG | {"seed": 1.5}}, "seed = 1.5 is not a whole number"),
         ({"log": {"duration": "1h"}}, "there is no rate; give rate = 100"),
         ({"log": {"rate": 100}}, "there is no duration; give duration = 1h"),
         ({"log": LOG | {"rate": "fast"}}, "'fast' is not a number with a unit"),
-        ({"log": LOG | {"axes": ["x"]}}, "effect 'g_sensitivity': the log has no axis 'y'; it has x"),
+        (
+            {"log": LOG | {"axes": ["x"]}},
+            "effect 'g_sensitivity': the log has no axis 'y'; it has x",
+        ),
         ({"environment": [{}]}, "an environment has no profile; there are steps, ramps, vibration"),
-        ({"environment": [{"profile": "vibratoin"}]}, "no profile 'vibratoin' .did you mean 'vibration'"),
-        ({"environment": [{"profile": "chamber", "speeed": 1}]}, r"no parameter 'speeed' .did you mean 'speed'.*speed \[degC/min\]"),
+        (
+            {"environment": [{"profile": "vibratoin"}]},
+            "no profile 'vibratoin' .did you mean 'vibration'",
+        ),
+        (
+            {"environment": [{"profile": "chamber", "speeed": 1}]},
+            r"no parameter 'speeed' .did you mean 'speed'.*speed \[degC/min\]",
+        ),
         ({"environment": [{"profile": "vibration"}]}, "lacks 'points'"),
         ({"environment": [{"profile": "vibration", "points": [[5, 1], [0, 1]]}]}, "do not rise"),
-        ({"environment": [{"profile": "vibration", "points": [1, 2]}]}, "is not a list of .time .s., vibration .g.."),
+        (
+            {"environment": [{"profile": "vibration", "points": [1, 2]}]},
+            "is not a list of .time .s., vibration .g..",
+        ),
         ({"environment": [WORLD[0], WORLD[0]]}, "the channel 'vibration' twice"),
         ({"environment": [WORLD[1] | {"channel": 3}]}, "channel = 3 is not text"),
         ({"environment": [WORLD[5] | {"cuts": 3}]}, "cuts = 3 is not a list"),
@@ -52,7 +71,10 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
         ({"log": LOG | {"duration": 1e300}}, "a duration of 1e.300 is not one"),
         ({"environment": [{"profile": "losses", "per_hour": 1e300}]}, "at most 1e8 gaps"),
         ({"environment": [{"profile": "losses", "seed": "x"}]}, "seed='x': give a whole number"),
-        ({"environment": [{"profile": "chamber", "lag": "5 m"}]}, "the unit 'm' is not known here; give the number in s"),
+        (
+            {"environment": [{"profile": "chamber", "lag": "5 m"}]},
+            "the unit 'm' is not known here; give the number in s",
+        ),
     ],
 )
 def test_a_wrong_model_is_explained(wrong, words):
@@ -62,9 +84,12 @@ def test_a_wrong_model_is_explained(wrong, words):
 
 def test_a_wrong_effect_names_file_and_place(tmp_path):
     path = tmp_path / "m.toml"
-    path.write_text('[noise]\nN = 1\n[[effect]]\nname = "temperature_bias"\nsensitivity = 1\n[[effect]]\nname = "shuppe"\n')
+    path.write_text(
+        '[noise]\nN = 1\n[[effect]]\nname = "temperature_bias"\nsensitivity = 1\n[[effect]]\nname = "shuppe"\n'
+    )
     with pytest.raises(
-        OptionError, match=rf"{re.escape(str(path))}, effect 2: there is no effect 'shuppe'.*; there are .*temperature_bias"
+        OptionError,
+        match=rf"{re.escape(str(path))}, effect 2: there is no effect 'shuppe'.*; there are .*temperature_bias",
     ):
         read_model(path)
     path.write_text("[noise\n")
@@ -81,13 +106,19 @@ def test_axes_come_from_the_model():
 
 
 def test_units_are_converted():
-    made = read_model({"noise": {"Q": "1 arcsec", "B": "0.001 deg/s"}, "log": {"duration": "2 min", "rate": "1 kHz"}})
+    made = read_model(
+        {
+            "noise": {"Q": "1 arcsec", "B": "0.001 deg/s"},
+            "log": {"duration": "2 min", "rate": "1 kHz"},
+        }
+    )
     assert made.coefficients("x")["Q"] == pytest.approx(np.pi / 180 / 3600 * 1e6)
     assert made.coefficients("x")["B"] == pytest.approx(3.6)
     assert made.log == {"duration": 120.0, "rate": 1000.0}
 
 
-# ---------------------------------------------------------------------------------------------------------------- command
+# ----------------------------------------------------------------------------------------------------------------
+# command
 
 
 def test_command_writes_a_log_that_run_takes(tmp_path, capsys):
@@ -100,27 +131,77 @@ def test_command_writes_a_log_that_run_takes(tmp_path, capsys):
     assert main(["simulate", str(path), "-o", str(out), *options]) == 0
     log = open_log(out)
     assert log.sizes["time"] == 6000
-    np.testing.assert_array_equal(log.rate.values, simulate(path, duration="2min", rate=50.0, seed=3).rate.values)
-    assert main(["run", str(out), "-o", str(tmp_path / "p.nc"), "--window", "30s", "--quiet-progress"]) == 0
+    np.testing.assert_array_equal(
+        log.rate.values, simulate(path, duration="2min", rate=50.0, seed=3).rate.values
+    )
+    assert (
+        main(["run", str(out), "-o", str(tmp_path / "p.nc"), "--window", "30s", "--quiet-progress"])
+        == 0
+    )
     again = tmp_path / "again.nc"
-    assert main(["simulate", str(path), "-o", str(again), "--like", str(out), "--seed", "3", "--quiet-progress"]) == 2  # temperature twice
+    assert (
+        main(
+            [
+                "simulate",
+                str(path),
+                "-o",
+                str(again),
+                "--like",
+                str(out),
+                "--seed",
+                "3",
+                "--quiet-progress",
+            ]
+        )
+        == 2
+    )  # temperature twice
     assert "the channel 'temperature' twice" in capsys.readouterr().err
     path.write_text("[noise]\nN = 0.02\n")
-    assert main(["simulate", str(path), "-o", str(again), "--like", str(out), "--seed", "3", "--quiet-progress"]) == 0
+    assert (
+        main(
+            [
+                "simulate",
+                str(path),
+                "-o",
+                str(again),
+                "--like",
+                str(out),
+                "--seed",
+                "3",
+                "--quiet-progress",
+            ]
+        )
+        == 0
+    )
     assert (open_log(again).time.values == log.time.values).all()
 
 
 def test_command_explains_a_wrong_model(tmp_path, capsys):
     path = tmp_path / "m.toml"
     path.write_text('[noise]\nN = 0.02\n[[effect]]\nname = "temperature_bias"\n')
-    assert main(["simulate", str(path), "-o", str(tmp_path / "log.nc"), "--duration", "1min", "--rate", "10"]) == 2
+    assert (
+        main(
+            [
+                "simulate",
+                str(path),
+                "-o",
+                str(tmp_path / "log.nc"),
+                "--duration",
+                "1min",
+                "--rate",
+                "10",
+            ]
+        )
+        == 2
+    )
     said = capsys.readouterr().err
     assert "lacks the parameter 'sensitivity'" in said
     assert "Traceback" not in said
     assert not (tmp_path / "log.nc").exists()
 
 
-# ----------------------------------------------------------------------------------------------------------- shipped models
+# -----------------------------------------------------------------------------------------------------------
+# shipped models
 
 MODELS = sorted((ROOT / "data" / "models").glob("*.toml"))
 
@@ -135,7 +216,9 @@ def test_shipped_models_make_logs(path):
 
 
 def test_shipped_models_are_all_there():
-    assert {"p16_vibration", "l13_vibration", "l13_temperature", "mwd_24h"} <= {path.stem for path in MODELS}
+    assert {"p16_vibration", "l13_vibration", "l13_temperature", "mwd_24h"} <= {
+        path.stem for path in MODELS
+    }
 
 
 def test_p16_has_its_timeline():

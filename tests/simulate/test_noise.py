@@ -47,7 +47,9 @@ def laws(term: str, tau: np.ndarray) -> np.ndarray:
 
 def records(term: str) -> np.ndarray:
     size = {"gauss_markov": MARKOV, "sinusoid": SINE}.get(term) or SIZES[term]
-    return make_noise(rate=RATE, size=LENGTH * RECORDS, seed=3, **{term: size}).reshape(RECORDS, LENGTH)
+    return make_noise(rate=RATE, size=LENGTH * RECORDS, seed=3, **{term: size}).reshape(
+        RECORDS, LENGTH
+    )
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +63,17 @@ def test_ensemble_allan_variance_is_the_law_at_every_tau(term, ensembles):
     ensembles[term] = made = records(term)
     found = np.array([allan(made, int(k)) for k in TAUS])
     expected = laws(term, TAUS / RATE)
-    np.testing.assert_allclose(found, expected, rtol=0.02, atol=2e-4 * expected.max() if term == "sinusoid" else 0.0)
+    np.testing.assert_allclose(
+        found, expected, rtol=0.02, atol=2e-4 * expected.max() if term == "sinusoid" else 0.0
+    )
 
 
 @pytest.mark.parametrize("term", [*"QNBK", "gauss_markov"])
 def test_ensemble_spectrum_integrates_to_the_law(term, ensembles):
     """P16 Eq. 7 on the spectrum of the samples: sigma^2 = int S(f) 2 sin^4(pi f tau) / (k sin(pi f dt))^2 df over all f that there are.
 
-    For samples, whose angle is a sum, (k sin(pi f dt))^2 stands for (pi f tau)^2; aliases are in S already.
+    For samples, whose angle is a sum, (k sin(pi f dt))^2 stands for (pi f tau)^2; aliases are in S
+    already.
     """
     made = ensembles.get(term)
     made = (records(term) if made is None else made).reshape(-1, 4000)
@@ -90,14 +95,24 @@ def test_gauss_markov_and_sinusoid_are_the_integral_of_their_spectra(tau):
     sigma, time = MARKOV
 
     def integrand(f):
-        return 4 * 2 * sigma**2 * time / (1 + (2 * np.pi * f * time) ** 2) * np.sin(np.pi * f * tau) ** 4 / (np.pi * f * tau) ** 2
+        return (
+            4
+            * 2
+            * sigma**2
+            * time
+            / (1 + (2 * np.pi * f * time) ** 2)
+            * np.sin(np.pi * f * tau) ** 4
+            / (np.pi * f * tau) ** 2
+        )
 
     total = sum(quad(integrand, j / tau, (j + 1) / tau, epsrel=1e-9)[0] for j in range(300))
     assert total == pytest.approx(float(markov_avar(tau, *MARKOV)), rel=1e-3)
     # a line of amplitude A is A^2 / 4 at +f and at -f; the integral counts +f and doubles it twice
     amplitude, frequency, _ = SINE
     u = np.pi * frequency * tau
-    assert float(laws("sinusoid", np.array(tau))) == pytest.approx(4 * amplitude**2 / 4 * np.sin(u) ** 4 / u**2, rel=1e-12)
+    assert float(laws("sinusoid", np.array(tau))) == pytest.approx(
+        4 * amplitude**2 / 4 * np.sin(u) ** 4 / u**2, rel=1e-12
+    )
 
 
 def test_the_bump_of_a_sinusoid_is_at_0_371_over_its_frequency():
@@ -152,7 +167,8 @@ def test_quantization_is_a_bounded_error_of_the_angle():
     assert np.abs(np.corrcoef(angle[1:], angle[:-1])[0, 1]) < 0.02
 
 
-# ---------------------------------------------------------------------------------------------------------------- streams
+# ----------------------------------------------------------------------------------------------------------------
+# streams
 
 ALL = {**SIZES, "gauss_markov": MARKOV, "sinusoid": SINE}
 
@@ -161,25 +177,48 @@ ALL = {**SIZES, "gauss_markov": MARKOV, "sinusoid": SINE}
 @given(chunk=st.integers(1, 700), lazy=st.booleans(), seed=st.integers(0, 2**40))
 def test_chunks_do_not_change_a_bit(chunk, lazy, seed):
     whole = make_noise(rate=RATE, size=600, seed=seed, **ALL)
-    cut = make_noise(rate=RATE, size=600, seed=seed, chunk=max(chunk, 60) if lazy else max(chunk, 3), lazy=lazy, **ALL)
+    cut = make_noise(
+        rate=RATE,
+        size=600,
+        seed=seed,
+        chunk=max(chunk, 60) if lazy else max(chunk, 3),
+        lazy=lazy,
+        **ALL,
+    )
     np.testing.assert_array_equal(np.asarray(cut), whole)
 
 
 def test_a_longer_record_begins_like_a_shorter_one():
-    np.testing.assert_array_equal(make_noise(rate=RATE, size=2000, **ALL)[:700], make_noise(rate=RATE, size=700, **ALL))
+    np.testing.assert_array_equal(
+        make_noise(rate=RATE, size=2000, **ALL)[:700], make_noise(rate=RATE, size=700, **ALL)
+    )
 
 
 def test_each_term_is_the_same_with_and_without_the_others():
-    parts = sum(make_noise(rate=RATE, size=3000, seed=7, **{name: size}) for name, size in ALL.items())
-    np.testing.assert_allclose(make_noise(rate=RATE, size=3000, seed=7, **ALL), parts, rtol=0, atol=1e-9)
+    parts = sum(
+        make_noise(rate=RATE, size=3000, seed=7, **{name: size}) for name, size in ALL.items()
+    )
+    np.testing.assert_allclose(
+        make_noise(rate=RATE, size=3000, seed=7, **ALL), parts, rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
-    "size", [{"Q": 0.5}, {"N": 0.01}, {"B": 0.5}, {"K": 3.0}, {"gauss_markov": (1.0, 0.5)}], ids=lambda size: next(iter(size))
+    "size",
+    [{"Q": 0.5}, {"N": 0.01}, {"B": 0.5}, {"K": 3.0}, {"gauss_markov": (1.0, 0.5)}],
+    ids=lambda size: next(iter(size)),
 )
 def test_axes_and_seeds_are_independent(size):
-    made = np.array([make_noise(seed=seed, axis=axis, rate=RATE, size=40_000, **size) for seed in (1, 2) for axis in "xyz"])
-    correlation = np.corrcoef(np.diff(made)) - np.eye(6)  # differences, for what wanders is never far from correlated
+    made = np.array(
+        [
+            make_noise(seed=seed, axis=axis, rate=RATE, size=40_000, **size)
+            for seed in (1, 2)
+            for axis in "xyz"
+        ]
+    )
+    correlation = np.corrcoef(np.diff(made)) - np.eye(
+        6
+    )  # differences, for what wanders is never far from correlated
     assert np.abs(correlation).max() < 6.0 / np.sqrt(40_000)
 
 
@@ -191,9 +230,13 @@ def test_level_may_change_from_sample_to_sample():
         level = {other: 0.0 for other in "QNBK"} | {term: high}
         plain, _ = shape(units, {other: 0.0 for other in "QNBK"} | {term: 1.0}, RATE, {})
         raised, _ = shape(units, level, RATE, {})
-        np.testing.assert_allclose(raised[:2999], plain[:2999], rtol=0, atol=1e-9 * np.abs(plain).max())
+        np.testing.assert_allclose(
+            raised[:2999], plain[:2999], rtol=0, atol=1e-9 * np.abs(plain).max()
+        )
         if term == "K":  # increments, not the position, are three times as large
-            np.testing.assert_allclose(raised[3001:] - raised[3000], 3 * (plain[3001:] - plain[3000]), rtol=1e-9)
+            np.testing.assert_allclose(
+                raised[3001:] - raised[3000], 3 * (plain[3001:] - plain[3000]), rtol=1e-9
+            )
         else:
             np.testing.assert_allclose(raised[3001:], 3 * plain[3001:], rtol=1e-9)
 

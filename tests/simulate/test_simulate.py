@@ -23,7 +23,8 @@ from gyrostab.simulate import drivers, lazy, read_model, simulate
 from gyrostab.simulate.lazy import Chain
 from tests.support.simulated import BIASED, LOG, WORLD, every_channel, model
 
-# ------------------------------------------------------------------------------------------------------------------- logs
+# -------------------------------------------------------------------------------------------------------------------
+# logs
 
 
 def test_it_is_a_log_like_any_other():
@@ -33,9 +34,19 @@ def test_it_is_a_log_like_any_other():
     assert list(log.axis.values) == ["x", "y", "z"]
     assert log.time.values[0] == np.datetime64("2026-03-14T08:00:00")
     assert log.rate.chunks is not None
-    assert {"vibration", "temperature", "rotation_rate", "accel_x", "supply_voltage", "light_power"} <= set(log.data_vars)
+    assert {
+        "vibration",
+        "temperature",
+        "rotation_rate",
+        "accel_x",
+        "supply_voltage",
+        "light_power",
+    } <= set(log.data_vars)
     table = gap_table(log)
-    assert table[["seconds", "samples", "cause"]].values.tolist() == [[0.5, 10, "missing"], [5.0, 100, "restart"]]
+    assert table[["seconds", "samples", "cause"]].values.tolist() == [
+        [0.5, 10, "missing"],
+        [5.0, 100, "restart"],
+    ]
     missing = np.isnan(log.rate.values)
     assert missing.sum() == 3 * 110
     assert missing[:, 200:210].all()
@@ -53,15 +64,21 @@ def test_it_goes_through_file_and_analysis(tmp_path):
 
 def test_noise_reaches_the_analysis_at_its_level():
     log = simulate({"noise": {"N": 0.02, "z": {"N": 0.04}}}, duration="1h", rate=50.0, seed=1)
-    n = davar(log, window="1h", taus=[0.02]).avar.squeeze(("time", "tau")) ** 0.5 * np.sqrt(0.02 / 3600)
+    n = davar(log, window="1h", taus=[0.02]).avar.squeeze(("time", "tau")) ** 0.5 * np.sqrt(
+        0.02 / 3600
+    )
     np.testing.assert_allclose(n, [0.02, 0.02, 0.04], rtol=0.01)
 
 
 @settings(max_examples=6, deadline=None)
-@given(chunk=st.integers(150, 2500), seed=st.integers(0, 2**32), oversampling=st.sampled_from([1, 3]))
+@given(
+    chunk=st.integers(150, 2500), seed=st.integers(0, 2**32), oversampling=st.sampled_from([1, 3])
+)
 def test_the_same_seed_gives_the_same_bits_whatever_the_chunks(chunk, seed, oversampling):
     one = model(log=LOG | {"oversampling": oversampling})
-    np.testing.assert_array_equal(simulate(one, seed=seed, chunk=chunk).rate.values, simulate(one, seed=seed).rate.values)
+    np.testing.assert_array_equal(
+        simulate(one, seed=seed, chunk=chunk).rate.values, simulate(one, seed=seed).rate.values
+    )
 
 
 def test_every_effect_gives_the_same_bits_whatever_the_chunks():
@@ -69,17 +86,23 @@ def test_every_effect_gives_the_same_bits_whatever_the_chunks():
     for name, kind in effects().items():
         plain = read_model(model(environment=[WORLD[5]], effect=[]))
         one = replace(plain, effects=(kind.example(),))
-        whole, cut = (simulate(one, environment=world, chunk=chunk).rate.values for chunk in (1800, 331))
+        whole, cut = (
+            simulate(one, environment=world, chunk=chunk).rate.values for chunk in (1800, 331)
+        )
         np.testing.assert_array_equal(cut, whole, err_msg=name)
 
 
 def test_another_seed_gives_other_noise():
-    assert np.all(simulate(model(), seed=1).rate.isel(time=5) != simulate(model(), seed=2).rate.isel(time=5))
+    assert np.all(
+        simulate(model(), seed=1).rate.isel(time=5) != simulate(model(), seed=2).rate.isel(time=5)
+    )
 
 
 def test_a_slice_is_that_of_the_whole():
     log = simulate(model(), chunk=200)
-    np.testing.assert_array_equal(log.rate.isel(time=slice(950, 960)).values, log.rate.values[:, 950:960])
+    np.testing.assert_array_equal(
+        log.rate.isel(time=slice(950, 960)).values, log.rate.values[:, 950:960]
+    )
 
 
 def test_oversampling_keeps_the_noise_of_the_log():
@@ -90,7 +113,8 @@ def test_oversampling_keeps_the_noise_of_the_log():
         assert found == pytest.approx(0.02**2 * 3600 / 0.05 + 9 * 0.05 / 3600 / 3, rel=0.02)
 
 
-# ---------------------------------------------------------------------------------------------------------------- effects
+# ----------------------------------------------------------------------------------------------------------------
+# effects
 
 
 def test_an_effect_alone_is_the_difference_of_two_runs():
@@ -110,7 +134,9 @@ def test_zero_size_changes_nothing_whatever_the_effect():
     before = simulate(plain, environment=world, seed=3).rate.values
     for name, kind in effects().items():
         off = replace(plain, effects=(kind.example().switched_off(),))
-        np.testing.assert_array_equal(simulate(off, environment=world, seed=3).rate.values, before, err_msg=name)
+        np.testing.assert_array_equal(
+            simulate(off, environment=world, seed=3).rate.values, before, err_msg=name
+        )
 
 
 def test_each_effect_without_its_channel_says_so():
@@ -119,13 +145,18 @@ def test_each_effect_without_its_channel_says_so():
         if not needs:
             continue
         bare = replace(read_model({"noise": {"N": 0.01}}), effects=(kind.example(),))
-        with pytest.raises(SchemaError, match=f"effect '{name}' needs the channel '{needs[0]}'.*there are no channels"):
+        with pytest.raises(
+            SchemaError,
+            match=f"effect '{name}' needs the channel '{needs[0]}'.*there are no channels",
+        ):
             simulate(bare, duration="10s", rate=10.0)
 
 
 def test_a_channel_in_the_wrong_unit_is_refused():
     wrong = [{"profile": "steps", "channel": "temperature", "unit": "V", "points": [[0, 1]]}]
-    with pytest.raises(SchemaError, match="needs 'temperature' in degree_Celsius; the channel is in 'V'"):
+    with pytest.raises(
+        SchemaError, match="needs 'temperature' in degree_Celsius; the channel is in 'V'"
+    ):
         simulate(model(environment=wrong, effect=BIASED[:1]))
 
 
@@ -140,7 +171,9 @@ def test_units_of_one_quantity_are_converted():
 
 
 def test_a_channel_may_have_another_name():
-    world = [{"profile": "steps", "channel": "coil_temperature", "unit": "degC", "points": [[0, 75]]}]
+    world = [
+        {"profile": "steps", "channel": "coil_temperature", "unit": "degC", "points": [[0, 75]]}
+    ]
     effect = [{"name": "temperature_bias", "sensitivity": 0.1, "driver": "coil_temperature"}]
     hot = simulate({"environment": world, "effect": effect}, duration="5s", rate=10.0)
     np.testing.assert_allclose(hot.rate.values, 5.0, rtol=1e-12)
@@ -148,7 +181,9 @@ def test_a_channel_may_have_another_name():
 
 def test_two_effects_of_one_name_add():
     world = [{"profile": "steps", "channel": "temperature", "unit": "degC", "points": [[0, 35]]}]
-    log = simulate({"environment": world, "effect": [BIASED[0], BIASED[0]]}, duration="5s", rate=10.0)
+    log = simulate(
+        {"environment": world, "effect": [BIASED[0], BIASED[0]]}, duration="5s", rate=10.0
+    )
     np.testing.assert_allclose(log.rate.values, 0.4, rtol=1e-12)
 
 
@@ -159,7 +194,8 @@ def test_turning_is_true_rate_on_its_axis():
     np.testing.assert_array_equal(log.rate.sel(axis="x"), 0.0)
 
 
-# ----------------------------------------------------------------------------------------------------------------- blocks
+# -----------------------------------------------------------------------------------------------------------------
+# blocks
 
 
 def test_a_chain_takes_each_step_once_and_goes_back_from_a_state_on_its_way():
@@ -176,7 +212,10 @@ def test_a_chain_takes_each_step_once_and_goes_back_from_a_state_on_its_way():
     assert chain(1001) == whole[1001]
     assert len(taken) <= 4  # 2000 steps, 512 states
     taken.clear()
-    assert [pickle.loads(pickle.dumps(Chain(_count, 1, 50)))(number) for number in (30, 7)] == [10 * (1 + 435), 10 * (1 + 21)]
+    assert [pickle.loads(pickle.dumps(Chain(_count, 1, 50)))(number) for number in (30, 7)] == [
+        10 * (1 + 435),
+        10 * (1 + 21),
+    ]
 
 
 def _count(number: int, state: int) -> tuple[int, int]:
@@ -192,7 +231,9 @@ def test_blocks_in_any_order_from_any_thread_are_those_of_the_whole():
 
 
 def test_a_copy_in_another_process_gives_the_same(monkeypatch):
-    monkeypatch.setattr(drivers, "SHORT", 100)  # channels that are read stretch by stretch travel too
+    monkeypatch.setattr(
+        drivers, "SHORT", 100
+    )  # channels that are read stretch by stretch travel too
     log = simulate(model(), seed=2, chunk=300)
     late = log.rate.data[:, 1500:].compute()
     copy = cloudpickle.loads(cloudpickle.dumps(log.rate.data))

@@ -45,10 +45,14 @@ def test_the_graph_is_small_and_travels(tmp_path, form):
         assert len(pickle.dumps(log.rate.data)) < 5000 + 2000 * data.npartitions
         assert same_bits(log.rate.copy(data=data), counts_log().rate)
         for scheduler in ("threads", "synchronous", *(["processes"] if form == "nc" else [])):
-            assert float(np.nansum(data[:, :1000].compute(scheduler=scheduler, num_workers=2))) == float(np.nansum(data[:, :1000]))
+            assert float(
+                np.nansum(data[:, :1000].compute(scheduler=scheduler, num_workers=2))
+            ) == float(np.nansum(data[:, :1000]))
 
 
-@pytest.mark.parametrize(("form", "how"), [("nc", "flip"), ("zarr", "flip"), ("zarr", "cut"), ("zarr", "remove")])
+@pytest.mark.parametrize(
+    ("form", "how"), [("nc", "flip"), ("zarr", "flip"), ("zarr", "cut"), ("zarr", "remove")]
+)
 def test_a_damaged_chunk_becomes_a_gap_and_is_told_once(tmp_path, form, how):
     path = WRITERS[form](counts_log(), tmp_path / f"log.{form}")
     spoil(path, 1, 1, how=how)
@@ -59,22 +63,35 @@ def test_a_damaged_chunk_becomes_a_gap_and_is_told_once(tmp_path, form, how):
         with dask.config.set(scheduler="threads", num_workers=2):
             assert same_bits(log.rate, wanted)
             assert np.isnan(log.rate[1, CHUNK + 3 :: 1000]).sum() == 120
-    (message,) = [str(warning.message) for warning in seen if issubclass(warning.category, UserWarning)]
+    (message,) = [
+        str(warning.message) for warning in seen if issubclass(warning.category, UserWarning)
+    ]
     assert str(path) in message
-    assert "axis y: the chunk from 2026-09-21T14:33:20.123456789 to 2026-09-21T14:53:20.113456789 is " in message
+    assert (
+        "axis y: the chunk from 2026-09-21T14:33:20.123456789 to 2026-09-21T14:53:20.113456789 is "
+        in message
+    )
     assert ("is missing: no file rate/1.1" if how == "remove" else "is damaged") in message
-    with open_log(path, strict=True) as log, pytest.raises(FormatError, match=r"axis y: the chunk from .*; copy it again, or leave out"):
+    with (
+        open_log(path, strict=True) as log,
+        pytest.raises(FormatError, match=r"axis y: the chunk from .*; copy it again, or leave out"),
+    ):
         log.rate.compute()
     with open_log(path, strict=True) as log:
         assert same_bits(log.rate[0], wanted[0])  # strict or not, what is sound is read
 
 
-@pytest.mark.parametrize("content", [b"", bytes(20), Blosc("lz4").encode(b"abc"), Blosc("lz4").encode(bytes(7))])
+@pytest.mark.parametrize(
+    "content", [b"", bytes(20), Blosc("lz4").encode(b"abc"), Blosc("lz4").encode(bytes(7))]
+)
 def test_a_chunk_of_a_few_bytes_is_damaged(tmp_path, content):
     """Not long enough for a header of blosc, for a checksum, or for a sample."""
     path = to_zarr(counts_log(), tmp_path / "log.zarr")
     (path / "rate" / "1.1").write_bytes(content)
-    with open_log(path) as log, pytest.warns(UserWarning, match=r"axis y: the chunk from .* is damaged: rate/1\.1: "):
+    with (
+        open_log(path) as log,
+        pytest.warns(UserWarning, match=r"axis y: the chunk from .* is damaged: rate/1\.1: "),
+    ):
         assert np.isnan(log.rate.values[1]).sum() == CHUNK
 
 
@@ -84,11 +101,17 @@ def test_chunks_that_are_kept_take_no_more_memory_than_they_may(tmp_path, monkey
     kept, chunk = KeptChunks(4 * CHUNK * 2, 4 * CHUNK), 4 * CHUNK
     decoded = []
     monkeypatch.setattr(read_module, "_KEPT", kept)
-    monkeypatch.setattr(read_module, "read_chunk", lambda *where, **how: decoded.append(where) or layout_module.read_chunk(*where, **how))
+    monkeypatch.setattr(
+        read_module,
+        "read_chunk",
+        lambda *where, **how: decoded.append(where) or layout_module.read_chunk(*where, **how),
+    )
     with open_log(WRITERS[form](counts_log(), tmp_path / f"log.{form}")) as log:
         for place in (0, 1, 0, 1, 2, 0):
             fill_row(log.rate.data, 1, place * CHUNK + 10, part := np.empty(10))
-            np.testing.assert_array_equal(part, counts_log().rate[1, place * CHUNK + 10 : place * CHUNK + 20])
+            np.testing.assert_array_equal(
+                part, counts_log().rate[1, place * CHUNK + 10 : place * CHUNK + 20]
+            )
             assert sum(one.nbytes for one in kept._chunks.values()) == kept._held <= 2 * chunk
     assert [where[2] for where in decoded] == [(1, 0), (1, 1), (1, 2), (1, 0)]
 
@@ -96,8 +119,14 @@ def test_chunks_that_are_kept_take_no_more_memory_than_they_may(tmp_path, monkey
 @pytest.mark.parametrize("form", WRITERS)
 def test_a_gap_in_the_chunk_of_a_channel_names_it(tmp_path, form):
     stamps = time_coordinate(START, 1.0, 70_000, name="time_temperature")
-    slow = xr.Dataset({"temperature": ("time_temperature", np.arange(70_000.0), {"units": "degree_Celsius"})})
-    log = counts_log(samples=100).assign(slow).assign_coords(time_temperature=stamps["time_temperature"].values)
+    slow = xr.Dataset(
+        {"temperature": ("time_temperature", np.arange(70_000.0), {"units": "degree_Celsius"})}
+    )
+    log = (
+        counts_log(samples=100)
+        .assign(slow)
+        .assign_coords(time_temperature=stamps["time_temperature"].values)
+    )
     path = WRITERS[form](log, tmp_path / f"log.{form}")
     if form == "zarr":
         (path / "temperature" / "1").unlink()
@@ -109,7 +138,10 @@ def test_a_gap_in_the_chunk_of_a_channel_names_it(tmp_path, form):
             raw.write(b"\x55" * 20)
     with (
         open_log(path) as back,
-        pytest.warns(UserWarning, match=r"channel temperature: the chunk from 2026-09-22T08:25:36\.1\d* to 2026-09-22T"),
+        pytest.warns(
+            UserWarning,
+            match=r"channel temperature: the chunk from 2026-09-22T08:25:36\.1\d* to 2026-09-22T",
+        ),
     ):
         values = back.temperature.values
     assert np.isnan(values).sum() == 70_000 - 65_536
@@ -120,7 +152,11 @@ def test_every_chunk_of_a_zarr_store_is_written_even_if_it_is_all_gap(tmp_path):
     log = counts_log()
     log.rate.values[0] = np.nan
     path = to_zarr(log, tmp_path / "log.zarr")
-    assert {item.name for item in (path / "rate").iterdir()} == {".zarray", ".zattrs", *(f"{r}.{n}" for r in (0, 1) for n in (0, 1, 2))}
+    assert {item.name for item in (path / "rate").iterdir()} == {
+        ".zarray",
+        ".zattrs",
+        *(f"{r}.{n}" for r in (0, 1) for n in (0, 1, 2)),
+    }
     path = to_zarr(log.chunk(time=1000), tmp_path / "lazy.zarr")
     assert len(list((path / "rate").iterdir())) == 8
     with warnings.catch_warnings(), open_log(path) as back:
@@ -128,7 +164,9 @@ def test_every_chunk_of_a_zarr_store_is_written_even_if_it_is_all_gap(tmp_path):
         assert np.isnan(back.rate[0]).all()
 
 
-@pytest.mark.parametrize(("form", "said"), [("nc", "cannot be opened again"), ("zarr", "is not there any more")])
+@pytest.mark.parametrize(
+    ("form", "said"), [("nc", "cannot be opened again"), ("zarr", "is not there any more")]
+)
 def test_a_store_that_vanishes_is_no_gap(tmp_path, form, said):
     path = WRITERS[form](counts_log(), tmp_path / f"log.{form}")
     with open_log(path) as log:
@@ -157,15 +195,27 @@ def test_a_worker_of_a_cluster_tells_the_client(tmp_path):
     distributed = pytest.importorskip("distributed")
     path = to_zarr(counts_log(samples=2 * CHUNK), tmp_path / "log.zarr")
     spoil(path, 1, 1, how="remove")
-    settings = {"n_workers": 1, "threads_per_worker": 2, "processes": True, "dashboard_address": None, "memory_limit": 0}
+    settings = {
+        "n_workers": 1,
+        "threads_per_worker": 2,
+        "processes": True,
+        "dashboard_address": None,
+        "memory_limit": 0,
+    }
 
     def compute(client):
         found = client.compute(log.rate.data).result()
         time.sleep(1.0)  # the message takes its own way
         return found
 
-    with distributed.LocalCluster(**settings) as cluster, distributed.Client(cluster) as client, open_log(path) as log:
-        with pytest.warns(UserWarning, match=r"axis y: the chunk from .* is missing: no file rate/1\.1"):
+    with (
+        distributed.LocalCluster(**settings) as cluster,
+        distributed.Client(cluster) as client,
+        open_log(path) as log,
+    ):
+        with pytest.warns(
+            UserWarning, match=r"axis y: the chunk from .* is missing: no file rate/1\.1"
+        ):
             found = compute(client)
         assert client.scheduler_info(n_workers=-1)["workers"]
     assert np.isnan(found[1, CHUNK:]).all()

@@ -39,10 +39,15 @@ def placed(draw):
     for _ in range(draw(st.integers(1, 2))):
         parts = []
         for _ in range(draw(st.integers(1, 4))):
-            values = np.array(draw(st.lists(st.sampled_from([1.5, -2.0, np.nan]), min_size=1, max_size=40)))
+            values = np.array(
+                draw(st.lists(st.sampled_from([1.5, -2.0, np.nan]), min_size=1, max_size=40))
+            )
             length = draw(st.integers(1, min(values.size, size)))
             cut = draw(st.integers(1, length))
-            first, own = draw(st.integers(0, size - length)), draw(st.integers(0, values.size - length))
+            first, own = (
+                draw(st.integers(0, size - length)),
+                draw(st.integers(0, values.size - length)),
+            )
             runs = [[first, own, cut], [first + cut, own + cut, length - cut]]
             parts.append((values, None, np.array(runs[: 1 + (cut < length)], dtype=np.int64)))
         rows.append(parts)
@@ -83,8 +88,16 @@ def stored_logs(folder, form):
         log = make_log(values, rate=100.0, unit="deg/h", start=start)
         log.rate.encoding = {"dtype": "int32", "scale_factor": 0.02}
         log = log.assign_coords(time_temperature=log["time"].values[::20])
-        log["temperature"] = ("time_temperature", rng.standard_normal(4000), {"units": "degree_Celsius"})
-        paths.append({"nc": to_netcdf, "zarr": to_zarr}[form](log.chunk(time=65_536), folder / f"{number}.{form}"))
+        log["temperature"] = (
+            "time_temperature",
+            rng.standard_normal(4000),
+            {"units": "degree_Celsius"},
+        )
+        paths.append(
+            {"nc": to_netcdf, "zarr": to_zarr}[form](
+                log.chunk(time=65_536), folder / f"{number}.{form}"
+            )
+        )
     return paths
 
 
@@ -113,16 +126,25 @@ def test_stored_samples_are_those_of_dask(tmp_path, form):
 @pytest.mark.parametrize("form", ["nc", "zarr"])
 @pytest.mark.parametrize("unit", [0.02, 0.05])
 def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, form, unit):
-    monkeypatch.setattr(write, "STRETCH_BYTES", 2**21)  # two stretches of 131072 samples of either axis, so that room is used again
+    monkeypatch.setattr(
+        write, "STRETCH_BYTES", 2**21
+    )  # two stretches of 131072 samples of either axis, so that room is used again
     log = opened(stored_logs(tmp_path, form))
     log.rate.encoding = {**log.rate.encoding, "scale_factor": unit}
-    slow = log.assign({name: log[name].copy(data=log[name].data.map_blocks(np.array)) for name in ("rate", "temperature")})
+    slow = log.assign(
+        {
+            name: log[name].copy(data=log[name].data.map_blocks(np.array))
+            for name in ("rate", "temperature")
+        }
+    )
     slow.rate.encoding = log.rate.encoding
     assert not can_fill(slow.rate.data)
     store = {"nc": to_netcdf, "zarr": to_zarr}[form]
     found = []
     with warnings.catch_warnings():
-        warnings.simplefilter("error" if unit == 0.02 else "ignore")  # of the other unit not every value is a multiple
+        warnings.simplefilter(
+            "error" if unit == 0.02 else "ignore"
+        )  # of the other unit not every value is a multiple
         for name, one in (("quick", log), ("slow", slow)):
             found.append(open_log(store(one, tmp_path / f"{name}.{form}")))
     assert found[0].rate.encoding == found[1].rate.encoding
@@ -142,14 +164,18 @@ def test_a_log_is_opened_as_xarray_opens_it(tmp_path, monkeypatch, form):
     assert list(quick.variables) == list(slow.variables)
     assert list(quick.coords) == list(slow.coords)
     assert quick.rate.encoding == slow.rate.encoding
-    assert {name: one.dtype for name, one in quick.variables.items()} == {name: one.dtype for name, one in slow.variables.items()}
+    assert {name: one.dtype for name, one in quick.variables.items()} == {
+        name: one.dtype for name, one in slow.variables.items()
+    }
 
 
 @pytest.mark.parametrize("how", ["group", "product", "size"])
 def test_a_netcdf_file_that_is_not_as_expected_is_left_to_xarray(tmp_path, monkeypatch, how):
     path = stored_logs(tmp_path, "nc")[0]
     if how == "size":
-        monkeypatch.setattr(header, "SMALL", 2)  # the small variables are too long to be read at once
+        monkeypatch.setattr(
+            header, "SMALL", 2
+        )  # the small variables are too long to be read at once
     else:
         with netCDF4.Dataset(path, "a") as file:
             if how == "group":
@@ -182,7 +208,10 @@ def test_a_large_product_is_that_of_the_small_way(tmp_path, monkeypatch):
         run(paths, tmp_path / "small.nc", windows=WINDOW)
         monkeypatch.setattr(checkpoint, "_SMALL", 0)
         run(paths, tmp_path / "large.nc", windows=WINDOW)
-    small, large = (open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False) for name in ("small", "large"))
+    small, large = (
+        open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False)
+        for name in ("small", "large")
+    )
     xr.testing.assert_identical(small, large)
 
 
@@ -193,7 +222,9 @@ def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_pat
 
     def watched(blocks, name):
         found = lazily(blocks, name)
-        seen = found.map_blocks(lambda values: asked.append(name) or values, dtype=found.dtype, meta=found._meta)
+        seen = found.map_blocks(
+            lambda values: asked.append(name) or values, dtype=found.dtype, meta=found._meta
+        )
         return with_part(seen, found.gyrostab_part)
 
     monkeypatch.setattr(checkpoint, "_SMALL", 0)
@@ -204,7 +235,10 @@ def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_pat
         run(paths, tmp_path / "large.nc", windows=WINDOW)
         monkeypatch.setattr(checkpoint, "_SMALL", 2**30)
         run(paths, tmp_path / "small.nc", windows=WINDOW)
-    small, large = (open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False) for name in ("small", "large"))
+    small, large = (
+        open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False)
+        for name in ("small", "large")
+    )
     xr.testing.assert_identical(small, large)
     assert small.edf.size >= 1000 > small.N.size
     assert "N" in asked
@@ -217,15 +251,23 @@ def test_a_part_of_a_variable_in_blocks_is_that_of_the_whole(tmp_path):
     cube = rng.standard_normal((3, 11, 4))
     blocks = []
     for begin, end in pairwise(edges):
-        part = xr.Dataset({"avar": (("axis", "time", "tau"), cube[:, begin:end])}, coords={"time": np.arange(begin, end)})
+        part = xr.Dataset(
+            {"avar": (("axis", "time", "tau"), cube[:, begin:end])},
+            coords={"time": np.arange(begin, end)},
+        )
         blocks.append(checkpoint.write_block(tmp_path, slice(begin, end), part, job="j"))
     array = checkpoint._lazily(blocks, "avar")
     np.testing.assert_array_equal(array.compute(), cube)
     for _ in range(200):
-        place = tuple(slice(*np.sort(rng.choice(size + 1, 2, replace=False))) for size in cube.shape)
+        place = tuple(
+            slice(*np.sort(rng.choice(size + 1, 2, replace=False))) for size in cube.shape
+        )
         np.testing.assert_array_equal(read_part(array, place), cube[place])
     turned = transposed(xr.Variable(("axis", "time", "tau"), array), ("tau", "axis", "time"))
-    np.testing.assert_array_equal(read_part(turned.data, (slice(1, 3), slice(0, 1), slice(3, 9))), cube.transpose(2, 0, 1)[1:3, :1, 3:9])
+    np.testing.assert_array_equal(
+        read_part(turned.data, (slice(1, 3), slice(0, 1), slice(3, 9))),
+        cube.transpose(2, 0, 1)[1:3, :1, 3:9],
+    )
     assert hasattr(turned.data, "gyrostab_part")
     blocks[1].path.write_bytes(blocks[1].path.read_bytes()[: blocks[1].begin + 5])
     with pytest.raises(OSError, match="is cut short"):
@@ -240,19 +282,28 @@ def test_a_part_is_fitted_as_the_whole(options):
     values = rng.standard_normal((2, 40_000))
     values[0, rng.integers(0, 40_000, 4000)] = np.nan
     surface = davar(make_log(values, rate=100.0, unit="deg/h"), **WINDOW)
-    xr.testing.assert_identical(fit_part(surface, **options), fit_noise(surface.chunk(time=5), **options).compute())
+    xr.testing.assert_identical(
+        fit_part(surface, **options), fit_noise(surface.chunk(time=5), **options).compute()
+    )
 
 
 def test_worker_processes_tell_of_damage_as_threads_do(tmp_path):
     path = stored_logs(tmp_path, "zarr")[0]
     (path / "rate" / "1.0").unlink()
     for scheduler in ("threads", "processes"):
-        with pytest.warns(UserWarning, match=r"axis y: the chunk from .* is missing: no file rate/1\.0"):
-            run([path], tmp_path / f"{scheduler}.nc", windows=WINDOW, scheduler=scheduler, workers=1)
+        with pytest.warns(
+            UserWarning, match=r"axis y: the chunk from .* is missing: no file rate/1\.0"
+        ):
+            run(
+                [path], tmp_path / f"{scheduler}.nc", windows=WINDOW, scheduler=scheduler, workers=1
+            )
 
 
 def test_logs_in_memory_join_as_before():
-    parts = [make_log(np.full(4, float(n)), rate=1.0, unit="deg/h", start=f"2026-01-01T00:00:0{3 * n}") for n in range(2)]
+    parts = [
+        make_log(np.full(4, float(n)), rate=1.0, unit="deg/h", start=f"2026-01-01T00:00:0{3 * n}")
+        for n in range(2)
+    ]
     joined = concatenate_logs(parts, ["a.nc", "b.nc"]).rate.data
     found = np.empty(7)
     fill_row(joined, 0, 0, found)
@@ -277,17 +328,31 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeyp
     rows[0, 5], rows[1, 1200] = np.inf, np.nan
     runs = np.array([[0, 0, 700], [705, 700, 1], [900, 800, 1000], [5000, 1900, 1100]])
     spool, cut = Spool(), 1234
-    pieces = {"memory": [rows], "disk": [rows[:, :cut], rows[:, cut:]], "both": [rows[:, :cut], rows[:, cut:]]}[kept]
+    pieces = {
+        "memory": [rows],
+        "disk": [rows[:, :cut], rows[:, cut:]],
+        "both": [rows[:, :cut], rows[:, cut:]],
+    }[kept]
     columns = [[lazily(spool.store(piece[row])) if kept == "disk" or (kept == "both" and number) else piece[row]
                 for number, piece in enumerate(pieces)] for row in (0, 1)]  # fmt: skip
     raw = rows if kept == "memory" else stack_rows([end_to_end(column, 500) for column in columns])
-    placed = fill.on_grid(raw, Placement(0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit)
+    placed = fill.on_grid(
+        raw, Placement(0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit
+    )
     assert can_fill(placed)
     expected = placed_by_hand(runs, 6100, rows)
     if scale != 1.0:
         expected = expected * scale if unit is None else np.rint(expected / unit) * (unit * scale)
     np.testing.assert_array_equal(placed.compute(), expected)
-    for begin, end in [(0, 6100), (3, 4), (701, 705), (690, 910), (1850, 5001), (2000, 2000), (6000, 6100)]:
+    for begin, end in [
+        (0, 6100),
+        (3, 4),
+        (701, 705),
+        (690, 910),
+        (1850, 5001),
+        (2000, 2000),
+        (6000, 6100),
+    ]:
         np.testing.assert_array_equal(stretch(placed, begin, end), expected[:, begin:end])
     np.testing.assert_array_equal(stretch(one_row(placed, 1), 600, 1000), expected[1, 600:1000])
 

@@ -17,9 +17,14 @@ from gyrostab.io.datasets import open_log, to_netcdf
 from tests.support.stored import WRITERS, same_bits, stored_kinds
 
 
-def write_csv(path: Path, header: str, columns: list[np.ndarray], first: int = 0, step: int = 10_000_000) -> Path:
+def write_csv(
+    path: Path, header: str, columns: list[np.ndarray], first: int = 0, step: int = 10_000_000
+) -> Path:
     stamps = first + np.arange(len(columns[0])) * step
-    rows = "\n".join(",".join([str(t), *("" if c != c else f"{c:.10g}" for c in row)]) for t, *row in zip(stamps, *columns, strict=True))
+    rows = "\n".join(
+        ",".join([str(t), *("" if c != c else f"{c:.10g}" for c in row)])
+        for t, *row in zip(stamps, *columns, strict=True)
+    )
     path.write_text(f"time [ns],{header}\n{rows}\n")
     return path
 
@@ -38,11 +43,17 @@ def test_integer_columns_of_a_text_log_are_stored_as_counts(tmp_path, form):
         rng.normal(1, 0.1, 500),
     ]
     columns[0][7] = np.nan
-    source = write_csv(tmp_path / "a.csv", "gyro_x,gyro_y,temperature [degC],vibration [g]", columns)
+    source = write_csv(
+        tmp_path / "a.csv", "gyro_x,gyro_y,temperature [degC],vibration [g]", columns
+    )
     log = ingested(source, unit={"gyro": "0.1 arcsec/s"})
     path = WRITERS[form](log, tmp_path / f"log.{form}")
     kinds = stored_kinds(path)
-    assert (kinds["rate"], kinds["temperature"], kinds["vibration"]) == ("int16", "int16", "float64")
+    assert (kinds["rate"], kinds["temperature"], kinds["vibration"]) == (
+        "int16",
+        "int16",
+        "float64",
+    )
     with open_log(path) as back:
         for name in ("rate", "temperature", "vibration"):
             assert same_bits(back[name], log[name])
@@ -66,7 +77,9 @@ def test_counts_through_every_door(tmp_path):
 
     savemat(tmp_path / "c.mat", {"time": time, "gyro_x": counts.astype(np.int32)})
     write_csv(tmp_path / "d1.csv", "gyro_x [deg/h]", [counts])
-    write_csv(tmp_path / "d2.csv", "gyro_x [deg/h]", [np.rint(counts / 1e3)], first=10**10 + 50_000_000)
+    write_csv(
+        tmp_path / "d2.csv", "gyro_x [deg/h]", [np.rint(counts / 1e3)], first=10**10 + 50_000_000
+    )
     write_csv(tmp_path / "e.csv", "angle_x", [np.rint(counts / 100)])
     write_csv(tmp_path / "f.csv", "gyro_x,gyro_y", [counts, counts])
     write_csv(tmp_path / "g.csv", "gyro_x [deg/h]", [np.append(counts[:-1], 0.5)])
@@ -92,10 +105,18 @@ def test_counts_through_every_door(tmp_path):
 def test_ingest_writes_the_working_store(tmp_path, capsys):
     from gyrostab.cli import main
 
-    source = write_csv(tmp_path / "a.csv", "gyro_x [deg/s],temperature [degC]", [np.arange(900.0) % 7, np.full(900, 20.5)])
+    source = write_csv(
+        tmp_path / "a.csv",
+        "gyro_x [deg/s],temperature [degC]",
+        [np.arange(900.0) % 7, np.full(900, 20.5)],
+    )
     assert main(["ingest", str(source), "-o", str(tmp_path / "log.zarr"), "--quiet-progress"]) == 0
-    assert main(["ingest", str(source), "-o", str(tmp_path / "log.nc"), "--compression", "zlib"]) == 0
-    assert main(["ingest", str(source), "-o", str(tmp_path / "b.zarr"), "--compression", "zlib"]) == 2
+    assert (
+        main(["ingest", str(source), "-o", str(tmp_path / "log.nc"), "--compression", "zlib"]) == 0
+    )
+    assert (
+        main(["ingest", str(source), "-o", str(tmp_path / "b.zarr"), "--compression", "zlib"]) == 2
+    )
     assert "--compression zlib is for NetCDF" in capsys.readouterr().err
     for name in ("log.nc", "log.zarr"):
         assert stored_kinds(tmp_path / name)["rate"] == "int16"
@@ -110,12 +131,23 @@ def test_a_small_archive(tmp_path, form):
     import make_archive
 
     sys.path.pop(0)
-    options = {"hours": 0.1, "rate": 50, "axes": 2, "file-hours": 0.025, "gaps": 0.05, "overlap": "5s", "seed": 3, "scale": 0.02}
+    options = {
+        "hours": 0.1,
+        "rate": 50,
+        "axes": 2,
+        "file-hours": 0.025,
+        "gaps": 0.05,
+        "overlap": "5s",
+        "seed": 3,
+        "scale": 0.02,
+    }
     given = [f"--{name}={value}" for name, value in {**options, "format": form}.items()]
     files = make_archive.main([str(tmp_path / "a"), *given])
     make_archive.main([str(tmp_path / "b"), *given])
     assert len(files) == 4
-    log, again = (gyrostab.regularise(gyrostab.read_log(sorted((tmp_path / name).iterdir()))) for name in "ab")
+    log, again = (
+        gyrostab.regularise(gyrostab.read_log(sorted((tmp_path / name).iterdir()))) for name in "ab"
+    )
     assert same_bits(log.rate, again.rate)
     assert log.attrs["sampling_rate_hz"] == 50.0
     assert 0.95 * 18_000 < log.sizes["time"] <= 18_000

@@ -19,13 +19,28 @@ from gyrostab.kernels.encoding.counts import from_counts, to_counts
 from gyrostab.store import chunk_samples
 from gyrostab.time.grid import TimeGridIndex, grid_times
 from tests.support import synthetic
-from tests.support.stored import CHUNK, FACTOR, RATE, START, WRITERS, counts_log, same_bits, stored_kinds
+from tests.support.stored import (
+    CHUNK,
+    FACTOR,
+    RATE,
+    START,
+    WRITERS,
+    counts_log,
+    same_bits,
+    stored_kinds,
+)
 
 
 @settings(max_examples=60, deadline=None)
 @given(
-    whole=hnp.arrays(np.float64, st.integers(1, 50), elements=st.integers(-(2**31) + 2, 2**31 - 1).map(float) | st.just(np.nan)),
-    factor=st.floats(1e-12, 1e12) | st.floats(-1e3, -1e-3) | st.sampled_from([1.0, 0.1, 1 / 3, 3600.0, 0.02]),
+    whole=hnp.arrays(
+        np.float64,
+        st.integers(1, 50),
+        elements=st.integers(-(2**31) + 2, 2**31 - 1).map(float) | st.just(np.nan),
+    ),
+    factor=st.floats(1e-12, 1e12)
+    | st.floats(-1e3, -1e-3)
+    | st.sampled_from([1.0, 0.1, 1 / 3, 3600.0, 0.02]),
 )
 def test_counts_come_back_bit_for_bit(whole, factor):
     values = whole * factor
@@ -35,11 +50,16 @@ def test_counts_come_back_bit_for_bit(whole, factor):
     back = from_counts(counts, factor, -2147483647)
     np.testing.assert_array_equal(np.isnan(back), np.isnan(values))
     known = ~np.isnan(values)
-    np.testing.assert_array_equal((back[known] + 0.0).view(np.int64), (values[known] + 0.0).view(np.int64))
+    np.testing.assert_array_equal(
+        (back[known] + 0.0).view(np.int64), (values[known] + 0.0).view(np.int64)
+    )
 
 
 @settings(max_examples=60, deadline=None)
-@given(values=hnp.arrays(np.float64, st.integers(1, 6), elements=st.floats(width=64)), factor=st.sampled_from([1.0, 0.1, 1 / 3]))
+@given(
+    values=hnp.arrays(np.float64, st.integers(1, 6), elements=st.floats(width=64)),
+    factor=st.sampled_from([1.0, 0.1, 1 / 3]),
+)
 def test_counts_are_made_only_of_what_they_give_back(values, factor):
     counts = to_counts(values, factor, "i2", -32767)
     known = ~np.isnan(values)
@@ -51,9 +71,15 @@ def test_counts_are_made_only_of_what_they_give_back(values, factor):
         np.testing.assert_array_equal(from_counts(counts, factor, -32767)[known], values[known])
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(
-    whole=hnp.arrays(np.float64, st.tuples(st.integers(1, 3), st.integers(2, 40)), elements=st.integers(-40000, 40000).map(float)),
+    whole=hnp.arrays(
+        np.float64,
+        st.tuples(st.integers(1, 3), st.integers(2, 40)),
+        elements=st.integers(-40000, 40000).map(float),
+    ),
     holes=st.lists(st.integers(0, 39), max_size=8),
     factor=st.sampled_from([1.0, 0.1, 1 / 3, 3600.0, 7.2e-5]),
     form=st.sampled_from(["nc", "zarr"]),
@@ -61,12 +87,18 @@ def test_counts_are_made_only_of_what_they_give_back(values, factor):
 def test_a_log_of_counts_comes_back_bit_for_bit(tmp_path, whole, holes, factor, form):
     values = whole * factor
     values[:, [hole for hole in holes if hole < values.shape[1]]] = np.nan
-    log = counts_log(samples=values.shape[1], axes="xyz"[: len(values)], factor=factor, dtype="i2").drop_vars("vibration")
+    log = counts_log(
+        samples=values.shape[1], axes="xyz"[: len(values)], factor=factor, dtype="i2"
+    ).drop_vars("vibration")
     log["rate"] = (log.rate.dims, values, log.rate.attrs, log.rate.encoding)
     path = WRITERS[form](log, tmp_path / f"log.{form}", overwrite=True)
     with open_log(path) as back:
         assert same_bits(back.rate, log.rate)
-        assert stored_kinds(path)["rate"] == ("int16" if np.nanmax(np.abs(np.nan_to_num(whole))) < 32767 else stored_kinds(path)["rate"])
+        assert stored_kinds(path)["rate"] == (
+            "int16"
+            if np.nanmax(np.abs(np.nan_to_num(whole))) < 32767
+            else stored_kinds(path)["rate"]
+        )
         assert stored_kinds(path)["rate"].startswith("int")
 
 
@@ -105,7 +137,9 @@ def test_compression_and_checksums(tmp_path):
     with netCDF4.Dataset(to_netcdf(counts_log(), tmp_path / "plain.nc")) as file:
         assert file["rate"].filters()["zlib"]
         assert not file["rate"].filters()["zstd"]
-    layout = json.loads((to_zarr(counts_log(), tmp_path / "log.zarr") / "rate" / ".zarray").read_text())
+    layout = json.loads(
+        (to_zarr(counts_log(), tmp_path / "log.zarr") / "rate" / ".zarray").read_text()
+    )
     assert layout["zarr_format"] == 2
     assert layout["compressor"]["id"] == "blosc"
     assert layout["compressor"]["cname"] == "lz4"
@@ -131,18 +165,28 @@ def test_wider_counts_or_doubles_where_the_declaration_does_not_hold(tmp_path, f
     wide = WRITERS[form](log.chunk(time=70_000) if lazy else log, tmp_path / f"wide.{form}")
     assert stored_kinds(wide)["rate"] == "int32"
     log.rate.values[1, 199_999] = np.pi
-    with pytest.warns(UserWarning, match=r"rate: not every value is a whole multiple of 0\.0333333; stored as doubles"):
+    with pytest.warns(
+        UserWarning,
+        match=r"rate: not every value is a whole multiple of 0\.0333333; stored as doubles",
+    ):
         path = WRITERS[form](log.chunk(time=70_000) if lazy else log, tmp_path / f"log.{form}")
     assert stored_kinds(path)["rate"] == "float64"
     assert stored_kinds(path)["vibration"] == "int16"
     with open_log(path) as back:
         assert same_bits(back.rate, log.rate)
-    assert sorted(item.name for item in tmp_path.iterdir()) == sorted([f"wide.{form}", f"log.{form}"])
+    assert sorted(item.name for item in tmp_path.iterdir()) == sorted(
+        [f"wide.{form}", f"log.{form}"]
+    )
 
 
 def test_a_value_that_stands_for_missing_is_not_lost(tmp_path):
     log = counts_log(samples=4, axes="x", factor=1.0, dtype="i4").drop_vars("vibration")
-    log["rate"] = (log.rate.dims, np.array([[-2147483647.0, 1.0, np.nan, 2.0]]), log.rate.attrs, log.rate.encoding)
+    log["rate"] = (
+        log.rate.dims,
+        np.array([[-2147483647.0, 1.0, np.nan, 2.0]]),
+        log.rate.attrs,
+        log.rate.encoding,
+    )
     with pytest.warns(UserWarning, match="stored as doubles"):
         path = to_netcdf(log, tmp_path / "log.nc")
     assert same_bits(open_log(path).rate, log.rate)
@@ -154,7 +198,10 @@ def test_a_value_that_stands_for_missing_is_not_lost(tmp_path):
 def test_a_cut_log_keeps_its_exact_times(tmp_path, form, rate, part):
     log = synthetic.log(samples=1000, rate=rate).isel(time=part)
     with open_log(WRITERS[form](log, tmp_path / f"cut.{form}")) as back:
-        np.testing.assert_array_equal(back.time.values, grid_times(synthetic.START, rate, np.arange(1000)[part]).view("M8[ns]"))
+        np.testing.assert_array_equal(
+            back.time.values,
+            grid_times(synthetic.START, rate, np.arange(1000)[part]).view("M8[ns]"),
+        )
         assert same_bits(back.rate, log.rate)
 
 
@@ -163,7 +210,9 @@ def test_samples_that_were_dropped_are_missing(tmp_path):
     picked = log.isel(time=[0, 1, 5, 50])
     with open_log(to_netcdf(picked, tmp_path / "log.nc")) as back:
         np.testing.assert_array_equal(back.time.values, log.time.values[:51])
-        np.testing.assert_array_equal(back.rate.sel(time=picked.time.values).values, picked.rate.values)
+        np.testing.assert_array_equal(
+            back.rate.sel(time=picked.time.values).values, picked.rate.values
+        )
         assert int(back.rate.notnull().sum()) == int(picked.rate.notnull().sum())
     assert "time" not in stored_kinds(tmp_path / "log.nc")
 
@@ -175,7 +224,11 @@ def test_a_log_that_runs_backwards_is_refused(tmp_path):
 
 
 def test_plain_stamps_that_are_a_grid_are_not_stored(tmp_path):
-    log = counts_log(samples=1000).drop_vars("time").assign_coords(time=pd.date_range("2026-11-20", periods=1000, freq="10ms"))
+    log = (
+        counts_log(samples=1000)
+        .drop_vars("time")
+        .assign_coords(time=pd.date_range("2026-11-20", periods=1000, freq="10ms"))
+    )
     with open_log(to_netcdf(log, tmp_path / "log.nc")) as back:
         np.testing.assert_array_equal(back.time.values, log.time.values)
     assert "time" not in stored_kinds(tmp_path / "log.nc")

@@ -16,10 +16,19 @@ N_TRUE = 0.02  # deg/sqrt(h)
 
 
 def write_log(
-    path: Path, seconds: float = 60.0, *, header: str = "time [s],gyro_x [deg/h],gyro_y [deg/h]", change: Callable | None = None
+    path: Path,
+    seconds: float = 60.0,
+    *,
+    header: str = "time [s],gyro_x [deg/h],gyro_y [deg/h]",
+    change: Callable | None = None,
 ) -> Path:
     """A log of white rate noise of `N_TRUE`; `change` may spoil its list of rows."""
-    noise = 60.0 * N_TRUE * np.sqrt(RATE) * np.random.default_rng(5).standard_normal((round(seconds * RATE), 2))
+    noise = (
+        60.0
+        * N_TRUE
+        * np.sqrt(RATE)
+        * np.random.default_rng(5).standard_normal((round(seconds * RATE), 2))
+    )
     rows = [f"{index / RATE:.2f},{x:.4f},{y:.4f}" for index, (x, y) in enumerate(noise)]
     path.write_text("\n".join([header, *(change(rows) if change else rows)]) + "\n")
     return path

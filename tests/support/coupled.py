@@ -31,7 +31,9 @@ def noise(kind: str, cells: int, rng: np.random.Generator) -> np.ndarray:
     if kind == "flicker":
         f = np.fft.rfftfreq(4 * cells)[1:]
         shape = np.concatenate([[0], f**-0.5])
-        slow = np.fft.irfft(shape * (rng.normal(size=shape.size) + 1j * rng.normal(size=shape.size)))[:cells]
+        slow = np.fft.irfft(
+            shape * (rng.normal(size=shape.size) + 1j * rng.normal(size=shape.size))
+        )[:cells]
         return white + 1.5 * slow / slow.std()
     if kind == "walk":
         return white + np.cumsum(rng.normal(0, 0.3, cells))
@@ -63,14 +65,20 @@ def product(
     warm = temperature(heat, cells + head, rng)
     rate = np.gradient(warm, CELL / 3600)
     cold = warm[head:]
-    drive = slope * warm[head - lag : head - lag + cells] + pace * rate[head - lag : head - lag + cells]
-    series = np.stack([noise(noises, cells, rng) + (drive if i == 0 else 0.0) for i in range(len(axes))])
+    drive = (
+        slope * warm[head - lag : head - lag + cells] + pace * rate[head - lag : head - lag + cells]
+    )
+    series = np.stack(
+        [noise(noises, cells, rng) + (drive if i == 0 else 0.0) for i in range(len(axes))]
+    )
     pair = lambda row: 0.5 * (row[..., 1:] + row[..., :-1])  # noqa: E731
     shape = (len(axes), windows)
     values = {name: np.full((*shape, 1), 1.0) for name in ("avar", "count", "coverage", "edf")} | {
         "estimator": np.ones((*shape, 1), np.int8)
     }
-    made = xr.Dataset({name: (("axis", "time", "tau"), value, attributes(name)) for name, value in values.items()})
+    made = xr.Dataset(
+        {name: (("axis", "time", "tau"), value, attributes(name)) for name, value in values.items()}
+    )
     made["window_mean"] = (("axis", "time"), 10 + pair(series), attributes("window_mean"))
     made["window_coverage"] = (("axis", "time"), np.ones(shape), attributes("window_coverage"))
     for term in TERMS:
@@ -81,9 +89,19 @@ def product(
     if terms:
         seen[..., [1, 2]] = 2
     made["observable"] = (("axis", "time", "term"), seen, attributes("observable"))
-    made["temperature"] = ("time", pair(cold), {"units": "degree_Celsius", "long_name": "temperature, mean of the window"})
-    made["temperature_rate"] = ("time", np.diff(cold) / (CELL / 3600), {"units": "K hour-1", "long_name": "rate of change of temperature"})
-    start = np.datetime64("2026-09-21T12:00:00", "ns") + (np.arange(windows) * int(STEP * 1e9)).astype("timedelta64[ns]")
+    made["temperature"] = (
+        "time",
+        pair(cold),
+        {"units": "degree_Celsius", "long_name": "temperature, mean of the window"},
+    )
+    made["temperature_rate"] = (
+        "time",
+        np.diff(cold) / (CELL / 3600),
+        {"units": "K hour-1", "long_name": "rate of change of temperature"},
+    )
+    start = np.datetime64("2026-09-21T12:00:00", "ns") + (
+        np.arange(windows) * int(STEP * 1e9)
+    ).astype("timedelta64[ns]")
     ends = np.stack([start, start + np.timedelta64(int(WINDOW * 1e9), "ns")], axis=1)
     made = made.assign_coords(
         axis=("axis", list(axes), attributes("axis")),

@@ -2,8 +2,9 @@
 
 python -m tests.support.crashing FOLDER LOG SEED CALLS KILLS
 
-prints, as JSON, what became of kills before calls that change the disk (so many of them, drawn at random; 0 for every one),
-and of kills at random moments. The runs make a surface without a fit, which takes the same way and less time.
+prints, as JSON, what became of kills before calls that change the disk (so many of them, drawn at
+random; 0 for every one), and of kills at random moments. The runs make a surface without a fit,
+which takes the same way and less time.
 """
 
 from __future__ import annotations
@@ -85,8 +86,12 @@ def main(folder: Path, log: Path, seed: int, points: int, kills: int) -> dict[st
     def outcome(output: Path, what: str) -> None:
         status = forked(lambda: make(log, output, resume=True))
         if status or output.read_bytes() != whole:
-            wrong.append(f"{what}: exit {status}, {'another product' if output.exists() else 'no product'}")
-        left = [path.name for path in folder.iterdir() if output.name in path.name and path != output]
+            wrong.append(
+                f"{what}: exit {status}, {'another product' if output.exists() else 'no product'}"
+            )
+        left = [
+            path.name for path in folder.iterdir() if output.name in path.name and path != output
+        ]
         if left:
             wrong.append(f"{what}: left {left}")
 
@@ -111,7 +116,10 @@ def main(folder: Path, log: Path, seed: int, points: int, kills: int) -> dict[st
         again = output.with_name(f".{output.name}.job").exists()
         if output.exists():
             output.unlink()
-        landed += forked(lambda output=output, again=again: make(log, output, resume=again), after=moment) == -signal.SIGKILL
+        landed += (
+            forked(lambda output=output, again=again: make(log, output, resume=again), after=moment)
+            == -signal.SIGKILL
+        )
         if kill % 3 != 1:
             outcome(output, f"killed after {moment:.3f} s")
     return {"calls": calls, "kills": landed, "seconds": seconds, "wrong": wrong}

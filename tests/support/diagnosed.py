@@ -39,7 +39,13 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
     shift[0, (block >= 1500) & (block < 1800)] = 0.08
     window_shift = np.zeros((len(axes), begin.size))
     window_shift[0, loud] = 0.08
-    mean = np.stack([window_shift + 0.018 * rng.standard_normal(window_shift.shape), 0 * window_shift, window_shift])
+    mean = np.stack(
+        [
+            window_shift + 0.018 * rng.standard_normal(window_shift.shape),
+            0 * window_shift,
+            window_shift,
+        ]
+    )
     line = np.arange(1, 1000) * 0.05
     density = np.full((3, len(axes), 12), (0.003 * 60) ** 2)
     return xr.Dataset(
@@ -67,7 +73,15 @@ def content() -> dict[str, Any]:
         "view": "davar", "what": "avar", "axes": ["x"], "begin": 1500.0, "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
         "sign": 1, "p_value": 0.0004, "estimate": 1.8, "frequency": np.nan,
     }  # fmt: skip
-    shift = box | {"view": "mean", "what": "mean", "tau_min_s": 20.0, "tau_max_s": 300.0, "ratio": 7.0, "estimate": 0.08, "p_value": 1e-9}
+    shift = box | {
+        "view": "mean",
+        "what": "mean",
+        "tau_min_s": 20.0,
+        "tau_max_s": 300.0,
+        "ratio": 7.0,
+        "estimate": 0.08,
+        "p_value": 1e-9,
+    }
     kept = ("view", "axes", "tau_min_s", "tau_max_s", "ratio", "p_value")
     mismatches = [
         {"id": number, **{key: one[key] for key in kept}, "start": when(one["begin"]), "end": when(one["end"]), "explained_by": [name],
@@ -79,7 +93,9 @@ def content() -> dict[str, Any]:
         ("vibration_noise", "white", 0.00045, "deg/sqrt(h)/g", []),
         ("vibration_rectification", "sensitivity", 0.0022, "deg/h/g^2", ["g_sensitivity"]),
     ):
-        said = make_effect({"name": name, parameter: value, "axes": ["x"]}).say({parameter: 0.05 * value})
+        said = make_effect({"name": name, parameter: value, "axes": ["x"]}).say(
+            {parameter: 0.05 * value}
+        )
         effects.append(
             {
                 "name": name, "axes": ["x"], "driver": "vibration", "intervals": [[when(1500), when(1800)]],
@@ -91,7 +107,11 @@ def content() -> dict[str, Any]:
             }
         )  # fmt: skip
     noise = {
-        axis: {term: {"value": value, "stderr": 0.05 * value, "unit": UNITS[term]} for term, value in NOISE.items()} for axis in ("x", "y")
+        axis: {
+            term: {"value": value, "stderr": 0.05 * value, "unit": UNITS[term]}
+            for term, value in NOISE.items()
+        }
+        for axis in ("x", "y")
     }
     return {
         "schema": "gyrostab.diagnosis/1",

@@ -38,12 +38,24 @@ def run(
         Contribution or signal; for the stage "noise" a dict of squared coefficients by symbol.
     """
     names = tuple(axis for axis in axes if not effect.axes or axis in effect.axes)
-    coefficients = {symbol: np.broadcast_to(value, len(names)).astype(float) for symbol, value in (noise or {}).items()}
+    coefficients = {
+        symbol: np.broadcast_to(value, len(names)).astype(float)
+        for symbol, value in (noise or {}).items()
+    }
     frame = Setup(rate=rate, size=size, start=0, axes=names, noise=coefficients, **setup)
     state = effect.begin(frame, np.random.default_rng(seed))
-    given = {name: np.broadcast_to(np.asarray(values, float), size) for name, values in (drivers or {}).items()}
-    motion = {axis: np.broadcast_to(np.asarray((true or {}).get(axis, 0.0), float), size) for axis in axes}
-    before = np.zeros((len(names), size)) if signal is None else np.broadcast_to(np.asarray(signal, float), (len(names), size))
+    given = {
+        name: np.broadcast_to(np.asarray(values, float), size)
+        for name, values in (drivers or {}).items()
+    }
+    motion = {
+        axis: np.broadcast_to(np.asarray((true or {}).get(axis, 0.0), float), size) for axis in axes
+    }
+    before = (
+        np.zeros((len(names), size))
+        if signal is None
+        else np.broadcast_to(np.asarray(signal, float), (len(names), size))
+    )
     parts = []
     edges = [0, *cuts, size]
     for first, end in itertools.pairwise(edges):
@@ -55,13 +67,26 @@ def run(
             drivers={name: values[here] for name, values in given.items()},
             true={axis: values[here] for axis, values in motion.items()},
             signal=before[:, here].copy(),
-            level={symbol: np.repeat(value[:, None] ** 2, end - first, axis=1) for symbol, value in coefficients.items()},
+            level={
+                symbol: np.repeat(value[:, None] ** 2, end - first, axis=1)
+                for symbol, value in coefficients.items()
+            },
         )
         values, state = effect.generate(chunk, copy.deepcopy(state))
-        parts.append(values if effect.stage == "noise" else np.broadcast_to(values, (len(names), np.shape(values)[-1])))
+        parts.append(
+            values
+            if effect.stage == "noise"
+            else np.broadcast_to(values, (len(names), np.shape(values)[-1]))
+        )
     if effect.stage == "noise":
         return {
-            symbol: np.concatenate([np.broadcast_to(part[symbol], (len(names), np.shape(part[symbol])[-1])) for part in parts], axis=1)
+            symbol: np.concatenate(
+                [
+                    np.broadcast_to(part[symbol], (len(names), np.shape(part[symbol])[-1]))
+                    for part in parts
+                ],
+                axis=1,
+            )
             for symbol in parts[0]
         }
     return np.concatenate(parts, axis=1)
@@ -81,7 +106,9 @@ def same_whatever_the_cuts(effect: Effect, cuts: Sequence[int], **options: Any) 
 def random_cuts(seed: int, size: int, pieces: int = 5) -> list[int]:
     """Some places to cut, also single samples apart."""
     rng = np.random.default_rng(seed)
-    places: NDArray[np.int64] = np.unique(np.concatenate([rng.integers(1, size, pieces), [1, size // 2, size // 2 + 1]]))
+    places: NDArray[np.int64] = np.unique(
+        np.concatenate([rng.integers(1, size, pieces), [1, size // 2, size // 2 + 1]])
+    )
     return [int(place) for place in places if 0 < place < size]
 
 
@@ -89,7 +116,12 @@ def avar(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:
     """Allan variance of every row over the whole record."""
     log = make_log(np.atleast_2d(rates), rate=rate, unit="deg/h")
     return (
-        davar(log, window=f"{log.sizes['time']}samples", taus=[float(tau) for tau in taus], tau_max=float(max(taus)))
+        davar(
+            log,
+            window=f"{log.sizes['time']}samples",
+            taus=[float(tau) for tau in taus],
+            tau_max=float(max(taus)),
+        )
         .avar.isel(time=0)
         .values
     )
@@ -100,17 +132,23 @@ def sigma(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]
     return np.sqrt(avar(rates, rate, taus))
 
 
-def allan_of_density(density: Callable[[NDArray[np.float64]], Any], tau: float, top: float) -> float:
+def allan_of_density(
+    density: Callable[[NDArray[np.float64]], Any], tau: float, top: float
+) -> float:
     """Allan variance of a two-sided density (P16 Eq. 7), by numerical integration up to `top` [Hz]."""
     f = np.linspace(top / 400_000, top, 400_000)
-    return float(4.0 * np.trapezoid(density(f) * np.sin(np.pi * f * tau) ** 4 / (np.pi * f * tau) ** 2, f))
+    return float(
+        4.0 * np.trapezoid(density(f) * np.sin(np.pi * f * tau) ** 4 / (np.pi * f * tau) ** 2, f)
+    )
 
 
 def allan_of_samples(density: Callable[[NDArray[np.float64]], Any], k: int, rate: float) -> float:
     """Allan variance of samples with a two-sided density, k samples at a time: the mean of k has the response of Dirichlet."""
     f = (np.arange(200_000) + 0.5) * (rate / 2) / 200_000
     x = np.pi * f / rate
-    return float(4.0 * np.sum(density(f) * np.sin(k * x) ** 4 / (k * np.sin(x)) ** 2) * (f[1] - f[0]))
+    return float(
+        4.0 * np.sum(density(f) * np.sin(k * x) ** 4 / (k * np.sin(x)) ** 2) * (f[1] - f[0])
+    )
 
 
 def steady(channel: str, unit: str, value: float) -> dict[str, Any]:
@@ -118,10 +156,14 @@ def steady(channel: str, unit: str, value: float) -> dict[str, Any]:
     return {"profile": "steps", "channel": channel, "unit": unit, "points": [[0, value]]}
 
 
-def windows_of(size: int, rate: float, length: float, frequency: Any = (1.0,), **more: Any) -> Windows:
+def windows_of(
+    size: int, rate: float, length: float, frequency: Any = (1.0,), **more: Any
+) -> Windows:
     """Windows of `length` [s] one after the other."""
     edges = np.arange(0.0, size / rate + 1e-9, length)
-    return Windows(edges[:-1], edges[1:], np.asarray(frequency, float), rate, more.pop("axes", ("x",)), **more)
+    return Windows(
+        edges[:-1], edges[1:], np.asarray(frequency, float), rate, more.pop("axes", ("x",)), **more
+    )
 
 
 def band_powers(rates: Any, rate: float, edges: Any) -> NDArray[np.float64]:
@@ -132,7 +174,16 @@ def band_powers(rates: Any, rate: float, edges: Any) -> NDArray[np.float64]:
     return np.array([power[(f > low) & (f < high)].mean() for low, high in pairwise(edges)])
 
 
-def said_density(effect: Effect, rate: float, edges: Any, parameter: str, axes: Sequence[str] = ("x",)) -> NDArray[np.float64]:
+def said_density(
+    effect: Effect, rate: float, edges: Any, parameter: str, axes: Sequence[str] = ("x",)
+) -> NDArray[np.float64]:
     """The same as `band_powers` of the density that the effect says, by fine bands."""
     fine = [np.linspace(low, high, 60)[1:-1] for low, high in pairwise(edges)]
-    return np.array([effect.explain(windows_of(100, rate, 10.0 / rate, f, axes=axes)).spectrum[parameter][0].mean() for f in fine])
+    return np.array(
+        [
+            effect.explain(windows_of(100, rate, 10.0 / rate, f, axes=axes))
+            .spectrum[parameter][0]
+            .mean()
+            for f in fine
+        ]
+    )

@@ -16,7 +16,9 @@ from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 COEFFICIENT = xr.DataArray(
-    np.tile([0.0, 0.003, 0.004, 0.02, 0.0], (3, 1)), {"axis": ["x", "y", "z"], "term": list("QNBKR")}, ("axis", "term")
+    np.tile([0.0, 0.003, 0.004, 0.02, 0.0], (3, 1)),
+    {"axis": ["x", "y", "z"], "term": list("QNBKR")},
+    ("axis", "term"),
 )
 _HEAT = {
     "profile": "ramps", "channel": "temperature", "unit": "degC",
@@ -26,19 +28,54 @@ _SHAKE = {
     "profile": "vibration",
     "points": [[0, 0.02], [1500, 5.0], [1580, 7.0], [1640, 4.5], [1710, 8.0], [1800, 0.02]],
 }
-_TURN = {"profile": "rotation", "points": [[0, 0], [300, 0], [310, 180], [1500, 180], [1510, 60], [2500, 60], [2510, 180], [3600, 180]]}
-_LIGHT = {"profile": "ramps", "channel": "light_power", "unit": "W", "points": [[0, 1e-4], [1500, 0.9e-4], [3600, 0.95e-4]]}
-_SUPPLY = {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": [[0, 24.0], [1000, 23.5], [2400, 24.1]]}
+_TURN = {
+    "profile": "rotation",
+    "points": [
+        [0, 0],
+        [300, 0],
+        [310, 180],
+        [1500, 180],
+        [1510, 60],
+        [2500, 60],
+        [2510, 180],
+        [3600, 180],
+    ],
+}
+_LIGHT = {
+    "profile": "ramps",
+    "channel": "light_power",
+    "unit": "W",
+    "points": [[0, 1e-4], [1500, 0.9e-4], [3600, 0.95e-4]],
+}
+_SUPPLY = {
+    "profile": "steps",
+    "channel": "supply_voltage",
+    "unit": "V",
+    "points": [[0, 24.0], [1000, 23.5], [2400, 24.1]],
+}
 _SECOND = dict(_HEAT, channel="temperature_2", points=[[0, 30], [700, 31], [2100, 45], [3600, 50]])
 #: Environments by name, as tuples of tables.
 WORLD: dict[str, tuple[dict[str, Any], ...]] = {
     "usual": (_HEAT, _SHAKE),
     "turning": (_HEAT, _SHAKE, dict(_TURN, sensor_rate=10.0)),
-    "full": (_HEAT, _SHAKE, dict(_TURN, sensor_rate=10.0, accelerations=True), _LIGHT, _SUPPLY, _SECOND),
+    "full": (
+        _HEAT,
+        _SHAKE,
+        dict(_TURN, sensor_rate=10.0, accelerations=True),
+        _LIGHT,
+        _SUPPLY,
+        _SECOND,
+    ),
 }
 
 
-def record(effects: list[dict[str, Any]], *, environment: Any = WORLD["usual"], seed: int = 1, drop: tuple[str, ...] = ()) -> xr.Dataset:
+def record(
+    effects: list[dict[str, Any]],
+    *,
+    environment: Any = WORLD["usual"],
+    seed: int = 1,
+    drop: tuple[str, ...] = (),
+) -> xr.Dataset:
     """Reduced record of three axes; the same arguments give the same Dataset, which is made once."""
     found = _made(json.dumps(effects), json.dumps(list(environment)), seed)
     return found.drop_vars([f"channel_{name}" for name in drop])
@@ -46,11 +83,20 @@ def record(effects: list[dict[str, Any]], *, environment: Any = WORLD["usual"], 
 
 @cache
 def _made(effects: str, environment: str, seed: int) -> xr.Dataset:
-    model = {"noise": NOISE, "effect": json.loads(effects), "environment": json.loads(environment), "log": {"axes": ["x", "y", "z"]}}
+    model = {
+        "noise": NOISE,
+        "effect": json.loads(effects),
+        "environment": json.loads(environment),
+        "log": {"axes": ["x", "y", "z"]},
+    }
     return reduce_log(simulate(model, duration="1h", rate=10.0, seed=seed).compute())
 
 
-def nulls(reduced: xr.Dataset, count: int = 80, seed: int = 3) -> tuple[xr.Dataset, list[xr.Dataset]]:
+def nulls(
+    reduced: xr.Dataset, count: int = 80, seed: int = 3
+) -> tuple[xr.Dataset, list[xr.Dataset]]:
     """Baseline of a record, and records of noise alone."""
     baseline = calibrate_noise(reduced)
-    return baseline, list(null_records(reduced, baseline, count=count, rng=np.random.default_rng(seed), chunk=count))
+    return baseline, list(
+        null_records(reduced, baseline, count=count, rng=np.random.default_rng(seed), chunk=count)
+    )

@@ -6,26 +6,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def white(rng: np.random.Generator, trials: int, n: int, *, N: float, rate: float) -> NDArray[np.float64]:
+def white(
+    rng: np.random.Generator, trials: int, n: int, *, N: float, rate: float
+) -> NDArray[np.float64]:
     """Angle random walk of N [deg/sqrt(h)] as rate [deg/h]: the angle grows by N sqrt(dt) in dt."""
     hours = 1 / rate / 3600
     return N * np.sqrt(hours) / hours * rng.standard_normal((trials, n))
 
 
-def quantization(rng: np.random.Generator, trials: int, n: int, *, Q: float, rate: float) -> NDArray[np.float64]:
+def quantization(
+    rng: np.random.Generator, trials: int, n: int, *, Q: float, rate: float
+) -> NDArray[np.float64]:
     """Quantization noise of Q [urad]: an error of the angle at each end of the sample."""
     angle = np.degrees(Q * 1e-6) * rng.standard_normal((trials, n + 1))
     return np.diff(angle, axis=1) * rate * 3600
 
 
-def random_walk(rng: np.random.Generator, trials: int, n: int, *, K: float, rate: float) -> NDArray[np.float64]:
+def random_walk(
+    rng: np.random.Generator, trials: int, n: int, *, K: float, rate: float
+) -> NDArray[np.float64]:
     """Rate random walk of K [deg/h^1.5]: Brownian motion averaged over each sample.
 
-    The mean over an interval with increment d is the start plus d / 2 plus an independent part of variance dt / 12.
+    The mean over an interval with increment d is the start plus d / 2 plus an independent part of
+    variance dt / 12.
     """
     hours = 1 / rate / 3600
     steps = K * np.sqrt(hours) * rng.standard_normal((trials, n))
-    return np.cumsum(steps, axis=1) - steps / 2 + K * np.sqrt(hours / 12) * rng.standard_normal((trials, n))
+    return (
+        np.cumsum(steps, axis=1)
+        - steps / 2
+        + K * np.sqrt(hours / 12) * rng.standard_normal((trials, n))
+    )
 
 
 def flicker(rng: np.random.Generator, trials: int, n: int, *, B: float) -> NDArray[np.float64]:
@@ -41,7 +52,9 @@ def flicker(rng: np.random.Generator, trials: int, n: int, *, B: float) -> NDArr
     return out
 
 
-def lose(rng: np.random.Generator, x: NDArray[np.float64], share: float, block: float) -> NDArray[np.float64]:
+def lose(
+    rng: np.random.Generator, x: NDArray[np.float64], share: float, block: float
+) -> NDArray[np.float64]:
     """Lose blocks of geometric length until `share` of each row is NaN."""
     for row in x:
         while share and np.isnan(row).mean() < share:

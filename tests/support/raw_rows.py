@@ -11,18 +11,30 @@ from numpy.typing import ArrayLike, NDArray
 START = 1_773_226_800_000_000_000  # 2026-03-11T11:00:00
 
 
-def raw_log(stamps: Any, values: Any = None, *, kind: str = "rate", name: str = "tool.csv", **channels: ArrayLike) -> xr.Dataset:
+def raw_log(
+    stamps: Any,
+    values: Any = None,
+    *,
+    kind: str = "rate",
+    name: str = "tool.csv",
+    **channels: ArrayLike,
+) -> xr.Dataset:
     """A raw log; `stamps` in ns (int), None for a file without time; values by row, or by axis and row."""
     n = len(stamps) if stamps is not None else np.shape(values)[-1]
     values = np.atleast_2d(np.arange(1.0, n + 1) if values is None else values)
     signal = "rate" if kind == "rate" else "angle"
     units = "degree hour-1" if kind == "rate" else "degree"
     data: dict[str, Any] = {signal: (("axis", "row"), values, {"units": units})}
-    data |= {key: ("row", np.asarray(column), {"units": "degree_Celsius"}) for key, column in channels.items()}
+    data |= {
+        key: ("row", np.asarray(column), {"units": "degree_Celsius"})
+        for key, column in channels.items()
+    }
     coords: dict[str, Any] = {"axis": list("xyz"[: len(values)])}
     if stamps is not None:
         coords["time"] = ("row", np.asarray(stamps, dtype=np.int64).view("datetime64[ns]"))
-    return xr.Dataset(data, coords, {"kind": kind, "source_files": [name], "row_start": [0], "notes": ["read"]})
+    return xr.Dataset(
+        data, coords, {"kind": kind, "source_files": [name], "row_start": [0], "notes": ["read"]}
+    )
 
 
 def stamps_of(samples: ArrayLike, rate: float) -> NDArray[np.int64]:

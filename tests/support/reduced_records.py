@@ -14,7 +14,9 @@ from gyrostab.noise import TERMS
 RATE, BLOCK_S, PARTS = 100.0, 20.0, 8
 
 
-def frame(*, blocks: int = 180, missing: float = 0.0, rate: float = RATE, block_s: float = BLOCK_S) -> dict[str, Any]:
+def frame(
+    *, blocks: int = 180, missing: float = 0.0, rate: float = RATE, block_s: float = BLOCK_S
+) -> dict[str, Any]:
     """Bands, shapes and edges that all records share."""
     half = int(block_s * rate / 2)
     edges = np.unique(np.round(np.geomspace(1, half, 15)).astype(int))
@@ -32,7 +34,14 @@ def frame(*, blocks: int = 180, missing: float = 0.0, rate: float = RATE, block_
     }
 
 
-def baseline(*, axes: str = "xyz", noise: float = 0.003, flicker: float = 0.0, walk: float = 0.0, **options: Any) -> xr.Dataset:
+def baseline(
+    *,
+    axes: str = "xyz",
+    noise: float = 0.003,
+    flicker: float = 0.0,
+    walk: float = 0.0,
+    **options: Any,
+) -> xr.Dataset:
     """White noise of `noise` deg/sqrt(h) on every axis, flicker of `flicker` deg/h, a walk of `walk` deg/h^1.5."""
     f = frame(**options)
     level = 3600.0 * noise**2
@@ -40,11 +49,16 @@ def baseline(*, axes: str = "xyz", noise: float = 0.003, flicker: float = 0.0, w
     for term, value in (("N", noise), ("B", flicker), ("K", walk)):
         coefficient[:, TERMS.index(term)] = value
     frequency = (f["low"] + f["high"]) / 2.0
-    spectrum = level + flicker**2 / (2 * np.pi * frequency) + (walk / 60.0 / (2 * np.pi * frequency)) ** 2
+    spectrum = (
+        level + flicker**2 / (2 * np.pi * frequency) + (walk / 60.0 / (2 * np.pi * frequency)) ** 2
+    )
     shape = (len(axes), f["blocks"])
     return xr.Dataset(
         {
-            "spectrum": (("axis", "block", "band"), np.broadcast_to(spectrum, (*shape, frequency.size)).copy()),
+            "spectrum": (
+                ("axis", "block", "band"),
+                np.broadcast_to(spectrum, (*shape, frequency.size)).copy(),
+            ),
             "known_mean": (("axis", "block"), np.zeros(shape)),
             "mean_variance": (("axis", "block"), np.full(shape, level * f["rate"] / f["samples"])),
             "coefficient": (("axis", "term"), coefficient),
@@ -63,7 +77,11 @@ def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: A
     cross = [_cross(power[:, a], power[:, b], shape[a], rng) for a, b in pairs]
     weight = np.full((axes, PARTS), blocks / PARTS)
     density = np.stack([np.interp(f["lines"], base["frequency"], row) for row in spectrum[:, 0]])
-    lines = density[:, None] * rng.gamma(weight[0, 0], size=(count, axes, PARTS, f["lines"].size)) / weight[0, 0]
+    lines = (
+        density[:, None]
+        * rng.gamma(weight[0, 0], size=(count, axes, PARTS, f["lines"].size))
+        / weight[0, 0]
+    )
     plane, cube = ("record", "axis", "block"), ("record", "axis", "block", "band")
     names = [str(axis) for axis in base["axis"].values]
     data: dict[str, Any] = {
@@ -91,11 +109,17 @@ def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: A
         "first": ("pair", [names[a] for a, _ in pairs]),
         "second": ("pair", [names[b] for _, b in pairs]),
     }
-    attrs = {"sampling_rate_hz": f["rate"], "block_s": f["block_s"], "start_ns": 1_790_000_000_000_000_000}
+    attrs = {
+        "sampling_rate_hz": f["rate"],
+        "block_s": f["block_s"],
+        "start_ns": 1_790_000_000_000_000_000,
+    }
     return xr.Dataset(data, coords=coords, attrs=attrs)
 
 
-def chunks(base: xr.Dataset, count: int, rng: np.random.Generator, *, size: int = 25, **options: Any):
+def chunks(
+    base: xr.Dataset, count: int, rng: np.random.Generator, *, size: int = 25, **options: Any
+):
     """Null records, `size` at a time."""
     for _ in range(count // size):
         yield records(base, size, rng, **options)
@@ -112,7 +136,9 @@ def smallest_p(reduced: xr.Dataset, base: xr.Dataset, null: NullScores) -> np.nd
     return np.asarray(np.min(p, axis=0))
 
 
-def _cross(first: np.ndarray, second: np.ndarray, shape: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _cross(
+    first: np.ndarray, second: np.ndarray, shape: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """Cross-periodogram of independent axes, given their powers: the coherency squared is Beta(1, n - 1)."""
     squared = rng.beta(1.0, np.maximum(shape - 1.0, 1e-9), first.shape)
     return np.sqrt(first * second * squared) * np.exp(2j * np.pi * rng.random(first.shape))

@@ -30,11 +30,22 @@ def nan_runs(values: np.ndarray) -> np.ndarray:
     return np.stack([edges[:, 0], edges[:, 1], length, 0 * length, 0 * length], axis=1)
 
 
-def log_of(values: np.ndarray, first: int = 0, *, rate: float = RATE, start: int = START, shift: int = 0, axes: str = "xy") -> xr.Dataset:
+def log_of(
+    values: np.ndarray,
+    first: int = 0,
+    *,
+    rate: float = RATE,
+    start: int = START,
+    shift: int = 0,
+    axes: str = "xy",
+) -> xr.Dataset:
     """A lazy regular log of the samples from `first` on of a grid; its clock is `shift` [ns] late."""
     begin = int(grid_times(start, rate, first)) + shift
     log = xr.Dataset(
-        {"rate": (("axis", "time"), values, {"units": "degree hour-1"}), **gap_variables(nan_runs(values), begin, rate)},
+        {
+            "rate": (("axis", "time"), values, {"units": "degree hour-1"}),
+            **gap_variables(nan_runs(values), begin, rate),
+        },
         coords={"axis": list(axes), **time_coordinate(begin, rate, values.shape[1])},
         attrs={"kind": "rate", "sampling_rate_hz": rate},
     )

@@ -21,7 +21,10 @@ WORLD = [
     {"profile": "gaps", "spans": [[10, 10.5]]},
 ]
 LOG = {"rate": 20, "duration": "90 s", "start": "2026-03-14T08:00:00"}
-BIASED = [{"name": "temperature_bias", "sensitivity": 0.02}, {"name": "g_sensitivity", "x": 0.5, "axes": ["y"]}]
+BIASED = [
+    {"name": "temperature_bias", "sensitivity": 0.02},
+    {"name": "g_sensitivity", "x": 0.5, "axes": ["y"]},
+]
 
 
 def model(**change: Any) -> dict[str, Any]:
@@ -31,12 +34,26 @@ def model(**change: Any) -> dict[str, Any]:
 
 def every_channel(duration: float) -> xr.Dataset:
     """Each channel that some effect asks for by its own name, so that none lacks its driver."""
-    typical = {"degree_Celsius": 60.0, "g": 1.0, "degree s-1": 90.0, "V": 24.0, "W": 1e-4, "uT": 30.0, "Pa": 1e7, "1": 0.5}
+    typical = {
+        "degree_Celsius": 60.0,
+        "g": 1.0,
+        "degree s-1": 90.0,
+        "V": 24.0,
+        "W": 1e-4,
+        "uT": 30.0,
+        "Pa": 1e7,
+        "1": 0.5,
+    }
     units = {name: unit for kind in effects().values() for name, unit in kind.channels.items()}
     units |= {"accel_x": "g"}
     return combine(
         *(
-            env.ramps(name, unit, [[0, typical.get(unit, 1.0)], [duration, 1.3 * typical.get(unit, 1.0)]], duration=duration)
+            env.ramps(
+                name,
+                unit,
+                [[0, typical.get(unit, 1.0)], [duration, 1.3 * typical.get(unit, 1.0)]],
+                duration=duration,
+            )
             for name, unit in units.items()
         )
     )

@@ -29,9 +29,15 @@ def lose_samples(kind: str, rows: int, random: np.random.Generator) -> NDArray[n
     return samples - samples[0]
 
 
-def scatter_stamps(samples: NDArray[np.int64], kind: str, scatter: float, random: np.random.Generator) -> NDArray[np.float64]:
+def scatter_stamps(
+    samples: NDArray[np.int64], kind: str, scatter: float, random: np.random.Generator
+) -> NDArray[np.float64]:
     """Times of arrival [samples]: a standard deviation (half a range if uniform) of `scatter`, in several ways."""
-    noise = random.uniform(-scatter, scatter, len(samples)) if kind == "uniform" else random.normal(0, scatter, len(samples))
+    noise = (
+        random.uniform(-scatter, scatter, len(samples))
+        if kind == "uniform"
+        else random.normal(0, scatter, len(samples))
+    )
     times = samples + noise
     if kind == "sorted":
         return np.sort(times)

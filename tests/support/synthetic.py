@@ -25,9 +25,20 @@ def product(*, windows: int = 40, taus: int = 12, axes: str = "xyz", seed: int =
     edf = np.broadcast_to(np.maximum(2.0, 1.5 * window / RATE / tau), shape).copy()
     growth = 1.0 + np.linspace(0.0, 2.0, windows)
     true = {
-        s: np.stack([COEFFICIENTS[s] * (1 + 0.5 * i) * (growth if s == "N" else np.ones(windows)) for i in range(len(axes))]) for s in TERMS
+        s: np.stack(
+            [
+                COEFFICIENTS[s] * (1 + 0.5 * i) * (growth if s == "N" else np.ones(windows))
+                for i in range(len(axes))
+            ]
+        )
+        for s in TERMS
     }
-    clean = np.stack([[model_avar(tau, {s: true[s][a, t] for s in TERMS}) for t in range(windows)] for a in range(len(axes))])
+    clean = np.stack(
+        [
+            [model_avar(tau, {s: true[s][a, t] for s in TERMS}) for t in range(windows)]
+            for a in range(len(axes))
+        ]
+    )
     avar = clean * rng.chisquare(edf) / edf
     gap = slice(windows // 2, windows // 2 + 4)
     estimator = np.ones(shape, np.int8)
@@ -52,20 +63,32 @@ def product(*, windows: int = 40, taus: int = 12, axes: str = "xyz", seed: int =
     data |= _coefficients(true, gap, rng)
     data["window_mean"] = (names[:2], rng.normal(7.0, 0.1, shape[:2]))
     data["window_coverage"] = (names[:2], coverage[..., 0])
-    result = xr.Dataset({name: (dims, values, attributes(name)) for name, (dims, values) in data.items()})
+    result = xr.Dataset(
+        {name: (dims, values, attributes(name)) for name, (dims, values) in data.items()}
+    )
     for name, units, values in (
         ("temperature", "degree_Celsius", 65.0 + np.linspace(0, 20, windows)),
         ("temperature_rate", "degree_Celsius hour-1", np.full(windows, 4.0)),
         ("vibration", "g", np.abs(rng.normal(1.0, 0.2, windows))),
     ):
-        result[name] = ("time", values, {"units": units, "long_name": f"{name.replace('_', ' ')}, mean of the window"})
+        result[name] = (
+            "time",
+            values,
+            {"units": units, "long_name": f"{name.replace('_', ' ')}, mean of the window"},
+        )
     first = np.arange(windows) * step
-    edges = np.stack([grid_times(START, RATE, first), grid_times(START, RATE, first + window)], axis=1)
+    edges = np.stack(
+        [grid_times(START, RATE, first), grid_times(START, RATE, first + window)], axis=1
+    )
     result = result.assign_coords(
         axis=("axis", list(axes), attributes("axis")),
         tau=("tau", tau, attributes("tau")),
         term=("term", list(TERMS), attributes("term")),
-        time=("time", (edges[:, 0] + (edges[:, 1] - edges[:, 0]) // 2).view("datetime64[ns]"), attributes("time")),
+        time=(
+            "time",
+            (edges[:, 0] + (edges[:, 1] - edges[:, 0]) // 2).view("datetime64[ns]"),
+            attributes("time"),
+        ),
         time_bounds=(("time", "bnds"), edges.view("datetime64[ns]")),
     )
     result.attrs = {
@@ -84,7 +107,9 @@ def product(*, windows: int = 40, taus: int = 12, axes: str = "xyz", seed: int =
     return result
 
 
-def _coefficients(true: dict[str, np.ndarray], gap: slice, rng: np.random.Generator) -> dict[str, Any]:
+def _coefficients(
+    true: dict[str, np.ndarray], gap: slice, rng: np.random.Generator
+) -> dict[str, Any]:
     data: dict[str, Any] = {}
     shape = true["N"].shape
     observable = np.full((*shape, len(TERMS)), 2, np.int8)
@@ -97,7 +122,10 @@ def _coefficients(true: dict[str, np.ndarray], gap: slice, rng: np.random.Genera
         value = true[symbol] + error * rng.normal(size=shape)
         data[symbol] = (("axis", "time"), np.where(state == 2, value, np.nan))
         data[f"{symbol}_stderr"] = (("axis", "time"), np.where(state == 2, error, np.nan))
-        data[f"{symbol}_upper"] = (("axis", "time"), np.where(state == 1, true[symbol] * 1.6, np.nan))
+        data[f"{symbol}_upper"] = (
+            ("axis", "time"),
+            np.where(state == 1, true[symbol] * 1.6, np.nan),
+        )
         if symbol in "NK":
             data[f"{symbol}_squared"] = (("axis", "time"), data[symbol][1] ** 2)
     data["observable"] = (("axis", "time", "term"), observable)
@@ -109,11 +137,18 @@ def _coefficients(true: dict[str, np.ndarray], gap: slice, rng: np.random.Genera
 def surface(**options: Any) -> xr.Dataset:
     """The same without coefficients."""
     whole = product(**options)
-    fitted = [f"{s}{end}" for s in LAWS for end in ("", "_stderr", "_upper", "_squared")] + ["observable", "fit_chi2", "fit_dof", "term"]
+    fitted = [f"{s}{end}" for s in LAWS for end in ("", "_stderr", "_upper", "_squared")] + [
+        "observable",
+        "fit_chi2",
+        "fit_dof",
+        "term",
+    ]
     return whole.drop_vars(fitted, errors="ignore")
 
 
-def log(*, samples: int = 3000, rate: float = RATE, start: int = START, axes: str = "xyz", seed: int = 2) -> xr.Dataset:
+def log(
+    *, samples: int = 3000, rate: float = RATE, start: int = START, axes: str = "xyz", seed: int = 2
+) -> xr.Dataset:
     """White noise on 7 deg/h with a gap, one slow and one full channel, and a gap table."""
     rng = np.random.default_rng(seed)
     values = rng.normal(7.0, 0.3, (len(axes), samples))
@@ -123,24 +158,51 @@ def log(*, samples: int = 3000, rate: float = RATE, start: int = START, axes: st
     slow = time_coordinate(start, rate / 100, max(1, samples // 100), name="time_temperature")
     result = xr.Dataset(
         {
-            "rate": (("axis", "time"), values, {"units": "degree hour-1", "long_name": "rotation rate"}),
-            "vibration": ("time", rng.normal(0, 1, samples), {"units": "g", "long_name": "vibration"}),
+            "rate": (
+                ("axis", "time"),
+                values,
+                {"units": "degree hour-1", "long_name": "rotation rate"},
+            ),
+            "vibration": (
+                "time",
+                rng.normal(0, 1, samples),
+                {"units": "g", "long_name": "vibration"},
+            ),
             "temperature": (
                 "time_temperature",
                 65 + np.arange(max(1, samples // 100)) / 10,
                 {"units": "degree_Celsius", "long_name": "temperature"},
             ),
-            "pump": ("time", np.arange(samples) % 7.0, {"units": "gal/min", "long_name": "pump flow"}),
+            "pump": (
+                "time",
+                np.arange(samples) % 7.0,
+                {"units": "gal/min", "long_name": "pump flow"},
+            ),
             "gap_start": ("gap", stamps[:1], {"long_name": "first missing sample"}),
             "gap_end": ("gap", stamps[1:], {"long_name": "last missing sample"}),
-            "gap_samples": ("gap", np.array([gap.stop - gap.start]), {"long_name": "missing samples", "units": "1"}),
+            "gap_samples": (
+                "gap",
+                np.array([gap.stop - gap.start]),
+                {"long_name": "missing samples", "units": "1"},
+            ),
             "gap_cause": (
                 "gap",
                 np.zeros(1, np.int8),
-                {"long_name": "cause", "flag_values": np.arange(2, dtype=np.int8), "flag_meanings": "missing unreadable"},
+                {
+                    "long_name": "cause",
+                    "flag_values": np.arange(2, dtype=np.int8),
+                    "flag_meanings": "missing unreadable",
+                },
             ),
         },
         coords={"axis": ("axis", list(axes), attributes("axis"))},
-        attrs={"sampling_rate_hz": rate, "kind": "rate", "source_files": ["a.csv"], "history": "", "notes": [], "epoch_said": True},
+        attrs={
+            "sampling_rate_hz": rate,
+            "kind": "rate",
+            "source_files": ["a.csv"],
+            "history": "",
+            "notes": [],
+            "epoch_said": True,
+        },
     )
     return result.assign_coords(time_coordinate(start, rate, samples)).assign_coords(slow)

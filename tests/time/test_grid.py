@@ -20,7 +20,9 @@ START = pd.Timestamp("2026-11-20T23:59:59.123456789").value
 
 
 @given(
-    rate=st.one_of(st.sampled_from([300.0, 99.3, 1 / 7, 248.553, 400.0, 1e6]), st.floats(1e-3, 1e6)),
+    rate=st.one_of(
+        st.sampled_from([300.0, 99.3, 1 / 7, 248.553, 400.0, 1e6]), st.floats(1e-3, 1e6)
+    ),
     index=st.integers(0, 10**9),
 )
 @settings(max_examples=300, deadline=None)
@@ -40,18 +42,24 @@ def test_two_hundred_hours_at_300_hz_end_on_the_nanosecond():
 
 def test_positions_undo_stamps():
     index = np.array([0, 1, 12345, 2 * 10**8])
-    np.testing.assert_allclose(grid_index(START, 99.3, grid_times(START, 99.3, index)), index, atol=1e-6)
+    np.testing.assert_allclose(
+        grid_index(START, 99.3, grid_times(START, 99.3, index)), index, atol=1e-6
+    )
 
 
 @pytest.fixture
 def log():
-    return xr.Dataset({"x": ("time", np.arange(3000.0))}, coords=time_coordinate(START, 300.0, 3000))
+    return xr.Dataset(
+        {"x": ("time", np.arange(3000.0))}, coords=time_coordinate(START, 300.0, 3000)
+    )
 
 
 class TestIndex:
     def test_a_day_of_samples_takes_no_memory(self):
         log = xr.Dataset(coords=time_coordinate(START, 1000.0, 10**11))  # three years
-        assert log.time[-1].values == np.datetime64(int(grid_times(START, 1000.0, 10**11 - 1)), "ns")
+        assert log.time[-1].values == np.datetime64(
+            int(grid_times(START, 1000.0, 10**11 - 1)), "ns"
+        )
         assert first_stamp(log) == START
 
     def test_slices_stay_lazy_and_exact(self, log):
@@ -63,7 +71,11 @@ class TestIndex:
 
     def test_labels_select_as_pandas_does(self, log):
         frame = log.x.to_series()
-        for a, b in (("2026-11-21T00:00:00", "2026-11-21T00:00:03"), (None, "2026-11-20T23:59:59.5"), ("2026-11-21", None)):
+        for a, b in (
+            ("2026-11-21T00:00:00", "2026-11-21T00:00:03"),
+            (None, "2026-11-20T23:59:59.5"),
+            ("2026-11-21", None),
+        ):
             np.testing.assert_array_equal(log.x.sel(time=slice(a, b)), frame.loc[a:b])
         np.testing.assert_array_equal(log.x.sel(time="2026-11-20"), frame.loc["2026-11-20"])
         stamp = log.time.values[777]

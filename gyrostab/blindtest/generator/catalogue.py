@@ -27,7 +27,9 @@ class Entry:
 
 CATALOGUE: dict[str, Entry] = {
     "vibration_noise": Entry(motion.vibration_noise, "vibration", needs="shaking"),
-    "vibration_rectification": Entry(motion.vibration_rectification, "vibration", needs="shaking", hidden=True),
+    "vibration_rectification": Entry(
+        motion.vibration_rectification, "vibration", needs="shaking", hidden=True
+    ),
     "shupe": Entry(heat.shupe, "temperature", needs="heat", hidden=True),
     "temperature_bias": Entry(heat.temperature_bias, "temperature", needs="heat", hidden=True),
     "thermal_hysteresis": Entry(heat.thermal_hysteresis, "temperature", needs="heat", hidden=True),
@@ -64,7 +66,8 @@ STRANGE: dict[str, Entry] = {
     "informative_gaps": Entry(strange.informative_gaps),
 }
 
-#: Names that stand for one another where the record lacks what would tell them apart (section 1.E of the design).
+#: Names that stand for one another where the record lacks what would tell them apart (section 1.E
+#: of the design).
 AMBIGUITY: tuple[frozenset[str], ...] = tuple(
     frozenset(names.split())
     for names in (

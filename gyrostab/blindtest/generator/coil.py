@@ -39,13 +39,21 @@ def _step(layers: int, thickness: float, diffusivity: float, dt: float) -> tuple
     return left @ (np.eye(layers) + dt / 2 * rate), left @ drive * dt
 
 
-def layer_temperatures(face: Array, *, dt: float, layers: int = 24, thickness: float = 0.012, diffusivity: float = 2.2e-7) -> Array:
+def layer_temperatures(
+    face: Array,
+    *,
+    dt: float,
+    layers: int = 24,
+    thickness: float = 0.012,
+    diffusivity: float = 2.2e-7,
+) -> Array:
     """Temperature of every layer [K] under the temperature of the outer face.
 
     Parameters
     ----------
     face : ndarray, shape (time,)
-        Temperature of the outer face [K or degC], every `dt` seconds; the coil begins in balance with it.
+        Temperature of the outer face [K or degC], every `dt` seconds; the coil begins in balance
+        with it.
     dt : float
         Step [s].
     layers : int
@@ -70,11 +78,18 @@ def layer_temperatures(face: Array, *, dt: float, layers: int = 24, thickness: f
     face = np.asarray(face, dtype=float)
     push = np.zeros_like(face)
     push[1:] = 0.5 * (face[1:] + face[:-1]) - face[0]
-    modes = np.stack([lfilter([1.0], [1.0, -value], weight * push) for value, weight in zip(values, vectors.T @ drive, strict=True)])
+    modes = np.stack(
+        [
+            lfilter([1.0], [1.0, -value], weight * push)
+            for value, weight in zip(values, vectors.T @ drive, strict=True)
+        ]
+    )
     return np.asarray(vectors @ modes + face[0])
 
 
-def layer_weights(layers: int, *, length: float = 500.0, trim: float = 0.0, scatter: Array | None = None) -> Array:
+def layer_weights(
+    layers: int, *, length: float = 500.0, trim: float = 0.0, scatter: Array | None = None
+) -> Array:
     """Weight ``integral of (L - 2 l) dl`` [m2] of each layer of a quadrupole winding.
 
     Parameters
@@ -84,7 +99,8 @@ def layer_weights(layers: int, *, length: float = 500.0, trim: float = 0.0, scat
     length : float
         Length of the fibre [m].
     trim : float
-        How far the middle of the fibre lies off the middle of the winding, as a share of the length.
+        How far the middle of the fibre lies off the middle of the winding, as a share of the
+        length.
     scatter : ndarray, shape (layers,), optional
         Error of each layer's length, as a share of it.
 
@@ -104,11 +120,21 @@ def layer_weights(layers: int, *, length: float = 500.0, trim: float = 0.0, scat
         mine = np.flatnonzero(side == sign)
         ends = np.cumsum(lengths[mine])
         begins = ends - lengths[mine]
-        weights[mine] = sign * (ends**2 - begins**2)  # (L - 2 l) integrated, l counted from the middle
+        weights[mine] = sign * (
+            ends**2 - begins**2
+        )  # (L - 2 l) integrated, l counted from the middle
     return weights + 2.0 * trim * length * lengths
 
 
-def coil_rate(face: Array, *, dt: float, weights: Array, diameter: float = 0.04, length: float = 500.0, index: float = 1.45) -> Array:
+def coil_rate(
+    face: Array,
+    *,
+    dt: float,
+    weights: Array,
+    diameter: float = 0.04,
+    length: float = 500.0,
+    index: float = 1.45,
+) -> Array:
     """Apparent rotation rate [deg/h] of a coil whose outer face has the temperature `face` [degC] every `dt` [s].
 
     Parameters

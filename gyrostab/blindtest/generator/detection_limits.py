@@ -1,12 +1,15 @@
 """How large an effect is, in units of the smallest that any method can see; and what knowing it is worth.
 
-A mean that is known up to its size, in noise of known density S(f), changes the log-likelihood by ``1/2 sum |M(f)|^2 / S(f)``; the limit
-is where that is `NATS`. In white noise and for a mean that is on for T_on of T this is ``a_min = N_s sqrt(2 c / T_eff)``. A change of the
-log variance by v in n samples is worth ``n v^2 / 4``, which gives ``2 sqrt(c / n)``; noise common to the axes ``n / 2 sum of rho^2``.
+A mean that is known up to its size, in noise of known density S(f), changes the log-likelihood by
+``1/2 sum |M(f)|^2 / S(f)``; the limit is where that is `NATS`. In white noise and for a mean that
+is on for T_on of T this is ``a_min = N_s sqrt(2 c / T_eff)``. A change of the log variance by v in
+n samples is worth ``n v^2 / 4``, which gives ``2 sqrt(c / n)``; noise common to the axes ``n / 2
+sum of rho^2``.
 
-In the noise of a real recording (`World.own`) the same counts against what was measured of it: S(f) is its own spectrum, lines included; a
-change of the level, which counts as far as white noise makes part of each band, stands beside what the level wanders by itself; and what
-axes share is that much less of what each has.
+In the noise of a real recording (`World.own`) the same counts against what was measured of it: S(f)
+is its own spectrum, lines included; a change of the level, which counts as far as white noise makes
+part of each band, stands beside what the level wanders by itself; and what axes share is that much
+less of what each has.
 """
 
 from __future__ import annotations
@@ -54,7 +57,11 @@ def mean_size(world: World, mean: Array, *, white: bool = False) -> float:
     nats = 0.0
     for axis, f, power in _mean_lines(world, mean):
         noise = world.noise[axis]
-        density = floor_psd(f, noise={"N": noise["N"]}, rate=world.rate) if white else line_density_of(world, axis=axis)
+        density = (
+            floor_psd(f, noise={"N": noise["N"]}, rate=world.rate)
+            if white
+            else line_density_of(world, axis=axis)
+        )
         nats += 0.5 * float((power / density).sum())
     return math.sqrt(nats / NATS)
 
@@ -72,7 +79,9 @@ def band_density(world: World, *, bands: int = BANDS) -> Array:
     if world.own is not None:
         return world.own.level
     f = (np.arange(bands) + 0.5) * world.rate / 2 / bands
-    return np.stack([floor_psd(f, noise={k: n[k] for k in "NQ"}, rate=world.rate) for n in world.noise])
+    return np.stack(
+        [floor_psd(f, noise={k: n[k] for k in "NQ"}, rate=world.rate) for n in world.noise]
+    )
 
 
 def _mean_lines(world: World, mean: Array) -> Iterator[tuple[int, Array, Array]]:
@@ -91,15 +100,19 @@ def _mean_lines(world: World, mean: Array) -> Iterator[tuple[int, Array, Array]]
 def learned_gain(world: World, mean: Array) -> float:
     """Expected log-likelihood [nats] of a known mean (axis, time) over noise that is fitted to the same record without it.
 
-    Angle random walk, bias instability and rate random walk of each axis are what suits best where the mean is taken for noise: a slow
-    mean is worth a part only of what it is where the noise is known beforehand.
+    Angle random walk, bias instability and rate random walk of each axis are what suits best where
+    the mean is taken for noise: a slow mean is worth a part only of what it is where the noise is
+    known beforehand.
 
     Parameters
     ----------
     world : World
     mean : ndarray, shape (axis, time)
     """
-    return sum(_learned(f, power, world.noise[axis], world.rate) for axis, f, power in _mean_lines(world, mean))
+    return sum(
+        _learned(f, power, world.noise[axis], world.rate)
+        for axis, f, power in _mean_lines(world, mean)
+    )
 
 
 def _learned(f: Array, power: Array, noise: dict[str, float], rate: float) -> float:
@@ -109,7 +122,10 @@ def _learned(f: Array, power: Array, noise: dict[str, float], rate: float) -> fl
     f, power = (np.add.reduceat(values, first) / count for values in (f, power))
     known = floor_psd(f, noise=noise, rate=rate)
     alone = np.stack(
-        [floor_psd(f, noise={"Q": noise.get("Q", 0.0)}, rate=rate), *(floor_psd(f, noise={one: 1.0}, rate=rate) for one in "NBK")]
+        [
+            floor_psd(f, noise={"Q": noise.get("Q", 0.0)}, rate=rate),
+            *(floor_psd(f, noise={one: 1.0}, rate=rate) for one in "NBK"),
+        ]
     )
 
     def apart(logarithms: Array) -> float:
@@ -117,9 +133,18 @@ def _learned(f: Array, power: Array, noise: dict[str, float], rate: float) -> fl
         return 0.5 * float((count * (ratio * (1 + power / known) - 1 - np.log(ratio))).sum())
 
     white = known[-1] / alone[1, -1]
-    meets = [known[place] / alone[2:, place] for place in range(0, f.size, max(1, f.size // 4))]  # either is as loud as all that is known
-    starts = [np.log([white, *np.where(chosen, level, level * 1e-3)]) for level in meets for chosen in ([True, False], [False, True])]
-    found = [minimize(apart, start, method="Nelder-Mead", options={"maxiter": 400}).fun for start in starts]
+    meets = [
+        known[place] / alone[2:, place] for place in range(0, f.size, max(1, f.size // 4))
+    ]  # either is as loud as all that is known
+    starts = [
+        np.log([white, *np.where(chosen, level, level * 1e-3)])
+        for level in meets
+        for chosen in ([True, False], [False, True])
+    ]
+    found = [
+        minimize(apart, start, method="Nelder-Mead", options={"maxiter": 400}).fun
+        for start in starts
+    ]
     return float(max(0.0, min(found)))
 
 
@@ -136,8 +161,9 @@ def variance_size(world: World, ratio: Array) -> float:
     ----------
     world : World
     ratio : ndarray, shape (axis, second) or (axis, second, frequency)
-        Density with the effect over density without; frequencies share (0, rate / 2) equally. A second axis of length 1 stands for a
-        change that lasts all the time and is then compared with no change; else with its own mean over time.
+        Density with the effect over density without; frequencies share (0, rate / 2) equally. A
+        second axis of length 1 stands for a change that lasts all the time and is then compared
+        with no change; else with its own mean over time.
 
     Returns
     -------
@@ -148,7 +174,9 @@ def variance_size(world: World, ratio: Array) -> float:
     change = np.log(ratio)
     weight = _weights(world, ratio)
     if ratio.shape[1] > 1:
-        change = change - (change * weight).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
+        change = change - (change * weight).sum(axis=1, keepdims=True) / weight.sum(
+            axis=1, keepdims=True
+        )
     else:
         weight = weight.sum(axis=1, keepdims=True)
     return math.sqrt(float((weight * change**2).sum()) / 4 / NATS)
@@ -158,7 +186,9 @@ def _own_nats(world: World, ratio: Array) -> float:
     """Of a change that lasts for a part of the time, in real noise [nats]."""
     assert world.own is not None
     if ratio.shape[1] == 1:
-        raise OptionError("what a change for good is worth in real noise nobody knows: it is there in the untouched recording too")
+        raise OptionError(
+            "what a change for good is worth in real noise nobody knows: it is there in the untouched recording too"
+        )
     if ratio.ndim == 2:  # noise can only be added, and is white
         white = np.array([white_level(noise["N"]) ** 2 for noise in world.noise])
         more = ratio / ratio.min(axis=1, keepdims=True) - 1
@@ -170,7 +200,8 @@ def _own_nats(world: World, ratio: Array) -> float:
 def variance_gain(world: World, ratio: Array, *, quiet: bool = True) -> float:
     """Expected log-likelihood [nats] of the truth over noise without the effect, for the `ratio` of `variance_size`.
 
-    Without `quiet` times, in which the noise could be seen without the effect, it is compared with the mean level instead.
+    Without `quiet` times, in which the noise could be seen without the effect, it is compared with
+    the mean level instead.
     """
     if world.own is not None:
         return _own_nats(world, ratio)
@@ -178,7 +209,9 @@ def variance_gain(world: World, ratio: Array, *, quiet: bool = True) -> float:
     if ratio.shape[1] == 1:
         weight = weight.sum(axis=1, keepdims=True)
     elif not quiet:
-        ratio = ratio * weight.sum(axis=1, keepdims=True) / (ratio * weight).sum(axis=1, keepdims=True)
+        ratio = (
+            ratio * weight.sum(axis=1, keepdims=True) / (ratio * weight).sum(axis=1, keepdims=True)
+        )
     return float((weight * (ratio - 1 - np.log(ratio))).sum()) / 2
 
 
@@ -193,7 +226,9 @@ def shared_size(world: World, correlations: Array, *, band: float = 1.0) -> floa
     return math.sqrt(n * float(worth.sum()) / 2 / NATS)
 
 
-def amplitude_for(size_of: Callable[[float], float], strength: float, *, first: float = 1.0) -> float:
+def amplitude_for(
+    size_of: Callable[[float], float], strength: float, *, first: float = 1.0
+) -> float:
     """Amplitude at which a growing `size_of` reaches `strength`, to 0.1 %.
 
     Examples

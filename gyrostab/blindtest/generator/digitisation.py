@@ -59,11 +59,15 @@ def dead_zone(world: World, rng: np.random.Generator, *, strength: float) -> Eff
     axis = int(rng.integers(3))
     number = _stuck(strength)
     there = float((~world.missing).sum())
-    width = number / there * _sample_sd(world, axis) * math.sqrt(math.pi / 2)  # so many normal samples lie within +- width
+    width = (
+        number / there * _sample_sd(world, axis) * math.sqrt(math.pi / 2)
+    )  # so many normal samples lie within +- width
 
     def after(record: Array) -> Array:
         out = record.copy()
-        out[axis] = loop.dead_zone(record[axis] - np.nanmean(np.where(world.missing, np.nan, record[axis])), width=width)
+        out[axis] = loop.dead_zone(
+            record[axis] - np.nanmean(np.where(world.missing, np.nan, record[axis])), width=width
+        )
         return out
 
     return Effect(
@@ -89,11 +93,17 @@ def clipping(world: World, rng: np.random.Generator, *, strength: float) -> Effe
     def after(record: Array) -> Array:
         out = record.copy()
         row = np.where(world.missing, np.nan, record[axis])
-        ends = np.nanquantile(row, [number / 2 / row.size, 1 - number / (2 if both else 1) / row.size])
+        ends = np.nanquantile(
+            row, [number / 2 / row.size, 1 - number / (2 if both else 1) / row.size]
+        )
         low = ends[0] if both else -np.inf
         if soft:  # the last tenth of a standard deviation before the stop is squeezed
             knee = 0.1 * _sample_sd(world, axis)
-            row = np.where(row > ends[1] - knee, ends[1] - knee / 2 + (row - ends[1] + knee) / 2 - knee / 2, row)
+            row = np.where(
+                row > ends[1] - knee,
+                ends[1] - knee / 2 + (row - ends[1] + knee) / 2 - knee / 2,
+                row,
+            )
         out[axis] = np.clip(row, low, ends[1])
         return out
 

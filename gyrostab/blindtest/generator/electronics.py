@@ -15,7 +15,14 @@ from gyrostab.blindtest.generator.detection_limits import NATS, shared_size
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, World, to_samples
-from gyrostab.blindtest.generator.shapes import by_axis, following, mean_effect, named, on_axes, variance_effect
+from gyrostab.blindtest.generator.shapes import (
+    by_axis,
+    following,
+    mean_effect,
+    named,
+    on_axes,
+    variance_effect,
+)
 
 __all__ = [
     "bias_jump", "feedback_reset", "held_samples", "logger_filter", "shared_source", "spectral_line", "spikes", "supply_bias",
@@ -30,7 +37,9 @@ def spectral_line(world: World, rng: np.random.Generator, *, strength: float) ->
     wander = rng.random() < 0.5
     phase = 2 * math.pi * frequency * np.arange(world.size) / world.rate
     if wander:
-        phase = phase + np.cumsum(rng.normal(0, math.sqrt(1.0 / (world.seconds * world.rate)), world.size))
+        phase = phase + np.cumsum(
+            rng.normal(0, math.sqrt(1.0 / (world.seconds * world.rate)), world.size)
+        )
     shares = on_axes(rng)
     effect = mean_effect(
         world,
@@ -42,7 +51,12 @@ def spectral_line(world: World, rng: np.random.Generator, *, strength: float) ->
         form="sine with a phase that wanders by a radian" if wander else "sine",
         differs=wander,
         tau=(max(1 / world.rate, 0.1 / frequency), 2 / frequency),
-        parameters={"frequency": {"value": (phase[-1] - phase[0]) / (2 * math.pi * (world.seconds - 1 / world.rate)), "unit": "Hz"}},
+        parameters={
+            "frequency": {
+                "value": (phase[-1] - phase[0]) / (2 * math.pi * (world.seconds - 1 / world.rate)),
+                "unit": "Hz",
+            }
+        },
     )
     amplitude = float(effect.parameters["peak"]["value"])
     effect.parameters["amplitude"] = {"values": by_axis(np.abs(shares), amplitude), "unit": "deg/h"}
@@ -66,9 +80,18 @@ def supply_bias(world: World, rng: np.random.Generator, *, strength: float) -> E
         regressor=("voltage", to_samples(world, v), "deg/h/V"),
     )
     if slow and effect.mean is not None:  # the diagnosis follows a voltage with a lag, straight
-        found = {axis: following(world, effect.mean[AXES.index(axis)], v, axis=AXES.index(axis)) for axis in effect.axes}
-        effect.parameters["voltage"] = {"values": {axis: slope for axis, (slope, _) in found.items()}, "unit": "deg/h/V"}
-        effect.parameters["lag"] = {"values": {axis: late for axis, (_, late) in found.items()}, "unit": "s"}
+        found = {
+            axis: following(world, effect.mean[AXES.index(axis)], v, axis=AXES.index(axis))
+            for axis in effect.axes
+        }
+        effect.parameters["voltage"] = {
+            "values": {axis: slope for axis, (slope, _) in found.items()},
+            "unit": "deg/h/V",
+        }
+        effect.parameters["lag"] = {
+            "values": {axis: late for axis, (_, late) in found.items()},
+            "unit": "s",
+        }
     return effect
 
 
@@ -97,7 +120,9 @@ def feedback_reset(world: World, rng: np.random.Generator, *, strength: float) -
     """A ramp that falls back by not quite 2 pi: the loop needs a share of the ramp to forget it."""
     rate = rng.uniform(0.3, 1.0) * min(15.0, 15.0 * world.rate / 8)
     axis = int(rng.integers(3))
-    wander = 1 + 0.02 * np.sin(2 * math.pi * np.arange(world.size) / world.rate / rng.uniform(100, 900))
+    wander = 1 + 0.02 * np.sin(
+        2 * math.pi * np.arange(world.size) / world.rate / rng.uniform(100, 900)
+    )
     phase = loop.ramp_phase(rate * wander, dt=1 / world.rate, first=rng.random())
     settle = rng.uniform(0.03, 0.25)
     shares = np.zeros(3)
@@ -119,7 +144,9 @@ def feedback_reset(world: World, rng: np.random.Generator, *, strength: float) -
 
 
 def _low_passed(rng: np.random.Generator, size: int, *, corner: float) -> Array:
-    lines = fft.rfft(rng.standard_normal(size)) / np.sqrt(1 + (np.arange(size // 2 + 1) / (corner * size / 2)) ** 4)
+    lines = fft.rfft(rng.standard_normal(size)) / np.sqrt(
+        1 + (np.arange(size // 2 + 1) / (corner * size / 2)) ** 4
+    )
     common = fft.irfft(lines, size)
     return np.asarray(common / common.std())
 
@@ -140,7 +167,9 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
     pairs = np.array([shares[0] * shares[1], shares[0] * shares[2], shares[1] * shares[2]])
     rho = min(strength / shared_size(world, pairs), 0.8)
     shares = shares * math.sqrt(rho)
-    common = _low_passed(rng, world.size, corner=corner) if coloured else rng.standard_normal(world.size)
+    common = (
+        _low_passed(rng, world.size, corner=corner) if coloured else rng.standard_normal(world.size)
+    )
     below = _level_below(corner) if coloured else 1.0
     own = np.stack([rng.standard_normal(world.size) for _ in AXES])
     size = shared_size(world, rho * pairs)
@@ -148,7 +177,9 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
         name="shared_source",
         axes=named(shares),
         driver=None,
-        form=f"common noise low-passed at {corner:.2f} of Nyquist" if coloured else "white common noise",
+        form=f"common noise low-passed at {corner:.2f} of Nyquist"
+        if coloured
+        else "white common noise",
         differs=coloured,
         size=size,
         nats=NATS * size**2,
@@ -158,7 +189,11 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
         parameters={
             "correlation": {"value": float(np.abs(rho * pairs).max()), "unit": "1"},
             "N": {
-                "values": {a: abs(float(r)) * n["N"] * below for a, r, n in zip(AXES, shares, world.noise, strict=True) if r},
+                "values": {
+                    a: abs(float(r)) * n["N"] * below
+                    for a, r, n in zip(AXES, shares, world.noise, strict=True)
+                    if r
+                },
                 "unit": "deg/sqrt(h)",
             },
         },
@@ -171,14 +206,20 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
 
     def taps(a: float) -> Array:
         a = min(a, 0.45)
-        return {"three": np.array([a / 2, 1 - a, a / 2]), "pole": (1 - a) * a ** np.arange(25), "mean": np.array([1 - a, a])}[kind]
+        return {
+            "three": np.array([a / 2, 1 - a, a / 2]),
+            "pole": (1 - a) * a ** np.arange(25),
+            "mean": np.array([1 - a, a]),
+        }[kind]
 
     f = (np.arange(200) + 0.5) / 200 * math.pi
 
     def ratio(a: float) -> Array:
         response = np.exp(-1j * f[:, None] * np.arange(taps(a).size)) @ taps(a)
         gain = np.maximum(np.abs(response) ** 2, 1e-12)
-        return np.asarray(np.tile(gain / np.exp(np.log(gain).mean()), (3, 1, 1)))  # nobody knows the level before the filter
+        return np.asarray(
+            np.tile(gain / np.exp(np.log(gain).mean()), (3, 1, 1))
+        )  # nobody knows the level before the filter
 
     effect, amplitude = variance_effect(
         world,
@@ -187,7 +228,11 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
         name="logger_filter",
         axes=AXES,
         driver=None,
-        form={"three": "three weights", "pole": "one pole", "mean": "mean of two neighbours, unequal"}[kind],
+        form={
+            "three": "three weights",
+            "pole": "one pole",
+            "mean": "mean of two neighbours, unequal",
+        }[kind],
         differs=kind != "pole",
         first=1e-4,
         tau=(1 / world.rate, 10 / world.rate),
@@ -200,13 +245,21 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
 
     parameters = {"weight": {"value": amplitude, "unit": "1"}}
     if kind == "pole":
-        parameters["cutoff"] = {"value": -math.log(min(amplitude, 0.45)) * world.rate / (2 * math.pi), "unit": "Hz", "unless": ["length"]}
+        parameters["cutoff"] = {
+            "value": -math.log(min(amplitude, 0.45)) * world.rate / (2 * math.pi),
+            "unit": "Hz",
+            "unless": ["length"],
+        }
     return replace(effect, after=after, parameters=parameters)
 
 
 def _sample_sd(world: World, axis: int) -> float:
     own = world.own
-    return white_level(world.noise[axis]["N"]) * math.sqrt(world.rate) if own is None else float(own.jump[axis])
+    return (
+        white_level(world.noise[axis]["N"]) * math.sqrt(world.rate)
+        if own is None
+        else float(own.jump[axis])
+    )
 
 
 def spikes(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -222,7 +275,9 @@ def spikes(world: World, rng: np.random.Generator, *, strength: float) -> Effect
     def after(record: Array) -> Array:
         out = record.copy()
         gone = np.where(world.missing, np.nan, record[axis])
-        flipped, where = telemetry.flip_bits(np.random.default_rng(seed), gone, number=number, lsb=lsb, bit=12)
+        flipped, where = telemetry.flip_bits(
+            np.random.default_rng(seed), gone, number=number, lsb=lsb, bit=12
+        )
         out[axis, where] = flipped[where]
         return out
 
@@ -251,10 +306,19 @@ def held_samples(world: World, rng: np.random.Generator, *, strength: float) -> 
     number = max(1, min(round(NATS / math.log(1e3) * strength**2) + 1, world.size // frame // 8))
     seed = int(rng.integers(2**31))
     pairs = number * (frame if hold else 1)
-    seen = telemetry.repeat_frames(np.random.default_rng(seed), np.zeros((1, world.size)), number=number, frame=frame, hold=hold)[1]
+    seen = telemetry.repeat_frames(
+        np.random.default_rng(seed),
+        np.zeros((1, world.size)),
+        number=number,
+        frame=frame,
+        hold=hold,
+    )[1]
     seen = seen[~world.missing[seen]]
     hours = float((~world.missing).sum()) / world.rate / 3600.0
-    held = {"per_hour": {"value": seen.size / hours, "unit": "1/h"}, "length": {"value": frame / world.rate, "unit": "s"}}
+    held = {
+        "per_hour": {"value": seen.size / hours, "unit": "1/h"},
+        "length": {"value": frame / world.rate, "unit": "s"},
+    }
     return Effect(
         name="held_samples",
         axes=AXES,
@@ -264,6 +328,12 @@ def held_samples(world: World, rng: np.random.Generator, *, strength: float) -> 
         size=strength,
         nats=float(pairs) * math.log(1e3),
         tau=(1 / world.rate, 2 * frame / world.rate),
-        after=lambda record: telemetry.repeat_frames(np.random.default_rng(seed), record, number=number, frame=frame, hold=hold)[0],
-        parameters={"number": {"value": int(seen.size), "unit": "1"}, "frame": {"value": frame, "unit": "1"}} | (held if hold else {}),
+        after=lambda record: telemetry.repeat_frames(
+            np.random.default_rng(seed), record, number=number, frame=frame, hold=hold
+        )[0],
+        parameters={
+            "number": {"value": int(seen.size), "unit": "1"},
+            "frame": {"value": frame, "unit": "1"},
+        }
+        | (held if hold else {}),
     )

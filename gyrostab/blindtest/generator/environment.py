@@ -60,10 +60,14 @@ def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False
             slopes[edges[k] : edges[k + 1]] = turn * per_minute / 60.0
             turn = -turn
     limit = 60.0 / max(60.0, float(np.ptp(np.cumsum(slopes))))  # a day of ramps stays below 60 K
-    return np.asarray(lag(rng.uniform(30, 70) + np.cumsum(slopes) * limit, rng.uniform(20, 120)) + wander)
+    return np.asarray(
+        lag(rng.uniform(30, 70) + np.cumsum(slopes) * limit, rng.uniform(20, 120)) + wander
+    )
 
 
-def shaking(rng: np.random.Generator, seconds: float, *, bursts: int, longest: float = 600.0) -> tuple[Array, NDArray[np.bool_]]:
+def shaking(
+    rng: np.random.Generator, seconds: float, *, bursts: int, longest: float = 600.0
+) -> tuple[Array, NDArray[np.bool_]]:
     """Root mean square of the acceleration [g], one value a second, and where it is in a burst.
 
     Parameters
@@ -92,8 +96,12 @@ def shaking(rng: np.random.Generator, seconds: float, *, bursts: int, longest: f
         length = min(rng.uniform(0.15, 0.55) * part, longest)
         begin = k * part + rng.uniform(0.1, 0.9) * (part - length)
         edge = rng.uniform(1, 8)
-        shape = 1 / (1 + np.exp(np.clip((np.abs(t - begin - length / 2) - length / 2) / edge * 4, -50, 50)))
-        level = level + rng.uniform(1.5, 10) * shape * np.exp(0.15 * lag(rng.normal(0, 3, size), 10.0))
+        shape = 1 / (
+            1 + np.exp(np.clip((np.abs(t - begin - length / 2) - length / 2) / edge * 4, -50, 50))
+        )
+        level = level + rng.uniform(1.5, 10) * shape * np.exp(
+            0.15 * lag(rng.normal(0, 3, size), 10.0)
+        )
         busy |= shape > 0.5
     return np.asarray(level), busy
 
@@ -154,5 +162,7 @@ def sense(
     >>> bool(np.allclose(seen / 0.0625, np.rint(seen / 0.0625)))
     True
     """
-    seen = lag(values, tau, dt=dt) * (1 + relative * rng.standard_normal(values.size)) + noise * rng.standard_normal(values.size)
+    seen = lag(values, tau, dt=dt) * (
+        1 + relative * rng.standard_normal(values.size)
+    ) + noise * rng.standard_normal(values.size)
     return np.asarray(np.rint(seen / lsb) * lsb if lsb else seen)

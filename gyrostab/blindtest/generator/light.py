@@ -17,7 +17,12 @@ LIGHT_SPEED = 299_792_458.0
 
 
 def detector_psd(
-    power: Array, *, responsivity: float = 0.9, load: float = 50e3, temperature: float = 300.0, rin: float = 1e-12
+    power: Array,
+    *,
+    responsivity: float = 0.9,
+    load: float = 50e3,
+    temperature: float = 300.0,
+    rin: float = 1e-12,
 ) -> dict[str, Array]:
     """One-sided spectral densities [A2/Hz] of the current of a detector under `power` [W].
 
@@ -56,7 +61,8 @@ def detector_psd(
 def relative_psd(power: Array, *, depth: float = 0.75 * math.pi, **detector: float) -> Array:
     """Spectral density of the phase noise [rad2/Hz], one-sided, of an interferometer biased at phase `depth` [rad].
 
-    The signal is ``P (1 + cos(phase))``, so the slope is ``P sin(depth)`` and the light that reaches the detector ``P (1 + cos(depth))``.
+    The signal is ``P (1 + cos(phase))``, so the slope is ``P sin(depth)`` and the light that
+    reaches the detector ``P (1 + cos(depth))``.
 
     Examples
     --------
@@ -70,7 +76,14 @@ def relative_psd(power: Array, *, depth: float = 0.75 * math.pi, **detector: flo
     return np.asarray(total / slope**2)
 
 
-def rate_noise(power: Array, *, diameter: float = 0.04, length: float = 500.0, wavelength: float = 1.55e-6, **detector: float) -> Array:
+def rate_noise(
+    power: Array,
+    *,
+    diameter: float = 0.04,
+    length: float = 500.0,
+    wavelength: float = 1.55e-6,
+    **detector: float,
+) -> Array:
     """White level N_s of the rate [deg/h per root Hz, two-sided] at light power [W].
 
     Examples
@@ -84,7 +97,13 @@ def rate_noise(power: Array, *, diameter: float = 0.04, length: float = 500.0, w
 
 
 def loss_db(
-    temperature: Array, hours: Array, *, per_kelvin: float, curvature: float = 0.0, per_hour: float = 0.0, power: float = 1.0
+    temperature: Array,
+    hours: Array,
+    *,
+    per_kelvin: float,
+    curvature: float = 0.0,
+    per_hour: float = 0.0,
+    power: float = 1.0,
 ) -> Array:
     """Light lost [dB], by temperature [degC] about 40 degC and by age [h] to a `power`.
 
@@ -94,7 +113,9 @@ def loss_db(
     0.4
     """
     warm = np.asarray(temperature) - 40.0
-    return np.asarray(per_kelvin * warm + curvature * warm**2 + per_hour * np.asarray(hours) ** power)
+    return np.asarray(
+        per_kelvin * warm + curvature * warm**2 + per_hour * np.asarray(hours) ** power
+    )
 
 
 def share_source(own: Array, common: Array, *, shares: Array) -> Array:
@@ -107,7 +128,8 @@ def share_source(own: Array, common: Array, *, shares: Array) -> Array:
     common : ndarray, shape (time,)
         Noise of the source, of unit variance.
     shares : ndarray, shape (axis,)
-        Correlation of each axis with the source, between -1 and 1; the sign is that of its modulation.
+        Correlation of each axis with the source, between -1 and 1; the sign is that of its
+        modulation.
 
     Examples
     --------

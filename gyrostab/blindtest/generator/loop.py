@@ -12,7 +12,9 @@ __all__ = ["dead_zone", "ramp_phase", "reset_error", "reset_frequency"]
 Array = NDArray[np.float64]
 
 
-def reset_frequency(rate: Array, *, diameter: float = 0.04, index: float = 1.45, wavelength: float = 1.55e-6) -> Array:
+def reset_frequency(
+    rate: Array, *, diameter: float = 0.04, index: float = 1.45, wavelength: float = 1.55e-6
+) -> Array:
     """Resets of the ramp per second [Hz] at a rotation rate [deg/h]: ``D w / (n lambda)``.
 
     Examples

@@ -1,7 +1,7 @@
 """The noise of a real recording, measured on itself, as far as limits need it: no five terms describe it.
 
-Its spectrum at every line, with all its slopes, filters and lines; how loud it typically is in each band; how much that level wanders by
-itself in time; and how far its wildest sample jumps out.
+Its spectrum at every line, with all its slopes, filters and lines; how loud it typically is in each
+band; how much that level wanders by itself in time; and how far its wildest sample jumps out.
 """
 
 from __future__ import annotations
@@ -26,9 +26,19 @@ BANDS = 24
 _SAMPLES = 6 * BANDS  # of a block, at least
 _WIDE = 33  # lines that are averaged
 _LOW = 128  # lines that the slope of the slow noise is fitted to
-#: White, flicker and random walk from which the fit of the slope starts, times the level: one loud line can make more than one best fit.
-_STARTS = ((1.0, 1e-2, 1e-2), (1.0, 10.0, 1e-2), (1.0, 1e-2, 100.0), (1e-2, 10.0, 1e-2), (1e-2, 1e-2, 100.0))
-_ROUNDS, _ENOUGH = 100, 1e-9  # of the fit of the slope, at most; and nats that a round brings at least
+#: White, flicker and random walk from which the fit of the slope starts, times the level: one loud
+#: line can make more than one best fit.
+_STARTS = (
+    (1.0, 1e-2, 1e-2),
+    (1.0, 10.0, 1e-2),
+    (1.0, 1e-2, 100.0),
+    (1e-2, 10.0, 1e-2),
+    (1e-2, 1e-2, 100.0),
+)
+_ROUNDS, _ENOUGH = (
+    100,
+    1e-9,
+)  # of the fit of the slope, at most; and nats that a round brings at least
 _STEPS = 0.5 ** np.arange(20.0)
 _LOST = 0.5  # of two blocks, at most
 _LINES = 1.94  # neighbouring lines whose powers say as much as one, behind a Hann window
@@ -38,9 +48,11 @@ _LINES = 1.94  # neighbouring lines whose powers say as much as one, behind a Ha
 class OwnNoise:
     """Noise of a real recording.
 
-    `lines` (axis, line) is its two-sided density [(deg/h)2/Hz] at the frequencies ``k rate / (2 size)``, k from 1; `level` (axis, band)
-    that in `BANDS` bands, typical in time; `logs` (axis, block, band) the logarithm of the power about blocks of `block` samples over it,
-    NaN where too much is lost; `jump` (axis,) [deg/h] the standard deviation that a single odd sample has to stand out of.
+    `lines` (axis, line) is its two-sided density [(deg/h)2/Hz] at the frequencies ``k rate / (2
+    size)``, k from 1; `level` (axis, band) that in `BANDS` bands, typical in time; `logs` (axis,
+    block, band) the logarithm of the power about blocks of `block` samples over it, NaN where too
+    much is lost; `jump` (axis,) [deg/h] the standard deviation that a single odd sample has to
+    stand out of.
     """
 
     rate: float
@@ -70,7 +82,8 @@ class OwnNoise:
         Returns
         -------
         float
-            Expected log-likelihood [nats], by the weights of the bands that are best where the level does not wander.
+            Expected log-likelihood [nats], by the weights of the bands that are best where the
+            level does not wander.
         """
         there = np.isfinite(self.logs[axis]).all(axis=1)
         change = change[there] - change[there].mean(axis=0)
@@ -81,14 +94,17 @@ class OwnNoise:
         weight = gain / float((gain**2).sum())
         size, wander = change @ weight, self.logs[axis][there] @ weight
         rate = self.rate / self.block
-        density = np.maximum(line_density(wander, rate=rate), 2.0 / (samples * float((gain**2).sum())) / rate)
+        density = np.maximum(
+            line_density(wander, rate=rate), 2.0 / (samples * float((gain**2).sum())) / rate
+        )
         return 0.5 * float((fft.dct(size, norm="ortho")[1:] ** 2 / rate / density).sum())
 
 
 def line_density(values: Array, *, rate: float) -> Array:
     """Two-sided density [unit2/Hz] of values (time,) at the frequencies ``k rate / (2 size)``, k from 1 to size - 1.
 
-    The mean of `_WIDE` lines about each, of what the lines are over a slope that is fitted to the slowest: white, flicker and random walk.
+    The mean of `_WIDE` lines about each, of what the lines are over a slope that is fitted to the
+    slowest: white, flicker and random walk.
 
     Examples
     --------
@@ -100,7 +116,9 @@ def line_density(values: Array, *, rate: float) -> Array:
     filled = np.where(there, values - values[there].mean(), 0.0)
     lines = fft.dct(filled, norm="ortho")[1:] ** 2 / (rate * there.mean())
     slope = _slope(lines[:_LOW])(np.arange(1.0, values.size))
-    return np.asarray(slope * uniform_filter1d(lines / slope, min(_WIDE, lines.size), mode="reflect"))
+    return np.asarray(
+        slope * uniform_filter1d(lines / slope, min(_WIDE, lines.size), mode="reflect")
+    )
 
 
 def _slope(lines: Array) -> Callable[[Array], Array]:
@@ -115,7 +133,8 @@ def _slope(lines: Array) -> Callable[[Array], Array]:
 def _suited(power: Array, shapes: Array, size: Array) -> Array:
     """Sizes of terms, none below zero, that suit powers best as seen from a start.
 
-    By Fisher scoring: least squares with the weights of the density found before, and a shorter step where the whole one is no better.
+    By Fisher scoring: least squares with the weights of the density found before, and a shorter
+    step where the whole one is no better.
     """
     density = shapes @ size
     misfit = _misfit(power, density)
@@ -152,7 +171,9 @@ def _block_powers(values: Array, *, rate: float, block: int) -> Array:
     mean = np.nansum(cut, axis=1, keepdims=True) / np.maximum(there.sum(axis=1, keepdims=True), 1)
     window = signal.windows.hann(2 * block, sym=False)
     weight = (there * window**2).sum(axis=1, keepdims=True)
-    lines = np.abs(fft.rfft(np.where(there, (cut - mean) * window, 0.0), axis=1)[:, 1:-1]) ** 2 / (rate * np.maximum(weight, 1e-9))
+    lines = np.abs(fft.rfft(np.where(there, (cut - mean) * window, 0.0), axis=1)[:, 1:-1]) ** 2 / (
+        rate * np.maximum(weight, 1e-9)
+    )
     edges = np.linspace(0, block - 1, BANDS + 1).astype(int)
     power = np.add.reduceat(lines, edges[:-1], axis=1) / np.diff(edges)
     return np.where(there.mean(axis=1, keepdims=True) > _LOST, np.maximum(power, 1e-300), np.nan)
@@ -191,7 +212,11 @@ def own_noise(record: Array, *, rate: float, axes: int | None = None) -> OwnNois
     lines = np.stack([line_density(row, rate=rate) for row in record])
     powers = np.log(np.stack([_block_powers(row, rate=rate, block=block) for row in record]))
     half = block / BANDS / _LINES  # a mean of so many pairs of squares has a median below its mean
-    typical = np.nanmedian(powers, axis=1, keepdims=True) - math.log(float(special.gammaincinv(half, 0.5)) / half)
+    typical = np.nanmedian(powers, axis=1, keepdims=True) - math.log(
+        float(special.gammaincinv(half, 0.5)) / half
+    )
     jump = np.array([_jump(row, own, rate=rate) for row, own in zip(record, lines, strict=True)])
     of = np.r_[0 : len(record), np.zeros(max(0, (axes or 0) - len(record)), dtype=int)]
-    return OwnNoise(rate, lines[of], np.exp(typical[of, 0]), (powers - typical)[of], block, jump[of])
+    return OwnNoise(
+        rate, lines[of], np.exp(typical[of, 0]), (powers - typical)[of], block, jump[of]
+    )

@@ -15,9 +15,23 @@ from gyrostab.blindtest.generator.detection_limits import band_density
 from gyrostab.blindtest.generator.measured_noise import BANDS
 from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, QUICK, Effect, World, to_samples
-from gyrostab.blindtest.generator.shapes import by_axis, mean_effect, named, on_axes, variance_effect
+from gyrostab.blindtest.generator.shapes import (
+    by_axis,
+    mean_effect,
+    named,
+    on_axes,
+    variance_effect,
+)
 
-__all__ = ["aliased_vibration", "earth_rate", "misalignment", "rotation_line", "scale_factor", "vibration_noise", "vibration_rectification"]
+__all__ = [
+    "aliased_vibration",
+    "earth_rate",
+    "misalignment",
+    "rotation_line",
+    "scale_factor",
+    "vibration_noise",
+    "vibration_rectification",
+]
 
 Array = NDArray[np.float64]
 
@@ -48,15 +62,29 @@ def _spans(active: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _shaken(
-    world: World, rng: np.random.Generator, share: float, *, band: tuple[float, float], mount: tuple[Array, Array], kind: str
+    world: World,
+    rng: np.random.Generator,
+    share: float,
+    *,
+    band: tuple[float, float],
+    mount: tuple[Array, Array],
+    kind: str,
 ) -> Array:
     """Angular shaking of one axis (time,) for 1 deg/h per g of rms, made at `vibration.FAST` where it shakes and logged."""
     out = np.zeros(world.size)
     for begin, end in _spans(world.busy) if share else []:
         first, last = round(begin * world.rate), min(round(end * world.rate), world.size)
-        fast = vibration.band_noise(rng, round((last - first) * vibration.FAST / world.rate), low=band[0], high=band[1])
-        level = np.interp(np.arange(fast.size) / vibration.FAST + first / world.rate, np.arange(world.vibration.size), world.vibration)
-        logged = vibration.decimate(np.asarray(lfilter(*mount, fast * level)), rate=world.rate, kind=kind)
+        fast = vibration.band_noise(
+            rng, round((last - first) * vibration.FAST / world.rate), low=band[0], high=band[1]
+        )
+        level = np.interp(
+            np.arange(fast.size) / vibration.FAST + first / world.rate,
+            np.arange(world.vibration.size),
+            world.vibration,
+        )
+        logged = vibration.decimate(
+            np.asarray(lfilter(*mount, fast * level)), rate=world.rate, kind=kind
+        )
         out[first:last] = share * logged[: last - first]
     return out
 
@@ -74,7 +102,9 @@ def _shaking_noise(
 ) -> Effect:
     shares = on_axes(rng, alone=0.4)
     f = (np.arange(BANDS) + 0.5) * world.rate / 2 / BANDS
-    density = vibration.folded_psd(f, rate=world.rate, kind=kind, low=band[0], high=band[1], mount=mount)
+    density = vibration.folded_psd(
+        f, rate=world.rate, kind=kind, low=band[0], high=band[1], mount=mount
+    )
     base = band_density(world)
     power = np.where(world.busy, world.vibration, 0.0) ** 2
     unit = shares[:, None, None] ** 2 * power[None, :, None] * (density / base)[:, None, :]
@@ -90,11 +120,22 @@ def _shaking_noise(
         first=1e-3,
         active=world.busy,
     )
-    extra = np.stack([amplitude * _shaken(world, rng, share, band=band, mount=mount, kind=kind) for share in shares])
+    extra = np.stack(
+        [
+            amplitude * _shaken(world, rng, share, band=band, mount=mount, kind=kind)
+            for share in shares
+        ]
+    )
     parameters: dict[str, Any] = {"sensitivity_at_4_khz": {"value": amplitude, "unit": "deg/h/g"}}
     if name == "vibration_noise":  # white noise of the same power is what a flat model should find
-        white = by_axis(np.abs(shares), amplitude * math.sqrt(float(density.mean())) / white_level(1.0))
-        parameters["white"] = {"values": white, "unit": "deg/sqrt(h)/g", "unless": ["quantization", "exponent"]}
+        white = by_axis(
+            np.abs(shares), amplitude * math.sqrt(float(density.mean())) / white_level(1.0)
+        )
+        parameters["white"] = {
+            "values": white,
+            "unit": "deg/sqrt(h)/g",
+            "unless": ["quantization", "exponent"],
+        }
     return replace(effect, extra=extra, parameters=parameters)
 
 
@@ -139,7 +180,9 @@ def aliased_vibration(world: World, rng: np.random.Generator, *, strength: float
 
 def _angle(world: World, rng: np.random.Generator) -> Array:
     """Toolface at the samples [rad]."""
-    return to_samples(world, tool.toolface(world.rotation, dt=QUICK, first=rng.uniform(0, 2 * math.pi)), dt=QUICK)
+    return to_samples(
+        world, tool.toolface(world.rotation, dt=QUICK, first=rng.uniform(0, 2 * math.pi)), dt=QUICK
+    )
 
 
 def _turn_tau(world: World) -> tuple[float, float]:
@@ -148,7 +191,14 @@ def _turn_tau(world: World) -> tuple[float, float]:
 
 
 def _turning(world: World) -> NDArray[np.bool_]:
-    return np.asarray(np.interp(np.arange(world.temperature.size), np.arange(world.rotation.size) * QUICK, world.rotation) > 1.0)
+    return np.asarray(
+        np.interp(
+            np.arange(world.temperature.size),
+            np.arange(world.rotation.size) * QUICK,
+            world.rotation,
+        )
+        > 1.0
+    )
 
 
 def earth_rate(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -166,9 +216,14 @@ def earth_rate(world: World, rng: np.random.Generator, *, strength: float) -> Ef
         tau=_turn_tau(world),
     )
     assert effect.mean is not None
-    across = float(np.hypot(effect.mean[0], effect.mean[1]).max())  # the earth's rate across the tool, of 15.041 deg/h at most
+    across = float(
+        np.hypot(effect.mean[0], effect.mean[1]).max()
+    )  # the earth's rate across the tool, of 15.041 deg/h at most
     if across < tool.EARTH_RATE:
-        effect.parameters["latitude"] = {"value": math.degrees(math.acos(across / tool.EARTH_RATE)), "unit": "deg"}
+        effect.parameters["latitude"] = {
+            "value": math.degrees(math.acos(across / tool.EARTH_RATE)),
+            "unit": "deg",
+        }
     return effect
 
 
@@ -176,7 +231,10 @@ def rotation_line(world: World, rng: np.random.Generator, *, strength: float) ->
     """Harmonics of the turning that wax with its rate."""
     angle, shares = _angle(world, rng), on_axes(rng)
     speed = to_samples(world, world.rotation / world.rotation.max(), dt=QUICK)
-    comb = sum(rng.uniform(0.3, 1.0) * np.sin(k * angle + rng.uniform(0, 6)) for k in (1, 2, 3)[: int(rng.integers(1, 4))])
+    comb = sum(
+        rng.uniform(0.3, 1.0) * np.sin(k * angle + rng.uniform(0, 6))
+        for k in (1, 2, 3)[: int(rng.integers(1, 4))]
+    )
     return mean_effect(
         world,
         np.asarray(comb * speed),
@@ -203,7 +261,9 @@ def scale_factor(world: World, rng: np.random.Generator, *, strength: float) -> 
         strength=strength,
         name="scale_factor",
         driver="rotation_rate",
-        form="linear and cubic in the rotation rate" if bend else "proportional to the rotation rate",
+        form="linear and cubic in the rotation rate"
+        if bend
+        else "proportional to the rotation rate",
         differs=bend,
         active=_turning(world),
         regressor=("linear", to_samples(world, world.rotation, dt=QUICK) * 3600.0 * 1e-6, "ppm"),
@@ -235,5 +295,7 @@ def misalignment(world: World, rng: np.random.Generator, *, strength: float) -> 
     angle = float(rng.uniform(2e-4, 2e-3) * rng.choice([-1.0, 1.0]))
     mean = leak.mean.copy()
     mean[2] = mean[int(np.argmax(np.abs(shares)))] / angle
-    parameters = leak.parameters | {"z": {"values": {AXES[int(np.argmax(shares))]: 1e3 * angle}, "unit": "mrad"}}
+    parameters = leak.parameters | {
+        "z": {"values": {AXES[int(np.argmax(shares))]: 1e3 * angle}, "unit": "mrad"}
+    }
     return replace(leak, mean=mean, parameters=parameters, beside=("real_motion", "scale_factor"))

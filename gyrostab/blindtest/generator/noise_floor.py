@@ -45,7 +45,9 @@ def floor_psd(frequency: Array, *, noise: dict[str, float], rate: float) -> Arra
     )
 
 
-def flicker(rng: np.random.Generator, size: int, *, b: float, rate: float, method: str = "spectrum") -> Array:
+def flicker(
+    rng: np.random.Generator, size: int, *, b: float, rate: float, method: str = "spectrum"
+) -> Array:
     """Bias instability `b` [deg/h]: from its spectrum, or as a sum of many relaxations.
 
     Parameters
@@ -75,9 +77,13 @@ def flicker(rng: np.random.Generator, size: int, *, b: float, rate: float, metho
         return np.asarray(fft.irfft(lines, length)[:size])
     total = np.zeros(size)
     slowest, fastest, per_decade = 4.0 * size / rate, 0.5 / rate, 3
-    times = np.geomspace(fastest, slowest, math.ceil(per_decade * math.log10(slowest / fastest)) + 1)
+    times = np.geomspace(
+        fastest, slowest, math.ceil(per_decade * math.log10(slowest / fastest)) + 1
+    )
     step = math.log(times[1] / times[0])
-    for tau in times:  # equal powers on a logarithmic scale of times make 1/f; one of them adds S = 2 s2 tau / (1 + (w tau)^2)
+    # equal powers on a logarithmic scale of times make 1/f; one of them adds S = 2 s2 tau / (1 + (w
+    # tau)^2)
+    for tau in times:
         sd = math.sqrt(b**2 / (2 * math.pi) * 2 * step)
         keep = math.exp(-1 / (rate * tau))
         shocks = rng.standard_normal(size) * sd * math.sqrt(1 - keep**2)

@@ -22,7 +22,11 @@ def breathing_noise(world: World, rng: np.random.Generator, *, strength: float) 
     """Noise that swells and sinks with a period that nothing else has."""
     period = rng.uniform(0.05, 0.2) * world.seconds
     t = np.arange(world.temperature.size)
-    swell = np.sin(2 * math.pi * t / period + rng.uniform(0, 6) + 0.8 * np.sin(2 * math.pi * t / (3.7 * period)))
+    swell = np.sin(
+        2 * math.pi * t / period
+        + rng.uniform(0, 6)
+        + 0.8 * np.sin(2 * math.pi * t / (3.7 * period))
+    )
     shares = np.abs(on_axes(rng, alone=0.5))
     effect, _ = variance_effect(
         world,
@@ -42,7 +46,9 @@ def chirped_line(world: World, rng: np.random.Generator, *, strength: float) -> 
     """A line that slides through a part of the band."""
     low, high = np.sort(rng.uniform(0.05, 0.4, 2)) * world.rate
     t = np.arange(world.size) / world.rate
-    frequency = low + (high - low + 0.02 * world.rate) * (t / world.seconds) ** rng.uniform(0.6, 1.8)
+    frequency = low + (high - low + 0.02 * world.rate) * (t / world.seconds) ** rng.uniform(
+        0.6, 1.8
+    )
     return mean_effect(
         world,
         np.sin(2 * math.pi * np.cumsum(frequency) / world.rate),
@@ -102,7 +108,15 @@ def three_levels(world: World, rng: np.random.Generator, *, strength: float) -> 
 
 def informative_gaps(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
     """Noise that rises until frames are lost: the worst of it is never seen."""
-    trouble = lag(np.abs(lag(stream(int(rng.integers(2**31)), "trouble").normal(0, 6, world.temperature.size), 15.0)), 10.0)
+    trouble = lag(
+        np.abs(
+            lag(
+                stream(int(rng.integers(2**31)), "trouble").normal(0, 6, world.temperature.size),
+                15.0,
+            )
+        ),
+        10.0,
+    )
     trouble = np.maximum(trouble - np.percentile(trouble, 60), 0.0)
     trouble /= trouble.max()
     shares = np.abs(on_axes(rng, alone=0.3))

@@ -28,9 +28,10 @@ QUICK = 0.1
 class World:
     """What happens, without noise and without effects.
 
-    `temperature` [degC], `vibration` [g rms], `busy`, `supply` [V] and `light` (relative) hold one value a second, `rotation` [deg/s] one
-    every `QUICK`; `cuts` are power cuts [s] (number, 2); `missing` tells which samples are lost; `noise` holds N, B, K, Q of every axis.
-    Where the noise is that of a real recording, `own` is what was measured of it, and limits go by that.
+    `temperature` [degC], `vibration` [g rms], `busy`, `supply` [V] and `light` (relative) hold one
+    value a second, `rotation` [deg/s] one every `QUICK`; `cuts` are power cuts [s] (number, 2);
+    `missing` tells which samples are lost; `noise` holds N, B, K, Q of every axis. Where the noise
+    is that of a real recording, `own` is what was measured of it, and limits go by that.
     """
 
     rate: float
@@ -58,10 +59,11 @@ class World:
 class Effect:
     """What one effect does to the record, and what is true of it.
 
-    `mean` (axis, time) [deg/h] is added; `variance` (axis, second) multiplies the white noise; `extra` (axis, time) [deg/h] is noise that
-    is added; `white` (axis, time) of unit variance stands in for the white noise, of which `common` is the part that axes share; `after` is
-    done to the finished record; `size` is in units of the closed-form limit; `nats` is the likelihood that knowing the truth is expected to
-    gain.
+    `mean` (axis, time) [deg/h] is added; `variance` (axis, second) multiplies the white noise;
+    `extra` (axis, time) [deg/h] is noise that is added; `white` (axis, time) of unit variance
+    stands in for the white noise, of which `common` is the part that axes share; `after` is done to
+    the finished record; `size` is in units of the closed-form limit; `nats` is the likelihood that
+    knowing the truth is expected to gain.
     """
 
     name: str
@@ -107,14 +109,22 @@ def per_second(world: World) -> NDArray[np.int64]:
     return np.bincount(at, minlength=world.temperature.size)
 
 
-def _noise(rng: np.random.Generator, rate: float, *, heavy: bool, calm: bool) -> tuple[dict[str, float], ...]:
-    base = {"N": 10 ** rng.uniform(-3.0, -2.0), "B": 10 ** rng.uniform(-3.0, -2.2), "K": 10 ** rng.uniform(-2.5, -1.3)}
+def _noise(
+    rng: np.random.Generator, rate: float, *, heavy: bool, calm: bool
+) -> tuple[dict[str, float], ...]:
+    base = {
+        "N": 10 ** rng.uniform(-3.0, -2.0),
+        "B": 10 ** rng.uniform(-3.0, -2.2),
+        "K": 10 ** rng.uniform(-2.5, -1.3),
+    }
     if heavy:
         base["K"] *= rng.uniform(3, 10)
         base["B"] *= rng.uniform(1, 4)
     if calm:
         base["K"] *= 0.2
-    share = 0.0 if rng.random() < 0.5 else 10 ** rng.uniform(-2.5, -1.0)  # of the steps in the variance at the shortest time
+    share = (
+        0.0 if rng.random() < 0.5 else 10 ** rng.uniform(-2.5, -1.0)
+    )  # of the steps in the variance at the shortest time
     axes = []
     for _ in AXES:
         own = {key: value * rng.uniform(0.8, 1.25) for key, value in base.items()}
@@ -124,9 +134,13 @@ def _noise(rng: np.random.Generator, rate: float, *, heavy: bool, calm: bool) ->
     return tuple(axes)
 
 
-def _missing(rng: np.random.Generator, size: int, rate: float, gaps: float, cuts: Array) -> NDArray[np.bool_]:
+def _missing(
+    rng: np.random.Generator, size: int, rate: float, gaps: float, cuts: Array
+) -> NDArray[np.bool_]:
     frame = max(1, int(rng.uniform(0.2, 4.0) * rate))
-    lost = telemetry.lose(rng, size, share=gaps, frame=frame, burst=1.0 if rng.random() < 0.4 else rng.uniform(3, 30))
+    lost = telemetry.lose(
+        rng, size, share=gaps, frame=frame, burst=1.0 if rng.random() < 0.4 else rng.uniform(3, 30)
+    )
     t = np.arange(size) / rate
     for begin, end in cuts:
         lost |= (t >= begin) & (t < end)
@@ -136,7 +150,14 @@ def _missing(rng: np.random.Generator, size: int, rate: float, gaps: float, cuts
 
 
 def draw_world(
-    rng: np.random.Generator, *, rate: float, seconds: float, gaps: float = 0.0, cuts: int = 0, heavy: bool = False, buried: bool = False
+    rng: np.random.Generator,
+    *,
+    rate: float,
+    seconds: float,
+    gaps: float = 0.0,
+    cuts: int = 0,
+    heavy: bool = False,
+    buried: bool = False,
 ) -> World:
     """Draw what happens in one case.
 
@@ -163,9 +184,15 @@ def draw_world(
     (6000, True)
     """
     size = round(seconds * rate)
-    vibration, busy = environment.shaking(rng, seconds, bursts=int(rng.integers(2, 5)), longest=2500.0 if buried else 300.0)
+    vibration, busy = environment.shaking(
+        rng, seconds, bursts=int(rng.integers(2, 5)), longest=2500.0 if buried else 300.0
+    )
     fastest = min(rng.uniform(30, 120), 60.0 * rate / 8)
-    turning = tool.rotation(rng, seconds, dt=QUICK, fastest=fastest) if rng.random() < 0.7 else np.zeros(math.ceil(seconds / QUICK) + 1)
+    turning = (
+        tool.rotation(rng, seconds, dt=QUICK, fastest=fastest)
+        if rng.random() < 0.7
+        else np.zeros(math.ceil(seconds / QUICK) + 1)
+    )
     when = telemetry.power_cuts(rng, seconds, number=cuts) if cuts else np.zeros((0, 2))
     day = int(rng.integers(0, 1000)) * 86400 + int(rng.integers(0, 86400))
     return World(

@@ -11,11 +11,26 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import minimize_scalar
 
-from gyrostab.blindtest.generator.detection_limits import NATS, amplitude_for, line_density_of, mean_size, variance_gain, variance_size
+from gyrostab.blindtest.generator.detection_limits import (
+    NATS,
+    amplitude_for,
+    line_density_of,
+    mean_size,
+    variance_gain,
+    variance_size,
+)
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.scenario import AXES, Effect, World, to_samples
 
-__all__ = ["by_axis", "following", "mean_effect", "named", "on_axes", "projection", "variance_effect"]
+__all__ = [
+    "by_axis",
+    "following",
+    "mean_effect",
+    "named",
+    "on_axes",
+    "projection",
+    "variance_effect",
+]
 
 Array = NDArray[np.float64]
 _SHORTEST, _LAGS = 1.0, 24  # lags that are tried: the first [s], and how many
@@ -38,7 +53,9 @@ def named(shares: Array) -> tuple[str, ...]:
 
 def by_axis(shares: Array, value: float) -> dict[str, float]:
     """`value` times the share of every axis that has one."""
-    return {axis: float(value * share) for axis, share in zip(AXES, shares, strict=True) if share != 0}
+    return {
+        axis: float(value * share) for axis, share in zip(AXES, shares, strict=True) if share != 0
+    }
 
 
 def projection(world: World, mean: Array, driver: Array, *, axis: int) -> float:
@@ -49,8 +66,9 @@ def projection(world: World, mean: Array, driver: Array, *, axis: int) -> float:
 def following(world: World, mean: Array, driver: Array, *, axis: int) -> tuple[float, float]:
     """Sensitivity and lag [s] of what follows a driver (second,) and comes nearest to a mean (time,), by least squares in the noise.
 
-    The sensitivity is that to a driver that stands. To the driver at once a mean that is late has another one, less by as much as the noise
-    makes of the steps of the driver: no number of the instrument's.
+    The sensitivity is that to a driver that stands. To the driver at once a mean that is late has
+    another one, less by as much as the noise makes of the steps of the driver: no number of the
+    instrument's.
 
     Examples
     --------
@@ -69,14 +87,19 @@ def following(world: World, mean: Array, driver: Array, *, axis: int) -> tuple[f
     if place == 0:
         return late(0.0)[0], 0.0
     ends = math.log(grid[max(place - 1, 1)]), math.log(grid[min(place + 1, _LAGS)])
-    time = math.exp(float(minimize_scalar(lambda log: late(math.exp(log))[1], bounds=ends, method="bounded").x))
+    time = math.exp(
+        float(minimize_scalar(lambda log: late(math.exp(log))[1], bounds=ends, method="bounded").x)
+    )
     return late(time)[0], time
 
 
 def _nearest(world: World, mean: Array, driver: Array, *, axis: int) -> tuple[float, float]:
     """Sensitivity of a mean (time,) to a driver (time,), and the share of the mean that this leaves, by least squares in the noise."""
     there = ~world.missing
-    x, y = (fft.dct(np.where(there, values - values[there].mean(), 0.0), norm="ortho")[1:] for values in (driver, mean))
+    x, y = (
+        fft.dct(np.where(there, values - values[there].mean(), 0.0), norm="ortho")[1:]
+        for values in (driver, mean)
+    )
     weight = 1.0 / line_density_of(world, axis=axis)
     slope = float((weight * x * y).sum() / (weight * x * x).sum())
     return slope, float((weight * (y - slope * x) ** 2).sum() / (weight * y * y).sum())
@@ -112,9 +135,11 @@ def mean_effect(
     name, driver, form, differs, tau, active
         See `Effect`.
     regressor : (str, ndarray, str), optional
-        Name of a parameter, the driver it multiplies (time,) and its unit: its value on every axis is the projection of the mean.
+        Name of a parameter, the driver it multiplies (time,) and its unit: its value on every axis
+        is the projection of the mean.
     unless : tuple of str
-        Terms that bend the response: where one of them is claimed beside the parameter, that is the slope at another place.
+        Terms that bend the response: where one of them is claimed beside the parameter, that is the
+        slope at another place.
 
     Returns
     -------
@@ -123,11 +148,20 @@ def mean_effect(
     mean = np.asarray(shares[:, None] * (shape if shape.ndim == 2 else shape[None, :]))
     mean *= strength / mean_size(world, mean)
     parameters = dict(more.pop("parameters", {}))
-    parameters["peak"] = {"value": float(np.abs(mean - np.median(mean, axis=1, keepdims=True)).max()), "unit": "deg/h"}
+    parameters["peak"] = {
+        "value": float(np.abs(mean - np.median(mean, axis=1, keepdims=True)).max()),
+        "unit": "deg/h",
+    }
     parameters["size_white"] = {"value": mean_size(world, mean, white=True), "unit": "1"}
     if regressor is not None:
-        values = {axis: projection(world, mean[i], regressor[1], axis=i) for i, axis in enumerate(AXES) if shares[i]}
-        parameters[regressor[0]] = {"values": values, "unit": regressor[2]} | ({"unless": list(unless)} if differs and unless else {})
+        values = {
+            axis: projection(world, mean[i], regressor[1], axis=i)
+            for i, axis in enumerate(AXES)
+            if shares[i]
+        }
+        parameters[regressor[0]] = {"values": values, "unit": regressor[2]} | (
+            {"unless": list(unless)} if differs and unless else {}
+        )
     return Effect(
         name=name,
         axes=named(shares),

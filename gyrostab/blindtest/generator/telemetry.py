@@ -11,11 +11,14 @@ __all__ = ["flip_bits", "lose", "power_cuts", "repeat_frames", "shortened"]
 
 Array = NDArray[np.float64]
 
-#: Shortest power cut [s]; what comes from the line alone is shorter where an effect hangs on the starts.
+#: Shortest power cut [s]; what comes from the line alone is shorter where an effect hangs on the
+#: starts.
 SHORTEST = 6.0
 
 
-def lose(rng: np.random.Generator, size: int, *, share: float, frame: int, burst: float = 1.0) -> NDArray[np.bool_]:
+def lose(
+    rng: np.random.Generator, size: int, *, share: float, frame: int, burst: float = 1.0
+) -> NDArray[np.bool_]:
     """Which of `size` samples are lost, in whole frames, by a line that is good or bad.
 
     Parameters
@@ -83,7 +86,9 @@ def power_cuts(rng: np.random.Generator, seconds: float, *, number: int) -> Arra
     return np.stack([begin, begin + off], axis=1)
 
 
-def flip_bits(rng: np.random.Generator, values: Array, *, number: int, lsb: float, bit: int) -> tuple[Array, NDArray[np.int64]]:
+def flip_bits(
+    rng: np.random.Generator, values: Array, *, number: int, lsb: float, bit: int
+) -> tuple[Array, NDArray[np.int64]]:
     """Flip one bit in `number` samples; the words are two's complement in steps of `lsb`.
 
     Parameters
@@ -117,7 +122,9 @@ def flip_bits(rng: np.random.Generator, values: Array, *, number: int, lsb: floa
     return after, where
 
 
-def repeat_frames(rng: np.random.Generator, values: Array, *, number: int, frame: int, hold: bool) -> tuple[Array, NDArray[np.int64]]:
+def repeat_frames(
+    rng: np.random.Generator, values: Array, *, number: int, frame: int, hold: bool
+) -> tuple[Array, NDArray[np.int64]]:
     """Send `number` frames twice, in the place of the next one, or hold their last sample through it.
 
     Parameters
@@ -145,6 +152,8 @@ def repeat_frames(rng: np.random.Generator, values: Array, *, number: int, frame
     after = values.copy()
     frames = np.sort(rng.choice(np.arange(1, values.shape[1] // frame), number, replace=False))
     for k in frames:
-        past = after[:, k * frame - 1 : k * frame] if hold else after[:, (k - 1) * frame : k * frame]
+        past = (
+            after[:, k * frame - 1 : k * frame] if hold else after[:, (k - 1) * frame : k * frame]
+        )
         after[:, k * frame : (k + 1) * frame] = past
     return after, frames * frame

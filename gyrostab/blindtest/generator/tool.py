@@ -15,7 +15,14 @@ Array = NDArray[np.float64]
 EARTH_RATE = 15.041
 
 
-def rotation(rng: np.random.Generator, seconds: float, *, dt: float, fastest: float = 120.0, stick_slip: bool = True) -> Array:
+def rotation(
+    rng: np.random.Generator,
+    seconds: float,
+    *,
+    dt: float,
+    fastest: float = 120.0,
+    stick_slip: bool = True,
+) -> Array:
     """Rotation rate [deg/s] of a tool that drills, stands and drills again.
 
     Parameters
@@ -47,7 +54,9 @@ def rotation(rng: np.random.Generator, seconds: float, *, dt: float, fastest: fl
         swing = rng.uniform(0.3, 0.95) if stick_slip and rng.random() < 0.5 else 0.0
         beat = rng.uniform(0.1, 0.5)
         drift = 1 + 0.02 * np.sin(2 * math.pi * t / rng.uniform(40, 200))
-        wanted[inside] = (mean / (1 + swing) * drift * (1 + swing * np.sin(2 * math.pi * beat * t)))[inside]
+        wanted[inside] = (
+            mean / (1 + swing) * drift * (1 + swing * np.sin(2 * math.pi * beat * t))
+        )[inside]
         begin = end + rng.uniform(0.08, 0.25) * seconds
     return wanted
 

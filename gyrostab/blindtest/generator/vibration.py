@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-__all__ = ["FAST", "band_noise", "decimate", "decimator_taps", "folded_psd", "mount_filter", "rectify"]
+__all__ = [
+    "FAST",
+    "band_noise",
+    "decimate",
+    "decimator_taps",
+    "folded_psd",
+    "mount_filter",
+    "rectify",
+]
 
 Array = NDArray[np.float64]
 
@@ -66,7 +74,8 @@ def decimator_taps(rate: float, kind: str) -> Array:
     rate : float
         Rate of the log [Hz], a divisor of `FAST`.
     kind : {"point", "dump", "cic2", "cic3", "fir"}
-        Take every n-th value, integrate and dump, two or three such in a row, or a short windowed sinc.
+        Take every n-th value, integrate and dump, two or three such in a row, or a short windowed
+        sinc.
 
     Examples
     --------
@@ -99,7 +108,15 @@ def decimate(x: Array, *, rate: float, kind: str) -> Array:
     return np.asarray(smooth[factor - 1 :: factor])
 
 
-def folded_psd(frequency: Array, *, rate: float, kind: str, low: float, high: float, mount: tuple[Array, Array] | None = None) -> Array:
+def folded_psd(
+    frequency: Array,
+    *,
+    rate: float,
+    kind: str,
+    low: float,
+    high: float,
+    mount: tuple[Array, Array] | None = None,
+) -> Array:
     """Two-sided density [1/Hz] at `rate` [Hz] of unit-rms band noise behind mount and decimator: all aliases added.
 
     Examples
@@ -114,7 +131,10 @@ def folded_psd(frequency: Array, *, rate: float, kind: str, low: float, high: fl
     taps = decimator_taps(rate, kind)
     alias = (np.asarray(frequency)[None, :] + rate * np.arange(round(FAST / rate))[:, None]) % FAST
     flat = alias.ravel()
-    gain = np.abs(signal.freqz_sos(sos, worN=flat, fs=FAST)[1]) ** 2 * np.abs(signal.freqz(taps, worN=flat, fs=FAST)[1]) ** 2
+    gain = (
+        np.abs(signal.freqz_sos(sos, worN=flat, fs=FAST)[1]) ** 2
+        * np.abs(signal.freqz(taps, worN=flat, fs=FAST)[1]) ** 2
+    )
     if mount is not None:
         gain = gain * np.abs(signal.freqz(*mount, worN=flat, fs=FAST)[1]) ** 2
     return np.asarray(level * gain.reshape(alias.shape).sum(axis=0))

@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 def wander_size(world: World, shares: Array, *, time: float, rms: float) -> tuple[float, float]:
     """Size of a bias with the correlation `time` [s] and `rms` [deg/h], in units of the limit, and its worth [nats].
 
-    It is random, so only its power can be known: at the frequency ``k / 2T`` of the record T its share of the density changes the log
-    variance of one number, and `gyrostab.blindtest.generator.detection_limits` says what that is worth.
+    It is random, so only its power can be known: at the frequency ``k / 2T`` of the record T its
+    share of the density changes the log variance of one number, and
+    `gyrostab.blindtest.generator.detection_limits` says what that is worth.
 
     Parameters
     ----------
@@ -34,7 +35,9 @@ def wander_size(world: World, shares: Array, *, time: float, rms: float) -> tupl
     rms : float
         Standard deviation [deg/h].
     """
-    f = np.arange(1, min(world.size, math.ceil(20 * world.seconds / time) + 50)) / (2 * world.seconds)
+    f = np.arange(1, min(world.size, math.ceil(20 * world.seconds / time) + 50)) / (
+        2 * world.seconds
+    )
     seen = float((~world.missing).mean())
     size = nats = 0.0
     for share, noise in zip(shares, world.noise, strict=True):
@@ -46,10 +49,20 @@ def wander_size(world: World, shares: Array, *, time: float, rms: float) -> tupl
 
 
 def _wandering(
-    world: World, rng: np.random.Generator, waveform: Array, *, strength: float, name: str, time: float, form: str, differs: bool
+    world: World,
+    rng: np.random.Generator,
+    waveform: Array,
+    *,
+    strength: float,
+    name: str,
+    time: float,
+    form: str,
+    differs: bool,
 ) -> Effect:
     shares = on_axes(rng)
-    rms = amplitude_for(lambda a: wander_size(world, shares, time=time, rms=a)[0], strength, first=1e-4)
+    rms = amplitude_for(
+        lambda a: wander_size(world, shares, time=time, rms=a)[0], strength, first=1e-4
+    )
     size, nats = wander_size(world, shares, time=time, rms=rms)
     return Effect(
         name=name,
@@ -80,7 +93,16 @@ def gauss_markov(world: World, rng: np.random.Generator, *, strength: float) -> 
         push = lfilter([1.0], [1.0, -keep], push)
     waveform = push[settle:] / push.std()
     form = f"{'second' if heavy else 'first'} order, {time:.0f} s"
-    return _wandering(world, rng, waveform, strength=strength, name="gauss_markov", time=time, form=form, differs=heavy)
+    return _wandering(
+        world,
+        rng,
+        waveform,
+        strength=strength,
+        name="gauss_markov",
+        time=time,
+        form=form,
+        differs=heavy,
+    )
 
 
 def telegraph(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -96,7 +118,16 @@ def telegraph(world: World, rng: np.random.Generator, *, strength: float) -> Eff
         t, level = t + stay, 1 - level
     waveform = (waveform - waveform.mean()) / math.sqrt(lean * (1 - lean))
     form = f"two levels, {dwell[0]:.0f} and {dwell[1]:.0f} s" + (", of gamma law" if gamma else "")
-    return _wandering(world, rng, waveform, strength=strength, name="telegraph", time=time, form=form, differs=gamma)
+    return _wandering(
+        world,
+        rng,
+        waveform,
+        strength=strength,
+        name="telegraph",
+        time=time,
+        form=form,
+        differs=gamma,
+    )
 
 
 def ageing_bias(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -113,10 +144,17 @@ def ageing_bias(world: World, rng: np.random.Generator, *, strength: float) -> E
         strength=strength,
         name="ageing_bias",
         driver="time",
-        form={"line": "a line", "logarithm": f"logarithm, {first:.0f} s", "power": f"power {power:g} of time"}[kind],
+        form={
+            "line": "a line",
+            "logarithm": f"logarithm, {first:.0f} s",
+            "power": f"power {power:g} of time",
+        }[kind],
         differs=kind == "power",
     )
     if kind == "line" and effect.mean is not None:
         slope = (effect.mean[:, -1] - effect.mean[:, 0]) / world.seconds * 86400.0
-        effect.parameters["slope"] = {"values": dict(zip(AXES, slope.tolist(), strict=True)), "unit": "deg/h/day"}
+        effect.parameters["slope"] = {
+            "values": dict(zip(AXES, slope.tolist(), strict=True)),
+            "unit": "deg/h/day",
+        }
     return effect

@@ -59,8 +59,9 @@ def prove(
 ) -> Proof:
     """Try the diagnosis on recordings with concealed effects, and count how often it is right.
 
-    The cases are drawn by a generator that shares no physics with the diagnosis. All truths are sealed by their SHA-256 before the first
-    recording is diagnosed; each diagnosis is given one recording and nothing else.
+    The cases are drawn by a generator that shares no physics with the diagnosis. All truths are
+    sealed by their SHA-256 before the first recording is diagnosed; each diagnosis is given one
+    recording and nothing else.
 
     Parameters
     ----------
@@ -75,7 +76,8 @@ def prove(
     workers : int
         Processes; as many as there are cores by default, 0 for none but this one.
     real : path-like
-        Folder of real recordings to be salted, one for every 40 cases; none are without it. See `gyrostab.blindtest.scenarios.real`.
+        Folder of real recordings to be salted, one for every 40 cases; none are without it. See
+        `gyrostab.blindtest.scenarios.real`.
     resume : bool
         Go on with what was begun in the folder; begin where nothing was.
     overwrite : bool
@@ -116,7 +118,11 @@ def prove(
     with hold(folder):
         job = begin(folder, wanted, fresh, resume=resume, overwrite=overwrite)
         tell(_opening(job, folder))
-        number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        number = (
+            len(os.sched_getaffinity(0))
+            if hasattr(os, "sched_getaffinity")
+            else os.cpu_count() or 1
+        )
         number = number if workers is None else workers
         plans = _plans(job)
         names = list(plans)
@@ -131,8 +137,14 @@ def _plans(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
     from gyrostab.blindtest.scenarios.plan import plan_cases
     from gyrostab.blindtest.scenarios.real import plan_injections
 
-    drawn = {case_name(job["seed"], plan["index"]): plan for plan in plan_cases(job["cases"], seed=job["seed"])}
-    return drawn | {case_name(job["seed"], plan["index"], plan["copy"]): plan for plan in plan_injections(job["salted"], seed=job["seed"])}
+    drawn = {
+        case_name(job["seed"], plan["index"]): plan
+        for plan in plan_cases(job["cases"], seed=job["seed"])
+    }
+    return drawn | {
+        case_name(job["seed"], plan["index"], plan["copy"]): plan
+        for plan in plan_injections(job["salted"], seed=job["seed"])
+    }
 
 
 def _opening(job: dict[str, Any], folder: Path) -> str:
@@ -151,30 +163,46 @@ def _counter(stage: Stage, label: str, total: int, first: int = 0) -> Callable[[
     return lambda done: stage(label, total, first + done, "cases")
 
 
-def _drawn(folder: Path, plans: dict[str, dict[str, Any]], workers: int, stage: Stage, real: Path | None) -> tuple[dict[str, str], str]:
+def _drawn(
+    folder: Path, plans: dict[str, dict[str, Any]], workers: int, stage: Stage, real: Path | None
+) -> tuple[dict[str, str], str]:
     """Draw what is not drawn, and seal; what was sealed once is never drawn again."""
     kept = read_sums(folder)
     if kept is not None:
         return kept
     if real is None and any("copy" in plan for plan in plans.values()):
-        raise ResumeError(f"{folder}: was begun with real recordings, which are not drawn yet; say again where they are with --real DIR")
+        raise ResumeError(
+            f"{folder}: was begun with real recordings, which are not drawn yet; say again where they are with --real DIR"
+        )
     jobs = [(folder, name, plan, real) for name, plan in plans.items()]
-    found = each_in_processes(draw_case, jobs, workers=workers, told=_counter(stage, "drawing", len(jobs)))
+    found = each_in_processes(
+        draw_case, jobs, workers=workers, told=_counter(stage, "drawing", len(jobs))
+    )
     sums = dict(zip(plans, found, strict=True))
     return sums, write_sums(folder, sums)
 
 
-def _diagnosed(folder: Path, job: dict[str, Any], names: list[str], workers: int, stage: Stage) -> dict[str, str]:
+def _diagnosed(
+    folder: Path, job: dict[str, Any], names: list[str], workers: int, stage: Stage
+) -> dict[str, str]:
     """Diagnose what is not diagnosed; the name of each case that fails, and why."""
     left = [name for name in names if not (folder / "diagnoses" / f"{name}.json").exists()]
     jobs = [
-        (folder / "recordings" / f"{name}.nc", folder / "diagnoses" / f"{name}.json", folder / "failed" / f"{name}.txt", job["nulls"])
+        (
+            folder / "recordings" / f"{name}.nc",
+            folder / "diagnoses" / f"{name}.json",
+            folder / "failed" / f"{name}.txt",
+            job["nulls"],
+        )
         for name in left
     ]
     told = _counter(stage, "diagnosing", len(names), len(names) - len(left))
     good = each_in_processes(diagnose_case, jobs, workers=workers, told=told)
     lost = [name for name, flag in zip(left, good, strict=True) if not flag]
-    return {name: (folder / "failed" / f"{name}.txt").read_text(encoding="utf-8").splitlines()[0] for name in lost}
+    return {
+        name: (folder / "failed" / f"{name}.txt").read_text(encoding="utf-8").splitlines()[0]
+        for name in lost
+    }
 
 
 def _opened(
@@ -192,11 +220,28 @@ def _opened(
     from gyrostab.blindtest.scenarios.commitment import open_truth
     from gyrostab.blindtest.scoring.table import missed, score_table
 
-    truths = {name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in names}
-    drawn = [name for name in names if "copy" not in truths[name]["plan"]]  # of real noise no truth says how much it is
-    jobs = [(folder / "recordings" / f"{name}.nc", truths[name], folder / "comparisons" / f"{name}.json") for name in drawn]
-    naive = each_in_processes(compare_case, jobs, workers=workers, told=_counter(stage, "comparing", len(drawn)))
-    found = {name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8")) for name in names if name not in failed}
+    truths = {
+        name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in names
+    }
+    drawn = [
+        name for name in names if "copy" not in truths[name]["plan"]
+    ]  # of real noise no truth says how much it is
+    jobs = [
+        (
+            folder / "recordings" / f"{name}.nc",
+            truths[name],
+            folder / "comparisons" / f"{name}.json",
+        )
+        for name in drawn
+    ]
+    naive = each_in_processes(
+        compare_case, jobs, workers=workers, told=_counter(stage, "comparing", len(drawn))
+    )
+    found = {
+        name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8"))
+        for name in names
+        if name not in failed
+    }
     stage("counting", 0)
     rows = score_rows(found, truths, dict(zip(drawn, naive, strict=True)))
     table = score_table(rows)

@@ -15,13 +15,17 @@ __all__ = ["draw_completeness", "draw_reliability"]
 
 _ACROSS = 5
 _POOLS = (1.5, 4.0)  # below the first: too faint to be asked for
-_LABELS = {"detected": "detected", "named": "named rightly (called unknown, where no catalogue holds it)"}
+_LABELS = {
+    "detected": "detected",
+    "named": "named rightly (called unknown, where no catalogue holds it)",
+}
 
 
 def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
     """Prepare a panel for each effect: shares detected and named against strength, with Wilson's intervals.
 
-    One effect has few cases of each strength, so those of like strength are pooled; the first panel is of all.
+    One effect has few cases of each strength, so those of like strength are pooled; the first panel
+    is of all.
     """
     from gyrostab.plot.style import new_figure, save_png
 
@@ -32,13 +36,22 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
     for place, panel in enumerate(panels.flat):
         if place < len(names):
             part = curves[curves["effect"] == names[place]]
-            _panel(panel, part if names[place] == "all" else _pooled(part), names[place].replace("_", " "))
+            _panel(
+                panel,
+                part if names[place] == "all" else _pooled(part),
+                names[place].replace("_", " "),
+            )
         else:
             panel.set_axis_off()
     figure.supxlabel("strength, in units of the closed-form limit")
     figure.supylabel("share of the cases, with 95 % interval")
     if names:
-        figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False)
+        figure.legend(
+            *panels.flat[0].get_legend_handles_labels(),
+            loc="outside upper center",
+            ncols=2,
+            frameon=False,
+        )
     return lambda target: save_png(figure, target, colours=64)
 
 
@@ -52,7 +65,10 @@ def _pooled(part: pd.DataFrame) -> pd.DataFrame:
     out = []
     for _, group in part.groupby(np.digitize(part["strength"], _POOLS)):
         number = int(group["n"].sum())
-        line: dict[str, Any] = {"strength": float(np.exp(np.average(np.log(group["strength"]), weights=group["n"]))), "n": number}
+        line: dict[str, Any] = {
+            "strength": float(np.exp(np.average(np.log(group["strength"]), weights=group["n"]))),
+            "n": number,
+        }
         for key in ("detected", "named"):
             hits = round(float((group[key] * group["n"]).sum()))
             low, high = wilson(hits, number)
@@ -95,7 +111,10 @@ def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
     for place, claim in enumerate(claims):
         panel.barh(place, claim["right"], color=COLOURS[2], height=0.6)
         panel.plot([claim["low"], claim["high"]], [place, place], color="black", linewidth=1.0)
-    panel.set_yticks(range(len(claims)), [f"{claim['name'].replace('_', ' ')} ({claim['n']})" for claim in claims])
+    panel.set_yticks(
+        range(len(claims)),
+        [f"{claim['name'].replace('_', ' ')} ({claim['n']})" for claim in claims],
+    )
     panel.set_ylim(max(len(claims), 1) - 0.4, -0.6)
     panel.set_xlim(0, 1)
     panel.set_xlabel("share of the claims (number) that are right,\nwith 95 % interval")

@@ -1,7 +1,8 @@
 """The folder of a benchmark: what it was asked for, which code has worked on it, and what is finished.
 
-``benchmark.json`` comes first; then ``recordings/`` and ``truth/`` grow together, ``SHA256SUMS`` seals the truths before the first file of
-``diagnoses/``, and ``comparisons/`` follow once the seal is open.
+``benchmark.json`` comes first; then ``recordings/`` and ``truth/`` grow together, ``SHA256SUMS``
+seals the truths before the first file of ``diagnoses/``, and ``comparisons/`` follow once the seal
+is open.
 """
 
 from __future__ import annotations
@@ -22,7 +23,18 @@ from gyrostab.store.output import is_leftover, replace_file
 from gyrostab.store.output.check import check_target
 from gyrostab.store.output.content import read_json
 
-__all__ = ["TUNING", "asked", "begin", "case_name", "code_state", "look", "read_sums", "write_json", "write_sums", "write_text"]
+__all__ = [
+    "TUNING",
+    "asked",
+    "begin",
+    "case_name",
+    "code_state",
+    "look",
+    "read_sums",
+    "write_json",
+    "write_sums",
+    "write_text",
+]
 
 #: Seeds below this one are for tuning; what is published uses others.
 TUNING = 1_000_000
@@ -31,7 +43,15 @@ _SCHEMA = "gyrostab.prove/2"
 _SUMS = "SHA256SUMS"
 _FOLDERS = ("recordings", "truth", "diagnoses", "comparisons", "failed")
 _CASE_FILE = re.compile(r"[0-9a-f]{12}\.(nc|json|txt)")
-_FILES = ("benchmark.json", _SUMS, "scores.csv", "table.md", "completeness.png", "reliability.png", "lock")
+_FILES = (
+    "benchmark.json",
+    _SUMS,
+    "scores.csv",
+    "table.md",
+    "completeness.png",
+    "reliability.png",
+    "lock",
+)
 
 
 def write_text(path: Path, text: str) -> Path:
@@ -75,32 +95,60 @@ def asked(directory: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        raise FormatError(f"{directory / 'benchmark.json'}: cannot be read ({error}); begin again with --overwrite") from error
+        raise FormatError(
+            f"{directory / 'benchmark.json'}: cannot be read ({error}); begin again with --overwrite"
+        ) from error
     if not isinstance(content, dict) or content.get("schema") != _SCHEMA:
-        raise FormatError(f"{directory / 'benchmark.json'}: is no benchmark of this version; begin again in another folder with -o")
+        raise FormatError(
+            f"{directory / 'benchmark.json'}: is no benchmark of this version; begin again in another folder with -o"
+        )
     return content
 
 
 def look(
-    directory: Path, wanted: Mapping[str, int | None], usual: Mapping[str, int], *, resume: bool, overwrite: bool
+    directory: Path,
+    wanted: Mapping[str, int | None],
+    usual: Mapping[str, int],
+    *,
+    resume: bool,
+    overwrite: bool,
 ) -> tuple[dict[str, Any] | None, dict[str, int]]:
     """What was begun in a folder and is to go on, or None, and what is to be done; see `begin`. Changes nothing."""
     before = asked(directory) if directory.is_dir() and (resume or not overwrite) else None
-    check_target(directory, overwrite=True, find_foreign=find_foreign_file if before is None else lambda _: None)
+    check_target(
+        directory,
+        overwrite=True,
+        find_foreign=find_foreign_file if before is None else lambda _: None,
+    )
     if before is None:
         chosen = dict(usual) | {name: value for name, value in wanted.items() if value is not None}
         _check_wishes(chosen)
         _check_content(directory, overwrite=overwrite)
         return None, chosen
     if not resume:
-        raise OutputError(f"{directory} holds a benchmark already: --resume goes on with it, --overwrite replaces it; or give another -o")
-    other = [f"{name} {before[name]}, not {value}" for name, value in wanted.items() if value is not None and value != before[name]]
+        raise OutputError(
+            f"{directory} holds a benchmark already: --resume goes on with it, --overwrite replaces it; or give another -o"
+        )
+    other = [
+        f"{name} {before[name]}, not {value}"
+        for name, value in wanted.items()
+        if value is not None and value != before[name]
+    ]
     if other:
-        raise ResumeError(f"{directory}: was begun with {', '.join(other)}; leave that out, or begin again with --overwrite")
+        raise ResumeError(
+            f"{directory}: was begun with {', '.join(other)}; leave that out, or begin again with --overwrite"
+        )
     return before, {name: before[name] for name in wanted}
 
 
-def begin(directory: Path, wanted: Mapping[str, int | None], usual: Mapping[str, int], *, resume: bool, overwrite: bool) -> dict[str, Any]:
+def begin(
+    directory: Path,
+    wanted: Mapping[str, int | None],
+    usual: Mapping[str, int],
+    *,
+    resume: bool,
+    overwrite: bool,
+) -> dict[str, Any]:
     """Make the folder, or take up what was begun in it.
 
     Parameters
@@ -131,7 +179,10 @@ def begin(directory: Path, wanted: Mapping[str, int | None], usual: Mapping[str,
     before, chosen = look(directory, wanted, usual, resume=resume, overwrite=overwrite)
     state = code_state()
     if before is not None:
-        for left in (*directory.glob(".*.part"), *directory.glob("*/.*.part")):  # of a run that was killed
+        for left in (
+            *directory.glob(".*.part"),
+            *directory.glob("*/.*.part"),
+        ):  # of a run that was killed
             if is_leftover(left.name):
                 _remove(left)
         if state != before["code"][-1]:
@@ -164,17 +215,27 @@ def _remove(path: Path) -> None:
 
 def _check_wishes(chosen: Mapping[str, int]) -> None:
     if chosen["cases"] < 1:
-        raise OptionError(f"cases={chosen['cases']}: give at least one case; 20 hold every kind, 400 give the published figures")
+        raise OptionError(
+            f"cases={chosen['cases']}: give at least one case; 20 hold every kind, 400 give the published figures"
+        )
     if chosen["seed"] < 0:
         raise OptionError(f"seed={chosen['seed']}: give a whole number from 0 up")
     if chosen["nulls"] < 100:
-        raise OptionError(f"nulls={chosen['nulls']}: a diagnosis needs 100 null records at least; give 400, or 200 for a quick look")
+        raise OptionError(
+            f"nulls={chosen['nulls']}: a diagnosis needs 100 null records at least; give 400, or 200 for a quick look"
+        )
 
 
 def _check_content(directory: Path, *, overwrite: bool) -> None:
-    found = [item.name for item in directory.iterdir() if item.name != "lock"] if directory.is_dir() else []
+    found = (
+        [item.name for item in directory.iterdir() if item.name != "lock"]
+        if directory.is_dir()
+        else []
+    )
     if found and not overwrite:
-        raise OutputError(f"output {str(directory)!r} is not empty; give --overwrite to replace what is in it, or another name with -o")
+        raise OutputError(
+            f"output {str(directory)!r} is not empty; give --overwrite to replace what is in it, or another name with -o"
+        )
 
 
 def find_foreign_file(directory: Path) -> str | None:
@@ -194,7 +255,11 @@ def find_foreign_file(directory: Path) -> str | None:
 def _is_of_benchmark(place: Path) -> bool:
     if is_leftover(place.name):
         return True
-    return place.name in _FILES if len(place.parts) == 1 else _CASE_FILE.fullmatch(place.name) is not None
+    return (
+        place.name in _FILES
+        if len(place.parts) == 1
+        else _CASE_FILE.fullmatch(place.name) is not None
+    )
 
 
 def write_sums(directory: Path, sums: Mapping[str, str]) -> str:
@@ -211,4 +276,6 @@ def read_sums(directory: Path) -> tuple[dict[str, str], str] | None:
     except FileNotFoundError:
         return None
     lines = [line.split("  truth/") for line in text.splitlines()]
-    return {name.removesuffix(".json"): value for value, name in lines}, hashlib.sha256(text.encode()).hexdigest()
+    return {name.removesuffix(".json"): value for value, name in lines}, hashlib.sha256(
+        text.encode()
+    ).hexdigest()

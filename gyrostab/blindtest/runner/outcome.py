@@ -23,12 +23,23 @@ __all__ = ["page_text", "score_rows", "write_outcome"]
 Rows = list[dict[str, Any]]
 
 #: Stands for the diagnosis of a case that has none: nothing was found in it.
-_NOTHING = {"verdict": "no mismatch", "mismatches": [], "effects": [], "unexplained": [], "held_out": {}, "seconds": math.nan}
+_NOTHING = {
+    "verdict": "no mismatch",
+    "mismatches": [],
+    "effects": [],
+    "unexplained": [],
+    "held_out": {},
+    "seconds": math.nan,
+}
 
 _SHOWN = 40  # cases that a list holds
 
 
-def score_rows(found: Mapping[str, dict[str, Any]], truths: Mapping[str, dict[str, Any]], naive: Mapping[str, Mapping[str, bool]]) -> Rows:
+def score_rows(
+    found: Mapping[str, dict[str, Any]],
+    truths: Mapping[str, dict[str, Any]],
+    naive: Mapping[str, Mapping[str, bool]],
+) -> Rows:
     """All rows of `score_case` with the name of the case; a case without a diagnosis counts as nothing found."""
     return [
         {"name": name, "failed": name not in found, **row}
@@ -38,21 +49,44 @@ def score_rows(found: Mapping[str, dict[str, Any]], truths: Mapping[str, dict[st
 
 
 def write_outcome(
-    folder: Path, rows: Rows, table: pd.DataFrame, *, job: Mapping[str, Any], sealed: str, failed: Mapping[str, str]
+    folder: Path,
+    rows: Rows,
+    table: pd.DataFrame,
+    *,
+    job: Mapping[str, Any],
+    sealed: str,
+    failed: Mapping[str, str],
 ) -> list[Path]:
     """Write ``scores.csv``, ``table.md``, ``completeness.png`` and ``reliability.png``."""
-    plain = [{key: json.dumps(value) if isinstance(value, list | dict | tuple) else value for key, value in row.items()} for row in rows]
-    targets = [folder / name for name in ("scores.csv", "table.md", "completeness.png", "reliability.png")]
+    plain = [
+        {
+            key: json.dumps(value) if isinstance(value, list | dict | tuple) else value
+            for key, value in row.items()
+        }
+        for row in rows
+    ]
+    targets = [
+        folder / name for name in ("scores.csv", "table.md", "completeness.png", "reliability.png")
+    ]
     write_text(targets[0], pd.DataFrame(plain).to_csv(index=False))
     write_text(targets[1], page_text(rows, table, job=job, sealed=sealed, failed=failed))
-    for target, draw in zip(targets[2:], (draw_completeness(curves(rows)), draw_reliability(reliability(rows))), strict=True):
+    for target, draw in zip(
+        targets[2:],
+        (draw_completeness(curves(rows)), draw_reliability(reliability(rows))),
+        strict=True,
+    ):
         with replace_file(target) as temporary:
             draw(temporary)
     return targets
 
 
 def page_text(
-    rows: Sequence[Mapping[str, Any]], table: pd.DataFrame, *, job: Mapping[str, Any], sealed: str, failed: Mapping[str, str]
+    rows: Sequence[Mapping[str, Any]],
+    table: pd.DataFrame,
+    *,
+    job: Mapping[str, Any],
+    sealed: str,
+    failed: Mapping[str, str],
 ) -> str:
     """The outcome in Markdown: how it was made, the table, the targets missed, the curves, and the cases that went wrong."""
     shown = curves(rows)
@@ -77,7 +111,14 @@ def page_text(
         "### Wrong names",
         _listed([_wrong(row) for row in _cases(drawn) if row["wrong"]], "none"),
         "### Clear effects that were missed",
-        _listed([_silent(row) for row in drawn if row["effect"] and row["strength"] >= 1.5 and not row["detected"]], "none"),
+        _listed(
+            [
+                _silent(row)
+                for row in drawn
+                if row["effect"] and row["strength"] >= 1.5 and not row["detected"]
+            ],
+            "none",
+        ),
         "### Real recordings with salt",
         *_salted(rows),
         "### What it cost",
@@ -91,7 +132,9 @@ def page_text(
 def _salted(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     found = injection_differences(rows)
     if not found:
-        return ["None: the folder of the real recordings was not given to this run, or it had too few cases."]
+        return [
+            "None: the folder of the real recordings was not given to this run, or it had too few cases."
+        ]
     lines = [
         f"{one['recording']}, {one['effect']} at {one['strength']:g}: "
         + ("named" if one["named"] else "not named")
@@ -116,11 +159,25 @@ _TURNED = {
 
 def _cost(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Seconds that a diagnosis took, by rate and length."""
-    each = pd.DataFrame([{key: row[key] for key in ("rate", "length", "seconds")} for row in _cases(rows)])
-    each["length"] = pd.cut(each["length"], [0, 1200, 3600, 10800, math.inf], labels=["< 20 min", "< 1 h", "< 3 h", "longer"], right=False)
+    each = pd.DataFrame(
+        [{key: row[key] for key in ("rate", "length", "seconds")} for row in _cases(rows)]
+    )
+    each["length"] = pd.cut(
+        each["length"],
+        [0, 1200, 3600, 10800, math.inf],
+        labels=["< 20 min", "< 1 h", "< 3 h", "longer"],
+        right=False,
+    )
     parts = each.groupby(["rate", "length"], observed=True)["seconds"]
     table = parts.agg(["count", "median", "max", "sum"]).reset_index()
-    return table.rename(columns={"rate": "rate [Hz]", "median": "median [s]", "max": "longest [s]", "sum": "all [s]"})
+    return table.rename(
+        columns={
+            "rate": "rate [Hz]",
+            "median": "median [s]",
+            "max": "longest [s]",
+            "sum": "all [s]",
+        }
+    )
 
 
 def _made(rows: Sequence[Mapping[str, Any]], job: Mapping[str, Any], sealed: str) -> str:
@@ -133,9 +190,13 @@ def _made(rows: Sequence[Mapping[str, Any]], job: Mapping[str, Any], sealed: str
         f"SHA-256 of the list of sealed truths, taken before the first diagnosis: `{sealed}`.",
     ]
     if job["seed"] < TUNING:
-        said.append(f"**This seed is one for tuning (below {TUNING:,}): these figures are not for publication.**")
+        said.append(
+            f"**This seed is one for tuning (below {TUNING:,}): these figures are not for publication.**"
+        )
     if len(job["code"]) > 1:
-        said.append(f"**The code changed {len(job['code']) - 1} times during this run: these figures are not those of one version.**")
+        said.append(
+            f"**The code changed {len(job['code']) - 1} times during this run: these figures are not those of one version.**"
+        )
     return "  \n".join(said)
 
 

@@ -24,7 +24,11 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NU
 
 
 def each_in_processes(
-    function: Callable[..., T], jobs: Sequence[tuple[Any, ...]], *, workers: int, told: Callable[[int], None] | None = None
+    function: Callable[..., T],
+    jobs: Sequence[tuple[Any, ...]],
+    *,
+    workers: int,
+    told: Callable[[int], None] | None = None,
 ) -> list[T]:
     """Call `function` with each of `jobs`; the results in the order of the jobs.
 
@@ -89,7 +93,9 @@ def _one_thread() -> Iterator[None]:
 @contextlib.contextmanager
 def _executor(workers: int) -> Iterator[ProcessPoolExecutor]:
     others = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
+    executor = ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare
+    )
     try:
         yield executor
     except BaseException:

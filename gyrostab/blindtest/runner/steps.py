@@ -28,7 +28,11 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
-        log, told = make_injection_case(plan, real) if real is not None and "copy" in plan else make_case(plan)
+        log, told = (
+            make_injection_case(plan, real)
+            if real is not None and "copy" in plan
+            else make_case(plan)
+        )
         sha256 = commit_case(log, told, part, name=name)
         os.replace(part / "recordings" / f"{name}.nc", directory / "recordings" / f"{name}.nc")
         os.replace(part / "truth" / f"{name}.json", truth)

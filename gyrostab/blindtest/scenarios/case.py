@@ -47,7 +47,13 @@ def _world(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) -> Worl
         rng = stream(plan["seed"], "world", plan["index"], attempt, trial)
         buried = plan["kind"] == "buried"
         world = draw_world(
-            rng, rate=plan["rate"], seconds=plan["seconds"], gaps=plan["gaps"], cuts=cuts, heavy=plan["heavy"], buried=buried
+            rng,
+            rate=plan["rate"],
+            seconds=plan["seconds"],
+            gaps=plan["gaps"],
+            cuts=cuts,
+            heavy=plan["heavy"],
+            buried=buried,
         )
         if any(entry.needs == "dips" for entry in entries):
             world = replace(world, light=environment.light_monitor(rng, plan["seconds"], dips=True))
@@ -57,7 +63,9 @@ def _world(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) -> Worl
             world = replace(world, noise=tuple(noise | {"Q": 0.0} for noise in world.noise))
         if _suits(world, entries):
             return world
-    raise OptionError(f"case {plan['index']} of seed {plan['seed']}: no environment with {plan['names']} in it was drawn in {_TRIES} tries")
+    raise OptionError(
+        f"case {plan['index']} of seed {plan['seed']}: no environment with {plan['names']} in it was drawn in {_TRIES} tries"
+    )
 
 
 def _told_from_cuts(world: World) -> NDArray[np.bool_]:
@@ -67,21 +75,30 @@ def _told_from_cuts(world: World) -> NDArray[np.bool_]:
     for begin, end in world.cuts:
         off |= (t >= begin) & (t < end)
     longest = max(1, round((SHORTEST - 2.0) * world.rate))
-    return np.asarray(off & world.missing | telemetry.shortened(world.missing & ~off, longest=longest))
+    return np.asarray(
+        off & world.missing | telemetry.shortened(world.missing & ~off, longest=longest)
+    )
 
 
 def _weaker(plan: dict[str, Any], attempt: int) -> dict[str, Any]:
     """A plan whose effect would not be buried in many tries, one step weaker."""
     if plan["kind"] != "buried" or attempt == 0 or attempt % _PATIENCE:
         return plan
-    return plan | {"strengths": [max((s for s in STRENGTHS if s < strength), default=strength) for strength in plan["strengths"]]}
+    return plan | {
+        "strengths": [
+            max((s for s in STRENGTHS if s < strength), default=strength)
+            for strength in plan["strengths"]
+        ]
+    }
 
 
 def draw_effects(plan: dict[str, Any], world: World, *, attempt: int = 0) -> list[Effect]:
     """The effects of a plan in a world."""
     known = CATALOGUE | STRANGE
     return [
-        known[name].make(world, stream(plan["seed"], "effect", plan["index"], attempt, name), strength=strength)
+        known[name].make(
+            world, stream(plan["seed"], "effect", plan["index"], attempt, name), strength=strength
+        )
         for name, strength in zip(plan["names"], plan["strengths"], strict=True)
     ]
 
@@ -99,7 +116,8 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
     log : xarray.Dataset
         A log of the contract; it holds nothing of the truth.
     truth : dict
-        JSON-ready: ``effects`` with names, axes, intervals, averaging times, sizes, expected gains and mean waveforms, ``noise`` and more.
+        JSON-ready: ``effects`` with names, axes, intervals, averaging times, sizes, expected gains
+        and mean waveforms, ``noise`` and more.
 
     Raises
     ------
@@ -125,17 +143,29 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
         world = _world(plan, entries, attempt)
         effects = draw_effects(plan, world, attempt=attempt)
         record = signal(world, effects, seed=seed + attempt)
-        proof = is_buried(world, effects, record, rng=stream(seed, "band", attempt)) if plan["kind"] == "buried" else None
+        proof = (
+            is_buried(world, effects, record, rng=stream(seed, "band", attempt))
+            if plan["kind"] == "buried"
+            else None
+        )
         if proof is None or proof["buried"]:
             break
     else:
-        raise OptionError(f"case {plan['index']} of seed {plan['seed']}: {plan['names']} at {plan['strengths']} cannot be buried; lower it")
+        raise OptionError(
+            f"case {plan['index']} of seed {plan['seed']}: {plan['names']} at {plan['strengths']} cannot be buried; lower it"
+        )
     channels = channels_of(world, effects, stream(seed, "channels", attempt))
     if plan["severing"]:
         driver = entries[0].channel
-        channels = sever(channels, str(driver), how=plan["severing"], rng=stream(seed, "sever", attempt))
+        channels = sever(
+            channels, str(driver), how=plan["severing"], rng=stream(seed, "sever", attempt)
+        )
     log = make_log(record, channels, start=world.start, rate=world.rate)
-    truth = truth_of(world, effects, strengths=plan["strengths"]) | {"plan": plan, "buried": proof, "attempts": attempt + 1}
+    truth = truth_of(world, effects, strengths=plan["strengths"]) | {
+        "plan": plan,
+        "buried": proof,
+        "attempts": attempt + 1,
+    }
     return log, truth
 
 
@@ -160,13 +190,19 @@ def _block_means(world: World, values: NDArray[np.float64]) -> list[float]:
 
 
 def _learned(world: World, effect: Effect) -> float:
-    return float(effect.nats if effect.mean is None else min(effect.nats, learned_gain(world, effect.mean)))
+    return float(
+        effect.nats if effect.mean is None else min(effect.nats, learned_gain(world, effect.mean))
+    )
 
 
 def _told(world: World, effect: Effect, strength: float) -> dict[str, Any]:
     waveform = {}
     if effect.mean is not None:
-        waveform = {axis: _block_means(world, row) for axis, row in zip(AXES, effect.mean, strict=True) if axis in effect.axes}
+        waveform = {
+            axis: _block_means(world, row)
+            for axis, row in zip(AXES, effect.mean, strict=True)
+            if axis in effect.axes
+        }
     return {
         "name": effect.name,
         "axes": list(effect.axes),
@@ -176,7 +212,9 @@ def _told(world: World, effect: Effect, strength: float) -> dict[str, Any]:
         "strength": float(strength),
         "size": float(effect.size),
         "expected_nats": float(effect.nats),
-        **({} if world.own is not None else {"learned_nats": _learned(world, effect)}),  # five terms say nothing of real noise
+        **(
+            {} if world.own is not None else {"learned_nats": _learned(world, effect)}
+        ),  # five terms say nothing of real noise
         "tau_min_s": float(effect.tau[0]),
         "tau_max_s": float(effect.tau[1]),
         "localised": effect.active is not None,
@@ -186,17 +224,26 @@ def _told(world: World, effect: Effect, strength: float) -> dict[str, Any]:
     }
 
 
-def truth_of(world: World, effects: Sequence[Effect], *, strengths: Sequence[float]) -> dict[str, Any]:
+def truth_of(
+    world: World, effects: Sequence[Effect], *, strengths: Sequence[float]
+) -> dict[str, Any]:
     """All that is true of a case, ready for JSON."""
     return {
         "schema": "gyrostab.concealed/1",
-        "effects": [_told(world, effect, strength) for effect, strength in zip(effects, strengths, strict=True)],
+        "effects": [
+            _told(world, effect, strength)
+            for effect, strength in zip(effects, strengths, strict=True)
+        ],
         "accepted": sorted({name for effect in effects for name in effect.beside}),
         "in_catalogue": all(effect.name in CATALOGUE for effect in effects),
         "noise": {axis: dict(noise) for axis, noise in zip(AXES, world.noise, strict=True)},
         "flicker": world.flicker,
         "sampling_rate_hz": world.rate,
-        "start": str(np.datetime_as_string(grid_times(world.start, world.rate, 0).view("datetime64[ns]"), unit="ms")),
+        "start": str(
+            np.datetime_as_string(
+                grid_times(world.start, world.rate, 0).view("datetime64[ns]"), unit="ms"
+            )
+        ),
         "seconds": world.seconds,
         "missing_share": float(lost(world, effects).mean()),
         "power_cuts": world.cuts.tolist(),

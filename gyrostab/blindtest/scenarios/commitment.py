@@ -79,8 +79,14 @@ def commit_case(log: xr.Dataset, truth: dict[str, Any], directory: str | Path, *
     for variable in handed.variables.values():
         if "units" in variable.attrs:
             variable.attrs = {**variable.attrs, "units": on_disk(variable.attrs["units"])}
-    packing: dict[Any, dict[str, Any]] = {str(key): {"zlib": True, "complevel": 1} for key in handed.data_vars if handed[key].ndim}
-    packing |= {str(key): {"dtype": "int64", "units": "nanoseconds since 1970-01-01"} for key in handed.variables if _is_time(handed, key)}
+    packing: dict[Any, dict[str, Any]] = {
+        str(key): {"zlib": True, "complevel": 1} for key in handed.data_vars if handed[key].ndim
+    }
+    packing |= {
+        str(key): {"dtype": "int64", "units": "nanoseconds since 1970-01-01"}
+        for key in handed.variables
+        if _is_time(handed, key)
+    }
     handed.to_netcdf(base / "recordings" / f"{name}.nc", engine="netcdf4", encoding=packing)
     return fingerprint(text)
 

@@ -37,8 +37,9 @@ def sever(channels: Channels, driver: str, *, how: str, rng: np.random.Generator
     driver : str
         The channel that drives the effect.
     how : {"withheld", "decoy", "lagged", "confounded", "noisy", "clipped"}
-        Left out; left out, with a channel of the same manner at other times; late by 30 to 180 s; joined by another
-        channel that moves with it; noisy by its own standard deviation; clipped at the upper half of its range.
+        Left out; left out, with a channel of the same manner at other times; late by 30 to 180 s;
+        joined by another channel that moves with it; noisy by its own standard deviation; clipped
+        at the upper half of its range.
     rng : numpy.random.Generator
 
     Raises
@@ -57,12 +58,19 @@ def sever(channels: Channels, driver: str, *, how: str, rng: np.random.Generator
     if how == "withheld" or how == "decoy":
         left.pop(driver, None)
         if driver == "rotation_rate":
-            left = {name: channel for name, channel in left.items() if not name.startswith("accel_")}
+            left = {
+                name: channel for name, channel in left.items() if not name.startswith("accel_")
+            }
         if how == "decoy" and values.size:
-            name, like = _stand_in(driver, np.roll(values[::-1], int(rng.integers(values.size))), rng)
+            name, like = _stand_in(
+                driver, np.roll(values[::-1], int(rng.integers(values.size))), rng
+            )
             left[name] = (like, rate)
     elif how == "lagged":
-        left[driver] = (_late(values, min(round(rng.uniform(30, 180) * rate), values.size // 4)), rate)
+        left[driver] = (
+            _late(values, min(round(rng.uniform(30, 180) * rate), values.size // 4)),
+            rate,
+        )
     elif how == "confounded":
         name, like = _stand_in(driver, values, rng)
         left[name] = (like, rate)
@@ -71,5 +79,7 @@ def sever(channels: Channels, driver: str, *, how: str, rng: np.random.Generator
     elif how == "clipped":
         left[driver] = (np.minimum(values, 0.5 * (values.min() + values.max())), rate)
     else:
-        raise OptionError(f"how={how!r}: give 'withheld', 'decoy', 'lagged', 'confounded', 'noisy' or 'clipped'")
+        raise OptionError(
+            f"how={how!r}: give 'withheld', 'decoy', 'lagged', 'confounded', 'noisy' or 'clipped'"
+        )
     return left

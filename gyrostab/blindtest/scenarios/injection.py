@@ -43,7 +43,12 @@ def rough_noise(record: Array, *, rate: float) -> dict[str, float]:
     white = float(np.nanmin((variance * tau)[tau <= max(1.0, tau[0])]))
     last = int(np.flatnonzero(np.isfinite(variance))[-1])
     left = max(0.0, float(variance[last]) - 1.5 * white / tau[last])
-    return {"N": math.sqrt(white) / 60.0, "B": 0.0, "K": math.sqrt(3 * left / (tau[last] / 3600.0)), "Q": 0.0}
+    return {
+        "N": math.sqrt(white) / 60.0,
+        "B": 0.0,
+        "K": math.sqrt(3 * left / (tau[last] / 3600.0)),
+        "Q": 0.0,
+    }
 
 
 def _world_of(log: xr.Dataset, record: Array, own: OwnNoise, rng: np.random.Generator) -> World:
@@ -53,7 +58,14 @@ def _world_of(log: xr.Dataset, record: Array, own: OwnNoise, rng: np.random.Gene
     noise = [rough_noise(row, rate=rate) for row in record]
     noise += [noise[0]] * (3 - len(noise))
     gone = np.asarray(np.isnan(record).any(axis=0))
-    world = replace(world, size=record.shape[1], start=first_stamp(log), noise=tuple(noise[:3]), missing=gone, own=own)
+    world = replace(
+        world,
+        size=record.shape[1],
+        start=first_stamp(log),
+        noise=tuple(noise[:3]),
+        missing=gone,
+        own=own,
+    )
     if "temperature" in log and np.isfinite(log["temperature"].values).mean() > 0.9:
         values = np.asarray(log["temperature"].values, dtype=float)
         at = np.linspace(0, values.size - 1, world.temperature.size)
@@ -102,11 +114,15 @@ def _as_counted(record: Array, added: Array, rng: np.random.Generator) -> Array:
         step = counts_of(values)
         if step > 0.0:
             level = float(values[np.isfinite(values)][0])
-            total[row] = level + step * np.floor((total[row] - level) / step + rng.random(values.size))
+            total[row] = level + step * np.floor(
+                (total[row] - level) / step + rng.random(values.size)
+            )
     return total
 
 
-def inject_effect(log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator) -> dict[str, tuple[xr.Dataset, dict[str, Any]]]:
+def inject_effect(
+    log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator
+) -> dict[str, tuple[xr.Dataset, dict[str, Any]]]:
     """Put an effect into a real log, and make the controls.
 
     Parameters
@@ -116,19 +132,21 @@ def inject_effect(log: xr.Dataset, effect: str, strength: float, rng: np.random.
     effect : str
         A name of the catalogue.
     strength : float
-        Size in units of the closed-form limit, by the noise of the log itself as `gyrostab.blindtest.generator.measured_noise` measures it.
+        Size in units of the closed-form limit, by the noise of the log itself as
+        `gyrostab.blindtest.generator.measured_noise` measures it.
     rng : numpy.random.Generator
 
     Returns
     -------
     dict
-        ``salted``, and without salt ``untouched``, ``flipped`` (the sign) and ``reversed`` (the time): log and truth each. All have the
-        same channels.
+        ``salted``, and without salt ``untouched``, ``flipped`` (the sign) and ``reversed`` (the
+        time): log and truth each. All have the same channels.
 
     Raises
     ------
     OptionError
-        When the effect is unknown, needs a restart that the log does not have, or axes that it does not have.
+        When the effect is unknown, needs a restart that the log does not have, or axes that it does
+        not have.
 
     Examples
     --------
@@ -152,27 +170,43 @@ def inject_effect(log: xr.Dataset, effect: str, strength: float, rng: np.random.
         padded = np.concatenate([salted, np.zeros((3 - len(axes), world.size))])
         salted = made.after(padded)[: len(axes)]
         salted[np.isnan(record)] = np.nan
-    channels = {name: channel for name, channel in channels_of(world, [made], rng).items() if name not in log.variables}
+    channels = {
+        name: channel
+        for name, channel in channels_of(world, [made], rng).items()
+        if name not in log.variables
+    }
     names = dict(zip("xyz", axes, strict=False))
     told = truth_of(world, [made], strengths=[strength])
     for one in told["effects"]:
         one["axes"] = [names[axis] for axis in one["axes"] if axis in names]
     bare = truth_of(world, [], strengths=[])
-    copies = {"salted": salted, "untouched": record, "flipped": -record, "reversed": record[:, ::-1].copy()}
+    copies = {
+        "salted": salted,
+        "untouched": record,
+        "flipped": -record,
+        "reversed": record[:, ::-1].copy(),
+    }
     return {
         name: (
             _with(log, values, channels, world),
             (told if name == "salted" else bare)
-            | {"plan": {"kind": "salted" if name == "salted" else "control", "copy": name}, "buried": None},
+            | {
+                "plan": {"kind": "salted" if name == "salted" else "control", "copy": name},
+                "buried": None,
+            },
         )
         for name, values in copies.items()
     }
 
 
-def _drawn(log: xr.Dataset, record: Array, effect: str, strength: float, rng: np.random.Generator) -> tuple[World, Effect]:
+def _drawn(
+    log: xr.Dataset, record: Array, effect: str, strength: float, rng: np.random.Generator
+) -> tuple[World, Effect]:
     entry = CATALOGUE[effect]
     if entry.cuts:
-        raise OptionError(f"{effect} follows restarts, and a real log has only its own; salt it with another effect")
+        raise OptionError(
+            f"{effect} follows restarts, and a real log has only its own; salt it with another effect"
+        )
     present = set("xyz"[: record.shape[0]])
     own = own_noise(record, rate=float(log.attrs["sampling_rate_hz"]), axes=3)
     for _ in range(_TRIES):
@@ -182,11 +216,18 @@ def _drawn(log: xr.Dataset, record: Array, effect: str, strength: float, rng: np
         made = entry.make(world, rng, strength=strength)
         if set(made.axes) <= present or (len(made.axes) == 3 and made.after is not None):
             return world, made
-    raise OptionError(f"{effect} needs more axes than the {record.shape[0]} of this log; salt it with another effect")
+    raise OptionError(
+        f"{effect} needs more axes than the {record.shape[0]} of this log; salt it with another effect"
+    )
 
 
-def _with(log: xr.Dataset, record: Array, channels: dict[str, tuple[Array, float]], world: World) -> xr.Dataset:
+def _with(
+    log: xr.Dataset, record: Array, channels: dict[str, tuple[Array, float]], world: World
+) -> xr.Dataset:
     gone = np.asarray(np.isnan(record).all(axis=0))
     out = log.isel(axis=slice(0, record.shape[0])).drop_dims("gap", errors="ignore")
-    out = out.assign(rate=(("axis", "time"), record, dict(log["rate"].attrs)), **gap_columns(gone, start=world.start, rate=world.rate))
+    out = out.assign(
+        rate=(("axis", "time"), record, dict(log["rate"].attrs)),
+        **gap_columns(gone, start=world.start, rate=world.rate),
+    )
     return with_channels(out, channels, start=world.start, rate=world.rate)

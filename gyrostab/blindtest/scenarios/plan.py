@@ -12,7 +12,8 @@ from gyrostab.errors import OptionError
 
 __all__ = ["KINDS", "SEVERINGS", "STRENGTHS", "plan_case", "plan_cases"]
 
-#: Kind of case -> how many of 20 are of it. "single" and "buried" hold one effect, "strange" one that is in no catalogue.
+#: Kind of case -> how many of 20 are of it. "single" and "buried" hold one effect, "strange" one
+#: that is in no catalogue.
 KINDS = {"null": 5, "single": 5, "buried": 2, "pair": 3, "triple": 1, "strange": 2, "severed": 2}
 
 #: Sizes in units of the closed-form limit.
@@ -37,9 +38,13 @@ def _pool(kind: str) -> list[tuple[str, float]]:
     if kind == "strange":
         return [(name, s) for name in STRANGE for s in STRENGTHS[1:]]
     if kind == "severed":
-        return [(name, s) for name, entry in CATALOGUE.items() if entry.channel for s in STRENGTHS[2:]]
+        return [
+            (name, s) for name, entry in CATALOGUE.items() if entry.channel for s in STRENGTHS[2:]
+        ]
     if kind == "buried":
-        return [(name, s) for name, entry in CATALOGUE.items() if entry.hidden for s in (1.0, 1.5, 2.5)]
+        return [
+            (name, s) for name, entry in CATALOGUE.items() if entry.hidden for s in (1.0, 1.5, 2.5)
+        ]
     return [(name, s) for name in CATALOGUE for s in STRENGTHS]
 
 
@@ -79,8 +84,8 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``index``, ``seed``, ``kind``, ``names``, ``strengths``, ``rate`` [Hz], ``seconds``, ``gaps`` (share), ``cuts``, ``heavy``,
-        ``severing``.
+        ``index``, ``seed``, ``kind``, ``names``, ``strengths``, ``rate`` [Hz], ``seconds``,
+        ``gaps`` (share), ``cuts``, ``heavy``, ``severing``.
 
     Raises
     ------
@@ -107,7 +112,11 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
         name, strength = _dealt(seed, kind, before)
         names, strengths = [name], [strength]
     for _ in range({"pair": 1, "triple": 2}.get(kind, 0)):
-        others = [other for other in CATALOGUE if other not in names and not any({other, name} in _APART for name in names)]
+        others = [
+            other
+            for other in CATALOGUE
+            if other not in names and not any({other, name} in _APART for name in names)
+        ]
         names.append(str(rng.choice(others)))
         strengths.append(float(rng.choice(STRENGTHS)))
     channel = (CATALOGUE | STRANGE)[names[0]].channel if names else None

@@ -30,19 +30,31 @@ class _Recording:
 
 
 REAL: dict[str, _Recording] = {
-    "fog-blueseis": _Recording("fog-blueseis-ramp/fog_ramp.csv.gz", {"rate_counts": "gyro_z"}, {"gyro": "1 nrad/s"}),
+    "fog-blueseis": _Recording(
+        "fog-blueseis-ramp/fog_ramp.csv.gz", {"rate_counts": "gyro_z"}, {"gyro": "1 nrad/s"}
+    ),
     "laser-gyros": _Recording(
         "rlg-static-30min/lasergyro.csv.gz",
         {"gx_deg_per_h": "gyro_x", "gy_deg_per_h": "gyro_y", "gz_deg_per_h": "gyro_z"},
         {"gyro": "deg/h"},
     ),
     "mems-ch104": _Recording(
-        "mems-static-53min/ch104.csv.gz", {"gx_dps": "gyro_x", "gy_dps": "gyro_y", "gz_dps": "gyro_z"}, {"gyro": "deg/s"}, 1200.0, 100.0
+        "mems-static-53min/ch104.csv.gz",
+        {"gx_dps": "gyro_x", "gy_dps": "gyro_y", "gz_dps": "gyro_z"},
+        {"gyro": "deg/s"},
+        1200.0,
+        100.0,
     ),
-    "ring-laser-g": _Recording("ringlaser-g-3h/ringlaser_g_3h.nc", {"BJZ": "gyro_z"}, {"gyro": "1.5825038e-13 rad/s"}, 2400.0),
+    "ring-laser-g": _Recording(
+        "ringlaser-g-3h/ringlaser_g_3h.nc",
+        {"BJZ": "gyro_z"},
+        {"gyro": "1.5825038e-13 rad/s"},
+        2400.0,
+    ),
 }
 
-#: Effects that can be added to noise which is there already, on one axis; and those which need three.
+#: Effects that can be added to noise which is there already, on one axis; and those which need
+#: three.
 _ON_ONE = (
     "vibration_rectification", "shupe", "temperature_bias", "thermal_hysteresis", "vibration_noise", "aliased_vibration",
     "temperature_noise", "light_power_noise", "ageing_noise", "spectral_line", "supply_bias", "spikes",
@@ -65,10 +77,22 @@ def plan_injections(number: int, *, seed: int) -> list[dict[str, Any]]:
         rng = stream(seed, "salted", index)
         names = list(REAL)
         recording = names[(int(stream(seed, "salted").integers(len(names))) + index) % len(names)]
-        effects = _ON_THREE if sum(name.startswith("gyro") for name in REAL[recording].columns.values()) == 3 else _ON_ONE
-        plan = {"index": index, "seed": seed, "recording": recording, "effect": str(rng.choice(effects))}
+        effects = (
+            _ON_THREE
+            if sum(name.startswith("gyro") for name in REAL[recording].columns.values()) == 3
+            else _ON_ONE
+        )
+        plan = {
+            "index": index,
+            "seed": seed,
+            "recording": recording,
+            "effect": str(rng.choice(effects)),
+        }
         plan |= {"strength": float(rng.choice(_STRENGTHS)), "part": float(rng.random())}
-        out += [plan | {"kind": "salted" if copy == "salted" else "control", "copy": copy} for copy in COPIES]
+        out += [
+            plan | {"kind": "salted" if copy == "salted" else "control", "copy": copy}
+            for copy in COPIES
+        ]
     return out
 
 
@@ -77,11 +101,15 @@ def _piece(recording: str, folder: Path, part: float) -> xr.Dataset:
     from gyrostab.ingest.grid.regularise import regularise
 
     entry = REAL[recording]
-    log = regularise(read_log(folder / entry.file, map=entry.columns, unit=entry.units, rate=entry.rate))
+    log = regularise(
+        read_log(folder / entry.file, map=entry.columns, unit=entry.units, rate=entry.rate)
+    )
     size = min(log.sizes["time"], round(entry.longest * float(log.attrs["sampling_rate_hz"])))
     first = round(part * (log.sizes["time"] - size))
     piece = log[["rate"]].isel(time=slice(first, first + size)).compute()
-    piece.attrs = {name: log.attrs[name] for name in ("sampling_rate_hz", "kind")}  # nothing that tells where it comes from
+    piece.attrs = {
+        name: log.attrs[name] for name in ("sampling_rate_hz", "kind")
+    }  # nothing that tells where it comes from
     return piece
 
 

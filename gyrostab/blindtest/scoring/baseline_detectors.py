@@ -12,14 +12,23 @@ from scipy import special
 
 from gyrostab.blindtest.generator import noise_floor as floor
 
-__all__ = ["allan_band", "allan_detector", "allan_variance", "band_excess", "channel_detector", "log_allan", "octaves"]
+__all__ = [
+    "allan_band",
+    "allan_detector",
+    "allan_variance",
+    "band_excess",
+    "channel_detector",
+    "log_allan",
+    "octaves",
+]
 
 Array = NDArray[np.float64]
 
 #: Level of both detectors.
 LEVEL = 0.01
 
-#: Samples from which on a record is long, samples of a mean in it, and of the part that nulls of its short times are made of.
+#: Samples from which on a record is long, samples of a mean in it, and of the part that nulls of
+#: its short times are made of.
 _LONG, _BLOCK, _PART = 50_000, 32, 20_000
 
 
@@ -35,7 +44,9 @@ def octaves(size: int) -> list[int]:
     return [2**k for k in range(most.bit_length())]
 
 
-def allan_variance(values: Array, factors: list[int], *, counts: NDArray[np.int64] | None = None) -> Array:
+def allan_variance(
+    values: Array, factors: list[int], *, counts: NDArray[np.int64] | None = None
+) -> Array:
     """Overlapping Allan variance of rates (time,) with NaN where lost; clusters count that are at least half full.
 
     Parameters
@@ -93,21 +104,35 @@ def log_allan(values: Array) -> Array:
     return np.asarray(np.log(np.concatenate([fine, coarse])))
 
 
-def _null(rng: np.random.Generator, missing: NDArray[np.bool_], noise: dict[str, float], rate: float, flicker: str) -> Array:
+def _null(
+    rng: np.random.Generator,
+    missing: NDArray[np.bool_],
+    noise: dict[str, float],
+    rate: float,
+    flicker: str,
+) -> Array:
     size = missing.size
     record = floor.white_level(noise["N"]) * math.sqrt(rate) * rng.standard_normal(size) + 7.0
-    record += floor.flicker(rng, size, b=noise["B"], rate=rate, method=flicker) + floor.random_walk(rng, size, k=noise["K"], rate=rate)
+    record += floor.flicker(rng, size, b=noise["B"], rate=rate, method=flicker) + floor.random_walk(
+        rng, size, k=noise["K"], rate=rate
+    )
     record = floor.quantize_angle(record, q=noise.get("Q", 0.0), rate=rate)
     record[missing] = np.nan
     return record
 
 
 def _null_logs(
-    rng: np.random.Generator, missing: NDArray[np.bool_], noise: dict[str, float], rate: float, flicker: str, nulls: int
+    rng: np.random.Generator,
+    missing: NDArray[np.bool_],
+    noise: dict[str, float],
+    rate: float,
+    flicker: str,
+    nulls: int,
 ) -> tuple[Array, Array]:
     """Logs of the Allan variance of nulls (null, factor), and by how much each factor's scatter is that of the whole record.
 
-    Of a long record the short times come from nulls of a part of it, the long ones from nulls of means.
+    Of a long record the short times come from nulls of a part of it, the long ones from nulls of
+    means.
     """
     factors = octaves(missing.size)
     if missing.size <= _LONG:
@@ -115,15 +140,26 @@ def _null_logs(
         return np.stack(rows), np.ones(len(factors))
     short = [k for k in factors if k <= _BLOCK]
     middle = (missing.size - _PART) // 2
-    part = missing[middle : middle + _PART] if not missing[middle : middle + _PART].all() else missing[:_PART]
+    part = (
+        missing[middle : middle + _PART]
+        if not missing[middle : middle + _PART].all()
+        else missing[:_PART]
+    )
     _, counts = _blocks(np.where(missing, np.nan, 0.0))
     fewer = np.sqrt(_BLOCK / np.maximum(counts, 1)) - 1
     rows = []
     for _ in range(nulls):
         fine = np.log(allan_variance(_null(rng, part, noise, rate, flicker), short))
         means = _null(rng, counts == 0, noise | {"Q": 0.0}, rate / _BLOCK, "spectrum")
-        means += floor.white_level(noise["N"]) * math.sqrt(rate / _BLOCK) * np.sqrt((1 + fewer) ** 2 - 1) * rng.standard_normal(counts.size)
-        coarse = np.log(allan_variance(means, [k // _BLOCK for k in factors if k > _BLOCK], counts=counts))
+        means += (
+            floor.white_level(noise["N"])
+            * math.sqrt(rate / _BLOCK)
+            * np.sqrt((1 + fewer) ** 2 - 1)
+            * rng.standard_normal(counts.size)
+        )
+        coarse = np.log(
+            allan_variance(means, [k // _BLOCK for k in factors if k > _BLOCK], counts=counts)
+        )
         rows.append(np.concatenate([fine, coarse]))
     smaller = math.sqrt(float((~part).sum()) / float((~missing).sum()))
     return np.stack(rows), np.where(np.array(factors) <= _BLOCK, smaller, 1.0)
@@ -156,8 +192,8 @@ def allan_band(
     Returns
     -------
     dict
-        ``keep`` (which of the `octaves` can be had), ``mean`` and ``sd`` of the log variance there, and ``limit``: what the largest of
-        ``abs(z)`` stays under in 99 % of nulls.
+        ``keep`` (which of the `octaves` can be had), ``mean`` and ``sd`` of the log variance there,
+        and ``limit``: what the largest of ``abs(z)`` stays under in 99 % of nulls.
     """
     logs, scatter_of_whole = _null_logs(rng, missing, noise, rate, flicker, nulls)
     keep = np.isfinite(logs).all(axis=0)
@@ -166,7 +202,9 @@ def allan_band(
     tied = np.corrcoef(logs, rowvar=False).reshape(mean.size, mean.size)
     values, vectors = np.linalg.eigh(0.98 * tied + 0.02 * np.eye(mean.size))
     normal = rng.standard_normal((20_000, mean.size)) @ (vectors * np.sqrt(np.maximum(values, 0))).T
-    scatter = np.sqrt(rng.chisquare(nulls - 1, (20_000, 1)) / (nulls - 1))  # the moments come from a few records themselves
+    scatter = np.sqrt(
+        rng.chisquare(nulls - 1, (20_000, 1)) / (nulls - 1)
+    )  # the moments come from a few records themselves
     spread = math.sqrt(1 + 1 / nulls)
     return {
         "keep": keep,
@@ -182,7 +220,9 @@ def band_excess(values: Array, band: dict[str, Any]) -> float:
     return float(np.nanmax(np.abs(z)))
 
 
-def allan_detector(record: Array, truth: dict[str, Any], *, rng: np.random.Generator, nulls: int = 60) -> bool:
+def allan_detector(
+    record: Array, truth: dict[str, Any], *, rng: np.random.Generator, nulls: int = 60
+) -> bool:
     """Whether the whole-record Allan deviation of any axis leaves its 99 % band, the noise being known exactly.
 
     Parameters
@@ -198,7 +238,12 @@ def allan_detector(record: Array, truth: dict[str, Any], *, rng: np.random.Gener
     axes = len(truth["noise"])
     for row, noise in zip(record, truth["noise"].values(), strict=True):
         band = allan_band(
-            noise=noise, rate=truth["sampling_rate_hz"], missing=np.isnan(row), rng=rng, nulls=nulls, flicker=truth["flicker"]
+            noise=noise,
+            rate=truth["sampling_rate_hz"],
+            missing=np.isnan(row),
+            rng=rng,
+            nulls=nulls,
+            flicker=truth["flicker"],
         )
         if band_excess(row, band) > _shared_limit(band["limit"], axes):
             return True
@@ -237,13 +282,19 @@ def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> bool:
         edges = np.minimum((np.arange(number) * block * own).astype(int), values.size - 1)
         driver = np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size))
         for i in range(record.shape[0]):
-            pairs += [_correlation_p(series[i][enough[i]], driver[enough[i]]) for series in (mean, spread)]
+            pairs += [
+                _correlation_p(series[i][enough[i]], driver[enough[i]]) for series in (mean, spread)
+            ]
     found = [p for p in pairs if math.isfinite(p)]
     return bool(found) and min(found) < LEVEL / len(found)
 
 
 def _channels(log: xr.Dataset) -> list[str]:
-    return [str(name) for name, variable in log.data_vars.items() if variable.dims in (("time",), (f"time_{name}",))]
+    return [
+        str(name)
+        for name, variable in log.data_vars.items()
+        if variable.dims in (("time",), (f"time_{name}",))
+    ]
 
 
 def _correlation_p(x: Array, y: Array) -> float:

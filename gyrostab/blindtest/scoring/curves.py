@@ -18,27 +18,37 @@ Row = Mapping[str, Any]
 def curves(rows: Sequence[Row]) -> pd.DataFrame:
     """Completeness against strength: shares detected and named, of every effect and of all, with Wilson's intervals.
 
-    Of an effect of no catalogue it is right to say that it is unknown, so this counts there in the place of a name.
+    Of an effect of no catalogue it is right to say that it is unknown, so this counts there in the
+    place of a name.
 
     Returns
     -------
     pandas.DataFrame
-        ``effect``, ``strength``, ``n``, ``detected``, ``detected_low``, ``detected_high``, ``named``, ``named_low``, ``named_high``.
+        ``effect``, ``strength``, ``n``, ``detected``, ``detected_low``, ``detected_high``,
+        ``named``, ``named_low``, ``named_high``.
     """
-    here = [row for row in rows if row["kind"] in ("single", "pair", "triple", "buried", "strange") and row["effect"]]
+    here = [
+        row
+        for row in rows
+        if row["kind"] in ("single", "pair", "triple", "buried", "strange") and row["effect"]
+    ]
     out = []
     for effect in ["all", *sorted({row["effect"] for row in here})]:
         for strength in sorted({row["strength"] for row in here}):
             part = [
                 row
                 for row in here
-                if row["strength"] == strength and (row["effect"] == effect or (effect == "all" and row["kind"] != "strange"))
+                if row["strength"] == strength
+                and (row["effect"] == effect or (effect == "all" and row["kind"] != "strange"))
             ]
             if not part:
                 continue
             line: dict[str, Any] = {"effect": effect, "strength": strength, "n": len(part)}
             for key in ("detected", "named"):
-                hits = sum(bool(row["unknown" if key == "named" and row["kind"] == "strange" else key]) for row in part)
+                hits = sum(
+                    bool(row["unknown" if key == "named" and row["kind"] == "strange" else key])
+                    for row in part
+                )
                 low, high = wilson(hits, len(part))
                 line |= {key: hits / len(part), f"{key}_low": low, f"{key}_high": high}
             out.append(line)
@@ -54,7 +64,15 @@ def reliability(rows: Sequence[Row]) -> pd.DataFrame:
     out = []
     for name, flags in sorted(said.items()):
         low, high = wilson(sum(flags), len(flags))
-        out.append({"name": name, "n": len(flags), "right": sum(flags) / len(flags), "low": low, "high": high})
+        out.append(
+            {
+                "name": name,
+                "n": len(flags),
+                "right": sum(flags) / len(flags),
+                "low": low,
+                "high": high,
+            }
+        )
     return pd.DataFrame(out, columns=["name", "n", "right", "low", "high"])
 
 
@@ -64,12 +82,17 @@ def by_effect(rows: Sequence[Row]) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        ``effect``; ``n`` at 1.5 times the limit and more, and of these the shares ``detected``, ``named`` (sets merged) and ``exactly``;
-        ``claims`` of this name in all cases and the share of them that is ``right``; ``numbers`` of it that could be compared and the
-        share ``held`` of their 95 % intervals that hold the truth. None where there is nothing to count.
+        ``effect``; ``n`` at 1.5 times the limit and more, and of these the shares ``detected``,
+        ``named`` (sets merged) and ``exactly``; ``claims`` of this name in all cases and the share
+        of them that is ``right``; ``numbers`` of it that could be compared and the share ``held``
+        of their 95 % intervals that hold the truth. None where there is nothing to count.
     """
     claims = {line["name"]: line for line in reliability(rows).to_dict("records")}
-    here = [row for row in rows if row["kind"] in ("single", "pair", "triple", "buried") and row["effect"]]
+    here = [
+        row
+        for row in rows
+        if row["kind"] in ("single", "pair", "triple", "buried") and row["effect"]
+    ]
     out = []
     for effect in sorted({row["effect"] for row in here} | set(claims)):
         clear = [row for row in here if row["effect"] == effect and row["strength"] >= CLEAR]
@@ -85,7 +108,9 @@ def by_effect(rows: Sequence[Row]) -> pd.DataFrame:
                 "held": _mean(numbers),
             }
         )
-    return pd.DataFrame(out, columns=["effect", "n", *_MARKS, "claims", "right", "numbers", "held"], dtype=object)
+    return pd.DataFrame(
+        out, columns=["effect", "n", *_MARKS, "claims", "right", "numbers", "held"], dtype=object
+    )
 
 
 _MARKS = {"detected": "detected", "named": "named", "exactly": "named_exactly"}

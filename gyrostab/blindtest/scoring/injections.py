@@ -22,9 +22,10 @@ def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     Returns
     -------
     list of dict
-        ``index``, ``recording``, ``effect``, ``strength``; ``there_before``: a name of the set of the effect is given to the untouched
-        copy already; ``named``: one is given to the salted one; ``others``: other names that salt has brought; ``flipped`` and
-        ``reversed``: names that turning the sign or the time has brought, sets merged.
+        ``index``, ``recording``, ``effect``, ``strength``; ``there_before``: a name of the set of
+        the effect is given to the untouched copy already; ``named``: one is given to the salted
+        one; ``others``: other names that salt has brought; ``flipped`` and ``reversed``: names that
+        turning the sign or the time has brought, sets merged.
     """
     groups: dict[Any, dict[str, Row]] = {}
     for row in rows:
@@ -72,7 +73,10 @@ def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
         return pd.DataFrame(columns=["quantity", "value", "low", "high", "n", "target", "state"])
     new = [one for one in found if not one["there_before"]]
     lines = [
-        share(f"salt of {CLEAR:g} times the limit and more: named rightly", (one["named"] for one in new if one["strength"] >= CLEAR)),
+        share(
+            f"salt of {CLEAR:g} times the limit and more: named rightly",
+            (one["named"] for one in new if one["strength"] >= CLEAR),
+        ),
         share("salt brings another name", (bool(one["others"]) for one in found)),
         share("turning the sign brings a name", (bool(one["flipped"]) for one in found)),
         share("turning the time brings a name", (bool(one["reversed"]) for one in found)),

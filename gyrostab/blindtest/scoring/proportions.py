@@ -40,7 +40,11 @@ class Target:
             return "not shown"
         if not self.least <= value <= self.most:
             return "missed"
-        return "met" if low >= self.least and high <= (self.most if self.surely is None else self.surely) else "not shown"
+        return (
+            "met"
+            if low >= self.least and high <= (self.most if self.surely is None else self.surely)
+            else "not shown"
+        )
 
 
 NO_TARGET = Target("")
@@ -64,14 +68,28 @@ def wilson(hits: int, total: int, *, z: float = 1.959964) -> tuple[float, float]
 
 def _line(name: str, value: float, low: float, high: float, number: int, target: Target) -> Line:
     state = target.state(value, low, high)
-    return {"quantity": name, "value": value, "low": low, "high": high, "n": number, "target": target.text, "state": state}
+    return {
+        "quantity": name,
+        "value": value,
+        "low": low,
+        "high": high,
+        "n": number,
+        "target": target.text,
+        "state": state,
+    }
 
 
 def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
     """A share of cases, with Wilson's interval."""
     found = [bool(flag) for flag in flags]
     hits, total = sum(found), len(found)
-    return _line(name, hits / total if total else math.nan, *(wilson(hits, total) if total else (math.nan, math.nan)), total, target)
+    return _line(
+        name,
+        hits / total if total else math.nan,
+        *(wilson(hits, total) if total else (math.nan, math.nan)),
+        total,
+        target,
+    )
 
 
 def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET) -> Line:
@@ -81,7 +99,11 @@ def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET
         return _line(name, math.nan, math.nan, math.nan, 0, target)
     reach = 0.98 * math.sqrt(found.size)
     low, high = math.floor((found.size - 1) / 2 - reach), math.ceil((found.size - 1) / 2 + reach)
-    ends = (-math.inf, math.inf) if found.size < 6 else (found[max(0, low)], found[min(found.size - 1, high)])
+    ends = (
+        (-math.inf, math.inf)
+        if found.size < 6
+        else (found[max(0, low)], found[min(found.size - 1, high)])
+    )
     return _line(name, float(np.median(found)), float(ends[0]), float(ends[1]), found.size, target)
 
 
@@ -90,6 +112,11 @@ def spread(name: str, pulls: Iterable[float | None], target: Target = NO_TARGET)
     found = np.abs([pull for pull in pulls if pull is not None and math.isfinite(pull)])
     if found.size == 0:
         return _line(name, math.nan, math.nan, math.nan, 0, target)
-    value, off = float(np.quantile(found, 0.6827)), 0.96 / math.sqrt(found.size)  # of the share, by the binomial law
-    low, high = (float(np.quantile(found, min(max(0.6827 + step, 0.0), 1.0))) for step in (-off, off))
+    value, off = (
+        float(np.quantile(found, 0.6827)),
+        0.96 / math.sqrt(found.size),
+    )  # of the share, by the binomial law
+    low, high = (
+        float(np.quantile(found, min(max(0.6827 + step, 0.0), 1.0))) for step in (-off, off)
+    )
     return _line(name, value, low, high, found.size, target)

@@ -16,14 +16,19 @@ __all__ = ["intersection_over_union", "score_case"]
 
 Intervals = Sequence[Sequence[str]]
 
-#: Numbers of which only the size can be known: the sign of what several axes share is a matter of convention.
+#: Numbers of which only the size can be known: the sign of what several axes share is a matter of
+#: convention.
 _UNSIGNED = ("N",)
 _LAST_DIGITS = 1e-9  # of a number
 
 
 def _seconds(intervals: Intervals) -> list[tuple[float, float]]:
     spans = sorted(
-        tuple(float(np.datetime64(stamp.removesuffix("Z"), "ns").astype(np.int64)) * 1e-9 for stamp in pair) for pair in intervals
+        tuple(
+            float(np.datetime64(stamp.removesuffix("Z"), "ns").astype(np.int64)) * 1e-9
+            for stamp in pair
+        )
+        for pair in intervals
     )
     joined: list[tuple[float, float]] = []
     for begin, end in spans:
@@ -60,7 +65,10 @@ def _claims(diagnosis: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Every name that is claimed once, the strongest first, with all its tables: one for every axis, or every line."""
     out: dict[str, dict[str, Any]] = {}
     for table in sorted(diagnosis["effects"], key=_gain, reverse=True):
-        one = out.setdefault(table["name"], {"name": table["name"], "alternatives": set(), "intervals": [], "tables": []})
+        one = out.setdefault(
+            table["name"],
+            {"name": table["name"], "alternatives": set(), "intervals": [], "tables": []},
+        )
         one["alternatives"] |= set(table.get("alternatives", ()))
         one["intervals"] += table.get("intervals", ())
         one["tables"].append(table)
@@ -73,39 +81,69 @@ def _numbers(claim: Mapping[str, Any], effect: Mapping[str, Any]) -> list[dict[s
     for name, true in effect["parameters"].items():
         wanted = true.get("values") or {None: true["value"]}
         for axis, value in wanted.items():
-            known = [_entry(table, name, axis, unless=true.get("unless", ())) for table in claim["tables"]]
-            near = [(_far(table, effect), entry) for table, entry in zip(claim["tables"], known, strict=True) if entry is not None]
+            known = [
+                _entry(table, name, axis, unless=true.get("unless", ()))
+                for table in claim["tables"]
+            ]
+            near = [
+                (_far(table, effect), entry)
+                for table, entry in zip(claim["tables"], known, strict=True)
+                if entry is not None
+            ]
             if not near:
                 continue
             found = min(near, key=lambda item: item[0])[1]
-            if found.get("unit") != true["unit"] or found.get("low") is None or found.get("high") is None:
+            if (
+                found.get("unit") != true["unit"]
+                or found.get("low") is None
+                or found.get("high") is None
+            ):
                 continue
             turned = -1.0 if name in _UNSIGNED and (found["value"] or 0.0) < 0 else 1.0
             low, high = sorted((turned * found["low"], turned * found["high"]))
             sure = found.get("value") is not None and found.get("stderr")
             pull = (turned * found["value"] - value) / found["stderr"] if sure else None
             last = _LAST_DIGITS * abs(value)  # what is exact may differ in the last digits
-            out.append({"parameter": name, "held": bool(low - last <= value <= high + last), "pull": pull})
+            out.append(
+                {"parameter": name, "held": bool(low - last <= value <= high + last), "pull": pull}
+            )
     return out
 
 
-def _entry(table: Mapping[str, Any], name: str, axis: str | None, *, unless: Sequence[str]) -> Mapping[str, Any] | None:
+def _entry(
+    table: Mapping[str, Any], name: str, axis: str | None, *, unless: Sequence[str]
+) -> Mapping[str, Any] | None:
     """The number of this name in a claim's table, for an axis or for all; none where others are beside it that change its meaning."""
     parameters, axes = table.get("parameters", {}), list(table.get("axes", ()))
-    if {key.split(".")[0] for key in parameters} & set(unless) or (axis is not None and axis not in axes):
+    if {key.split(".")[0] for key in parameters} & set(unless) or (
+        axis is not None and axis not in axes
+    ):
         return None
-    found: Mapping[str, Any] | None = parameters.get(f"{name}.{axis}" if axis is not None and len(axes) > 1 else name)
+    found: Mapping[str, Any] | None = parameters.get(
+        f"{name}.{axis}" if axis is not None and len(axes) > 1 else name
+    )
     return found
 
 
 def _far(table: Mapping[str, Any], effect: Mapping[str, Any]) -> float:
     """How far a claim's table is from an effect that has a frequency: of several lines the nearest is meant."""
-    true, found = effect["parameters"].get("frequency"), table.get("parameters", {}).get("frequency")
-    return abs(found["value"] - true["value"]) if true and found and found.get("value") is not None else 0.0
+    true, found = (
+        effect["parameters"].get("frequency"),
+        table.get("parameters", {}).get("frequency"),
+    )
+    return (
+        abs(found["value"] - true["value"])
+        if true and found and found.get("value") is not None
+        else 0.0
+    )
 
 
 def _tau_hit(diagnosis: Mapping[str, Any], name: str, effect: Mapping[str, Any]) -> bool | None:
-    bands = [(m["tau_min_s"], m["tau_max_s"]) for m in diagnosis["mismatches"] if name in m.get("explained_by", ())]
+    bands = [
+        (m["tau_min_s"], m["tau_max_s"])
+        for m in diagnosis["mismatches"]
+        if name in m.get("explained_by", ())
+    ]
     bands = [band for band in bands if band[0] is not None and band[1] is not None]
     if not bands:
         return None
@@ -113,12 +151,23 @@ def _tau_hit(diagnosis: Mapping[str, Any], name: str, effect: Mapping[str, Any])
 
 
 def _check(diagnosis: Mapping[str, Any]) -> None:
-    lacking = [key for key in ("verdict", "mismatches", "effects", "unexplained", "held_out") if key not in diagnosis]
+    lacking = [
+        key
+        for key in ("verdict", "mismatches", "effects", "unexplained", "held_out")
+        if key not in diagnosis
+    ]
     if lacking:
-        raise SchemaError(f"this is not a diagnosis: it has no {lacking[0]!r}; give the content of diagnosis.json")
+        raise SchemaError(
+            f"this is not a diagnosis: it has no {lacking[0]!r}; give the content of diagnosis.json"
+        )
 
 
-def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive: Mapping[str, bool] | None = None) -> list[dict[str, Any]]:
+def score_case(
+    diagnosis: Mapping[str, Any],
+    truth: Mapping[str, Any],
+    *,
+    naive: Mapping[str, bool] | None = None,
+) -> list[dict[str, Any]]:
     """Compare a diagnosis with the truth.
 
     Parameters
@@ -133,10 +182,12 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
     Returns
     -------
     list of dict
-        A row for every true effect, or one row where there is none: ``kind``, ``effect``, ``strength``, ``detected``, ``named`` (classes
-        merged by the ambiguity sets), ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (names that stand for nothing true),
-        ``unknown``, ``iou``, ``tau_hit``, ``numbers``, ``gain``, ``oracle``, ``learned`` (the oracle's, where noise is learned from the
-        record), ``seconds``, ``claims`` and more. A name is counted once, on however many axes it is claimed.
+        A row for every true effect, or one row where there is none: ``kind``, ``effect``,
+        ``strength``, ``detected``, ``named`` (classes merged by the ambiguity sets),
+        ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (names that stand for nothing true),
+        ``unknown``, ``iou``, ``tau_hit``, ``numbers``, ``gain``, ``oracle``, ``learned`` (the
+        oracle's, where noise is learned from the record), ``seconds``, ``claims`` and more. A name
+        is counted once, on however many axes it is claimed.
 
     Raises
     ------
@@ -164,7 +215,11 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
         "detected": detected,
         "wrong": len(wrong),
         "wrong_names": wrong,
-        "unknown": bool(detected and not wrong and (diagnosis["verdict"] in ("unknown", "partly explained") or not claims)),
+        "unknown": bool(
+            detected
+            and not wrong
+            and (diagnosis["verdict"] in ("unknown", "partly explained") or not claims)
+        ),
         "claims": [(claim["name"], bool(_names(claim) & standing)) for claim in claims],
         "gain": float((diagnosis["held_out"] or {}).get("log_likelihood_gain") or 0.0),
         "oracle": float(sum(effect["expected_nats"] for effect in truth["effects"])),
@@ -174,12 +229,25 @@ def score_case(diagnosis: Mapping[str, Any], truth: Mapping[str, Any], *, naive:
         "naive": dict(naive or {}),
     }
     if not true:
-        return [case | {"effect": None, "strength": 0.0, "learned_strength": None, "size": 0.0, "form_differs": None}]
+        return [
+            case
+            | {
+                "effect": None,
+                "strength": 0.0,
+                "learned_strength": None,
+                "size": 0.0,
+                "form_differs": None,
+            }
+        ]
     return [case | _row(diagnosis, claims, effect, accepted, true) for effect in truth["effects"]]
 
 
 def _row(
-    diagnosis: Mapping[str, Any], claims: Sequence[Mapping[str, Any]], effect: Mapping[str, Any], accepted: set[str], true: Sequence[str]
+    diagnosis: Mapping[str, Any],
+    claims: Sequence[Mapping[str, Any]],
+    effect: Mapping[str, Any],
+    accepted: set[str],
+    true: Sequence[str],
 ) -> dict[str, Any]:
     name = effect["name"]
     others = accepted.union(*(merged(other) for other in true if other != name)) - merged(name)
@@ -189,7 +257,9 @@ def _row(
     row: dict[str, Any] = {
         "effect": name,
         "strength": effect["strength"],
-        "learned_strength": math.sqrt(effect["learned_nats"] / NATS) if "learned_nats" in effect else None,
+        "learned_strength": math.sqrt(effect["learned_nats"] / NATS)
+        if "learned_nats" in effect
+        else None,
         "size": effect["size"],
         "form_differs": effect["form_differs"],
         "named": bool(top and top["name"] in merged(name)),

@@ -24,8 +24,9 @@ FAINT = 0.1
 def trace_visibility(world: World, effect: Effect) -> dict[str, float]:
     """Separation d' of samples, and of means over 1 s, with and without an effect, where the effect is at work.
 
-    For a mean it is the rms of the mean over the standard deviation of the noise, for noise the change of the log variance over root 2,
-    and both grow with the root of the number of samples that are averaged.
+    For a mean it is the rms of the mean over the standard deviation of the noise, for noise the
+    change of the log variance over root 2, and both grow with the root of the number of samples
+    that are averaged.
 
     Returns
     -------
@@ -55,13 +56,21 @@ def trace_visibility(world: World, effect: Effect) -> dict[str, float]:
     return {"sample": sample, "second": second}
 
 
-def is_buried(world: World, effects: Sequence[Effect], record: Array, *, rng: np.random.Generator, nulls: int = 50) -> dict[str, Any]:
+def is_buried(
+    world: World,
+    effects: Sequence[Effect],
+    record: Array,
+    *,
+    rng: np.random.Generator,
+    nulls: int = 50,
+) -> dict[str, Any]:
     """Verify that no effect of a record (axis, time) can be seen, see `trace_visibility`; the Allan band is made of nulls of its own.
 
     Returns
     -------
     dict
-        ``buried``, ``sample`` and ``second`` (the largest d'), and ``allan`` (the largest deviation over its 99 % limit, per axis).
+        ``buried``, ``sample`` and ``second`` (the largest d'), and ``allan`` (the largest deviation
+        over its 99 % limit, per axis).
     """
     seen = [trace_visibility(world, effect) for effect in effects]
     worst = {key: max((one[key] for one in seen), default=0.0) for key in ("sample", "second")}
@@ -72,7 +81,14 @@ def is_buried(world: World, effects: Sequence[Effect], record: Array, *, rng: np
     for axis, row, noise in zip(AXES, record, world.noise, strict=True):
         if axis not in touched:
             continue
-        band = allan_band(noise=noise, rate=world.rate, missing=np.isnan(row), rng=rng, nulls=nulls, flicker=world.flicker)
+        band = allan_band(
+            noise=noise,
+            rate=world.rate,
+            missing=np.isnan(row),
+            rng=rng,
+            nulls=nulls,
+            flicker=world.flicker,
+        )
         allan[axis] = band_excess(row, band) / band["limit"]
         if allan[axis] >= 1:
             break

@@ -14,8 +14,8 @@ __all__ = ["demo"]
 def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -> None:
     """Run the main job on the simulated log that comes with gyrostab.
 
-    Writes the product, the regular log, a report and figures into a folder, and prints the noise coefficients
-    before, during and after the vibration.
+    Writes the product, the regular log, a report and figures into a folder, and prints the noise
+    coefficients before, during and after the vibration.
 
     Example: gyrostab demo -o demo-output
 

@@ -31,7 +31,8 @@ def diagnose(
 ) -> None:
     """Find where a recording differs from its simulation, name the physics that is missing, and add it to the model.
 
-    Writes diagnosis.json, model.toml (for gyrostab simulate), diagnosis.nc and report.html into a folder, and prints the verdict.
+    Writes diagnosis.json, model.toml (for gyrostab simulate), diagnosis.nc and report.html into a
+    folder, and prints the verdict.
 
     Example: gyrostab diagnose run7.nc -o run7-diagnosis
 
@@ -42,12 +43,13 @@ def diagnose(
     output
         Folder to make.
     simulation
-        What the recording is compared with: a model, or a simulated log on the same stamps (default: noise calibrated on quiet
-        stretches of the recording).
+        What the recording is compared with: a model, or a simulated log on the same stamps
+        (default: noise calibrated on quiet stretches of the recording).
     quiet
-        Stretch of the recording in which nothing happens, for the calibration: 2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after
-        the start. Repeat for more (default: detected automatically). With --simulation it calibrates the level of the simulated
-        noise, by one factor for each axis.
+        Stretch of the recording in which nothing happens, for the calibration:
+        2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after the start. Repeat for more (default:
+        detected automatically). With --simulation it calibrates the level of the simulated noise,
+        by one factor for each axis.
     block
         Length of the blocks that are looked at (default: 20s, less in short records).
     level
@@ -68,9 +70,20 @@ def diagnose(
     with work(common) as stage:
         stage("reading", 0)
         log = load_log(recording, **reading.options())
-        expected = load_log([simulation]) if simulation and simulation.suffix.lower() != ".toml" else simulation
+        expected = (
+            load_log([simulation])
+            if simulation and simulation.suffix.lower() != ".toml"
+            else simulation
+        )
         diagnosis = run_diagnosis(
-            log, simulation=expected, quiet=spans or None, block=block, false_alarm_level=level, nulls=nulls, seed=seed, progress=stage
+            log,
+            simulation=expected,
+            quiet=spans or None,
+            block=block,
+            false_alarm_level=level,
+            nulls=nulls,
+            seed=seed,
+            progress=stage,
         )
         stage("drawing", 0)
         files = write_diagnosis(diagnosis, output, overwrite=common.overwrite)

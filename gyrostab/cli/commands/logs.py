@@ -15,7 +15,8 @@ __all__ = ["ingest", "scan"]
 def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common()) -> None:
     """Say what is in some logs: span, sampling rate, axes, channels, gaps, what is odd, and the command to run next.
 
-    A file that cannot be read as it is needs no options here: every column of it is shown, with a guess at the gyro, its unit and the time.
+    A file that cannot be read as it is needs no options here: every column of it is shown, with a
+    guess at the gyro, its unit and the time.
 
     Example: gyrostab scan run7/*.csv
 
@@ -43,7 +44,9 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     if options and examined.errors:
         raise examined.errors[0]
     if len(lost):
-        raise FormatError(f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; the table says why")
+        raise FormatError(
+            f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; the table says why"
+        )
 
 
 @app.command(sort_key=2, help_epilogue="")
@@ -69,8 +72,8 @@ def ingest(
     output
         File to write, LOG.nc or LOG.zarr.
     compression
-        Of a NetCDF file: zlib is read by every program; zstd is faster, but Octave, MATLAB and h5netcdf do not read it
-        (default: zlib).
+        Of a NetCDF file: zlib is read by every program; zstd is faster, but Octave, MATLAB and
+        h5netcdf do not read it (default: zlib).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.jobs.run import load_log, samples_of
@@ -79,7 +82,9 @@ def ingest(
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
     zarr = target.suffix.lower() == ".zarr"
     if zarr and compression:
-        raise OptionError(f"--compression {compression} is for NetCDF, and {output} is Zarr; leave it out")
+        raise OptionError(
+            f"--compression {compression} is for NetCDF, and {output} is Zarr; leave it out"
+        )
     with work(common) as stage:
         stage("reading", 0)
         log = load_log(logs, **reading.options())
@@ -92,5 +97,7 @@ def ingest(
         if zarr:
             to_zarr(log, target, overwrite=common.overwrite, progress=tell)
         else:
-            to_netcdf(log, target, overwrite=common.overwrite, compression=compression, progress=tell)
+            to_netcdf(
+                log, target, overwrite=common.overwrite, compression=compression, progress=tell
+            )
     print(target)

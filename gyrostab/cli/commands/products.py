@@ -46,11 +46,18 @@ def report(
         stage("drawing", 0)
         if product.is_dir() and (product / "diagnosis.json").exists():
             if log is not None:
-                raise OptionError("--log is for the report of a product; a diagnosis holds what its report shows")
+                raise OptionError(
+                    "--log is for the report of a product; a diagnosis holds what its report shows"
+                )
             write_diagnosis_report(open_diagnosis(product), target, overwrite=common.overwrite)
             print(target)
             return
-        write_report(open_product(product), target, log=open_log(log) if log else None, overwrite=common.overwrite)
+        write_report(
+            open_product(product),
+            target,
+            log=open_log(log) if log else None,
+            overwrite=common.overwrite,
+        )
     print(target)
 
 
@@ -76,9 +83,11 @@ def correlate(
     with_
         Channel of the product, or of the file given by --channel.
     max_lag
-        Longest time by which the gyro may follow the channel (default: a tenth of the record; 0s for none).
+        Longest time by which the gyro may follow the channel (default: a tenth of the record; 0s
+        for none).
     output
-        NetCDF file to write: the product with the correlation beside it; a figure of the same name in PNG stands beside it.
+        NetCDF file to write: the product with the correlation beside it; a figure of the same name
+        in PNG stands beside it.
     """
     from gyrostab.correlate import correlate as compute
     from gyrostab.correlate import format_correlation, join
@@ -90,11 +99,15 @@ def correlate(
 
     given, file = other.options(), other.channel
     target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite) if output else None
-    picture = check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
+    picture = (
+        check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
+    )
     with work(common) as stage:
         stage("correlating", 0)
         dataset = open_product(product)
-        found = compute(dataset, channel=read_channel(file, with_, **given) if file else with_, max_lag=max_lag)
+        found = compute(
+            dataset, channel=read_channel(file, with_, **given) if file else with_, max_lag=max_lag
+        )
         if target and picture:
             with new_output(picture, overwrite=common.overwrite) as temporary:
                 save_png(plot_correlation(found), temporary)
@@ -158,7 +171,10 @@ def export(
     from gyrostab.io.kalibr import to_kalibr
     from gyrostab.store.output import check_output
 
-    writers: dict[str, tuple[Any, list[str]]] = {"kalibr": (to_kalibr, [".yaml", ".yml"]), "zarr": (to_zarr, [".zarr"])}
+    writers: dict[str, tuple[Any, list[str]]] = {
+        "kalibr": (to_kalibr, [".yaml", ".yml"]),
+        "zarr": (to_zarr, [".zarr"]),
+    }
     write, suffixes = writers[format]
     target = check_output(output, suffixes=suffixes, overwrite=common.overwrite)
     with work(common) as stage:

@@ -33,8 +33,9 @@ def prove(
 ) -> None:
     """Try the diagnosis on recordings whose hidden effects it is not told, and count how often it is right.
 
-    Draws cases by physics that the diagnosis does not share, prints the SHA-256 that seals their truths, diagnoses the recordings, opens
-    the seal, and writes scores.csv, table.md and figures, failures included. About half a minute a case and core.
+    Draws cases by physics that the diagnosis does not share, prints the SHA-256 that seals their
+    truths, diagnoses the recordings, opens the seal, and writes scores.csv, table.md and figures,
+    failures included. About half a minute a case and core.
 
     Example: gyrostab prove --cases 20 --nulls 200 -o proof
 
@@ -45,11 +46,13 @@ def prove(
     cases
         Number of cases (default: 40); every 20 hold all kinds.
     seed
-        Of the draws (default: a fresh one, which is printed). Seeds below 1000000 are for tuning; figures that are published use others.
+        Of the draws (default: a fresh one, which is printed). Seeds below 1000000 are for tuning;
+        figures that are published use others.
     nulls
         Null records of each diagnosis (default: 400; 200 for a quick look).
     real
-        Folder of real recordings (default: $GYROSTAB_RECORDINGS); one is salted for every 40 cases. Without it none is.
+        Folder of real recordings (default: $GYROSTAB_RECORDINGS); one is salted for every 40 cases.
+        Without it none is.
     resume
         Continue a run that was stopped or killed; begin one where there is none.
     """
@@ -61,7 +64,10 @@ def prove(
         print(text, flush=True)
 
     if seed is not None and seed < TUNING:
-        print(f"note: seed {seed} is below {TUNING}: such seeds are for tuning, and their figures are not for publication", file=sys.stderr)
+        print(
+            f"note: seed {seed} is below {TUNING}: such seeds are for tuning, and their figures are not for publication",
+            file=sys.stderr,
+        )
     try:
         with work(common) as stage, _lines(stage, quiet=common.quiet_progress) as told:
             proof = run_benchmark(
@@ -77,11 +83,17 @@ def prove(
                 say=say,
             )
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted; what is finished is kept: gyrostab prove --resume -o {output} goes on") from None
+        raise KeyboardInterrupt(
+            f"interrupted; what is finished is kept: gyrostab prove --resume -o {output} goes on"
+        ) from None
     print(markdown(proof.table))
     print("\ntargets missed:", *(f"  {line}" for line in proof.missed or ["none"]), sep="\n")
     if proof.failed:
-        print("\ndiagnoses that failed:", *(f"  {name}: {why}" for name, why in proof.failed.items()), sep="\n")
+        print(
+            "\ndiagnoses that failed:",
+            *(f"  {name}: {why}" for name, why in proof.failed.items()),
+            sep="\n",
+        )
     print("\nwritten:", *(f"  {file}" for file in proof.files), sep="\n")
 
 
@@ -102,10 +114,20 @@ def _lines(stage: Any, *, quiet: bool) -> Iterator[Any]:
         if worked and total and clock - now["said"] > _EVERY:
             now["said"] = clock
             left = (clock - now["begun"]) / worked * (total - (done or 0))
-            print(f"{label} {done} of {total} {unit}, {_length(left)} left", file=sys.stderr, flush=True)
+            print(
+                f"{label} {done} of {total} {unit}, {_length(left)} left",
+                file=sys.stderr,
+                flush=True,
+            )
 
     yield told
 
 
 def _length(seconds: float) -> str:
-    return f"{seconds / 3600:.1f} h" if seconds > 5400 else f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
+    return (
+        f"{seconds / 3600:.1f} h"
+        if seconds > 5400
+        else f"{seconds / 60:.0f} min"
+        if seconds > 90
+        else f"{seconds:.0f} s"
+    )

@@ -39,11 +39,14 @@ def simulate(
     output
         File to write, LOG.nc or LOG.zarr.
     duration
-        Length of the log: 1h, 200h. --rate and --start give sampling rate and first time; all three may stand in the model.
+        Length of the log: 1h, 200h. --rate and --start give sampling rate and first time; all three
+        may stand in the model.
     like
-        Recording whose time stamps, gaps and channels are taken instead. Repeat for more files of it.
+        Recording whose time stamps, gaps and channels are taken instead. Repeat for more files of
+        it.
     seed
-        Seed of the random numbers: the same log for the same seed, the same noise with and without effects (default: the model's, or 0).
+        Seed of the random numbers: the same log for the same seed, the same noise with and without
+        effects (default: the model's, or 0).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.jobs.run import load_log, samples_of
@@ -54,10 +57,14 @@ def simulate(
     with work(common) as stage:
         stage("reading", 0)
         if like:
-            log = make(model, like=load_log(like, **reading.options()), duration=duration, seed=seed)
+            log = make(
+                model, like=load_log(like, **reading.options()), duration=duration, seed=seed
+            )
         else:
             if reading.time_from or reading.time_to or reading.exclude:
-                raise OptionError("--from, --to and --exclude cut the recording of --like; give that recording too, or --duration")
+                raise OptionError(
+                    "--from, --to and --exclude cut the recording of --like; give that recording too, or --duration"
+                )
             log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
         stage("simulating", samples_of(log))
         write = to_zarr if target.suffix.lower() == ".zarr" else to_netcdf

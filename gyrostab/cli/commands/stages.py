@@ -94,7 +94,11 @@ def fit(
     target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite)
     with work(common) as stage:
         stage("fitting", 0)
-        to_netcdf(fit_noise(open_surface(surface), **fitting.options()), target, overwrite=common.overwrite)
+        to_netcdf(
+            fit_noise(open_surface(surface), **fitting.options()),
+            target,
+            overwrite=common.overwrite,
+        )
     _print_product(target)
 
 
@@ -107,11 +111,21 @@ def _print_product(target: Path) -> None:
 
     with open_product(target) as product:
         print(format_product(product))
-    print(f"\nNext: gyrostab report {quote(str(target))} -o {quote(str(target.with_suffix('.html')))}")
+    print(
+        f"\nNext: gyrostab report {quote(str(target))} -o {quote(str(target.with_suffix('.html')))}"
+    )
     print(target)
 
 
-def _job(logs: list[Path], output: Path, windows: Windows, reading: Reading, running: Running, common: Common, **more: Any) -> Path:
+def _job(
+    logs: list[Path],
+    output: Path,
+    windows: Windows,
+    reading: Reading,
+    running: Running,
+    common: Common,
+    **more: Any,
+) -> Path:
     """Run the main job with what all its commands let the user choose."""
     from gyrostab.jobs.run import run as run_job
 

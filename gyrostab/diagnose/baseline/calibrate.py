@@ -1,7 +1,8 @@
 """The stationary noise that a record is compared with: calibrated on its quiet time.
 
-Band powers of the quiet blocks give Q, N and what they can of B and K; the block means give the slow part of B and K. The posterior
-is kept as draws, so that null records carry the error of the calibration.
+Band powers of the quiet blocks give Q, N and what they can of B and K; the block means give the
+slow part of B and K. The posterior is kept as draws, so that null records carry the error of the
+calibration.
 """
 
 from __future__ import annotations
@@ -13,11 +14,29 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.expected_statistics import NOISE, common_variance, line_columns, noise_powers, white_variance
+from gyrostab.diagnose.baseline.expected_statistics import (
+    NOISE,
+    common_variance,
+    line_columns,
+    noise_powers,
+    white_variance,
+)
 from gyrostab.diagnose.baseline.known_effects import evenness, expect_known_effects
 from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_noise
-from gyrostab.diagnose.baseline.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior, scales, summed
-from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks, find_quiescent_spans, loudness
+from gyrostab.diagnose.baseline.posterior import (
+    Fit,
+    Posterior,
+    fit_squares,
+    floor_square,
+    noise_posterior,
+    scales,
+    summed,
+)
+from gyrostab.diagnose.baseline.quiescent import (
+    find_quiescent_blocks,
+    find_quiescent_spans,
+    loudness,
+)
 from gyrostab.diagnose.baseline.simulated import odd_band, shown_by, with_shown
 from gyrostab.diagnose.baseline.wandering import with_wandering
 from gyrostab.diagnose.evidence.products import mean_products
@@ -25,7 +44,14 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import HOUR, LAWS, TERMS
 from gyrostab.simulate.model import Model, read_model
 
-__all__ = ["DRAWS", "assemble_baseline", "baseline_from_model", "baseline_from_simulation", "calibrate_noise", "grid_values"]
+__all__ = [
+    "DRAWS",
+    "assemble_baseline",
+    "baseline_from_model",
+    "baseline_from_simulation",
+    "calibrate_noise",
+    "grid_values",
+]
 
 Array = NDArray[np.float64]
 #: Draws from the posterior of the noise of an axis.
@@ -48,14 +74,19 @@ def _noisier(power: Array, shape: Array, spectrum: Array) -> Array:
 
 def grid_values(term: str, centre: float, scale: float) -> Array:
     """Values of K or B that the noise may have, from none to far above both the calibrated one and what is just seen."""
-    return np.array([factor * (max(centre, scale) if factor > 1.0 else centre) for factor in _FACTORS[term]])
+    return np.array(
+        [factor * (max(centre, scale) if factor > 1.0 else centre) for factor in _FACTORS[term]]
+    )
 
 
 def _grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Array, Array]:
     """K and B of the coarse grid, and log of the posterior around every point."""
     centres = np.sqrt(np.median(posterior.slow, axis=0))
     least = scales(density, span)
-    K, B = grid_values("K", float(centres[1]), least[0]), grid_values("B", float(centres[0]), least[1])
+    K, B = (
+        grid_values("K", float(centres[1]), least[0]),
+        grid_values("B", float(centres[0]), least[1]),
+    )
     place = []
     for fine, coarse in ((posterior.K, K), (posterior.B, B)):
         between = np.sqrt(coarse[1:-1] * coarse[2:])
@@ -74,8 +105,9 @@ def calibrate_noise(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     reduced : xarray.Dataset
         From `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
-        What is known to be quiet: seconds since the start, or ISO times. Without it blocks with little vibration, steady temperature, no
-        rotation, not soon after a restart, and not louder than most.
+        What is known to be quiet: seconds since the start, or ISO times. Without it blocks with
+        little vibration, steady temperature, no rotation, not soon after a restart, and not louder
+        than most.
 
     Returns
     -------
@@ -107,7 +139,11 @@ def calibrate_noise(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     (True, 'calibrated')
     """
     chosen, reason = find_quiescent_blocks(reduced, quiet)
-    attrs = {"source": "calibrated", "calibrated_on": find_quiescent_spans(reduced, chosen), "quiet_by": reason}
+    attrs = {
+        "source": "calibrated",
+        "calibrated_on": find_quiescent_spans(reduced, chosen),
+        "quiet_by": reason,
+    }
     return assemble_baseline(reduced, _posteriors(reduced, chosen), quiet=chosen, attrs=attrs)
 
 
@@ -115,7 +151,10 @@ def _posteriors(reduced: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterio
     """Noise of every axis from the chosen blocks (axis, block)."""
     columns = noise_powers(reduced)
     common, rest = common_variance(reduced)
-    power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
+    power, shape = (
+        reduced["power"].transpose("axis", "block", "band").values,
+        reduced["shape"].transpose("axis", "block", "band").values,
+    )
     mean = reduced["mean"].transpose("axis", "block").values
     step = float(reduced.attrs["block_s"])
     found = []
@@ -131,7 +170,17 @@ def _posteriors(reduced: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterio
         square = np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0])
         variance = white_variance(reduced, np.tile(square, (len(mean), 1)))[row]
         present = use & np.isfinite(mean[row])
-        found.append(noise_posterior(fit, mean[row], variance, present, step=step, draws=DRAWS, rng=np.random.default_rng(row)))
+        found.append(
+            noise_posterior(
+                fit,
+                mean[row],
+                variance,
+                present,
+                step=step,
+                draws=DRAWS,
+                rng=np.random.default_rng(row),
+            )
+        )
     return found
 
 
@@ -170,13 +219,26 @@ def assemble_baseline(
     square = np.stack([one.square for one in found])
     noise = np.einsum("abfn,an->abf", columns, square)
     expected = noise if spectrum is None else spectrum
-    power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
+    power, shape = (
+        reduced["power"].transpose("axis", "block", "band").values,
+        reduced["shape"].transpose("axis", "block", "band").values,
+    )
     floor = np.array([1e-3 * one.min() / HOUR for one in expected])
-    white = white_variance(reduced, np.stack([square[:, 0], np.maximum(square[:, 1], floor), square[:, 2], square[:, 3]], axis=1))
+    white = white_variance(
+        reduced,
+        np.stack(
+            [square[:, 0], np.maximum(square[:, 1], floor), square[:, 2], square[:, 3]], axis=1
+        ),
+    )
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
-    variance = white * np.stack([_noisier(*parts) for parts in zip(power, shape, expected, strict=True)])
+    variance = white * np.stack(
+        [_noisier(*parts) for parts in zip(power, shape, expected, strict=True)]
+    )
     span = reduced.sizes["block"] * float(reduced.attrs["block_s"])
-    grids = [_grid(one, max(one.square[1], least) * HOUR, span) for one, least in zip(found, floor, strict=True)]
+    grids = [
+        _grid(one, max(one.square[1], least) * HOUR, span)
+        for one, least in zip(found, floor, strict=True)
+    ]
     draws = np.stack([one.draws for one in found])
     common, rest = common_variance(reduced)
     value, error = _coefficients(found)
@@ -185,27 +247,85 @@ def assemble_baseline(
     told = ", ".join(f"{term} in {LAWS[term].label}" for term in TERMS)
     variables: dict[str, Any] = {
         "coefficient": (("axis", "term"), value, {"long_name": "noise coefficient", "units": told}),
-        "stderr": (("axis", "term"), error, {"long_name": "standard error of the coefficient", "units": told}),
+        "stderr": (
+            ("axis", "term"),
+            error,
+            {"long_name": "standard error of the coefficient", "units": told},
+        ),
         "quiet": (plane, quiet, {"long_name": "block is calibrated on", "units": "1"}),
         "spectrum": (cube, expected, {"long_name": "expected power", "units": _POWER}),
-        "known_mean": (plane, np.zeros(quiet.shape) if known_mean is None else known_mean, {"units": "degree hour-1"}),
-        "mean_variance": (plane, variance, {"long_name": "white variance of the block mean", "units": "degree2 hour-2"}),
-        "common": (plane, common, {"long_name": "relative variance that the powers of a block have in common", "units": "1"}),
-        "shape_alone": (cube, rest, {"long_name": "shape of the gamma distribution of a power beside the common part", "units": "1"}),
-        "columns": ((*cube, "noise"), columns, {"long_name": "expected power per squared coefficient", "units": _POWER}),
-        "square": (("axis", "noise"), square, {"long_name": "squared coefficient that fits the powers", "units": f"square of {told}"}),
-        "square_stderr": (("axis", "noise"), np.stack([one.error for one in found]), {"units": f"square of {told}"}),
-        "posterior": (("axis", "draw", "noise"), draws, {"long_name": "draws of the squares in powers", "units": f"square of {told}"}),
-        "posterior_slow": (("axis", "draw", "slow"), np.stack([one.slow for one in found]), {"units": f"square of {told}"}),
+        "known_mean": (
+            plane,
+            np.zeros(quiet.shape) if known_mean is None else known_mean,
+            {"units": "degree hour-1"},
+        ),
+        "mean_variance": (
+            plane,
+            variance,
+            {"long_name": "white variance of the block mean", "units": "degree2 hour-2"},
+        ),
+        "common": (
+            plane,
+            common,
+            {
+                "long_name": "relative variance that the powers of a block have in common",
+                "units": "1",
+            },
+        ),
+        "shape_alone": (
+            cube,
+            rest,
+            {
+                "long_name": "shape of the gamma distribution of a power beside the common part",
+                "units": "1",
+            },
+        ),
+        "columns": (
+            (*cube, "noise"),
+            columns,
+            {"long_name": "expected power per squared coefficient", "units": _POWER},
+        ),
+        "square": (
+            ("axis", "noise"),
+            square,
+            {"long_name": "squared coefficient that fits the powers", "units": f"square of {told}"},
+        ),
+        "square_stderr": (
+            ("axis", "noise"),
+            np.stack([one.error for one in found]),
+            {"units": f"square of {told}"},
+        ),
+        "posterior": (
+            ("axis", "draw", "noise"),
+            draws,
+            {"long_name": "draws of the squares in powers", "units": f"square of {told}"},
+        ),
+        "posterior_slow": (
+            ("axis", "draw", "slow"),
+            np.stack([one.slow for one in found]),
+            {"units": f"square of {told}"},
+        ),
         "grid_K": (("axis", "grid"), np.stack([grid[0] for grid in grids]), {"units": "deg/h^1.5"}),
         "grid_B": (("axis", "grid"), np.stack([grid[1] for grid in grids]), {"units": "deg/h"}),
-        "grid_prior": (("axis", "grid"), np.full((len(found), grids[0][0].size), -np.log(grids[0][0].size)), {"units": "1"}),
-        "grid_calibrated": (("axis", "grid"), np.stack([grid[2] for grid in grids]), {"units": "1"}),
+        "grid_prior": (
+            ("axis", "grid"),
+            np.full((len(found), grids[0][0].size), -np.log(grids[0][0].size)),
+            {"units": "1"},
+        ),
+        "grid_calibrated": (
+            ("axis", "grid"),
+            np.stack([grid[2] for grid in grids]),
+            {"units": "1"},
+        ),
     }
     coordinates = {
-        name: reduced[name] for name in ("axis", "time", "begin", "end", "frequency", "band_low", "band_high") if name in reduced
+        name: reduced[name]
+        for name in ("axis", "time", "begin", "end", "frequency", "band_low", "band_high")
+        if name in reduced
     }
-    joined = [str(axis) for axis, one in zip(reduced["axis"].values, found, strict=True) if not one.joined]
+    joined = [
+        str(axis) for axis, one in zip(reduced["axis"].values, found, strict=True) if not one.joined
+    ]
     return xr.Dataset(
         variables,
         coords={**coordinates, "term": list(TERMS), "noise": list(NOISE), "slow": ["B", "K"]},
@@ -230,7 +350,9 @@ def _ramp_error(reduced: xr.Dataset, white: Array, value: Array, quiet: NDArray[
     for row in range(len(white)):
         K, B = value[row, 3:4], value[row, 2:3]
         step = float(reduced.attrs["block_s"])
-        seen = mean_products(hours[:, :0], hours, variance=white[row], step=step, K=K, B=B, present=present[row]).gram[0, 0, 0]
+        seen = mean_products(
+            hours[:, :0], hours, variance=white[row], step=step, K=K, B=B, present=present[row]
+        ).gram[0, 0, 0]
         error[row] = 1.0 / np.sqrt(seen) if seen > 0.0 else np.inf
     return error
 
@@ -245,15 +367,17 @@ def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -
     model : path, mapping or Model
         As `gyrostab.simulate` takes it.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
-        Quiet stretches of the recording. One factor for each axis then fits the noise of the model to them; its noise terms keep
-        their proportions, and its effects their sizes. Without it the noise is taken as it is.
+        Quiet stretches of the recording. One factor for each axis then fits the noise of the model
+        to them; its noise terms keep their proportions, and its effects their sizes. Without it the
+        noise is taken as it is.
 
     Returns
     -------
     xarray.Dataset
-        As `calibrate_noise` has it; the noise has the error of that factor, or none. With ``cross(pair, block, band)``, the expected
-        cross-spectrum, where axes share an effect of the model. ``attrs["left_out"]`` names the effects that show elsewhere too (in
-        distributions, transfers, orders of the rotation, random wander): that part of them is not in it.
+        As `calibrate_noise` has it; the noise has the error of that factor, or none. With
+        ``cross(pair, block, band)``, the expected cross-spectrum, where axes share an effect of the
+        model. ``attrs["left_out"]`` names the effects that show elsewhere too (in distributions,
+        transfers, orders of the rotation, random wander): that part of them is not in it.
 
     Raises
     ------
@@ -269,7 +393,9 @@ def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -
         coefficients = made.coefficients(axis)
         square = np.array([coefficients[term] ** 2 for term in NOISE])
         if not square.any():
-            raise OptionError(f"{made.source}: axis {axis} has no noise to compare a recording with; give N in [noise] or [noise.{axis}]")
+            raise OptionError(
+                f"{made.source}: axis {axis} has no noise to compare a recording with; give N in [noise] or [noise.{axis}]"
+            )
         draws = np.tile(square, (DRAWS, 1))
         K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
         found.append(Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True))
@@ -284,14 +410,27 @@ def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -
     hours = (reduced["begin"].values + reduced["end"].values) / (2.0 * HOUR)
     ramp = np.array([made.coefficients(axis)["R"] for axis in axes])
     out = assemble_baseline(
-        reduced, found, quiet=chosen, attrs=attrs, known_mean=known.mean + ramp[:, None] * hours, spectrum=known.spectrum
+        reduced,
+        found,
+        quiet=chosen,
+        attrs=attrs,
+        known_mean=known.mean + ramp[:, None] * hours,
+        spectrum=known.spectrum,
     )
     out = with_wandering(out, known.wandering, known.spectrum)
     if known.cross is not None:
-        out["cross"] = (("pair", "block", "band"), known.cross, {"long_name": "expected cross-spectrum", "units": _POWER})
+        out["cross"] = (
+            ("pair", "block", "band"),
+            known.cross,
+            {"long_name": "expected cross-spectrum", "units": _POWER},
+        )
     for name, values in known.lines.items():
         last = "band" if name == "line_spectrum" else "line"
-        out[name] = (("axis", last), values, {"long_name": "expected power of lines", "units": _POWER})
+        out[name] = (
+            ("axis", last),
+            values,
+            {"long_name": "expected power of lines", "units": _POWER},
+        )
     if known.lines:
         noise = np.stack([line_columns(reduced) @ one.square for one in found])
         out["shape_alone"] *= evenness(noise + known.lines["peaks"], reduced)[:, None]
@@ -300,30 +439,41 @@ def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -
     return out
 
 
-def _levelled(reduced: xr.Dataset, model: Model, found: list[Posterior], quiet: NDArray[np.bool_]) -> list[Posterior]:
+def _levelled(
+    reduced: xr.Dataset, model: Model, found: list[Posterior], quiet: NDArray[np.bool_]
+) -> list[Posterior]:
     """Scale the noise of a model to the quiet blocks (axis, block) of the recording, beside its effects."""
     square = np.stack([one.square for one in found])
-    whole, added = (expect_known_effects(reduced, model, part).spectrum for part in (square, 0.0 * square))
+    whole, added = (
+        expect_known_effects(reduced, model, part).spectrum for part in (square, 0.0 * square)
+    )
     return _scaled(found, *quiescent_level(reduced, whole - added, added, quiet))
 
 
 def _scaled(found: list[Posterior], factor: Array, error: Array) -> list[Posterior]:
     every = zip(found, factor.tolist(), error.tolist(), strict=True)
-    return [scale_noise(one, by, doubt, np.random.default_rng(row)) for row, (one, by, doubt) in enumerate(every)]
+    return [
+        scale_noise(one, by, doubt, np.random.default_rng(row))
+        for row, (one, by, doubt) in enumerate(every)
+    ]
 
 
-def baseline_from_simulation(reduced: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
+def baseline_from_simulation(
+    reduced: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None
+) -> xr.Dataset:
     """Take the noise of a simulated log with the error of calibrating it, and its level over time where that changes.
 
-    What it shows all the time beside the five noise terms is taken as measured: the form of its spectrum, what axes share, steady lines.
-    What a simulation does to the means over time cannot be told from its random walk, so it is not taken as known; `baseline_from_model` takes it.
+    What it shows all the time beside the five noise terms is taken as measured: the form of its
+    spectrum, what axes share, steady lines. What a simulation does to the means over time cannot be
+    told from its random walk, so it is not taken as known; `baseline_from_model` takes it.
 
     Parameters
     ----------
     reduced, simulated : xarray.Dataset
         Recording and simulation, from `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
-        Quiet stretches of the recording: one factor for each axis fits the noise of the simulation to them.
+        Quiet stretches of the recording: one factor for each axis fits the noise of the simulation
+        to them.
 
     Raises
     ------
@@ -331,37 +481,66 @@ def baseline_from_simulation(reduced: xr.Dataset, simulated: xr.Dataset, *, quie
         When the two differ in axes, sampling rate or length.
     """
     for name, wanted, got in (
-        ("sampling rate [Hz]", reduced.attrs["sampling_rate_hz"], simulated.attrs["sampling_rate_hz"]),
-        ("blocks", (reduced.sizes["block"], reduced.attrs["block_samples"]), (simulated.sizes["block"], simulated.attrs["block_samples"])),
+        (
+            "sampling rate [Hz]",
+            reduced.attrs["sampling_rate_hz"],
+            simulated.attrs["sampling_rate_hz"],
+        ),
+        (
+            "blocks",
+            (reduced.sizes["block"], reduced.attrs["block_samples"]),
+            (simulated.sizes["block"], simulated.attrs["block_samples"]),
+        ),
         ("axes", list(reduced["axis"].values), list(simulated["axis"].values)),
     ):
         if wanted != got:
-            raise SchemaError(f"simulation: {name} {got}, but {wanted} in the recording; simulate with --like RECORDING")
+            raise SchemaError(
+                f"simulation: {name} {got}, but {wanted} in the recording; simulate with --like RECORDING"
+            )
     chosen, reason = find_quiescent_blocks(simulated)
     found, level, odd = _explained(simulated, chosen)
-    plain = np.einsum("abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in found])) * level[..., None]
+    plain = (
+        np.einsum("abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in found]))
+        * level[..., None]
+    )
     shown = shown_by(simulated, plain, odd)
-    noise = np.einsum("abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found]))
-    attrs = {"source": "simulation", "calibrated_on": find_quiescent_spans(simulated, chosen), "quiet_by": reason}
+    noise = np.einsum(
+        "abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found])
+    )
+    attrs = {
+        "source": "simulation",
+        "calibrated_on": find_quiescent_spans(simulated, chosen),
+        "quiet_by": reason,
+    }
     spectrum = noise * level[..., None] * shown.form[:, None]
     if quiet is not None:
         chosen, attrs["quiet_by"] = find_quiescent_blocks(reduced, quiet)
         attrs["calibrated_on"] = find_quiescent_spans(reduced, chosen)
         factor, error = quiescent_level(reduced, spectrum, 0.0 * spectrum, chosen)
         found, spectrum = _scaled(found, factor, error), spectrum * factor[:, None, None]
-    return with_shown(assemble_baseline(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum), shown, reduced)
+    return with_shown(
+        assemble_baseline(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum),
+        shown,
+        reduced,
+    )
 
 
-def _explained(simulated: xr.Dataset, chosen: NDArray[np.bool_]) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:
+def _explained(
+    simulated: xr.Dataset, chosen: NDArray[np.bool_]
+) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:
     """Noise of every axis from the bands that it explains, its level over time (axis, block), and the other bands (axis, band)."""
     columns = noise_powers(simulated)
     odd = np.zeros((simulated.sizes["axis"], simulated.sizes["band"]), np.bool_)
     while True:
-        there = simulated.assign(power=simulated["power"].where(~xr.DataArray(odd, dims=("axis", "band"))))
+        there = simulated.assign(
+            power=simulated["power"].where(~xr.DataArray(odd, dims=("axis", "band")))
+        )
         found = _posteriors(there, chosen)
         plain = np.einsum("abfn,an->abf", columns, np.stack([one.square for one in found]))
         level = _level(there, plain)
-        more = odd_band(there, plain * level[..., None]) & (odd.sum(axis=1, keepdims=True) < odd.shape[1] - _LEAST_BANDS)
+        more = odd_band(there, plain * level[..., None]) & (
+            odd.sum(axis=1, keepdims=True) < odd.shape[1] - _LEAST_BANDS
+        )
         if not more.any():
             return found, level, odd
         odd |= more
@@ -369,7 +548,9 @@ def _explained(simulated: xr.Dataset, chosen: NDArray[np.bool_]) -> tuple[list[P
 
 def _level(simulated: xr.Dataset, plain: Array) -> Array:
     """Power of every block over that of the noise terms (axis, block, band), (axis, block); 1 where chance may do as much."""
-    power, shape = (simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape"))
+    power, shape = (
+        simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape")
+    )
     level = np.ones(plain.shape[:2])
     for row in range(len(plain)):
         risen, deviation = loudness(power[row] / plain[row] - 1.0, shape[row])

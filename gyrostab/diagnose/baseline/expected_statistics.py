@@ -13,7 +13,14 @@ from gyrostab.kernels.spectra.expected import expected_powers
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import HOUR, URAD_PER_S
 
-__all__ = ["NOISE", "band_columns", "common_variance", "line_columns", "noise_powers", "white_variance"]
+__all__ = [
+    "NOISE",
+    "band_columns",
+    "common_variance",
+    "line_columns",
+    "noise_powers",
+    "white_variance",
+]
 
 Array = NDArray[np.float64]
 #: Random terms, in the order of the dimension `noise`.
@@ -29,7 +36,10 @@ def line_columns(reduced: xr.Dataset) -> Array:
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
     size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
-    return np.asarray(expected_powers(taper(size), rate, ordinates(size)).T * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR]))
+    return np.asarray(
+        expected_powers(taper(size), rate, ordinates(size)).T
+        * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR])
+    )
 
 
 def band_columns(reduced: xr.Dataset) -> Array:
@@ -77,9 +87,13 @@ def common_variance(reduced: xr.Dataset) -> tuple[Array, Array]:
     samples = np.maximum(reduced["samples"].transpose("axis", "block").values, 1)
     scattered = np.clip(1.0 - np.where(np.isfinite(near), near, 1.0), 0.0, 1.0)
     weights = taper(int(reduced.attrs["block_samples"]))
-    scattered = np.maximum(scattered - (1.0 - float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())), 0.0)
+    scattered = np.maximum(
+        scattered - (1.0 - float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())), 0.0
+    )
     common = 2.0 * scattered / samples
-    common = np.minimum(common, 0.8 / np.where(np.isfinite(shape), shape, 0.0).max(axis=2, initial=1e-9))
+    common = np.minimum(
+        common, 0.8 / np.where(np.isfinite(shape), shape, 0.0).max(axis=2, initial=1e-9)
+    )
     return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
 
 
@@ -90,4 +104,7 @@ def white_variance(reduced: xr.Dataset, square: Array) -> Array:
     rate, count = float(reduced.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
     apart = 1.0 - np.where(np.isfinite(near), near, samples / float(reduced.attrs["block_samples"]))
     runs = np.maximum(apart, 0.0) * count + 1.0  # each leaves a rounding of the angle at either end
-    return np.asarray(HOUR * rate * square[:, 1:2] / count + 2.0 * URAD_PER_S**2 * rate**2 * square[:, :1] * runs / count**2)
+    return np.asarray(
+        HOUR * rate * square[:, 1:2] / count
+        + 2.0 * URAD_PER_S**2 * rate**2 * square[:, :1] * runs / count**2
+    )

@@ -34,11 +34,19 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-_REACH, _BETWEEN = 100, 4  # ordinates on either side that a line leaks into; places of it between one and the next, on either side
-_SIZE_ERROR = 0.1  # of the power of a known line: twice the share of its amplitude by which a form may be wrong, and more
+_REACH, _BETWEEN = (
+    100,
+    4,
+)  # ordinates on either side that a line leaks into; places of it between one and the next, on either side
+# of the power of a known line: twice the share of its amplitude by which a form may be wrong, and
+# more
+_SIZE_ERROR = 0.1
 _INSIDE_PEAK = 1000  # places within a step of a density
 _IN_ALL = "lattice"  # what is odd about every sample
-_MOVES, _USUAL = 5.0, 0.5  # of the noise of a mean, its square, that counts as moving; share of the blocks that may be left out
+_MOVES, _USUAL = (
+    5.0,
+    0.5,
+)  # of the noise of a mean, its square, that counts as moving; share of the blocks that may be left out
 _CHANCE = 5.0  # standard deviations
 _SLIGHT = 0.1  # of the noise, below which what leaks from a line is taken off as it is
 
@@ -55,9 +63,9 @@ class KnownEffects(NamedTuple):
     cross : ndarray of complex, shape (pair, block, band), or None
         Expected cross-spectrum [degree2 hour-2 Hz-1]; None where the axes share nothing.
     lines : dict of str to ndarray
-        At full resolution (axis, line): steady ``lines``, the most that each ordinate may have of them (``lines_most``), and ``peaks``
-        of some width. And ``line_spectrum`` (axis, band): what they have in the bands, at their own place [degree2 hour-2 Hz-1].
-        Empty without any.
+        At full resolution (axis, line): steady ``lines``, the most that each ordinate may have of
+        them (``lines_most``), and ``peaks`` of some width. And ``line_spectrum`` (axis, band): what
+        they have in the bands, at their own place [degree2 hour-2 Hz-1]. Empty without any.
     wandering : Wandering
         What they do to the means at random.
     left_out : list of str
@@ -88,22 +96,38 @@ def expect_known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Kn
         When the recording lacks the channel of an effect.
     """
     acting = [_acting(effect, reduced) for effect in map(_simulated(model), model.effects)]
-    shown = [one for one in acting if not _leaves_odd_samples(one)]  # the blocks with odd samples are found, and left out
+    shown = [
+        one for one in acting if not _leaves_odd_samples(one)
+    ]  # the blocks with odd samples are found, and left out
     powers = [power for one in shown for power in _powers(one, reduced)]
     response = _response(shown, reduced)
-    noise = np.einsum("fn,abn->abf", band_columns(reduced), np.maximum(_levels(shown, square, reduced), 0.0))
+    noise = np.einsum(
+        "fn,abn->abf", band_columns(reduced), np.maximum(_levels(shown, square, reduced), 0.0)
+    )
     added = np.zeros(noise.shape)
     for power in powers:
         added += power.own
-    narrow = [(one.acting.effect, one.acting.rows, one.own) for one in powers if one.acting.seen.line is not None and one.factor.any()]
-    sizes = {"bands": reduced.sizes["band"], "blocks": reduced.sizes["block"], "axes": reduced.sizes["axis"]}
+    narrow = [
+        (one.acting.effect, one.acting.rows, one.own)
+        for one in powers
+        if one.acting.seen.line is not None and one.factor.any()
+    ]
+    sizes = {
+        "bands": reduced.sizes["band"],
+        "blocks": reduced.sizes["block"],
+        "axes": reduced.sizes["axis"],
+    }
     return KnownEffects(
         mean=_means(shown, reduced),
         spectrum=effective((noise + added) * response, reduced),
         cross=_cross(powers, response, reduced),
-        lines=_known_lines(reduced, narrow, response[:, 0]) if narrow and "line_power" in reduced else {},
+        lines=_known_lines(reduced, narrow, response[:, 0])
+        if narrow and "line_power" in reduced
+        else {},
         wandering=wandering([(_wander_squares(one, reduced), one.seen) for one in shown], **sizes),
-        left_out=[one.effect.name for one in acting if _leaves_odd_samples(one) or _shows_elsewhere(one)],
+        left_out=[
+            one.effect.name for one in acting if _leaves_odd_samples(one) or _shows_elsewhere(one)
+        ],
     )
 
 
@@ -162,8 +186,12 @@ def _leaves_odd_samples(one: _Acting) -> bool:
 def _shows_elsewhere(one: _Acting) -> bool:
     """Whether means, powers and cross-spectra do not hold all that an effect does."""
     seen = one.seen
-    elsewhere = seen.marks or not told_in_full(seen) or seen.transfer or seen.order or seen.phase_locked
-    return bool(elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None))
+    elsewhere = (
+        seen.marks or not told_in_full(seen) or seen.transfer or seen.order or seen.phase_locked
+    )
+    return bool(
+        elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None)
+    )
 
 
 def _means(acting: Sequence[_Acting], reduced: xr.Dataset) -> Array:
@@ -181,7 +209,9 @@ def _levels(acting: Sequence[_Acting], square: Array, reduced: xr.Dataset) -> Ar
     for one in acting:
         for (term, name), values in one.seen.level.items():
             own = square[one.rows, None, NOISE.index(term)]
-            level[one.rows, :, NOISE.index(term)] += own * _sizes(one.effect, name, one.axes)[:, None] * values
+            level[one.rows, :, NOISE.index(term)] += (
+                own * _sizes(one.effect, name, one.axes)[:, None] * values
+            )
     return level
 
 
@@ -193,7 +223,11 @@ def _powers(one: _Acting, reduced: xr.Dataset) -> list[_Power]:
         factor[one.rows] = _factors(one.effect, name, one.axes)
         density = np.zeros((factor.size, reduced.sizes["block"], bands))
         peak = _peak(one.effect, name, reduced, one.axes)
-        density[one.rows] = values.reshape(*values.shape[:-1], bands, -1).mean(axis=-1) if peak is None else _over_bands(peak, reduced)
+        density[one.rows] = (
+            values.reshape(*values.shape[:-1], bands, -1).mean(axis=-1)
+            if peak is None
+            else _over_bands(peak, reduced)
+        )
         out.append(_Power(one, factor, density))
     return out
 
@@ -207,7 +241,9 @@ def _response(acting: Sequence[_Acting], reduced: xr.Dataset) -> Array:
     return response
 
 
-def _cross(powers: Sequence[_Power], response: Array, reduced: xr.Dataset) -> NDArray[np.complex128] | None:
+def _cross(
+    powers: Sequence[_Power], response: Array, reduced: xr.Dataset
+) -> NDArray[np.complex128] | None:
     """Cross-spectrum of what the axes share, behind a filter (axis, 1, band), as `Known.cross` has it."""
     if "cross" not in reduced:
         return None
@@ -235,7 +271,8 @@ def _wander_squares(one: _Acting, reduced: xr.Dataset) -> dict[str, Array]:
 def expect_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks in which what is known of an axis moves far above its noise, (axis, block); none on an axis where that is the usual thing.
 
-    The mean of such a block is known, and what moves inside it is not: its spectrum would be compared with that of noise.
+    The mean of such a block is known, and what moves inside it is not: its spectrum would be
+    compared with that of noise.
 
     Parameters
     ----------
@@ -259,11 +296,15 @@ def remove_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset
     if not moving.any():
         return reduced
     still = xr.DataArray(~moving, dims=("axis", "block"))
-    out = reduced.assign({name: reduced[name].where(still) for name in ("power", "kurtosis") if name in reduced})
+    out = reduced.assign(
+        {name: reduced[name].where(still) for name in ("power", "kurtosis") if name in reduced}
+    )
     return out.assign(cross=cross_without(reduced, moving)) if "cross" in reduced else out
 
 
-def _known_lines(reduced: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array) -> dict[str, Array]:
+def _known_lines(
+    reduced: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array
+) -> dict[str, Array]:
     """Lines of effects (with their axes, and their power in the bands), behind a filter (axis, band), as `Known.lines` has them."""
     axes = [str(axis) for axis in reduced["axis"].values]
     frequency, bands = reduced["line_frequency"].values, reduced["frequency"].values
@@ -281,14 +322,23 @@ def _known_lines(reduced: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], 
             alone = np.count_nonzero(values, axis=-1).max() <= places
             peak = _peak(effect, name, reduced, chosen)
             if peak is not None:
-                broad[rows] += np.abs(_factors(effect, name, chosen)[:, None]) ** 2 * peak * passed[rows]
+                broad[rows] += (
+                    np.abs(_factors(effect, name, chosen)[:, None]) ** 2 * peak * passed[rows]
+                )
                 continue
             own_leak = leak[1]
             if alone and places == 1 and seen.line is not None and np.ptp(seen.line) == 0.0:
-                apart = float(seen.line.flat[0]) - frequency[int(np.argmax(values.reshape(-1, frequency.size)[0]))]
-                own_leak = _leak(int(reduced.attrs["block_samples"]), apart * float(reduced.attrs["block_s"]))[0]
+                apart = (
+                    float(seen.line.flat[0])
+                    - frequency[int(np.argmax(values.reshape(-1, frequency.size)[0]))]
+                )
+                own_leak = _leak(
+                    int(reduced.attrs["block_samples"]), apart * float(reduced.attrs["block_s"])
+                )[0]
             for row, one in zip(rows, size * passed[rows], strict=True):
-                (steady if alone else broad)[row] += np.convolve(one, own_leak if alone else leak[0], "same")
+                (steady if alone else broad)[row] += np.convolve(
+                    one, own_leak if alone else leak[0], "same"
+                )
                 most[row] += np.convolve(one, leak[2], "same") if alone else 0.0
     return {"lines": steady, "lines_most": most, "peaks": broad, "line_spectrum": own}
 
@@ -300,19 +350,32 @@ def _peak(effect: Effect, name: str, reduced: xr.Dataset, axes: tuple[str, ...])
     """
     if not math.isfinite(getattr(effect, "quality", math.inf)) or "line_frequency" not in reduced:
         return None
-    frequency, finer, size = reduced["line_frequency"].values, 2 * _BETWEEN, int(reduced.attrs["block_samples"])
+    frequency, finer, size = (
+        reduced["line_frequency"].values,
+        2 * _BETWEEN,
+        int(reduced.attrs["block_samples"]),
+    )
     fine = frequency[0] / finer * np.arange(1, finer * frequency.size + 1)
     seen = _explained(effect, reduced, axes, fine)
     density = seen.spectrum[name].reshape(-1, fine.size)[0].copy()
     centre = fine.size if seen.line is None else int(np.argmin(np.abs(fine - seen.line.flat[0])))
     inside = (np.arange(_INSIDE_PEAK) + 0.5) / _INSIDE_PEAK - 0.5
-    for place in range(max(centre - 1, 0), min(centre + 2, fine.size)):  # where the peak may be narrower than the steps of the density
+    for place in range(
+        max(centre - 1, 0), min(centre + 2, fine.size)
+    ):  # where the peak may be narrower than the steps of the density
         there = fine[place] + (fine[1] - fine[0]) * inside
-        density[place] = _explained(effect, reduced, axes, there).spectrum[name].reshape(-1, inside.size)[0].mean()
+        density[place] = (
+            _explained(effect, reduced, axes, there)
+            .spectrum[name]
+            .reshape(-1, inside.size)[0]
+            .mean()
+        )
     window = np.abs(np.fft.fft(taper(size), size * finer)) ** 2
     reach = min(_REACH, frequency.size // 2) * finer
     window = np.concatenate([window[-reach:], window[: reach + 1]])
-    shown = np.convolve(np.concatenate([density[::-1], density[:1], density]), window / window.sum(), "same")
+    shown = np.convolve(
+        np.concatenate([density[::-1], density[:1], density]), window / window.sum(), "same"
+    )
     return np.asarray(shown[fine.size + finer :: finer])
 
 
@@ -324,7 +387,9 @@ def _over_bands(density: Array, reduced: xr.Dataset) -> Array:
 
 def evenness(density: Array, reduced: xr.Dataset) -> Array:
     """Share of the ordinates of a band (axis, band) that scatter by themselves where one of them is louder than others (axis, line)."""
-    return np.stack([_over_bands(one, reduced) ** 2 / _over_bands(one**2, reduced) for one in density])
+    return np.stack(
+        [_over_bands(one, reduced) ** 2 / _over_bands(one**2, reduced) for one in density]
+    )
 
 
 def _leak(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
@@ -343,8 +408,8 @@ def _leak(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
 def remove_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """The record with its line spectrum freed of the steady lines that the baseline knows.
 
-    A line is left as it is above what is known of it where it is stronger than the form of an effect may be wrong and the noise
-    beside it may do.
+    A line is left as it is above what is known of it where it is stronger than the form of an
+    effect may be wrong and the noise beside it may do.
 
     Parameters
     ----------
@@ -352,7 +417,10 @@ def remove_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """
     if "lines" not in baseline:
         return reduced
-    power, weight = reduced["line_power"].transpose("axis", "part", "line"), reduced["line_weight"].transpose("axis", "part")
+    power, weight = (
+        reduced["line_power"].transpose("axis", "part", "line"),
+        reduced["line_weight"].transpose("axis", "part"),
+    )
     noise = expected_lines(baseline, reduced["line_frequency"].values)[:, None]
     known, most = (baseline[name].values[:, None] for name in ("lines", "lines_most"))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -360,16 +428,22 @@ def remove_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     above = power.values - noise - known
     stands = power.values - noise - most > _SIZE_ERROR * most + _CHANCE * scatter
     beside = np.pad(stands, ((0, 0), (0, 0), (LEAK, LEAK)))
-    stands = np.lib.stride_tricks.sliding_window_view(beside, 2 * LEAK + 1, axis=-1).any(axis=-1)  # with what it leaks into
+    stands = np.lib.stride_tricks.sliding_window_view(beside, 2 * LEAK + 1, axis=-1).any(
+        axis=-1
+    )  # with what it leaks into
     freed = noise + np.where(stands | (most < _SLIGHT * noise), above, 0.0)
     freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
-    return reduced.assign(line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan)))
+    return reduced.assign(
+        line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))
+    )
 
 
 def _simulated(model: Model) -> Callable[[Effect], Effect]:
     """Effects as the model simulates them: a filter works at the rate of the model's instrument."""
     instrument = float(model.log.get("oversampling", 1))
-    return lambda effect: replace(effect, instrument=instrument) if isinstance(effect, LoggerFilter) else effect
+    return lambda effect: (
+        replace(effect, instrument=instrument) if isinstance(effect, LoggerFilter) else effect
+    )
 
 
 def find_drivers(effect: Effect) -> dict[str, str]:
@@ -377,22 +451,36 @@ def find_drivers(effect: Effect) -> dict[str, str]:
     return {role: effect.channel_names()[role] for role in effect.needs()}
 
 
-def _explained(effect: Effect, reduced: xr.Dataset, axes: tuple[str, ...], frequency: Array | None = None) -> Prediction:
+def _explained(
+    effect: Effect, reduced: xr.Dataset, axes: tuple[str, ...], frequency: Array | None = None
+) -> Prediction:
     """What an effect predicts for the record on some of its axes; spectra at many frequencies in each band, since a peak may be narrow."""
     drivers = find_drivers(effect)
-    present = [str(name).removeprefix("channel_") for name in reduced.data_vars if str(name).startswith("channel_")]
+    present = [
+        str(name).removeprefix("channel_")
+        for name in reduced.data_vars
+        if str(name).startswith("channel_")
+    ]
     for role, name in drivers.items():
         if name not in present:
             raise driver_error(effect, role, present)
     return effect.explain(
-        replace(windows_of(reduced, drivers), axes=axes, frequency=inside_bands(reduced) if frequency is None else frequency)
+        replace(
+            windows_of(reduced, drivers),
+            axes=axes,
+            frequency=inside_bands(reduced) if frequency is None else frequency,
+        )
     )
 
 
 def _sizes(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
     """A parameter for each axis."""
     known = {one.name: one for one in effect.parameters()}
-    return effect.each(name, axes) if known[name].many else np.full(len(axes), float(getattr(effect, name)))
+    return (
+        effect.each(name, axes)
+        if known[name].many
+        else np.full(len(axes), float(getattr(effect, name)))
+    )
 
 
 def _factors(effect: Effect, name: str, axes: tuple[str, ...]) -> NDArray[np.complex128]:

@@ -19,7 +19,9 @@ _ROUNDS = 20  # of Fisher scoring, which converges quadratically
 _LEAST = 0.1  # of the factor before, below which no round takes it: the power of noise is positive
 
 
-def quiescent_level(reduced: xr.Dataset, noise: Array, added: Array, quiet: NDArray[np.bool_]) -> tuple[Array, Array]:
+def quiescent_level(
+    reduced: xr.Dataset, noise: Array, added: Array, quiet: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     """Measure how loud the noise of the quiet blocks is against that of a simulation.
 
     Parameters
@@ -43,7 +45,9 @@ def quiescent_level(reduced: xr.Dataset, noise: Array, added: Array, quiet: NDAr
     SchemaError
         When an axis has no spectrum in its quiet blocks.
     """
-    power, shape = (reduced[name].transpose("axis", "block", "band").values for name in ("power", "shape"))
+    power, shape = (
+        reduced[name].transpose("axis", "block", "band").values for name in ("power", "shape")
+    )
     common, alone = common_variance(reduced)
     found = []
     for row, axis in enumerate(reduced["axis"].values):
@@ -73,7 +77,9 @@ def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tupl
     return factor, 1.0 / (factor * math.sqrt(information))
 
 
-def scale_noise(noise: Posterior, factor: float, error: float, rng: np.random.Generator) -> Posterior:
+def scale_noise(
+    noise: Posterior, factor: float, error: float, rng: np.random.Generator
+) -> Posterior:
     """Scale the noise of an axis, with the error of the scale in its draws.
 
     Parameters

@@ -12,7 +12,16 @@ from gyrostab.diagnose.evidence.products import mean_products, take_out
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import HOUR
 
-__all__ = ["Fit", "Posterior", "expected_of", "fit_squares", "floor_square", "noise_posterior", "scales", "summed"]
+__all__ = [
+    "Fit",
+    "Posterior",
+    "expected_of",
+    "fit_squares",
+    "floor_square",
+    "noise_posterior",
+    "scales",
+    "summed",
+]
 
 Array = NDArray[np.float64]
 _DISAGREE = 8.0  # nats by which spectrum and means may differ about B and K
@@ -65,7 +74,8 @@ class Posterior(NamedTuple):
     Attributes
     ----------
     square, error : ndarray, shape (4,)
-        Squares of Q, N, B, K that fit the band powers best, and their errors [squared units of the noise table].
+        Squares of Q, N, B, K that fit the band powers best, and their errors [squared units of the
+        noise table].
     K, B, weight : ndarray, shape (cell,)
         Fine grid of K and B, and its share of the posterior.
     draws : ndarray, shape (draw, 4)
@@ -119,18 +129,30 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
     """Squares, their information, and the expected powers."""
     width = fit.columns.shape[1]
     square, normal = np.zeros(width), np.zeros((width, width))
-    square[1] = max(float((fit.weight * fit.rest() / fit.columns[:, 1]).sum() / fit.weight.sum()), 0.0)
-    spectrum = np.asarray(fit.columns @ square if fit.start is None else fit.start, dtype=np.float64)
+    square[1] = max(
+        float((fit.weight * fit.rest() / fit.columns[:, 1]).sum() / fit.weight.sum()), 0.0
+    )
+    spectrum = np.asarray(
+        fit.columns @ square if fit.start is None else fit.start, dtype=np.float64
+    )
     beside, precision = fit.free()
-    alone = not beside.shape[1] and fit.known is None and fit.start is None  # else the likelihood is not that of these powers only
+    alone = (
+        not beside.shape[1] and fit.known is None and fit.start is None
+    )  # else the likelihood is not that of these powers only
     for _ in range(50):
         weight = fit.weight / spectrum**2
-        normal, right, to_noise, to_right = _without(beside, precision, fit.columns, fit.rest(), weight)
+        normal, right, to_noise, to_right = _without(
+            beside, precision, fit.columns, fit.rest(), weight
+        )
         found = np.empty(width)
         solve_nonnegative(normal, right, (1 << width) - 1, found, 0)
         after = np.asarray(fit.columns @ np.maximum(found, 0.0), dtype=np.float64)
         if beside.shape[1] or fit.known is not None:
-            after = after + (fit.power - fit.rest()) + beside @ (to_right - to_noise @ np.maximum(found, 0.0))
+            after = (
+                after
+                + (fit.power - fit.rest())
+                + beside @ (to_right - to_noise @ np.maximum(found, 0.0))
+            )
             after = np.asarray(np.maximum(after, _LEAST * spectrum))
         if not (after > 0.0).all():
             break
@@ -148,7 +170,9 @@ def _step(fit: Fit, spectrum: Array, after: Array) -> float:
     """How far to go towards the next spectrum: all the way, or half as far until that is likelier; scoring goes too far where none fits."""
     least = _log_likelihood(fit, spectrum)
     part = 1.0
-    while part > _SHORTEST and _log_likelihood(fit, spectrum + part * (after - spectrum)) < least - _EVEN * abs(least):
+    while part > _SHORTEST and _log_likelihood(
+        fit, spectrum + part * (after - spectrum)
+    ) < least - _EVEN * abs(least):
         part *= 0.5
     return part
 
@@ -157,7 +181,9 @@ def _log_likelihood(fit: Fit, spectrum: Array) -> float:
     return -float((fit.weight * (np.log(spectrum) + fit.power / spectrum)).sum())
 
 
-def _without(beside: Array, precision: Array, columns: Array, power: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
+def _without(
+    beside: Array, precision: Array, columns: Array, power: Array, weight: Array
+) -> tuple[Array, Array, Array, Array]:
     """Normal equations of `columns` with the sizes of `beside` solved for; and what these are, ``to_right - to_noise @ squares``."""
     weighted = columns.T * weight
     normal, right = weighted @ columns, weighted @ power
@@ -201,9 +227,17 @@ def _by_powers(fit: Fit, spectrum: Array, K: Array, B: Array) -> tuple[Array, Ar
     without = _normal(near[:, 1:], weight, precision)
     parts = [
         _chunk(
-            fit, np.outer(b**2, fit.columns[:, 2]) + np.outer(k**2, fit.columns[:, 3]), near, (normal, without), (weight, known, spectrum)
+            fit,
+            np.outer(b**2, fit.columns[:, 2]) + np.outer(k**2, fit.columns[:, 3]),
+            near,
+            (normal, without),
+            (weight, known, spectrum),
         )
-        for b, k in zip(np.array_split(B, -(-B.size // _AT_ONCE)), np.array_split(K, -(-K.size // _AT_ONCE)), strict=True)
+        for b, k in zip(
+            np.array_split(B, -(-B.size // _AT_ONCE)),
+            np.array_split(K, -(-K.size // _AT_ONCE)),
+            strict=True,
+        )
     ]
     inverse = np.linalg.inv(normal)[:2, :2] if beside.shape[1] else None
     return (
@@ -221,7 +255,13 @@ def _normal(near: Array, weight: Array, precision: Array) -> Array:
     return normal
 
 
-def _chunk(fit: Fit, slow: Array, near: Array, normals: tuple[Array, Array], frame: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+def _chunk(
+    fit: Fit,
+    slow: Array,
+    near: Array,
+    normals: tuple[Array, Array],
+    frame: tuple[Array, Array, Array],
+) -> tuple[Array, Array]:
     """Some points of the grid, `slow` (point, cell) the powers of B and K."""
     weight, known, spectrum = frame
     right = (weight * (fit.rest() - slow)) @ near
@@ -229,11 +269,15 @@ def _chunk(fit: Fit, slow: Array, near: Array, normals: tuple[Array, Array], fra
     alone = np.linalg.solve(normals[1], right[:, 1:].T).T
     alone[:, 0] = np.maximum(alone[:, 0], 1e-12 * float(spectrum.max()) / HOUR)
     inside = np.asarray((best[:, :2] > 0.0).all(axis=1))
-    used = np.where(inside[:, None], best, np.concatenate([np.zeros((len(best), 1)), alone], axis=1))
+    used = np.where(
+        inside[:, None], best, np.concatenate([np.zeros((len(best), 1)), alone], axis=1)
+    )
     expected = used @ near.T + slow + known
     if near.shape[1] > 2 or fit.known is not None:
         expected = np.maximum(expected, _LEAST * spectrum)
-    return np.asarray(-(fit.weight * (np.log(expected) + fit.power / expected)).sum(axis=1)), np.asarray(best[:, :2])
+    return np.asarray(
+        -(fit.weight * (np.log(expected) + fit.power / expected)).sum(axis=1)
+    ), np.asarray(best[:, :2])
 
 
 def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Array:
@@ -243,7 +287,9 @@ def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Arra
     Q = np.maximum(mean[:, 0] - sd * ndtri(rng.random(len(mean)) * ndtr(-low)), 0.0)
     slope = float(covariance[0, 1] / covariance[0, 0])
     rest = float(np.sqrt(covariance[1, 1] - slope * covariance[0, 1]))
-    return np.stack([Q, mean[:, 1] + slope * (Q - mean[:, 0]) + rest * rng.standard_normal(len(mean))], axis=1)
+    return np.stack(
+        [Q, mean[:, 1] + slope * (Q - mean[:, 0]) + rest * rng.standard_normal(len(mean))], axis=1
+    )
 
 
 def noise_posterior(
@@ -280,10 +326,18 @@ def noise_posterior(
     coarse_K, coarse_B = _fine_grid(density, mean.size * step, step)
     K, B = (part.ravel() for part in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
     values = np.where(present, mean, 0.0)[:, None]
-    columns = np.empty((mean.size, 0)) if effects is None else effects / np.maximum(np.abs(effects).max(axis=0), 1e-300)
-    products = mean_products(values, columns, variance=variance, step=step, K=K, B=B, present=present)
+    columns = (
+        np.empty((mean.size, 0))
+        if effects is None
+        else effects / np.maximum(np.abs(effects).max(axis=0), 1e-300)
+    )
+    products = mean_products(
+        values, columns, variance=variance, step=step, K=K, B=B, present=present
+    )
     products = take_out(
-        products, columns.shape[1], _WIDE * np.eye(columns.shape[1]) / np.maximum(variance[present].min(initial=1.0), 1e-300)
+        products,
+        columns.shape[1],
+        _WIDE * np.eye(columns.shape[1]) / np.maximum(variance[present].min(initial=1.0), 1e-300),
     )
     slow = -0.5 * (products.square[:, 0] + products.log_determinant)
     fast, best, normal = _by_powers(fit, spectrum, K, B)

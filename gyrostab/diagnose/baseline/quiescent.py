@@ -19,7 +19,9 @@ Array = NDArray[np.float64]
 #: Blocks over which the level is averaged.
 LEVEL_SPANS = (1, 5, 15)
 _LEAST_SHARE, _LEAST = 0.25, 16  # of the blocks; below, the calmest are taken
-_LEAST_SAMPLES = 100  # of quiet time: the shortest block of its own choice; N is known to 7 % from them
+_LEAST_SAMPLES = (
+    100  # of quiet time: the shortest block of its own choice; N is known to 7 % from them
+)
 _AFTER_RESTART_S = 900.0
 _LOUD = 4.5  # standard deviations
 
@@ -48,14 +50,24 @@ def _restlessness(reduced: xr.Dataset) -> dict[str, Array]:
         filled = np.interp(place, place[good], values[good])
         if name.startswith("channel_vibration") or name == "channel_rotation_rate":
             size = np.abs(filled)
-            found[name] = size / max(2.0 * float(np.quantile(size, 0.2)), 0.05 * float(size.max()), np.finfo(float).tiny)
+            found[name] = size / max(
+                2.0 * float(np.quantile(size, 0.2)), 0.05 * float(size.max()), np.finfo(float).tiny
+            )
         elif name.startswith("channel_temperature"):
-            smooth = _running(filled[:, None], 5)[:, 0] / _running(np.ones((values.size, 1)), 5)[:, 0]
+            smooth = (
+                _running(filled[:, None], 5)[:, 0] / _running(np.ones((values.size, 1)), 5)[:, 0]
+            )
             slope = np.abs(np.gradient(smooth, step))
-            scatter = float(np.median(np.abs(np.diff(filled, 2)))) / (5.0 * step)  # of the slope, by noise and by digits
-            found[name] = slope / max(0.3 * float(np.quantile(slope, 0.95)), 3.0 * scatter, np.finfo(float).tiny)
+            scatter = float(np.median(np.abs(np.diff(filled, 2)))) / (
+                5.0 * step
+            )  # of the slope, by noise and by digits
+            found[name] = slope / max(
+                0.3 * float(np.quantile(slope, 0.95)), 3.0 * scatter, np.finfo(float).tiny
+            )
     if "moving" in reduced:
-        found["motion"] = np.where(reduced["moving"].values.any(axis=0), 2.0, 0.0)  # more than 1: not at rest
+        found["motion"] = np.where(
+            reduced["moving"].values.any(axis=0), 2.0, 0.0
+        )  # more than 1: not at rest
     if reduced.sizes.get("restart", 0):
         since = reduced["begin"].values[:, None] - reduced["restart_end"].values
         since = np.where(since < -step, np.inf, np.maximum(since, 1.0)).min(axis=1)
@@ -95,8 +107,13 @@ def loudness(residual: Array, weight: Array) -> tuple[Array, Array]:
         better = (z > deviation) & (deviation < _LOUD)
         level[better] = 1.0 + (excess / np.maximum(shape, 1e-9))[better]
         deviation = np.maximum(deviation, z)
-    own, spread = 1.0 + total[:, 0] / np.maximum(count[:, 0], 1e-9), 3.0 / np.sqrt(np.maximum(count[:, 0], 1e-9))
-    level = np.clip(level, own / (1.0 + spread), np.maximum(own, 0.0) * (1.0 + spread) + spread)  # a neighbour's noise is not its own
+    own, spread = (
+        1.0 + total[:, 0] / np.maximum(count[:, 0], 1e-9),
+        3.0 / np.sqrt(np.maximum(count[:, 0], 1e-9)),
+    )
+    level = np.clip(
+        level, own / (1.0 + spread), np.maximum(own, 0.0) * (1.0 + spread) + spread
+    )  # a neighbour's noise is not its own
     return level, deviation
 
 
@@ -113,7 +130,10 @@ def _typical(power: Array, shape: Array) -> Array | None:
 
 def _calm_level(reduced: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Blocks of each axis, (axis, block), whose spectrum is not louder than that of the typical block of `start`."""
-    power, shape = reduced["power"].transpose("axis", "block", "band").values, reduced["shape"].transpose("axis", "block", "band").values
+    power, shape = (
+        reduced["power"].transpose("axis", "block", "band").values,
+        reduced["shape"].transpose("axis", "block", "band").values,
+    )
     calm = np.broadcast_to(start, power.shape[:2]).copy()
     for row in range(len(power)):
         for _ in range(3):
@@ -170,7 +190,9 @@ def _given(reduced: xr.Dataset, quiet: Any) -> NDArray[np.bool_]:
     array = np.asarray(quiet)
     if array.dtype == np.bool_:
         if array.shape != (n,):
-            raise OptionError(f"quiet has the shape {array.shape}; give one bool for each of the {n} blocks, or (start, end) pairs")
+            raise OptionError(
+                f"quiet has the shape {array.shape}; give one bool for each of the {n} blocks, or (start, end) pairs"
+            )
         chosen = array.copy()
     else:
         begin, end = reduced["begin"].values, reduced["end"].values

@@ -8,7 +8,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence, line_skirt, local_level
+from gyrostab.diagnose.evidence.spectral_lines import (
+    expected_lines,
+    line_evidence,
+    line_skirt,
+    local_level,
+)
 from gyrostab.diagnose.predict.linear_model import band_widths, in_place, pair_rows
 
 __all__ = ["Shown", "odd_band", "shown_by", "with_shown"]
@@ -36,7 +41,8 @@ class Shown(NamedTuple):
     coherency_error : ndarray, shape (pair, band)
         Standard deviation of its real and of its imaginary part; 0 where it is 0.
     lines, peaks : ndarray, shape (axis, line)
-        Power of steady lines, and of what else the noise terms do not have near the odd bands [degree2 hour-2 Hz-1].
+        Power of steady lines, and of what else the noise terms do not have near the odd bands
+        [degree2 hour-2 Hz-1].
     """
 
     form: Array
@@ -83,7 +89,9 @@ def shown_by(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> 
 
 def _form(simulated: xr.Dataset, expected: Array) -> tuple[Array, Array]:
     """Powers over those expected, (axis, band), and the shape of their gamma distribution."""
-    power, shape = (simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape"))
+    power, shape = (
+        simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape")
+    )
     return _mean(power / expected, shape)
 
 
@@ -92,7 +100,9 @@ def _mean(values: NDArray[Any], shape: Array) -> tuple[NDArray[Any], Array]:
     good = np.isfinite(values) & np.isfinite(shape) & (shape > 0.0)
     weight = np.where(good, shape, 0.0)
     total = weight.sum(axis=1)
-    return (weight * np.where(good, values, 0.0)).sum(axis=1) / np.where(total > 0.0, total, 1.0), total
+    return (weight * np.where(good, values, 0.0)).sum(axis=1) / np.where(
+        total > 0.0, total, 1.0
+    ), total
 
 
 def _coherency(simulated: xr.Dataset, expected: Array) -> tuple[NDArray[np.complex128], Array]:
@@ -101,22 +111,35 @@ def _coherency(simulated: xr.Dataset, expected: Array) -> tuple[NDArray[np.compl
     if "cross" not in simulated:
         return np.zeros((0, expected.shape[2]), np.complex128), np.zeros((0, expected.shape[2]))
     axes = [str(axis) for axis in simulated["axis"].values]
-    cross, shape = (simulated[name].transpose("pair", "block", "band").values for name in ("cross", "cross_shape"))
+    cross, shape = (
+        simulated[name].transpose("pair", "block", "band").values
+        for name in ("cross", "cross_shape")
+    )
     pairs = [(axes.index(one), axes.index(other)) for one, other in pair_rows(simulated)]
-    both = np.stack([np.sqrt(expected[one] * expected[other]) for one, other in pairs]) if pairs else np.empty(cross.shape)
+    both = (
+        np.stack([np.sqrt(expected[one] * expected[other]) for one, other in pairs])
+        if pairs
+        else np.empty(cross.shape)
+    )
     found, known = _mean(cross / both, shape)
     total = 2.0 * (np.abs(found) ** 2 * known).sum(axis=1, keepdims=True)
-    there = (known > 0.0) & (chi2.sf(total, 2.0 * (known > 0.0).sum(axis=1, keepdims=True)) < _CHANCE)
+    there = (known > 0.0) & (
+        chi2.sf(total, 2.0 * (known > 0.0).sum(axis=1, keepdims=True)) < _CHANCE
+    )
     with np.errstate(divide="ignore"):
         return np.where(there, found, 0.0), np.where(there, 1.0 / np.sqrt(2.0 * known), 0.0)
 
 
 def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Power of the lines that stand out, with what they leak into; and what else there is near the odd bands, (axis, line)."""
-    power, weight = simulated["line_power"].transpose("axis", "part", "line").values, simulated["line_weight"].values
+    power, weight = (
+        simulated["line_power"].transpose("axis", "part", "line").values,
+        simulated["line_weight"].values,
+    )
     slope = expected_lines(
         xr.Dataset(
-            {"spectrum": (("axis", "block", "band"), expected)}, coords={"axis": simulated["axis"], "frequency": simulated["frequency"]}
+            {"spectrum": (("axis", "block", "band"), expected)},
+            coords={"axis": simulated["axis"], "frequency": simulated["frequency"]},
         ),
         simulated["line_frequency"].values,
     )
@@ -138,7 +161,9 @@ def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tu
         mean = np.average(power[row][good], axis=0, weights=weight[row][good])
         level = np.where(known, local_level(mean[None])[0], mean)
         lines[row] = np.maximum(mean - level, 0.0)
-        smooth = np.convolve(np.pad(level, _SMOOTH // 2, mode="edge"), np.full(_SMOOTH, 1.0 / _SMOOTH), "valid")
+        smooth = np.convolve(
+            np.pad(level, _SMOOTH // 2, mode="edge"), np.full(_SMOOTH, 1.0 / _SMOOTH), "valid"
+        )
         peaks[row] = np.where(inside[near[row]].any(axis=0), smooth - slope[row], 0.0)
     return lines, peaks
 
@@ -146,28 +171,62 @@ def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tu
 def _inside(reduced: xr.Dataset) -> NDArray[np.bool_]:
     """Whether a line lies in a band, (band, line)."""
     frequency = reduced["line_frequency"].values
-    return np.asarray((frequency >= reduced["band_low"].values[:, None]) & (frequency < reduced["band_high"].values[:, None]))
+    return np.asarray(
+        (frequency >= reduced["band_low"].values[:, None])
+        & (frequency < reduced["band_high"].values[:, None])
+    )
 
 
 def with_shown(baseline: xr.Dataset, shown: Shown, reduced: xr.Dataset) -> xr.Dataset:
     """The baseline, whose spectrum has the form already, with what null records and views ask of the rest.
 
-    Added are ``form_shape(axis, band)``; where axes share something ``cross(pair, block, band)`` and ``cross_error(pair, band)``, the
-    latter over the root of the powers of both; and where there are lines what `without_known_lines` reads.
+    Added are ``form_shape(axis, band)``; where axes share something ``cross(pair, block, band)``
+    and ``cross_error(pair, band)``, the latter over the root of the powers of both; and where there
+    are lines what `without_known_lines` reads.
     """
     out = baseline.assign(
-        form_shape=(("axis", "band"), shown.form_shape, {"long_name": "shape of what the form is known by", "units": "1"})
+        form_shape=(
+            ("axis", "band"),
+            shown.form_shape,
+            {"long_name": "shape of what the form is known by", "units": "1"},
+        )
     )
     if shown.coherency.any():
         axes = [str(axis) for axis in reduced["axis"].values]
         spectrum = baseline["spectrum"].transpose("axis", "block", "band").values
-        both = np.stack([np.sqrt(spectrum[axes.index(one)] * spectrum[axes.index(other)]) for one, other in pair_rows(reduced)])
-        out["cross"] = (("pair", "block", "band"), shown.coherency[:, None] * both, {"long_name": "cross-spectrum", "units": _POWER})
-        out["cross_error"] = (("pair", "band"), shown.coherency_error, {"long_name": "error of the coherency", "units": "1"})
+        both = np.stack(
+            [
+                np.sqrt(spectrum[axes.index(one)] * spectrum[axes.index(other)])
+                for one, other in pair_rows(reduced)
+            ]
+        )
+        out["cross"] = (
+            ("pair", "block", "band"),
+            shown.coherency[:, None] * both,
+            {"long_name": "cross-spectrum", "units": _POWER},
+        )
+        out["cross_error"] = (
+            ("pair", "band"),
+            shown.coherency_error,
+            {"long_name": "error of the coherency", "units": "1"},
+        )
     if shown.lines.any() or shown.peaks.any():
-        own = (shown.lines + shown.peaks) @ _inside(reduced).T * reduced["line_frequency"].values[0] / band_widths(reduced)
+        own = (
+            (shown.lines + shown.peaks)
+            @ _inside(reduced).T
+            * reduced["line_frequency"].values[0]
+            / band_widths(reduced)
+        )
         attrs = {"long_name": "power of lines", "units": _POWER}
-        out["line_spectrum"] = (("axis", "band"), own * in_place(reduced).mean(axis=1)[:, None], attrs)
-        for name, values in (("lines", shown.lines), ("lines_most", shown.lines), ("peaks", shown.peaks)):
+        out["line_spectrum"] = (
+            ("axis", "band"),
+            own * in_place(reduced).mean(axis=1)[:, None],
+            attrs,
+        )
+        for name, values in (
+            ("lines", shown.lines),
+            ("lines_most", shown.lines),
+            ("peaks", shown.peaks),
+        ):
             out[name] = (("axis", "line"), values, attrs)
     return out

@@ -46,13 +46,16 @@ def _steady(time: float, variance: Array) -> bool:
     return bool(np.isinf(time) or np.ptp(variance) == 0.0)
 
 
-def wandering(effects: Sequence[tuple[Mapping[str, Array], Prediction]], *, bands: int, blocks: int, axes: int) -> Wandering:
+def wandering(
+    effects: Sequence[tuple[Mapping[str, Array], Prediction]], *, bands: int, blocks: int, axes: int
+) -> Wandering:
     """Random means of several effects.
 
     Parameters
     ----------
     effects : sequence of (mapping of str to ndarray of shape (axis,), Prediction)
-        Squared sizes by parameter, 0 on axes without the effect, and what it predicts; its spectra at as many frequencies in each band.
+        Squared sizes by parameter, 0 on axes without the effect, and what it predicts; its spectra
+        at as many frequencies in each band.
     bands, blocks, axes : int
     """
     square, time = [], []
@@ -67,7 +70,9 @@ def wandering(effects: Sequence[tuple[Mapping[str, Array], Prediction]], *, band
                 square.append(sizes[name] * variance[0])
                 time.append(memory)
             if name in seen.spectrum:
-                lowest = np.asarray(seen.spectrum[name]).reshape(-1, blocks, bands, seen.spectrum[name].shape[-1] // bands)[0, :, 0]
+                lowest = np.asarray(seen.spectrum[name]).reshape(
+                    -1, blocks, bands, seen.spectrum[name].shape[-1] // bands
+                )[0, :, 0]
                 power += sizes[name][:, None] * lowest.mean(axis=-1)
     return Wandering(np.array(square).reshape(-1, axes).T, np.array(time), walk, power)
 

@@ -11,14 +11,24 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.predict.condition import FLOOR, Component, condition_on, power_shares
-from gyrostab.diagnose.predict.linear_model import State, begin_state, cross_column, known_cross, pair_rows
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    begin_state,
+    cross_column,
+    known_cross,
+    pair_rows,
+)
 from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 
 __all__ = ["predicted"]
 
 
 def predicted(
-    naming: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None, *, left_out: Sequence[Identification] = ()
+    naming: Identifications,
+    baseline: xr.Dataset,
+    known: NDArray[np.bool_] | None = None,
+    *,
+    left_out: Sequence[Identification] = (),
 ) -> xr.Dataset:
     """The baseline with the named effects in it, fitted to the blocks that may be used.
 
@@ -31,21 +41,27 @@ def predicted(
     known : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
     left_out : sequence of Claim, optional
-        Effects of the naming that are fitted with the others, and then taken out again; what a low-pass stopped stays out.
+        Effects of the naming that are fitted with the others, and then taken out again; what a
+        low-pass stopped stays out.
 
     Returns
     -------
     xarray.Dataset
-        With ``spectrum`` and ``known_mean`` of the effects; for effects that axes share also ``cross`` (pair, block, band).
+        With ``spectrum`` and ``known_mean`` of the effects; for effects that axes share also
+        ``cross`` (pair, block, band).
     """
     reduced = naming.state.reduced
-    keep = np.ones(reduced.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+    keep = (
+        np.ones(reduced.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+    )
     seen = reduced.copy()
     for name in ("mean", "power", "cross"):
         if name in seen:
             seen[name] = seen[name].where(xr.DataArray(keep, dims="block"))
     state = begin_state(seen, baseline)
-    mine: dict[tuple[str, str], list[bool]] = {}  # of each given column: it is of an effect that is left out
+    mine: dict[
+        tuple[str, str], list[bool]
+    ] = {}  # of each given column: it is of an effect that is left out
     claims = (*naming.expected, *naming.claims)
     for claim in claims:
         state = condition_on(state, list(claim.parts))
@@ -59,7 +75,10 @@ def predicted(
         columns = state.given.get(("mean", axis), [])
         kept = ~np.array(mine.get(("mean", axis), []), np.bool_)
         if kept.any():
-            alone = replace(state, given={key: value for key, value in state.given.items() if key != ("mean", axis)})
+            alone = replace(
+                state,
+                given={key: value for key, value in state.given.items() if key != ("mean", axis)},
+            )
             size, _ = mean_mixture(alone, axis, columns).moments()
             mean[row] += np.tensordot(size[kept], np.stack(columns)[kept], axes=1)
     after = baseline.assign(
@@ -72,27 +91,37 @@ def predicted(
         return after
     expected = known_cross(baseline)
     cross = _shared(shared, state, naming)
-    return after.assign(cross=(("pair", "block", "band"), cross if expected is None else cross + expected))
+    return after.assign(
+        cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
+    )
 
 
-def _less(state: State, baseline: xr.Dataset, mine: Mapping[tuple[str, str], Sequence[bool]]) -> NDArray[np.float64]:
+def _less(
+    state: State, baseline: xr.Dataset, mine: Mapping[tuple[str, str], Sequence[bool]]
+) -> NDArray[np.float64]:
     """Expected powers without some of the columns given to them."""
     weight = state.weight.copy()
     least = FLOOR * baseline["spectrum"].transpose("axis", "block", "band").values
     for row, axis in enumerate(state.axes):
         chosen = np.array(mine.get(("power", axis), []), np.bool_)
         if chosen.any():
-            weight[row] = np.maximum(weight[row] - power_shares(state, axis)[chosen].sum(axis=0), least[row])
+            weight[row] = np.maximum(
+                weight[row] - power_shares(state, axis)[chosen].sum(axis=0), least[row]
+            )
     return weight
 
 
-def _shared(parts: Sequence[Component], state: State, naming: Identifications) -> NDArray[np.complex128]:
+def _shared(
+    parts: Sequence[Component], state: State, naming: Identifications
+) -> NDArray[np.complex128]:
     shape = state.weight.shape[1:]
     pairs = pair_rows(state.reduced)
     total = np.zeros((len(pairs), *shape), np.complex128)
     for part in parts:
         row = pairs.index(part.row)
-        alone = replace(state, given={key: value for key, value in state.given.items() if key[0] != "cross"})
+        alone = replace(
+            state, given={key: value for key, value in state.given.items() if key[0] != "cross"}
+        )
         mean, _ = component_mixture(part, alone).moments()
         for size, design in zip(mean, part.variant.design, strict=True):
             total[row] += size * cross_column(design, row, state.reduced)

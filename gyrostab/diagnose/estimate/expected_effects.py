@@ -18,7 +18,9 @@ from gyrostab.diagnose.predict.linear_model import begin_state
 __all__ = ["expected_baseline", "fit_expected", "without_expected"]
 
 
-def expected_baseline(naming: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None) -> xr.Dataset:
+def expected_baseline(
+    naming: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None
+) -> xr.Dataset:
     """The baseline with the effects that were expected, and no others, fitted to the blocks that are `known`.
 
     Parameters
@@ -29,15 +31,23 @@ def expected_baseline(naming: Identifications, baseline: xr.Dataset, known: NDAr
     known : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
     """
-    return predicted(replace(naming, claims=(), unknown=()), baseline, known) if naming.expected else baseline
+    return (
+        predicted(replace(naming, claims=(), unknown=()), baseline, known)
+        if naming.expected
+        else baseline
+    )
 
 
 def fit_expected(naming: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """The numbers that the recording gives to the effects that were expected, with all that was named in the model."""
-    return fit_identifications(replace(naming, claims=naming.expected, expected=naming.claims), baseline)
+    return fit_identifications(
+        replace(naming, claims=naming.expected, expected=naming.claims), baseline
+    )
 
 
-def without_expected(reduced: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]) -> xr.Dataset:
+def without_expected(
+    reduced: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]
+) -> xr.Dataset:
     """The record without the blocks in which effects that were expected leave odd samples, or move the rate too fast for its spectrum.
 
     Parameters

@@ -18,9 +18,19 @@ from gyrostab.physics.registry import effects
 
 __all__ = ["Point", "refined"]
 _SECONDS = {"s": 1.0, "h": 3600.0}
-_SCALES, _INSTANT = (*_SECONDS, "degC"), "at"  # units of what has values between two others; but not an instant, whose grid is fine
-_LIKELY, _STEEP, _MOVED = 6.0, 1.0, 1.0  # nats below the best; nats and standard errors from one value to the next
-_ROUNDS, _MOST = 5, 40  # halvings of a step of the grid, and steps beyond it; points that are added between them at most
+_SCALES, _INSTANT = (
+    (*_SECONDS, "degC"),
+    "at",
+)  # units of what has values between two others; but not an instant, whose grid is fine
+_LIKELY, _STEEP, _MOVED = (
+    6.0,
+    1.0,
+    1.0,
+)  # nats below the best; nats and standard errors from one value to the next
+_ROUNDS, _MOST = (
+    5,
+    40,
+)  # halvings of a step of the grid, and steps beyond it; points that are added between them at most
 _NONE = 100.0  # times smaller than the next value is as good as none
 
 
@@ -40,13 +50,16 @@ class Point:
 
     def weighed(self) -> Mixture:
         """The sizes, weighted by all of this."""
-        return replace(self.sizes, log_weight=self.sizes.log_weight - self.unlikely + math.log(self.share))
+        return replace(
+            self.sizes, log_weight=self.sizes.log_weight - self.unlikely + math.log(self.share)
+        )
 
 
 def _scaled(variant: Variant, sizes: Mixture) -> Point:
     """A point whose sizes are as likely beforehand as those of others of as many standard errors.
 
-    One number is another effect where a time is longer: were all numbers alike, slow forms would be, which look like their beginning only.
+    One number is another effect where a time is longer: were all numbers alike, slow forms would
+    be, which look like their beginning only.
     """
     mean = np.einsum("g,gij->ij", sizes.weights(), sizes.covariance)
     return Point(variant, sizes, unlikely=0.5 * float(np.linalg.slogdet(mean)[1]))
@@ -55,8 +68,9 @@ def _scaled(variant: Variant, sizes: Mixture) -> Point:
 def refined(part: Component, state: State, points: Sequence[Point]) -> list[Point]:
     """Points with others between them, wherever the likelihood or the size of an effect on means changes much from one to the next.
 
-    The grid goes on where the likelihood still rises at its end. A step is halved about the best point, and again while its ends are likely
-    and differ, so that the likelihood is smooth from point to point. What a step stands for is shared by the points in it.
+    The grid goes on where the likelihood still rises at its end. A step is halved about the best
+    point, and again while its ends are likely and differ, so that the likelihood is smooth from
+    point to point. What a step stands for is shared by the points in it.
 
     Parameters
     ----------
@@ -69,14 +83,21 @@ def refined(part: Component, state: State, points: Sequence[Point]) -> list[Poin
     name = _scale(part, points)
     if name is None:
         return list(points)
-    found = [_Placed(_scaled(one.variant, one.sizes), *place) for one, place in zip(points, _places(points, name), strict=True)]
+    found = [
+        _Placed(_scaled(one.variant, one.sizes), *place)
+        for one, place in zip(points, _places(points, name), strict=True)
+    ]
     for line in sorted({one.line for one in found}):
         members = sorted((one for one in found if one.line == line), key=lambda one: one.place)
         for down in (True, False) if len(members) > 1 else ():
             found += _beyond(part, state, name, members, found, down)
     for _ in range(_ROUNDS):
         steps = _wide(found)[: max(_MOST - len(found) + len(points), 0)]
-        new = [made for one, other in steps if (made := _middle(part, state, name, one, other)) is not None]
+        new = [
+            made
+            for one, other in steps
+            if (made := _middle(part, state, name, one, other)) is not None
+        ]
         if not new:
             break
         found += new
@@ -104,14 +125,19 @@ def _scale(part: Component, points: Sequence[Point]) -> str | None:
 
 
 def _unit(part: Component, name: str) -> str:
-    return next((item.unit for item in effects()[part.candidate.effect].parameters() if item.name == name), "")
+    return next(
+        (item.unit for item in effects()[part.candidate.effect].parameters() if item.name == name),
+        "",
+    )
 
 
 def _places(points: Sequence[Point], name: str) -> list[tuple[int, float]]:
     """Line (of like other values) and place of every point."""
     lines: dict[tuple[object, ...], list[int]] = {}
     for number, point in enumerate(points):
-        lines.setdefault(tuple(value for key, value in point.variant.values.items() if key != name), []).append(number)
+        lines.setdefault(
+            tuple(value for key, value in point.variant.values.items() if key != name), []
+        ).append(number)
     out: dict[int, tuple[int, float]] = {}
     for line, members in enumerate(lines.values()):
         ordered = sorted(members, key=lambda number: _value(points[number], name))
@@ -135,7 +161,9 @@ def _wide(found: Sequence[_Placed]) -> list[tuple[_Placed, _Placed]]:
     out = []
     for one, other in _neighbours(found):
         likely = max(one.point.evidence, other.point.evidence) > top - _LIKELY
-        if (first and (best is one or best is other)) or (likely and _differ(one.point, other.point)):
+        if (first and (best is one or best is other)) or (
+            likely and _differ(one.point, other.point)
+        ):
             out.append((one, other))
     return sorted(out, key=lambda pair: -max(one.point.evidence for one in pair))
 
@@ -147,14 +175,23 @@ def _differ(one: Point, other: Point) -> bool:
     return bool((np.abs(mean - after) > _MOVED * np.sqrt(np.diagonal(covariance))).any())
 
 
-def _middle(part: Component, state: State, name: str, one: _Placed, other: _Placed) -> _Placed | None:
+def _middle(
+    part: Component, state: State, name: str, one: _Placed, other: _Placed
+) -> _Placed | None:
     """The point in the middle of a step: of the logarithm, but from none on."""
     low, high = sorted((_value(one.point, name), _value(other.point, name)))
     value = math.sqrt(low * high) if low > high / _NONE else 0.5 * (low + high)
     return _made(part, state, name, one, value, 0.5 * (one.place + other.place))
 
 
-def _beyond(part: Component, state: State, name: str, line: Sequence[_Placed], found: Sequence[_Placed], down: bool) -> list[_Placed]:
+def _beyond(
+    part: Component,
+    state: State,
+    name: str,
+    line: Sequence[_Placed],
+    found: Sequence[_Placed],
+    down: bool,
+) -> list[_Placed]:
     """Points beyond an end of a line, by steps like the last one, as long as the likelihood rises and is the largest but for `_LIKELY`.
 
     A lag longer than the record is only another slope.
@@ -163,9 +200,17 @@ def _beyond(part: Component, state: State, name: str, line: Sequence[_Placed], f
     ratio = _value(last.point, name) / max(_value(before.point, name), 1e-300)
     top, out = max(one.point.evidence for one in found) - _LIKELY, list[_Placed]()
     longest = float(state.reduced["end"].values[-1]) / _SECONDS.get(_unit(part, name), math.nan)
-    while len(out) < _ROUNDS and 1.0 / _NONE < ratio < _NONE and last.point.evidence > max(before.point.evidence + _STEEP, top):
+    while (
+        len(out) < _ROUNDS
+        and 1.0 / _NONE < ratio < _NONE
+        and last.point.evidence > max(before.point.evidence + _STEEP, top)
+    ):
         value = ratio * _value(last.point, name)
-        after = None if value > longest else _made(part, state, name, last, value, last.place + (-1.0 if down else 1.0))
+        after = (
+            None
+            if value > longest
+            else _made(part, state, name, last, value, last.place + (-1.0 if down else 1.0))
+        )
         if after is None:
             break
         out.append(after)
@@ -173,7 +218,9 @@ def _beyond(part: Component, state: State, name: str, line: Sequence[_Placed], f
     return out
 
 
-def _made(part: Component, state: State, name: str, like: _Placed, value: float, place: float) -> _Placed | None:
+def _made(
+    part: Component, state: State, name: str, like: _Placed, value: float, place: float
+) -> _Placed | None:
     """A point of another value on the same line; None where the effect cannot have it."""
     wanted = replace(like.point.variant, values={**like.point.variant.values, name: value})
     try:
@@ -192,5 +239,8 @@ def _shared(found: Sequence[_Placed]) -> list[Point]:
         ordered = sorted((one for one in found if one.line == line), key=lambda one: one.place)
         place = np.array([one.place for one in ordered])
         edge = np.concatenate([[place[0] - 0.5], 0.5 * (place[1:] + place[:-1]), [place[-1] + 0.5]])
-        out += [replace(one.point, share=float(share)) for one, share in zip(ordered, np.diff(edge), strict=True)]
+        out += [
+            replace(one.point, share=float(share))
+            for one, share in zip(ordered, np.diff(edge), strict=True)
+        ]
     return out

@@ -31,7 +31,8 @@ from gyrostab.physics.rotation import EarthRate
 __all__ = ["FORM_ERROR", "Estimate", "Fitted", "fit_identifications"]
 
 Array = NDArray[np.float64]
-#: Error of the form of an effect, as a share of its size: no effect is exactly what its equation says.
+#: Error of the form of an effect, as a share of its size: no effect is exactly what its equation
+#: says.
 FORM_ERROR = 0.04
 _TWO_SIDED = 1.959964
 _ANGLE = "deg"
@@ -67,7 +68,8 @@ class Fitted:
     claim : Claim
     axes : tuple of str
     parameters : mapping of str to Estimate
-        Of an effect with a number for each axis: name and axis, with a dot between, where there are several axes.
+        Of an effect with a number for each axis: name and axis, with a dot between, where there are
+        several axes.
     effect : Effect or None
         With these numbers, as a model takes it; None where they make no effect.
     note : str
@@ -101,13 +103,18 @@ def fit_identifications(naming: Identifications, baseline: xr.Dataset) -> list[F
     Returns
     -------
     list of Fitted
-        An entry for each axis of an effect with one number for all of its axes; one entry for all axes where each has its own number.
+        An entry for each axis of an effect with one number for all of its axes; one entry for all
+        axes where each has its own number.
     """
     start = begin_state(naming.state.reduced, baseline)
     found: list[Fitted] = []
     for claim in naming.claims:
         state = start
-        everything: list[Identification | Unidentified] = [*naming.expected, *naming.claims, *naming.unknown]
+        everything: list[Identification | Unidentified] = [
+            *naming.expected,
+            *naming.claims,
+            *naming.unknown,
+        ]
         for one in everything:
             if one is not claim:
                 state = condition_on(state, list(one.parts))
@@ -120,11 +127,21 @@ def _fit_claim(claim: Identification, state: State, naming: Identifications) -> 
     views = {part.candidate.view for part in claim.parts}
     kind = effects()[claim.effect]
     many = any(item.many for item in kind.parameters() if item.name in kind.size_parameters)
-    filtered = any(is_filter(part.candidate.view, part.variant) for part in claim.parts)  # one logger: its axes are filtered alike
-    together = many or filtered or "cross" in views or any(not part.candidate.each for part in claim.parts)
+    filtered = any(
+        is_filter(part.candidate.view, part.variant) for part in claim.parts
+    )  # one logger: its axes are filtered alike
+    together = (
+        many or filtered or "cross" in views or any(not part.candidate.each for part in claim.parts)
+    )
     if together:
-        return [_fitted(claim, _axes(claim, parts), parts, state, naming) for parts in _by_harmonic(claim, state)]
-    return [_fitted(claim, (axis,), [part for part in claim.parts if axis in part.row], state, naming) for axis in claim.axes]
+        return [
+            _fitted(claim, _axes(claim, parts), parts, state, naming)
+            for parts in _by_harmonic(claim, state)
+        ]
+    return [
+        _fitted(claim, (axis,), [part for part in claim.parts if axis in part.row], state, naming)
+        for axis in claim.axes
+    ]
 
 
 def _axes(claim: Identification, parts: Sequence[Component]) -> tuple[str, ...]:
@@ -135,21 +152,37 @@ def _axes(claim: Identification, parts: Sequence[Component]) -> tuple[str, ...]:
 def _by_harmonic(claim: Identification, state: State) -> list[list[Component]]:
     """Parts of a claim; those of several harmonics of the rotation, each of which has a size and a phase of its own, one by one.
 
-    A harmonic beside the strongest is left out where its amplitude is within two standard errors on every axis.
+    A harmonic beside the strongest is left out where its amplitude is within two standard errors on
+    every axis.
     """
-    turning = [part for part in claim.parts if part.candidate.view == "order" and part.candidate.each]
+    turning = [
+        part for part in claim.parts if part.candidate.view == "order" and part.candidate.each
+    ]
     sets = harmonic_sets(state.reduced.sizes["harmonic"]) if turning else []
     there = sorted({k for part in turning for k in sets[part.place]})
     alone = [[replace(part, place=k) for part in turning if k in sets[part.place]] for k in there]
     if len(alone) < 2:
         return [list(claim.parts)]
-    clear = [max(size / error for size, error, _ in (_amplitude(part, state) for part in parts)) for parts in alone]
-    kept = [parts for parts, times in zip(alone, clear, strict=True) if times > 2.0 or times == max(clear)]
+    clear = [
+        max(size / error for size, error, _ in (_amplitude(part, state) for part in parts))
+        for parts in alone
+    ]
+    kept = [
+        parts
+        for parts, times in zip(alone, clear, strict=True)
+        if times > 2.0 or times == max(clear)
+    ]
     rest = [part for part in claim.parts if part not in turning]
     return [[*kept[0], *rest], *kept[1:]]
 
 
-def _fitted(claim: Identification, axes: tuple[str, ...], parts: list[Component], state: State, naming: Identifications) -> Fitted:
+def _fitted(
+    claim: Identification,
+    axes: tuple[str, ...],
+    parts: list[Component],
+    state: State,
+    naming: Identifications,
+) -> Fitted:
     kind = effects()[claim.effect]
     units = {item.name: item.unit for item in kind.parameters()}
     values: dict[str, Any] = {}
@@ -169,32 +202,56 @@ def _fitted(claim: Identification, axes: tuple[str, ...], parts: list[Component]
         sizes = {**_elsewhere(by_view, view, axes, state, naming), **own}
     for name, (mean, sd, *ends) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
-        if math.isfinite(mean) and not math.isnan(sd):  # a low-pass of infinite bandwidth is none; an exponent may be told, not measured
-            form = 0.0 if unit == _ANGLE or (view, name) == _PLACE else FORM_ERROR * mean  # angles have that of the size already
-            estimates[name] = _estimate(mean, sd, unit, ends=ends, positive=_positive(kind, name), form=form)
+        if math.isfinite(mean) and not math.isnan(
+            sd
+        ):  # a low-pass of infinite bandwidth is none; an exponent may be told, not measured
+            form = (
+                0.0 if unit == _ANGLE or (view, name) == _PLACE else FORM_ERROR * mean
+            )  # angles have that of the size already
+            estimates[name] = _estimate(
+                mean, sd, unit, ends=ends, positive=_positive(kind, name), form=form
+            )
         _put(values, name, mean, axes)
-    values |= {name: value for name, value in by_view[view][0].variant.values.items() if name not in values}
+    values |= {
+        name: value for name, value in by_view[view][0].variant.values.items() if name not in values
+    }
     values |= _words(claim, by_view[view][0], state)
-    return Fitted(claim, axes, estimates, _instance(kind, values, axes, claim.driver), next((note for _, note in plain if note), ""))
+    return Fitted(
+        claim,
+        axes,
+        estimates,
+        _instance(kind, values, axes, claim.driver),
+        next((note for _, note in plain if note), ""),
+    )
 
 
 def _elsewhere(
-    by_view: Mapping[str, list[Component]], view: str, axes: tuple[str, ...], state: State, naming: Identifications
+    by_view: Mapping[str, list[Component]],
+    view: str,
+    axes: tuple[str, ...],
+    state: State,
+    naming: Identifications,
 ) -> dict[str, tuple[float, ...]]:
     """Sizes on axes that the strongest view says nothing of, from the strongest of the others that does."""
     seen = {axis for part in by_view[view] for axis in part.row}
     found: dict[str, tuple[float, ...]] = {}
-    for other in sorted(set(by_view) - {view}, key=lambda name: -sum(part.gain for part in by_view[name])):
+    for other in sorted(
+        set(by_view) - {view}, key=lambda name: -sum(part.gain for part in by_view[name])
+    ):
         lacking = {axis for part in by_view[other] for axis in part.row} - seen
         if lacking:
             sizes = _SIZES.get(other, _linear)(by_view[other], axes, state, naming)
-            found |= {name: size for name, size in sizes.items() if name.partition(".")[2] in lacking}
+            found |= {
+                name: size for name, size in sizes.items() if name.partition(".")[2] in lacking
+            }
             seen |= lacking
     return found
 
 
 def _positive(kind: type[Effect], name: str) -> bool:
-    return next((item.low >= 0.0 for item in kind.parameters() if item.name == name.split(".")[0]), False)
+    return next(
+        (item.low >= 0.0 for item in kind.parameters() if item.name == name.split(".")[0]), False
+    )
 
 
 def _put(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...]) -> None:
@@ -213,10 +270,16 @@ def _words(claim: Identification, part: Component, state: State) -> dict[str, An
         return {"harmonics": 1.0}
     if claim.effect == "feedback_reset" and "ramp_turns" in state.reduced:
         low, high = (float(state.reduced["ramp_turns"].attrs[name]) for name in ("low", "high"))
-        return {"phase": "channel", "full": float(part.variant.values.get("full", 1.0)) * (high - low)}
+        return {
+            "phase": "channel",
+            "full": float(part.variant.values.get("full", 1.0)) * (high - low),
+        }
     if claim.effect == "held_samples":
         return {"fill": "zero" if part.variant.columns[0] == "filled" else "repeat"}
-    if claim.effect == "rate_quantization" and cut_off(state.reduced)[state.axes.index(part.row[0])]:
+    if (
+        claim.effect == "rate_quantization"
+        and cut_off(state.reduced)[state.axes.index(part.row[0])]
+    ):
         return {"mode": "zero"}
     if claim.effect == "spikes":
         return {"kind": "outlier"}
@@ -226,7 +289,9 @@ def _words(claim: Identification, part: Component, state: State) -> dict[str, An
     return {}
 
 
-def _instance(kind: type[Effect], values: Mapping[str, Any], axes: tuple[str, ...], driver: tuple[str, ...]) -> Effect | None:
+def _instance(
+    kind: type[Effect], values: Mapping[str, Any], axes: tuple[str, ...], driver: tuple[str, ...]
+) -> Effect | None:
     known = {item.name: item for item in kind.parameters()}
     clean = {}
     for name, value in values.items():
@@ -247,19 +312,27 @@ def _within(value: Any, low: float, high: float) -> Any:
     return min(max(float(value), low), high)
 
 
-def _estimate(mean: float, sd: float, unit: str, *, positive: bool, form: float, ends: Sequence[float] = ()) -> Estimate:
+def _estimate(
+    mean: float, sd: float, unit: str, *, positive: bool, form: float, ends: Sequence[float] = ()
+) -> Estimate:
     """With the error of the `form` in it; `ends` are those of the 95 % interval without it, where that is not symmetric."""
     if sd <= 0.0:  # what is counted, not measured, is exact
         return Estimate(mean, 0.0, mean, mean, unit)
     low, high = ends or (mean - _TWO_SIDED * sd, mean + _TWO_SIDED * sd)
-    low, high = mean - math.hypot(mean - low, _TWO_SIDED * form), mean + math.hypot(high - mean, _TWO_SIDED * form)
+    low, high = (
+        mean - math.hypot(mean - low, _TWO_SIDED * form),
+        mean + math.hypot(high - mean, _TWO_SIDED * form),
+    )
     return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
 
 
-# ---------------------------------------------------------------------------------------------------------------- sizes
+# ----------------------------------------------------------------------------------------------------------------
+# sizes
 
 
-def _linear(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, ...]]:
+def _linear(
+    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+) -> dict[str, tuple[float, ...]]:
     """Parameters of means, powers, profiles and transfers; by axis where there are several."""
     out: dict[str, tuple[float, ...]] = {}
     for part in parts:
@@ -281,11 +354,15 @@ def _root(square: float, sd: float) -> tuple[float, float]:
     return value, sd / (2.0 * value) if square > sd else math.sqrt(max(square, 0.0) + sd) - value
 
 
-def _common(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, ...]]:
+def _common(
+    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+) -> dict[str, tuple[float, ...]]:
     return estimate_shared_factors(parts, axes, state)
 
 
-def _turning(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, ...]]:
+def _turning(
+    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+) -> dict[str, tuple[float, ...]]:
     """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down.
 
     Angles have the error of the form that the amplitude has: a share of an angle would be none.
@@ -296,10 +373,16 @@ def _turning(parts: list[Component], axes: tuple[str, ...], state: State, naming
         error = math.hypot(sd / max(size, 1e-300), FORM_ERROR)
         if not part.candidate.each:
             across = size * float(np.abs(part.variant.design).max())
-            return {"latitude": _latitude(across, error * across), "toolface": (angle, math.degrees(error))}
+            return {
+                "latitude": _latitude(across, error * across),
+                "toolface": (angle, math.degrees(error)),
+            }
         label = "" if len(axes) == 1 else f".{part.row[0]}"
         out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
-        out["order"] = (float(state.reduced["harmonic"].values[part.place % state.reduced.sizes["harmonic"]]), 0.0)
+        out["order"] = (
+            float(state.reduced["harmonic"].values[part.place % state.reduced.sizes["harmonic"]]),
+            0.0,
+        )
     return out
 
 
@@ -319,21 +402,35 @@ def _amplitude(part: Component, state: State) -> tuple[float, float, float]:
     return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
 
 
-def _line(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, float]]:
+def _line(
+    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+) -> dict[str, tuple[float, float]]:
     name = {"real_motion": "sway"}.get(parts[0].candidate.effect, parts[0].variant.columns[0])
     out: dict[str, tuple[float, float]] = {}
-    for part in sorted(parts, key=lambda part: part.gain):  # of several lines of an axis the strongest
+    for part in sorted(
+        parts, key=lambda part: part.gain
+    ):  # of several lines of an axis the strongest
         amplitude, frequency = line_size(state.reduced, part.row[0], part.place)
         label = "" if len(axes) == 1 or name == "sway" else f".{part.row[0]}"
         out[f"{name}{label}"], out["frequency"] = amplitude, frequency
     return out
 
 
-def _odd(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, float]]:
-    return sample_count_sizes(parts[0].candidate.effect, parts[0].variant.columns[0], parts[0].row[0], state.reduced, naming.tallies)
+def _odd(
+    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+) -> dict[str, tuple[float, float]]:
+    return sample_count_sizes(
+        parts[0].candidate.effect,
+        parts[0].variant.columns[0],
+        parts[0].row[0],
+        state.reduced,
+        naming.tallies,
+    )
 
 
-def _levels(parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications) -> dict[str, tuple[float, float]]:
+def _levels(
+    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+) -> dict[str, tuple[float, float]]:
     return estimate_telegraph(parts, axes, state)
 
 

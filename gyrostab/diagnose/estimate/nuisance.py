@@ -24,11 +24,14 @@ _AT_ONCE = 1e-2  # s: a lag that is as good as none
 _TAILS = (0.025, 0.975)
 
 
-def sizes_over(part: Component, state: State, naming: Identifications) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
+def sizes_over(
+    part: Component, state: State, naming: Identifications
+) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
     """Sizes of a part, averaged over the noise and over what else is free.
 
-    An exponent has its default and a lag is none, unless other values are better by 3 nats and an error of the form. The scatter of the
-    sizes holds all lags that the record allows also where none is told; of an exponent the size is another one, in another unit.
+    An exponent has its default and a lag is none, unless other values are better by 3 nats and an
+    error of the form. The scatter of the sizes holds all lags that the record allows also where
+    none is told; of an exponent the size is another one, in another unit.
 
     Parameters
     ----------
@@ -44,24 +47,32 @@ def sizes_over(part: Component, state: State, naming: Identifications) -> tuple[
     covariance : ndarray, shape (column, column)
         About that mean.
     nuisance : dict of str to (float, float) or (float, float, float, float)
-        Value and standard deviation of the others, and the ends of the 95 % interval where that is not symmetric; NaN for one that is told,
-        but not measured.
+        Value and standard deviation of the others, and the ends of the 95 % interval where that is
+        not symmetric; NaN for one that is told, but not measured.
     """
-    grid = [Point(variant, component_mixture(part, state, variant)) for variant in _family(part, naming)]
+    grid = [
+        Point(variant, component_mixture(part, state, variant)) for variant in _family(part, naming)
+    ]
     usual = _usual(part, [point.variant for point in grid], [point.evidence for point in grid])
     points = refined(part, state, [grid[place] for place in usual])
     family = [point.variant for point in points]
     evidence = np.array([point.evidence for point in points])
     mean, covariance = _merged(points).moments()
     at_once = _at_once(family)
-    told = [place for place in at_once if evidence[place] > evidence.max() - AMBIGUOUS - FORM * max(part.gain, 0.0)]
+    told = [
+        place
+        for place in at_once
+        if evidence[place] > evidence.max() - AMBIGUOUS - FORM * max(part.gain, 0.0)
+    ]
     if told:
         middle, _ = _merged([points[place] for place in told]).moments()
         mean, covariance = middle, covariance + np.outer(middle - mean, middle - mean)
     weighed = evidence + np.log([point.share for point in points])
     share = np.exp(weighed - np.logaddexp.reduce(weighed))
     nuisance: dict[str, tuple[float, ...]] = {}
-    for name in {key for one in family for key, value in one.values.items() if not isinstance(value, str)}:
+    for name in {
+        key for one in family for key, value in one.values.items() if not isinstance(value, str)
+    }:
         tried = np.array([float(one.values[name]) for one in family])
         if not np.isfinite(tried).all():
             continue
@@ -70,41 +81,75 @@ def sizes_over(part: Component, state: State, naming: Identifications) -> tuple[
             continue
         none = bool(told) and _is_lag(name)
         middle_of = 0.0 if none else float(share @ tried)
-        spread = max(math.sqrt(float(share @ (tried - middle_of) ** 2)), 0.3 * _spacing(tried, middle_of))
-        nuisance[name] = (middle_of, spread) if none else (middle_of, spread, *_ends(tried, share, middle_of))
+        spread = max(
+            math.sqrt(float(share @ (tried - middle_of) ** 2)), 0.3 * _spacing(tried, middle_of)
+        )
+        nuisance[name] = (
+            (middle_of, spread) if none else (middle_of, spread, *_ends(tried, share, middle_of))
+        )
     return mean, covariance, nuisance
 
 
 def _merged(points: Sequence[Point]) -> Mixture:
     several = [point.weighed() for point in points]
-    return Mixture(*(np.concatenate([getattr(one, name) for one in several]) for name in ("log_weight", "mean", "covariance")))
+    return Mixture(
+        *(
+            np.concatenate([getattr(one, name) for one in several])
+            for name in ("log_weight", "mean", "covariance")
+        )
+    )
 
 
 def _family(part: Component, naming: Identifications) -> list[Variant]:
     """Variants of the part with the same columns: the grid."""
     candidate = next(
-        (one for one in naming.candidates if one.key == part.candidate.key and one.view == part.candidate.view), part.candidate
+        (
+            one
+            for one in naming.candidates
+            if one.key == part.candidate.key and one.view == part.candidate.view
+        ),
+        part.candidate,
     )
-    return [one for one in candidate.variants if one.columns == part.variant.columns and one.squared == part.variant.squared]
+    return [
+        one
+        for one in candidate.variants
+        if one.columns == part.variant.columns and one.squared == part.variant.squared
+    ]
 
 
 def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
     """Places of the variants with the default of every parameter that the grid has it of, but lags: their sizes are of one unit."""
     known = {item.name: item.default for item in effects()[effect].parameters()}
-    tried = {name for name in known if not _is_lag(name) and any(one.values.get(name) == known[name] for one in family)}
-    return [place for place, one in enumerate(family) if all(one.values.get(name, known[name]) == known[name] for name in tried)]
+    tried = {
+        name
+        for name in known
+        if not _is_lag(name) and any(one.values.get(name) == known[name] for one in family)
+    }
+    return [
+        place
+        for place, one in enumerate(family)
+        if all(one.values.get(name, known[name]) == known[name] for name in tried)
+    ]
 
 
 def _usual(part: Component, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
     """Places of the plain variants, unless others are clearly better."""
     plain, top = plain_places(part.candidate.effect, family), max(evidence)
-    return plain if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS else list(range(len(family)))
+    return (
+        plain
+        if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS
+        else list(range(len(family)))
+    )
 
 
 def _at_once(family: Sequence[Variant]) -> list[int]:
     """Places of the variants without any lag; none where nothing lags at all."""
     lags = [_lags(one.values) for one in family]
-    return [place for place, mine in enumerate(lags) if mine and max(mine.values()) <= _AT_ONCE] if any(lags) else []
+    return (
+        [place for place, mine in enumerate(lags) if mine and max(mine.values()) <= _AT_ONCE]
+        if any(lags)
+        else []
+    )
 
 
 def _lags(values: Mapping[str, float | str]) -> dict[str, float]:
@@ -121,7 +166,11 @@ def _ends(tried: Array, share: Array, middle: float) -> tuple[float, float]:
     Lags, times and plays are known to a factor, so that there is more room above than below.
     """
     known, place = np.unique(tried, return_inverse=True)
-    between = np.where(known[:-1] > known[1:] / 100.0, np.sqrt(known[:-1] * known[1:]), 0.5 * (known[:-1] + known[1:]))
+    between = np.where(
+        known[:-1] > known[1:] / 100.0,
+        np.sqrt(known[:-1] * known[1:]),
+        0.5 * (known[:-1] + known[1:]),
+    )
     first, last = known[0] - (between[0] - known[0]), known[-1] + (known[-1] - between[-1])
     edge = np.concatenate([[max(first, 0.0)], between, [last]])
     below = np.append(0.0, np.cumsum(np.bincount(place, weights=share)))

@@ -17,7 +17,9 @@ __all__ = ["add_outlier_power"]
 _IN_ALL = "lattice"  # odd about every sample, so that the noise that was calibrated has it already
 
 
-def add_outlier_power(baseline: xr.Dataset, reduced: xr.Dataset, fitted: Sequence[Fitted]) -> xr.Dataset:
+def add_outlier_power(
+    baseline: xr.Dataset, reduced: xr.Dataset, fitted: Sequence[Fitted]
+) -> xr.Dataset:
     """The baseline with the mean power of spikes, held samples and other odd samples, as their fitted numbers and their physics say.
 
     Parameters
@@ -33,7 +35,9 @@ def add_outlier_power(baseline: xr.Dataset, reduced: xr.Dataset, fitted: Sequenc
     spectrum = baseline["spectrum"].transpose("axis", "block", "band")
     added = np.zeros(spectrum.shape)
     for one in fitted:
-        if one.effect is None or not any(part.candidate.view == "marks" for part in one.claim.parts):
+        if one.effect is None or not any(
+            part.candidate.view == "marks" for part in one.claim.parts
+        ):
             continue
         rows = [axes.index(axis) for axis in one.axes]
         seen = one.effect.explain(replace(windows_of(reduced, {}), axes=tuple(one.axes)))
@@ -45,4 +49,8 @@ def add_outlier_power(baseline: xr.Dataset, reduced: xr.Dataset, fitted: Sequenc
             square = baseline["coefficient"].sel(term=term, axis=list(one.axes)).values ** 2
             own = square[:, None] * getattr(one.effect, name) * share
             added[rows] += own[..., None] * term_density(term, frequency, rate)
-    return baseline.assign(spectrum=spectrum.copy(data=spectrum.values + added)) if added.any() else baseline
+    return (
+        baseline.assign(spectrum=spectrum.copy(data=spectrum.values + added))
+        if added.any()
+        else baseline
+    )

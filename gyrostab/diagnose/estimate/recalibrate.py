@@ -10,15 +10,35 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.calibrate import DRAWS, assemble_baseline
-from gyrostab.diagnose.baseline.expected_statistics import common_variance, noise_powers, white_variance
+from gyrostab.diagnose.baseline.expected_statistics import (
+    common_variance,
+    noise_powers,
+    white_variance,
+)
 from gyrostab.diagnose.baseline.known_effects import find_drivers
-from gyrostab.diagnose.baseline.posterior import Fit, Posterior, fit_squares, floor_square, noise_posterior
+from gyrostab.diagnose.baseline.posterior import (
+    Fit,
+    Posterior,
+    fit_squares,
+    floor_square,
+    noise_posterior,
+)
 from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, Fitted, fit_identifications
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.predict.candidates import variants_of, windows_of
-from gyrostab.diagnose.predict.condition import Component, condition_on, condition_on_component, find_anomalous_blocks
+from gyrostab.diagnose.predict.condition import (
+    Component,
+    condition_on,
+    condition_on_component,
+    find_anomalous_blocks,
+)
 from gyrostab.diagnose.predict.filter_response import is_filter, response_of
-from gyrostab.diagnose.predict.linear_model import State, begin_state, effective, reference_channel_power
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    begin_state,
+    effective,
+    reference_channel_power,
+)
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.base import Effect
 from gyrostab.physics.phase import fold
@@ -56,12 +76,16 @@ class _Seen:
 
 
 def recalibrate(
-    naming: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted], known: NDArray[np.bool_] | None = None
+    naming: Identifications,
+    baseline: xr.Dataset,
+    fitted: Sequence[Fitted],
+    known: NDArray[np.bool_] | None = None,
 ) -> xr.Dataset:
     """Calibrate the noise with the named effects in the model, those of free size free.
 
-    An axis that no effect touches keeps its noise; so does one on which effects leave too little to tell it by. Where something is
-    unknown the quiet blocks are used, else the whole record: the levels of an effect are told from noise by their course.
+    An axis that no effect touches keeps its noise; so does one on which effects leave too little to
+    tell it by. Where something is unknown the quiet blocks are used, else the whole record: the
+    levels of an effect are told from noise by their course.
 
     Parameters
     ----------
@@ -76,12 +100,15 @@ def recalibrate(
     Returns
     -------
     xarray.Dataset
-        As `gyrostab.diagnose.baseline.calibrate.calibrate_noise` has it; ``attrs["recalibrated"]`` names the axes.
+        As `gyrostab.diagnose.baseline.calibrate.calibrate_noise` has it; ``attrs["recalibrated"]``
+        names the axes.
     """
     if baseline.attrs.get("source") != "calibrated" or not naming.claims:
         return baseline
     reduced = naming.state.reduced
-    use = np.ones(reduced.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+    use = (
+        np.ones(reduced.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+    )
     state = begin_state(reduced, baseline)
     for claim in naming.claims:
         state = condition_on(state, list(claim.parts))
@@ -104,7 +131,13 @@ def recalibrate(
         found.append(_kept(baseline, row) if posterior is None else posterior)
     if not changed:
         return baseline
-    out = assemble_baseline(reduced, found, quiet=quiet, attrs={**baseline.attrs, "recalibrated": changed}, spectrum=power)
+    out = assemble_baseline(
+        reduced,
+        found,
+        quiet=quiet,
+        attrs={**baseline.attrs, "recalibrated": changed},
+        spectrum=power,
+    )
     out["columns"] = out["columns"].copy(data=columns)
     for row, axis in enumerate(state.axes):
         if axis not in changed:
@@ -127,9 +160,12 @@ def remove_fast_switching(naming: Identifications, baseline: xr.Dataset) -> xr.D
     ----------
     naming : Naming
     baseline : xarray.Dataset
-        That the naming started from; returned as it is unless it was calibrated on the recording, and such a bias is named.
+        That the naming started from; returned as it is unless it was calibrated on the recording,
+        and such a bias is named.
     """
-    hops = tuple(one for one in naming.claims if any(part.variant.inside.size for part in one.parts))
+    hops = tuple(
+        one for one in naming.claims if any(part.variant.inside.size for part in one.parts)
+    )
     if not hops:
         return baseline
     alone = replace(naming, claims=hops, unknown=())
@@ -144,10 +180,21 @@ def _kept(baseline: xr.Dataset, row: int) -> Posterior:
     weight = np.exp(one["grid_calibrated"].values)
     draws = one["posterior"].transpose("draw", "noise").values
     slow = one["posterior_slow"].transpose("draw", "slow").values
-    return Posterior(one["square"].values, one["square_stderr"].values, K, B, weight / weight.sum(), draws, slow, True)
+    return Posterior(
+        one["square"].values,
+        one["square_stderr"].values,
+        K,
+        B,
+        weight / weight.sum(),
+        draws,
+        slow,
+        True,
+    )
 
 
-def _seen(naming: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: str) -> _Seen | None:
+def _seen(
+    naming: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: str
+) -> _Seen | None:
     """What all named effects do on an axis; None where they do nothing."""
     reduced = naming.state.reduced
     shape = (reduced.sizes["block"], reduced.sizes["band"])
@@ -160,21 +207,43 @@ def _seen(naming: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted
             _add(out, part, naming, baseline, axis)
         numbers = next((one for one in fitted if one.claim is claim and axis in one.axes), None)
         effect = None if numbers is None else numbers.effect
-        in_power = any(part.candidate.view == "power" for part in parts)  # which has it with a free size
-        if numbers is not None and effect is not None and not in_power and any(_only_said(part, reduced) for part in parts):
+        in_power = any(
+            part.candidate.view == "power" for part in parts
+        )  # which has it with a free size
+        if (
+            numbers is not None
+            and effect is not None
+            and not in_power
+            and any(_only_said(part, reduced) for part in parts)
+        ):
             out.known += _said(effect, reduced, axis)
-            out.doubt = max([out.doubt, *(2.0 * one.stderr / abs(one.value) for one in numbers.parameters.values() if one.value)])
-        if effect is not None and any(is_filter(part.candidate.view, part.variant) for part in parts):
+            out.doubt = max(
+                [
+                    out.doubt,
+                    *(
+                        2.0 * one.stderr / abs(one.value)
+                        for one in numbers.parameters.values()
+                        if one.value
+                    ),
+                ]
+            )
+        if effect is not None and any(
+            is_filter(part.candidate.view, part.variant) for part in parts
+        ):
             out.response = out.response * response_of(effect, reduced)
     return out if touched else None
 
 
 def _only_said(part: Component, reduced: xr.Dataset) -> bool:
     """Whether the power of a part is in no column, but only in what the effect says of itself; with odd samples it may be left out."""
-    return part.candidate.view == "cross" or (part.candidate.view == "marks" and not find_anomalous_blocks(part, reduced).any())
+    return part.candidate.view == "cross" or (
+        part.candidate.view == "marks" and not find_anomalous_blocks(part, reduced).any()
+    )
 
 
-def _add(out: _Seen, part: Component, naming: Identifications, baseline: xr.Dataset, axis: str) -> None:
+def _add(
+    out: _Seen, part: Component, naming: Identifications, baseline: xr.Dataset, axis: str
+) -> None:
     view = part.candidate.view
     state = begin_state(naming.state.reduced, baseline)
     if is_filter(view, part.variant):
@@ -185,7 +254,9 @@ def _add(out: _Seen, part: Component, naming: Identifications, baseline: xr.Data
         out.known += _comb(part, replace(state, weight=naming.state.weight))
     elif view in ("mean", "levels", "power", "order", "line"):
         given = condition_on_component(state, part).given
-        out.free += [np.broadcast_to(one, out.known.shape) for one in given.get(("power", axis), [])]
+        out.free += [
+            np.broadcast_to(one, out.known.shape) for one in given.get(("power", axis), [])
+        ]
         out.means += given.get(("mean", axis), [])
 
 
@@ -193,7 +264,10 @@ def _followed(part: Component, state: State) -> Array:
     """Power that follows a channel or another axis, (block, band)."""
     mean, _ = component_mixture(part, state).moments()
     transfer = np.tensordot(mean, part.variant.design, axes=1)
-    return np.asarray(np.abs(transfer) ** 2 * np.nan_to_num(reference_channel_power(part.candidate.witness[0], state.reduced)))
+    return np.asarray(
+        np.abs(transfer) ** 2
+        * np.nan_to_num(reference_channel_power(part.candidate.witness[0], state.reduced))
+    )
 
 
 def _comb(part: Component, state: State) -> Array:
@@ -208,7 +282,9 @@ def _comb(part: Component, state: State) -> Array:
     out = np.zeros((turns.size, low.size))
     for number, size in enumerate(square, start=1):
         place = fold(number * turns, rate)[:, None]
-        out += np.where((place >= low) & (place < high) & (turns > 0.0)[:, None], size / (high - low), 0.0)
+        out += np.where(
+            (place >= low) & (place < high) & (turns > 0.0)[:, None], size / (high - low), 0.0
+        )
     return out
 
 
@@ -229,7 +305,9 @@ def _said(effect: Effect, reduced: xr.Dataset, axis: str) -> Array:
 def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -> Posterior | None:
     """Noise of an axis beside effects; None where too little is left to tell it by."""
     reduced = state.reduced
-    power, shape = (reduced[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape"))
+    power, shape = (
+        reduced[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
+    )
     chosen = chosen & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
     if chosen.sum() < _LEAST:
         return None
@@ -237,7 +315,12 @@ def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -
     common, alone = (one[row] for one in common_variance(reduced))
     fit = _fit(power, _weights(shape, alone, common), columns, state.weight[row], seen, chosen)
     square, information = fit_squares(fit)
-    plain = float(((fit.weight / (fit.start if fit.start is not None else fit.power) ** 2) * fit.columns[:, 1] ** 2).sum())
+    plain = float(
+        (
+            (fit.weight / (fit.start if fit.start is not None else fit.power) ** 2)
+            * fit.columns[:, 1] ** 2
+        ).sum()
+    )
     if not information[1, 1] > _BLURRED * plain or not square[1] > 0.0:
         return None
     square = np.maximum(square, [0.0, floor_square(fit), 0.0, 0.0])
@@ -265,12 +348,27 @@ def _weights(shape: Array, alone: Array, common: Array) -> Array:
     return np.asarray(shape * np.minimum(share, 1.0)[:, None])
 
 
-def _fit(power: Array, shape: Array, columns: Array, expected: Array, seen: _Seen, chosen: NDArray[np.bool_]) -> Fit:
+def _fit(
+    power: Array,
+    shape: Array,
+    columns: Array,
+    expected: Array,
+    seen: _Seen,
+    chosen: NDArray[np.bool_],
+) -> Fit:
     """Powers averaged over blocks of like level."""
     level = np.where(chosen, np.log(expected.mean(axis=1)), np.inf)
-    groups = np.array_split(np.argsort(level, kind="stable")[: int(chosen.sum())], min(_GROUPS, int(chosen.sum())))
+    groups = np.array_split(
+        np.argsort(level, kind="stable")[: int(chosen.sum())], min(_GROUPS, int(chosen.sum()))
+    )
     size = [max(float(np.abs(one).max()), 1e-300) for one in seen.free]
-    parts = [power, columns, seen.known, expected, *[one / top for one, top in zip(seen.free, size, strict=True)]]
+    parts = [
+        power,
+        columns,
+        seen.known,
+        expected,
+        *[one / top for one, top in zip(seen.free, size, strict=True)],
+    ]
     means: list[list[Array]] = [[] for _ in parts]
     weights = []
     for blocks in groups:
@@ -289,8 +387,19 @@ def _fit(power: Array, shape: Array, columns: Array, expected: Array, seen: _See
     known = flat[2][:, None]
     precision = np.zeros(beside.shape[1])
     if np.any(known > 0.0):  # what an effect is said to have is not known better than so
-        beside, precision = np.concatenate([beside, known], axis=1), np.append(precision, 1.0 / seen.doubt**2)
-    return Fit(flat[0], flat[1], weight[some], known=flat[2], beside=beside, precision=precision, start=flat[3])
+        beside, precision = (
+            np.concatenate([beside, known], axis=1),
+            np.append(precision, 1.0 / seen.doubt**2),
+        )
+    return Fit(
+        flat[0],
+        flat[1],
+        weight[some],
+        known=flat[2],
+        beside=beside,
+        precision=precision,
+        start=flat[3],
+    )
 
 
 def with_noise(naming: Identifications, baseline: xr.Dataset) -> Identifications:
@@ -307,7 +416,10 @@ def with_noise(naming: Identifications, baseline: xr.Dataset) -> Identifications
     for part in (part for claim in naming.claims for part in claim.parts):
         one = part.candidate
         if one.view == "power" and id(one) not in swapped:
-            made = [variants_of(one, variant, reduced, baseline["coefficient"]) or variant for variant in one.variants]
+            made = [
+                variants_of(one, variant, reduced, baseline["coefficient"]) or variant
+                for variant in one.variants
+            ]
             swapped[id(one)] = (one, replace(one, variants=tuple(made)))
 
     def part_of(part: Component) -> Component:
@@ -317,6 +429,11 @@ def with_noise(naming: Identifications, baseline: xr.Dataset) -> Identifications
         place = next(number for number, one in enumerate(old.variants) if one is part.variant)
         return replace(part, candidate=new, variant=new.variants[place])
 
-    claims = tuple(replace(claim, parts=tuple(part_of(part) for part in claim.parts)) for claim in naming.claims)
-    candidates = tuple(swapped[id(one)][1] if id(one) in swapped else one for one in naming.candidates)
+    claims = tuple(
+        replace(claim, parts=tuple(part_of(part) for part in claim.parts))
+        for claim in naming.claims
+    )
+    candidates = tuple(
+        swapped[id(one)][1] if id(one) in swapped else one for one in naming.candidates
+    )
     return replace(naming, claims=claims, candidates=candidates)

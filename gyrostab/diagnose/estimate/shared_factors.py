@@ -26,11 +26,14 @@ _ORDER = 0.05  # by which the level below a low-pass is another where it has two
 _ENDS = (0.025, 0.975)
 
 
-def estimate_shared_factors(parts: Sequence[Component], axes: tuple[str, ...], state: State) -> dict[str, tuple[float, ...]]:
+def estimate_shared_factors(
+    parts: Sequence[Component], axes: tuple[str, ...], state: State
+) -> dict[str, tuple[float, ...]]:
     """Factor of every axis, with its standard error and the ends of its 95 % interval, and the low-pass of what is shared.
 
-    White noise and low-passes of any bandwidth are weighed by the cross-spectra of all pairs. No axis shares more than it has. One pair
-    tells a product alone: its factors then lie anywhere between what the other axis and the axis itself have at most.
+    White noise and low-passes of any bandwidth are weighed by the cross-spectra of all pairs. No
+    axis shares more than it has. One pair tells a product alone: its factors then lie anywhere
+    between what the other axis and the axis itself have at most.
 
     Parameters
     ----------
@@ -53,17 +56,24 @@ def estimate_shared_factors(parts: Sequence[Component], axes: tuple[str, ...], s
     chosen = rng.choice(seen.share.size, size=_DRAWS, p=seen.share)
     product = seen.product[chosen] + seen.error[chosen] * rng.standard_normal((_DRAWS, len(rows)))
     limit = seen.limit[chosen]
-    factor = _of_pair(product[:, 0], limit, rng) if len(axes) == 2 else _of_many(product, rows, axes, limit)
+    factor = (
+        _of_pair(product[:, 0], limit, rng)
+        if len(axes) == 2
+        else _of_many(product, rows, axes, limit)
+    )
     white = np.isinf(seen.width)
     factor *= np.exp(np.where(white[chosen], 0.0, _ORDER) * rng.standard_normal(_DRAWS))[:, None]
     plain = bool(seen.share[white].sum() >= 0.5)
     alike = white[chosen] == plain
     sizes: dict[str, tuple[float, ...]] = {
-        name if len(axes) == 1 else f"{name}.{axis}": _told(factor[:, k], alike) for k, axis in enumerate(axes)
+        name if len(axes) == 1 else f"{name}.{axis}": _told(factor[:, k], alike)
+        for k, axis in enumerate(axes)
     }
     if "bandwidth" in parts[0].variant.values:
         width = seen.width[chosen][alike]
-        sizes["bandwidth"] = (math.inf, 0.0) if plain else _told(width, np.ones(width.size, np.bool_))
+        sizes["bandwidth"] = (
+            (math.inf, 0.0) if plain else _told(width, np.ones(width.size, np.bool_))
+        )
     return sizes
 
 
@@ -95,13 +105,17 @@ class _Seen(NamedTuple):
     limit: Array
 
 
-def _seen(part: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State) -> _Seen:
+def _seen(
+    part: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State
+) -> _Seen:
     """White noise is as likely beforehand as all low-passes together; what lies between two bandwidths of the grid is smooth."""
     from scipy.interpolate import CubicSpline
 
     rate = float(state.reduced.attrs["sampling_rate_hz"])
     grid = np.geomspace(rate / _NARROWEST, rate / _WIDEST, _STEPS)
-    widths = np.append(grid, math.inf) if "bandwidth" in part.variant.values else np.array([math.inf])
+    widths = (
+        np.append(grid, math.inf) if "bandwidth" in part.variant.values else np.array([math.inf])
+    )
     table = np.array([_of_width(part, float(width), rows, axes, state) for width in widths])
     prior = np.zeros(1)
     if widths.size > 1:
@@ -111,19 +125,38 @@ def _seen(part: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...
         prior = np.append(np.full(fine.size, -math.log(fine.size)), 0.0)
     log, count = prior + table[:, 0], len(rows)
     share = np.exp(log - np.logaddexp.reduce(log))
-    return _Seen(widths, share, table[:, 1 : 1 + count], table[:, 1 + count : 1 + 2 * count], table[:, 1 + 2 * count :])
+    return _Seen(
+        widths,
+        share,
+        table[:, 1 : 1 + count],
+        table[:, 1 + count : 1 + 2 * count],
+        table[:, 1 + 2 * count :],
+    )
 
 
-def _of_width(part: Component, width: float, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State) -> Array:
+def _of_width(
+    part: Component,
+    width: float,
+    rows: Sequence[tuple[str, ...]],
+    axes: tuple[str, ...],
+    state: State,
+) -> Array:
     """Logarithm of the likelihood of a low-pass, products of the factors of each pair, their errors, and limits of the axes."""
     variant = part.variant
     if "bandwidth" in variant.values:
         other = replace(variant, values={**variant.values, "bandwidth": width})
-        variant = variants_of(part.candidate, other, state.reduced, state.baseline["coefficient"]) or variant
+        variant = (
+            variants_of(part.candidate, other, state.reduced, state.baseline["coefficient"])
+            or variant
+        )
     moments = [component_mixture(replace(part, row=row), state, variant).moments() for row in rows]
-    product, square = (np.array([float(one.flat[0]) for one in several]) for several in zip(*moments, strict=True))
+    product, square = (
+        np.array([float(one.flat[0]) for one in several]) for several in zip(*moments, strict=True)
+    )
     limit = [_level(axis, variant, state) for axis in axes]
-    return np.concatenate([[0.5 * float((product**2 / square).sum())], product, np.sqrt(square), limit])
+    return np.concatenate(
+        [[0.5 * float((product**2 / square).sum())], product, np.sqrt(square), limit]
+    )
 
 
 def _level(axis: str, variant: Variant, state: State) -> float:
@@ -131,9 +164,17 @@ def _level(axis: str, variant: Variant, state: State) -> float:
     reduced = state.reduced
     row = next(number for number, pair in enumerate(pair_rows(reduced)) if axis in pair)
     design = cross_column(variant.design[0], row, reduced).real
-    power, shape = (reduced[name].sel(axis=axis).transpose("block", "band").values for name in ("power", "shape"))
-    weight = np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0) / state.weight[state.axes.index(axis)] ** 2
-    return math.sqrt(float((weight * design * np.nan_to_num(power)).sum() / (weight * design**2).sum()))
+    power, shape = (
+        reduced[name].sel(axis=axis).transpose("block", "band").values
+        for name in ("power", "shape")
+    )
+    weight = (
+        np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)
+        / state.weight[state.axes.index(axis)] ** 2
+    )
+    return math.sqrt(
+        float((weight * design * np.nan_to_num(power)).sum() / (weight * design**2).sum())
+    )
 
 
 def _of_pair(product: Array, limit: Array, rng: np.random.Generator) -> Array:
@@ -144,7 +185,9 @@ def _of_pair(product: Array, limit: Array, rng: np.random.Generator) -> Array:
     return np.stack([first, np.sign(product) * size / first], axis=1)
 
 
-def _of_many(product: Array, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], limit: Array) -> Array:
+def _of_many(
+    product: Array, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], limit: Array
+) -> Array:
     """Factors (draw, axis) whose products are nearest to those of the pairs, of the sign in which they agree with the first of all."""
     place = {row: number for number, row in enumerate(rows)}
     matrix = np.zeros((product.shape[0], len(axes), len(axes)))

@@ -14,7 +14,9 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 __all__ = ["estimate_telegraph"]
 
 
-def estimate_telegraph(parts: Sequence[Component], axes: tuple[str, ...], state: State) -> dict[str, tuple[float, float]]:
+def estimate_telegraph(
+    parts: Sequence[Component], axes: tuple[str, ...], state: State
+) -> dict[str, tuple[float, float]]:
     """Step of every axis [degree hour-1] and mean times on both levels [s], each with its error.
 
     Parameters
@@ -29,7 +31,8 @@ def estimate_telegraph(parts: Sequence[Component], axes: tuple[str, ...], state:
     Returns
     -------
     dict of str to (float, float)
-        The lower level is that of the axis that shows most; where another axis hops the other way its step is negative.
+        The lower level is that of the axis that shows most; where another axis hops the other way
+        its step is negative.
     """
     ranked = sorted(parts, key=lambda part: -part.gain)
     name, first = ranked[0].variant.columns[0], ranked[0].variant
@@ -42,4 +45,7 @@ def estimate_telegraph(parts: Sequence[Component], axes: tuple[str, ...], state:
         label = name if len(axes) == 1 else f"{name}.{part.row[0]}"
         out[label] = (sign * float(mean[0]), float(math.sqrt(covariance[0, 0])))
     stays = max(float(first.values["hops"]) / 2.0, 1.0)  # on either level
-    return out | {time: (float(first.values[time]), float(first.values[time]) / math.sqrt(stays)) for time in ("low", "high")}
+    return out | {
+        time: (float(first.values[time]), float(first.values[time]) / math.sqrt(stays))
+        for time in ("low", "high")
+    }

@@ -41,21 +41,32 @@ def find_upper_limits(naming: Identifications) -> dict[str, UpperLimit]:
     Returns
     -------
     dict of str to Limit
-        95 % limit of the effect's first size, the largest over axes; of effects in means and powers.
+        95 % limit of the effect's first size, the largest over axes; of effects in means and
+        powers.
     """
     named = {claim.effect for claim in (*naming.expected, *naming.claims)}
     out = {}
     for name, kind in effects().items():
         if name in named:
             continue
-        unit = next((item.unit for item in kind.parameters() if item.name in kind.size_parameters), "1")
+        unit = next(
+            (item.unit for item in kind.parameters() if item.name in kind.size_parameters), "1"
+        )
         if name in naming.reasons:
             out[name] = UpperLimit(math.nan, unit, naming.reasons[name])
             continue
-        found = [_limit(one, naming.state) for one in naming.candidates if one.effect == name and one.view in ("mean", "power", "cross")]
+        found = [
+            _limit(one, naming.state)
+            for one in naming.candidates
+            if one.effect == name and one.view in ("mean", "power", "cross")
+        ]
         known = [(value, column) for value, column in found if math.isfinite(value)]
         if not known:
-            out[name] = UpperLimit(math.nan, unit, "not identifiable: free noise does as much" if found else "below limit")
+            out[name] = UpperLimit(
+                math.nan,
+                unit,
+                "not identifiable: free noise does as much" if found else "below limit",
+            )
             continue
         value, column = max(known)
         unit = next((item.unit for item in kind.parameters() if item.name == column), unit)
@@ -67,8 +78,13 @@ def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
     """Limit of the first parameter over the lags, times and plays of its grid, each as likely as the record says, largest over the rows."""
     if not candidate.variants[0].columns:
         return math.nan, ""
-    family = _told_over(candidate, [one for one in candidate.variants if one.columns == candidate.variants[0].columns])
-    rows = pair_rows(state.reduced) if candidate.view == "cross" else [(axis,) for axis in state.axes]
+    family = _told_over(
+        candidate,
+        [one for one in candidate.variants if one.columns == candidate.variants[0].columns],
+    )
+    rows = (
+        pair_rows(state.reduced) if candidate.view == "cross" else [(axis,) for axis in state.axes]
+    )
     found = [_of_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows]
     known = [bound for bound in found if math.isfinite(bound)]
     worst = max(known) if known else math.nan
@@ -77,30 +93,52 @@ def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
 
 def _told_over(candidate: Candidate, family: Sequence[Variant]) -> Sequence[Variant]:
     """Of means some plain variants, evenly over the grid; of others the one in its middle: the sizes of the rest have other meanings."""
-    plain = [family[place] for place in plain_places(candidate.effect, family)] if candidate.view == "mean" else []
+    plain = (
+        [family[place] for place in plain_places(candidate.effect, family)]
+        if candidate.view == "mean"
+        else []
+    )
     every = -(-len(plain) // _MOST)
     return plain[every // 2 :: every] if plain else [family[len(family) // 2]]
 
 
 def _of_row(part: Component, family: Sequence[Variant], state: State) -> float:
     """The number that the size, or its square, is below at 95 %, on an axis or a pair; NaN where the record cannot tell."""
-    moves = [one for one in family if part.candidate.view != "mean" or np.ptp(mean_columns(one, state.axes.index(part.row[0]))[0]) > 0.0]
+    moves = [
+        one
+        for one in family
+        if part.candidate.view != "mean"
+        or np.ptp(mean_columns(one, state.axes.index(part.row[0]))[0]) > 0.0
+    ]
     sizes = [component_mixture(part, state, one) for one in moves]
-    moments = [(float(mean[0]), math.sqrt(max(float(square[0, 0]), 0.0))) for mean, square in (one.moments() for one in sizes)]
-    usable = [place for place, (mean, sd) in enumerate(moments) if math.isfinite(mean) and math.isfinite(sd) and sd > 0.0]
+    moments = [
+        (float(mean[0]), math.sqrt(max(float(square[0, 0]), 0.0)))
+        for mean, square in (one.moments() for one in sizes)
+    ]
+    usable = [
+        place
+        for place, (mean, sd) in enumerate(moments)
+        if math.isfinite(mean) and math.isfinite(sd) and sd > 0.0
+    ]
     if not usable:
         return math.nan
     mean, sd = np.array([moments[place] for place in usable]).T
-    evidence = np.array([float(np.logaddexp.reduce(sizes[place].log_weight)) for place in usable]) - np.log(sd)
+    evidence = np.array(
+        [float(np.logaddexp.reduce(sizes[place].log_weight)) for place in usable]
+    ) - np.log(sd)
     if not np.isfinite(evidence).any():
         return math.nan
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
-    one_sided = part.variant.squared and part.candidate.view == "power"  # a product of two axes has either sign
+    one_sided = (
+        part.variant.squared and part.candidate.view == "power"
+    )  # a product of two axes has either sign
     size = np.maximum(mean, 0.0) if one_sided else np.abs(mean)
     return mixture_limit(size, sd, share)
 
 
-def mixture_limit(size: NDArray[np.float64], sd: NDArray[np.float64], share: NDArray[np.float64]) -> float:
+def mixture_limit(
+    size: NDArray[np.float64], sd: NDArray[np.float64], share: NDArray[np.float64]
+) -> float:
     """Find the number that a mixture of normal laws is below with a probability of 95 %.
 
     Parameters

@@ -1,8 +1,10 @@
 """How much better the insides of blocks are explained by two levels than by noise: for a bias that hops within blocks.
 
-The means of blocks tell no levels where the bias hops several times in each of them; means over sixteenths of a block may. They know less
-of the noise, since what its spectrum has between both lengths was not calibrated by means. So noise has a free white level here, and two
-levels have to do better too than normal noise of any spectrum, which includes Gauss-Markov noise of the same second order, and lines.
+The means of blocks tell no levels where the bias hops several times in each of them; means over
+sixteenths of a block may. They know less of the noise, since what its spectrum has between both
+lengths was not calibrated by means. So noise has a free white level here, and two levels have to do
+better too than normal noise of any spectrum, which includes Gauss-Markov noise of the same second
+order, and lines.
 """
 
 from __future__ import annotations
@@ -14,8 +16,21 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.products import WIDTHS, mean_products, take_out
-from gyrostab.diagnose.evidence.telegraph import MEAN_SWITCHES, TelegraphCourses, course_evidence, telegraph_courses, usual_courses, waves
-from gyrostab.kernels.spectra.periodogram import band_edges, band_powers, gap_spectra, ordinates, taper
+from gyrostab.diagnose.evidence.telegraph import (
+    MEAN_SWITCHES,
+    TelegraphCourses,
+    course_evidence,
+    telegraph_courses,
+    usual_courses,
+    waves,
+)
+from gyrostab.kernels.spectra.periodogram import (
+    band_edges,
+    band_powers,
+    gap_spectra,
+    ordinates,
+    taper,
+)
 from gyrostab.physics.lorentz import lorentz_density
 
 __all__ = ["SwitchingEvidence", "switching_evidence", "switching_powers"]
@@ -24,13 +39,22 @@ Array = NDArray[np.float64]
 #: Nats by which two levels must be better than normal noise of any spectrum.
 NORMAL, _SURE = 10.0, 20.0
 _ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that stands for it
-_MOST = 12_000  # means that a course is sought in; where there are more of them they are put together
+_MOST = (
+    12_000  # means that a course is sought in; where there are more of them they are put together
+)
 _PARTS = 64  # of a piece, each on one level
 _BETWEEN = 0.1  # share of a piece
-_DRAWN, _BELOW, _SHAPE = 16, 4.0, 0.2  # records drawn; deviations below their likelihood, and nats for each hop, that are let pass
+_DRAWN, _BELOW, _SHAPE = (
+    16,
+    4.0,
+    0.2,
+)  # records drawn; deviations below their likelihood, and nats for each hop, that are let pass
 _LEAST = 0.5  # of the samples of a mean that must be there
 _QUIETEST = 1e-4  # of the expected white variance
-_OF_SQUARE, _NEXT = 0.455, 1.15  # median of the square of a normal number; between white levels that are tried
+_OF_SQUARE, _NEXT = (
+    0.455,
+    1.15,
+)  # median of the square of a normal number; between white levels that are tried
 _TOLD = 0.4  # periods of a wave in a piece, up to which pieces tell it
 _AT_ONCE = 500  # blocks whose spectra are worked out at once
 # quantiles of the means that may be levels: excursions may be rare
@@ -44,8 +68,9 @@ class SwitchingEvidence:
     Attributes
     ----------
     gain : float
-        Lower bound of the log Bayes factor against noise [nats]; -inf where there are fewer than `MEAN_SWITCHES` hops, or where normal
-        noise of any spectrum does as well but for `NORMAL` nats.
+        Lower bound of the log Bayes factor against noise [nats]; -inf where there are fewer than
+        `MEAN_SWITCHES` hops, or where normal noise of any spectrum does as well but for `NORMAL`
+        nats.
     share : ndarray, shape (block, piece)
         Of each piece on the upper level.
     times : ndarray, shape (2,)
@@ -53,7 +78,8 @@ class SwitchingEvidence:
     hops : float
         Expected number.
     refuted : bool
-        The pieces do better with two levels than with white noise and a walk, but it is not two levels that they have.
+        The pieces do better with two levels than with white noise and a walk, but it is not two
+        levels that they have.
     """
 
     gain: float
@@ -63,13 +89,16 @@ class SwitchingEvidence:
     refuted: bool = False
 
 
-def switching_evidence(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None) -> SwitchingEvidence | None:
+def switching_evidence(
+    data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None
+) -> SwitchingEvidence | None:
     """What two levels gain in means over pieces of blocks.
 
     Parameters
     ----------
     data : xarray.Dataset
-        One reduced record with ``piece_mean`` (axis block inner) [degree hour-1] and ``piece_samples``.
+        One reduced record with ``piece_mean`` (axis block inner) [degree hour-1] and
+        ``piece_samples``.
     baseline : xarray.Dataset
         As for `gyrostab.diagnose.evidence.telegraph.telegraph_evidence`.
     axis : str
@@ -96,24 +125,42 @@ def switching_evidence(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, giv
     best: SwitchingEvidence | None = None
     for count in (0, 8):
         beside = np.concatenate([waves(n, count), own], axis=1)
-        found = telegraph_courses(flat, variance, present, beside, starts=_STARTS, least=_QUIETEST, parts=_PARTS)
+        found = telegraph_courses(
+            flat, variance, present, beside, starts=_STARTS, least=_QUIETEST, parts=_PARTS
+        )
         gain, beyond = _worth(found, flat, variance, present, own, step, baseline.sel(axis=axis))
         gain -= np.log(2.0)
         share = np.repeat(found.share[0].reshape(shape), together, axis=1)
         seen = found.hops[0] >= MEAN_SWITCHES and gain > 0.0
         alike = seen and _like_two_levels(found, variance, present)
-        good, refuted = alike and beyond > NORMAL, seen and gain > _SURE and (not alike or beyond < -_SURE)
-        one = SwitchingEvidence(gain if good else -np.inf, share, found.times[0] * step, float(found.hops[0]), bool(refuted))
-        best = one if best is None or one.gain > best.gain else replace(best, refuted=best.refuted and one.refuted)
+        good, refuted = (
+            alike and beyond > NORMAL,
+            seen and gain > _SURE and (not alike or beyond < -_SURE),
+        )
+        one = SwitchingEvidence(
+            gain if good else -np.inf,
+            share,
+            found.times[0] * step,
+            float(found.hops[0]),
+            bool(refuted),
+        )
+        best = (
+            one
+            if best is None or one.gain > best.gain
+            else replace(best, refuted=best.refuted and one.refuted)
+        )
     return best
 
 
 def _like_two_levels(found: TelegraphCourses, variance: Array, present: NDArray[np.bool_]) -> bool:
     """Whether the bias is between the levels as rarely as one is that hops like this.
 
-    More levels, or a wave, are followed as well by hops that are fast enough; but shares of neighbouring pieces are not alike then.
+    More levels, or a wave, are followed as well by hops that are fast enough; but shares of
+    neighbouring pieces are not alike then.
     """
-    log, share = usual_courses(found, variance, present, parts=_PARTS, count=_DRAWN, rng=np.random.default_rng(0))
+    log, share = usual_courses(
+        found, variance, present, parts=_PARTS, count=_DRAWN, rng=np.random.default_rng(0)
+    )
     alike = _alike(share)
     return bool(
         found.log[0] > log.mean() - _BELOW * log.std() - _SHAPE * float(found.hops[0])
@@ -124,7 +171,9 @@ def _like_two_levels(found: TelegraphCourses, variance: Array, present: NDArray[
 def _alike(share: Array) -> Array:
     """Number of neighbouring pieces (record,) that are as long on the upper level, and neither always nor never."""
     between = (share > _BETWEEN) & (share < 1.0 - _BETWEEN)
-    return np.asarray((between[:, 1:] & between[:, :-1] & (np.abs(np.diff(share, axis=1)) < _BETWEEN)).sum(axis=1))
+    return np.asarray(
+        (between[:, 1:] & between[:, :-1] & (np.abs(np.diff(share, axis=1)) < _BETWEEN)).sum(axis=1)
+    )
 
 
 def _pieces(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple[Array, Array, int]:
@@ -136,8 +185,14 @@ def _pieces(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple[Array, A
     while samples.size // together > _MOST and together < samples.shape[1]:
         together *= 2
     count = samples.reshape(len(samples), -1, together).sum(axis=2)
-    total = np.where(samples > 0, np.nan_to_num(mean) * samples, 0.0).reshape(len(samples), -1, together).sum(axis=2)
-    enough = (count >= _LEAST * max(np.median(count), 1.0)) & np.isfinite(one["mean"].values)[:, None]
+    total = (
+        np.where(samples > 0, np.nan_to_num(mean) * samples, 0.0)
+        .reshape(len(samples), -1, together)
+        .sum(axis=2)
+    )
+    enough = (count >= _LEAST * max(np.median(count), 1.0)) & np.isfinite(one["mean"].values)[
+        :, None
+    ]
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.where(enough, total / count, np.nan) - known["known_mean"].values[:, None]
         variance = (known["mean_variance"].values * one["samples"].values)[:, None] / count
@@ -152,7 +207,13 @@ def _grouped(given: Array, together: int) -> Array:
 
 
 def _worth(
-    found: TelegraphCourses, values: Array, variance: Array, present: NDArray[np.bool_], given: Array, step: float, baseline: xr.Dataset
+    found: TelegraphCourses,
+    values: Array,
+    variance: Array,
+    present: NDArray[np.bool_],
+    given: Array,
+    step: float,
+    baseline: xr.Dataset,
 ) -> tuple[float, float]:
     """Evidence of the course over that of white noise with a walk, and over that of normal noise of any spectrum [nats]."""
     K, B, prior = _slow(baseline)
@@ -171,7 +232,9 @@ def _worth(
         none, two = course_evidence(take_out(plain, beside, wide), 0, scatter, prior, unit=unit)
         logs["none"].append(none)
         logs["two"].append(two)
-    none, two = (float(np.logaddexp.reduce(logs[name])) - np.log(scales.size) for name in ("none", "two"))
+    none, two = (
+        float(np.logaddexp.reduce(logs[name])) - np.log(scales.size) for name in ("none", "two")
+    )
     two -= float(found.cost[0])
     return two - none, two - _normal_log(values[:, 0], variance, present, given)
 
@@ -188,7 +251,11 @@ def _normal_log(values: Array, variance: Array, present: NDArray[np.bool_], give
     constant = 0.5 * np.log(np.median(variance[present]) / n)  # that of a free constant
     best = -np.inf
     for order in (order for order in _ORDERS if order < n / 10):
-        lags = np.stack([np.roll(y, lag) for lag in range(1, order + 1)], axis=1) if order else np.empty((y.size, 0))
+        lags = (
+            np.stack([np.roll(y, lag) for lag in range(1, order + 1)], axis=1)
+            if order
+            else np.empty((y.size, 0))
+        )
         there = present & np.all([np.roll(present, lag) for lag in range(order + 1)], axis=0)
         there[:order] = False
         used, others = int(there.sum()), present & ~there
@@ -212,20 +279,26 @@ def _slow(baseline: xr.Dataset) -> tuple[Array, Array, Array]:
     return K[chosen], B[chosen], free[chosen] - np.logaddexp.reduce(free[chosen])
 
 
-def _scales(found: TelegraphCourses, values: Array, variance: Array, present: NDArray[np.bool_]) -> Array:
+def _scales(
+    found: TelegraphCourses, values: Array, variance: Array, present: NDArray[np.bool_]
+) -> Array:
     """White levels that are tried, over the expected one: that, more, and what differences of neighbours say with a course and without."""
     both = present[1:] & present[:-1]
     seen = [1.0, 2.0, 4.0]
     for left in (values, values - found.step[0] * found.share[0]):
         square = np.diff(left)[both] ** 2 / (variance[1:] + variance[:-1])[both]
-        seen += [float(np.mean(square)), *(float(np.median(square)) / _OF_SQUARE * np.array([1.0 / _NEXT, 1.0, _NEXT]))]
+        seen += [
+            float(np.mean(square)),
+            *(float(np.median(square)) / _OF_SQUARE * np.array([1.0 / _NEXT, 1.0, _NEXT])),
+        ]
     return np.unique(np.maximum(seen, 1e-12))
 
 
 def switching_powers(share: Array, low: float, high: float, size: int, rate: float) -> Array:
     """Band powers within blocks of a bias of two levels, for a step of one.
 
-    At frequencies that pieces tell, those of the course; beyond, those of hops at random instants, as many as each block has.
+    At frequencies that pieces tell, those of the course; beyond, those of hops at random instants,
+    as many as each block has.
 
     Parameters
     ----------
@@ -257,10 +330,14 @@ def switching_powers(share: Array, low: float, high: float, size: int, rate: flo
         wave -= wave.mean(axis=1, keepdims=True)
         spectra = np.fft.rfft(wave * weights, axis=1)[:, 1 : ordinates(size) + 1]
         place = np.zeros(len(spectra), np.int64)
-        out[first : first + len(spectra)] = band_powers(spectra, spectra, expected, place, edges, rate).real
+        out[first : first + len(spectra)] = band_powers(
+            spectra, spectra, expected, place, edges, rate
+        ).real
     frequency = (edges[:-1] + edges[1:] - 1) / 2.0 * rate / size
     moves = np.abs(np.diff(share.ravel(), prepend=share[0, 0])).reshape(share.shape).sum(axis=1)
-    usual = low * high / (low + high) ** 2 * lorentz_density(frequency, low * high / (low + high), rate)
+    usual = (
+        low * high / (low + high) ** 2 * lorentz_density(frequency, low * high / (low + high), rate)
+    )
     beyond = moves[:, None] / max(float(moves.mean()), 1e-300) * usual
     return np.where(frequency < _TOLD * rate * share.shape[1] / size, out, beyond)
 

@@ -25,12 +25,14 @@ def fold_blocks(reduced: xr.Dataset) -> xr.DataArray:
     Parameters
     ----------
     reduced : xarray.Dataset
-        From `reduce_log`; its dimension `block`, coordinates or variables `begin` and `end` [s] are used.
+        From `reduce_log`; its dimension `block`, coordinates or variables `begin` and `end` [s] are
+        used.
 
     Returns
     -------
     xarray.DataArray
-        ``fold(length, block)``, 0 to 3; coordinate ``length`` is that of a stretch [s], a whole number of blocks.
+        ``fold(length, block)``, 0 to 3; coordinate ``length`` is that of a stretch [s], a whole
+        number of blocks.
 
     Raises
     ------

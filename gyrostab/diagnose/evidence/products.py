@@ -31,7 +31,8 @@ __all__ = [
 Array = NDArray[np.float64]
 #: Standard deviations of the prior of a factor, in errors that it would have in white noise.
 WIDTHS = (1.0, 10.0, 100.0, 1000.0)
-#: A design that keeps less than this share of its square beside constants and given columns is not there.
+#: A design that keeps less than this share of its square beside constants and given columns is not
+#: there.
 _NOTHING = 1e-9
 _AT_ONCE = 10_000  # designs times records times grid points whose evidence is worked out at once
 
@@ -71,14 +72,17 @@ def take_out(products: Products, given: int, precision: Array) -> Products:
         square=products.square - (products.cross[:, out] * to_y).sum(axis=1),
         cross=products.cross[:, keep] - products.gram[:, keep, out] @ to_y,
         gram=products.gram[:, keep, keep] - products.gram[:, keep, out] @ to_x,
-        log_determinant=products.log_determinant + np.linalg.slogdet(inner)[1] - np.linalg.slogdet(precision)[1],
+        log_determinant=products.log_determinant
+        + np.linalg.slogdet(inner)[1]
+        - np.linalg.slogdet(precision)[1],
     )
 
 
 def limits_of(before: Array, after: Array) -> Array:
     """Error of the factor of every column in white noise [1 / unit of the column], 0 where there is nothing to see.
 
-    `before` and `after` are the squares of the columns, and what is left of them beside the constant and the given columns.
+    `before` and `after` are the squares of the columns, and what is left of them beside the
+    constant and the given columns.
     """
     seen = after > _NOTHING * np.maximum(before, np.finfo(float).tiny)
     return np.where(seen, 1.0 / np.sqrt(np.where(seen, after, 1.0)), 0.0)
@@ -113,7 +117,8 @@ def mean_products(
     present : ndarray of bool, shape (block,)
         Blocks that are used.
     pairs : two ndarrays, optional
-        Columns whose products with each other are asked for, from `pairs_of`; all by default. The other products stay 0.
+        Columns whose products with each other are asked for, from `pairs_of`; all by default. The
+        other products stay 0.
     wander : Wander, optional
         What is there beside, whatever K and B are.
     """
@@ -142,7 +147,9 @@ def mean_products(
     return Products(square, cross, gram, determinant)
 
 
-def pairs_of(width: int, designs: Sequence[NDArray[np.int64]], given: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pairs_of(
+    width: int, designs: Sequence[NDArray[np.int64]], given: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Numbers of columns that meet in a model: each and itself, those of a design, and the last `given` and any other."""
     wanted = np.eye(width, dtype=np.bool_)
     wanted[:, width - given :] = True
@@ -160,20 +167,24 @@ def power_products(residual: Array, weight: Array, columns: Array) -> Products:
     residual : ndarray, shape (cell, record)
         ``power / spectrum - 1``.
     weight : ndarray, shape (cell,)
-        Shape of the gamma distribution of the power; 0 where there is none, where `residual` may be anything finite.
+        Shape of the gamma distribution of the power; 0 where there is none, where `residual` may be
+        anything finite.
     columns : ndarray, shape (cell, column)
         Relative change of the spectrum for a unit of each factor.
     """
     weighted = (columns * weight[:, None]).T
     square = weight @ (residual * residual)
-    return Products(square[None], (weighted @ residual)[None], (weighted @ columns)[None], np.zeros(1))
+    return Products(
+        square[None], (weighted @ residual)[None], (weighted @ columns)[None], np.zeros(1)
+    )
 
 
 def share_out(values: Array, weight: Array, common: Array, unit: Array | None = None) -> Array:
     """Take from the cells of each block so much of their common part that they are as good as independent.
 
-    Under random gaps the powers of all bands of a block rise and fall together: their covariance is ``1 / weight`` on the diagonal,
-    and ``common`` times the product of the units everywhere. Products of columns that went through here are those of that covariance.
+    Under random gaps the powers of all bands of a block rise and fall together: their covariance is
+    ``1 / weight`` on the diagonal, and ``common`` times the product of the units everywhere.
+    Products of columns that went through here are those of that covariance.
 
     Parameters
     ----------
@@ -197,12 +208,16 @@ def share_out(values: Array, weight: Array, common: Array, unit: Array | None = 
     """
     one = np.ones_like(weight) if unit is None else unit
     total = (weight * one**2).sum(axis=1)
-    taken = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(total > 0.0, total, 1.0)
+    taken = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(
+        total > 0.0, total, 1.0
+    )
     part = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
     return np.asarray(values - one[..., None] * part[:, None])
 
 
-def evidence(products: Products, designs: Sequence[NDArray[np.int64]], limits: Array, log_weight: Array) -> Array:
+def evidence(
+    products: Products, designs: Sequence[NDArray[np.int64]], limits: Array, log_weight: Array
+) -> Array:
     """Log marginal likelihood without any design, and with each.
 
     Parameters
@@ -220,7 +235,9 @@ def evidence(products: Products, designs: Sequence[NDArray[np.int64]], limits: A
     ndarray, shape (1 + design, record)
     """
     weight = log_weight - np.logaddexp.reduce(log_weight)
-    base = np.ascontiguousarray((weight[:, None] - 0.5 * (products.square + products.log_determinant[:, None])).T)
+    base = np.ascontiguousarray(
+        (weight[:, None] - 0.5 * (products.square + products.log_determinant[:, None])).T
+    )
     out = np.empty((1 + len(designs), base.shape[0]))
     out[0] = np.logaddexp.reduce(base, axis=1)
     at_once = max(1, _AT_ONCE // max(base.size, 1))
@@ -228,14 +245,20 @@ def evidence(products: Products, designs: Sequence[NDArray[np.int64]], limits: A
         alike = [number for number, chosen in enumerate(designs) if chosen.size == width]
         for first in range(0, len(alike), at_once):
             several = alike[first : first + at_once]
-            out[1 + np.array(several)] = _alike_evidence(products, np.stack([designs[number] for number in several]), limits, base)
+            out[1 + np.array(several)] = _alike_evidence(
+                products, np.stack([designs[number] for number in several]), limits, base
+            )
     return out
 
 
-def _alike_evidence(products: Products, chosen: NDArray[np.int64], limits: Array, base: Array) -> Array:
+def _alike_evidence(
+    products: Products, chosen: NDArray[np.int64], limits: Array, base: Array
+) -> Array:
     """Log marginal likelihood (design, record) of designs of so many columns each, `chosen` (design, column)."""
     scale = limits[chosen]
-    gram = products.gram[:, chosen[:, :, None], chosen[:, None, :]] * (scale[:, :, None] * scale[:, None, :])
+    gram = products.gram[:, chosen[:, :, None], chosen[:, None, :]] * (
+        scale[:, :, None] * scale[:, None, :]
+    )
     rotated = products.cross[:, chosen] * scale[..., None]
     if chosen.shape[1] == 1:
         eigenvalues = gram[..., 0]
@@ -243,21 +266,31 @@ def _alike_evidence(products: Products, chosen: NDArray[np.int64], limits: Array
         eigenvalues, vectors = np.linalg.eigh(gram)
         rotated = vectors.swapaxes(2, 3) @ rotated
     squares = np.ascontiguousarray(np.maximum(eigenvalues, 0.0).swapaxes(0, 1))
-    return mixed_evidence(base, np.ascontiguousarray(rotated.transpose(1, 3, 0, 2)), squares, np.square(WIDTHS))
+    return mixed_evidence(
+        base, np.ascontiguousarray(rotated.transpose(1, 3, 0, 2)), squares, np.square(WIDTHS)
+    )
 
 
-def score(factors: Array, owner: Sequence[int] | NDArray[np.int64], *, weight: Sequence[float] | None = None, folds: int = FOLDS) -> Array:
+def score(
+    factors: Array,
+    owner: Sequence[int] | NDArray[np.int64],
+    *,
+    weight: Sequence[float] | None = None,
+    folds: int = FOLDS,
+) -> Array:
     """Held-out gain of candidates, the largest over the lengths of the folds.
 
     Parameters
     ----------
     factors : ndarray, shape (subset, design, record)
-        Logarithms of Bayes factors [nats] on the subsets of `fold_subsets`, without the column of the evidence of none. Factors of
-        data that are independent, as means and powers, may be added before.
+        Logarithms of Bayes factors [nats] on the subsets of `fold_subsets`, without the column of
+        the evidence of none. Factors of data that are independent, as means and powers, may be
+        added before.
     owner : sequence of int, shape (design,)
         Number of the candidate to which each design belongs.
     weight : sequence of float, shape (design,), optional
-        Chance of each design before the data are seen, against the others of its candidate; all alike by default.
+        Chance of each design before the data are seen, against the others of its candidate; all
+        alike by default.
 
     Returns
     -------
@@ -272,11 +305,15 @@ def score(factors: Array, owner: Sequence[int] | NDArray[np.int64], *, weight: S
     [7.99, 8.0]
     """
     owner = np.asarray(owner)
-    chance = np.zeros(owner.size) if weight is None else np.log(np.asarray(weight, dtype=np.float64))
+    chance = (
+        np.zeros(owner.size) if weight is None else np.log(np.asarray(weight, dtype=np.float64))
+    )
     out = []
     for candidate in range(int(owner.max()) + 1 if owner.size else 0):
         chosen = owner == candidate
         own = chance[chosen] - np.logaddexp.reduce(chance[chosen])
         mixed = np.logaddexp.reduce(factors[:, chosen] + own[:, None], axis=1)
-        out.append((mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1).max(axis=0))
+        out.append(
+            (mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1).max(axis=0)
+        )
     return np.array(out).reshape(len(out), factors.shape[2])

@@ -27,7 +27,10 @@ Array = NDArray[Any]
 COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
 #: Statistics of the distribution that a coarse lattice makes by itself.
 GRID_COUNTS = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
-_COARSE, _STILL = 0.2, 0.1  # step in scatters of the samples; share of the blocks that tell the scatter at rest
+_COARSE, _STILL = (
+    0.2,
+    0.1,
+)  # step in scatters of the samples; share of the blocks that tell the scatter at rest
 _ENDS = 2  # samples that are the smallest and the largest of any record
 _SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
 
@@ -60,13 +63,19 @@ def still_scatter(reduced: xr.Dataset) -> NDArray[np.float64]:
     width = reduced["band_high"].values - reduced["band_low"].values
     power = reduced["power"].transpose("axis", ..., "band").values
     square = 2.0 * (power @ width).reshape(len(power), -1)
-    return np.sqrt([np.quantile(row[np.isfinite(row)], _STILL) if np.isfinite(row).any() else np.inf for row in square])
+    return np.sqrt(
+        [
+            np.quantile(row[np.isfinite(row)], _STILL) if np.isfinite(row).any() else np.inf
+            for row in square
+        ]
+    )
 
 
 def beyond_ends(values: NDArray[Any]) -> NDArray[Any]:
     """Samples at the ends of the range, less the first two of the record: one at either end is what any record has.
 
-    A count of which two are certain has no Poisson law: without a lattice chance never brings a third one.
+    A count of which two are certain has no Poisson law: without a lattice chance never brings a
+    third one.
 
     Parameters
     ----------
@@ -108,8 +117,8 @@ class Expected:
 def expected_counts(values: Array) -> tuple[Array, Array]:
     """Mean count of every block (axis, block), and overdispersion of the record's (axis,), from null records (record, axis, block).
 
-    Blocks of few samples, and those far from a value that is counted, have few. One record in which all blocks have the same is added,
-    so that none is expected to have nothing at all.
+    Blocks of few samples, and those far from a value that is counted, have few. One record in which
+    all blocks have the same is added, so that none is expected to have nothing at all.
     """
     records, _, blocks = values.shape
     total = values.sum(axis=2)
@@ -125,7 +134,13 @@ def _log_ratio(count: Array, mean: Array) -> Array:
     from scipy.special import gammaln
 
     a, b = _SHAPE, _RATE
-    raised = gammaln(count + a) - gammaln(a) + a * np.log(b) - (count + a) * np.log(b + mean) + count * np.log(mean)
+    raised = (
+        gammaln(count + a)
+        - gammaln(a)
+        + a * np.log(b)
+        - (count + a) * np.log(b + mean)
+        + count * np.log(mean)
+    )
     even = -mean + count * np.log(mean)
     return np.asarray(np.where(count > mean, raised - even, np.minimum(raised - even, 0.0)))
 
@@ -158,9 +173,13 @@ def count_evidence(values: Array, mean: Array, spread: Array, subsets: NDArray[n
     return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
 
 
-def kurtosis_evidence(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
+def kurtosis_evidence(
+    values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]
+) -> Array:
     """Held-out gain of a higher kurtosis; `mean` and `spread` are those of a block, (axis,); the rest as in `count_evidence`."""
-    z = np.clip(np.where(np.isfinite(values), (values - mean[:, None]) / spread[:, None], 0.0), -8.0, 8.0)
+    z = np.clip(
+        np.where(np.isfinite(values), (values - mean[:, None]) / spread[:, None], 0.0), -8.0, 8.0
+    )
     found = []
     for subset in subsets:
         total = z[:, :, subset].sum(axis=2) / np.sqrt(subset.sum())

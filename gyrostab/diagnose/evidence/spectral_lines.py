@@ -30,15 +30,18 @@ def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
     bands = np.log(baseline["frequency"].values)
     if "line_spectrum" in baseline:
         spectrum = np.maximum(spectrum - baseline["line_spectrum"].values, _LOWEST * spectrum)
-    smooth = np.stack([np.exp(np.interp(np.log(frequency), bands, np.log(row))) for row in spectrum])
+    smooth = np.stack(
+        [np.exp(np.interp(np.log(frequency), bands, np.log(row))) for row in spectrum]
+    )
     return smooth + baseline["peaks"].values if "peaks" in baseline else smooth
 
 
 def line_evidence(power: Array, weight: Array, expected: Array | None = None) -> Array:
     """Gain of a steady line on the parts of the record that were held out, less the logarithm of the number of lines.
 
-    The level is that of the lines around, in every part for itself, and not below those next to it on either side: a slope or a broad
-    hump is no line. The lowest two lines have nothing below them and are never taken for one.
+    The level is that of the lines around, in every part for itself, and not below those next to it
+    on either side: a slope or a broad hump is no line. The lowest two lines have nothing below them
+    and are never taken for one.
 
     Parameters
     ----------
@@ -63,7 +66,9 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
     for number in range(FOLDS):
         held = np.arange(power.shape[2]) % FOLDS == number
         train = np.maximum(precision[:, :, ~held].sum(axis=2), 1e-300)
-        square = np.maximum((above[:, :, ~held] * precision[:, :, ~held]).sum(axis=2) / train, 0.0)[:, :, None]
+        square = np.maximum((above[:, :, ~held] * precision[:, :, ~held]).sum(axis=2) / train, 0.0)[
+            :, :, None
+        ]
         ratio, excess = clean[:, :, held] / level[:, :, held], square / level[:, :, held]
         gain += (share[:, held] * (ratio * excess / (1.0 + excess) - np.log1p(excess))).sum(axis=2)
     gain[..., :_SLOWEST] = -np.inf
@@ -78,11 +83,15 @@ def level_about(power: Array) -> Array:
     stretches = count // _BESIDE
     if stretches < 3:
         return level
-    medians = np.median(power[..., : stretches * _BESIDE].reshape(*power.shape[:-1], stretches, _BESIDE), axis=-1)
+    medians = np.median(
+        power[..., : stretches * _BESIDE].reshape(*power.shape[:-1], stretches, _BESIDE), axis=-1
+    )
     own = np.minimum(np.arange(count) // _BESIDE, stretches - 1)
     right = medians[..., np.minimum(own + 1, stretches - 1)]
     left = medians[..., np.maximum(own - 1, 0)]
-    below = np.cumsum(power[..., :_BESIDE], axis=-1) / np.arange(1, _BESIDE + 1)  # the first stretch has only its own lowest lines
+    below = np.cumsum(power[..., :_BESIDE], axis=-1) / np.arange(
+        1, _BESIDE + 1
+    )  # the first stretch has only its own lowest lines
     left[..., :_BESIDE] = below[..., np.maximum(np.arange(_BESIDE) - LEAK, 0)]
     left[..., :_SLOWEST] = 0.0
     last = own == stretches - 1
@@ -94,9 +103,13 @@ def local_level(total: Array) -> Array:
     """Medians over stretches of lines, and straight lines between their middles."""
     count = total.shape[-1]
     ends = np.linspace(0, count, max(1, count // (2 * _NEIGHBOURS)) + 1).astype(int)
-    medians = np.stack([np.median(total[..., low:high], axis=-1) for low, high in pairwise(ends)], axis=-1)
+    medians = np.stack(
+        [np.median(total[..., low:high], axis=-1) for low, high in pairwise(ends)], axis=-1
+    )
     middle = (ends[1:] + ends[:-1] - 1) / 2.0
-    place = np.clip(np.interp(np.arange(count), middle, np.arange(middle.size)), 0.0, middle.size - 1.0)
+    place = np.clip(
+        np.interp(np.arange(count), middle, np.arange(middle.size)), 0.0, middle.size - 1.0
+    )
     low = np.minimum(place.astype(int), max(middle.size - 2, 0))
     high = np.minimum(low + 1, middle.size - 1)
     return np.asarray(medians[..., low] + (place - low) * (medians[..., high] - medians[..., low]))
@@ -105,13 +118,16 @@ def local_level(total: Array) -> Array:
 def line_skirt(reduced: xr.Dataset, axis: str, place: int) -> NDArray[np.bool_]:
     """Lines that belong to the one at `place`: those it leaks into, and on both sides as far as the power has not come down to the level.
 
-    A line whose phase wanders is wider than the leakage; what stands on its slopes is no other line.
+    A line whose phase wanders is wider than the leakage; what stands on its slopes is no other
+    line.
     """
     weight = reduced["line_weight"].sel(axis=axis).values
     power = reduced["line_power"].sel(axis=axis).transpose("part", "line").values
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / max(float(weight[good].sum()), 1e-300)
-    limit = local_level(total[None])[0] * (1.0 + _FALL / np.sqrt(max(float(weight[good].sum()), 1.0)))
+    limit = local_level(total[None])[0] * (
+        1.0 + _FALL / np.sqrt(max(float(weight[good].sum()), 1.0))
+    )
     mine = np.abs(np.arange(total.size) - place) <= LEAK
     for step in (-1, 1):
         at = place + step

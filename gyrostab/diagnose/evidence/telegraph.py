@@ -1,10 +1,12 @@
 """How much better block means are explained by two levels between which the bias hops than by free random walk and flicker.
 
-Where the bias stands on which level is told by the means themselves, so the course that they tell is no column of known form: what it
-gains as one is only counted beyond what it costs to say it. The sum is a lower bound of the logarithm of the Bayes factor of the
-hopping bias, whatever the random walk and the flicker beside it: for the law q of courses that the means and white noise give, against
-the law p that none were seen for, the evidence is at least that of the mean course less ``KL(q, p)`` and less the scatter of q,
-``D^2 / 2 sum var / sigma^2``. What Gauss-Markov noise does, a random walk does better than two levels.
+Where the bias stands on which level is told by the means themselves, so the course that they tell
+is no column of known form: what it gains as one is only counted beyond what it costs to say it. The
+sum is a lower bound of the logarithm of the Bayes factor of the hopping bias, whatever the random
+walk and the flicker beside it: for the law q of courses that the means and white noise give,
+against the law p that none were seen for, the evidence is at least that of the mean course less
+``KL(q, p)`` and less the scatter of q, ``D^2 / 2 sum var / sigma^2``. What Gauss-Markov noise does,
+a random walk does better than two levels.
 """
 
 from __future__ import annotations
@@ -22,14 +24,25 @@ from gyrostab.diagnose.evidence.wandering import known_wander
 from gyrostab.kernels.regression.evidence import mixed_evidence
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
-__all__ = ["MEAN_SWITCHES", "TelegraphCourses", "course_evidence", "telegraph_courses", "telegraph_evidence", "usual_courses", "waves"]
+__all__ = [
+    "MEAN_SWITCHES",
+    "TelegraphCourses",
+    "course_evidence",
+    "telegraph_courses",
+    "telegraph_evidence",
+    "usual_courses",
+    "waves",
+]
 
 Array = NDArray[np.float64]
 #: Parts of a block, each on one level.
 PARTS = 4
 #: Hops that it takes: one or two are jumps.
 MEAN_SWITCHES = 5.0
-_SHORTEST, _FIRST = 0.5, 5.0  # blocks: the shortest mean time on a level, and the one that the search begins with
+_SHORTEST, _FIRST = (
+    0.5,
+    5.0,
+)  # blocks: the shortest mean time on a level, and the one that the search begins with
 #: Quantiles of the means that may be levels.
 STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
 _TRIAL, _ROUNDS, _MANY_ROUNDS, _STILL = 3, 14, 60, 0.01
@@ -107,7 +120,9 @@ def telegraph_courses(
     """
     y = np.where(present, values.T, 0.0)
     weight = np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0)
-    plain = np.linalg.lstsq(beside * np.sqrt(weight)[:, None], (y * np.sqrt(weight)).T, rcond=None)[0].T
+    plain = np.linalg.lstsq(beside * np.sqrt(weight)[:, None], (y * np.sqrt(weight)).T, rcond=None)[
+        0
+    ].T
     level = np.quantile((y - plain @ beside.T)[:, present], np.unique(starts), axis=1)
     tried = []
     for start in starts:
@@ -117,12 +132,22 @@ def telegraph_courses(
         fit = _Fit(size, np.full((len(y), 2), _FIRST), np.ones(len(y)))
         tried.append(_improved(fit, y, weight, beside, _TRIAL, least))
     chosen = np.argmax([log for _, log in tried], axis=0)
-    size, times, scale = (_picked([getattr(fit, name) for fit, _ in tried], chosen) for name in ("size", "times", "scale"))
+    size, times, scale = (
+        _picked([getattr(fit, name) for fit, _ in tried], chosen)
+        for name in ("size", "times", "scale")
+    )
     best = _Fit(size, times, scale)
     best, _ = _improved(best, y, weight, beside, _ROUNDS, least)
     told = _told(best, y, weight, beside)
     if parts > PARTS:
-        finer, _ = _improved(_Fit(best.size, best.times, np.ones(len(y)), parts), y, weight, beside, _MANY_ROUNDS, least)
+        finer, _ = _improved(
+            _Fit(best.size, best.times, np.ones(len(y)), parts),
+            y,
+            weight,
+            beside,
+            _MANY_ROUNDS,
+            least,
+        )
         told = _told(finer, y, weight, beside)
     return told
 
@@ -142,7 +167,9 @@ def _picked(several: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
     return np.asarray(np.stack(several)[chosen, np.arange(chosen.size)])
 
 
-def _smoothed(fit: _Fit, y: Array, weight: Array, beside: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _smoothed(
+    fit: _Fit, y: Array, weight: Array, beside: Array
+) -> tuple[Array, Array, Array, Array, Array]:
     """Log likelihood, share and its square, steps up, and the sum of squares over the white variance."""
     left = y - fit.size[:, :-1] @ beside.T
     step = fit.size[:, -1]
@@ -153,12 +180,18 @@ def _smoothed(fit: _Fit, y: Array, weight: Array, beside: Array) -> tuple[Array,
     start = fit.times / fit.times.sum(axis=1, keepdims=True)
     found, share, square, up = levels_smooth(np.exp(log - most[..., None]), chance, rises, start)
     seen = weight > 0.0
-    found = found + most.sum(axis=1) + 0.5 * (np.log(weight[seen] / (2.0 * np.pi)).sum() - seen.sum() * np.log(fit.scale))
+    found = (
+        found
+        + most.sum(axis=1)
+        + 0.5 * (np.log(weight[seen] / (2.0 * np.pi)).sum() - seen.sum() * np.log(fit.scale))
+    )
     away = (left - step[:, None] * share) ** 2 + step[:, None] ** 2 * (square - share**2)
     return found, share, square, up, away @ weight
 
 
-def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, least: float) -> tuple[_Fit, Array]:
+def _improved(
+    fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, least: float
+) -> tuple[_Fit, Array]:
     """Expectation and maximisation, until nothing moves; and the log likelihood."""
     n, count = y.shape[1], int((weight > 0.0).sum())
     still = _STILL / np.sqrt(np.median(weight[weight > 0.0]))
@@ -170,7 +203,9 @@ def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, le
         normal[:, :-1, :-1] = gram
         normal[:, -1, :-1] = normal[:, :-1, -1] = (share * weight) @ beside
         normal[:, -1, -1] = square @ weight
-        normal += 1e-9 * np.eye(len(gram) + 1) * (np.einsum("rii->ri", normal)[:, None, :] + weight.max())
+        normal += (
+            1e-9 * np.eye(len(gram) + 1) * (np.einsum("rii->ri", normal)[:, None, :] + weight.max())
+        )
         sums = np.concatenate([right, ((y * share) @ weight)[:, None]], axis=1)
         size = np.linalg.solve(normal, sums[..., None])[..., 0]
         high = share.sum(axis=1)
@@ -178,7 +213,12 @@ def _improved(fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, le
         times = np.stack([(n - high + 0.5) / (up + 0.5), (high + 0.5) / (down + 0.5)], axis=1)
         moved = np.abs(size - fit.size).max()
         slow = rounds == _MANY_ROUNDS and np.abs(np.log(times / fit.times)).max() > _STILL
-        fit = _Fit(size, np.clip(times, _SHORTEST * PARTS / fit.parts, n), np.maximum(total / count, least), fit.parts)
+        fit = _Fit(
+            size,
+            np.clip(times, _SHORTEST * PARTS / fit.parts, n),
+            np.maximum(total / count, least),
+            fit.parts,
+        )
         log, share, square, up, total = _smoothed(fit, y, weight, beside)
         if moved < still and not slow:
             break
@@ -190,7 +230,11 @@ def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> TelegraphCourses
     log, share, square, up, total = _smoothed(fit, y, weight, beside)
     seen = weight > 0.0
     spread = np.maximum(square - share**2, 0.0)
-    expected = -0.5 * (total / fit.scale - np.log(weight[seen] / (2.0 * np.pi)).sum() + seen.sum() * np.log(fit.scale))
+    expected = -0.5 * (
+        total / fit.scale
+        - np.log(weight[seen] / (2.0 * np.pi)).sum()
+        + seen.sum() * np.log(fit.scale)
+    )
     hops = 2.0 * up + share[:, 0] - share[:, -1]
     turned = fit.size[:, -1] < 0.0
     return TelegraphCourses(
@@ -206,7 +250,13 @@ def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> TelegraphCourses
 
 
 def usual_courses(
-    found: TelegraphCourses, variance: Array, present: NDArray[np.bool_], *, parts: int, count: int, rng: np.random.Generator
+    found: TelegraphCourses,
+    variance: Array,
+    present: NDArray[np.bool_],
+    *,
+    parts: int,
+    count: int,
+    rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     """Logarithms of the likelihood (record,), and shares (record, block), that means of two levels have that hop as it was found.
 
@@ -227,7 +277,9 @@ def usual_courses(
     y = np.where(present, found.step[0] * share + noise, 0.0)
     size = np.tile([0.0, found.step[0]], (count, 1))
     fit = _Fit(size, np.tile(found.times[0], (count, 1)), np.full(count, found.scale[0]), parts)
-    return _smoothed(fit, y, np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0), np.ones((n, 1)))[:2]
+    return _smoothed(
+        fit, y, np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0), np.ones((n, 1))
+    )[:2]
 
 
 def _drawn_course(n: int, low: float, high: float, rng: np.random.Generator) -> Array:
@@ -245,16 +297,22 @@ def _drawn_course(n: int, low: float, high: float, rng: np.random.Generator) -> 
 
 def _unknown(hops: Array, blocks: int) -> Array:
     """What it costs that both mean times are not known [nats]: the logarithm of each is, to the root of one over its hops."""
-    return np.asarray(2.0 * np.log(max(np.log(2.0 * blocks), 1.0)) + np.maximum(np.log(np.maximum(hops, 1.0) / (4.0 * np.pi)), 0.0))
+    return np.asarray(
+        2.0 * np.log(max(np.log(2.0 * blocks), 1.0))
+        + np.maximum(np.log(np.maximum(hops, 1.0) / (4.0 * np.pi)), 0.0)
+    )
 
 
-def telegraph_evidence(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None) -> tuple[Array, TelegraphCourses]:
+def telegraph_evidence(
+    data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None
+) -> tuple[Array, TelegraphCourses]:
     """Gains of a bias of two levels on an axis.
 
     Parameters
     ----------
     data : xarray.Dataset
-        Reduced data, one record or many with the same gaps: ``mean`` ((record,) axis block) [degree hour-1].
+        Reduced data, one record or many with the same gaps: ``mean`` ((record,) axis block) [degree
+        hour-1].
     baseline : xarray.Dataset
         As for `gyrostab.diagnose.evidence.held_out.mean_factors`.
     axis : str
@@ -264,11 +322,16 @@ def telegraph_evidence(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, giv
     Returns
     -------
     gain : ndarray, shape (record,)
-        Lower bound of the log Bayes factor [nats]; -inf where there are fewer than `MEAN_SWITCHES` hops.
+        Lower bound of the log Bayes factor [nats]; -inf where there are fewer than `MEAN_SWITCHES`
+        hops.
     courses : Courses
     """
     mean = (data["mean"] - baseline["known_mean"]).sel(axis=axis)
-    values = (mean if "record" in mean.dims else mean.expand_dims("record")).transpose("block", "record").values
+    values = (
+        (mean if "record" in mean.dims else mean.expand_dims("record"))
+        .transpose("block", "record")
+        .values
+    )
     variance = baseline["mean_variance"].sel(axis=axis).values
     present = np.asarray(np.isfinite(values).all(axis=1)) & np.isfinite(variance)
     n = present.size
@@ -281,16 +344,25 @@ def telegraph_evidence(data: xr.Dataset, baseline: xr.Dataset, *, axis: str, giv
         "present": present,
         "wander": known_wander(baseline, axis),
     }
-    grid: dict[str, Any] = {name: baseline[f"grid_{name}"].sel(axis=axis).values for name in ("K", "B")}
+    grid: dict[str, Any] = {
+        name: baseline[f"grid_{name}"].sel(axis=axis).values for name in ("K", "B")
+    }
     log_weight = baseline["grid_prior"].sel(axis=axis).values
     safe = np.where(present[:, None], values, 0.0)
     tried = []
     for count in _DRIFTS:
-        found = telegraph_courses(safe, variance, present, np.concatenate([waves(n, count), own], axis=1))
+        found = telegraph_courses(
+            safe, variance, present, np.concatenate([waves(n, count), own], axis=1)
+        )
         worth = _worth(found, safe, own, frame, grid, log_weight) - np.log(len(_DRIFTS))
         tried.append((np.where(found.hops >= MEAN_SWITCHES, worth, -np.inf), found))
     chosen = np.argmax([gain for gain, _ in tried], axis=0)
-    best = TelegraphCourses(*(_picked([getattr(one, item.name) for _, one in tried], chosen) for item in fields(TelegraphCourses)))
+    best = TelegraphCourses(
+        *(
+            _picked([getattr(one, item.name) for _, one in tried], chosen)
+            for item in fields(TelegraphCourses)
+        )
+    )
     return _picked([gain for gain, _ in tried], chosen), best
 
 
@@ -299,7 +371,14 @@ def waves(n: int, count: int) -> Array:
     return np.asarray(np.cos(np.pi * (np.arange(n)[:, None] + 0.5) / n * np.arange(count + 1)))
 
 
-def _worth(found: TelegraphCourses, values: Array, given: Array, frame: dict[str, Any], grid: dict[str, Any], log_weight: Array) -> Array:
+def _worth(
+    found: TelegraphCourses,
+    values: Array,
+    given: Array,
+    frame: dict[str, Any],
+    grid: dict[str, Any],
+    log_weight: Array,
+) -> Array:
     """Evidence of the courses over that of none, less what they cost; the scatter of a course counts as a datum that has no step."""
     records, beside = values.shape[1], given.shape[1]
     columns = np.concatenate([found.share.T, given], axis=1)
@@ -309,7 +388,9 @@ def _worth(found: TelegraphCourses, values: Array, given: Array, frame: dict[str
     square = np.diagonal(white.gram[0])
     wide = np.where(square[records:] > 0.0, square[records:], 1.0) / WIDTHS[-1] ** 2
     pairs = pairs_of(columns.shape[1], [], beside)
-    products = take_out(mean_products(values, columns, **frame, **grid, pairs=pairs), beside, np.diag(wide))
+    products = take_out(
+        mean_products(values, columns, **frame, **grid, pairs=pairs), beside, np.diag(wide)
+    )
     usual = np.diagonal(take_out(white, beside, np.diag(wide)).gram[0])
     weight = log_weight - np.logaddexp.reduce(log_weight)
     out = np.empty(records)
@@ -319,7 +400,9 @@ def _worth(found: TelegraphCourses, values: Array, given: Array, frame: dict[str
     return out - found.cost
 
 
-def course_evidence(products: Products, place: int, scatter: float, log_weight: Array, *, unit: float) -> tuple[float, float]:
+def course_evidence(
+    products: Products, place: int, scatter: float, log_weight: Array, *, unit: float
+) -> tuple[float, float]:
     """Logarithms of the evidence of no course and of one, over a grid of the noise.
 
     Parameters
@@ -333,11 +416,14 @@ def course_evidence(products: Products, place: int, scatter: float, log_weight: 
     log_weight : ndarray, shape (grid,)
         Of the grid points.
     unit : float
-        Square of the course over the white variance; the prior of the step has the widths of all factors.
+        Square of the course over the white variance; the prior of the step has the widths of all
+        factors.
     """
     base = (log_weight - 0.5 * (products.square[:, place] + products.log_determinant))[None]
     size = 1.0 / np.sqrt(max(unit + scatter, 1e-300))
     rotated = np.ascontiguousarray((products.cross[:, place, place] * size)[None, None, :, None])
-    eigenvalues = np.maximum((products.gram[:, place, place] + scatter) * size**2, 0.0)[None, :, None]
+    eigenvalues = np.maximum((products.gram[:, place, place] + scatter) * size**2, 0.0)[
+        None, :, None
+    ]
     two = float(mixed_evidence(base, rotated, eigenvalues, np.square(WIDTHS))[0, 0])
     return float(np.logaddexp.reduce(base[0])), two

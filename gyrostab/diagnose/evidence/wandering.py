@@ -35,8 +35,8 @@ def known_wander(baseline: xr.Dataset, axis: str | int) -> Wander:
     Parameters
     ----------
     baseline : xarray.Dataset
-        Of `gyrostab.diagnose.baseline.calibrate.baseline_from_model`, with ``wander_square`` (axis, wander), ``wander_time`` (wander) and
-        ``wander_walk`` (axis, block); nothing without these.
+        Of `gyrostab.diagnose.baseline.calibrate.baseline_from_model`, with ``wander_square`` (axis,
+        wander), ``wander_time`` (wander) and ``wander_walk`` (axis, block); nothing without these.
     axis : str or int
         Name, or number.
     """
@@ -45,7 +45,11 @@ def known_wander(baseline: xr.Dataset, axis: str | int) -> Wander:
     own = baseline[["wander_square", "wander_time", "wander_walk"]]
     own = own.isel(axis=axis) if isinstance(axis, int) else own.sel(axis=axis)
     there = own["wander_square"].values > 0.0
-    return Wander(own["wander_square"].values[there], own["wander_time"].values[there], own["wander_walk"].values)
+    return Wander(
+        own["wander_square"].values[there],
+        own["wander_time"].values[there],
+        own["wander_walk"].values,
+    )
 
 
 def mean_share(step: float, time: Array) -> Array:

@@ -27,7 +27,12 @@ _LOUDEST = 8.0  # standard deviations that the level of one block may be away
 def flexible(state: State, claims: Sequence[Identification], axis: str) -> State:
     """The state with the next points of the nuisance grids beside those named: a time constant lies between two of them."""
     row = state.axes.index(axis)
-    for part in (part for one in claims for part in one.parts if part.candidate.view == "mean" and part.row == (axis,)):
+    for part in (
+        part
+        for one in claims
+        for part in one.parts
+        if part.candidate.view == "mean" and part.row == (axis,)
+    ):
         family = [one for one in part.candidate.variants if one.columns == part.variant.columns]
         place = next(number for number, one in enumerate(family) if one is part.variant)
         for other in family[max(place - 1, 0) : place] + family[place + 1 : place + 2]:
@@ -38,16 +43,24 @@ def flexible(state: State, claims: Sequence[Identification], axis: str) -> State
 def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> float:
     """What free random walk and flicker gain over the calibrated ones, with all that is named in the model [nats].
 
-    Zero where the noise is less red than calibrated: a calibration on blocks that an effect touches takes it for noise.
+    Zero where the noise is less red than calibrated: a calibration on blocks that an effect touches
+    takes it for noise.
     """
     given = state.given.get(("mean", axis))
     beside = np.stack(given, axis=-1) if given else None
     columns = [np.linspace(-1.0, 1.0, state.reduced.sizes["block"])] if not given else []
     evidence, strength = [], []
     span = state.reduced.sizes["block"] * float(state.reduced.attrs["block_s"])
-    slow = state.baseline["grid_K"].sel(axis=axis).values ** 2 * span / HOUR + state.baseline["grid_B"].sel(axis=axis).values ** 2
+    slow = (
+        state.baseline["grid_K"].sel(axis=axis).values ** 2 * span / HOUR
+        + state.baseline["grid_B"].sel(axis=axis).values ** 2
+    )
     for tier in ("free", "calibrated"):
-        evidence.append(mean_factors(state.reduced, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds)[0, 0, 0])
+        evidence.append(
+            mean_factors(
+                state.reduced, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds
+            )[0, 0, 0]
+        )
         strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))
     return float(evidence[0] - evidence[1]) if strength[0] > strength[1] else 0.0
 
@@ -55,8 +68,9 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
 def variance_fluctuation(state: State, axis: str) -> float:
     """What a level of the powers that wanders freely, as flicker and random walk do, gains over one that stands still [nats].
 
-    The level is that of all bands of a block together, over the one expected with all that is named. It is the twin of `excess_low_frequency_noise`: where
-    something is left, the noise changes in another way than what is named says.
+    The level is that of all bands of a block together, over the one expected with all that is
+    named. It is the twin of `excess_low_frequency_noise`: where something is left, the noise
+    changes in another way than what is named says.
     """
     row = state.axes.index(axis)
     level, variance, columns = _levels(state, row, axis)
@@ -66,12 +80,17 @@ def variance_fluctuation(state: State, axis: str) -> float:
     step = float(state.reduced.attrs["block_s"])
     usual = float(np.median(variance[present]))
     least = scales(usual * step, present.sum() * step)
-    K, B = (part.ravel() for part in np.meshgrid(*([0.0, *(one * np.array(_STEPS))] for one in least), indexing="ij"))
+    K, B = (
+        part.ravel()
+        for part in np.meshgrid(*([0.0, *(one * np.array(_STEPS))] for one in least), indexing="ij")
+    )
     safe = np.where(present, variance, usual)
     error = np.sqrt(safe)
     values = np.clip(np.where(present, level, 0.0), -_LOUDEST * error, _LOUDEST * error)[:, None]
     products = mean_products(values, columns, variance=safe, step=step, K=K, B=B, present=present)
-    gram = products.gram + 1e-9 * np.eye(columns.shape[1]) * (1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None])
+    gram = products.gram + 1e-9 * np.eye(columns.shape[1]) * (
+        1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
+    )
     size = np.linalg.solve(gram, products.cross)[..., 0]
     square = products.square[:, 0] - (size * products.cross[..., 0]).sum(axis=1)
     log = -0.5 * (square + products.log_determinant + np.linalg.slogdet(gram)[1])
@@ -81,15 +100,29 @@ def variance_fluctuation(state: State, axis: str) -> float:
 def _levels(state: State, row: int, axis: str) -> tuple[Array, Array, Array]:
     """Of every block: level over the expected less one, its variance, and what a change of size of all that is named does to it."""
     shape = state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values
-    ratio = state.reduced["power"].transpose("axis", "block", "band").values[row] / state.weight[row] - 1.0
+    ratio = (
+        state.reduced["power"].transpose("axis", "block", "band").values[row] / state.weight[row]
+        - 1.0
+    )
     use = np.where(np.isfinite(shape) & np.isfinite(ratio), shape, 0.0)
     total = use.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = (use * np.nan_to_num(ratio)).sum(axis=1) / total
         variance = 1.0 / total + state.baseline["common"].sel(axis=axis).values
-        named = [(use * one / state.weight[row]).sum(axis=1) / total for one in state.given.get(("power", axis), [])]
+        named = [
+            (use * one / state.weight[row]).sum(axis=1) / total
+            for one in state.given.get(("power", axis), [])
+        ]
     columns = np.nan_to_num(np.stack(named, axis=-1)) if named else np.empty((total.size, 0))
-    moves = np.ptp(columns, axis=0) > 1e-9 * np.abs(columns).max(axis=0, initial=1e-300) if named else np.zeros(0, bool)
+    moves = (
+        np.ptp(columns, axis=0) > 1e-9 * np.abs(columns).max(axis=0, initial=1e-300)
+        if named
+        else np.zeros(0, bool)
+    )
     columns = columns[:, moves]
-    columns = columns / np.maximum(np.abs(columns).max(axis=0, initial=0.0), 1e-300) if columns.shape[1] else columns
+    columns = (
+        columns / np.maximum(np.abs(columns).max(axis=0, initial=0.0), 1e-300)
+        if columns.shape[1]
+        else columns
+    )
     return level, variance, columns

@@ -59,15 +59,18 @@ def by_key(found: Sequence[Found]) -> dict[str, list[Component]]:
 
 def _once(parts: Sequence[Component]) -> list[Component]:
     """Parts without the spectrum of an effect on axes whose course within blocks is known: that holds the same powers."""
-    told = {part.row for part in parts if part.candidate.view == "levels" and part.variant.inside.size}
+    told = {
+        part.row for part in parts if part.candidate.view == "levels" and part.variant.inside.size
+    }
     return [part for part in parts if part.candidate.view != "power" or part.row not in told]
 
 
 def without_lines(parts: dict[str, list[Component]]) -> dict[str, list[Component]]:
     """The same, where a line counts for the plainest name only.
 
-    Any line has the form that a ripple of the supply or a sway would have, and nothing in the line itself tells of them; that they can be
-    meant as well stands among the alternatives. What else such an effect does counts as before.
+    Any line has the form that a ripple of the supply or a sway would have, and nothing in the line
+    itself tells of them; that they can be meant as well stands among the alternatives. What else
+    such an effect does counts as before.
     """
     out = {}
     for key, several in parts.items():
@@ -91,7 +94,14 @@ def sum_evidence(parts: Sequence[Component]) -> float:
 def evidence_of(parts: Sequence[Component], like: Component) -> float:
     """Gain of the part in the same view and row, and beside the same witness."""
     wanted = like.candidate.view, like.row, like.candidate.witness
-    return next((one.gain for one in parts if (one.candidate.view, one.row, one.candidate.witness) == wanted), like.gain)
+    return next(
+        (
+            one.gain
+            for one in parts
+            if (one.candidate.view, one.row, one.candidate.witness) == wanted
+        ),
+        like.gain,
+    )
 
 
 def tried_again(parts: Sequence[Component]) -> list[Candidate]:

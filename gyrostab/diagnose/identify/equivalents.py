@@ -16,14 +16,18 @@ __all__ = ["prefer_plainer"]
 
 _ALIKE = 0.999  # correlation of the errors of two terms, from which on they are one to the data
 _AMBIGUOUS = 3.0  # nats by which one term alone must be better than another
-_NEEDED, _FORM = 6.0, 0.01  # nats that a second term must bring, and of the first one's, which an error of its form may leave
+_NEEDED, _FORM = (
+    6.0,
+    0.01,
+)  # nats that a second term must bring, and of the first one's, which an error of its form may leave
 
 
 def prefer_plainer(part: Component, state: State) -> tuple[Component, str]:
     """The part with one of its terms, where that does as well as all, and a sentence about it; else the part as it is.
 
-    A part of one term gets the first of those that alone do as well, but for 3 nats and an error of the form.
-    Terms that rise and fall together, as g^2 and g^4 at one level of vibration, have sizes that are large, opposite and wrong.
+    A part of one term gets the first of those that alone do as well, but for 3 nats and an error of
+    the form. Terms that rise and fall together, as g^2 and g^4 at one level of vibration, have
+    sizes that are large, opposite and wrong.
 
     Parameters
     ----------
@@ -45,7 +49,9 @@ def prefer_plainer(part: Component, state: State) -> tuple[Component, str]:
         return part, ""
     gains = {name: _alone(part, state, variant) for name, variant in alone.items()}
     best = max(gains.values())
-    name = next(name for name in part.variant.columns if gains.get(name, -np.inf) > best - _NEEDED)  # the first that will do
+    name = next(
+        name for name in part.variant.columns if gains.get(name, -np.inf) > best - _NEEDED
+    )  # the first that will do
     whole = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
     if alike < _ALIKE and whole - gains[name] > _NEEDED + _FORM * gains[name]:
         return part, ""
@@ -55,14 +61,23 @@ def prefer_plainer(part: Component, state: State) -> tuple[Component, str]:
 
 def _first_alike(part: Component, state: State) -> tuple[Component, str]:
     """A part of one term: by the first of the terms that alone do as well, whichever rounding or chance had put ahead."""
-    names = dict.fromkeys(one.columns[0] for one in part.candidate.variants if len(one.columns) == 1)
+    names = dict.fromkeys(
+        one.columns[0] for one in part.candidate.variants if len(one.columns) == 1
+    )
     terms = [one for name in names if (one := _only(part, name)) is not None]
     own = _alone(part, state, part.variant)
-    alike = [one for one in terms if one.columns == part.variant.columns or _alone(part, state, one) > own - _AMBIGUOUS - _FORM * own]
+    alike = [
+        one
+        for one in terms
+        if one.columns == part.variant.columns
+        or _alone(part, state, one) > own - _AMBIGUOUS - _FORM * own
+    ]
     if len(alike) < 2:
         return part, ""
     first, *others = alike
-    return replace(part, variant=first), _untold(first.columns[0], [one.columns[0] for one in others])
+    return replace(part, variant=first), _untold(
+        first.columns[0], [one.columns[0] for one in others]
+    )
 
 
 def _alone(part: Component, state: State, variant: Variant) -> float:
@@ -80,6 +95,10 @@ def _untold(name: str, others: Sequence[str]) -> str:
 def _only(part: Component, name: str) -> Variant | None:
     """The variant of the same values with this term alone."""
     for one in part.candidate.variants:
-        if one.columns == (name,) and one.squared == part.variant.squared and one.values == part.variant.values:
+        if (
+            one.columns == (name,)
+            and one.squared == part.variant.squared
+            and one.values == part.variant.values
+        ):
             return one
     return None

@@ -19,13 +19,17 @@ _ONCE = {"telegraph": "bias_jump"}  # a hop that does not come back
 
 
 def identify_expected_effects(
-    known: Sequence[Effect], candidates: Sequence[Candidate], start: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
+    known: Sequence[Effect],
+    candidates: Sequence[Candidate],
+    start: State,
+    gains: Callable[[Sequence[Candidate], State], list[Found]],
 ) -> tuple[list[Identification], State]:
     """Claims of effects that are expected, and the state with them in it; whatever else is named has to stand beside them.
 
-    Their sizes are free, for the model says how often something happens and the recording when. The strongest comes first, but odd
-    samples before all: they raise powers and means too. An effect that holds several parts of a kind, as two jumps or two lines do, is
-    taken as often as it brings something.
+    Their sizes are free, for the model says how often something happens and the recording when. The
+    strongest comes first, but odd samples before all: they raise powers and means too. An effect
+    that holds several parts of a kind, as two jumps or two lines do, is taken as often as it brings
+    something.
 
     Parameters
     ----------
@@ -62,18 +66,33 @@ def _odd(parts: Sequence[Component]) -> bool:
 def _follows(candidate: Candidate, effect: Effect) -> bool:
     """Whether a candidate is this effect of a model, with the channels that it has there; or what it is where it happens once."""
     named = {*filter(None, candidate.driver)}
-    return candidate.effect in (effect.name, _ONCE.get(effect.name)) and named <= {*effect.channel_names().values()}
+    return candidate.effect in (effect.name, _ONCE.get(effect.name)) and named <= {
+        *effect.channel_names().values()
+    }
 
 
 def _parts(
-    effect: Effect, candidates: Sequence[Candidate], state: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
+    effect: Effect,
+    candidates: Sequence[Candidate],
+    state: State,
+    gains: Callable[[Sequence[Candidate], State], list[Found]],
 ) -> list[Component]:
     """What an effect brings on its axes, in the views and with the channels in which it brings most."""
     by = by_key(gains([one for one in candidates if _follows(one, effect)], state))
-    own = [[part for part in parts if not effect.axes or set(part.row) <= set(effect.axes)] for parts in by.values()]
+    own = [
+        [part for part in parts if not effect.axes or set(part.row) <= set(effect.axes)]
+        for parts in by.values()
+    ]
     return max(own, key=sum_evidence, default=[])
 
 
 def _claim(parts: Sequence[Component], state: State) -> Identification:
     first = parts[0].candidate
-    return Identification(first.effect, first.driver, axes_of(parts, state.axes), tuple(parts), sum_evidence(parts), LEAST)
+    return Identification(
+        first.effect,
+        first.driver,
+        axes_of(parts, state.axes),
+        tuple(parts),
+        sum_evidence(parts),
+        LEAST,
+    )

@@ -21,28 +21,42 @@ from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.reduce.zero_bin import may_be_cut_off
 from gyrostab.physics.registry import effects
 
-__all__ = ["EQUIVALENTS", "OBSERVATIONALLY_EQUIVALENT", "find_equivalent_effects", "find_plainer_effect", "is_physical", "without_pulses"]
+__all__ = [
+    "EQUIVALENTS",
+    "OBSERVATIONALLY_EQUIVALENT",
+    "find_equivalent_effects",
+    "find_plainer_effect",
+    "is_physical",
+    "without_pulses",
+]
 
 #: Effect -> effects that look the same in block statistics, whatever the excitation.
 OBSERVATIONALLY_EQUIVALENT: dict[str, tuple[str, ...]] = {
     "gauss_markov": ("telegraph",),
     "spectral_line": ("real_motion", "supply_bias"),
 }
-#: Effect -> effect that it becomes where a parameter goes to its end: without play, hysteresis is proportional to temperature.
+#: Effect -> effect that it becomes where a parameter goes to its end: without play, hysteresis is
+#: proportional to temperature.
 EQUIVALENTS = {"thermal_hysteresis": "temperature_bias"}
 _SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
 _SURE = 3.0  # standard errors beyond its range, from which on a size is impossible
 _COMB = 3  # lines that may be one comb
 _MOVING = 1.5  # times the expected power, from which on an axis moves
 _MORE, _FORM = 3.0, 0.01  # nats that further levels may gain, and of the first two's
-_LEAN, _SQUARE = 2e-2, 1e-5  # shares of the turning: of an axis that is across it, at most; and to which one can be squared up
+_LEAN, _SQUARE = (
+    2e-2,
+    1e-5,
+)  # shares of the turning: of an axis that is across it, at most; and to which one can be squared up
 _LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
 
 
-def without_pulses(chosen: Sequence[Identification | Unidentified]) -> list[Identification | Unidentified]:
+def without_pulses(
+    chosen: Sequence[Identification | Unidentified],
+) -> list[Identification | Unidentified]:
     """What is chosen, without spikes on axes that have a comb of lines or a profile of the ramp.
 
-    A comb is a pulse that comes again and again, and what jumps out there is the pulse itself: wrong samples would make no lines.
+    A comb is a pulse that comes again and again, and what jumps out there is the pulse itself:
+    wrong samples would make no lines.
     """
     lines: Counter[str] = Counter()
     for part in (part for one in chosen for part in one.parts):
@@ -52,7 +66,9 @@ def without_pulses(chosen: Sequence[Identification | Unidentified]) -> list[Iden
     for one in chosen:
         if isinstance(one, Identification) and one.effect == "spikes":
             kept = tuple(part for part in one.parts if lines[part.row[0]] < _COMB)
-            out += [replace(one, parts=kept, axes=tuple(part.row[0] for part in kept))] if kept else []
+            out += (
+                [replace(one, parts=kept, axes=tuple(part.row[0] for part in kept))] if kept else []
+            )
         else:
             out.append(one)
     return out
@@ -63,24 +79,36 @@ def is_physical(parts: Sequence[Component], state: State, *, error: float = 0.0)
 
     `error` is what errors of the form of all else that is named may leave to the effect [nats].
     """
-    whole = on_all_axes(parts, state) and is_sudden(parts, state, error=error) and is_lasting(parts, state) and levels(parts, state)
+    whole = (
+        on_all_axes(parts, state)
+        and is_sudden(parts, state, error=error)
+        and is_lasting(parts, state)
+        and levels(parts, state)
+    )
     return [part for part in parts if _possible(part, state)] if whole else []
 
 
 def find_plainer_effect(parts: Sequence[Component], state: State) -> str | None:
     """Effect that says the same more plainly; None where there is none.
 
-    A real turning is seen by the cosine of the angle to the axis, which is rarely small; errors of the scale factor are.
+    A real turning is seen by the cosine of the angle to the axis, which is rarely small; errors of
+    the scale factor are.
     """
     effect = parts[0].candidate.effect
-    if effect == "real_motion" and all(_spin(part) and _share(part, state) < _LEAN for part in parts):
+    if effect == "real_motion" and all(
+        _spin(part) and _share(part, state) < _LEAN for part in parts
+    ):
         return "scale_factor"
     return EQUIVALENTS.get(effect)
 
 
 def _spin(part: Component) -> bool:
     """Whether a part says that an axis sees the turning of the tool."""
-    return part.candidate.effect == "real_motion" and part.candidate.view == "mean" and part.variant.columns == ("spin",)
+    return (
+        part.candidate.effect == "real_motion"
+        and part.candidate.view == "mean"
+        and part.variant.columns == ("spin",)
+    )
 
 
 def _share(part: Component, state: State) -> float:
@@ -93,11 +121,19 @@ def _possible(part: Component, state: State) -> bool:
     from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 
     effect, view = part.candidate.effect, part.candidate.view
-    if effect == "misalignment" and view == "transfer" and not _moves(part.candidate.witness[0], state):
+    if (
+        effect == "misalignment"
+        and view == "transfer"
+        and not _moves(part.candidate.witness[0], state)
+    ):
         return False
     if _spin(part) and _share(part, state) < _SQUARE:
         return False
-    if effect == "fringe_hop" and abs(component_size(part, state)[0]) * np.abs(part.variant.design).max() < _SMALLEST_FRINGE:
+    if (
+        effect == "fringe_hop"
+        and abs(component_size(part, state)[0]) * np.abs(part.variant.design).max()
+        < _SMALLEST_FRINGE
+    ):
         return False
     if effect in LARGEST and part.variant.columns[0] != "any":
         return bool(np.abs(component_mixture(part, state).moments()[0]).max() <= LARGEST[effect])
@@ -116,10 +152,16 @@ def _in_range(part: Component, state: State) -> bool:
     """Whether the sizes of block means can lie where the registry allows the parameters: an instrument that has others is broken."""
     from gyrostab.diagnose.predict.sizes import component_mixture
 
-    largest = {item.name: max(abs(item.low), abs(item.high)) for item in effects()[part.candidate.effect].parameters()}
+    largest = {
+        item.name: max(abs(item.low), abs(item.high))
+        for item in effects()[part.candidate.effect].parameters()
+    }
     sizes, covariance = component_mixture(part, state).moments()
     least = np.abs(sizes) - _SURE * np.sqrt(np.diagonal(covariance))
-    return all(size <= largest.get(name, np.inf) for name, size in zip(part.variant.columns, least, strict=True))
+    return all(
+        size <= largest.get(name, np.inf)
+        for name, size in zip(part.variant.columns, least, strict=True)
+    )
 
 
 def _from_least(part: Component, state: State) -> bool:
@@ -128,7 +170,9 @@ def _from_least(part: Component, state: State) -> bool:
 
     if part.variant.squared or len(part.variant.columns) != 1:
         return True
-    least = {item.name: item.low for item in effects()[part.candidate.effect].parameters()}.get(part.variant.columns[0])
+    least = {item.name: item.low for item in effects()[part.candidate.effect].parameters()}.get(
+        part.variant.columns[0]
+    )
     if least is None or not np.isfinite(least):
         return True
     size, error = component_size(part, state)
@@ -150,18 +194,27 @@ def _moves(axis: str, state: State) -> bool:
     """Whether an axis shows more than its noise at some frequency: what is at rest cannot leak in."""
     row = state.axes.index(axis)
     expected = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
-    return bool(np.nanmax(np.nanmean(measured(state.reduced, "power").values[row] / expected, axis=0)) > _MOVING)
+    return bool(
+        np.nanmax(np.nanmean(measured(state.reduced, "power").values[row] / expected, axis=0))
+        > _MOVING
+    )
 
 
-def find_equivalent_effects(effect: str, parts: Sequence[Component], state: State, *, lines: int = 0) -> list[str]:
+def find_equivalent_effects(
+    effect: str, parts: Sequence[Component], state: State, *, lines: int = 0
+) -> list[str]:
     """Effects that are part of the answer by their nature; `lines` are named in all."""
     out = list(OBSERVATIONALLY_EQUIVALENT.get(effect, ()))
     reduced = state.reduced
     if effect == "spectral_line" and "profile" not in reduced and lines >= _COMB:
         out.append("feedback_reset")
-    if effect == "dead_zone" and len(state.axes) == 1:  # no other axis says whether the sample was lost
+    if (
+        effect == "dead_zone" and len(state.axes) == 1
+    ):  # no other axis says whether the sample was lost
         out.append("held_samples")
-    if effect == "dead_zone" and any(may_be_cut_off(reduced)[state.axes.index(part.row[0])] for part in parts):
+    if effect == "dead_zone" and any(
+        may_be_cut_off(reduced)[state.axes.index(part.row[0])] for part in parts
+    ):
         out.append("rate_quantization")  # cut off towards zero, its cell of zero is twice as wide
     if effect == "telegraph" and not any(part.candidate.view == "levels" for part in parts):
         out.append("gauss_markov")  # two levels show in the means only

@@ -16,10 +16,19 @@ from gyrostab.diagnose.predict.designs import Candidate
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import CountEvidence
 
-__all__ = ["Identification", "Identifications", "Unidentified", "add_identification", "find_unidentified", "form_error", "with_axes_of"]
+__all__ = [
+    "Identification",
+    "Identifications",
+    "Unidentified",
+    "add_identification",
+    "find_unidentified",
+    "form_error",
+    "with_axes_of",
+]
 
 Array = NDArray[np.float64]
-#: What an error of the spectrum of a driven noise leaves to a filter, as a share of its gain: 0.08 was seen in loud vibration.
+#: What an error of the spectrum of a driven noise leaves to a filter, as a share of its gain: 0.08
+#: was seen in loud vibration.
 _FILTER, _SPECTRUM = "logger_filter", 0.1
 
 
@@ -91,7 +100,8 @@ class Identifications:
         Effects named, the strongest first.
     unknown : tuple of Unknown
     threshold : float
-        Gain that noise alone reaches in any effect, axis and grid point with the probability `level` [nats].
+        Gain that noise alone reaches in any effect, axis and grid point with the probability
+        `level` [nats].
     null_best : ndarray
         Largest gain in each null record, sorted [nats].
     reasons : dict of str to str
@@ -103,7 +113,8 @@ class Identifications:
     folds : xarray.DataArray
     tallies : Tallies
     expected : tuple of Claim
-        Effects that the simulation has as well, with the size and course that the recording gives them; they are in `state` too.
+        Effects that the simulation has as well, with the size and course that the recording gives
+        them; they are in `state` too.
     """
 
     claims: tuple[Identification, ...]
@@ -130,44 +141,93 @@ def add_identification(
 ) -> list[Identification | Unidentified]:
     """The list with another claim; one of the same effect and channel becomes one with it, but for lines of other frequencies."""
     for place, other in enumerate(chosen):
-        if isinstance(one, Identification) and isinstance(other, Identification) and _same(one, other):
+        if (
+            isinstance(one, Identification)
+            and isinstance(other, Identification)
+            and _same(one, other)
+        ):
             axes = tuple(sorted({*other.axes, *one.axes}))
             alike = tuple(dict.fromkeys([*other.alternatives, *one.alternatives]))
-            both = replace(other, axes=axes, parts=(*other.parts, *one.parts), gain=other.gain + one.gain, alternatives=alike)
+            both = replace(
+                other,
+                axes=axes,
+                parts=(*other.parts, *one.parts),
+                gain=other.gain + one.gain,
+                alternatives=alike,
+            )
             return [*chosen[:place], both, *chosen[place + 1 :]]
     return [*chosen, one]
 
 
 def with_axes_of(claim: Identification, again: Mapping[str, Sequence[Component]]) -> Identification:
     """A claim without the axes on which it no longer brings anything, by its parts that were found with the others in the model."""
-    seen = {axis for part in again.get(claim.parts[0].candidate.key, []) if part.gain > LEAST for axis in part.row}
+    seen = {
+        axis
+        for part in again.get(claim.parts[0].candidate.key, [])
+        if part.gain > LEAST
+        for axis in part.row
+    }
     kept = tuple(part for part in claim.parts if set(part.row) <= seen)
-    return replace(claim, parts=kept, axes=tuple(axis for axis in claim.axes if axis in seen)) if kept else claim
+    return (
+        replace(claim, parts=kept, axes=tuple(axis for axis in claim.axes if axis in seen))
+        if kept
+        else claim
+    )
 
 
 def _same(one: Identification, other: Identification) -> bool:
-    lines = {part.place for claim in (one, other) for part in claim.parts if part.candidate.view == "line"}
+    lines = {
+        part.place
+        for claim in (one, other)
+        for part in claim.parts
+        if part.candidate.view == "line"
+    }
     return (one.effect, one.driver) == (other.effect, other.driver) and len(lines) < 2
 
 
-def find_unidentified(key: str, parts: Sequence[Component], threshold: float, near: Sequence[str]) -> Unidentified:
+def find_unidentified(
+    key: str, parts: Sequence[Component], threshold: float, near: Sequence[str]
+) -> Unidentified:
     """What a generic found; `near` are the effects that come nearest."""
-    return Unidentified(key, axes_of(parts, ()), sum_evidence(parts), threshold, tuple(dict.fromkeys(near)), tuple(parts))
+    return Unidentified(
+        key,
+        axes_of(parts, ()),
+        sum_evidence(parts),
+        threshold,
+        tuple(dict.fromkeys(near)),
+        tuple(parts),
+    )
 
 
-def form_error(parts: Sequence[Component], chosen: Sequence[Identification | Unidentified], *, share: float) -> float:
+def form_error(
+    parts: Sequence[Component], chosen: Sequence[Identification | Unidentified], *, share: float
+) -> float:
     """What errors of the form of what is named already may leave in the views and axes of these parts [nats].
 
-    A steady line leaves nothing at other frequencies: what it leaks into is taken out with it. What follows a channel has a course in time
-    that the record tells well, but its spectrum is that of a simple law, in place of mounts and decimators: what that leaves over
-    frequency, a filter takes for its own.
+    A steady line leaves nothing at other frequencies: what it leaks into is taken out with it. What
+    follows a channel has a course in time that the record tells well, but its spectrum is that of a
+    simple law, in place of mounts and decimators: what that leaves over frequency, a filter takes
+    for its own.
     """
-    views = [(_kind(part), set(part.row), part.candidate.effect) for part in parts if part.candidate.view != "line"]
+    views = [
+        (_kind(part), set(part.row), part.candidate.effect)
+        for part in parts
+        if part.candidate.view != "line"
+    ]
     error = 0.0
     for one in chosen:
         for part in one.parts:
-            beside = [effect for view, axes, effect in views if view in _leaves(part) and axes & set(part.row)]
-            of_spectrum = part.candidate.view == "power" and isinstance(one, Identification) and bool(one.driver) and _FILTER in beside
+            beside = [
+                effect
+                for view, axes, effect in views
+                if view in _leaves(part) and axes & set(part.row)
+            ]
+            of_spectrum = (
+                part.candidate.view == "power"
+                and isinstance(one, Identification)
+                and bool(one.driver)
+                and _FILTER in beside
+            )
             error += max(_SPECTRUM if of_spectrum else 0.0, share) * part.gain if beside else 0.0
     return error
 

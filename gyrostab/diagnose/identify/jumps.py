@@ -18,7 +18,10 @@ Array = NDArray[np.float64]
 _JUMP, _INSTANT = "bias_jump", "at"
 _BLOCKS = (4, 8)  # lengths of a transition that is no jump
 _BETTER, _FORM = 3.0, 0.01  # nats by which it must do better, and of what the jump gains
-_LENGTHS, _SHORT = 48, 0.1  # lengths of an event that are tried; of the record, that it lasts at most, but for eight blocks
+_LENGTHS, _SHORT = (
+    48,
+    0.1,
+)  # lengths of an event that are tried; of the record, that it lasts at most, but for eight blocks
 _LEAST_BESIDE = 3  # blocks before and behind an event, that tell the level there
 _LOUDER = (10.0, 100.0, 1e3, 1e4, 1e5)  # times the usual variance of the means
 _SURE = 3.0  # standard errors of the level after an event, from which on it is another than before
@@ -26,7 +29,11 @@ _SURE = 3.0  # standard errors of the level after an event, from which on it is 
 
 def jumps_at_will(part: Component, state: State) -> bool:
     """Whether a part is a jump at an instant of its own choice, and not one at which power came back."""
-    if part.candidate.effect != _JUMP or part.candidate.view != "mean" or _INSTANT not in part.variant.values:
+    if (
+        part.candidate.effect != _JUMP
+        or part.candidate.view != "mean"
+        or _INSTANT not in part.variant.values
+    ):
         return False
     ends = state.reduced["restart_end"].values if "restart_end" in state.reduced else np.empty(0)
     return not np.isclose(ends, float(part.variant.values[_INSTANT])).any()
@@ -35,7 +42,8 @@ def jumps_at_will(part: Component, state: State) -> bool:
 def is_sudden(parts: Sequence[Component], state: State, *, error: float = 0.0) -> bool:
     """Whether jumps step, rather than go over from one level to the other within some blocks.
 
-    Where a straight way of four or eight blocks about the same instant says more on all axes together, something else came and went.
+    Where a straight way of four or eight blocks about the same instant says more on all axes
+    together, something else came and went.
 
     Parameters
     ----------
@@ -57,8 +65,9 @@ def is_sudden(parts: Sequence[Component], state: State, *, error: float = 0.0) -
 def is_lasting(parts: Sequence[Component], state: State) -> bool:
     """Whether the means stay on another level after jumps, rather than come back.
 
-    What lasts for two blocks to a tenth of the record before or after the instant, and says more than a level that stays, on all axes
-    together, is an event that ends. It is none where the level behind it is another than the one before: then there are two jumps.
+    What lasts for two blocks to a tenth of the record before or after the instant, and says more
+    than a level that stays, on all axes together, is an event that ends. It is none where the level
+    behind it is another than the one before: then there are two jumps.
 
     Parameters
     ----------
@@ -74,9 +83,14 @@ def is_lasting(parts: Sequence[Component], state: State) -> bool:
     spans = _spans(jumps[0], state)
     if not spans:
         return True
-    events = [sum(float(np.logaddexp.reduce(_events(part, state, span)[0].log_weight)) for part in jumps) for span in spans]
+    events = [
+        sum(float(np.logaddexp.reduce(_events(part, state, span)[0].log_weight)) for part in jumps)
+        for span in spans
+    ]
     best = int(np.argmax(events))
-    if events[best] - step <= _BETTER + np.log(len(spans)) + _FORM * sum(max(part.gain, 0.0) for part in jumps):
+    if events[best] - step <= _BETTER + np.log(len(spans)) + _FORM * sum(
+        max(part.gain, 0.0) for part in jumps
+    ):
         return True
     return any(_other_level(part, state, spans[best]) for part in jumps)
 
@@ -84,9 +98,9 @@ def is_lasting(parts: Sequence[Component], state: State) -> bool:
 def levels(parts: Sequence[Component], state: State) -> bool:
     """Whether jumps lead to levels, and are not the wildest of means that scatter more for a while.
 
-    Waves slower than a block make means scatter, and of such means any two that follow each other are a jump. So the jumps must say
-    something, but for 3 nats of chance, where the white noise of the means may be louder for some stretch about the instant, with and
-    without them.
+    Waves slower than a block make means scatter, and of such means any two that follow each other
+    are a jump. So the jumps must say something, but for 3 nats of chance, where the white noise of
+    the means may be louder for some stretch about the instant, with and without them.
 
     Parameters
     ----------
@@ -104,12 +118,19 @@ def _beside_scatter(part: Component, state: State) -> float:
     variances = _scatter(part, state)
     jump = [component_mixture(part, state, variance=one) for one in variances]
     none = [mean_mixture(state, part.row[0], [], variance=one) for one in variances]
-    with_it, without = (np.array([np.logaddexp.reduce(one.log_weight) for one in several]) for several in (jump, none))
+    with_it, without = (
+        np.array([np.logaddexp.reduce(one.log_weight) for one in several])
+        for several in (jump, none)
+    )
     likely = jump[int(with_it.argmax())]
     size, covariance = likely.moments()
-    wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0]))) * float(np.ptp(part.variant.design))
+    wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0]))) * float(
+        np.ptp(part.variant.design)
+    )
     instants = np.log(len(part.candidate.variants))
-    return float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without) - np.log(wide) - 0.5 - instants)
+    return float(
+        np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without) - np.log(wide) - 0.5 - instants
+    )
 
 
 def _scatter(part: Component, state: State) -> list[Array]:
@@ -118,10 +139,17 @@ def _scatter(part: Component, state: State) -> list[Array]:
     block = np.arange(blocks)
     at = round(float(part.variant.values[_INSTANT]) / float(state.reduced.attrs["block_s"]))
     lengths = [2**power for power in range(1, max(blocks, 2).bit_length())]
-    spans = {(max(at - one, 0), min(at + two, blocks)) for length in lengths for one, two in ((length, length), (0, length), (length, 0))}
+    spans = {
+        (max(at - one, 0), min(at + two, blocks))
+        for length in lengths
+        for one, two in ((length, length), (0, length), (length, 0))
+    }
     usual = state.baseline["mean_variance"].sel(axis=axis).values
     inside = [(block >= first) & (block < stop) for first, stop in sorted(spans)]
-    return [usual, *(np.where(here, factor * usual, usual) for here in inside for factor in _LOUDER)]
+    return [
+        usual,
+        *(np.where(here, factor * usual, usual) for here in inside for factor in _LOUDER),
+    ]
 
 
 def _spans(part: Component, state: State) -> list[tuple[int, int]]:
@@ -130,7 +158,11 @@ def _spans(part: Component, state: State) -> list[tuple[int, int]]:
     at = round(float(part.variant.values[_INSTANT]) / block)
     lengths = np.unique(np.geomspace(2.0, max(_SHORT * blocks, 8.0), _LENGTHS).astype(int)).tolist()
     both = [span for length in lengths for span in ((at, at + length), (at - length, at))]
-    return [(first, stop) for first, stop in both if first >= _LEAST_BESIDE and stop <= blocks - _LEAST_BESIDE]
+    return [
+        (first, stop)
+        for first, stop in both
+        if first >= _LEAST_BESIDE and stop <= blocks - _LEAST_BESIDE
+    ]
 
 
 def _events(part: Component, state: State, span: tuple[int, int]) -> tuple[Mixture, Mixture]:
@@ -139,7 +171,9 @@ def _events(part: Component, state: State, span: tuple[int, int]) -> tuple[Mixtu
     shape = part.variant.design.shape
     during = np.broadcast_to(((block >= span[0]) & (block < span[1])).astype(np.float64), shape)
     behind = np.broadcast_to((block >= span[1]).astype(np.float64), shape)
-    alone, both = (replace(part.variant, design=one) for one in (during, np.concatenate([during, behind])))
+    alone, both = (
+        replace(part.variant, design=one) for one in (during, np.concatenate([during, behind]))
+    )
     return component_mixture(part, state, alone), component_mixture(part, state, both)
 
 
@@ -154,7 +188,9 @@ def _evidence(part: Component, state: State, length: int) -> float:
     variant = part.variant
     if length:
         block = float(state.reduced.attrs["block_s"])
-        middle = (np.arange(state.reduced.sizes["block"]) + 0.5) * block - float(variant.values[_INSTANT])
+        middle = (np.arange(state.reduced.sizes["block"]) + 0.5) * block - float(
+            variant.values[_INSTANT]
+        )
         way = np.clip(middle / (length * block) + 0.5, 0.0, 1.0)
         variant = replace(variant, design=np.broadcast_to(way, variant.design.shape))
     return float(np.logaddexp.reduce(component_mixture(part, state, variant).log_weight))

@@ -25,18 +25,33 @@ __all__ = ["filter_sizes", "on_all_axes", "without_slopes"]
 Array = NDArray[np.float64]
 _KEPT = 0.5  # of its gain, that a line must keep beside a filter
 _FINE, _ZOOMS = 21, 4
-_NEXT, _ELSEWHERE, _TAIL, _TWO_SIDED = 0.25, 0.02, 0.025, 1.959964  # reach of a place on the grid; shares of what lies elsewhere
-_APART, _FORM = 6.0, 0.1  # nats by which axes may disagree by chance; and of the gain, what an error of the spectrum may leave
+_NEXT, _ELSEWHERE, _TAIL, _TWO_SIDED = (
+    0.25,
+    0.02,
+    0.025,
+    1.959964,
+)  # reach of a place on the grid; shares of what lies elsewhere
+_APART, _FORM = (
+    6.0,
+    0.1,
+)  # nats by which axes may disagree by chance; and of the gain, what an error of the spectrum may leave
 
 
-def without_slopes(passing: list[str], parts: Mapping[str, list[Component]], state: State, folds: xr.DataArray) -> list[str]:
+def without_slopes(
+    passing: list[str], parts: Mapping[str, list[Component]], state: State, folds: xr.DataArray
+) -> list[str]:
     """Keys without lines that are gone, or nearly so, when the spectrum is straightened by a filter that passes as well.
 
-    A line is judged by its neighbours, so that the steep slope of a filter, or the lobes of an average, look like one. Lines that
-    stay come before the filter: what they leave in their bands, many of them, has a broad form too.
+    A line is judged by its neighbours, so that the steep slope of a filter, or the lobes of an
+    average, look like one. Lines that stay come before the filter: what they leave in their bands,
+    many of them, has a broad form too.
     """
     lines = [key for key in passing if parts[key][0].candidate.view == "line"]
-    filters = [key for key in passing if any(is_filter(part.candidate.view, part.variant) for part in parts[key])]
+    filters = [
+        key
+        for key in passing
+        if any(is_filter(part.candidate.view, part.variant) for part in parts[key])
+    ]
     if not lines or not filters:
         return passing
     trial = condition_on(state, list(parts[filters[0]]))
@@ -44,19 +59,24 @@ def without_slopes(passing: list[str], parts: Mapping[str, list[Component]], sta
     left = {one.candidate.key: float(np.maximum(one.gain[0], 0.0).sum()) for one in again}
     before = {key: sum(max(part.gain, 0.0) for part in parts[key]) for key in lines}
     real = {key for key in lines if left.get(key, 0.0) > _KEPT * before[key]}
-    return [key for key in passing if (key in real if key in lines else key not in filters or not real)]
+    return [
+        key for key in passing if (key in real if key in lines else key not in filters or not real)
+    ]
 
 
 def on_all_axes(parts: Sequence[Component], state: State) -> bool:
     """Whether one filter suits all axes: they pass the same logger, so that it takes the same share of the noise of each.
 
-    The share of the strongest part is fitted on every axis, also on those that do not show it, and once for all of them.
+    The share of the strongest part is fitted on every axis, also on those that do not show it, and
+    once for all of them.
     """
     shown = [part for part in parts if is_filter(part.candidate.view, part.variant)]
     if not shown:
         return True
     first = max(shown, key=lambda part: part.gain)
-    share, error = np.array([component_size(replace(first, row=(axis,)), state) for axis in state.axes]).T
+    share, error = np.array(
+        [component_size(replace(first, row=(axis,)), state) for axis in state.axes]
+    ).T
     weight = error**-2.0
     apart = 0.5 * float((weight * (share - (weight * share).sum() / weight.sum()) ** 2).sum())
     return apart <= _APART + _FORM * sum(max(part.gain, 0.0) for part in shown)
@@ -66,13 +86,16 @@ def _candidates(parts: Mapping[str, list[Component]], keys: Iterable[str]) -> li
     return [parts[key][0].candidate for key in keys]
 
 
-def filter_sizes(parts: Sequence[Component], state: State) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
+def filter_sizes(
+    parts: Sequence[Component], state: State
+) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
     """Cutoff or length of a filter, and the words beside it, by the likelihood of the powers of all its axes with free noise.
 
     Returns
     -------
     sizes : dict of str to (float, float) or (float, float, float, float)
-        The one parameter that is measured, with its error; and with the ends of its 95 % interval where several places suit.
+        The one parameter that is measured, with its error; and with the ends of its 95 % interval
+        where several places suit.
     others : dict of str to float
         Order, and what the samples are.
     """
@@ -80,7 +103,10 @@ def filter_sizes(parts: Sequence[Component], state: State) -> tuple[dict[str, tu
     fits = [_fit(part.row[0], state) for part in parts]
 
     def likelihood(values: Mapping[str, Any]) -> float:
-        filtered = band_columns(state.reduced) * response_of(kind.example(**values), state.reduced)[:, None]
+        filtered = (
+            band_columns(state.reduced)
+            * response_of(kind.example(**values), state.reduced)[:, None]
+        )
         return sum(_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
 
     family = [one.values for one in parts[0].candidate.variants if is_filter("power", one)]
@@ -90,12 +116,21 @@ def filter_sizes(parts: Sequence[Component], state: State) -> tuple[dict[str, tu
     others = {key: float(value) for key, value in best.items() if key != name}
     if name == "length" and best["instrument"] == 1.0:
         return {name: (float(best[name]), 0.0)}, others  # a count of samples
-    alike = sorted({float(one[name]) for one in family if all(one[key] == best[key] for key in others)})
+    alike = sorted(
+        {float(one[name]) for one in family if all(one[key] == best[key] for key in others)}
+    )
     sharp = _zoomed(alike, float(best[name]), lambda value: likelihood({**best, name: value}))
-    return {name: _of_all(sharp, [(float(one[name]), each) for one, each in zip(family, log, strict=True) if one[name]])}, others
+    return {
+        name: _of_all(
+            sharp,
+            [(float(one[name]), each) for one, each in zip(family, log, strict=True) if one[name]],
+        )
+    }, others
 
 
-def _zoomed(grid: Sequence[float], start: float, likelihood: Callable[[float], float]) -> tuple[float, float]:
+def _zoomed(
+    grid: Sequence[float], start: float, likelihood: Callable[[float], float]
+) -> tuple[float, float]:
     """Mean and standard deviation of a parameter about the best point of its grid, by a likelihood."""
     place = grid.index(start)
     low, high = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
@@ -114,15 +149,16 @@ def _zoomed(grid: Sequence[float], start: float, likelihood: Callable[[float], f
 def _of_all(sharp: tuple[float, float], tried: Sequence[tuple[float, float]]) -> tuple[float, ...]:
     """A parameter with its error; and with the ends of its 95 % interval where more of the grid than one place suits the record.
 
-    With free noise that rises with frequency a low-pass far down does what a weak one far up does; and other orders, or samples that are
-    picked, have cutoffs of their own.
+    With free noise that rises with frequency a low-pass far down does what a weak one far up does;
+    and other orders, or samples that are picked, have cutoffs of their own.
 
     Parameters
     ----------
     sharp : (float, float)
         Mean and standard deviation about the best place.
     tried : sequence of (float, float)
-        Values of all filters of the family, evenly spread in their logarithm, and logarithms of their likelihoods.
+        Values of all filters of the family, evenly spread in their logarithm, and logarithms of
+        their likelihoods.
     """
     value, log = (np.array(one) for one in zip(*sorted(tried), strict=True))
     share = np.exp(log - np.logaddexp.reduce(log))
@@ -140,22 +176,38 @@ def _fit(axis: str, state: State) -> tuple[Fit, Array]:
     """Powers of an axis averaged over the record, with the noise and what else is named free; and how gaps mix the bands of the noise."""
     reduced = state.reduced
     row = state.axes.index(axis)
-    power, shape = (reduced[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape"))
-    use = np.where(np.isfinite(power) & np.isfinite(shape) & ~state.masked[row][:, None], shape, 0.0)
+    power, shape = (
+        reduced[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
+    )
+    use = np.where(
+        np.isfinite(power) & np.isfinite(shape) & ~state.masked[row][:, None], shape, 0.0
+    )
     total = np.maximum(use.sum(axis=0), 1e-300)
     common, alone = (one[row] for one in common_variance(reduced))
     each = np.nansum(alone, axis=1)
     share = min(1.0, float((each / (1.0 + common * each)).sum() / max(np.nansum(shape), 1e-300)))
 
     def mean(values: Array) -> Array:
-        return np.asarray((use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total)
+        return np.asarray(
+            (use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total
+        )
 
     whole = mean(in_place(reduced)[row, :, None])
     width = (reduced["band_high"] - reduced["band_low"]).values
     seen = np.diag(whole) + np.outer(1.0 - whole, width / width.sum())
     beside = [mean(one) for one in state.given.get(("power", axis), [])]
-    free = np.stack([one / max(np.abs(one).max(), 1e-300) for one in beside], axis=1) if beside else None
-    return Fit(mean(power), seen @ band_columns(reduced), total * share, beside=free, start=mean(state.weight[row])), seen
+    free = (
+        np.stack([one / max(np.abs(one).max(), 1e-300) for one in beside], axis=1)
+        if beside
+        else None
+    )
+    return Fit(
+        mean(power),
+        seen @ band_columns(reduced),
+        total * share,
+        beside=free,
+        start=mean(state.weight[row]),
+    ), seen
 
 
 def _likelihood(fit: Fit) -> float:

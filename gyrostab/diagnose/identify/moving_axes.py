@@ -1,6 +1,7 @@
 """Axes that turn far above their noise with no effect to say why: their moving stretches are kept out of what is compared with noise.
 
-What one axis measures while it turns stays there as what the others may see of it, through a lean of theirs.
+What one axis measures while it turns stays there as what the others may see of it, through a lean
+of theirs.
 """
 
 from __future__ import annotations
@@ -22,13 +23,28 @@ __all__ = ["moving_blocks", "unexplained_motion", "without_motion"]
 Array = NDArray[np.float64]
 _BEYOND, _FAR = 6.0, 100.0  # times the scatter of the means at rest
 _GROWN = 2  # blocks to either side that belong to a motion
-_FEWEST, _MOST = 2, 2.0 / 3.0  # blocks that move, and share of them: what turns most of the time has no rest to be compared with
-_CORE, _CORE_WIDTH = 0.25, 0.637  # share of the blocks whose means lie closest together, and its width in standard deviations
+_FEWEST, _MOST = (
+    2,
+    2.0 / 3.0,
+)  # blocks that move, and share of them: what turns most of the time has no rest to be compared with
+_CORE, _CORE_WIDTH = (
+    0.25,
+    0.637,
+)  # share of the blocks whose means lie closest together, and its width in standard deviations
 _LEAST_REST = 12  # blocks
 _ROUNDS = 3
-_FITTED = ("mean", "levels")  # views whose columns say how much of a mean that moves they account for
-_MEANS = ("wander", "marks", "order", "transfer")  # views of effects that account for it in other ways
-_LEFT = 0.1  # of the squares of the motion, which may be left by what accounts for it: an error of its form
+_FITTED = (
+    "mean",
+    "levels",
+)  # views whose columns say how much of a mean that moves they account for
+_MEANS = (
+    "wander",
+    "marks",
+    "order",
+    "transfer",
+)  # views of effects that account for it in other ways
+# of the squares of the motion, which may be left by what accounts for it: an error of its form
+_LEFT = 0.1
 _KEPT = ("mean", "power", "cross")
 
 
@@ -77,10 +93,16 @@ def _moving(mean: Array) -> NDArray[np.bool_]:
     if there.sum() < _FEWEST:
         return nothing
     place = np.flatnonzero(good)
-    near = np.convolve(there[place], np.ones(2 * _GROWN + 1), "same") > 0.5  # neighbours among the blocks that are there
+    near = (
+        np.convolve(there[place], np.ones(2 * _GROWN + 1), "same") > 0.5
+    )  # neighbours among the blocks that are there
     out = nothing.copy()
     out[place] = near
-    return out if rest.sum() >= (1.0 - _MOST) * good.sum() and np.count_nonzero(~near) >= _LEAST_REST else nothing
+    return (
+        out
+        if rest.sum() >= (1.0 - _MOST) * good.sum() and np.count_nonzero(~near) >= _LEAST_REST
+        else nothing
+    )
 
 
 def _core(mean: Array) -> tuple[float, float]:
@@ -95,8 +117,9 @@ def _core(mean: Array) -> tuple[float, float]:
 def unexplained_motion(reduced: xr.Dataset, claims: Iterable[Identification]) -> NDArray[np.bool_]:
     """Moving blocks, (axis, block), of the axes on which no named effect accounts for the means.
 
-    What stands for a mean must leave next to nothing of the motion. It is not enough that it brings something: of a turning that comes
-    and goes, a step or a channel that drifts explains a part as well.
+    What stands for a mean must leave next to nothing of the motion. It is not enough that it brings
+    something: of a turning that comes and goes, a step or a channel that drifts explains a part as
+    well.
 
     Parameters
     ----------
@@ -108,9 +131,17 @@ def unexplained_motion(reduced: xr.Dataset, claims: Iterable[Identification]) ->
     moving = moving_blocks(reduced)
     for row, axis in enumerate(map(str, reduced["axis"].values)):
         columns = [
-            column for part in parts if part.candidate.view in _FITTED and part.row == (axis,) for column in mean_columns(part.variant, row)
+            column
+            for part in parts
+            if part.candidate.view in _FITTED and part.row == (axis,)
+            for column in mean_columns(part.variant, row)
         ]
-        if axis in told or (columns and _accounted(reduced["mean"].sel(axis=axis).values, moving[row], np.stack(columns, axis=1))):
+        if axis in told or (
+            columns
+            and _accounted(
+                reduced["mean"].sel(axis=axis).values, moving[row], np.stack(columns, axis=1)
+            )
+        ):
             moving[row] = False
     return moving
 
@@ -130,7 +161,12 @@ def _accounted(mean: Array, moving: NDArray[np.bool_], columns: Array) -> bool:
 
 
 def without_motion(
-    log: xr.Dataset, reduced: xr.Dataset, moving: NDArray[np.bool_], *, restart_gap: Any = 5.0, progress: Stage = no_stage
+    log: xr.Dataset,
+    reduced: xr.Dataset,
+    moving: NDArray[np.bool_],
+    *,
+    restart_gap: Any = 5.0,
+    progress: Stage = no_stage,
 ) -> xr.Dataset:
     """The reduced record with the moving blocks left out on the axes that move; what they measured stays as ``measured_<name>``.
 
@@ -149,5 +185,9 @@ def without_motion(
     out = out.drop_dims([dim for dim in ("gap", "restart") if dim in out.dims]).assign(
         {one: reduced[one] for one in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
     )
-    out["moving"] = (("axis", "block"), moving, {"long_name": "left out because the axis moves", "units": "1"})
+    out["moving"] = (
+        ("axis", "block"),
+        moving,
+        {"long_name": "left out because the axis moves", "units": "1"},
+    )
     return out

@@ -30,11 +30,15 @@ def layers(parts: Sequence[Component]) -> list[list[Component]]:
 
 
 def found_again(
-    parts: Sequence[Component], first: Sequence[Component], state: State, gains: Callable[[Sequence[Candidate], State], list[Found]]
+    parts: Sequence[Component],
+    first: Sequence[Component],
+    state: State,
+    gains: Callable[[Sequence[Candidate], State], list[Found]],
 ) -> list[list[Component]]:
     """For each layer of a claim what is found of it anew with the layers before it in the model.
 
-    What several variants explain together is no gain of one of them: the first of two opposite jumps explains little alone.
+    What several variants explain together is no gain of one of them: the first of two opposite
+    jumps explains little alone.
 
     Parameters
     ----------

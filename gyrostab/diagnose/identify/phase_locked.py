@@ -14,8 +14,9 @@ _VIEWS = ("order", "phase_locked")
 def without_waves(naming: Identifications) -> tuple[Identifications, float]:
     """The naming without what is locked to rotation or ramp, and what that gains on time that was kept apart [nats].
 
-    The powers of the bands know how large a wave is, but not its phase: with a wave in them they gain a small part of what the wave is
-    worth, and lose by every band that it frees. So a wave is judged by its own view alone, and the powers of both models are without it.
+    The powers of the bands know how large a wave is, but not its phase: with a wave in them they
+    gain a small part of what the wave is worth, and lose by every band that it frees. So a wave is
+    judged by its own view alone, and the powers of both models are without it.
     """
     gain, kept = 0.0, []
     for claim in naming.claims:

@@ -12,10 +12,14 @@ from gyrostab.diagnose.reduce.outliers import outlier_limit
 
 __all__ = ["line_size", "sample_count_sizes"]
 
-_DEPARTURE = 1.08  # of white noise from the median of eight samples beside each, in its own deviations
+_DEPARTURE = (
+    1.08  # of white noise from the median of eight samples beside each, in its own deviations
+)
 _USUAL = 0.2  # of the usual variance of a block, by which that of one may be higher by chance
 _CALM = 5  # blocks without an outlier that tell how loud the noise is
-_LAW = 0.1  # of the number and the size of outliers, by which the law of their sizes may be another; at least half of those not seen
+# of the number and the size of outliers, by which the law of their sizes may be another; at least
+# half of those not seen
+_LAW = 0.1
 Pair = tuple[float, float]
 
 
@@ -40,7 +44,9 @@ def line_size(reduced: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
     return (amplitude, noise / (2.0 * max(amplitude, math.sqrt(noise)))), (frequency, 0.5 * step)
 
 
-def sample_count_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: CountEvidence) -> dict[str, Pair]:
+def sample_count_sizes(
+    effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: CountEvidence
+) -> dict[str, Pair]:
     """Parameters of an effect on the distribution."""
     from scipy.stats import norm
 
@@ -55,7 +61,10 @@ def sample_count_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, t
     spread = _spread(reduced, axis)
     error = math.sqrt(count + usual)
     if effect == "spikes":
-        count = max(float(reduced["peaks"].sel(axis=axis).where(reduced[mark].sel(axis=axis) > 0).sum()), 1.0)
+        count = max(
+            float(reduced["peaks"].sel(axis=axis).where(reduced[mark].sel(axis=axis) > 0).sum()),
+            1.0,
+        )
         error = math.sqrt(count)
         told = _outliers(reduced, axis)
         if told is None:  # no block was steady enough to have a kurtosis
@@ -64,13 +73,21 @@ def sample_count_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, t
         number = count / seen
         law = max(_LAW, 0.5 * (1.0 - seen))
         doubt = math.hypot(1.0 / math.sqrt(2.0 * many), law)
-        return {"per_hour": (number / hours, number / hours * math.hypot(1.0 / error, law)), "size": (size, doubt * size)}
+        return {
+            "per_hour": (number / hours, number / hours * math.hypot(1.0 / error, law)),
+            "size": (size, doubt * size),
+        }
     if effect == "held_samples":
-        usual = usual if float(reduced["lattice"].sel(axis=axis)) > 0.0 else 0.0  # without a lattice chance makes none
+        usual = (
+            usual if float(reduced["lattice"].sel(axis=axis)) > 0.0 else 0.0
+        )  # without a lattice chance makes none
         count = max(float(reduced[mark].sel(axis=axis).sum()) - usual, 1.0)
         runs = _held_runs(reduced, axis, mark, usual)
         length = max(count / runs, 1.0) / rate  # of a geometric law: scattered by itself
-        return {"per_hour": (runs / hours, math.sqrt(runs) / hours), "length": (length, length / math.sqrt(runs))}
+        return {
+            "per_hour": (runs / hours, math.sqrt(runs) / hours),
+            "length": (length, length / math.sqrt(runs)),
+        }
     share = min(count / samples, 0.999)
     if effect == "clipping":
         limit = spread * float(norm.isf(share / 2.0))
@@ -78,14 +95,17 @@ def sample_count_sizes(effect: str, mark: str, axis: str, reduced: xr.Dataset, t
         return {"limit": (limit, slope * error / samples)}
     if effect == "dead_zone":
         width = spread * float(norm.ppf(0.5 + share / 2.0))
-        return {"width": (width, spread / (2.0 * float(norm.pdf(width / spread))) * error / samples)}
+        return {
+            "width": (width, spread / (2.0 * float(norm.pdf(width / spread))) * error / samples)
+        }
     return {}
 
 
 def _held_runs(reduced: xr.Dataset, axis: str, mark: str, usual: float) -> float:
     """How often samples were held: runs of them, less those that a lattice makes by chance."""
     own = {
-        name: float(reduced[name].sel(axis=axis).sum()) for name in ("adjacent", "repeats", "repeat_runs", "zeros", "zero_runs", "filled")
+        name: float(reduced[name].sel(axis=axis).sum())
+        for name in ("adjacent", "repeats", "repeat_runs", "zeros", "zero_runs", "filled")
     }
     if mark == "filled":
         return max(own["zero_runs"] * own["filled"] / max(own["zeros"], 1.0), 1.0)
@@ -95,27 +115,39 @@ def _held_runs(reduced: xr.Dataset, axis: str, mark: str, usual: float) -> float
 def _outliers(reduced: xr.Dataset, axis: str) -> tuple[float, float, float] | None:
     """Share of outliers that is seen, their rms size [degree hour-1], and outliers told by; None where nothing tells.
 
-    Of a block of n samples of the deviation s with m outliers of the square u s^2 each, a = m u / n, the fourth moment over the squared
-    second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2, which is solved for a. Only the larger ones of a normal law are seen,
-    whose deviation is no less than the least that is: below, the number of those not seen would be anything.
+    Of a block of n samples of the deviation s with m outliers of the square u s^2 each, a = m u /
+    n, the fourth moment over the squared second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2,
+    which is solved for a. Only the larger ones of a normal law are seen, whose deviation is no less
+    than the least that is: below, the number of those not seen would be anything.
     """
     from scipy.stats import norm
 
-    count, excess, samples = (reduced[name].sel(axis=axis).values.astype(np.float64) for name in ("peaks", "kurtosis", "samples"))
+    count, excess, samples = (
+        reduced[name].sel(axis=axis).values.astype(np.float64)
+        for name in ("peaks", "kurtosis", "samples")
+    )
     good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
     alone = good & (count == 1.0)  # of several in a block the sizes differ
     good = alone if alone.any() else good
     if not good.any():
         return None
     many = count[good]
-    most = samples[good] / (many * (1.0 - many / samples[good])) - 3.0  # without noise, the mean of the block taken off
+    most = (
+        samples[good] / (many * (1.0 - many / samples[good])) - 3.0
+    )  # without noise, the mean of the block taken off
     tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * most)
     half, far = tails - 3.0, most - tails
     share = (half + np.sqrt(half**2 + far * half)) / far
     variance = reduced["variance"].sel(axis=axis).values
-    calm = (count == 0.0) & (variance > 0.0)  # most blocks may have spikes: the median of all would not be the noise
-    usual = float(np.median(variance[calm] if calm.sum() >= _CALM else variance[good] / (1.0 + share)))
-    share = np.where(many > 1.0, np.fmin(share, np.maximum(variance[good] / usual - 1.0, 0.0) + _USUAL), share)
+    calm = (count == 0.0) & (
+        variance > 0.0
+    )  # most blocks may have spikes: the median of all would not be the noise
+    usual = float(
+        np.median(variance[calm] if calm.sum() >= _CALM else variance[good] / (1.0 + share))
+    )
+    share = np.where(
+        many > 1.0, np.fmin(share, np.maximum(variance[good] / usual - 1.0, 0.0) + _USUAL), share
+    )
     square = float((share * samples[good]).sum() / many.sum())
     limit = _DEPARTURE * outlier_limit(float(samples.sum()))
     ends = np.geomspace(1.0, 1e-4, 400)  # the least size that is seen, over the rms size

@@ -15,13 +15,17 @@ __all__ = ["is_always_present"]
 
 _STEADY = ("gauss_markov", "telegraph", "logger_filter")
 _PARTS, _LEAST = 8, 3  # of the record that are looked at one by one; blocks in each at least
-_APART, _FORM = 8.0, 0.1  # nats by which they may differ by chance; and of the gain, what other effects may leave
+_APART, _FORM = (
+    8.0,
+    0.1,
+)  # nats by which they may differ by chance; and of the gain, what other effects may leave
 
 
 def is_always_present(part: Component, state: State) -> bool:
     """Whether a part that has no course in time has the same size in all eighths of the record; true for what may come and go.
 
-    What is loud while the tool turns, or for any other while, has a broad spectrum too, and is no filter and no wandering bias.
+    What is loud while the tool turns, or for any other while, has a broad spectrum too, and is no
+    filter and no wandering bias.
 
     Parameters
     ----------
@@ -29,13 +33,24 @@ def is_always_present(part: Component, state: State) -> bool:
     state : State
         With all else that is named.
     """
-    if part.candidate.effect not in _STEADY or part.candidate.view != "power" or state.reduced.sizes["block"] < _PARTS * _LEAST:
+    if (
+        part.candidate.effect not in _STEADY
+        or part.candidate.view != "power"
+        or state.reduced.sizes["block"] < _PARTS * _LEAST
+    ):
         return True
     state = replace(state, weight=condition_on(state, [part]).weight)
-    size, error = np.array([_size(part, state, inside) for inside in np.array_split(np.arange(state.reduced.sizes["block"]), _PARTS)]).T
+    size, error = np.array(
+        [
+            _size(part, state, inside)
+            for inside in np.array_split(np.arange(state.reduced.sizes["block"]), _PARTS)
+        ]
+    ).T
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0
     size = np.where(weight > 0.0, size, 0.0)
-    apart = 0.5 * float((weight * (size - (weight * size).sum() / max(weight.sum(), 1e-300)) ** 2).sum())
+    apart = 0.5 * float(
+        (weight * (size - (weight * size).sum() / max(weight.sum(), 1e-300)) ** 2).sum()
+    )
     return apart <= _APART + _FORM * max(part.gain, 0.0)
 
 
@@ -47,5 +62,7 @@ def _size(part: Component, state: State, inside: NDArray[np.int64]) -> tuple[flo
     power = state.reduced["power"].isel(axis=row).values
     if not (np.isfinite(power).any(axis=1) & ~state.masked[row] & ~outside).any():
         return 0.0, np.inf
-    mean, covariance = component_mixture(part, replace(state, masked=state.masked | outside)).moments()
+    mean, covariance = component_mixture(
+        part, replace(state, masked=state.masked | outside)
+    ).moments()
     return float(mean[0]), float(np.sqrt(covariance[0, 0]))

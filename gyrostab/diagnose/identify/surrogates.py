@@ -24,7 +24,9 @@ _FEWEST = 20
 _OF_AXES = ("misalignment",)  # effects that follow the means of other axes
 
 
-def passes_time_shift_test(parts: Sequence[Component], state: State, folds: xr.DataArray, *, share: float = 0.01) -> tuple[bool, float]:
+def passes_time_shift_test(
+    parts: Sequence[Component], state: State, folds: xr.DataArray, *, share: float = 0.01
+) -> tuple[bool, float]:
     """Whether an effect explains more than almost all slid copies of its channel do.
 
     Parameters
@@ -59,8 +61,16 @@ def passes_time_shift_test(parts: Sequence[Component], state: State, folds: xr.D
             if copy is None or _alike(copy, part.variant, row) > _ALIKE:
                 valid[number] = False
         chosen = [copy if copy is not None else part.variant for copy in copies]
-        several = [replace(part.candidate, effect=f"slid {number}", variants=(one,)) for number, one in enumerate(chosen)]
-        found = compute_evidence([replace(part.candidate, variants=(part.variant,)), *several], state.reduced, state, folds)
+        several = [
+            replace(part.candidate, effect=f"slid {number}", variants=(one,))
+            for number, one in enumerate(chosen)
+        ]
+        found = compute_evidence(
+            [replace(part.candidate, variants=(part.variant,)), *several],
+            state.reduced,
+            state,
+            folds,
+        )
         values = np.array([one.gain[0, row] for one in found])
         real += float(values[0])
         slid += values[1:]
@@ -74,7 +84,9 @@ def _follows(part: Component, state: State) -> bool:
     """Whether a part follows a channel in means or powers, or the means of other axes."""
     if part.candidate.view not in ("mean", "power"):
         return False
-    return any(part.candidate.driver) or (part.candidate.view == "mean" and part.candidate.effect in _OF_AXES)
+    return any(part.candidate.driver) or (
+        part.candidate.view == "mean" and part.candidate.effect in _OF_AXES
+    )
 
 
 def _slid(part: Component, state: State, shift: int) -> Variant | None:
@@ -84,8 +96,14 @@ def _slid(part: Component, state: State, shift: int) -> Variant | None:
     for name in filter(None, candidate.driver):
         for key in {f"channel_{name}", f"fine_{name}"} & set(map(str, reduced.data_vars)):
             reduced[key] = reduced[key].copy(data=np.roll(reduced[key].values, shift, axis=0))
-    for key in {"mean", "measured_mean"} & set(map(str, reduced.data_vars)) if candidate.effect in _OF_AXES else ():
-        reduced[key] = reduced[key].copy(data=np.roll(reduced[key].values, shift, axis=list(reduced[key].dims).index("block")))
+    for key in (
+        {"mean", "measured_mean"} & set(map(str, reduced.data_vars))
+        if candidate.effect in _OF_AXES
+        else ()
+    ):
+        reduced[key] = reduced[key].copy(
+            data=np.roll(reduced[key].values, shift, axis=list(reduced[key].dims).index("block"))
+        )
     made = variants_of(candidate, part.variant, reduced, state.baseline["coefficient"])
     return made
 

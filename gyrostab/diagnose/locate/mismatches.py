@@ -45,13 +45,18 @@ FIELDS = {
 
 
 def locate_mismatches(
-    reduced: xr.Dataset, baseline: xr.Dataset, nulls: Iterable[xr.Dataset] | NullScores, *, level: float = 0.01
+    reduced: xr.Dataset,
+    baseline: xr.Dataset,
+    nulls: Iterable[xr.Dataset] | NullScores,
+    *,
+    level: float = 0.01,
 ) -> xr.Dataset:
     """Find where a recording differs from the simulation by more than noise does.
 
-    Every view scores its cells; a score counts in standard deviations of the null records, and its p-value is the share of null
-    records in which any cell of any view does as much. From the largest on, cells become boxes: the span of time that explains
-    most, and the averaging times beside the largest that stand out there too. What a box explains is left out of the next.
+    Every view scores its cells; a score counts in standard deviations of the null records, and its
+    p-value is the share of null records in which any cell of any view does as much. From the
+    largest on, cells become boxes: the span of time that explains most, and the averaging times
+    beside the largest that stand out there too. What a box explains is left out of the next.
 
     Parameters
     ----------
@@ -60,17 +65,19 @@ def locate_mismatches(
     baseline : xarray.Dataset
         What the simulation expects.
     nulls : iterable of xarray.Dataset, or NullScores
-        Null records of `gyrostab.diagnose.nulls.records.null_records`, or what `null_scores` made of them.
+        Null records of `gyrostab.diagnose.nulls.records.null_records`, or what `null_scores` made
+        of them.
     level : float
         Share of records of the simulation itself in which anything may be found.
 
     Returns
     -------
     xarray.Dataset
-        By ``mismatch``, the surest first: ``view``, ``axes`` (parted by blanks), ``what``, ``begin``, ``end`` [s since the start],
-        ``start_time``, ``end_time``, ``tau_min_s``, ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``,
-        ``ratio`` (observed over expected; in the mean and restart views the number of standard deviations), ``estimate`` (see the
-        view), ``p_value``.
+        By ``mismatch``, the surest first: ``view``, ``axes`` (parted by blanks), ``what``,
+        ``begin``, ``end`` [s since the start], ``start_time``, ``end_time``, ``tau_min_s``,
+        ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``,
+        ``ratio`` (observed over expected; in the mean and restart views the number of standard
+        deviations), ``estimate`` (see the view), ``p_value``.
 
     Raises
     ------
@@ -84,7 +91,9 @@ def locate_mismatches(
     (array(['davar']), array(['x']), array([1500.]), array([1800.]))
     """
     if not 0.0 < level < 0.5:
-        raise OptionError(f"level {level!r}: give the share of false alarms, above 0 and below 0.5, for instance 0.01")
+        raise OptionError(
+            f"level {level!r}: give the share of false alarms, above 0 and below 0.5, for instance 0.01"
+        )
     null = nulls if isinstance(nulls, NullScores) else null_scores(baseline, nulls)
     boxes: list[dict[str, Any]] = []
     for name, score in STATISTICS.items():
@@ -102,7 +111,9 @@ def louder(boxes: Iterable[Mapping[str, Any]]) -> list[tuple[list[str], float, f
     return [(str(box["axes"]).split(), float(box["begin"]), float(box["end"])) for box in told]
 
 
-def _boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float) -> list[dict[str, Any]]:
+def _boxes(
+    name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
+) -> list[dict[str, Any]]:
     scores = score(reduced, baseline)
     z, critical = standardise(scores, null.views[name]), null.critical(name, level)
     found = []
@@ -117,7 +128,9 @@ def _boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, nul
     return found
 
 
-def _mean_boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float) -> list[dict[str, Any]]:
+def _mean_boxes(
+    name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
+) -> list[dict[str, Any]]:
     """As `_boxes`; a step in one place pulls the mean of the record, so that each one found is taken off before the next is looked for."""
     critical, found = null.critical(name, level), []
     known = baseline["known_mean"].transpose("axis", "block").copy(deep=True)
@@ -132,8 +145,13 @@ def _mean_boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset
                 open_rows.discard(row)
                 continue
             box["p_value"] = float(null.p_value(name, box["z"]))
-            inside = (reduced["begin"].values >= box["begin"] - 1e-9) & (reduced["end"].values <= box["end"] + 1e-9)
-            box |= {"estimate": region_mean(reduced, now, row, inside), "tau_max_s": max(box["end"] - box["begin"], box["tau_min_s"])}
+            inside = (reduced["begin"].values >= box["begin"] - 1e-9) & (
+                reduced["end"].values <= box["end"] + 1e-9
+            )
+            box |= {
+                "estimate": region_mean(reduced, now, row, inside),
+                "tau_max_s": max(box["end"] - box["begin"], box["tau_min_s"]),
+            }
             known.values[row] += np.where(inside, box["estimate"], 0.0)
             found.append(box)
         if not open_rows:
@@ -141,13 +159,17 @@ def _mean_boxes(name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset
     return merge_wandering_regions(found)
 
 
-def _next_box(scores: xr.Dataset, row: int, left: Array, z: Array, critical: float) -> dict[str, Any] | None:
+def _next_box(
+    scores: xr.Dataset, row: int, left: Array, z: Array, critical: float
+) -> dict[str, Any] | None:
     """Box around the largest score left, which is then taken out of `left`; None when none is above `critical`."""
     if not np.isfinite(left).any() or np.nanmax(np.abs(left)) < critical:
         return None
     window, column = np.unravel_index(np.nanargmax(np.abs(left)), left.shape)
     sign = 1.0 if left[window, column] > 0 else -1.0
-    free = np.where(np.isfinite(left[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0)  # what is explained counts for nothing
+    free = np.where(
+        np.isfinite(left[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0
+    )  # what is explained counts for nothing
     begin, end, fine = _span(scores, free * sign, int(window))
     together, ratio = _stacked(scores, row, z * sign, fine, int(window))
     columns, reach = _columns(scores, together, ratio, int(column))
@@ -161,9 +183,17 @@ def _next_box(scores: xr.Dataset, row: int, left: Array, z: Array, critical: flo
         "tau_max_s": float(scores["tau_max_s"].values[columns].max()),
         "frequency": float(scores["frequency"].values[column]),
         "sign": int(sign),
-        "z": float(sign * max(abs(left[window, column]), together[column] if np.isfinite(together[column]) else 0.0)),
+        "z": float(
+            sign
+            * max(
+                abs(left[window, column]),
+                together[column] if np.isfinite(together[column]) else 0.0,
+            )
+        ),
         "ratio": float(ratio[column]),
-        "estimate": float(scores["estimate"].values[row, window, column]) if "estimate" in scores else float(ratio[column]),
+        "estimate": float(scores["estimate"].values[row, window, column])
+        if "estimate" in scores
+        else float(ratio[column]),
     }
     overlap = (scores["begin"].values < end - 1e-9) & (scores["end"].values > begin + 1e-9)
     overlap[window] = True
@@ -174,7 +204,8 @@ def _next_box(scores: xr.Dataset, row: int, left: Array, z: Array, critical: flo
 def _span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float, NDArray[np.int64]]:
     """Span of time around a window that explains most of a column: begin, end, and the shortest windows inside.
 
-    Of all runs of the shortest windows it is the one with the largest sum over the root of its number.
+    Of all runs of the shortest windows it is the one with the largest sum over the root of its
+    number.
     """
     first, stop = scores["first"].values, scores["stop"].values
     begin, end = scores["begin"].values, scores["end"].values
@@ -185,7 +216,10 @@ def _span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float, NDAr
     best, low, high = -np.inf, 0, fine.size
     for count in range(1, fine.size + 1):
         sums = (total[count:] - total[:-count]) / np.sqrt(count)
-        sums[(stop[fine[count - 1 :]] <= first[window]) | (first[fine[: fine.size - count + 1]] >= stop[window])] = -np.inf
+        sums[
+            (stop[fine[count - 1 :]] <= first[window])
+            | (first[fine[: fine.size - count + 1]] >= stop[window])
+        ] = -np.inf
         place = int(np.argmax(sums))
         if sums[place] > best:
             best, low, high = float(sums[place]), place, place + count
@@ -193,13 +227,19 @@ def _span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float, NDAr
     inside = fine[(first[fine] >= first[window]) & (stop[fine] <= stop[window])]
     if best < 0.8 * z[window]:  # the pieces do not add up to what the window shows as one
         raised = inside[z[inside] > _RAISED]
-        chosen = inside[(inside >= raised[0]) & (inside <= raised[-1])] if raised.size else np.array([window])
+        chosen = (
+            inside[(inside >= raised[0]) & (inside <= raised[-1])]
+            if raised.size
+            else np.array([window])
+        )
     elif first[window] == first.min() and stop[window] == stop.max() and best < z[window] + _WHOLE:
         chosen = inside
     return float(begin[chosen[0]]), float(end[chosen[-1]]), chosen
 
 
-def _side_by_side(first: NDArray[np.int64], stop: NDArray[np.int64], usable: NDArray[np.int64]) -> NDArray[np.int64]:
+def _side_by_side(
+    first: NDArray[np.int64], stop: NDArray[np.int64], usable: NDArray[np.int64]
+) -> NDArray[np.int64]:
     """The shortest windows, in order, of those that overlap every second one left out."""
     shortest = usable[(stop - first)[usable] == (stop - first)[usable].min()]
     chosen, until = [], -1
@@ -210,7 +250,9 @@ def _side_by_side(first: NDArray[np.int64], stop: NDArray[np.int64], usable: NDA
     return np.array(chosen, dtype=np.int64)
 
 
-def _stacked(scores: xr.Dataset, row: int, z: Array, fine: NDArray[np.int64], window: int) -> tuple[Array, Array]:
+def _stacked(
+    scores: xr.Dataset, row: int, z: Array, fine: NDArray[np.int64], window: int
+) -> tuple[Array, Array]:
     """Scores of every column over the span, and the ratio there; those of the window where a column has no shorter ones."""
     ratio = scores["ratio"].values[row]
     known = np.isfinite(z[fine])
@@ -222,7 +264,9 @@ def _stacked(scores: xr.Dataset, row: int, z: Array, fine: NDArray[np.int64], wi
     return np.where(coarse, z[window], together), np.where(coarse, ratio[window], mean)
 
 
-def _columns(scores: xr.Dataset, together: Array, ratio: Array, column: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _columns(
+    scores: xr.Dataset, together: Array, ratio: Array, column: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Columns of a box, and those that it explains."""
     what, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
     above = np.nan_to_num(together) > _GROWN
@@ -239,21 +283,31 @@ def _columns(scores: xr.Dataset, together: Array, ratio: Array, column: int) -> 
     box = grown[excess[grown] >= 0.25 * excess[column]]
     beside = _BESIDE_LINE if what[column] == "line" else 0
     if what[column] == "line":
-        return np.array([column]), np.arange(max(lower - beside, 0), min(upper + beside + 1, what.size))
+        return np.array([column]), np.arange(
+            max(lower - beside, 0), min(upper + beside + 1, what.size)
+        )
     overlap = (low <= high[grown].max() * 1.01) & (high >= low[grown].min() * 0.99)
     return box, np.flatnonzero(overlap)
 
 
-def _table(boxes: list[dict[str, Any]], reduced: xr.Dataset, null: NullScores, level: float) -> xr.Dataset:
+def _table(
+    boxes: list[dict[str, Any]], reduced: xr.Dataset, null: NullScores, level: float
+) -> xr.Dataset:
     variables: dict[str, Any] = {}
     for field, units in FIELDS.items():
         kind = str if field in ("view", "axes", "what") else int if field == "sign" else float
         values = np.array([box[field] for box in boxes], dtype=kind)
         variables[field] = ("mismatch", values, {"units": units} if units else {})
-    start = np.datetime64(int(reduced.attrs["start_ns"]), "ns") if "start_ns" in reduced.attrs else np.datetime64("1970-01-01", "ns")
+    start = (
+        np.datetime64(int(reduced.attrs["start_ns"]), "ns")
+        if "start_ns" in reduced.attrs
+        else np.datetime64("1970-01-01", "ns")
+    )
     for field, edge in (("start_time", "begin"), ("end_time", "end")):
         seconds = np.array([box[edge] for box in boxes], dtype=float)
         variables[field] = ("mismatch", start + np.rint(seconds * 1e9).astype("timedelta64[ns]"))
     attributes = {"level": level, "null_records": null.records}
     attributes |= {f"critical_{name}": null.critical(name, level) for name in null.views}
-    return xr.Dataset(variables, coords={"mismatch": np.arange(1, len(boxes) + 1)}, attrs=attributes)
+    return xr.Dataset(
+        variables, coords={"mismatch": np.arange(1, len(boxes) + 1)}, attrs=attributes
+    )

@@ -9,7 +9,9 @@ __all__ = ["merge_regions", "merge_wandering_regions"]
 
 Region = dict[str, Any]
 _LIKE = 0.5  # share of the time of both that two boxes have in common when they are one
-_NEAR = 0.25  # of the longer of two boxes, which may lie between them when they are one, if it is no longer than the shorter
+# of the longer of two boxes, which may lie between them when they are one, if it is no longer than
+# the shorter
+_NEAR = 0.25
 _LINE = 0.02  # share of the frequency by which one line may wander
 _KINDS = ("slow", "restless", "glide")
 _STEPS = 3  # boxes of one mean, beyond which it is said to wander
@@ -18,8 +20,8 @@ _STEPS = 3  # boxes of one mean, beyond which it is said to wander
 def merge_regions(boxes: Sequence[Region]) -> list[Region]:
     """Join boxes, the surest first; the surest of those that are joined gives its numbers.
 
-    Boxes of different axes are one when they share most of their time; those of the same axes also when they lie side by side, and
-    their joint box then spans both.
+    Boxes of different axes are one when they share most of their time; those of the same axes also
+    when they lie side by side, and their joint box then spans both.
 
     Parameters
     ----------
@@ -48,13 +50,21 @@ def merge_regions(boxes: Sequence[Region]) -> list[Region]:
 
 def _alike(one: Region, other: Region) -> bool:
     """The same view, direction, and averaging times or line."""
-    if one["view"] != other["view"] or (one["sign"] != other["sign"] and one["view"] != "cross_axis"):
+    if one["view"] != other["view"] or (
+        one["sign"] != other["sign"] and one["view"] != "cross_axis"
+    ):
         return False
     if one["what"] == "line" or other["what"] == "line":
-        return bool(one["what"] == other["what"] and abs(one["frequency"] / other["frequency"] - 1.0) < _LINE)
+        return bool(
+            one["what"] == other["what"]
+            and abs(one["frequency"] / other["frequency"] - 1.0) < _LINE
+        )
     if _kind(one) != _kind(other):
         return False
-    return bool(min(one["tau_max_s"], other["tau_max_s"]) >= 0.99 * max(one["tau_min_s"], other["tau_min_s"]))
+    return bool(
+        min(one["tau_max_s"], other["tau_max_s"])
+        >= 0.99 * max(one["tau_min_s"], other["tau_min_s"])
+    )
 
 
 def _kind(box: Region) -> str:
@@ -70,17 +80,26 @@ def _shared(one: Region, other: Region) -> float:
 
 def _touching(one: Region, other: Region) -> bool:
     """Pieces of the same axes that lie side by side."""
-    if not set(one["axes"].split()) <= set(other["axes"].split()) or one["view"] in ("mean", "restart"):
+    if not set(one["axes"].split()) <= set(other["axes"].split()) or one["view"] in (
+        "mean",
+        "restart",
+    ):
         return False
     shorter, longer = sorted([one["end"] - one["begin"], other["end"] - other["begin"]])
-    return bool(max(one["begin"], other["begin"]) - min(one["end"], other["end"]) <= min(_NEAR * longer, shorter) + 1e-6)
+    return bool(
+        max(one["begin"], other["begin"]) - min(one["end"], other["end"])
+        <= min(_NEAR * longer, shorter) + 1e-6
+    )
 
 
 def _join(box: Region, other: Region) -> None:
     if _shared(box, other) <= _LIKE:
         box["begin"], box["end"] = min(box["begin"], other["begin"]), max(box["end"], other["end"])
         if box["what"] != "line":
-            low, high = min(box["tau_min_s"], other["tau_min_s"]), max(box["tau_max_s"], other["tau_max_s"])
+            low, high = (
+                min(box["tau_min_s"], other["tau_min_s"]),
+                max(box["tau_max_s"], other["tau_max_s"]),
+            )
             box["tau_min_s"], box["tau_max_s"] = low, high
     names = box["axes"].split()
     box["axes"] = " ".join([*names, *(name for name in other["axes"].split() if name not in names)])

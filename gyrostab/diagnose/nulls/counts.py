@@ -17,7 +17,9 @@ _TURNS = 20  # of an iteration that halves its error
 COARSE = 1.5  # standard deviations: a lattice step from which on the values are few levels
 
 
-def null_counts(reduced: xr.Dataset, sd: Array, count: int, rng: np.random.Generator) -> dict[str, NDArray[np.int64]]:
+def null_counts(
+    reduced: xr.Dataset, sd: Array, count: int, rng: np.random.Generator
+) -> dict[str, NDArray[np.int64]]:
     """Outliers, repeats, extremes and zeros as Gaussian noise on the lattice has them.
 
     Parameters
@@ -41,7 +43,9 @@ def null_counts(reduced: xr.Dataset, sd: Array, count: int, rng: np.random.Gener
     cut = cut_off(reduced)
     for axis, step in enumerate(reduced["lattice"].values):
         if step > 0.0:
-            repeat[axis], zero[axis] = _lattice_chances(mean[axis], float(step), sd[axis], cut=bool(cut[axis]))
+            repeat[axis], zero[axis] = _lattice_chances(
+                mean[axis], float(step), sd[axis], cut=bool(cut[axis])
+            )
         if not reduced["zeros"].values[axis].any():
             zero[axis] = 0.0
         own = zero[axis] ** 2 / (2.0 if cut[axis] else 1.0)  # of two cells in one
@@ -50,7 +54,11 @@ def null_counts(reduced: xr.Dataset, sd: Array, count: int, rng: np.random.Gener
     zeros = rng.binomial(samples, np.broadcast_to(zero, size))
     filled = _filled_zeros(reduced, zeros, samples, rng)
     return {
-        "outliers": rng.poisson(np.broadcast_to(CHANCE * samples / np.maximum(samples.sum(axis=1, keepdims=True), 1), size)),
+        "outliers": rng.poisson(
+            np.broadcast_to(
+                CHANCE * samples / np.maximum(samples.sum(axis=1, keepdims=True), 1), size
+            )
+        ),
         "repeats": rng.binomial(adjacent, np.broadcast_to(repeat, size)),
         "zeros": zeros,
         "stuck": zeros - filled,
@@ -59,7 +67,12 @@ def null_counts(reduced: xr.Dataset, sd: Array, count: int, rng: np.random.Gener
     }
 
 
-def _filled_zeros(reduced: xr.Dataset, zeros: NDArray[np.int64], samples: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+def _filled_zeros(
+    reduced: xr.Dataset,
+    zeros: NDArray[np.int64],
+    samples: NDArray[np.int64],
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
     """Of so many zeros (record, axis, block) those that look like samples filled with zeros, where chance alone brings zeros together."""
     subset = reduced["axes_at_once"].transpose("subset", "axis").values.astype(bool)
     number = reduced["at_once"].transpose("subset", "block").values.astype(np.int64)
@@ -84,14 +97,19 @@ def _filled(mean: Array) -> Array:
     return out
 
 
-def _lattice_chances(mean: Array, step: float, sd: Array, *, cut: bool = False) -> tuple[Array, Array]:
+def _lattice_chances(
+    mean: Array, step: float, sd: Array, *, cut: bool = False
+) -> tuple[Array, Array]:
     """Chance in each block that a sample equals the one before (the cell of 0 as the others), and that it is 0; `cut` off towards zero."""
     inner = float(np.sqrt(max(sd[0] ** 2 - step**2 / 12.0, (0.05 * step) ** 2)))
     centre = (_before_cut(mean, step, inner) if cut else mean)[:, None]
     reach = int(np.ceil(6.0 * inner / step)) + 1
 
     def chance(level: Array) -> Array:
-        return np.asarray(ndtr((level + step / 2.0 - centre) / inner) - ndtr((level - step / 2.0 - centre) / inner))
+        return np.asarray(
+            ndtr((level + step / 2.0 - centre) / inner)
+            - ndtr((level - step / 2.0 - centre) / inner)
+        )
 
     zero = chance(np.array([-0.5, 0.5]) * step).sum(axis=1) if cut else chance(np.zeros(1))[:, 0]
     if step < COARSE * inner:
@@ -108,7 +126,9 @@ def _before_cut(mean: Array, step: float, scatter: float) -> Array:
     return out
 
 
-def _extremes(reduced: xr.Dataset, sd: Array, samples: NDArray[np.int64], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _extremes(
+    reduced: xr.Dataset, sd: Array, samples: NDArray[np.int64], count: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
     """The smallest and the largest value, each in the blocks where it falls: once, but for a lattice that is not fine."""
     out = np.zeros((count, *samples.shape), np.int64)
     for axis, step in enumerate(reduced["lattice"].values):

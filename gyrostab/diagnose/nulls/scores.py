@@ -15,12 +15,16 @@ from gyrostab.errors import OptionError
 __all__ = ["NullScores", "StatisticNull", "Tail", "null_scores", "standardise"]
 
 Array = NDArray[np.float64]
-_BELOW = 1.4  # standard deviations below the largest of independent cells, from which on scores are kept
+_BELOW = (
+    1.4  # standard deviations below the largest of independent cells, from which on scores are kept
+)
 _AT_ONCE = 1_000_000  # band powers of the null records that are scored at once
 _FIRST = 20  # null records that tell what a standard deviation is
 _POOL = 100.0  # null records that the mean over like windows counts for
 _SHARE = 0.25  # of the null records, the largest, to which the tail is fitted
-_STEEPEST = 0.7  # scale of the tail of half a squared normal score, at least: that of a single cell is 1
+_STEEPEST = (
+    0.7  # scale of the tail of half a squared normal score, at least: that of a single cell is 1
+)
 _LEAST = 40
 _LEAST_P = 1e-9  # a tail from hundreds of records says nothing of rarer things
 
@@ -37,13 +41,21 @@ class Tail:
     def surprise(self, value: Array | float) -> Array:
         """``-log`` of the probability that the largest of a null record is `value` or more."""
         value = np.asarray(value, dtype=float)
-        rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (self.sample.size + 1.0)
+        rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (
+            self.sample.size + 1.0
+        )
         beyond = (value - self.start) / self.scale - np.log(self.share)
-        return np.asarray(np.where(value > self.start, beyond, -np.log(np.clip(rank, self.share, 1.0))))
+        return np.asarray(
+            np.where(value > self.start, beyond, -np.log(np.clip(rank, self.share, 1.0)))
+        )
 
     def level(self, p: float) -> float:
         """Value that the largest of a null record reaches with probability `p`."""
-        return float(self.start + self.scale * np.log(self.share / p)) if p < self.share else float(np.quantile(self.sample, 1.0 - p))
+        return (
+            float(self.start + self.scale * np.log(self.share / p))
+            if p < self.share
+            else float(np.quantile(self.sample, 1.0 - p))
+        )
 
 
 @dataclass(frozen=True)
@@ -117,7 +129,9 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
                         gathered[name] = _Gathered(found)
                     gathered[name].add(found)
     if records < _LEAST:
-        raise OptionError(f"{records} null records are too few to tell how often noise alone does as much; give nulls=400")
+        raise OptionError(
+            f"{records} null records are too few to tell how often noise alone does as much; give nulls=400"
+        )
     views = {}
     largest = {}
     for name, view in gathered.items():
@@ -160,7 +174,9 @@ class _Gathered:
         z = scores["z"].values.reshape(scores.sizes["record"], -1)
         known = np.isfinite(z)
         filled = np.where(known, z, 0.0)
-        self.sums += np.stack([known.sum(axis=0), filled.sum(axis=0), np.square(filled).sum(axis=0)])
+        self.sums += np.stack(
+            [known.sum(axis=0), filled.sum(axis=0), np.square(filled).sum(axis=0)]
+        )
         self.waiting.append(z)
         if self.records + sum(len(part) for part in self.waiting) >= _FIRST:
             self._keep()
@@ -210,4 +226,6 @@ def _moments(sums: Array, like: Array, floor: Array) -> tuple[Array, Array]:
         mean = first / count
         variance = (np.maximum(second - count * mean**2, 0.0) + _POOL * like) / (count + _POOL)
     known = count > 1
-    return np.where(known, mean, np.nan), np.where(known, np.maximum(np.sqrt(variance), floor), np.nan)
+    return np.where(known, mean, np.nan), np.where(
+        known, np.maximum(np.sqrt(variance), floor), np.nan
+    )

@@ -46,9 +46,15 @@ def shared_by(reduced: xr.Dataset, baseline: xr.Dataset) -> Shared | None:
         return None
     axes = [str(axis) for axis in reduced["axis"].values]
     pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(reduced)]
-    spectrum, own = (baseline[name].transpose("axis", "block", "band").values for name in ("spectrum", "shape_alone"))
+    spectrum, own = (
+        baseline[name].transpose("axis", "block", "band").values
+        for name in ("spectrum", "shape_alone")
+    )
     cross = baseline["cross"].transpose("pair", "block", "band").values
-    samples, together = reduced["samples"].transpose("axis", "block").values, reduced["cross_samples"].transpose("pair", "block").values
+    samples, together = (
+        reduced["samples"].transpose("axis", "block").values,
+        reduced["cross_samples"].transpose("pair", "block").values,
+    )
     matrix = np.zeros((*spectrum.shape[1:], len(axes), len(axes)), np.complex128)
     matrix[..., range(len(axes)), range(len(axes))] = 1.0
     white = matrix[:, 0].real.copy()
@@ -58,21 +64,32 @@ def shared_by(reduced: xr.Dataset, baseline: xr.Dataset) -> Shared | None:
             overlap = np.nan_to_num(together[number] / np.sqrt(samples[a] * samples[b]))
         matrix[..., a, b], matrix[..., b, a] = coherency, coherency.conj()
         white[:, a, b] = white[:, b, a] = coherency[:, 0].real * overlap
-    return Shared(_root(matrix), pairs, own, reduced["cross_shape"].transpose("pair", "block", "band").values, _root(white))
+    return Shared(
+        _root(matrix),
+        pairs,
+        own,
+        reduced["cross_shape"].transpose("pair", "block", "band").values,
+        _root(white),
+    )
 
 
 def _root(matrix: NDArray[Any]) -> NDArray[Any]:
     """Square root of correlations (..., axis, axis), the diagonal of whose square is 1."""
     values, vectors = np.linalg.eigh(matrix)
-    root = (vectors * np.sqrt(np.maximum(values, _LEAST))[..., None, :]) @ vectors.conj().swapaxes(-1, -2)
+    root = (vectors * np.sqrt(np.maximum(values, _LEAST))[..., None, :]) @ vectors.conj().swapaxes(
+        -1, -2
+    )
     return np.asarray(root / np.sqrt((np.abs(root) ** 2).sum(axis=-1, keepdims=True)))
 
 
-def shared_spectra(shared: Shared, count: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.complex128]]:
+def shared_spectra(
+    shared: Shared, count: int, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.complex128]]:
     """Draw powers and cross-spectra over their expectation, and over the root of the product of those of both axes.
 
-    The law is that of Wishart, by the triangular factors of Bartlett: as many independent ordinates as the shape says, for each axis
-    its own number. Samples that only one axis of a pair has add a scatter that they do not share.
+    The law is that of Wishart, by the triangular factors of Bartlett: as many independent ordinates
+    as the shape says, for each axis its own number. Samples that only one axis of a pair has add a
+    scatter that they do not share.
 
     Returns
     -------
@@ -82,13 +99,17 @@ def shared_spectra(shared: Shared, count: int, rng: np.random.Generator) -> tupl
     own = np.where(np.isfinite(shared.own) & (shared.own > 0.0), shared.own, 1.0)
     power = np.empty((count, *own.shape))
     cross = np.empty((count, len(shared.pairs), *own.shape[1:]), np.complex128)
-    beside = [_beside(shared.both[number], own[a], own[b]) for number, (a, b) in enumerate(shared.pairs)]
+    beside = [
+        _beside(shared.both[number], own[a], own[b]) for number, (a, b) in enumerate(shared.pairs)
+    ]
     for record in range(count):
         mixed = np.einsum("bfij,jkbf->ikbf", shared.root, _triangular(own, rng))
         power[record] = (mixed.real**2 + mixed.imag**2).sum(axis=1)
         for number, (a, b) in enumerate(shared.pairs):
             alone = rng.standard_normal((2, *own.shape[1:])) * beside[number]
-            cross[record, number] = (mixed[a] * mixed[b].conj()).sum(axis=0) + alone[0] + 1j * alone[1]
+            cross[record, number] = (
+                (mixed[a] * mixed[b].conj()).sum(axis=0) + alone[0] + 1j * alone[1]
+            )
     return power, cross
 
 
@@ -112,4 +133,10 @@ def _beside(both: Array, one: Array, other: Array) -> Array:
 
 def shared_white(shared: Shared, count: int, rng: np.random.Generator) -> Array:
     """White noise of unit variance, (record, axis, block), that axes share as far as their lowest band says."""
-    return np.asarray(np.einsum("bij,rjb->rib", shared.white, rng.standard_normal((count, len(shared.own), len(shared.white)))))
+    return np.asarray(
+        np.einsum(
+            "bij,rjb->rib",
+            shared.white,
+            rng.standard_normal((count, len(shared.own), len(shared.white))),
+        )
+    )

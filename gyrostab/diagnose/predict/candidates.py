@@ -36,7 +36,18 @@ __all__ = [
 
 Array = NDArray[Any]
 #: Where an effect can show, in the order in which they are looked at.
-STATISTIC_NAMES = ("marks", "mean", "power", "cross", "order", "phase_locked", "transfer", "line", "wander", "levels")
+STATISTIC_NAMES = (
+    "marks",
+    "mean",
+    "power",
+    "cross",
+    "order",
+    "phase_locked",
+    "transfer",
+    "line",
+    "wander",
+    "levels",
+)
 _MOST_VALUES, _MOST_VARIANTS = 60, 200
 #: Effect -> largest size that is plausible, of each of its parameters.
 LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
@@ -49,7 +60,11 @@ _SAME = 1e-3  # designs that differ by less of their size are one
 def channel_units(reduced: xr.Dataset) -> dict[str, str]:
     """Channel of the log -> its unit."""
     begin = "channel_"
-    return {str(name)[len(begin) :]: str(reduced[name].attrs.get("units", "")) for name in reduced.data_vars if str(name).startswith(begin)}
+    return {
+        str(name)[len(begin) :]: str(reduced[name].attrs.get("units", ""))
+        for name in reduced.data_vars
+        if str(name).startswith(begin)
+    }
 
 
 def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
@@ -63,12 +78,20 @@ def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         Channel of the effect -> channel of the log.
     """
     axes = tuple(str(axis) for axis in reduced["axis"].values)
-    own = dict(zip(axes, map(_bridged, measured(reduced, "mean").transpose("axis", "block").values), strict=True))
+    own = dict(
+        zip(
+            axes,
+            map(_bridged, measured(reduced, "mean").transpose("axis", "block").values),
+            strict=True,
+        )
+    )
 
     def spans(name: str) -> Array:
         if f"{name}_begin" not in reduced:
             return np.empty((0, 2))
-        return np.stack([reduced[f"{name}_begin"].values, reduced[f"{name}_end"].values], axis=1).astype(np.float64)
+        return np.stack(
+            [reduced[f"{name}_begin"].values, reduced[f"{name}_end"].values], axis=1
+        ).astype(np.float64)
 
     return Windows(
         begin=reduced["begin"].values.astype(np.float64),
@@ -76,14 +99,26 @@ def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         frequency=reduced["frequency"].values,
         rate=float(reduced.attrs["sampling_rate_hz"]),
         axes=axes,
-        drivers={inner: _bridged(reduced[f"channel_{name}"].values) for inner, name in drivers.items()},
-        fine={inner: reduced[f"fine_{name}"].values for inner, name in drivers.items() if f"fine_{name}" in reduced},
+        drivers={
+            inner: _bridged(reduced[f"channel_{name}"].values) for inner, name in drivers.items()
+        },
+        fine={
+            inner: reduced[f"fine_{name}"].values
+            for inner, name in drivers.items()
+            if f"fine_{name}" in reduced
+        },
         own=own,
         gaps=spans("gap"),
         restarts=spans("restart"),
-        phase=(np.arange(reduced.sizes["phase"]) + 0.5) / reduced.sizes["phase"] if "profile" in reduced else np.empty(0),
+        phase=(np.arange(reduced.sizes["phase"]) + 0.5) / reduced.sizes["phase"]
+        if "profile" in reduced
+        else np.empty(0),
         turns=reduced["ramp_turns"].values if "ramp_turns" in reduced else np.empty(0),
-        bands={inner: band for inner, name in drivers.items() if (band := _band(reduced[f"channel_{name}"])) is not None},
+        bands={
+            inner: band
+            for inner, name in drivers.items()
+            if (band := _band(reduced[f"channel_{name}"])) is not None
+        },
     )
 
 
@@ -105,7 +140,9 @@ def _bridged(values: Array) -> Array:
     return np.interp(place, place[good], values[good])
 
 
-def effect_candidates(reduced: xr.Dataset, coefficient: xr.DataArray) -> tuple[list[Candidate], dict[str, str]]:
+def effect_candidates(
+    reduced: xr.Dataset, coefficient: xr.DataArray
+) -> tuple[list[Candidate], dict[str, str]]:
     """All effects of the registry as far as this record can tell about them.
 
     Parameters
@@ -151,7 +188,9 @@ def effect_candidates(reduced: xr.Dataset, coefficient: xr.DataArray) -> tuple[l
             said = said or why
         found += made
         if not made:
-            reasons[name] = f"not identifiable: {said or 'it leaves no trace in means, spectra and distribution of this record'}"
+            reasons[name] = (
+                f"not identifiable: {said or 'it leaves no trace in means, spectra and distribution of this record'}"
+            )
     return found, reasons
 
 
@@ -163,12 +202,18 @@ def _by_lattice(kind: type[Effect], reduced: xr.Dataset) -> bool:
     return bool(marks) and set(marks) <= set(GRID_COUNTS)
 
 
-# ------------------------------------------------------------------------------------------------------------- channels
+# -------------------------------------------------------------------------------------------------------------
+# channels
 
 
-def _drivers(kind: type[Effect], reduced: xr.Dataset, units: Mapping[str, str]) -> Iterator[dict[str, str]]:
+def _drivers(
+    kind: type[Effect], reduced: xr.Dataset, units: Mapping[str, str]
+) -> Iterator[dict[str, str]]:
     """Channels of the effect -> channels of the log, in every way that makes sense."""
-    options = [_matches(channel, unit, tuple(kind.channels), reduced, units) or [""] for channel, unit in kind.channels.items()]
+    options = [
+        _matches(channel, unit, tuple(kind.channels), reduced, units) or [""]
+        for channel, unit in kind.channels.items()
+    ]
     seen = set()
     for chosen in product(*options):
         named = [name for name in chosen if name]
@@ -180,20 +225,37 @@ def _drivers(kind: type[Effect], reduced: xr.Dataset, units: Mapping[str, str]) 
         yield {}
 
 
-def _matches(channel: str, unit: str, channels: tuple[str, ...], reduced: xr.Dataset, units: Mapping[str, str]) -> list[str]:
+def _matches(
+    channel: str,
+    unit: str,
+    channels: tuple[str, ...],
+    reduced: xr.Dataset,
+    units: Mapping[str, str],
+) -> list[str]:
     """Channels of the log that can stand for one of the effect's: vectors by their name, others by the beginning of it."""
     if sum(other[:-1] == channel[:-1] for other in channels) > 1 and channel[-1] in "xyz":
         names = [channel]
     else:
         base = channel.rstrip("0123456789").rstrip("_")
-        names = sorted((name for name in units if name == base or name.startswith(base + "_")), key=lambda name: (name != channel, name))
-    return [name for name in names if units.get(name) == unit and np.isfinite(reduced[f"channel_{name}"].values).mean() >= MIN_BLOCK_SHARE]
+        names = sorted(
+            (name for name in units if name == base or name.startswith(base + "_")),
+            key=lambda name: (name != channel, name),
+        )
+    return [
+        name
+        for name in names
+        if units.get(name) == unit
+        and np.isfinite(reduced[f"channel_{name}"].values).mean() >= MIN_BLOCK_SHARE
+    ]
 
 
-# -------------------------------------------------------------------------------------------------------------- variants
+# --------------------------------------------------------------------------------------------------------------
+# variants
 
 
-def _of_kind(kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray) -> tuple[list[Candidate], str]:
+def _of_kind(
+    kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray
+) -> tuple[list[Candidate], str]:
     """Candidates of one effect with its channels, by view; and why there are none."""
     if kind.channels and not drivers:
         return _strangers(kind, reduced), missing_channel_reason(tuple(kind.channels), reduced)
@@ -203,36 +265,59 @@ def _of_kind(kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], c
     for values in _grid(kind, windows):
         try:
             effect = kind.example(**values)
-            predictions.append((values, _visible(kind.name, _exogenous(effect, windows), reduced, coefficient)))
+            predictions.append(
+                (values, _visible(kind.name, _exogenous(effect, windows), reduced, coefficient))
+            )
         except KeyError as error:
             why = missing_channel_reason((str(error.args[0]),), reduced)
         except OptionError as error:
             why = str(error)
     driver = tuple(drivers.get(channel, "") for channel in kind.channels) if drivers else ()
-    still = [name for name in drivers.values() if np.ptp(windows.drivers[_inner(drivers, name)]) == 0.0]
+    still = [
+        name for name in drivers.values() if np.ptp(windows.drivers[_inner(drivers, name)]) == 0.0
+    ]
     if still:
         why = f"{' and '.join(still)} {'does' if len(still) == 1 else 'do'} not change"
     many = {item.name for item in kind.parameters() if item.many}
     made = []
     for view, build in BUILDERS.items():
-        variants = _distinct([one for values, seen in predictions for one in build(values, seen, reduced, coefficient)])
+        variants = _distinct(
+            [
+                one
+                for values, seen in predictions
+                for one in build(values, seen, reduced, coefficient)
+            ]
+        )
         variants = _weighed(variants, windows)
         if not variants:
             continue
-        marks = tuple(dict.fromkeys(mark for _, seen in predictions for mark in seen.marks)) if view == "marks" else ()
+        marks = (
+            tuple(dict.fromkeys(mark for _, seen in predictions for mark in seen.marks))
+            if view == "marks"
+            else ()
+        )
         each = view != "order" or bool(many & set(variants[0].columns))
         made.append(Candidate(kind.name, view, driver, variants, marks=marks, each=each))
-    made += [replace(one, driver=driver) for one in _transfers(kind.name, predictions, windows, reduced)]
+    made += [
+        replace(one, driver=driver) for one in _transfers(kind.name, predictions, windows, reduced)
+    ]
     return made, why
 
 
-def variants_of(candidate: Candidate, variant: Variant, reduced: xr.Dataset, coefficient: xr.DataArray) -> Variant | None:
+def variants_of(
+    candidate: Candidate, variant: Variant, reduced: xr.Dataset, coefficient: xr.DataArray
+) -> Variant | None:
     """A variant of a candidate made anew, for other channels or other values of the same parameters; None where it is nothing."""
     kind = effects()[candidate.effect]
-    drivers = {inner: name for inner, name in zip(kind.channels, candidate.driver, strict=False) if name}
+    drivers = {
+        inner: name for inner, name in zip(kind.channels, candidate.driver, strict=False) if name
+    }
     seen = _exogenous(kind.example(**variant.values), windows_of(reduced, drivers))
     made = BUILDERS[candidate.view](dict(variant.values), seen, reduced, coefficient)
-    return next((one for one in made if one.columns == variant.columns and one.squared == variant.squared), None)
+    return next(
+        (one for one in made if one.columns == variant.columns and one.squared == variant.squared),
+        None,
+    )
 
 
 def _inner(drivers: Mapping[str, str], name: str) -> str:
@@ -243,7 +328,9 @@ def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
     """Values of the nuisance parameters, and of the words."""
     try:
         grid: dict[str, Sequence[Any]] = {
-            name: tried_instants(values, windows) if name == _INSTANT else _thinned(values, _MOST_VALUES)
+            name: tried_instants(values, windows)
+            if name == _INSTANT
+            else _thinned(values, _MOST_VALUES)
             for name, values in kind.example().nuisance(windows).items()
         }
     except KeyError:
@@ -256,7 +343,10 @@ def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
     points = list(product(*grid.values()))
     most = max(_MOST_VARIANTS, len(grid.get(_INSTANT, ())))
     for point in points[:: max(1, -(-len(points) // most))]:
-        yield {name: value if isinstance(value, str) else float(value) for name, value in zip(grid, point, strict=True)}
+        yield {
+            name: value if isinstance(value, str) else float(value)
+            for name, value in zip(grid, point, strict=True)
+        }
 
 
 def _thinned(values: Array, most: int) -> list[Any]:
@@ -268,7 +358,8 @@ def _thinned(values: Array, most: int) -> list[Any]:
 def _weighed(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
     """Variants with the chance of the instant at which something happens.
 
-    It is as likely when power comes back as at all other times together, and at these as likely as the time that each stands for is long.
+    It is as likely when power comes back as at all other times together, and at these as likely as
+    the time that each stands for is long.
     """
     if not variants or not all(_INSTANT in one.values for one in variants):
         return variants
@@ -281,7 +372,9 @@ def _weighed(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, 
     span = np.gradient(others)[place]
     weight[~known] = span / span.mean()
     weight[known] = weight[~known].sum() / max(int(known.sum()), 1)
-    return tuple(replace(one, weight=float(share)) for one, share in zip(variants, weight, strict=True))
+    return tuple(
+        replace(one, weight=float(share)) for one, share in zip(variants, weight, strict=True)
+    )
 
 
 def _exogenous(effect: Effect, windows: Windows) -> Prediction:
@@ -290,7 +383,10 @@ def _exogenous(effect: Effect, windows: Windows) -> Prediction:
     if not whole.mean:
         return whole
     shape = (len(windows.axes), windows.begin.size)
-    mean = {name: np.array(np.broadcast_to(np.atleast_2d(values), shape)) for name, values in whole.mean.items()}
+    mean = {
+        name: np.array(np.broadcast_to(np.atleast_2d(values), shape))
+        for name, values in whole.mean.items()
+    }
     nothing = np.full(windows.begin.size, np.nan)
     without_any = effect.explain(replace(windows, own=dict.fromkeys(windows.axes, nothing))).mean
     for name, values in mean.items():
@@ -304,10 +400,13 @@ def _exogenous(effect: Effect, windows: Windows) -> Prediction:
     return replace(whole, mean=mean)
 
 
-def _visible(name: str, seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray) -> Prediction:
+def _visible(
+    name: str, seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+) -> Prediction:
     """What an effect predicts, without the means that white noise alone hides on every axis at the largest size there is.
 
-    An axis at rest cannot leak into others: its noise, taken for a motion, would only blur what moves.
+    An axis at rest cannot leak into others: its noise, taken for a motion, would only blur what
+    moves.
     """
     if name not in LARGEST or not seen.mean:
         return seen
@@ -331,7 +430,11 @@ def _distinct(variants: list[Variant]) -> tuple[Variant, ...]:
             size = np.abs(one.design).max(initial=0.0)
             if not (np.isfinite(size) and size > 0.0):
                 continue
-            mark: tuple[Any, ...] = (one.columns, one.time, np.round(one.design / size / _SAME).tobytes())
+            mark: tuple[Any, ...] = (
+                one.columns,
+                one.time,
+                np.round(one.design / size / _SAME).tobytes(),
+            )
         else:
             mark = (one.columns,)
         if mark not in seen:
@@ -340,7 +443,12 @@ def _distinct(variants: list[Variant]) -> tuple[Variant, ...]:
     return tuple(kept)
 
 
-def _transfers(name: str, predictions: list[tuple[dict[str, Any], Prediction]], windows: Windows, reduced: xr.Dataset) -> list[Candidate]:
+def _transfers(
+    name: str,
+    predictions: list[tuple[dict[str, Any], Prediction]],
+    windows: Windows,
+    reduced: xr.Dataset,
+) -> list[Candidate]:
     """Rates that follow another channel, or another axis, at every frequency."""
     there = {str(one) for one in reduced["witness"].values} if "witness" in reduced.dims else set()
     axes = set(windows.axes) if "cross" in reduced else set()
@@ -348,12 +456,17 @@ def _transfers(name: str, predictions: list[tuple[dict[str, Any], Prediction]], 
     for values, seen in predictions:
         for (parameter, channel), transfer in seen.transfer.items():
             if channel in there or channel in axes:
-                found.setdefault(channel, []).append(Variant(values, (parameter,), np.asarray(transfer)[None]))
+                found.setdefault(channel, []).append(
+                    Variant(values, (parameter,), np.asarray(transfer)[None])
+                )
     if found and effects()[name].stage == "motion":
         strange = [channel for channel in sorted(there) if not _known(channel)]
         for channel in [*found, *strange]:
             found[channel] = found.get(channel, []) + _any_transfer(windows.frequency.size)
-    return [Candidate(name, "transfer", (), _distinct(variants), witness=(channel,)) for channel, variants in found.items()]
+    return [
+        Candidate(name, "transfer", (), _distinct(variants), witness=(channel,))
+        for channel, variants in found.items()
+    ]
 
 
 def _strangers(kind: type[Effect], reduced: xr.Dataset) -> list[Candidate]:
@@ -362,14 +475,20 @@ def _strangers(kind: type[Effect], reduced: xr.Dataset) -> list[Candidate]:
         return []
     variants = _distinct(_any_transfer(reduced.sizes["band"]))
     strange = sorted(str(one) for one in reduced["witness"].values if not _known(str(one)))
-    return [Candidate(kind.name, "transfer", (), variants, witness=(channel,)) for channel in strange]
+    return [
+        Candidate(kind.name, "transfer", (), variants, witness=(channel,)) for channel in strange
+    ]
 
 
 def _known(channel: str) -> bool:
     """A channel drives some effect of the registry, or is known to be no motion."""
     bases = {name for kind in effects().values() for name in kind.channels}
     return (
-        any(channel == name or channel.startswith(name.rstrip("0123456789").rstrip("_") + "_") for name in bases) or channel == "pressure"
+        any(
+            channel == name or channel.startswith(name.rstrip("0123456789").rstrip("_") + "_")
+            for name in bases
+        )
+        or channel == "pressure"
     )
 
 

@@ -121,18 +121,27 @@ def _hopping(state: State, part: Component) -> State:
     row = state.axes.index(axis)
     attrs = state.reduced.attrs
     low, high = (float(part.variant.values[name]) for name in ("low", "high"))
-    power = switching_powers(inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"]))
+    power = switching_powers(
+        inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"])
+    )
     state = add_fast_switching(state, part)
     state = state.with_columns("power", axis, [power_column(power[None], row, state)])
-    moves = xr.DataArray(np.ptp(inside, axis=1) > _HOPS, dims="block") & (state.reduced["axis"] == axis)
-    blank = {name: state.reduced[name].where(~moves, other) for name, other in (("kurtosis", np.nan), ("outliers", 0))}
+    moves = xr.DataArray(np.ptp(inside, axis=1) > _HOPS, dims="block") & (
+        state.reduced["axis"] == axis
+    )
+    blank = {
+        name: state.reduced[name].where(~moves, other)
+        for name, other in (("kurtosis", np.nan), ("outliers", 0))
+    }
     return replace(state, reduced=state.reduced.assign(blank))
 
 
 def add_fast_switching(state: State, part: Component) -> State:
     """The state with the course of a bias that hops within blocks, in the means of blocks and of their pieces."""
     axis = part.row[0]
-    return state.with_columns("mean", axis, mean_columns(part.variant, 0)).with_columns("inner", axis, [part.variant.inside])
+    return state.with_columns("mean", axis, mean_columns(part.variant, 0)).with_columns(
+        "inner", axis, [part.variant.inside]
+    )
 
 
 def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
@@ -160,11 +169,15 @@ def _power(state: State, part: Component) -> State:
     row = state.axes.index(axis)
     if is_filter("power", part.variant) and "line_power" in state.reduced:
         expected = expected_lines(state.baseline, state.reduced["line_frequency"].values)[row]
-        reduced, stopped = straightened(state.reduced, axis, part.candidate.effect, part.variant.values, expected)
+        reduced, stopped = straightened(
+            state.reduced, axis, part.candidate.effect, part.variant.values, expected
+        )
         state = replace(state, reduced=reduced).with_columns("line", "all", [stopped])
     if is_filter("power", part.variant) and axis in state.baseline.attrs.get("recalibrated", ()):
         return state  # the noise of the baseline is filtered already
-    return state.with_columns("power", axis, [power_column(one, row, state) for one in part.variant.design])
+    return state.with_columns(
+        "power", axis, [power_column(one, row, state) for one in part.variant.design]
+    )
 
 
 def _cross(state: State, part: Component) -> State:
@@ -177,11 +190,17 @@ def _cross(state: State, part: Component) -> State:
     if not part.variant.squared:
         return state
     calibrated = state.baseline.attrs.get("source", "calibrated") == "calibrated"
-    added = [one.real for one in part.variant.design if not (calibrated and _white(one))]  # white noise was calibrated with it
+    added = [
+        one.real for one in part.variant.design if not (calibrated and _white(one))
+    ]  # white noise was calibrated with it
     for axis in part.row if added else ():
         powers = [power_column(one, state.axes.index(axis), state) for one in added]
         known = state.given.get(("power", axis), [])
-        state = state.with_columns("power", axis, [one for one in powers if not any(np.array_equal(one, other) for other in known)])
+        state = state.with_columns(
+            "power",
+            axis,
+            [one for one in powers if not any(np.array_equal(one, other) for other in known)],
+        )
     return state
 
 
@@ -196,7 +215,10 @@ def _coherent(state: State, axes: tuple[str, ...], density: Array) -> State:
     nothing = np.zeros_like(density)
     for pair in pair_rows(state.reduced) if "cross" in state.reduced else []:
         if set(pair) & set(axes):
-            both = [np.concatenate([density, nothing], axis=-1), np.concatenate([nothing, density], axis=-1)]
+            both = [
+                np.concatenate([density, nothing], axis=-1),
+                np.concatenate([nothing, density], axis=-1),
+            ]
             state = state.with_columns("cross", ",".join(pair), both)
     return state
 
@@ -231,13 +253,17 @@ def _order(state: State, part: Component) -> State:
     lines = state.reduced["line_frequency"].values
     taken = np.zeros(lines.size, np.bool_)
     for k in chosen:
-        taken |= (lines >= np.nanmin(turn) * (k + 1) - 2 * lines[0]) & (lines <= np.nanmax(turn) * (k + 1) + 2 * lines[0])
+        taken |= (lines >= np.nanmin(turn) * (k + 1) - 2 * lines[0]) & (
+            lines <= np.nanmax(turn) * (k + 1) + 2 * lines[0]
+        )
     return state.with_columns("line", "all", [taken])
 
 
 def _free_shape(state: State, axis: str) -> State:
     bands = state.weight.shape[2]
-    return state.with_columns("power", axis, [np.broadcast_to(one, state.weight.shape[1:]) for one in np.eye(bands)])
+    return state.with_columns(
+        "power", axis, [np.broadcast_to(one, state.weight.shape[1:]) for one in np.eye(bands)]
+    )
 
 
 def _profile(state: State, part: Component) -> State:
@@ -249,7 +275,10 @@ def _profile(state: State, part: Component) -> State:
 
 def _comb(state: State) -> NDArray[np.bool_]:
     """Lines at the multiples of the turns of the ramp, folded as samples see them."""
-    lines, rate = state.reduced["line_frequency"].values, float(state.reduced.attrs["sampling_rate_hz"])
+    lines, rate = (
+        state.reduced["line_frequency"].values,
+        float(state.reduced.attrs["sampling_rate_hz"]),
+    )
     turns = np.abs(state.reduced["ramp_turns"].values)
     turns = turns[np.isfinite(turns)]
     if not turns.size:
@@ -257,7 +286,9 @@ def _comb(state: State) -> NDArray[np.bool_]:
     number = np.arange(1, max(2, int(rate / max(turns.mean(), lines[0]))))
     low, high = (fold(number * one, rate) for one in (turns.min(), turns.max()))
     reach = _LINE_REACH * lines[0]
-    near = (lines[:, None] >= np.minimum(low, high) - reach) & (lines[:, None] <= np.maximum(low, high) + reach)
+    near = (lines[:, None] >= np.minimum(low, high) - reach) & (
+        lines[:, None] <= np.maximum(low, high) + reach
+    )
     return np.asarray(near.any(axis=1))
 
 
@@ -266,7 +297,11 @@ def _transfer(state: State, part: Component) -> State:
     power = reference_channel_power(part.candidate.witness[0], state.reduced)
     power = np.where(np.isfinite(power), power, 0.0)
     columns = np.concatenate(
-        [part.variant.design.real * np.sqrt(power)[:, None], part.variant.design.imag * np.sqrt(power)[:, None]], axis=-1
+        [
+            part.variant.design.real * np.sqrt(power)[:, None],
+            part.variant.design.imag * np.sqrt(power)[:, None],
+        ],
+        axis=-1,
     )
     state = state.with_columns("transfer", axis, list(np.moveaxis(columns, 1, 0)))
     for band in range(power.shape[1]):
@@ -323,7 +358,9 @@ def find_anomalous_blocks(part: Component, reduced: xr.Dataset) -> NDArray[np.bo
     if _everywhere(part) or not there.any():
         return np.zeros(there.size, np.bool_)
     count = reduced[part.variant.columns[0]].sel(axis=part.row[0]).values
-    usual = 0.0 if part.variant.columns[0] == "outliers" else float(np.median(count[there]))  # noise has as good as none
+    usual = (
+        0.0 if part.variant.columns[0] == "outliers" else float(np.median(count[there]))
+    )  # noise has as good as none
     odd = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
     return np.asarray(odd & (odd[there].mean() <= _ODD))
 
@@ -360,7 +397,13 @@ def reweighted(state: State, *, rounds: int = 4) -> State:
     for row, axis in enumerate(state.axes):
         named = state.given.get(("power", axis))
         if named:
-            weight[row] = _fit(state, row, axis, np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1), rounds)[0]
+            weight[row] = _fit(
+                state,
+                row,
+                axis,
+                np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1),
+                rounds,
+            )[0]
     return replace(state, weight=weight, reduced=without_turns(state.reduced, weight))
 
 
@@ -377,8 +420,8 @@ def power_shares(state: State, axis: str, *, rounds: int = 4) -> Array:
 def without_turns(reduced: xr.Dataset, expected: Array) -> xr.Dataset:
     """The record without the kurtosis and outliers that a changing level of the noise explains.
 
-    Two levels in one block have tails that neither of them has; and noise of another level than usual has another kurtosis, since
-    that of rounding gets lost in what is louder.
+    Two levels in one block have tails that neither of them has; and noise of another level than
+    usual has another kurtosis, since that of rounding gets lost in what is louder.
 
     Parameters
     ----------
@@ -404,14 +447,18 @@ def _fit(state: State, row: int, axis: str, named: Array, rounds: int) -> tuple[
     """Fitted powers of an axis, and the sizes of the named columns."""
     expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
     level, precision = noise_columns(state.baseline, axis=axis)
-    columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(expected.size, -1)
+    columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(
+        expected.size, -1
+    )
     size = np.maximum(np.abs(columns).max(axis=0), 1e-300)
     columns = columns / size
     prior = np.zeros(columns.shape[1])
     prior[: level.shape[2]] = np.diagonal(precision) / size[: level.shape[2]] ** 2
     power = state.reduced["power"].values[row].ravel()
     shape = state.reduced["shape"].values[row].ravel()
-    good = np.isfinite(power) & np.isfinite(shape) & ~np.repeat(state.masked[row], expected.shape[1])
+    good = (
+        np.isfinite(power) & np.isfinite(shape) & ~np.repeat(state.masked[row], expected.shape[1])
+    )
     fitted, sizes = expected.ravel().copy(), np.zeros(size.size)
     for _ in range(rounds):
         w = np.where(good, shape / fitted**2, 0.0)

@@ -19,7 +19,10 @@ __all__ = ["inside_bands", "is_filter", "response_of", "straightened"]
 
 Array = NDArray[np.float64]
 _INSIDE = 48  # frequencies in a band
-_SHARES, _PASSED = 50, 0.002  # sizes that are tried; least share that a filter of full form lets pass by
+_SHARES, _PASSED = (
+    50,
+    0.002,
+)  # sizes that are tried; least share that a filter of full form lets pass by
 _LOUD = 3.0  # times the level about, beyond which a line is cut
 _STOPPED = 0.05  # of the largest response, below which what is seen is leakage from elsewhere
 
@@ -30,7 +33,9 @@ def _share(power: Array, full: Array) -> float:
     passed = full >= _STOPPED * full.max()
     shares = 1.0 - np.append(np.geomspace(1.0, _PASSED, _SHARES), 0.0)
     form = 1.0 + shares[:, None] * (full[passed] - 1.0)
-    return float(shares[np.argmin(np.log((usual[passed] / form).mean(axis=1)) + np.log(form).mean(axis=1))])
+    return float(
+        shares[np.argmin(np.log((usual[passed] / form).mean(axis=1)) + np.log(form).mean(axis=1))]
+    )
 
 
 def is_filter(view: str, variant: Variant) -> bool:
@@ -40,7 +45,9 @@ def is_filter(view: str, variant: Variant) -> bool:
 
 def response_of(effect: Effect, reduced: xr.Dataset) -> Array:
     """Factor of the noise in the bands: the mean over the frequencies of each, for a filter is steep."""
-    return np.asarray(_response(effect, reduced, inside_bands(reduced)).reshape(-1, _INSIDE).mean(axis=1))
+    return np.asarray(
+        _response(effect, reduced, inside_bands(reduced)).reshape(-1, _INSIDE).mean(axis=1)
+    )
 
 
 def inside_bands(reduced: xr.Dataset) -> Array:
@@ -60,7 +67,8 @@ def straightened(
 ) -> tuple[xr.Dataset, NDArray[np.bool_]]:
     """The record with the line spectrum of an axis as it was before a filter, once only; and the lines that the filter stops.
 
-    A filter is named by the form of what it takes, of any size: a weak one is straightened by as much as the spectrum asks for.
+    A filter is named by the form of what it takes, of any size: a weak one is straightened by as
+    much as the spectrum asks for.
 
     Parameters
     ----------
@@ -74,11 +82,17 @@ def straightened(
     """
     frequency = reduced["line_frequency"].values
     full = _response(effects()[effect].example(**values), reduced, frequency)
-    weight, power = reduced["line_weight"].sel(axis=axis).values, reduced["line_power"].sel(axis=axis).transpose("part", "line").values
+    weight, power = (
+        reduced["line_weight"].sel(axis=axis).values,
+        reduced["line_power"].sel(axis=axis).transpose("part", "line").values,
+    )
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     response = full
     if good.any():
-        response = 1.0 + _share(np.average(power[good], axis=0, weights=weight[good]) / np.maximum(expected, 1e-300), full) * (full - 1.0)
+        response = 1.0 + _share(
+            np.average(power[good], axis=0, weights=weight[good]) / np.maximum(expected, 1e-300),
+            full,
+        ) * (full - 1.0)
     stopped = response < _STOPPED * response.max()
     done = str(reduced.attrs.get("straightened", "")).split()
     if axis in done:
@@ -86,4 +100,6 @@ def straightened(
     here = reduced["axis"] == axis
     factor = xr.DataArray(np.maximum(response, _STOPPED * response.max()), dims="line")
     before = reduced["line_power"]
-    return reduced.assign(line_power=before.where(~here, before / factor)).assign_attrs(straightened=" ".join([*done, axis])), stopped
+    return reduced.assign(line_power=before.where(~here, before / factor)).assign_attrs(
+        straightened=" ".join([*done, axis])
+    ), stopped

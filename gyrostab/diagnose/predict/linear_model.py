@@ -1,7 +1,7 @@
 """Views whose noise is independent from cell to cell: powers, cross-spectra, orders, profiles, transfers, as linear models.
 
-The data may be a recording or null records, with the dimension ``record`` in front. Weights and given columns are those of a `State`: what
-is believed of the noise, and what is named so far.
+The data may be a recording or null records, with the dimension ``record`` in front. Weights and
+given columns are those of a `State`: what is believed of the noise, and what is named so far.
 """
 
 from __future__ import annotations
@@ -36,9 +36,13 @@ __all__ = [
 ]
 
 Array = NDArray[Any]
-_MOVING = 9.0  # times the noise, beyond which the power of an axis is motion: three times in amplitude
+_MOVING = (
+    9.0  # times the noise, beyond which the power of an axis is motion: three times in amplitude
+)
 _CALM = 0.25  # of the blocks that are calm
-_LEAST_SHARE = 0.05  # of the variance of a cross-spectrum, that is left beside the phase of what is shared
+_LEAST_SHARE = (
+    0.05  # of the variance of a cross-spectrum, that is left beside the phase of what is shared
+)
 
 
 @dataclass(frozen=True)
@@ -52,12 +56,13 @@ class State:
     baseline : xarray.Dataset
         From `gyrostab.diagnose.baseline.calibrate`.
     weight : ndarray, shape (axis, block, band)
-        Powers that the weights of all cells are taken from [degree2 hour-2 Hz-1]: the expected ones and those of the effects so far.
+        Powers that the weights of all cells are taken from [degree2 hour-2 Hz-1]: the expected ones
+        and those of the effects so far.
     masked : ndarray of bool, shape (axis, block)
         Blocks of which powers and cross-spectra are left out.
     given : mapping of (str, str) to list of ndarray
-        (view, row) -> columns that are in the model with and without a candidate; the row is an axis, or both axes of a pair with a
-        comma between.
+        (view, row) -> columns that are in the model with and without a candidate; the row is an
+        axis, or both axes of a pair with a comma between.
     """
 
     reduced: xr.Dataset
@@ -86,16 +91,23 @@ def begin_state(reduced: xr.Dataset, baseline: xr.Dataset) -> State:
 
 def drawn(cells: LinearModel, rng: np.random.Generator, count: int) -> LinearModel:
     """The same cells with noise alone, `count` records of it."""
-    spread = np.where(cells.weight > 0.0, 1.0 / np.sqrt(np.where(cells.weight > 0.0, cells.weight, 1.0)), 0.0)
+    spread = np.where(
+        cells.weight > 0.0, 1.0 / np.sqrt(np.where(cells.weight > 0.0, cells.weight, 1.0)), 0.0
+    )
     return cells._replace(values=spread[..., None] * rng.standard_normal((*spread.shape, count)))
 
 
 def in_place(reduced: xr.Dataset, row: str = "axis") -> Array:
     """Share of a density that the samples of each block show at its own frequencies, (axis or pair, block): 1 without gaps.
 
-    Random gaps spread the rest over all frequencies. That the tapered ends of a block have fewer neighbours spreads nothing.
+    Random gaps spread the rest over all frequencies. That the tapered ends of a block have fewer
+    neighbours spreads nothing.
     """
-    near = reduced["neighbours" if row == "axis" else "cross_neighbours"].transpose(row, "block").values
+    near = (
+        reduced["neighbours" if row == "axis" else "cross_neighbours"]
+        .transpose(row, "block")
+        .values
+    )
     weights = taper(int(reduced.attrs["block_samples"]))
     whole = float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())
     return np.minimum(np.where(np.isfinite(near), near, whole) / whole, 1.0)
@@ -127,14 +139,21 @@ def _row_of(density: Array, row: int) -> Array:
 
 def pair_rows(reduced: xr.Dataset) -> list[tuple[str, ...]]:
     """Both axes of each pair."""
-    return [(str(a), str(b)) for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)]
+    return [
+        (str(a), str(b))
+        for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)
+    ]
 
 
 def cross_without(reduced: xr.Dataset, left_out: NDArray[np.bool_]) -> xr.DataArray:
     """Covariances of the pairs of axes without the blocks that are left out on either, (axis, block)."""
     axes = [str(axis) for axis in reduced["axis"].values]
-    pairs = np.array([[axes.index(axis) for axis in pair] for pair in pair_rows(reduced)], np.int64).reshape(-1, 2)
-    return reduced["cross"].where(~xr.DataArray(left_out[pairs].any(axis=1), dims=("pair", "block")))
+    pairs = np.array(
+        [[axes.index(axis) for axis in pair] for pair in pair_rows(reduced)], np.int64
+    ).reshape(-1, 2)
+    return reduced["cross"].where(
+        ~xr.DataArray(left_out[pairs].any(axis=1), dims=("pair", "block"))
+    )
 
 
 def statistic_rows(candidate: Candidate, state: State) -> list[tuple[str, ...]]:
@@ -147,7 +166,9 @@ def statistic_rows(candidate: Candidate, state: State) -> list[tuple[str, ...]]:
     return [(axis,) for axis in state.axes]
 
 
-def build_linear_model(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
+def build_linear_model(
+    candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+) -> LinearModel:
     """One row of a view for candidates of that view that have the same rows; the designs are those of all their variants in order.
 
     Candidates of the view "transfer" must have the same witness.
@@ -155,7 +176,8 @@ def build_linear_model(candidates: Sequence[Candidate], row: int, data: xr.Datas
     return _BUILDERS[candidates[0].view](candidates, row, data, state)
 
 
-# ---------------------------------------------------------------------------------------------------------------- frames
+# ----------------------------------------------------------------------------------------------------------------
+# frames
 
 
 def _records(values: Array, plain: int) -> Array:
@@ -168,7 +190,14 @@ def _parts(values: Array, axis: int = -1) -> Array:
     return np.concatenate([values.real, values.imag], axis=axis)
 
 
-def _beside(state: State, view: str, row: tuple[str, ...], shape: tuple[int, ...], known: Sequence[Array] = (), precision: Any = ()) -> Any:
+def _beside(
+    state: State,
+    view: str,
+    row: tuple[str, ...],
+    shape: tuple[int, ...],
+    known: Sequence[Array] = (),
+    precision: Any = (),
+) -> Any:
     """Given columns (block, cell, column) and their precision: those known beforehand, and those of the effects named."""
     named = state.given.get((view, ",".join(row)), [])
     columns = [np.broadcast_to(one, shape) for one in [*known, *named]]
@@ -181,7 +210,8 @@ def _spread(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
     return np.stack([np.broadcast_to(one, shape) for one in columns], axis=-1)
 
 
-# --------------------------------------------------------------------------------------------------------------- powers
+# ---------------------------------------------------------------------------------------------------------------
+# powers
 
 
 def power_column(density: Array, row: int, state: State) -> Array:
@@ -190,11 +220,19 @@ def power_column(density: Array, row: int, state: State) -> Array:
     return np.broadcast_to(seen, state.weight.shape[1:])
 
 
-def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
+def _power(
+    candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+) -> LinearModel:
     axis = state.axes[row]
     expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
-    values = _records(data["power"].transpose(..., "axis", "block", "band").values, 3)[row] - expected[..., None]
-    weight = state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values / state.weight[row] ** 2
+    values = (
+        _records(data["power"].transpose(..., "axis", "block", "band").values, 3)[row]
+        - expected[..., None]
+    )
+    weight = (
+        state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values
+        / state.weight[row] ** 2
+    )
     weight = np.where(state.masked[row][:, None], 0.0, weight)
     level, precision = noise_columns(state.baseline, axis=axis)
     known = [level[..., number] * expected for number in range(level.shape[2])]
@@ -206,11 +244,14 @@ def _power(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
         for variant in each.variants
     ]
     return independent(
-        LinearModel(values, weight, designs, given, whole), state.baseline["common"].sel(axis=axis).values, state.weight[row]
+        LinearModel(values, weight, designs, given, whole),
+        state.baseline["common"].sel(axis=axis).values,
+        state.weight[row],
     )
 
 
-# --------------------------------------------------------------------------------------------------------------- crosses
+# ---------------------------------------------------------------------------------------------------------------
+# crosses
 
 
 def cross_column(density: Array, row: int, reduced: xr.Dataset) -> Array:
@@ -221,40 +262,72 @@ def cross_column(density: Array, row: int, reduced: xr.Dataset) -> Array:
 
 def known_cross(baseline: xr.Dataset) -> Array | None:
     """Cross-spectra that the baseline expects, (pair, block, band); None where it expects nothing of them."""
-    return np.asarray(baseline["cross"].transpose("pair", "block", "band").values) if "cross" in baseline else None
+    return (
+        np.asarray(baseline["cross"].transpose("pair", "block", "band").values)
+        if "cross" in baseline
+        else None
+    )
 
 
-def _cross(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
+def _cross(
+    candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+) -> LinearModel:
     pair = pair_rows(state.reduced)[row]
     i, j = (state.axes.index(axis) for axis in pair)
     known = known_cross(state.baseline)
     shared = known[row] if known is not None else np.zeros(1)
-    values = _records(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row] - shared[..., None]
+    values = (
+        _records(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row]
+        - shared[..., None]
+    )
     shape = state.reduced["cross_shape"].transpose("pair", "block", "band").values[row]
-    alone, apart = state.weight[i] * state.weight[j], (shared**2).real  # in phase with what is shared the scatter is larger, beside it less
-    weight = np.concatenate([2.0 * shape / (alone + apart), 2.0 * shape / np.maximum(alone - apart, _LEAST_SHARE * alone)], axis=1)
+    alone, apart = (
+        state.weight[i] * state.weight[j],
+        (shared**2).real,
+    )  # in phase with what is shared the scatter is larger, beside it less
+    weight = np.concatenate(
+        [
+            2.0 * shape / (alone + apart),
+            2.0 * shape / np.maximum(alone - apart, _LEAST_SHARE * alone),
+        ],
+        axis=1,
+    )
     weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
     given, precision = _beside(state, "cross", pair, weight.shape)
     near, width = in_place(state.reduced, "pair")[row], band_widths(state.reduced)
     designs = [
-        _spread([_parts(_mixed(_row_of(one, row) + 0j, near, width)) for one in variant.design], weight.shape)
+        _spread(
+            [_parts(_mixed(_row_of(one, row) + 0j, near, width)) for one in variant.design],
+            weight.shape,
+        )
         for each in candidates
         for variant in each.variants
     ]
     return LinearModel(_parts(values, axis=1), weight, designs, given, precision)
 
 
-# ---------------------------------------------------------------------------------------------------------------- orders
+# ----------------------------------------------------------------------------------------------------------------
+# orders
 
 
 def order_weight(state: State) -> Array:
     """(axis, block, harmonic): one over the variance of each part of a complex amplitude."""
     reduced = state.reduced
     rate, frequency = float(reduced.attrs["sampling_rate_hz"]), reduced["frequency"].values
-    place = np.abs(reduced["channel_rotation_rate"].values)[:, None] / 360.0 * reduced["harmonic"].values
-    good = np.isfinite(reduced["order"].values) & (place * float(reduced.attrs["block_s"]) >= 2.0) & (place < rate / 2.0)
+    place = (
+        np.abs(reduced["channel_rotation_rate"].values)[:, None]
+        / 360.0
+        * reduced["harmonic"].values
+    )
+    good = (
+        np.isfinite(reduced["order"].values)
+        & (place * float(reduced.attrs["block_s"]) >= 2.0)
+        & (place < rate / 2.0)
+    )
     nearest = np.abs(np.log(np.maximum(place, frequency[0])[..., None] / frequency)).argmin(axis=-1)
-    level = np.take_along_axis(state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2)
+    level = np.take_along_axis(
+        state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2
+    )
     level = noise_at_orders(reduced, level)
     seconds = reduced["samples"].values[..., None] / rate
     return np.where(good, seconds / (2.0 * level), 0.0)
@@ -275,23 +348,36 @@ def order_columns(pattern: Array, chosen: tuple[int, ...]) -> list[Array]:
     return columns
 
 
-def _order(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
+def _order(
+    candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+) -> LinearModel:
     values = _records(data["order"].transpose(..., "axis", "block", "harmonic").values, 3)
     weight = order_weight(state)
     count = weight.shape[-1]
     if candidates[0].each:
         both = np.concatenate([weight[row], weight[row]], axis=1)
-        designs = [_spread(order_columns(np.ones(count, complex), chosen), both.shape) for chosen in harmonic_sets(count)]
+        designs = [
+            _spread(order_columns(np.ones(count, complex), chosen), both.shape)
+            for chosen in harmonic_sets(count)
+        ]
         given, precision = _beside(state, "order", (state.axes[row],), both.shape)
-        return LinearModel(_parts(values[row], axis=1), both, designs * len(candidates), given, precision)
-    both = np.concatenate([np.concatenate([one, one], axis=1) for one in weight], axis=1)  # the cells of all axes side by side
+        return LinearModel(
+            _parts(values[row], axis=1), both, designs * len(candidates), given, precision
+        )
+    both = np.concatenate(
+        [np.concatenate([one, one], axis=1) for one in weight], axis=1
+    )  # the cells of all axes side by side
     stacked = np.concatenate([_parts(one, axis=1) for one in values], axis=1)
     designs = []
     for each in candidates:
         for variant in each.variants:
             for pattern in (variant.design[0], np.conj(variant.design[0])):
                 by_axis = [order_columns(one, (0,)) for one in pattern]
-                designs.append(_spread([np.concatenate(parts) for parts in zip(*by_axis, strict=True)], both.shape))
+                designs.append(
+                    _spread(
+                        [np.concatenate(parts) for parts in zip(*by_axis, strict=True)], both.shape
+                    )
+                )
     named = [state.given.get(("order", axis), []) for axis in state.axes]
     given, precision = np.empty((*both.shape, 0)), np.empty((0, 0))
     for number, columns in enumerate(named):
@@ -304,24 +390,36 @@ def _order(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: S
     return LinearModel(stacked, both, designs, given, precision)
 
 
-# -------------------------------------------------------------------------------------------------------------- profiles
+# --------------------------------------------------------------------------------------------------------------
+# profiles
 
 
-def _profile(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
+def _profile(
+    candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+) -> LinearModel:
     values = _records(data["profile"].transpose(..., "axis", "block", "phase").values, 3)[row]
     rate = float(state.reduced.attrs["sampling_rate_hz"])
     width = (state.reduced["band_high"] - state.reduced["band_low"]).values
     variance = rate * (state.weight[row] * width).sum(axis=-1) / width.sum()
     weight = state.reduced["profile_samples"].values[row] / variance[:, None]
-    given, precision = _beside(state, "phase_locked", (state.axes[row],), weight.shape, [np.ones(weight.shape[1])], [-1.0])
-    designs = [_spread(list(variant.design), weight.shape) for each in candidates for variant in each.variants]
+    given, precision = _beside(
+        state, "phase_locked", (state.axes[row],), weight.shape, [np.ones(weight.shape[1])], [-1.0]
+    )
+    designs = [
+        _spread(list(variant.design), weight.shape)
+        for each in candidates
+        for variant in each.variants
+    ]
     return LinearModel(values, weight, designs, given, precision)
 
 
-# ------------------------------------------------------------------------------------------------------------- transfers
+# -------------------------------------------------------------------------------------------------------------
+# transfers
 
 
-def reference_channel_of(name: str, row: int, data: xr.Dataset, reduced: xr.Dataset, baseline: xr.Dataset) -> tuple[Array, Array]:
+def reference_channel_of(
+    name: str, row: int, data: xr.Dataset, reduced: xr.Dataset, baseline: xr.Dataset
+) -> tuple[Array, Array]:
     """Cross-power of an axis with a channel or another axis, (block, band, record), and the power of that, (block, band).
 
     What both axes are known to share is taken off.
@@ -335,32 +433,46 @@ def reference_channel_of(name: str, row: int, data: xr.Dataset, reduced: xr.Data
         found = np.full(cross.shape[1:], np.nan + 0j)
         for number, pair in enumerate(pair_rows(reduced)):
             if set(pair) == {name, axes[row]} and name != axes[row]:
-                found = np.where(there, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan)
+                found = np.where(
+                    there, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan
+                )
         return found, reference_channel_power(name, reduced)
     place = [str(one) for one in reduced["witness"].values].index(name)
-    cross = _records(data["witness_cross"].transpose(..., "axis", "witness", "block", "band").values, 4)
+    cross = _records(
+        data["witness_cross"].transpose(..., "axis", "witness", "block", "band").values, 4
+    )
     return cross[row, place], reference_channel_power(name, reduced)
 
 
 def reference_channel_power(name: str, reduced: xr.Dataset) -> Array:
     """Power of a channel on the log's time, or of an axis as it measured, (block, band)."""
     if name in reduced["axis"].values:
-        return np.asarray(measured(reduced, "power").sel(axis=name).transpose("block", "band").values)
+        return np.asarray(
+            measured(reduced, "power").sel(axis=name).transpose("block", "band").values
+        )
     return np.asarray(reduced["witness_power"].sel(witness=name).transpose("block", "band").values)
 
 
-def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State) -> LinearModel:
-    cross, power = reference_channel_of(candidates[0].witness[0], row, data, state.reduced, state.baseline)
+def _transfer(
+    candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+) -> LinearModel:
+    cross, power = reference_channel_of(
+        candidates[0].witness[0], row, data, state.reduced, state.baseline
+    )
     root = np.sqrt(np.where(power > 0.0, power, np.nan))
     share = _moving_share(candidates[0].witness[0], power, state)
     weight = 2.0 * state.reduced["shape"].values[row] / state.weight[row]
-    weight = np.where(np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0)
+    weight = np.where(
+        np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0
+    )
     weight = np.concatenate([weight, weight], axis=1)
     with np.errstate(invalid="ignore"):
         values = _parts(cross / root[..., None], axis=1)
     given, precision = _beside(state, "transfer", (state.axes[row],), weight.shape)
     designs = [
-        _spread([_parts(one * root * share) for one in variant.design], weight.shape) for each in candidates for variant in each.variants
+        _spread([_parts(one * root * share) for one in variant.design], weight.shape)
+        for each in candidates
+        for variant in each.variants
     ]
     return LinearModel(values, weight, designs, given, precision)
 
@@ -368,8 +480,9 @@ def _transfer(candidates: Sequence[Candidate], row: int, data: xr.Dataset, state
 def _moving_share(name: str, power: Array, state: State) -> Array:
     """Share of the power of another axis (block, band) that is motion; 1 for a channel, whose noise is not known.
 
-    What leaks is motion that comes and goes: while the tool rests axes may have noise and lines in common, which is no leak. So what an
-    axis shows in the calmer blocks of a band, and its expected noise, are no motion.
+    What leaks is motion that comes and goes: while the tool rests axes may have noise and lines in
+    common, which is no leak. So what an axis shows in the calmer blocks of a band, and its expected
+    noise, are no motion.
     """
     if name not in state.axes:
         return np.ones_like(power)
@@ -382,4 +495,10 @@ def _moving_share(name: str, power: Array, state: State) -> Array:
         return np.where(power > _MOVING * noise, 1.0 - noise / power, 0.0)
 
 
-_BUILDERS = {"power": _power, "cross": _cross, "order": _order, "phase_locked": _profile, "transfer": _transfer}
+_BUILDERS = {
+    "power": _power,
+    "cross": _cross,
+    "order": _order,
+    "phase_locked": _profile,
+    "transfer": _transfer,
+}

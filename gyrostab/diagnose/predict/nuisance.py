@@ -28,8 +28,9 @@ _STRETCHES = 240  # stretches of time that are tried
 def stretches(blocks: int, most: int = _STRETCHES) -> NDArray[np.int64]:
     """First block and the one behind the last of stretches of time, (stretch, 2): single blocks, two, four and so on, up to half of them.
 
-    Each begins half its length behind the one before. Where there are too many of a length, these are left out but at both ends of the
-    record, where all that a law of time says of a short event is said.
+    Each begins half its length behind the one before. Where there are too many of a length, these
+    are left out but at both ends of the record, where all that a law of time says of a short event
+    is said.
 
     Examples
     --------
@@ -41,9 +42,13 @@ def stretches(blocks: int, most: int = _STRETCHES) -> NDArray[np.int64]:
     lengths = [2**power for power in range(max(1, blocks // 2).bit_length())]
     first = [np.arange(0, blocks - length + 1, max(1, length // 2)) for length in lengths]
     while sum(one.size for one in first) > most:
-        longest = next(number for number, one in enumerate(first) if one.size > 2)  # of the stretches that are many these are the shortest
+        longest = next(
+            number for number, one in enumerate(first) if one.size > 2
+        )  # of the stretches that are many these are the shortest
         first[longest] = np.array([0, blocks - lengths[longest]])
-    return np.concatenate([np.stack([one, one + length], axis=1) for one, length in zip(first, lengths, strict=True)])
+    return np.concatenate(
+        [np.stack([one, one + length], axis=1) for one, length in zip(first, lengths, strict=True)]
+    )
 
 
 def splines(begin: Array, end: Array, knots: int = _KNOTS) -> Array:
@@ -66,13 +71,22 @@ def nuisance_alternatives(reduced: xr.Dataset) -> list[Candidate]:
     bands = reduced.sizes["band"]
     level = hats[:, None, :, None] * white
     shapes = np.eye(bands)[:, None, None, :]
-    bursts = tuple(_burst(first, stop, reduced, white) for first, stop in stretches(reduced.sizes["block"]).tolist())
+    bursts = tuple(
+        _burst(first, stop, reduced, white)
+        for first, stop in stretches(reduced.sizes["block"]).tolist()
+    )
     found = [
         Candidate("~bias(t)", "mean", (), (Variant({}, _numbered(len(hats)), hats[:, None, :]),)),
         Candidate("~N(t)", "power", (), (Variant({}, _numbered(len(hats)), level),)),
         Candidate("~burst", "power", (), bursts),
         Candidate("~S(f)", "power", (), (*_alone(shapes), Variant({}, _numbered(bands), shapes))),
-        Candidate("~outliers", "marks", (), (Variant({}, ("kurtosis",), np.empty(0)),), marks=("kurtosis",)),
+        Candidate(
+            "~outliers",
+            "marks",
+            (),
+            (Variant({}, ("kurtosis",), np.empty(0)),),
+            marks=("kurtosis",),
+        ),
     ]
     if "cross" in reduced and reduced.sizes["pair"]:
         found.append(Candidate("~cov", "cross", (), _covariances(bands)))
@@ -92,13 +106,18 @@ def _numbered(count: int) -> tuple[str, ...]:
 
 
 def _alone(designs: Array) -> tuple[Variant, ...]:
-    return tuple(Variant({"band": float(number)}, ("0",), one[None]) for number, one in enumerate(designs))
+    return tuple(
+        Variant({"band": float(number)}, ("0",), one[None]) for number, one in enumerate(designs)
+    )
 
 
 def _covariances(bands: int) -> tuple[Variant, ...]:
     """Covariance in any one band, or in four groups of bands, with any phase."""
     alone = [np.eye(bands)[number] for number in range(bands)]
-    groups = [np.isin(np.arange(bands), part).astype(float) for part in np.array_split(np.arange(bands), min(4, bands))]
+    groups = [
+        np.isin(np.arange(bands), part).astype(float)
+        for part in np.array_split(np.arange(bands), min(4, bands))
+    ]
     variants = [_phased([one]) for one in alone]
     return (*variants, _phased(groups))
 

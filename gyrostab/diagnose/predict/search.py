@@ -26,15 +26,30 @@ from gyrostab.diagnose.evidence.telegraph import TelegraphCourses, telegraph_evi
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.linear_model import State, build_linear_model, drawn, statistic_rows
 
-__all__ = ["CountEvidence", "Found", "compute_evidence", "fast_switching_evidence", "of_means", "together", "totals"]
+__all__ = [
+    "CountEvidence",
+    "Found",
+    "compute_evidence",
+    "fast_switching_evidence",
+    "of_means",
+    "together",
+    "totals",
+]
 
 Array = NDArray[np.float64]
-_OF_MEANS, _TAILS = ("mean", "levels"), ("kurtosis", "outliers")  # views of means; what the means do not hear of
+_OF_MEANS, _TAILS = (
+    ("mean", "levels"),
+    ("kurtosis", "outliers"),
+)  # views of means; what the means do not hear of
 _PRICE = 1.5  # nats that another axis or view must bring
 _WITHIN = 2.0  # blocks that a bias stays on a level at most, where pieces of blocks know it better
 _LONG = 3.0  # the same, where they can refute it
-_STEP = 16.0  # standard deviations of a block's mean, above which four parts of a block are too few for its course
-_MOST_BLOCKS = 20_000  # of null records that come together, in which two levels are sought on an axis
+# standard deviations of a block's mean, above which four parts of a block are too few for its
+# course
+_STEP = 16.0
+_MOST_BLOCKS = (
+    20_000  # of null records that come together, in which two levels are sought on an axis
+)
 
 
 @dataclass(frozen=True)
@@ -116,7 +131,9 @@ def compute_evidence(
     found: list[Found] = []
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for one in candidates:
-        groups.setdefault((one.view, one.witness, one.each if one.view == "order" else True), []).append(one)
+        groups.setdefault(
+            (one.view, one.witness, one.each if one.view == "order" else True), []
+        ).append(one)
     for (view, *_), group in groups.items():
         if view == "mean":
             found += _means(group, data, state, folds)
@@ -143,7 +160,11 @@ def of_means(found: Sequence[Found], before: State, now: State) -> list[Found]:
 
 
 def _of_means_given(state: State) -> dict[tuple[str, str], list[int]]:
-    return {key: [id(column) for column in columns] for key, columns in state.given.items() if key[0] in ("mean", "inner") and columns}
+    return {
+        key: [id(column) for column in columns]
+        for key, columns in state.given.items()
+        if key[0] in ("mean", "inner") and columns
+    }
 
 
 def totals(found: Sequence[Found]) -> dict[str, Array]:
@@ -160,34 +181,60 @@ def together(gain: Array) -> Array:
     return np.asarray(good[..., -1] + np.maximum(good[..., :-1] - _PRICE, 0.0).sum(axis=-1))
 
 
-def _collect(group: Sequence[Candidate], rows: list[tuple[str, ...]], factors: list[Array], spread: int = 1) -> list[Found]:
+def _collect(
+    group: Sequence[Candidate], rows: list[tuple[str, ...]], factors: list[Array], spread: int = 1
+) -> list[Found]:
     """From the factors of all variants of a group, row by row."""
     variants = [[one for one in each.variants for _ in range(spread)] for each in group]
     owner = np.repeat(np.arange(len(group)), [len(several) for several in variants])
     weight = [one.weight for several in variants for one in several]
-    gain = np.stack([score(one, owner, weight=weight) for one in factors], axis=-1)  # (candidate, record, row)
-    first = np.stack([one[0, :, 0] for one in factors], axis=-1) + np.log(weight)[:, None]  # (design, row)
+    gain = np.stack(
+        [score(one, owner, weight=weight) for one in factors], axis=-1
+    )  # (candidate, record, row)
+    first = (
+        np.stack([one[0, :, 0] for one in factors], axis=-1) + np.log(weight)[:, None]
+    )  # (design, row)
     out = []
     for number, each in enumerate(group):
         own = first[owner == number]
         best = tuple(variants[number][int(place)] for place in own.argmax(axis=0))
-        out.append(Found(each, rows, gain[number], best, own.argmax(axis=0)[None] if spread > 1 else np.empty((0, 0), np.int64)))
+        out.append(
+            Found(
+                each,
+                rows,
+                gain[number],
+                best,
+                own.argmax(axis=0)[None] if spread > 1 else np.empty((0, 0), np.int64),
+            )
+        )
     return out
 
 
-def _means(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray) -> list[Found]:
+def _means(
+    group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray
+) -> list[Found]:
     factors = []
     for row, axis in enumerate(state.axes):
         designs = [
-            np.moveaxis(variant.design[:, row if variant.design.shape[1] > 1 else 0], 0, -1) for each in group for variant in each.variants
+            np.moveaxis(variant.design[:, row if variant.design.shape[1] > 1 else 0], 0, -1)
+            for each in group
+            for variant in each.variants
         ]
         given = state.given.get(("mean", axis))
         beside = np.stack(given, axis=-1) if given else None
-        factors.append(mean_factors(data, state.baseline, designs, axis=axis, given=beside, folds=folds)[:, 1:])
+        factors.append(
+            mean_factors(data, state.baseline, designs, axis=axis, given=beside, folds=folds)[:, 1:]
+        )
     return _collect(group, [(axis,) for axis in state.axes], factors)
 
 
-def _cells(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray, rng: np.random.Generator | None) -> list[Found]:
+def _cells(
+    group: Sequence[Candidate],
+    data: xr.Dataset,
+    state: State,
+    folds: xr.DataArray,
+    rng: np.random.Generator | None,
+) -> list[Found]:
     rows = statistic_rows(group[0], state)
     if not rows:  # pairs of a single axis
         return []
@@ -203,7 +250,13 @@ def _cells(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
     return _collect(group, rows, factors, spread)
 
 
-def _marks(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr.DataArray, tallies: CountEvidence) -> list[Found]:
+def _marks(
+    group: Sequence[Candidate],
+    data: xr.Dataset,
+    state: State,
+    folds: xr.DataArray,
+    tallies: CountEvidence,
+) -> list[Found]:
     subsets = fold_subsets(folds)
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     coarse = has_coarse_grid(state.reduced)
@@ -211,7 +264,12 @@ def _marks(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
     for each in group:
         gain, best = [], []
         for variant in each.variants:
-            parts = [np.where(coarse & (name in GRID_COUNTS), 0.0, _mark(name, data, state, subsets, tallies)) for name in variant.columns]
+            parts = [
+                np.where(
+                    coarse & (name in GRID_COUNTS), 0.0, _mark(name, data, state, subsets, tallies)
+                )
+                for name in variant.columns
+            ]
             gain.append(np.max(parts, axis=0))
         place = np.argmax([one[0] for one in gain], axis=0)
         best = [each.variants[int(number)] for number in place]
@@ -219,11 +277,16 @@ def _marks(group: Sequence[Candidate], data: xr.Dataset, state: State, folds: xr
     return out
 
 
-def _mark(name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_], tallies: CountEvidence) -> Array:
+def _mark(
+    name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_], tallies: CountEvidence
+) -> Array:
     """Gain of a raised statistic, (record, axis)."""
     records = data.sizes.get("record", 1)
     if name == "lattice":
-        return np.broadcast_to(_lattice(state, tallies) if "record" not in data.dims else 0.0, (records, len(state.axes)))
+        return np.broadcast_to(
+            _lattice(state, tallies) if "record" not in data.dims else 0.0,
+            (records, len(state.axes)),
+        )
     if name not in data or name not in tallies.of:
         return np.zeros((records, len(state.axes)))
     values = data[name].transpose(..., "axis", "block").values.astype(np.float64)
@@ -236,14 +299,20 @@ def _mark(name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_],
 def _lattice(state: State, tallies: CountEvidence) -> Array:
     """Samples of a rounded rate, one nat each: noise without a lattice never stands on it."""
     samples = state.reduced["samples"].transpose("axis", "block").values.sum(axis=1)
-    return np.where(tallies.rounded, samples, 0.0).astype(np.float64) if tallies.rounded.size else np.zeros(samples.size)
+    return (
+        np.where(tallies.rounded, samples, 0.0).astype(np.float64)
+        if tallies.rounded.size
+        else np.zeros(samples.size)
+    )
 
 
 def _lines(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[Found]:
     power = data["line_power"].transpose(..., "axis", "part", "line").values
     power = power if power.ndim == 4 else power[None]
     expected = expected_lines(state.baseline, state.reduced["line_frequency"].values)
-    gain = line_evidence(power, state.reduced["line_weight"].transpose("axis", "part").values, expected)
+    gain = line_evidence(
+        power, state.reduced["line_weight"].transpose("axis", "part").values, expected
+    )
     taken = state.given.get(("line", "all"), [])
     for mask in taken:
         gain = np.where(mask, -np.inf, gain)
@@ -252,23 +321,31 @@ def _lines(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[F
     best = np.where(np.isfinite(best), best, -np.log(power.shape[-1]))
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     places = np.repeat(place[:, None], len(rows), axis=1)
-    return [Found(each, rows, best, tuple(each.variants[0] for _ in rows), places) for each in group]
+    return [
+        Found(each, rows, best, tuple(each.variants[0] for _ in rows), places) for each in group
+    ]
 
 
 def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[Found]:
     """A bias of two levels, by axis.
 
-    Its gain is below the logarithm of a Bayes factor, which chance lets pass x nats in exp(-x) of all records at most. So where
-    records are long, some of the null records are enough.
+    Its gain is below the logarithm of a Bayes factor, which chance lets pass x nats in exp(-x) of
+    all records at most. So where records are long, some of the null records are enough.
     """
     records = data.sizes.get("record", 1)
-    some = data.isel(record=slice(max(1, _MOST_BLOCKS // data.sizes["block"]))) if "record" in data.dims else data
+    some = (
+        data.isel(record=slice(max(1, _MOST_BLOCKS // data.sizes["block"])))
+        if "record" in data.dims
+        else data
+    )
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     gain = np.full((records, len(rows)), -np.inf)
     courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
     for row, axis in enumerate(state.axes):
         given = state.given.get(("mean", axis))
-        found, course = telegraph_evidence(some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None)
+        found, course = telegraph_evidence(
+            some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None
+        )
         gain[: found.size, row] = found
         within, refuted = _within(some, state, axis, course, float(found[0]))
         if refuted:
@@ -276,10 +353,15 @@ def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[
         if within is not None:
             gain[0, row] = max(within.gain, gain[0, row])
         courses.append((course, within))
-    return [Found(each, rows, gain, tuple(_course(each.variants[0], *one, state) for one in courses)) for each in group]
+    return [
+        Found(each, rows, gain, tuple(_course(each.variants[0], *one, state) for one in courses))
+        for each in group
+    ]
 
 
-def _within(data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, gain: float) -> tuple[SwitchingEvidence | None, bool]:
+def _within(
+    data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, gain: float
+) -> tuple[SwitchingEvidence | None, bool]:
     """Hops within blocks, where these tell more than the means of blocks do; and whether they say that there are not two levels."""
     found, block = _hops(data, state, axis), float(state.reduced.attrs["block_s"])
     if found is None:
@@ -294,12 +376,18 @@ def _within(data: xr.Dataset, state: State, axis: str, course: TelegraphCourses,
 def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
     """Two levels between which the bias hops within blocks; None where there are none."""
     found = _hops(data, state, axis)
-    return found if found is not None and _resolved(found, float(state.reduced.attrs["block_s"])) else None
+    return (
+        found
+        if found is not None and _resolved(found, float(state.reduced.attrs["block_s"]))
+        else None
+    )
 
 
 def _resolved(found: SwitchingEvidence, block: float) -> bool:
     """Whether pieces of blocks of so many seconds tell two levels; what is shorter than a piece is a spike."""
-    return bool(np.isfinite(found.gain)) and float(found.times.min()) >= block / found.share.shape[1]
+    return (
+        bool(np.isfinite(found.gain)) and float(found.times.min()) >= block / found.share.shape[1]
+    )
 
 
 def _hops(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
@@ -307,15 +395,24 @@ def _hops(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None
     known, inner = (state.given.get((view, axis), []) for view in ("mean", "inner"))
     if len(inner) < len(known):
         return None
-    return switching_evidence(data, state.baseline, axis=axis, given=np.stack(inner, axis=-1) if inner else None)
+    return switching_evidence(
+        data, state.baseline, axis=axis, given=np.stack(inner, axis=-1) if inner else None
+    )
 
 
-def _course(variant: Variant, found: TelegraphCourses, within: SwitchingEvidence | None, state: State) -> Variant:
+def _course(
+    variant: Variant, found: TelegraphCourses, within: SwitchingEvidence | None, state: State
+) -> Variant:
     """The variant with the course of the first record, and its mean times [s]."""
     if within is not None:
         low, high = within.times
         values = {"low": float(low), "high": float(high), "hops": within.hops}
-        return replace(variant, values=values, design=within.share.mean(axis=1)[None, None], inside=within.share)
+        return replace(
+            variant,
+            values=values,
+            design=within.share.mean(axis=1)[None, None],
+            inside=within.share,
+        )
     block = float(state.reduced.attrs["block_s"])
     low, high = found.times[0] * block
     values = {"low": float(low), "high": float(high), "hops": float(found.hops[0])}

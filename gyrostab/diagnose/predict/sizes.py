@@ -46,10 +46,19 @@ class Mixture:
         weight = self.weights()
         mean = weight @ self.mean
         apart = self.mean - mean
-        return mean, np.einsum("g,gij->ij", weight, self.covariance) + np.einsum("g,gi,gj->ij", weight, apart, apart)
+        return mean, np.einsum("g,gij->ij", weight, self.covariance) + np.einsum(
+            "g,gi,gj->ij", weight, apart, apart
+        )
 
 
-def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str = "free", variance: Array | None = None) -> Mixture:
+def mean_mixture(
+    state: State,
+    axis: str,
+    columns: Sequence[Array],
+    *,
+    tier: str = "free",
+    variance: Array | None = None,
+) -> Mixture:
     """Sizes of columns of the block means on an axis, over the grid of random walk and flicker; given columns are free beside them.
 
     Parameters
@@ -70,7 +79,10 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     present = np.isfinite(y)
     size = np.abs(whole - whole.mean(axis=0)).max(axis=0)
     size = np.where(size > 0.0, size, 1.0)
-    grid: dict[str, Any] = {"K": baseline["grid_K"].sel(axis=axis).values, "B": baseline["grid_B"].sel(axis=axis).values}
+    grid: dict[str, Any] = {
+        "K": baseline["grid_K"].sel(axis=axis).values,
+        "B": baseline["grid_B"].sel(axis=axis).values,
+    }
     products = mean_products(
         np.where(present, y, 0.0)[:, None],
         whole / size,
@@ -82,16 +94,24 @@ def mean_mixture(state: State, axis: str, columns: Sequence[Array], *, tier: str
     )
     prior = baseline["grid_prior" if tier == "free" else "grid_calibrated"].sel(axis=axis).values
     own = len(columns)
-    gram = products.gram + _RIDGE * np.eye(whole.shape[1]) * (1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None])
+    gram = products.gram + _RIDGE * np.eye(whole.shape[1]) * (
+        1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
+    )
     covariance = np.linalg.inv(gram)
     mean = np.einsum("gij,gj->gi", covariance, products.cross[:, :, 0])
     fitted = (mean * products.cross[:, :, 0]).sum(axis=1)
-    log_weight = prior - 0.5 * (products.square[:, 0] - fitted + products.log_determinant + np.linalg.slogdet(gram)[1])
+    log_weight = prior - 0.5 * (
+        products.square[:, 0] - fitted + products.log_determinant + np.linalg.slogdet(gram)[1]
+    )
     scale = size[:own]
-    return Mixture(log_weight, mean[:, :own] / scale, covariance[:, :own, :own] / np.outer(scale, scale))
+    return Mixture(
+        log_weight, mean[:, :own] / scale, covariance[:, :own, :own] / np.outer(scale, scale)
+    )
 
 
-def component_mixture(part: Component, state: State, variant: Variant | None = None, *, variance: Array | None = None) -> Mixture:
+def component_mixture(
+    part: Component, state: State, variant: Variant | None = None, *, variance: Array | None = None
+) -> Mixture:
     """Sizes of a part's columns, in the unit of the parameters (or their squares), when `state` is in the model beside it."""
     variant = variant or part.variant
     if part.candidate.view in ("mean", "levels"):
@@ -101,8 +121,12 @@ def component_mixture(part: Component, state: State, variant: Variant | None = N
     row = statistic_rows(candidate, state).index(part.row)
     cells = build_linear_model([candidate], row, state.reduced, state)
     design = cells.designs[max(part.place, 0) if part.candidate.view == "order" else 0]
-    columns = np.concatenate([design, cells.given], axis=2).reshape(-1, design.shape[2] + cells.given.shape[2])
-    weight = np.where(np.isfinite(cells.weight) & np.isfinite(cells.values[..., 0]), cells.weight, 0.0).ravel()
+    columns = np.concatenate([design, cells.given], axis=2).reshape(
+        -1, design.shape[2] + cells.given.shape[2]
+    )
+    weight = np.where(
+        np.isfinite(cells.weight) & np.isfinite(cells.values[..., 0]), cells.weight, 0.0
+    ).ravel()
     values = np.where(weight > 0.0, np.nan_to_num(cells.values[..., 0]).ravel(), 0.0)
     columns = np.where(np.isfinite(columns), columns, 0.0)
     size = np.sqrt(np.maximum((weight[:, None] * columns**2).sum(axis=0), 1e-300))
@@ -116,7 +140,9 @@ def component_mixture(part: Component, state: State, variant: Variant | None = N
     mean = covariance @ moved
     log_weight = 0.5 * mean @ moved - 0.5 * np.linalg.slogdet(normal)[1]
     scale = size[:own]
-    with np.errstate(over="ignore"):  # of a column that is nowhere but 0 the record says nothing: its variance is infinite
+    with np.errstate(
+        over="ignore"
+    ):  # of a column that is nowhere but 0 the record says nothing: its variance is infinite
         own_covariance = covariance[:own, :own] / np.outer(scale, scale)
     return Mixture(np.array([log_weight]), (mean[:own] / scale)[None], own_covariance[None])
 

@@ -22,14 +22,19 @@ from gyrostab.units import INNER, parse_unit
 __all__ = ["FINE", "FOLLOWED", "HARMONICS", "PARTS", "PHASES", "PIECES", "Accumulator"]
 
 Array = NDArray[np.float64]
-#: Parts of the record with a line spectrum each; harmonics of the rotation; bins of the ramp's phase.
+#: Parts of the record with a line spectrum each; harmonics of the rotation; bins of the ramp's
+#: phase.
 PARTS, HARMONICS, PHASES = 8, (1, 2, 3), 40
-#: Parts of a block over which channels are averaged, and the beginnings of the names of those that effects follow with a lag.
+#: Parts of a block over which channels are averaged, and the beginnings of the names of those that
+#: effects follow with a lag.
 FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
 #: Pieces of a block over which the axes are averaged.
 PIECES = 16
 _POWER_SHARE = 0.25  # of a block that must be present for its spectrum
-_BESIDE = (1, 5)  # turns in a block, from and below, beside those of the tool, where the noise about an order is measured
+_BESIDE = (
+    1,
+    5,
+)  # turns in a block, from and below, beside those of the tool, where the noise about an order is measured
 _APART = 0.9  # turns in a block, that these are away from what was taken off
 _GAP_S = 1.0  # shorter gaps are not listed
 _FOR_LATTICE, _KEPT = 64, 2**16  # blocks whose values are kept; of each axis, about
@@ -50,13 +55,17 @@ class Accumulator:
         self.weights = kernel.taper(length)
         whole = np.ones((1, length), bool)
         self.whole = kernel.gap_spectra(whole, self.weights)
-        self.whole_shape = kernel.shape_of_bands(*_swap(self.whole), np.array([length]), self.edges, length)[0]
+        self.whole_shape = kernel.shape_of_bands(
+            *_swap(self.whole), np.array([length]), self.edges, length
+        )[0]
         self.whole_neighbours = _neighbours(whole, self.weights)[0]
         bands = self.edges.size - 1
         self.moments = np.full((rows, blocks, 5), np.nan)
         self.counts = np.zeros((rows, blocks, 9), np.int64)
         self.together = np.zeros((self.axes, blocks), np.int64)
-        self.at_once: dict[tuple[bool, ...], NDArray[np.int64]] = {(True,) * self.axes: np.zeros(blocks, np.int64)}
+        self.at_once: dict[tuple[bool, ...], NDArray[np.int64]] = {
+            (True,) * self.axes: np.zeros(blocks, np.int64)
+        }
         self.histogram = np.zeros((self.axes, blocks, HISTOGRAM), np.uint32)
         self.peaks: list[list[Peaks]] = [[] for _ in range(self.axes)]
         self.power = np.full((rows, blocks, bands), np.nan)
@@ -72,14 +81,20 @@ class Accumulator:
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, PARTS, 2))
         self.pieces = np.zeros((2, self.axes, blocks, PIECES))  # sums and numbers of samples
-        self.fine = {name: np.full((blocks, FINE), np.nan) for name in self.beside if name.startswith(FOLLOWED)}
+        self.fine = {
+            name: np.full((blocks, FINE), np.nan)
+            for name in self.beside
+            if name.startswith(FOLLOWED)
+        }
         self.kept: list[Array] = []
         self.gaps: list[tuple[int, int]] = []
         self.open: int | None = None
         self.turning, self.turning_factor = _turning(log)
         self.turn_carry: float | None = None
         self.turns = 0.0
-        self.order = np.full((self.axes, blocks, len(HARMONICS)), np.nan + 0j) if self.turning else None
+        self.order = (
+            np.full((self.axes, blocks, len(HARMONICS)), np.nan + 0j) if self.turning else None
+        )
         self.order_level = np.full(self.order.shape, np.nan) if self.order is not None else None
         self.ramp = self.beside.index("ramp") + self.axes if "ramp" in self.beside else None
         self.ramp_range = _range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
@@ -95,7 +110,9 @@ class Accumulator:
         present = ~np.isnan(stretch.values)
         centred = np.empty_like(stretch.values)
         for row in range(self.rows):
-            kernel.block_samples(stretch.values[row], centred[row], self.moments[row, part], self.counts[row, part])
+            kernel.block_samples(
+                stretch.values[row], centred[row], self.moments[row, part], self.counts[row, part]
+            )
             if row < self.axes:
                 found = find_peaks(stretch.values[row], self.histogram[row, part])
                 self.peaks[row].append(found._replace(block=found.block + stretch.first))
@@ -103,12 +120,18 @@ class Accumulator:
         self.together[:, part] = zeros_together(stretch.values[: self.axes])
         for kind, number in samples_at_once(present[: self.axes]).items():
             self.at_once.setdefault(kind, np.zeros(self.blocks, np.int64))[part] = number
-        self.adjacent[:, part] = np.count_nonzero(present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1)
+        self.adjacent[:, part] = np.count_nonzero(
+            present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1
+        )
         self._find_gaps(part, present[: self.axes])
         inner = np.arange(PIECES) * self.length // PIECES
         for row in range(self.axes):
-            self.pieces[0, row, part] = np.add.reduceat(np.where(present[row], stretch.values[row], 0.0), inner, axis=1)
-            self.pieces[1, row, part] = np.add.reduceat(present[row], inner, axis=1, dtype=np.float64)
+            self.pieces[0, row, part] = np.add.reduceat(
+                np.where(present[row], stretch.values[row], 0.0), inner, axis=1
+            )
+            self.pieces[1, row, part] = np.add.reduceat(
+                present[row], inner, axis=1, dtype=np.float64
+            )
         for name, fine in self.fine.items():
             row, edges = self.axes + self.beside.index(name), np.arange(FINE) * self.length // FINE
             total = np.add.reduceat(np.where(present[row], stretch.values[row], 0.0), edges, axis=1)
@@ -116,7 +139,10 @@ class Accumulator:
                 fine[part] = total / np.add.reduceat(present[row].astype(np.float64), edges, axis=1)
         every = max(1, self.blocks // _FOR_LATTICE)
         chosen = [number for number in range(part.start, part.stop) if number % every == 0]
-        self.kept += [stretch.values[: self.axes, number - part.start, : _KEPT // _FOR_LATTICE].copy() for number in chosen]
+        self.kept += [
+            stretch.values[: self.axes, number - part.start, : _KEPT // _FOR_LATTICE].copy()
+            for number in chosen
+        ]
         if self.order is not None:
             self._orders(part, centred[: self.axes])
         if self.profile_sums is not None:
@@ -124,7 +150,9 @@ class Accumulator:
             self._turn_ramp(part, phase)
             for row in range(self.axes):
                 sums, counts = self.profile_sums[row, part], self.profile_counts[row, part]
-                kernel.phase_profile(centred[row], present[row], phase, *self.ramp_range, sums, counts)
+                kernel.phase_profile(
+                    centred[row], present[row], phase, *self.ramp_range, sums, counts
+                )
 
     def _turn_ramp(self, part: slice, phase: Array) -> None:
         """How often the ramp turns in each block, from the moves between samples, none of them half a turn."""
@@ -134,7 +162,10 @@ class Accumulator:
         moved -= np.round(moved)
         there = np.isfinite(moved)
         total = np.where(there, moved, 0.0).sum(axis=1)
-        self.ramp_turns[part] = np.where(there.any(axis=1), total / np.maximum(there.sum(axis=1), 1), np.nan) * self.rate
+        self.ramp_turns[part] = (
+            np.where(there.any(axis=1), total / np.maximum(there.sum(axis=1), 1), np.nan)
+            * self.rate
+        )
 
     def _spectra(self, part: slice, centred: Array, present: NDArray[np.bool_]) -> None:
         inside = slice(1, kernel.ordinates(self.length) + 1)
@@ -146,13 +177,17 @@ class Accumulator:
             place, table = self._masks(row, part, present[row], counts[row], used[row])
             places.append(place)
             tables.append(table)
-            power = kernel.band_powers(spectra[row], spectra[row], table, place, self.edges, self.rate).real
+            power = kernel.band_powers(
+                spectra[row], spectra[row], table, place, self.edges, self.rate
+            ).real
             self.power[row, part] = np.where(used[row][:, None], power, np.nan)
             if row < self.axes:
                 self._lines(row, part, spectra[row], table, place, used[row])
         for number, (a, b) in enumerate(self.pairs):
             both = np.count_nonzero(present[a] & present[b], axis=-1)
-            cross = kernel.band_powers(spectra[a], spectra[b], tables[a], places[a], self.edges, self.rate)
+            cross = kernel.band_powers(
+                spectra[a], spectra[b], tables[a], places[a], self.edges, self.rate
+            )
             differ = (both != counts[a]) | (both != counts[b])
             differ &= used[a] & used[b]
             self.cross_shape[number, part] = self.shape[a, part]
@@ -160,14 +195,21 @@ class Accumulator:
             self.cross_samples[number, part] = both
             if differ.any():
                 both_there = (present[a] & present[b])[differ]
-                cross[differ], self.cross_shape[number, part][differ] = self._jointly(centred[[a, b]][:, differ], both_there)
+                cross[differ], self.cross_shape[number, part][differ] = self._jointly(
+                    centred[[a, b]][:, differ], both_there
+                )
                 self.cross_neighbours[number, part][differ] = _neighbours(both_there, self.weights)
             cross[~(used[a] & used[b])] = np.nan
             cross[both < max(_POWER_SHARE * self.length, 2)] = np.nan
             self.cross[number, part] = cross
 
     def _masks(
-        self, row: int, part: slice, present: NDArray[np.bool_], counts: NDArray[np.int64], used: NDArray[np.bool_]
+        self,
+        row: int,
+        part: slice,
+        present: NDArray[np.bool_],
+        counts: NDArray[np.int64],
+        used: NDArray[np.bool_],
     ) -> tuple[NDArray[np.int64], Array]:
         """Expected powers of the masks that occur, number 0 being the full one, and which of them each block has."""
         gappy = used & (counts < self.length)
@@ -181,36 +223,58 @@ class Accumulator:
             shape = np.broadcast_to(self.whole_shape, (counts.size, self.whole_shape.size)).copy()
             neighbours = np.full(counts.size, self.whole_neighbours)
             if gappy.any():
-                shape[gappy] = kernel.shape_of_bands(mask, squared, expected, counts[gappy], self.edges, self.length)
+                shape[gappy] = kernel.shape_of_bands(
+                    mask, squared, expected, counts[gappy], self.edges, self.length
+                )
                 neighbours[gappy] = _neighbours(present[gappy], self.weights)
             shape[~used] = neighbours[~used] = np.nan
             self.shape[row, part], self.neighbours[row, part] = shape, neighbours
         return place, table
 
     def _lines(
-        self, row: int, part: slice, spectra: NDArray[np.complex128], table: Array, place: NDArray[np.int64], used: NDArray[np.bool_]
+        self,
+        row: int,
+        part: slice,
+        spectra: NDArray[np.complex128],
+        table: Array,
+        place: NDArray[np.int64],
+        used: NDArray[np.bool_],
     ) -> None:
         part_of = np.arange(part.start, part.stop) * PARTS // self.blocks
         for piece in np.unique(part_of):
             chosen = used & (part_of == piece)
-            self.line_sum[row, piece] += (spectra[chosen].real ** 2 + spectra[chosen].imag ** 2).sum(axis=0)
+            self.line_sum[row, piece] += (
+                spectra[chosen].real ** 2 + spectra[chosen].imag ** 2
+            ).sum(axis=0)
             expected = table[place[chosen]]
             self.line_expected[row, piece] += expected.sum(axis=0)
             middle = expected.mean(axis=1)
             self.line_counts[row, piece] += [middle.sum(), (middle**2).sum()]
 
-    def _jointly(self, centred: Array, present: NDArray[np.bool_]) -> tuple[NDArray[np.complex128], Array]:
+    def _jointly(
+        self, centred: Array, present: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.complex128], Array]:
         """Cross-periodogram of blocks over the samples that both signals have, and the shape that powers of these would have."""
         out = np.full((present.shape[0], self.edges.size - 1), np.nan + 0j)
         shape = np.full(out.shape, np.nan)
         enough = present.sum(axis=-1) >= max(_POWER_SHARE * self.length, 2)
         if enough.any():
             present, centred = present[enough], centred[:, enough]
-            centred = np.where(present, centred - (centred * present).sum(-1, keepdims=True) / present.sum(-1)[:, None], 0.0)
-            one, other = np.fft.rfft(centred * self.weights, axis=-1)[..., 1 : kernel.ordinates(self.length) + 1]
+            centred = np.where(
+                present,
+                centred - (centred * present).sum(-1, keepdims=True) / present.sum(-1)[:, None],
+                0.0,
+            )
+            one, other = np.fft.rfft(centred * self.weights, axis=-1)[
+                ..., 1 : kernel.ordinates(self.length) + 1
+            ]
             expected, mask, squared = kernel.gap_spectra(present, self.weights)
-            out[enough] = kernel.band_powers(one, other, expected, np.arange(present.shape[0]), self.edges, self.rate)
-            shape[enough] = kernel.shape_of_bands(mask, squared, expected, present.sum(axis=-1), self.edges, self.length)
+            out[enough] = kernel.band_powers(
+                one, other, expected, np.arange(present.shape[0]), self.edges, self.rate
+            )
+            shape[enough] = kernel.shape_of_bands(
+                mask, squared, expected, present.sum(axis=-1), self.edges, self.length
+            )
         return out, shape
 
     def _find_gaps(self, part: slice, present: NDArray[np.bool_]) -> None:
@@ -231,7 +295,9 @@ class Accumulator:
         assert self.order is not None
         assert self.order_level is not None
         index = np.arange(part.start * self.length, part.stop * self.length)
-        rotation, self.turn_carry = channel_at(self.turning, grid_times(self.start, self.rate, index), self.turn_carry)
+        rotation, self.turn_carry = channel_at(
+            self.turning, grid_times(self.start, self.rate, index), self.turn_carry
+        )
         inside = rotation * self.turning_factor / (360.0 * self.rate)
         edges = np.cumsum(np.concatenate([[self.turns], inside]))
         self.turns = math.fmod(float(edges[-1]), 1.0)
@@ -255,7 +321,8 @@ class Accumulator:
 def _power_beside(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
     """Mean power (axis, block) of what turns a few times in the block more or less than a harmonic, NaN where nothing tells it.
 
-    Places at which the mean of the block or a harmonic was taken off, or would be seen in the mirror, do not count.
+    Places at which the mean of the block or a harmonic was taken off, or would be seen in the
+    mirror, do not count.
 
     Parameters
     ----------
@@ -282,20 +349,29 @@ def _swap(found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
 def _neighbours(present: NDArray[np.bool_], weights: Array) -> Array:
     tapered = present * weights
     with np.errstate(invalid="ignore"):
-        return np.asarray((tapered[:, 1:] * tapered[:, :-1]).sum(axis=-1) / (tapered**2).sum(axis=-1))
+        return np.asarray(
+            (tapered[:, 1:] * tapered[:, :-1]).sum(axis=-1) / (tapered**2).sum(axis=-1)
+        )
 
 
 def _turning(log: xr.Dataset) -> tuple[Source | None, float]:
     """The rotation rate of the tool at any instant, and the factor to degree s-1; None when the log has it not, or without a number."""
     name = "rotation_rate"
-    if name not in numeric_channels(log)[0] + numeric_channels(log)[1] or not np.isfinite(_range(log[name].data)).all():
+    if (
+        name not in numeric_channels(log)[0] + numeric_channels(log)[1]
+        or not np.isfinite(_range(log[name].data)).all()
+    ):
         return None, 1.0
     wanted = parse_unit(INNER[name])
     try:
         found = parse_unit(str(log[name].attrs.get("units")))
     except UnitError:
         return None, 1.0
-    return (make_source(log, name), found.factor / wanted.factor) if found.quantity == wanted.quantity else (None, 1.0)
+    return (
+        (make_source(log, name), found.factor / wanted.factor)
+        if found.quantity == wanted.quantity
+        else (None, 1.0)
+    )
 
 
 def _range(data: Any) -> tuple[float, float]:
@@ -304,5 +380,7 @@ def _range(data: Any) -> tuple[float, float]:
 
     array = da.asarray(data)
     finite = da.isfinite(array)
-    low, high = da.compute(da.where(finite, array, np.inf).min(), da.where(finite, array, -np.inf).max())
+    low, high = da.compute(
+        da.where(finite, array, np.inf).min(), da.where(finite, array, -np.inf).max()
+    )
     return float(low), float(high)

@@ -83,7 +83,9 @@ class _Clock:
         """Number of values before an instant."""
         if self.stamps is not None:
             return int(np.searchsorted(self.stamps, instant))
-        return int(np.clip(np.ceil(float(grid_index(self.start, self.rate, instant))), 0, self.size))
+        return int(
+            np.clip(np.ceil(float(grid_index(self.start, self.rate, instant))), 0, self.size)
+        )
 
     def period(self) -> float:
         """Median interval [ns], or where intervals vary their mean without gaps; infinite for a single value."""
@@ -102,13 +104,13 @@ class _Clock:
 def align_channels(log: xr.Dataset) -> Aligned:
     """Lay channels that have their own stamps on the time grid of the gyro.
 
-    A channel sampled like the gyro, or a faster ramp, gives each sample the value nearest to it. A faster
-    channel gives it the mean of its values about it, and one up to four times slower a value on the
-    straight line between its neighbours, but not across gaps. Slower channels, and vibration,
-    whose rms counts, keep their stamps: they enter by their means over blocks. So do accelerometers
-    and magnetometers where the log has the rotation rate: with it the lines at the rotation are
-    measured, and the wave of gravity would explain them once more. A toolface always keeps its
-    stamps, since angles that wrap have no mean.
+    A channel sampled like the gyro, or a faster ramp, gives each sample the value nearest to it. A
+    faster channel gives it the mean of its values about it, and one up to four times slower a value
+    on the straight line between its neighbours, but not across gaps. Slower channels, and
+    vibration, whose rms counts, keep their stamps: they enter by their means over blocks. So do
+    accelerometers and magnetometers where the log has the rotation rate: with it the lines at the
+    rotation are measured, and the wave of gravity would explain them once more. A toolface always
+    keeps its stamps, since angles that wrap have no mean.
 
     Parameters
     ----------
@@ -140,7 +142,9 @@ def align_channels(log: xr.Dataset) -> Aligned:
                 unused[name] = problem
             elif problem is not None:
                 dim = f"time_{name}"
-                log = log.drop_vars([name, dim]).assign({name: ("time", problem.values, log[name].attrs)})
+                log = log.drop_vars([name, dim]).assign(
+                    {name: ("time", problem.values, log[name].attrs)}
+                )
                 notes += [problem.note] if problem.note else []
     mine = [part for name in unused for part in (name, f"time_{name}") if part in log.variables]
     return Aligned(log.drop_vars(mine), unused, notes)
@@ -169,18 +173,39 @@ def _lay_channel(log: xr.Dataset, name: str) -> _Laid | str | None:
             f"it is sampled at {1e9 / period:.4g} Hz, slower than the gyro at {rate:.4g} Hz, "
             "so that its phase between its samples is not known"
         )
-    if name.startswith("vibration") or ratio > MAX_LINEAR_PERIODS or _is_wave_of_rotation(log, name):
+    if (
+        name.startswith("vibration")
+        or ratio > MAX_LINEAR_PERIODS
+        or _is_wave_of_rotation(log, name)
+    ):
         return None
     held = log[name].attrs.get("interpolation") == "previous"
     choose: _Choose
     if ratio > MAX_SAME_PERIODS:
-        choose, reach, how = partial(_at_line, held=held), MAX_BRIDGED_PERIODS, f"it is interpolated from {1e9 / period:.4g} Hz"
+        choose, reach, how = (
+            partial(_at_line, held=held),
+            MAX_BRIDGED_PERIODS,
+            f"it is interpolated from {1e9 / period:.4g} Hz",
+        )
     elif is_ramp or ratio * MAX_SAME_PERIODS >= 1.0:
         choose, reach, how = _at_nearest, MAX_NEAREST_PERIODS, "each sample has the nearest value"
     else:
-        choose, reach, how = _at_mean, 1.0, f"each sample has the mean of its values at {1e9 / period:.4g} Hz"
-    lay = partial(_lay_piece, clock, start=start, rate=rate, reach=max(reach * period, 0.5e9 / rate), choose=choose)
-    return _Laid(_on_grid(log, name, clock, lay, size), _note(name, clock, start, rate, period, how))
+        choose, reach, how = (
+            _at_mean,
+            1.0,
+            f"each sample has the mean of its values at {1e9 / period:.4g} Hz",
+        )
+    lay = partial(
+        _lay_piece,
+        clock,
+        start=start,
+        rate=rate,
+        reach=max(reach * period, 0.5e9 / rate),
+        choose=choose,
+    )
+    return _Laid(
+        _on_grid(log, name, clock, lay, size), _note(name, clock, start, rate, period, how)
+    )
 
 
 def _is_wave_of_rotation(log: xr.Dataset, name: str) -> bool:
@@ -204,7 +229,11 @@ def _note(name: str, clock: _Clock, start: int, rate: float, period: float, how:
     if abs(skew) < 1e-3 / rate and abs(period * rate / 1e9 - 1.0) < 1e-3:
         return ""
     where = "after" if skew > 0.0 else "before"
-    said = f"its stamps are {abs(skew) * 1e3:.3g} ms {where} those of the gyro; " if abs(skew) >= 1e-3 / rate else ""
+    said = (
+        f"its stamps are {abs(skew) * 1e3:.3g} ms {where} those of the gyro; "
+        if abs(skew) >= 1e-3 / rate
+        else ""
+    )
     return f"channel {name}: {said}{how}"
 
 
@@ -224,7 +253,12 @@ def _on_grid(log: xr.Dataset, name: str, clock: _Clock, lay: Any, size: int) -> 
     pieces = list(pairwise(edges))
     spans = [_needed(clock, lay, low, high) for low, high in pieces]
     if isinstance(signal, np.ndarray) and isinstance(data, np.ndarray):
-        return np.concatenate([lay(data[a:b], a, low, high) for (low, high), (a, b) in zip(pieces, spans, strict=True)])
+        return np.concatenate(
+            [
+                lay(data[a:b], a, low, high)
+                for (low, high), (a, b) in zip(pieces, spans, strict=True)
+            ]
+        )
     import dask
     import dask.array as da
 
@@ -240,11 +274,22 @@ def _needed(clock: _Clock, lay: Any, low: int, high: int) -> tuple[int, int]:
     """Values that the samples `low` to `high` may need, one beyond on either side."""
     start, rate, reach = (lay.keywords[word] for word in ("start", "rate", "reach"))
     first, last = (int(edge) for edge in grid_times(start, rate, [low, high - 1]))
-    return max(clock.place(first - int(reach)) - 1, 0), min(clock.place(last + int(reach)) + 1, clock.size)
+    return max(clock.place(first - int(reach)) - 1, 0), min(
+        clock.place(last + int(reach)) + 1, clock.size
+    )
 
 
 def _lay_piece(
-    clock: _Clock, values: Any, offset: int, low: int, high: int, *, start: int, rate: float, reach: float, choose: _Choose
+    clock: _Clock,
+    values: Any,
+    offset: int,
+    low: int,
+    high: int,
+    *,
+    start: int,
+    rate: float,
+    reach: float,
+    choose: _Choose,
 ) -> Array:
     """Values at the samples `low` to `high`, NaN where none is within reach."""
     numbers = np.asarray(values, dtype=np.float64)
@@ -257,16 +302,26 @@ def _lay_piece(
     return np.asarray(choose(instants, stamps, numbers, reach, 1e9 / rate))
 
 
-def _at_nearest(instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float) -> Array:
-    after = np.clip(np.searchsorted(stamps, instants), 1, stamps.size - 1) if stamps.size > 1 else np.zeros(instants.size, np.int64)
+def _at_nearest(
+    instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float
+) -> Array:
+    after = (
+        np.clip(np.searchsorted(stamps, instants), 1, stamps.size - 1)
+        if stamps.size > 1
+        else np.zeros(instants.size, np.int64)
+    )
     before = np.maximum(after - 1, 0)
     place = np.where(instants - stamps[before] <= stamps[after] - instants, before, after)
     return np.where(np.abs(instants - stamps[place]) <= reach, values[place], np.nan)
 
 
-def _at_line(instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float, *, held: bool) -> Array:
+def _at_line(
+    instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float, *, held: bool
+) -> Array:
     after = np.searchsorted(stamps, instants, side="left")
-    inside = (after < stamps.size) & ((after > 0) | (stamps[np.minimum(after, stamps.size - 1)] == instants))
+    inside = (after < stamps.size) & (
+        (after > 0) | (stamps[np.minimum(after, stamps.size - 1)] == instants)
+    )
     high = np.clip(after, 0, stamps.size - 1)
     low = np.where(stamps[high] == instants, high, np.maximum(high - 1, 0))
     near = inside & (stamps[high] - stamps[low] <= reach)

@@ -14,7 +14,15 @@ from gyrostab.schema import log_channels, signal_name
 from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.store import direct
 
-__all__ = ["Stretch", "channel_at", "channel_means", "numeric_channels", "read_stretches", "row_count", "sample_count"]
+__all__ = [
+    "Stretch",
+    "channel_at",
+    "channel_means",
+    "numeric_channels",
+    "read_stretches",
+    "row_count",
+    "sample_count",
+]
 
 Array = NDArray[np.float64]
 _READ = 2**20  # samples over all rows that are read at once, unless a chunk holds more
@@ -40,7 +48,9 @@ class Stretch(NamedTuple):
 def numeric_channels(log: xr.Dataset) -> tuple[list[str], list[str]]:
     """Names of the channels that stand on the log's own time, and of those that have a time of their own."""
     names = [name for name in log_channels(log) if np.issubdtype(log[name].dtype, np.number)]
-    return [name for name in names if log[name].dims == ("time",)], [name for name in names if log[name].dims != ("time",)]
+    return [name for name in names if log[name].dims == ("time",)], [
+        name for name in names if log[name].dims != ("time",)
+    ]
 
 
 def sample_count(log: xr.Dataset) -> int:
@@ -75,7 +85,9 @@ def read_stretches(log: xr.Dataset, size: int) -> Iterator[Stretch]:
         blocks = values.shape[1] // size
         for low in range(0, blocks, together):
             high = min(low + together, blocks)
-            yield Stretch(number + low, values[:, low * size : high * size].reshape(rows, high - low, size))
+            yield Stretch(
+                number + low, values[:, low * size : high * size].reshape(rows, high - low, size)
+            )
         number += blocks
         rest = np.array(values[:, blocks * size :])  # a copy, so that the rest of the values can go
 
@@ -93,7 +105,9 @@ def _rates(log: xr.Dataset) -> Iterator[Array]:
             whole = values if before is None else np.concatenate([before, values], axis=1)
             before = whole[:, -1:].copy()
             values = whole[:, :-1].copy()
-            values[:axes] = np.diff(whole[:axes], axis=1) * (float(log.attrs["sampling_rate_hz"]) * HOUR)
+            values[:axes] = np.diff(whole[:axes], axis=1) * (
+                float(log.attrs["sampling_rate_hz"]) * HOUR
+            )
         yield values
 
 
@@ -102,7 +116,9 @@ def _cuts(signal: Any, rows: int) -> Iterator[tuple[int, int]]:
     chunks: Sequence[int] = signal.chunks[1] if hasattr(signal, "chunks") else (signal.shape[1],)
     if len(chunks) == 1 and not hasattr(signal, "chunks"):
         step = max(1, _READ // rows)
-        yield from ((low, min(low + step, signal.shape[1])) for low in range(0, signal.shape[1], step))
+        yield from (
+            (low, min(low + step, signal.shape[1])) for low in range(0, signal.shape[1], step)
+        )
         return
     low = high = 0
     for chunk in chunks:
@@ -125,10 +141,16 @@ def _loaded(signal: Any, beside: Sequence[Any], low: int, high: int) -> Array:
     return out
 
 
-def channel_at(source: Source, instants: NDArray[np.int64], carry: float | None) -> tuple[Array, float | None]:
+def channel_at(
+    source: Source, instants: NDArray[np.int64], carry: float | None
+) -> tuple[Array, float | None]:
     """Values of a channel at rising `instants` [ns since 1970], and what the call for the next ones must be given."""
     stretch = source.stretch(int(instants[0]) - 1, int(instants[-1]))
-    part = None if stretch is None else (stretch, direct.stretch(source.values, stretch.low, stretch.high))
+    part = (
+        None
+        if stretch is None
+        else (stretch, direct.stretch(source.values, stretch.low, stretch.high))
+    )
     return source.at(instants, part, carry)
 
 
@@ -168,7 +190,11 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
         means = sums / counts
     means = np.sqrt(means) if rms else means
     if stamps.size > 1 and stamps.size <= _LONG:
-        means = _bridged(means, make_source(log, name), edges, 3 * float(np.median(np.diff(stamps)))) if (counts > 0).any() else means
+        means = (
+            _bridged(means, make_source(log, name), edges, 3 * float(np.median(np.diff(stamps))))
+            if (counts > 0).any()
+            else means
+        )
     return means
 
 
@@ -179,7 +205,10 @@ def _bridged(means: Array, source: Source, edges: NDArray[np.int64], longest: fl
     assert known is not None
     after = np.searchsorted(known, middle)
     inside = (after > 0) & (after < known.size)
-    near = inside & (known[np.clip(after, 1, known.size - 1)] - known[np.clip(after - 1, 0, known.size - 2)] <= longest)
+    near = inside & (
+        known[np.clip(after, 1, known.size - 1)] - known[np.clip(after - 1, 0, known.size - 2)]
+        <= longest
+    )
     fill = np.isnan(means) & near
     if fill.any():
         means = means.copy()

@@ -28,7 +28,10 @@ Array = NDArray[np.float64]
 CHANCE = 0.02
 _LOWEST = 4.0  # deviations of the block's own from which on a sample may be an outlier
 _SWELLS = np.linspace(0.0, 0.6, 61)  # scatter of the logarithm of a level within blocks
-_FAIR = (2.5, 3.7)  # deviations between which departures tell how much the level swells, and outliers hardly count
+_FAIR = (
+    2.5,
+    3.7,
+)  # deviations between which departures tell how much the level swells, and outliers hardly count
 _CLEAR = 64.0  # a lattice is as many times coarser than the last digit
 _RARE = 0.01  # of the values, which may stand off a lattice that is coarse
 _TAILS = 0.1  # of the values, where spikes may be as common as those of the lattice
@@ -80,15 +83,19 @@ def outlier_limit(samples: float) -> float:
     return float(max(-ndtri(CHANCE / (2.0 * max(samples, 1.0))), _LOWEST))
 
 
-def count_outliers(histogram: NDArray[np.uint32], found: Sequence[Sequence[Peaks]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def count_outliers(
+    histogram: NDArray[np.uint32], found: Sequence[Sequence[Peaks]]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Samples that jump out, and their count for evidence: one that does by twice the limit has three, since no chance makes it.
 
-    The limit is so many standard deviations of the departures that Gaussian noise as long as the record has `CHANCE` beyond. The
-    deviation is from the median: the larger of the block's own and of that which it has together with two neighbours on either side,
-    that of the next one where this is louder by half, for the noise may have risen within the block, at least a tenth of the record's,
-    and at least what the noise right before or after the sample has. Where departures of 2.5 to 3.7 deviations are more than those of
-    Gaussian noise, the level swells faster than that can follow: the limit is moved out to where a level of a log-normal law with as
-    many of them has `CHANCE` beyond.
+    The limit is so many standard deviations of the departures that Gaussian noise as long as the
+    record has `CHANCE` beyond. The deviation is from the median: the larger of the block's own and
+    of that which it has together with two neighbours on either side, that of the next one where
+    this is louder by half, for the noise may have risen within the block, at least a tenth of the
+    record's, and at least what the noise right before or after the sample has. Where departures of
+    2.5 to 3.7 deviations are more than those of Gaussian noise, the level swells faster than that
+    can follow: the limit is moved out to where a level of a log-normal law with as many of them has
+    `CHANCE` beyond.
 
     Parameters
     ----------
@@ -111,9 +118,18 @@ def count_outliers(histogram: NDArray[np.uint32], found: Sequence[Sequence[Peaks
     >>> number[0, [7, 9]], outliers[0, [7, 9]], int(number.sum())
     (array([1, 1]), array([3, 1]), 2)
     """
-    sums = np.concatenate([np.zeros_like(histogram[:, :1], dtype=np.int64), np.cumsum(histogram, axis=1, dtype=np.int64)], axis=1)
+    sums = np.concatenate(
+        [
+            np.zeros_like(histogram[:, :1], dtype=np.int64),
+            np.cumsum(histogram, axis=1, dtype=np.int64),
+        ],
+        axis=1,
+    )
     blocks = np.arange(histogram.shape[1])
-    near = sums[:, np.minimum(blocks + _NEAR + 1, blocks.size)] - sums[:, np.maximum(blocks - _NEAR, 0)]
+    near = (
+        sums[:, np.minimum(blocks + _NEAR + 1, blocks.size)]
+        - sums[:, np.maximum(blocks - _NEAR, 0)]
+    )
     own, wide = _deviation(np.diff(sums, axis=1)), _deviation(near)
     beside = np.pad(own, ((0, 0), (1, 1)))
     beside = np.maximum(beside[:, :-2], beside[:, 2:])
@@ -125,7 +141,9 @@ def count_outliers(histogram: NDArray[np.uint32], found: Sequence[Sequence[Peaks
         for one in parts:
             away = one.size / np.maximum(scale[axis, one.block], one.level)
             np.add.at(number[axis], one.block, away > limit)
-            np.add.at(outliers[axis], one.block, np.where(away > 2.0 * limit, 3, 1) * (away > limit))
+            np.add.at(
+                outliers[axis], one.block, np.where(away > 2.0 * limit, 3, 1) * (away > limit)
+            )
     return number, outliers
 
 
@@ -152,11 +170,16 @@ def _number_between(histogram: NDArray[np.uint32], scale: Array, low: float, hig
     """Departures from `low` to `high` deviations, those of a bin shared out as normal ones."""
     from scipy.special import ndtr
 
-    edges = np.concatenate([[0.0], histogram_edge(np.arange(1, HISTOGRAM + 1))]) / np.where(scale > 0.0, scale, np.inf)[:, None]
+    edges = (
+        np.concatenate([[0.0], histogram_edge(np.arange(1, HISTOGRAM + 1))])
+        / np.where(scale > 0.0, scale, np.inf)[:, None]
+    )
     tail = ndtr(-edges)
     inside = ndtr(-np.clip(edges, low, high))
     whole = tail[:, :-1] - tail[:, 1:]
-    share = np.divide(inside[:, :-1] - inside[:, 1:], whole, out=np.zeros_like(whole), where=whole > 0.0)
+    share = np.divide(
+        inside[:, :-1] - inside[:, 1:], whole, out=np.zeros_like(whole), where=whole > 0.0
+    )
     return float((histogram * share).sum())
 
 
@@ -168,14 +191,16 @@ def _deviation(histogram: NDArray[np.int64]) -> Array:
     inside = np.take_along_axis(histogram, number[..., None] + 1, axis=-1)[..., 0]
     before = np.take_along_axis(total, number[..., None], axis=-1)[..., 0] - inside
     share = np.divide(wanted - before, inside, out=np.ones(wanted.shape), where=inside > 0)
-    return np.asarray(np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / _MEDIAN, 0.0))
+    return np.asarray(
+        np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / _MEDIAN, 0.0)
+    )
 
 
 def zeros_together(values: Array) -> NDArray[np.int64]:
     """Exact zeros that all axes have at once; on a single axis those that have another one beside them.
 
-    That is how lost samples look which were filled with zeros. A loop that sticks at zero does it in each axis by itself, whenever its
-    rate goes by.
+    That is how lost samples look which were filled with zeros. A loop that sticks at zero does it
+    in each axis by itself, whenever its rate goes by.
 
     Parameters
     ----------
@@ -198,7 +223,9 @@ def zeros_together(values: Array) -> NDArray[np.int64]:
         return np.zeros(zero.shape[:2], np.int64)
     if len(zero) == 1:
         pair = zero[..., 1:] & zero[..., :-1]
-        found = zero & (np.pad(pair, ((0, 0), (0, 0), (1, 0))) | np.pad(pair, ((0, 0), (0, 0), (0, 1))))
+        found = zero & (
+            np.pad(pair, ((0, 0), (0, 0), (1, 0))) | np.pad(pair, ((0, 0), (0, 0), (0, 1)))
+        )
     else:
         gone = np.isnan(values)
         found = zero & (zero | gone).all(axis=0) & (zero.sum(axis=0) > 1)
@@ -231,12 +258,19 @@ def samples_at_once(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArra
     kinds, place = np.unique(code, return_inverse=True)
     each = np.arange(blocks)[:, None] * kinds.size + place.reshape(code.shape)
     number = np.bincount(each.ravel(), minlength=blocks * kinds.size).reshape(blocks, kinds.size)
-    found = {tuple(bool(kind >> axis & 1) for axis in range(axes)): number[:, k] for k, kind in enumerate(kinds.tolist())}
+    found = {
+        tuple(bool(kind >> axis & 1) for axis in range(axes)): number[:, k]
+        for k, kind in enumerate(kinds.tolist())
+    }
     return {kind: found[kind] for kind in sorted(found) if sum(kind) > 1}
 
 
 def beyond_chance(
-    together: NDArray[Any], zeros: NDArray[Any], samples: NDArray[Any], subset: NDArray[np.bool_], at_once: NDArray[Any]
+    together: NDArray[Any],
+    zeros: NDArray[Any],
+    samples: NDArray[Any],
+    subset: NDArray[np.bool_],
+    at_once: NDArray[Any],
 ) -> NDArray[np.int64]:
     """Zeros of `zeros_together` less those that independent zeros of the axes, or of a single axis, would bring together.
 
@@ -264,13 +298,17 @@ def beyond_chance(
         chance = zeros * (1.0 - (1.0 - share) ** 2)
     else:
         all_zero = chance_of_all(share, subset)
-        chance = np.moveaxis(np.tensordot(subset.T.astype(np.float64), all_zero * at_once, axes=(1, -2)), 0, -2)
+        chance = np.moveaxis(
+            np.tensordot(subset.T.astype(np.float64), all_zero * at_once, axes=(1, -2)), 0, -2
+        )
     return np.asarray(np.maximum(together - np.rint(chance), 0), np.int64)
 
 
 def chance_of_all(share: Array, subset: NDArray[np.bool_]) -> Array:
     """Chance that all axes of each subset are zero at once, (..., subset, block), from the shares (..., axis, block) of zeros."""
-    return np.asarray(np.stack([np.prod(share[..., np.flatnonzero(one), :], axis=-2) for one in subset], axis=-2))
+    return np.asarray(
+        np.stack([np.prod(share[..., np.flatnonzero(one), :], axis=-2) for one in subset], axis=-2)
+    )
 
 
 def quantization_step(values: Array) -> float:
@@ -302,7 +340,9 @@ def quantization_step(values: Array) -> float:
             apart = apart[apart > fine]
             if 0 < apart.size <= 0.8 * finite.size:
                 step = _common(apart, fine)
-                if step > 0.0 and (several is levels or _share_off(levels, times, step, fine) <= _RARE):
+                if step > 0.0 and (
+                    several is levels or _share_off(levels, times, step, fine) <= _RARE
+                ):
                     return step
     return 0.0
 
@@ -327,7 +367,9 @@ def _common(apart: Array, fine: float) -> float:
     step = float(apart.min())
     while step > _CLEAR * fine:
         whole = np.round(apart / step)
-        near = whole < step / (16.0 * fine)  # farther ones may be off by their number times the error of the step
+        near = whole < step / (
+            16.0 * fine
+        )  # farther ones may be off by their number times the error of the step
         rest = np.abs(apart - whole * step)
         wrong = near & (rest > 2.0 * fine * (1.0 + whole))
         if not near.any():

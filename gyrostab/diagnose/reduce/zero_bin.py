@@ -1,8 +1,9 @@
 """How wide the cell of a lattice is that the value 0 stands for: a rate that is cut off towards zero has one of two steps there.
 
-Rounding to the nearest value, or to the one below, makes all cells as wide as the step. Cutting off towards zero takes what is less than a
-step on either side of zero together, and leaves all other cells as they are. A loop that sticks at zero makes that cell wider too, but what
-it takes is missing beside it.
+Rounding to the nearest value, or to the one below, makes all cells as wide as the step. Cutting off
+towards zero takes what is less than a step on either side of zero together, and leaves all other
+cells as they are. A loop that sticks at zero makes that cell wider too, but what it takes is
+missing beside it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ Array = NDArray[np.float64]
 CELLS = ("zero", "next")
 _CUT = np.array([2.0, 1.0])  # widths [steps] of a rate that is cut off towards zero
 _FORM = 0.05  # of a width, by which the noise may have another law than the fit
-_SURE, _LIKE = 5.0, 3.5  # standard errors by which the cell must be wider than one step, and by which a width may be off
+_SURE, _LIKE = (
+    5.0,
+    3.5,
+)  # standard errors by which the cell must be wider than one step, and by which a width may be off
 _TOLD = 0.25  # largest standard error of its width, over all axes
 _COARSEST = 0.7  # scatters of the samples; beyond, the cells follow no parabola
 _REACH, _FEWEST, _MOST = 1.0, 4, 200  # scatters, and cells on either side, that the fit goes out to
@@ -29,8 +33,8 @@ _TURNS = 50
 def cell_widths(values: Array, step: float) -> tuple[Array, Array]:
     """Widths of the cell of 0 and of the two beside it, in steps, with their standard errors; NaN where they cannot be told.
 
-    The logarithms of the counts of the cells beyond are a parabola in the rate, as those of normal noise are, which says how many values
-    there are to a step.
+    The logarithms of the counts of the cells beyond are a parabola in the rate, as those of normal
+    noise are, which says how many values there are to a step.
 
     Parameters
     ----------
@@ -59,14 +63,19 @@ def cell_widths(values: Array, step: float) -> tuple[Array, Array]:
     if step > _COARSEST * scatter or (np.abs(finite - place * step) > _OFF * step).mean() > _OFF:
         return nothing, nothing
     reach = int(np.clip(_REACH * scatter / step, _FEWEST, _MOST))
-    count = np.bincount((place[np.abs(place) <= reach] + reach).astype(np.int64), minlength=2 * reach + 1)
+    count = np.bincount(
+        (place[np.abs(place) <= reach] + reach).astype(np.int64), minlength=2 * reach + 1
+    )
     number = np.arange(-reach, reach + 1)
     beyond = np.abs(number) > 1
     fit = _parabola((number + 0.5 * np.sign(number))[beyond], count[beyond], float(reach))
     if fit is None:
         return nothing, nothing
     size, covariance = fit
-    found = [(count[reach], np.array([-0.5, 0.5])), (count[reach - 1] + count[reach + 1], np.array([-1.5, 1.5]))]
+    found = [
+        (count[reach], np.array([-0.5, 0.5])),
+        (count[reach - 1] + count[reach + 1], np.array([-1.5, 1.5])),
+    ]
     width, error = np.empty(2), np.empty(2)
     for cell, (seen, at) in enumerate(found):
         columns = _columns(at, float(reach))
@@ -74,7 +83,9 @@ def cell_widths(values: Array, step: float) -> tuple[Array, Array]:
         slope = each @ columns / each.sum()
         usual = float(each.mean() if cell == 0 else each.sum())
         width[cell] = seen / usual
-        error[cell] = np.hypot(np.sqrt(max(seen, 1)) / usual, width[cell] * np.sqrt(slope @ covariance @ slope))
+        error[cell] = np.hypot(
+            np.sqrt(max(seen, 1)) / usual, width[cell] * np.sqrt(slope @ covariance @ slope)
+        )
     return width, error
 
 
@@ -87,7 +98,11 @@ def _parabola(at: Array, count: NDArray[np.int64], reach: float) -> tuple[Array,
     columns = _columns(at, reach)
     if (count > 0).sum() <= columns.shape[1]:
         return None
-    size = np.linalg.lstsq(columns * np.sqrt(count)[:, None], np.log(np.maximum(count, 0.5)) * np.sqrt(count), rcond=None)[0]
+    size = np.linalg.lstsq(
+        columns * np.sqrt(count)[:, None],
+        np.log(np.maximum(count, 0.5)) * np.sqrt(count),
+        rcond=None,
+    )[0]
     for _ in range(_TURNS):
         expected = np.exp(np.clip(columns @ size, -30.0, 30.0))
         normal = (columns.T * expected) @ columns + 1e-9 * np.eye(columns.shape[1])
@@ -129,10 +144,15 @@ def may_be_cut_off(reduced: xr.Dataset) -> NDArray[np.bool_]:
 
 
 def _widths(reduced: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
-    width, error = (reduced[name].transpose("axis", "cell").values for name in ("cell_width", "cell_width_stderr"))
+    width, error = (
+        reduced[name].transpose("axis", "cell").values
+        for name in ("cell_width", "cell_width_stderr")
+    )
     return width, error, np.isfinite(width).all(axis=1) & np.isfinite(error).all(axis=1)
 
 
 def _like_cut(width: Array, error: Array) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
-        return np.asarray((np.abs(width - _CUT) <= _LIKE * np.hypot(error, _FORM * _CUT)).all(axis=1))
+        return np.asarray(
+            (np.abs(width - _CUT) <= _LIKE * np.hypot(error, _FORM * _CUT)).all(axis=1)
+        )

@@ -19,7 +19,8 @@ from gyrostab.diagnose.result.attribution_weights import Scores, left_of, needed
 __all__ = ["active_spans", "attribute_mismatches", "spans", "unexpected"]
 
 Array = NDArray[np.float64]
-#: Where an effect shows -> views of mismatches that it can explain; "model" ones are looked at again with the effect in the model.
+#: Where an effect shows -> views of mismatches that it can explain; "model" ones are looked at
+#: again with the effect in the model.
 _SHOWS: dict[str, tuple[str, ...]] = {
     "mean": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
     "power": ("davar", "spectrum", "distribution"),
@@ -32,14 +33,29 @@ _SHOWS: dict[str, tuple[str, ...]] = {
     "wander": ("mean", "davar", "restart", "cross_axis"),
     "levels": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
 }
-_MODELLED = ("mean", "power", "cross", "wander", "levels")  # parts that the baseline with the effects holds
+_MODELLED = (
+    "mean",
+    "power",
+    "cross",
+    "wander",
+    "levels",
+)  # parts that the baseline with the effects holds
 _ACTS = 0.1  # of its largest, that a contribution counts as there
-_STILL, _RESTS = 0.05, 0.05  # of the largest, that is as good as nothing, and share of the blocks that must be so
+_STILL, _RESTS = (
+    0.05,
+    0.05,
+)  # of the largest, that is as good as nothing, and share of the blocks that must be so
 _MEETS = 0.3  # of the shorter of effect and mismatch
 _MOST_SPANS = 6
-_BESIDE, _SHARP = 3, 0.02  # lines beside a strong one, and share of its frequency, that belong to it
+_BESIDE, _SHARP = (
+    3,
+    0.02,
+)  # lines beside a strong one, and share of its frequency, that belong to it
 _BUMP, _WIDE = 0.371, 4.0
-_MOVES = ("mean", "levels")  # parts that may move the rate within a block, which is power there and at the lowest lines
+_MOVES = (
+    "mean",
+    "levels",
+)  # parts that may move the rate within a block, which is power there and at the lowest lines
 _MOVED = 0.1  # of the largest step from block to block
 
 
@@ -87,7 +103,9 @@ def spans(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[floa
     """
     if there.mean() > 0.9:
         return [(float(begin[0]), float(end[-1]))]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).reshape(
+        -1, 2
+    )
     joined: list[list[int]] = []
     for first, stop in edges.tolist():
         if joined and first - joined[-1][1] <= max(1, there.size // 50):
@@ -112,10 +130,12 @@ def attribute_mismatches(
 ) -> list[list[str]]:
     """Effects that explain each mismatch.
 
-    An effect explains it when it acts on one of its axes at its time and can show in its view; and where the baseline with the effects
-    holds what it does there, when the mismatch is gone with that baseline, or nearly so, and takes this effect for it. A mismatch of the
-    mean may also stand before or after what an effect does, where that is what the mean differs from. Where an effect moves the rate
-    within blocks, these blocks have more power than the noise, and the lines more at their low end.
+    An effect explains it when it acts on one of its axes at its time and can show in its view; and
+    where the baseline with the effects holds what it does there, when the mismatch is gone with
+    that baseline, or nearly so, and takes this effect for it. A mismatch of the mean may also stand
+    before or after what an effect does, where that is what the mean differs from. Where an effect
+    moves the rate within blocks, these blocks have more power than the noise, and the lines more at
+    their low end.
 
     Parameters
     ----------
@@ -129,8 +149,8 @@ def attribute_mismatches(
     level : float
         False-alarm level.
     without : callable, optional
-        Gives the baseline with the effects but for some of them, at the sizes that they have beside these. Without it every effect that
-        is in the place of a mismatch is said to explain it.
+        Gives the baseline with the effects but for some of them, at the sizes that they have beside
+        these. Without it every effect that is in the place of a mismatch is said to explain it.
     still : xarray.Dataset, optional
         Has the line spectra of the recording without the blocks in which an effect moves the rate.
 
@@ -139,12 +159,17 @@ def attribute_mismatches(
     list of list of str
         Names, for each mismatch.
     """
-    boxes = [{str(name): found[name].values[number] for name in found.data_vars} for number in range(found.sizes["mismatch"])]
+    boxes = [
+        {str(name): found[name].values[number] for name in found.data_vars}
+        for number in range(found.sizes["mismatch"])
+    ]
     scores = statistic_scores(reduced, after, null, boxes, claims, still=still)
     known: dict[tuple[int, ...], Scores] = {(): scores}
 
     def left(box: Mapping[str, Any], out: Sequence[Identification]) -> tuple[float, float]:
-        chosen = tuple(number for number, claim in enumerate(claims) if any(claim is one for one in out))
+        chosen = tuple(
+            number for number, claim in enumerate(claims) if any(claim is one for one in out)
+        )
         if chosen not in known and without is not None:
             rest = [claim for number, claim in enumerate(claims) if number not in chosen]
             known[chosen] = statistic_scores(reduced, without(out), null, boxes, rest, still=still)
@@ -157,9 +182,15 @@ def attribute_mismatches(
         score, limit = left_of(box, scores, null, level)
         shown = []
         for claim, its_time, its_moves in zip(claims, when, moves, strict=True):
-            moved = _is_inside(box, reduced) and any(_overlap(box, span) > 0.0 for span in its_moves)
+            moved = _is_inside(box, reduced) and any(
+                _overlap(box, span) > 0.0 for span in its_moves
+            )
             parts = [part for part in claim.parts if _can_show(part, box, reduced)]
-            parts = [part for part in parts if moved or part.candidate.view not in _MOVES or box["view"] != "spectrum"]
+            parts = [
+                part
+                for part in parts
+                if moved or part.candidate.view not in _MOVES or box["view"] != "spectrum"
+            ]
             if not parts or not set(str(box["axes"]).split()) & set(claim.axes):
                 continue
             if score >= limit and {part.candidate.view for part in parts} <= _modelled(claim, box):
@@ -177,14 +208,21 @@ def attribute_mismatches(
 
 
 def unexpected(
-    found: xr.Dataset, expected: Sequence[Identification], reduced: xr.Dataset, before: xr.Dataset, null: NullScores, *, level: float
+    found: xr.Dataset,
+    expected: Sequence[Identification],
+    reduced: xr.Dataset,
+    before: xr.Dataset,
+    null: NullScores,
+    *,
+    level: float,
 ) -> xr.Dataset:
     """Mismatches without those that effects explain which the simulation has as well.
 
     Parameters
     ----------
     found : xarray.Dataset
-        Located where odd samples that are expected were left out; so these explain what is odd and no more.
+        Located where odd samples that are expected were left out; so these explain what is odd and
+        no more.
     expected : sequence of Claim
     reduced, before : xarray.Dataset
         The recording, and the baseline with these effects.
@@ -192,10 +230,18 @@ def unexpected(
     level : float
     """
     odd = [
-        one for one in expected if any(part.candidate.view == "marks" and find_anomalous_blocks(part, reduced).any() for part in one.parts)
+        one
+        for one in expected
+        if any(
+            part.candidate.view == "marks" and find_anomalous_blocks(part, reduced).any()
+            for part in one.parts
+        )
     ]
     others = [one for one in expected if one not in odd]
-    by_count, by_all = (attribute_mismatches(found, claims, reduced, before, null, level=level) for claims in (odd, others))
+    by_count, by_all = (
+        attribute_mismatches(found, claims, reduced, before, null, level=level)
+        for claims in (odd, others)
+    )
     told = [
         bool(named) or (bool(counted) and view == "distribution")
         for view, counted, named in zip(found["view"].values, by_count, by_all, strict=True)
@@ -203,12 +249,18 @@ def unexpected(
     return found.isel(mismatch=~np.array(told, np.bool_)) if expected else found
 
 
-def _beside(box: Mapping[str, Any], parts: Sequence[Component], left: Callable[[], tuple[float, float]]) -> bool:
+def _beside(
+    box: Mapping[str, Any], parts: Sequence[Component], left: Callable[[], tuple[float, float]]
+) -> bool:
     """Whether a mismatch of the mean is there for what an effect does at other times.
 
-    The constant of a record is free: a mean that is higher in one part is one that is lower in the rest, and either may stand out.
+    The constant of a record is free: a mean that is higher in one part is one that is lower in the
+    rest, and either may stand out.
     """
-    if str(box["view"]) != "mean" or not {part.candidate.view for part in parts} <= {"mean", "levels"}:
+    if str(box["view"]) != "mean" or not {part.candidate.view for part in parts} <= {
+        "mean",
+        "levels",
+    }:
         return False
     score, limit = left()
     return score >= limit
@@ -217,18 +269,25 @@ def _beside(box: Mapping[str, Any], parts: Sequence[Component], left: Callable[[
 def _modelled(claim: Identification, box: Mapping[str, Any]) -> set[str]:
     """Parts that must take the mismatch away; that several axes wander as one is in no model, and what wanders on them may do it."""
     held = {*_MODELLED, "line", "marks"} if box["view"] == "cross_axis" else set(_MODELLED)
-    wanders = str(box["what"]) == "slow" and len(set(str(box["axes"]).split()) & set(claim.axes)) > 1
+    wanders = (
+        str(box["what"]) == "slow" and len(set(str(box["axes"]).split()) & set(claim.axes)) > 1
+    )
     return held - ({"wander"} if wanders else set())
 
 
 def _can_show(part: Component, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
     """Whether a part of an effect can be seen where a mismatch is.
 
-    A line explains a line at its own frequency only, and a mean of what axes share only what is slow.
+    A line explains a line at its own frequency only, and a mean of what axes share only what is
+    slow.
     """
     if str(box["view"]) not in _SHOWS.get(part.candidate.view, ()):
         return False
-    if part.candidate.view in ("mean", "wander", "levels") and box["view"] == "cross_axis" and box["what"] != "slow":
+    if (
+        part.candidate.view in ("mean", "wander", "levels")
+        and box["view"] == "cross_axis"
+        and box["what"] != "slow"
+    ):
         return False
     if part.candidate.view == "line" and box["view"] == "cross_axis":
         return str(box["what"]) != "slow"
@@ -239,7 +298,9 @@ def _can_show(part: Component, box: Mapping[str, Any], reduced: xr.Dataset) -> b
     if np.isfinite(box["frequency"]):
         return bool(abs(box["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine)
     tau = _BUMP / mine  # where the Allan variance of a sine is largest
-    return str(box["what"]).startswith(("avar", "level", "restless")) and bool(box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE)
+    return str(box["what"]).startswith(("avar", "level", "restless")) and bool(
+        box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE
+    )
 
 
 def _reach(claim: Identification, reduced: xr.Dataset) -> list[tuple[float, float]]:
@@ -260,17 +321,29 @@ def _overlap(box: Mapping[str, Any], span: tuple[float, float]) -> float:
 
 def _is_inside(box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
     """Whether a mismatch is of the inside of blocks, and not of their means."""
-    return str(box["view"]) in ("spectrum", "distribution") or float(box["tau_max_s"]) < float(reduced.attrs["block_s"])
+    return str(box["view"]) in ("spectrum", "distribution") or float(box["tau_max_s"]) < float(
+        reduced.attrs["block_s"]
+    )
 
 
-def _moves(claim: Identification, reduced: xr.Dataset, after: xr.Dataset) -> list[tuple[float, float]]:
+def _moves(
+    claim: Identification, reduced: xr.Dataset, after: xr.Dataset
+) -> list[tuple[float, float]]:
     """Blocks [s] in which an effect moves the rate of an axis too fast for what is said of their inside."""
-    axes, moving = [str(axis) for axis in reduced["axis"].values], expect_known_motion(reduced, after)
+    axes, moving = (
+        [str(axis) for axis in reduced["axis"].values],
+        expect_known_motion(reduced, after),
+    )
     there = np.zeros(reduced.sizes["block"], np.bool_)
-    for part in (part for part in claim.parts if part.candidate.view in _MOVES and part.variant.design.size):
+    for part in (
+        part for part in claim.parts if part.candidate.view in _MOVES and part.variant.design.size
+    ):
         row = axes.index(part.row[0])
         for column in mean_columns(part.variant, row):
             step = np.abs(np.diff(np.nan_to_num(column)))
             far = step > _MOVED * step.max(initial=0.0)
             there |= moving[row] & (np.append(far, False) | np.append(False, far))
-    return [(float(reduced["begin"].values[block]), float(reduced["end"].values[block])) for block in np.flatnonzero(there)]
+    return [
+        (float(reduced["begin"].values[block]), float(reduced["end"].values[block]))
+        for block in np.flatnonzero(there)
+    ]

@@ -25,7 +25,17 @@ Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
 Box = Mapping[str, Any]
 #: View of a mismatch -> parts of effects of which it holds what they bring there.
 _WEIGHED: dict[str, tuple[str, ...]] = {
-    "davar": ("mean", "levels", "power", "cross", "marks", "line", "order", "phase_locked", "transfer"),
+    "davar": (
+        "mean",
+        "levels",
+        "power",
+        "cross",
+        "marks",
+        "line",
+        "order",
+        "phase_locked",
+        "transfer",
+    ),
     "mean": ("mean", "levels", "marks"),
     "restart": ("mean", "levels", "marks"),
     "cross_axis": ("mean", "levels", "cross", "line", "marks"),
@@ -47,17 +57,22 @@ def statistic_scores(
 ) -> Scores:
     """Views of the recording against a baseline with effects in it.
 
-    What is said of blocks leaves out those of odd samples of `claims`, and what is said of their inside those in which an effect moves
-    the rate; so do the lines of `still`, which are those of `reduced` by default.
+    What is said of blocks leaves out those of odd samples of `claims`, and what is said of their
+    inside those in which an effect moves the rate; so do the lines of `still`, which are those of
+    `reduced` by default.
     """
     out = []
     reduced = remove_known_motion(reduced, after)
     after = _with_shared_lines(reduced, after, claims := list(claims))
     seen = mask_anomalous_blocks(reduced, [part for claim in claims for part in claim.parts])
-    turns_left_out = without_turns(reduced, after["spectrum"].transpose("axis", "block", "band").values)
+    turns_left_out = without_turns(
+        reduced, after["spectrum"].transpose("axis", "block", "band").values
+    )
     special = {"distribution": turns_left_out, "restless": levelled(seen, after, louder(boxes))}
     if still is not None:
-        special |= dict.fromkeys(_OF_LINES, seen.assign({name: still[name] for name in ("line_power", "line_weight")}))
+        special |= dict.fromkeys(
+            _OF_LINES, seen.assign({name: still[name] for name in ("line_power", "line_weight")})
+        )
     for name, score in STATISTICS.items():
         scores = score(special.get(name, seen), after) if name in null.views else None
         if scores is not None:
@@ -65,24 +80,45 @@ def statistic_scores(
     return out
 
 
-def _with_shared_lines(reduced: xr.Dataset, after: xr.Dataset, claims: Sequence[Identification]) -> xr.Dataset:
+def _with_shared_lines(
+    reduced: xr.Dataset, after: xr.Dataset, claims: Sequence[Identification]
+) -> xr.Dataset:
     """The baseline with the covariance of a line that axes have in common: its mean over the record, in the bands where the line is.
 
     The lowest band stays as it is, for it tells what the means of the blocks share.
     """
-    lines = [(part.place, part.row[0]) for claim in claims for part in claim.parts if part.candidate.view == "line" and part.place >= 0]
+    lines = [
+        (part.place, part.row[0])
+        for claim in claims
+        for part in claim.parts
+        if part.candidate.view == "line" and part.place >= 0
+    ]
     if "cross" not in reduced or len(lines) < 2:
         return after
-    seen, shape = (reduced[name].transpose("pair", "block", "band").values for name in ("cross", "cross_shape"))
-    known = after["cross"].transpose("pair", "block", "band").values if "cross" in after else np.zeros_like(seen)
+    seen, shape = (
+        reduced[name].transpose("pair", "block", "band").values for name in ("cross", "cross_shape")
+    )
+    known = (
+        after["cross"].transpose("pair", "block", "band").values
+        if "cross" in after
+        else np.zeros_like(seen)
+    )
     weight = np.where(np.isfinite(seen) & np.isfinite(shape), shape, 0.0)
     total = weight.sum(axis=1)
-    mean = np.divide((np.nan_to_num(seen - known) * weight).sum(axis=1), total, out=np.zeros(total.shape, complex), where=total > 0.0)
+    mean = np.divide(
+        (np.nan_to_num(seen - known) * weight).sum(axis=1),
+        total,
+        out=np.zeros(total.shape, complex),
+        where=total > 0.0,
+    )
     reach = 1.0 / float(reduced.attrs["block_s"])
     cross = known.copy()
     for place in {place for place, _ in lines}:
         frequency = float(reduced["line_frequency"].values[place])
-        bands = np.flatnonzero((reduced["band_low"].values <= frequency + reach) & (frequency - reach < reduced["band_high"].values))
+        bands = np.flatnonzero(
+            (reduced["band_low"].values <= frequency + reach)
+            & (frequency - reach < reduced["band_high"].values)
+        )
         axes = {axis for other, axis in lines if other == place}
         for number, pair in enumerate(pair_rows(reduced)):
             if set(pair) <= axes:
@@ -97,9 +133,17 @@ def left_of(box: Box, scores: Scores, null: NullScores, level: float) -> tuple[f
     for name, view, z in scores:
         if view.attrs["view"] != box["view"] or str(box["what"]) not in view["what"].values:
             continue
-        rows = [number for number, axes in enumerate(view["axes"].values) if set(str(axes).split()) & set(str(box["axes"]).split())]
-        inside = (view["begin"].values >= box["begin"] - 1e-6) & (view["end"].values <= box["end"] + 1e-6)
-        columns = (view["what"].values == box["what"]) & (view["tau_min_s"].values >= 0.99 * box["tau_min_s"])
+        rows = [
+            number
+            for number, axes in enumerate(view["axes"].values)
+            if set(str(axes).split()) & set(str(box["axes"]).split())
+        ]
+        inside = (view["begin"].values >= box["begin"] - 1e-6) & (
+            view["end"].values <= box["end"] + 1e-6
+        )
+        columns = (view["what"].values == box["what"]) & (
+            view["tau_min_s"].values >= 0.99 * box["tau_min_s"]
+        )
         columns &= view["tau_min_s"].values <= 1.01 * box["tau_max_s"]
         cells = np.abs(z[np.ix_(rows, inside, columns)])
         if np.isfinite(cells).any():
@@ -109,21 +153,25 @@ def left_of(box: Box, scores: Scores, null: NullScores, level: float) -> tuple[f
 
 
 def needed(
-    box: Box, shown: Sequence[tuple[Identification, Sequence[Component]]], left: Callable[[Sequence[Identification]], tuple[float, float]]
+    box: Box,
+    shown: Sequence[tuple[Identification, Sequence[Component]]],
+    left: Callable[[Sequence[Identification]], tuple[float, float]],
 ) -> list[Identification]:
     """Those of the effects in the place of a mismatch that it takes to explain it.
 
-    It takes an effect without which alone the mismatch would be one again. Of several that do the same, none is so: it takes each that
-    brings half of an equal share or more of what all of them take off the largest score. What brings less could be larger or smaller by
-    its own size, and the mismatch would be gone all the same. An effect of which a view does not hold what it brings stays, and so does the
-    one that brings most.
+    It takes an effect without which alone the mismatch would be one again. Of several that do the
+    same, none is so: it takes each that brings half of an equal share or more of what all of them
+    take off the largest score. What brings less could be larger or smaller by its own size, and the
+    mismatch would be gone all the same. An effect of which a view does not hold what it brings
+    stays, and so does the one that brings most.
 
     Parameters
     ----------
     box : mapping
         The mismatch, with the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
     shown : sequence of (Claim, sequence of Part)
-        Effects that act there and together leave nothing of it, each with its parts that can show in its view.
+        Effects that act there and together leave nothing of it, each with its parts that can show
+        in its view.
     left : callable
         The score that is left there when some effects are left out, and the score of a mismatch.
     """
@@ -134,7 +182,11 @@ def needed(
     brought = left(weighed)[0] - whole
     without = [left((one,)) for one in weighed]
     fair = _FAIR * brought / len(shown)
-    kept = [number for number, (score, limit) in enumerate(without) if score >= limit or 0.0 < fair <= score - whole]
+    kept = [
+        number
+        for number, (score, limit) in enumerate(without)
+        if score >= limit or 0.0 < fair <= score - whole
+    ]
     if not kept and len(weighed) == len(shown):
         kept = [int(np.argmax([score for score, _ in without]))]
     dropped = [id(one) for number, one in enumerate(weighed) if number not in kept]
@@ -143,4 +195,6 @@ def needed(
 
 def _is_weighed(part: Component, box: Box) -> bool:
     """Whether a view holds what a part brings; a low-pass may be in the noise of the baseline by now."""
-    return part.candidate.view in _WEIGHED.get(str(box["view"]), ()) and not is_filter(part.candidate.view, part.variant)
+    return part.candidate.view in _WEIGHED.get(str(box["view"]), ()) and not is_filter(
+        part.candidate.view, part.variant
+    )

@@ -16,7 +16,17 @@ from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import Effect
 
-__all__ = ["HELD_OUT", "MISMATCH_VIEWS", "SCHEMA", "VERDICTS", "Diagnosis", "check_diagnosis", "effect_table", "model_text", "plain"]
+__all__ = [
+    "HELD_OUT",
+    "MISMATCH_VIEWS",
+    "SCHEMA",
+    "VERDICTS",
+    "Diagnosis",
+    "check_diagnosis",
+    "effect_table",
+    "model_text",
+    "plain",
+]
 
 SCHEMA = "gyrostab.diagnosis/1"
 VERDICTS = ("no mismatch", "explained", "partly explained", "unknown")
@@ -33,7 +43,8 @@ class Diagnosis:
     content : mapping
         What `diagnosis.json` holds, as plain data; `check_diagnosis` says what is in it.
     surfaces : xarray.Dataset
-        Allan variances and means of the recording, of the simulation before, and of that with the effects added.
+        Allan variances and means of the recording, of the simulation before, and of that with the
+        effects added.
     model : mapping
         Tables of the simulation with the effects added, as `gyrostab.read_model` takes them.
     """
@@ -67,16 +78,26 @@ class Diagnosis:
         for effect in self.effects:
             gain = effect["held_out_gain"]
             lines.append(f"- {effect['name']}: {effect['statement']}")
-            lines.append(f"  predicts time kept apart better by {gain['nats']:.3g} nats; chance reaches {gain['threshold']:.2g}")
+            lines.append(
+                f"  predicts time kept apart better by {gain['nats']:.3g} nats; chance reaches {gain['threshold']:.2g}"
+            )
             if step := next_measurement(effect["name"], effect["alternatives"]):
                 lines.append(f"  {step}")
-        lines += [f"- channel {one['name']} is not used: {one['reason']}" for one in self.content.get("unused_channels", [])]
+        lines += [
+            f"- channel {one['name']} is not used: {one['reason']}"
+            for one in self.content.get("unused_channels", [])
+        ]
         left = set(self.content["unexplained"])
         boxes = [box for box in self.mismatches if box["id"] in left]
-        lines += [f"- unexplained: {without_chance(box['statement']) if len(boxes) > 1 else box['statement']}" for box in boxes]
+        lines += [
+            f"- unexplained: {without_chance(box['statement']) if len(boxes) > 1 else box['statement']}"
+            for box in boxes
+        ]
         if len(boxes) > 1:
             likeliest = max(box["p_value"] for box in boxes)
-            lines.append(f"  Noise alone does as much as the least certain of these in {chance_share(likeliest)} such records.")
+            lines.append(
+                f"  Noise alone does as much as the least certain of these in {chance_share(likeliest)} such records."
+            )
         return "\n".join(lines)
 
 
@@ -103,11 +124,18 @@ def plain(value: Any) -> Any:
     return value
 
 
-# ------------------------------------------------------------------------------------------------------------------ the check
+# ------------------------------------------------------------------------------------------------------------------
+# the check
 
 _NUMBER = (int, float)
 _LATER = (int, float, type(None))  # null where the record cannot tell
-_ENTRY: dict[str, Any] = {"value": _LATER, "stderr": _LATER, "low": _LATER, "high": _LATER, "unit": str}
+_ENTRY: dict[str, Any] = {
+    "value": _LATER,
+    "stderr": _LATER,
+    "low": _LATER,
+    "high": _LATER,
+    "unit": str,
+}
 _FIELDS: dict[str, dict[str, Any]] = {
     "": {
         "schema": str, "recording": dict, "baseline": dict, "verdict": str, "false_alarm_level": _NUMBER, "mismatches": list,
@@ -142,19 +170,32 @@ HELD_OUT = tuple(_FIELDS["held_out"])
 
 def _require(table: Any, kind: str, where: str) -> None:
     if not isinstance(table, Mapping):
-        raise SchemaError(f"diagnosis: {where or 'the whole'} is no table but {type(table).__name__}")
+        raise SchemaError(
+            f"diagnosis: {where or 'the whole'} is no table but {type(table).__name__}"
+        )
     for name, types in _FIELDS[kind].items():
         place = f"{where}.{name}" if where else name
         if name not in table:
             raise SchemaError(f"diagnosis: {place} is missing")
         value = table[name]
-        if not isinstance(value, types) or (isinstance(value, bool) and bool not in np.atleast_1d(types)):
+        if not isinstance(value, types) or (
+            isinstance(value, bool) and bool not in np.atleast_1d(types)
+        ):
             raise SchemaError(f"diagnosis: {place} is {value!r}, which is no {_called(types)}")
 
 
 def _called(types: Any) -> str:
-    names = {int: "whole number", float: "number", str: "text", list: "list", dict: "table", type(None): "null"}
-    return " or ".join(dict.fromkeys(names[one] for one in (types if isinstance(types, tuple) else (types,))))
+    names = {
+        int: "whole number",
+        float: "number",
+        str: "text",
+        list: "list",
+        dict: "table",
+        type(None): "null",
+    }
+    return " or ".join(
+        dict.fromkeys(names[one] for one in (types if isinstance(types, tuple) else (types,)))
+    )
 
 
 def _times(values: Iterable[Any], where: str) -> None:
@@ -162,7 +203,9 @@ def _times(values: Iterable[Any], where: str) -> None:
         try:
             np.datetime64(str(value).removesuffix("Z"))
         except ValueError:
-            raise SchemaError(f"diagnosis: {where} holds {value!r}, which is no time of ISO 8601") from None
+            raise SchemaError(
+                f"diagnosis: {where} holds {value!r}, which is no time of ISO 8601"
+            ) from None
 
 
 def check_diagnosis(content: Mapping[str, Any]) -> None:
@@ -178,14 +221,18 @@ def check_diagnosis(content: Mapping[str, Any]) -> None:
     if content["schema"] != SCHEMA:
         raise SchemaError(f"diagnosis: the schema is {content['schema']!r}, expected {SCHEMA!r}")
     if content["verdict"] not in VERDICTS:
-        raise SchemaError(f"diagnosis: the verdict is {content['verdict']!r}; there are {', '.join(VERDICTS)}")
+        raise SchemaError(
+            f"diagnosis: the verdict is {content['verdict']!r}; there are {', '.join(VERDICTS)}"
+        )
     _require(content["recording"], "recording", "recording")
     _times((content["recording"]["start"], content["recording"]["end"]), "recording")
     _check_baseline(content["baseline"])
     _require(content["held_out"], "held_out", "held_out")
     numbers = [box.get("id") for box in content["mismatches"]]
     if len(set(numbers)) < len(numbers):
-        raise SchemaError(f"diagnosis: the ids of the mismatches are {numbers}; each must be there once")
+        raise SchemaError(
+            f"diagnosis: the ids of the mismatches are {numbers}; each must be there once"
+        )
     names = [effect.get("name") for effect in content["effects"]]
     for place, box in enumerate(content["mismatches"]):
         _check_mismatch(box, f"mismatches[{place}]", names)
@@ -200,18 +247,24 @@ def check_diagnosis(content: Mapping[str, Any]) -> None:
         _require(channel, "unused_channel", f"unused_channels[{place}]")
     stray = [number for number in content["unexplained"] if number not in numbers]
     if stray:
-        raise SchemaError(f"diagnosis: unexplained names the mismatch {stray[0]}, which is not there")
+        raise SchemaError(
+            f"diagnosis: unexplained names the mismatch {stray[0]}, which is not there"
+        )
 
 
 def _check_baseline(baseline: Mapping[str, Any]) -> None:
     _require(baseline, "baseline", "baseline")
     if baseline["source"] not in _SOURCES:
-        raise SchemaError(f"diagnosis: baseline.source is {baseline['source']!r}; there are {', '.join(_SOURCES)}")
+        raise SchemaError(
+            f"diagnosis: baseline.source is {baseline['source']!r}; there are {', '.join(_SOURCES)}"
+        )
     for axis, terms in baseline["noise"].items():
         for term, entry in terms.items():
             where = f"baseline.noise.{axis}.{term}"
             if term not in TERMS:
-                raise SchemaError(f"diagnosis: {where} is no noise term; there are {', '.join(TERMS)}")
+                raise SchemaError(
+                    f"diagnosis: {where} is no noise term; there are {', '.join(TERMS)}"
+                )
             _require(entry, "noise", where)
     for span in baseline["calibrated_on"]:
         _times(span, "baseline.calibrated_on")
@@ -222,13 +275,19 @@ def _check_baseline(baseline: Mapping[str, Any]) -> None:
 def _check_mismatch(box: Mapping[str, Any], where: str, names: list[Any]) -> None:
     _require(box, "mismatch", where)
     if box["view"] not in MISMATCH_VIEWS:
-        raise SchemaError(f"diagnosis: {where}.view is {box['view']!r}; there are {', '.join(MISMATCH_VIEWS)}")
+        raise SchemaError(
+            f"diagnosis: {where}.view is {box['view']!r}; there are {', '.join(MISMATCH_VIEWS)}"
+        )
     _times((box["start"], box["end"]), where)
     if not 0.0 <= box["p_value"] <= 1.0:
-        raise SchemaError(f"diagnosis: {where}.p_value is {box['p_value']}, which is no probability")
+        raise SchemaError(
+            f"diagnosis: {where}.p_value is {box['p_value']}, which is no probability"
+        )
     stray = [name for name in box["explained_by"] if name not in names]
     if stray:
-        raise SchemaError(f"diagnosis: {where}.explained_by names {stray[0]!r}, which is not among the effects")
+        raise SchemaError(
+            f"diagnosis: {where}.explained_by names {stray[0]!r}, which is not among the effects"
+        )
 
 
 def _check_effect(effect: Mapping[str, Any], where: str) -> None:
@@ -239,10 +298,13 @@ def _check_effect(effect: Mapping[str, Any], where: str) -> None:
     for name, entry in effect["parameters"].items():
         for key, types in _ENTRY.items():
             if not isinstance(entry.get(key, 0.5 if key == "unit" else "none"), types):
-                raise SchemaError(f"diagnosis: {where}.parameters.{name}.{key} is {entry.get(key)!r}")
+                raise SchemaError(
+                    f"diagnosis: {where}.parameters.{name}.{key} is {entry.get(key)!r}"
+                )
 
 
-# ------------------------------------------------------------------------------------------------------------------ the model
+# ------------------------------------------------------------------------------------------------------------------
+# the model
 
 
 def effect_table(effect: Effect) -> dict[str, Any]:
@@ -316,12 +378,18 @@ def _pairs(table: Mapping[str, Any]) -> list[str]:
 
 
 def _key(key: str) -> str:
-    return key if key and all(letter.isascii() and (letter.isalnum() or letter in "_-") for letter in key) else _quoted(key)
+    return (
+        key
+        if key and all(letter.isascii() and (letter.isalnum() or letter in "_-") for letter in key)
+        else _quoted(key)
+    )
 
 
 def _quoted(text: str) -> str:
     """A basic string of TOML: as that of JSON, but for DEL, and for halves of surrogate pairs, which have no place in a file."""
-    return json.dumps(text.encode("utf-8", "replace").decode("utf-8"), ensure_ascii=False).replace("\x7f", "\\u007f")
+    return json.dumps(text.encode("utf-8", "replace").decode("utf-8"), ensure_ascii=False).replace(
+        "\x7f", "\\u007f"
+    )
 
 
 def _value(value: Any) -> str:

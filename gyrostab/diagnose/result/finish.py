@@ -91,7 +91,11 @@ def finish_diagnosis(task: Task, compared: Compared, begun: float) -> Diagnosis:
         "seconds": round(time.perf_counter() - begun, 3),
     }
     own = task.given if isinstance(task.given, Model) else None
-    diagnosis = Diagnosis(plain(content), _surfaces(reduced, fit, before, after), model_tables(fit.noise, fit.fitted, own))
+    diagnosis = Diagnosis(
+        plain(content),
+        _surfaces(reduced, fit, before, after),
+        model_tables(fit.noise, fit.fitted, own),
+    )
     check_diagnosis(diagnosis.content)
     return diagnosis
 
@@ -101,7 +105,9 @@ def _used_channels(naming: Identifications) -> set[str]:
     return {name for one in naming.candidates for name in (*one.driver, *one.witness)}
 
 
-def fit_supported(naming: Identifications, baseline: xr.Dataset) -> tuple[Identifications, list[Fitted], Fit]:
+def fit_supported(
+    naming: Identifications, baseline: xr.Dataset
+) -> tuple[Identifications, list[Fitted], Fit]:
     """Fit the effects until each that is left has a size away from zero.
 
     Returns
@@ -123,7 +129,9 @@ def fit_supported(naming: Identifications, baseline: xr.Dataset) -> tuple[Identi
         naming = kept
 
 
-def fitted_beside_their_noise(naming: Identifications, baseline: xr.Dataset, first: list[Fitted]) -> Fit:
+def fitted_beside_their_noise(
+    naming: Identifications, baseline: xr.Dataset, first: list[Fitted]
+) -> Fit:
     """Calibrate the noise beside the effects as they were fitted `first`, and fit them once more to what is left."""
     noise = recalibrate(naming, baseline, first)
     if noise is baseline:
@@ -132,7 +140,9 @@ def fitted_beside_their_noise(naming: Identifications, baseline: xr.Dataset, fir
     return Fit(naming, noise, fit_identifications(naming, noise), fit_expected(naming, baseline))
 
 
-def worth(reduced: xr.Dataset, baseline: xr.Dataset, naming: Identifications, first: Sequence[Fitted]) -> dict[str, float]:
+def worth(
+    reduced: xr.Dataset, baseline: xr.Dataset, naming: Identifications, first: Sequence[Fitted]
+) -> dict[str, float]:
     """What the effects gain on time that they were not fitted to, each by the views that can tell; the noise is fitted with them."""
     told, hopping = remove_telegraph_bias(naming)
     judged, waving = without_waves(told)
@@ -142,21 +152,32 @@ def worth(reduced: xr.Dataset, baseline: xr.Dataset, naming: Identifications, fi
         return predicted(with_noise(chosen, own), own, known)
 
     parts = [part for claim in told.claims for part in claim.parts]
-    odd = sum(part.gain for part in parts if part.candidate.view == "marks")  # no other number has them
-    clean = mask_anomalous_blocks(reduced, [*parts, *(part for claim in told.expected for part in claim.parts)])
+    odd = sum(
+        part.gain for part in parts if part.candidate.view == "marks"
+    )  # no other number has them
+    clean = mask_anomalous_blocks(
+        reduced, [*parts, *(part for claim in told.expected for part in claim.parts)]
+    )
     start = partial(expected_baseline, told, baseline) if told.expected else baseline
     whole, rest = (partial(trained, one) if one.claims else start for one in (told, judged))
     later = tuple(claim for claim in judged.claims if _can_be_forecast(claim, reduced))
     forecast = partial(trained, replace(judged, claims=later)) if later else start
-    found = held_out(clean, start, rest, more_gain=odd + hopping + waving, shown=whole if waving else None, forecast=forecast)
+    found = held_out(
+        clean,
+        start,
+        rest,
+        more_gain=odd + hopping + waving,
+        shown=whole if waving else None,
+        forecast=forecast,
+    )
     return found if later or not told.claims else found | {"forecast_gain": np.nan}
 
 
 def _can_be_forecast(claim: Identification, reduced: xr.Dataset) -> bool:
     """Return whether an effect acts both in the time that a forecast is fitted to and in the time that it predicts.
 
-    The size of an event in the last part is not known before, and one that is over says nothing of later. Counts of odd samples are in
-    neither means nor powers, which the forecast predicts.
+    The size of an event in the last part is not known before, and one that is over says nothing of
+    later. Counts of odd samples are in neither means nor powers, which the forecast predicts.
     """
     if {part.candidate.view for part in claim.parts} <= {"marks"}:
         return False
@@ -164,15 +185,30 @@ def _can_be_forecast(claim: Identification, reduced: xr.Dataset) -> bool:
     return bool(acts[known].any() and acts[~known].any())
 
 
-def _mismatches(task: Task, compared: Compared, fit: Fit, after: xr.Dataset) -> list[dict[str, Any]]:
+def _mismatches(
+    task: Task, compared: Compared, fit: Fit, after: xr.Dataset
+) -> list[dict[str, Any]]:
     """Places beyond chance and those of what was named, each with the effects that explain it."""
     reduced, found, claims = compared.reduced, compared.found, fit.naming.claims
 
     def without(left_out: Sequence[Identification]) -> xr.Dataset:
         return predicted(fit.naming, fit.noise, left_out=left_out)
 
-    lines = still_lines(task, reduced, after) if claims and (found["view"] == "spectrum").any() else None
-    explained = attribute_mismatches(found, claims, reduced, after, compared.null, level=task.level / 2.0, without=without, still=lines)
+    lines = (
+        still_lines(task, reduced, after)
+        if claims and (found["view"] == "spectrum").any()
+        else None
+    )
+    explained = attribute_mismatches(
+        found,
+        claims,
+        reduced,
+        after,
+        compared.null,
+        level=task.level / 2.0,
+        without=without,
+        still=lines,
+    )
     mismatches = mismatch_tables(found, reduced, explained)
     mismatches += identification_tables(fit.naming, reduced, mismatches)
     mismatches += unidentified_tables(fit.naming, reduced, mismatches)

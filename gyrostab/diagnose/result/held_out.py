@@ -21,7 +21,10 @@ __all__ = ["Trained", "forecast_from", "held_out", "log_likelihood", "stretches"
 
 #: A baseline, or what fits one to the blocks where its argument, a mask of blocks, is true.
 Trained = xr.Dataset | Callable[[NDArray[np.bool_]], xr.Dataset]
-_STRETCH_S, _FEWEST = 100.0, 36  # length of a stretch, and how many there must be: long ones would hide an event whole
+_STRETCH_S, _FEWEST = (
+    100.0,
+    36,
+)  # length of a stretch, and how many there must be: long ones would hide an event whole
 _LEAST = 12
 _KNOWN = 0.7  # share of the record that a forecast begins from
 _SHORT = 5  # blocks
@@ -39,34 +42,40 @@ def held_out(
 ) -> dict[str, float]:
     """Compare two models of a recording on time that they have not seen.
 
-    The record is cut into stretches; every fourth is held out in turn, and the models are fitted to the rest. Where the models differ in
-    their means, so it is done for stretches of all lengths of `gyrostab.diagnose.evidence.folds`, as for the names, and the length at which
-    the gain is largest counts: over a short hole a random walk knows a slow drift from both sides, whether it has a model or not.
+    The record is cut into stretches; every fourth is held out in turn, and the models are fitted to
+    the rest. Where the models differ in their means, so it is done for stretches of all lengths of
+    `gyrostab.diagnose.evidence.folds`, as for the names, and the length at which the gain is
+    largest counts: over a short hole a random walk knows a slow drift from both sides, whether it
+    has a model or not.
 
     Parameters
     ----------
     reduced : xarray.Dataset
         The recording.
     before, after : xarray.Dataset or callable
-        Baselines, the second with the effects in its ``spectrum``, ``known_mean`` and, for what the axes share, ``cross`` (pair,
-        block, band). A callable gets the mask of the blocks that may be used, and gives the baseline fitted to them; a Dataset is
-        taken as it is, and what comes of it is held out only if it was fitted elsewhere.
+        Baselines, the second with the effects in its ``spectrum``, ``known_mean`` and, for what the
+        axes share, ``cross`` (pair, block, band). A callable gets the mask of the blocks that may
+        be used, and gives the baseline fitted to them; a Dataset is taken as it is, and what comes
+        of it is held out only if it was fitted elsewhere.
     more_gain : float
-        Held-out gain of what is in neither means nor powers nor cross-spectra, which is added [nats]: counts of odd samples, waves of known
-        course, biases of two levels. Lines are in the powers of their bands already, and would count twice.
+        Held-out gain of what is in neither means nor powers nor cross-spectra, which is added
+        [nats]: counts of odd samples, waves of known course, biases of two levels. Lines are in the
+        powers of their bands already, and would count twice.
     shown : xarray.Dataset or callable, optional
-        Baseline with all effects, those of `more_gain` too, where `after` is without them: what the Allan variance is compared with.
+        Baseline with all effects, those of `more_gain` too, where `after` is without them: what the
+        Allan variance is compared with.
     forecast : xarray.Dataset or callable, optional
         Baseline with the effects that can be forecast; `after` by default.
 
     Returns
     -------
     dict
-        ``blocks``, the stretches; ``log_likelihood_gain`` of `after` over `before` and its ``stderr`` by the noise of the recording
-        [nats]; ``misfit_before``, ``misfit_after``, the mean square of the scores of the Allan variance, 1 for a model that
-        fits, and ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band; ``mean_misfit_before`` and
-        ``mean_misfit_after``, the same of the means of the stretches; ``forecast_gain``, the gain on the last 30 % of models fitted
-        to the first 70 % [nats].
+        ``blocks``, the stretches; ``log_likelihood_gain`` of `after` over `before` and its
+        ``stderr`` by the noise of the recording [nats]; ``misfit_before``, ``misfit_after``, the
+        mean square of the scores of the Allan variance, 1 for a model that fits, and
+        ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band;
+        ``mean_misfit_before`` and ``mean_misfit_after``, the same of the means of the stretches;
+        ``forecast_gain``, the gain on the last 30 % of models fitted to the first 70 % [nats].
 
     Raises
     ------
@@ -82,7 +91,9 @@ def held_out(
     cut = stretches(reduced)
     fold = np.arange(cut.first.size) % FOLDS
     gains = _Gain(more_gain, 2.0 * abs(more_gain))
-    squares: dict[str, list[Array]] = {name: [] for name in ("before", "after", "mean_before", "mean_after")}
+    squares: dict[str, list[Array]] = {
+        name: [] for name in ("before", "after", "mean_before", "mean_after")
+    }
     moves = False
     for number in range(FOLDS):
         held = Windows(cut.first[fold == number], cut.stop[fold == number])
@@ -115,9 +126,13 @@ class _Gain(NamedTuple):
         return _Gain(self.nats + other.nats, self.variance + other.variance)
 
 
-def _gain(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_]) -> _Gain:
+def _gain(
+    reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_]
+) -> _Gain:
     """What one trained model gains over another on the blocks held out."""
-    nats = log_likelihood(reduced, after, ~held, held) - log_likelihood(reduced, before, ~held, held)
+    nats = log_likelihood(reduced, after, ~held, held) - log_likelihood(
+        reduced, before, ~held, held
+    )
     return _Gain(nats, _variance(reduced, before, after, held, nats))
 
 
@@ -128,7 +143,9 @@ def _longer(reduced: xr.Dataset, before: Trained, after: Trained, more_gain: flo
         whole = _Gain(more_gain, 2.0 * abs(more_gain))
         for number in range(FOLDS):
             held = fold == number
-            whole = whole.plus(_gain(reduced, _trained(before, ~held), _trained(after, ~held), held))
+            whole = whole.plus(
+                _gain(reduced, _trained(before, ~held), _trained(after, ~held), held)
+            )
         found.append(whole)
     return found
 
@@ -146,11 +163,15 @@ def stretches(reduced: xr.Dataset) -> Windows:
         raise OptionError(
             f"the record has {blocks} blocks, too few to hold any out: it needs {_LEAST}; give a longer record or shorter blocks"
         )
-    edge = np.rint(np.linspace(0, blocks, min(blocks, max(_FEWEST, round(span / _STRETCH_S))) + 1)).astype(np.int64)
+    edge = np.rint(
+        np.linspace(0, blocks, min(blocks, max(_FEWEST, round(span / _STRETCH_S))) + 1)
+    ).astype(np.int64)
     return Windows(edge[:-1], edge[1:])
 
 
-def log_likelihood(reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: NDArray[np.bool_]) -> float:
+def log_likelihood(
+    reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: NDArray[np.bool_]
+) -> float:
     """Log-likelihood of held-out blocks given the known blocks [nats], up to a constant of the data.
 
     Parameters
@@ -162,7 +183,9 @@ def log_likelihood(reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.
     """
     total = float((_power_terms(reduced, baseline) + _cross_terms(reduced, baseline))[held].sum())
     for axis in range(reduced.sizes["axis"]):
-        total += _mean_evidence(reduced, baseline, axis, known | held) - _mean_evidence(reduced, baseline, axis, known)
+        total += _mean_evidence(reduced, baseline, axis, known | held) - _mean_evidence(
+            reduced, baseline, axis, known
+        )
     return total
 
 
@@ -177,10 +200,16 @@ def _inside(windows: Windows, blocks: int) -> NDArray[np.bool_]:
     return inside
 
 
-def _variance(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_], gain: float) -> float:
+def _variance(
+    reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_], gain: float
+) -> float:
     """Variance of a gain: that of the powers from the scatter of their cells about `after`; a normal law has twice its gain."""
-    power, shape = (values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape"))
-    one, other = (values_of(baseline, "spectrum", "axis", "block", "band") for baseline in (after, before))
+    power, shape = (
+        values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape")
+    )
+    one, other = (
+        values_of(baseline, "spectrum", "axis", "block", "band") for baseline in (after, before)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.square(shape * (1.0 / one - 1.0 / other) * (power - one))[:, held]
     by_power = float((_power_terms(reduced, after) - _power_terms(reduced, before))[held].sum())
@@ -189,7 +218,9 @@ def _variance(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: 
 
 def _power_terms(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
     """Log-likelihood of the band powers of every block, by gamma laws."""
-    power, shape = (values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape"))
+    power, shape = (
+        values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape")
+    )
     spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
     there = np.isfinite(power) & np.isfinite(shape) & (spectrum > 0)
     safe = np.where(there, spectrum, 1.0)
@@ -204,14 +235,21 @@ def _cross_terms(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
     axes = [str(axis) for axis in reduced["axis"].values]
     left = [axes.index(str(axis)) for axis in reduced["first"].values]
     right = [axes.index(str(axis)) for axis in reduced["second"].values]
-    power, shape = (np.moveaxis(values_of(reduced, name, "axis", "block", "band"), 0, -1) for name in ("power", "shape"))
+    power, shape = (
+        np.moveaxis(values_of(reduced, name, "axis", "block", "band"), 0, -1)
+        for name in ("power", "shape")
+    )
     spectrum = np.moveaxis(values_of(baseline, "spectrum", "axis", "block", "band"), 0, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         both = np.sqrt(spectrum[..., left] * spectrum[..., right])
         seen = np.moveaxis(values_of(reduced, "cross", "pair", "block", "band"), 0, -1) / both
         model = np.moveaxis(values_of(baseline, "cross", "pair", "block", "band"), 0, -1) / both
         flat = power / spectrum
-    there = np.isfinite(seen).all(axis=-1) & np.isfinite(model).all(axis=-1) & np.isfinite(flat).all(axis=-1)
+    there = (
+        np.isfinite(seen).all(axis=-1)
+        & np.isfinite(model).all(axis=-1)
+        & np.isfinite(flat).all(axis=-1)
+    )
     size = len(axes)
     expected = np.zeros((*there.shape, size, size), dtype=np.complex128)
     found = expected.copy()
@@ -225,9 +263,14 @@ def _cross_terms(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
     return np.asarray((-weight * (np.linalg.slogdet(expected)[1] + trace)).sum(axis=-1))
 
 
-def _mean_evidence(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, used: NDArray[np.bool_]) -> float:
+def _mean_evidence(
+    reduced: xr.Dataset, baseline: xr.Dataset, axis: int, used: NDArray[np.bool_]
+) -> float:
     """Log-likelihood of the block means that are used, with a free constant, averaged over the calibrated random walk and flicker."""
-    residual = values_of(reduced, "mean", "axis", "block")[axis] - values_of(baseline, "known_mean", "axis", "block")[axis]
+    residual = (
+        values_of(reduced, "mean", "axis", "block")[axis]
+        - values_of(baseline, "known_mean", "axis", "block")[axis]
+    )
     variance = values_of(baseline, "mean_variance", "axis", "block")[axis]
     present = used & np.isfinite(residual) & np.isfinite(variance) & (variance > 0)
     if "grid_K" in baseline:
@@ -235,7 +278,10 @@ def _mean_evidence(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, used: N
         weight = baseline["grid_calibrated"].values[axis]
     else:
         terms = [str(term) for term in baseline["term"].values]
-        walk, flicker = (np.nan_to_num(baseline["coefficient"].values[axis, [terms.index(term)]]) for term in ("K", "B"))
+        walk, flicker = (
+            np.nan_to_num(baseline["coefficient"].values[axis, [terms.index(term)]])
+            for term in ("K", "B")
+        )
         weight = np.zeros(1)
     found = mean_products(
         np.where(present, residual, 0.0)[:, None],
@@ -255,14 +301,19 @@ def _allan_scores(reduced: xr.Dataset, baseline: xr.Dataset, held: Windows) -> A
     """Squared scores of the Allan variance in windows that lie inside the held-out stretches, side by side."""
     first, stop = [held.first], [held.stop]
     for length in {1, min(_SHORT, int((held.stop - held.first).min()))}:
-        inside = [np.arange(low, high - length + 1, length) for low, high in zip(held.first, held.stop, strict=True)]
+        inside = [
+            np.arange(low, high - length + 1, length)
+            for low, high in zip(held.first, held.stop, strict=True)
+        ]
         start = np.concatenate(inside)
         first.append(start)
         stop.append(start + length)
     windows = Windows(np.concatenate(first), np.concatenate(stop))
     surface = allan_surface(reduced, baseline, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])[..., surface["columns"]["what"] == "avar"]
+        z = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])[
+            ..., surface["columns"]["what"] == "avar"
+        ]
     return np.asarray(z[np.isfinite(z)] ** 2)
 
 
@@ -291,5 +342,7 @@ def forecast_from(reduced: xr.Dataset) -> NDArray[np.bool_]:
 
 def _forecast(reduced: xr.Dataset, before: Trained, after: Trained) -> float:
     known = forecast_from(reduced)
-    late, early = (log_likelihood(reduced, _trained(model, known), known, ~known) for model in (after, before))
+    late, early = (
+        log_likelihood(reduced, _trained(model, known), known, ~known) for model in (after, before)
+    )
     return late - early

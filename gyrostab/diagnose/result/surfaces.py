@@ -33,15 +33,21 @@ def make_surfaces(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset) ->
     Returns
     -------
     xarray.Dataset
-        ``avar`` (case, axis, window, tau) [degree2 hour-2], case one of `CASES`; ``avar_low``, ``avar_high``, where 95 % of recordings
-        of that simulation lie (NaN for the recording itself); ``mean`` (case, axis, window) [degree hour-1] and ``mean_stderr``, how far a
-        recording of that simulation may be from it; coordinates ``begin``, ``end`` [s since the start], ``time``, ``tau`` [s].
+        ``avar`` (case, axis, window, tau) [degree2 hour-2], case one of `CASES`; ``avar_low``,
+        ``avar_high``, where 95 % of recordings of that simulation lie (NaN for the recording
+        itself); ``mean`` (case, axis, window) [degree hour-1] and ``mean_stderr``, how far a
+        recording of that simulation may be from it; coordinates ``begin``, ``end`` [s since the
+        start], ``time``, ``tau`` [s].
     """
     windows = _windows(reduced.sizes["block"])
     plain = before.assign(known_mean=before["known_mean"] * 0.0)
     recorded = allan_surface(reduced, plain, windows)
     keep = (recorded["columns"]["what"] == "avar") & np.isfinite(recorded["shape"]).any(axis=(0, 1))
-    avar, low, high = [recorded["observed"][..., keep]], [np.full(recorded["observed"][..., keep].shape, np.nan)], []
+    avar, low, high = (
+        [recorded["observed"][..., keep]],
+        [np.full(recorded["observed"][..., keep].shape, np.nan)],
+        [],
+    )
     high.append(low[0])
     mean, error = [_averaged(reduced, values_of(reduced, "mean", "axis", "block"), windows)], []
     error.append(np.full(mean[0].shape, np.nan))
@@ -56,7 +62,9 @@ def make_surfaces(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset) ->
             information = window_means(reduced, baseline, windows)[1]
             error.append(1.0 / np.sqrt(information))
         mean.append(_predicted(reduced, baseline, windows))
-    return _labelled(reduced, windows, recorded["columns"]["tau_min_s"][keep], [avar, low, high], [mean, error])
+    return _labelled(
+        reduced, windows, recorded["columns"]["tau_min_s"][keep], [avar, low, high], [mean, error]
+    )
 
 
 def _windows(blocks: int) -> Windows:
@@ -68,15 +76,27 @@ def _windows(blocks: int) -> Windows:
 
 def _known(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Allan variance of the known mean, which the noise is without."""
-    means = np.where(np.isfinite(values_of(reduced, "mean", "axis", "block")), values_of(baseline, "known_mean", "axis", "block"), np.nan)
+    means = np.where(
+        np.isfinite(values_of(reduced, "mean", "axis", "block")),
+        values_of(baseline, "known_mean", "axis", "block"),
+        np.nan,
+    )
     alone = reduced.assign(mean=(("axis", "block"), means))
     found = allan_surface(alone, baseline.assign(known_mean=baseline["known_mean"] * 0.0), windows)
-    return np.asarray(np.where(found["columns"]["tau_min_s"] >= float(reduced.attrs["block_s"]), found["observed"], 0.0))
+    return np.asarray(
+        np.where(
+            found["columns"]["tau_min_s"] >= float(reduced.attrs["block_s"]), found["observed"], 0.0
+        )
+    )
 
 
 def _averaged(reduced: xr.Dataset, values: Array, windows: Windows) -> Array:
     """Mean over windows, weighted with the samples present where the recording has a mean."""
-    weight = np.where(np.isfinite(values_of(reduced, "mean", "axis", "block")), values_of(reduced, "samples", "axis", "block"), 0.0)
+    weight = np.where(
+        np.isfinite(values_of(reduced, "mean", "axis", "block")),
+        values_of(reduced, "samples", "axis", "block"),
+        0.0,
+    )
     sums = over_windows((np.where(weight > 0, values, 0.0) * weight)[..., None], windows)[..., 0]
     total = over_windows(weight[..., None], windows)[..., 0]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -85,34 +105,63 @@ def _averaged(reduced: xr.Dataset, values: Array, windows: Windows) -> Array:
 
 def _predicted(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Mean of the effects, and the constant that the recording has beside them."""
-    known, mean = values_of(baseline, "known_mean", "axis", "block"), values_of(reduced, "mean", "axis", "block")
-    weight = np.where(np.isfinite(mean), 1.0 / values_of(baseline, "mean_variance", "axis", "block"), 0.0)
+    known, mean = (
+        values_of(baseline, "known_mean", "axis", "block"),
+        values_of(reduced, "mean", "axis", "block"),
+    )
+    weight = np.where(
+        np.isfinite(mean), 1.0 / values_of(baseline, "mean_variance", "axis", "block"), 0.0
+    )
     weight = np.where(np.isfinite(weight), weight, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        level = (weight * np.nan_to_num(mean - known)).sum(axis=-1, keepdims=True) / weight.sum(axis=-1, keepdims=True)
+        level = (weight * np.nan_to_num(mean - known)).sum(axis=-1, keepdims=True) / weight.sum(
+            axis=-1, keepdims=True
+        )
     return _averaged(reduced, known + level, windows)
 
 
-def _labelled(reduced: xr.Dataset, windows: Windows, tau: Array, squares: list[Any], means: list[Any]) -> xr.Dataset:
+def _labelled(
+    reduced: xr.Dataset, windows: Windows, tau: Array, squares: list[Any], means: list[Any]
+) -> xr.Dataset:
     cube, plane = ("case", "axis", "window", "tau"), ("case", "axis", "window")
     begin, end = reduced["begin"].values[windows.first], reduced["end"].values[windows.stop - 1]
     start = np.datetime64(int(reduced.attrs["start_ns"]), "ns")
     middle = start + np.rint((begin + end) / 2.0 * 1e9).astype("timedelta64[ns]")
     units = {"avar": "degree2 hour-2", "mean": "degree hour-1", "time": "s"}
-    names = (("avar", "Allan variance"), ("avar_low", "lower end of the 95 % band"), ("avar_high", "upper end of the 95 % band"))
+    names = (
+        ("avar", "Allan variance"),
+        ("avar_low", "lower end of the 95 % band"),
+        ("avar_high", "upper end of the 95 % band"),
+    )
     data: dict[str, Any] = {
-        name: (cube, np.stack(np.broadcast_arrays(*values)), {"units": units["avar"], "long_name": told})
+        name: (
+            cube,
+            np.stack(np.broadcast_arrays(*values)),
+            {"units": units["avar"], "long_name": told},
+        )
         for (name, told), values in zip(names, squares, strict=True)
     }
-    for (name, told), values in zip((("mean", "mean rate"), ("mean_stderr", "standard deviation of the mean")), means, strict=True):
+    for (name, told), values in zip(
+        (("mean", "mean rate"), ("mean_stderr", "standard deviation of the mean")),
+        means,
+        strict=True,
+    ):
         data[name] = (plane, np.stack(values), {"units": units["mean"], "long_name": told})
     coordinates: dict[str, Any] = {
         "case": ("case", list(CASES)),
         "axis": ("axis", [str(axis) for axis in reduced["axis"].values]),
         "time": ("window", middle, {"long_name": "middle of the window"}),
-        "begin": ("window", begin, {"units": "s", "long_name": "start of the window, since the start"}),
+        "begin": (
+            "window",
+            begin,
+            {"units": "s", "long_name": "start of the window, since the start"},
+        ),
         "end": ("window", end, {"units": "s", "long_name": "end of the window, since the start"}),
         "tau": ("tau", tau, {"units": "s", "long_name": "averaging time"}),
     }
-    attributes = {name: reduced.attrs[name] for name in ("start", "start_ns", "sampling_rate_hz", "block_s") if name in reduced.attrs}
+    attributes = {
+        name: reduced.attrs[name]
+        for name in ("start", "start_ns", "sampling_rate_hz", "block_s")
+        if name in reduced.attrs
+    }
     return xr.Dataset(data, coords=coordinates, attrs=attributes)

@@ -75,7 +75,11 @@ def iso(reduced: xr.Dataset, seconds: float) -> str:
 
 def recording_table(reduced: xr.Dataset) -> dict[str, Any]:
     """What the recording is."""
-    channels = [str(name).removeprefix("channel_") for name in reduced.data_vars if str(name).startswith("channel_")]
+    channels = [
+        str(name).removeprefix("channel_")
+        for name in reduced.data_vars
+        if str(name).startswith("channel_")
+    ]
     return {
         "files": [str(name) for name in reduced.attrs["source_files"]],
         "axes": [str(axis) for axis in reduced["axis"].values],
@@ -93,23 +97,44 @@ def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str
     for axis in baseline["axis"].values:
         noise[str(axis)] = {}
         for term in baseline["term"].values:
-            value, error = (float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr"))
-            noise[str(axis)][str(term)] = {"value": value, "stderr": error if math.isfinite(error) else None, "unit": LAWS[str(term)].label}
+            value, error = (
+                float(baseline[name].sel(axis=axis, term=term))
+                for name in ("coefficient", "stderr")
+            )
+            noise[str(axis)][str(term)] = {
+                "value": value,
+                "stderr": error if math.isfinite(error) else None,
+                "unit": LAWS[str(term)].label,
+            }
     spans = baseline.attrs.get("calibrated_on", [])
     known = [
-        {"name": one.claim.effect, "axes": list(one.axes), "statement": one.say() or unsized_statement(one.claim.effect, one.axes)}
+        {
+            "name": one.claim.effect,
+            "axes": list(one.axes),
+            "statement": one.say() or unsized_statement(one.claim.effect, one.axes),
+        }
         for one in expected
     ]
-    table = {"source": baseline.attrs["source"], "noise": noise, "calibrated_on": [list(span) for span in spans]}
+    table = {
+        "source": baseline.attrs["source"],
+        "noise": noise,
+        "calibrated_on": [list(span) for span in spans],
+    }
     return {**table, "expected": known} if known else table
 
 
-def mismatch_tables(found: xr.Dataset, reduced: xr.Dataset, explained: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
+def mismatch_tables(
+    found: xr.Dataset, reduced: xr.Dataset, explained: Sequence[Sequence[str]]
+) -> list[dict[str, Any]]:
     """The mismatches, each with its sentence."""
     whole = float(reduced["end"].values[-1])
     out = []
     for number, names in enumerate(explained):
-        box = {str(name): found[name].values[number].item() for name in found.data_vars if found[name].dtype.kind != "M"}
+        box = {
+            str(name): found[name].values[number].item()
+            for name in found.data_vars
+            if found[name].dtype.kind != "M"
+        }
         box["axes"] = str(box["axes"]).split()
         out.append(
             {
@@ -138,12 +163,17 @@ def chance_of_gain(best: Array, gain: float) -> float:
     return max(_TAIL * math.exp(-(gain - start) / scale), _LEAST_P)
 
 
-def identification_tables(naming: Identifications, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def identification_tables(
+    naming: Identifications, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
     """Mismatches that only naming saw: where a named effect acts that explains none of those known, by its strongest part."""
     out: list[dict[str, Any]] = []
     begin, end = reduced["begin"].values, reduced["end"].values
     for claim in naming.claims:
-        if any(claim.effect in box["explained_by"] and set(box["axes"]) & set(claim.axes) for box in known):
+        if any(
+            claim.effect in box["explained_by"] and set(box["axes"]) & set(claim.axes)
+            for box in known
+        ):
             continue
         strongest = max(claim.parts, key=lambda part: part.gain)
         view = _PART_VIEW.get(strongest.candidate.view, "davar")
@@ -180,18 +210,25 @@ def _taus(part: Component, view: str, reduced: xr.Dataset) -> tuple[float, float
     return 1.0 / float(reduced.attrs["sampling_rate_hz"]), block
 
 
-def unidentified_tables(naming: Identifications, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def unidentified_tables(
+    naming: Identifications, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
     """Mismatches that only naming saw: what no effect explains, where no box that is left says so already."""
     out: list[dict[str, Any]] = []
     for one in naming.unknown:
         view = _GENERIC_VIEW.get(one.generic, "davar")
-        told = any(box["view"] == view and set(box["axes"]) & set(one.axes) and not box["explained_by"] for box in known)
+        told = any(
+            box["view"] == view and set(box["axes"]) & set(one.axes) and not box["explained_by"]
+            for box in known
+        )
         if not told:
             out.append(_unknown_table(one, naming, reduced, len(known) + len(out) + 1, view))
     return out
 
 
-def _unknown_table(one: Unidentified, naming: Identifications, reduced: xr.Dataset, number: int, view: str) -> dict[str, Any]:
+def _unknown_table(
+    one: Unidentified, naming: Identifications, reduced: xr.Dataset, number: int, view: str
+) -> dict[str, Any]:
     p_value = chance_of_gain(naming.null_best, one.gain)
     near = ", ".join(plain_name(name) for name in one.candidates)
     beside = f"; what comes nearest: {near}" if near else ""
@@ -216,21 +253,34 @@ def _unknown_table(one: Unidentified, naming: Identifications, reduced: xr.Datas
 def _when(one: Unidentified, reduced: xr.Dataset) -> tuple[float, float, str]:
     """Begin and end of what has no name [s], with words for an event; else the whole record."""
     whole = float(reduced["end"].values[-1])
-    found = [(part.variant.values["begin"], part.variant.values["end"]) for part in one.parts if "begin" in part.variant.values]
+    found = [
+        (part.variant.values["begin"], part.variant.values["end"])
+        for part in one.parts
+        if "begin" in part.variant.values
+    ]
     if not found:
         return float(reduced["begin"].values[0]), whole, ""
     begin, end = min(first for first, _ in found), max(last for _, last in found)
     return begin, end, f", {span_text(begin, end, whole)}"
 
 
-def motion_tables(claims: Sequence[Identification], reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def motion_tables(
+    claims: Sequence[Identification], reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
     """One mismatch for every axis whose moving stretches were left out of the comparison, from the first of them to the last."""
     if "moving" not in reduced:
         return []
-    begin, end, block = reduced["begin"].values, reduced["end"].values, float(reduced.attrs["block_s"])
+    begin, end, block = (
+        reduced["begin"].values,
+        reduced["end"].values,
+        float(reduced.attrs["block_s"]),
+    )
     out: list[dict[str, Any]] = []
     for axis, moving, mean in zip(
-        map(str, reduced["axis"].values), reduced["moving"].values, measured(reduced, "mean").values, strict=True
+        map(str, reduced["axis"].values),
+        reduced["moving"].values,
+        measured(reduced, "mean").values,
+        strict=True,
     ):
         if not moving.any():
             continue
@@ -248,7 +298,9 @@ def motion_tables(claims: Sequence[Identification], reduced: xr.Dataset, known: 
                 "ratio": None,
                 "p_value": _LEAST_P,
                 "explained_by": [],
-                "statement": motion_statement(axis, span_text(first, last, float(end[-1])), largest, _followers(axis, claims)),
+                "statement": motion_statement(
+                    axis, span_text(first, last, float(end[-1])), largest, _followers(axis, claims)
+                ),
             }
         )
     return out
@@ -257,15 +309,23 @@ def motion_tables(claims: Sequence[Identification], reduced: xr.Dataset, known: 
 def _followers(axis: str, claims: Sequence[Identification]) -> list[str]:
     """Axes on which the rate of an axis is seen through a lean of theirs."""
     parts = [part for claim in claims if claim.effect == "misalignment" for part in claim.parts]
-    return sorted({name for part in parts if axis in (*part.variant.columns, *part.candidate.witness) for name in part.row})
+    return sorted(
+        {
+            name
+            for part in parts
+            if axis in (*part.variant.columns, *part.candidate.witness)
+            for name in part.row
+        }
+    )
 
 
 def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[str, Any]]:
     """The named effects, the strongest first.
 
-    An effect with different numbers on several axes is one claim in as many tables, each with the gain of the claim, which is what
-    passed the threshold. The standard error of a held-out gain is the one that the logarithm of a likelihood ratio has where the
-    model is right: the root of twice the gain.
+    An effect with different numbers on several axes is one claim in as many tables, each with the
+    gain of the claim, which is what passed the threshold. The standard error of a held-out gain is
+    the one that the logarithm of a likelihood ratio has where the model is right: the root of twice
+    the gain.
     """
     begin, end = reduced["begin"].values, reduced["end"].values
     out = []
@@ -280,12 +340,18 @@ def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[st
                 "driver": ",".join(filter(None, claim.driver)) or None,
                 "intervals": [[iso(reduced, low), iso(reduced, high)] for low, high in when],
                 "parameters": {name: asdict(estimate) for name, estimate in one.parameters.items()},
-                "held_out_gain": {"nats": claim.gain, "stderr": math.sqrt(2.0 * max(claim.gain, 0.0)), "threshold": claim.threshold},
+                "held_out_gain": {
+                    "nats": claim.gain,
+                    "stderr": math.sqrt(2.0 * max(claim.gain, 0.0)),
+                    "threshold": claim.threshold,
+                },
                 "alternatives": list(claim.alternatives),
                 "statement": effect_statement(
                     one.say() or unsized_statement(claim.effect, one.axes),
                     alternatives=claim.alternatives,
-                    intervals=[] if when == [(float(begin[0]), whole)] else [span_text(*span, whole) for span in when],
+                    intervals=[]
+                    if when == [(float(begin[0]), whole)]
+                    else [span_text(*span, whole) for span in when],
                 ),
             }
         )
@@ -294,18 +360,28 @@ def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[st
 
 def limit_tables(found: Mapping[str, UpperLimit]) -> dict[str, Any]:
     """How large what was not found may be, and why it was not."""
-    return {name: {"upper_limit": one.upper_limit, "unit": one.unit, "reason": one.reason} for name, one in found.items()}
+    return {
+        name: {"upper_limit": one.upper_limit, "unit": one.unit, "reason": one.reason}
+        for name, one in found.items()
+    }
 
 
-def model_tables(baseline: xr.Dataset, fitted: Sequence[Fitted], own: Model | None) -> dict[str, Any]:
+def model_tables(
+    baseline: xr.Dataset, fitted: Sequence[Fitted], own: Model | None
+) -> dict[str, Any]:
     """The simulation with the effects added, as the tables of a model; `own` is the model that was given."""
     noise = {
-        str(axis): {str(term): float(f"{float(baseline['coefficient'].sel(axis=axis, term=term)):.6g}") for term in baseline["term"].values}
+        str(axis): {
+            str(term): float(f"{float(baseline['coefficient'].sel(axis=axis, term=term)):.6g}")
+            for term in baseline["term"].values
+        }
         for axis in baseline["axis"].values
     }
     before = list(own.effects) if own is not None else []
     found = [one.effect for one in fitted if one.effect is not None]
-    instrument = max([int(own.log.get("oversampling", 1)) if own is not None else 1, *map(_instrument, found)])
+    instrument = max(
+        [int(own.log.get("oversampling", 1)) if own is not None else 1, *map(_instrument, found)]
+    )
     log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
     return {**log, "noise": noise, "effect": [effect_table(effect) for effect in [*before, *found]]}
 
@@ -315,28 +391,52 @@ def _instrument(effect: Effect) -> int:
     return int(getattr(effect, "instrument", 1)) or _FAST
 
 
-def surfaces_with_blocks(surfaces: xr.Dataset, reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
+def surfaces_with_blocks(
+    surfaces: xr.Dataset, reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset
+) -> xr.Dataset:
     """The surfaces with what else the report draws: block means, channels, and spectra of the whole record."""
     power = "degree2 hour-2 s"
-    channels = {str(name): reduced[name] for name in reduced.data_vars if str(name).startswith("channel_")}
+    channels = {
+        str(name): reduced[name] for name in reduced.data_vars if str(name).startswith("channel_")
+    }
     with np.errstate(invalid="ignore"):
         cases = [reduced["power"], before["spectrum"], after["spectrum"]]
         there = np.isfinite(reduced["power"].transpose("axis", "block", "band").values)
-        density = np.stack([_mean_where(one.transpose("axis", "block", "band").values, there) for one in cases])
+        density = np.stack(
+            [_mean_where(one.transpose("axis", "block", "band").values, there) for one in cases]
+        )
         lines = reduced["line_power"].weighted(reduced["line_weight"].fillna(0.0)).mean("part")
     step = max(1, lines.sizes["line"] // _MOST_LINES)
     lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines
-    frequency = reduced["line_frequency"].coarsen(line=step, boundary="trim").mean() if step > 1 else reduced["line_frequency"]
+    frequency = (
+        reduced["line_frequency"].coarsen(line=step, boundary="trim").mean()
+        if step > 1
+        else reduced["line_frequency"]
+    )
     added = xr.Dataset(
         {
-            "block_mean": (("axis", "block"), reduced["mean"].transpose("axis", "block").values, dict(reduced["mean"].attrs)),
-            "density": (("case", "axis", "band"), density, {"units": power, "long_name": "two-sided power density of the record"}),
+            "block_mean": (
+                ("axis", "block"),
+                reduced["mean"].transpose("axis", "block").values,
+                dict(reduced["mean"].attrs),
+            ),
+            "density": (
+                ("case", "axis", "band"),
+                density,
+                {"units": power, "long_name": "two-sided power density of the record"},
+            ),
             "line_density": (
                 ("axis", "line"),
                 lines.transpose("axis", "line").values,
-                {"units": power, "long_name": "two-sided power density of the recording at full resolution"},
+                {
+                    "units": power,
+                    "long_name": "two-sided power density of the recording at full resolution",
+                },
             ),
-            **{name: ("block", values.values, dict(values.attrs)) for name, values in channels.items()},
+            **{
+                name: ("block", values.values, dict(values.attrs))
+                for name, values in channels.items()
+            },
         },
         coords={
             "block_begin": ("block", reduced["begin"].values, dict(reduced["begin"].attrs)),
@@ -350,4 +450,11 @@ def surfaces_with_blocks(surfaces: xr.Dataset, reduced: xr.Dataset, before: xr.D
 
 def _mean_where(values: Array, there: NDArray[np.bool_]) -> Array:
     count = there.sum(axis=1)
-    return np.asarray(np.divide(np.where(there, values, 0.0).sum(axis=1), count, out=np.full(count.shape, np.nan), where=count > 0))
+    return np.asarray(
+        np.divide(
+            np.where(there, values, 0.0).sum(axis=1),
+            count,
+            out=np.full(count.shape, np.nan),
+            where=count > 0,
+        )
+    )

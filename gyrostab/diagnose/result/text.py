@@ -185,7 +185,9 @@ def motion_statement(axis: str, when: str, largest: float, followers: Sequence[s
     >>> motion_statement("z", "from 1 min to 5 min after the start", 389.0, ["x"])[-95:]
     'xis x sees a share of it, so it is real rotation of the tool, whose true rate no channel tells.'
     """
-    told = f"The rate of axis {axis} moves far above its noise {when}, by {largest:.3g} deg/h at most"
+    told = (
+        f"The rate of axis {axis} moves far above its noise {when}, by {largest:.3g} deg/h at most"
+    )
     if followers:
         sees = "sees a share" if len(followers) == 1 else "see shares"
         return f"{told}; {axes_text(followers)} {sees} of it, so it is real rotation of the tool, whose true rate no channel tells."
@@ -227,7 +229,11 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
     """
     axes, when = axes_text(box["axes"]), span_text(box["begin"], box["end"], whole)
     low, high = length_text(box["tau_min_s"]), length_text(box["tau_max_s"])
-    taus = f"averaging times of {low} to {high}" if box["tau_max_s"] > 1.01 * box["tau_min_s"] else f"an averaging time of {low}"
+    taus = (
+        f"averaging times of {low} to {high}"
+        if box["tau_max_s"] > 1.01 * box["tau_min_s"]
+        else f"an averaging time of {low}"
+    )
     verb = "is" if len(box["axes"]) == 1 else "are"
     more = box.get("sign", 1) >= 0
     sure = chance(box["p_value"])
@@ -274,7 +280,9 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
             f"of the noise ({sure})."
         )
     if box["view"] == "restart":
-        return f"The rate of {axes} does not begin where it ended when the power comes back ({sure})."
+        return (
+            f"The rate of {axes} does not begin where it ended when the power comes back ({sure})."
+        )
     told = _MARKS.get(what, "an unusual distribution of its samples")
     return f"{begin} {'has' if one else 'have'} {told} {when} ({sure})."
 
@@ -286,7 +294,8 @@ def named_statement(view: str, effect: str, axes: Sequence[str], when: str, p_va
     --------
     >>> named_statement("mean", "shupe", ["y"], "over the whole record", 0.004)
     'The mean rate of axis y differs over the whole record, in no single place, but taken together as a bias that follows the
-     rate of change of temperature (Shupe effect) would have it (noise alone does that in 1 of 250 such records).'
+     rate of change of temperature (Shupe effect) would have it (noise alone does that in 1 of 250
+     such records).'
     """
     what = _SHOWN.get(view, "The noise")
     return (
@@ -345,13 +354,18 @@ def next_measurement(name: str, alternatives: Sequence[str]) -> str:
     steps = list(dict.fromkeys(_NEXT[one] for one in (name, *alternatives[:2]) if one in _NEXT))
     if not steps:
         return ""
-    if "vibration_rectification" in (name, *alternatives) and "g_sensitivity" in (name, *alternatives):
+    if "vibration_rectification" in (name, *alternatives) and "g_sensitivity" in (
+        name,
+        *alternatives,
+    ):
         steps = [_NEXT[name]]
     begin = "To tell them apart, " if alternatives else "To confirm it, "
     return begin + "; or ".join(steps[:2] if alternatives else steps[:1]) + "."
 
 
-def effect_statement(said: str, *, alternatives: Sequence[str] = (), intervals: Sequence[str] = ()) -> str:
+def effect_statement(
+    said: str, *, alternatives: Sequence[str] = (), intervals: Sequence[str] = ()
+) -> str:
     """What a named effect does and when, and what the record cannot tell it from.
 
     Parameters
@@ -373,7 +387,9 @@ def effect_statement(said: str, *, alternatives: Sequence[str] = (), intervals: 
     if intervals:
         parts.append(f"It shows {', and '.join(intervals)}.")
     if alternatives:
-        parts.append(f"This record cannot tell it from {', or '.join(plain_name(one) for one in alternatives)}.")
+        parts.append(
+            f"This record cannot tell it from {', or '.join(plain_name(one) for one in alternatives)}."
+        )
     return " ".join(parts)
 
 
@@ -385,11 +401,17 @@ def summary(content: Mapping[str, Any]) -> str:
         level = 100.0 * content["false_alarm_level"]
         return f"On {axes} nothing differs from the simulation by more than noise does (chance of a false alarm: {level:g} %)."
     are, them = ("is", "it") if found == 1 else ("are", "them")
-    places = f"{found} place{'' if found == 1 else 's'} where the recording differs from the simulation"
+    places = (
+        f"{found} place{'' if found == 1 else 's'} where the recording differs from the simulation"
+    )
     if not named:
         return f"There {are} {places}; none of the known effects explains {them}."
     names, failed = _named_text(named), failed_checks(content["held_out"])
-    but = f" The named effects do not describe the record well: {'; '.join(failed)}." if failed else ""
+    but = (
+        f" The named effects do not describe the record well: {'; '.join(failed)}."
+        if failed
+        else ""
+    )
     if content["verdict"] == "unknown":
         return f"There {are} {places}. What was named does not explain {them}: {names}.{but}"
     if not left:
@@ -402,4 +424,6 @@ def _named_text(named: Sequence[Mapping[str, Any]]) -> str:
     """List the named effects, each once for the axes that it acts on."""
     texts = [f"{plain_name(effect['name'])}, on {axes_text(effect['axes'])}" for effect in named]
     counts = {text: texts.count(text) for text in texts}
-    return "; ".join(text if count == 1 else f"{text} ({count} times)" for text, count in counts.items())
+    return "; ".join(
+        text if count == 1 else f"{text} ({count} times)" for text, count in counts.items()
+    )

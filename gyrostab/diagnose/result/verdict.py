@@ -35,9 +35,15 @@ def _has_coverage(held: Mapping[str, Any]) -> bool:
 
 #: Check of the held-out evidence, and what to say where it fails.
 _CHECKS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
-    (_has_gain, "held-out data are not predicted better (log-likelihood gain {log_likelihood_gain:.3g} nats)"),
+    (
+        _has_gain,
+        "held-out data are not predicted better (log-likelihood gain {log_likelihood_gain:.3g} nats)",
+    ),
     (_has_forecast, "the forecast of the last 30 % is worse ({forecast_gain:.3g} nats)"),
-    (_has_coverage, "fewer cells lie in their 95 % band ({coverage95_after:.1%} after {coverage95_before:.1%})"),
+    (
+        _has_coverage,
+        "fewer cells lie in their 95 % band ({coverage95_after:.1%} after {coverage95_before:.1%})",
+    ),
 )
 
 
@@ -59,7 +65,12 @@ def failed_checks(held: Mapping[str, Any]) -> list[str]:
     return [text.format_map(known) for check, text in _CHECKS if not check(held)]
 
 
-def decide_verdict(mismatches: Sequence[Any], named: Sequence[Any], unexplained: Iterable[int], held: Mapping[str, Any]) -> str:
+def decide_verdict(
+    mismatches: Sequence[Any],
+    named: Sequence[Any],
+    unexplained: Iterable[int],
+    held: Mapping[str, Any],
+) -> str:
     """Choose one of `gyrostab.diagnose.result.diagnosis.VERDICTS`.
 
     Parameters

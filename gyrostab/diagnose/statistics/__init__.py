@@ -1,7 +1,8 @@
 """Where recording and simulation are compared: each view gives near-normal scores of its cells.
 
-A view is a file with a function ``score(reduced, baseline)`` that gives a Dataset of `cells.view_dataset`, or None when the recording
-has nothing that it looks at; the tuple here is all that must know of it.
+A view is a file with a function ``score(reduced, baseline)`` that gives a Dataset of
+`cells.view_dataset`, or None when the recording has nothing that it looks at; the tuple here is all
+that must know of it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from gyrostab.diagnose.statistics import variance_stability as restless
 
 __all__ = ["STATISTICS"]
 
-#: Every view by a name of its own; the name in the contract is the attribute ``view`` of what it gives.
+#: Every view by a name of its own; the name in the contract is the attribute ``view`` of what it
+#: gives.
 STATISTICS: dict[str, Callable[[xr.Dataset, xr.Dataset], xr.Dataset | None]] = {
     "davar": davar.score,
     "mean": mean.score,

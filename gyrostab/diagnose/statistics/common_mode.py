@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.wandering import known_wander
 from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of, window_set
+from gyrostab.diagnose.statistics.scores import (
+    Array,
+    Windows,
+    cube_root_score,
+    over_windows,
+    statistic_dataset,
+    values_of,
+    window_set,
+)
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
 
@@ -21,30 +29,37 @@ LENGTHS = (60,)
 #: Blocks over which the increments are averaged.
 SPANS = (1, 2, 4, 8, 16, 32, 64)
 _FEWEST = 8.0  # independent averages; with fewer a correlation is no number to judge by
-_OVERLAP = 1.5  # independent averages that overlapping ones are worth, for each that lies beside the next
+_OVERLAP = (
+    1.5  # independent averages that overlapping ones are worth, for each that lies beside the next
+)
 _SINGULAR = -27.0  # logarithm of a determinant that is as good as zero
-_PROBES, _SEED = 64, 20  # series of white noise that tell what a known covariance makes of the increments
+_PROBES, _SEED = (
+    64,
+    20,
+)  # series of white noise that tell what a known covariance makes of the increments
 
 
 def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     """Score the correlation of what is new in the block means of every pair of axes, against axes that wander independently.
 
-    The block means of each axis are whitened by its noise: what is left of each is what the ones before do not foretell, the
-    increment of a random walk or the mean of white noise. The noise of the sensors is new on every axis by itself, however much
-    of it there is; hence the correlation is scored, which no error of the calibration changes. The increments are averaged over
-    several blocks, since what the axes share may be slow.
+    The block means of each axis are whitened by its noise: what is left of each is what the ones
+    before do not foretell, the increment of a random walk or the mean of white noise. The noise of
+    the sensors is new on every axis by itself, however much of it there is; hence the correlation
+    is scored, which no error of the calibration changes. The increments are averaged over several
+    blocks, since what the axes share may be slow.
 
     Parameters
     ----------
     reduced, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects; white noise that the axes share by its ``cross`` is taken off.
+        Recording or null records, and what the simulation expects; white noise that the axes share
+        by its ``cross`` is taken off.
 
     Returns
     -------
     xarray.Dataset or None
-        None with one axis, or where the record is too short. A row for each pair, whose ``ratio`` and ``estimate`` are the
-        correlation. Three axes or more have a row of all together, by the determinant of their correlations; its ``estimate`` is the
-        root of the mean square of them.
+        None with one axis, or where the record is too short. A row for each pair, whose ``ratio``
+        and ``estimate`` are the correlation. Three axes or more have a row of all together, by the
+        determinant of their correlations; its ``estimate`` is the root of the mean square of them.
     """
     axes = [str(axis) for axis in reduced["axis"].values]
     blocks = reduced.sizes["block"]
@@ -52,13 +67,18 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     if len(axes) < 2 or not spans:
         return None
     windows = window_set(blocks, LENGTHS)
-    residual = values_of(reduced, "mean", "axis", "block") - values_of(baseline, "known_mean", "axis", "block")
+    residual = values_of(reduced, "mean", "axis", "block") - values_of(
+        baseline, "known_mean", "axis", "block"
+    )
     there = np.isfinite(residual).reshape(-1, *residual.shape[-2:]).all(axis=0)
     new = _increments(residual, there, reduced, baseline)
     pairs = list(combinations(range(len(axes)), 2))
     shared = _shared(there, pairs, reduced, baseline) if "cross" in baseline else None
     found = [_correlations(new, there, pairs, windows, span, shared) for span in spans]
-    r, count = np.stack([one for one, _ in found], axis=-1), np.stack([one for _, one in found], axis=-1)
+    r, count = (
+        np.stack([one for one, _ in found], axis=-1),
+        np.stack([one for _, one in found], axis=-1),
+    )
     z = correlation_score(r, np.broadcast_to(count, r.shape))
     rows = [f"{axes[a]} {axes[b]}" for a, b in pairs]
     if len(rows) > 1:
@@ -82,15 +102,24 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     )
 
 
-def _increments(residual: Array, there: NDArray[np.bool_], reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
+def _increments(
+    residual: Array, there: NDArray[np.bool_], reduced: xr.Dataset, baseline: xr.Dataset
+) -> Array:
     """Whitened block means by (record), axis, block; zero where there is none."""
     terms = [str(term) for term in baseline["term"].values]
     white = baseline["mean_variance"].transpose("axis", "block").values
-    begin, end, block = reduced["begin"].values, reduced["end"].values, float(reduced.attrs["block_s"])
+    begin, end, block = (
+        reduced["begin"].values,
+        reduced["end"].values,
+        float(reduced.attrs["block_s"]),
+    )
     share, times, faster = flicker_states(block, float(end[-1] - begin[0]))
     new = np.empty_like(residual)
     for axis in range(residual.shape[-2]):
-        b, k = (float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)])) for term in ("B", "K"))
+        b, k = (
+            float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)]))
+            for term in ("B", "K")
+        )
         present = there[axis] & np.isfinite(white[axis]) & (white[axis] > 0)
         variance = np.where(present, white[axis] + b**2 * faster, 1.0)
         series = residual[..., axis, :].reshape(-1, residual.shape[-1])
@@ -102,10 +131,17 @@ def _increments(residual: Array, there: NDArray[np.bool_], reduced: xr.Dataset, 
     return new
 
 
-def _shared(there: NDArray[np.bool_], pairs: list[tuple[int, int]], reduced: xr.Dataset, baseline: xr.Dataset) -> tuple[Array, Array]:
+def _shared(
+    there: NDArray[np.bool_],
+    pairs: list[tuple[int, int]],
+    reduced: xr.Dataset,
+    baseline: xr.Dataset,
+) -> tuple[Array, Array]:
     """Increments of one white noise on all axes by probe, axis, block, and the part of it that each pair is known to share."""
     series = np.random.default_rng(_SEED).standard_normal((_PROBES, 1, there.shape[1]))
-    series = series * np.sqrt(np.nan_to_num(baseline["mean_variance"].transpose("axis", "block").values))
+    series = series * np.sqrt(
+        np.nan_to_num(baseline["mean_variance"].transpose("axis", "block").values)
+    )
     spectrum = baseline["spectrum"].transpose("axis", "block", "band").values[..., 0]
     cross = baseline["cross"].transpose("pair", "block", "band").values[..., 0].real
     one, other = ([pair[side] for pair in pairs] for side in (0, 1))

@@ -6,7 +6,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of, window_set
+from gyrostab.diagnose.statistics.scores import (
+    Array,
+    Windows,
+    cube_root_score,
+    over_windows,
+    statistic_dataset,
+    values_of,
+    window_set,
+)
 
 __all__ = ["LENGTHS", "correlation_score", "score"]
 
@@ -23,14 +31,15 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     Parameters
     ----------
     reduced, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects: the bands are weighed by its spectrum, and a ``cross`` (pair,
-        block, band) that the axes share by it is taken off.
+        Recording or null records, and what the simulation expects: the bands are weighed by its
+        spectrum, and a ``cross`` (pair, block, band) that the axes share by it is taken off.
 
     Returns
     -------
     xarray.Dataset or None
-        None with one axis. Columns ``in phase`` and ``in quadrature``; ``ratio`` is the coherency, and ``estimate`` too. Three
-        axes or more have a row of all pairs together, over all bands in phase.
+        None with one axis. Columns ``in phase`` and ``in quadrature``; ``ratio`` is the coherency,
+        and ``estimate`` too. Three axes or more have a row of all pairs together, over all bands in
+        phase.
     """
     if "cross" not in reduced or reduced.sizes.get("pair", 0) == 0:
         return None
@@ -45,7 +54,12 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     rows = [f"{axes[a]} {axes[b]}" for a, b in zip(left, right, strict=True)]
     bands = reduced.sizes["band"]
     if len(rows) > 1:
-        z, r = (np.concatenate([part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)], axis=-3) for part in (z, r))
+        z, r = (
+            np.concatenate(
+                [part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)], axis=-3
+            )
+            for part in (z, r)
+        )
         broad = z[..., :-1, :, bands]
         together = (broad**2).mean(axis=-2)
         z[..., -1, :, bands] = cube_root_score(together, np.full(together.shape, len(rows) / 2.0))
@@ -60,7 +74,10 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         rows=rows,
         windows=windows,
         columns={
-            "what": np.repeat(["in phase", "all in phase", "in quadrature", "all in quadrature"], [bands, 1, bands, 1]),
+            "what": np.repeat(
+                ["in phase", "all in phase", "in quadrature", "all in quadrature"],
+                [bands, 1, bands, 1],
+            ),
             "tau_min_s": np.tile(0.5 / f_max, 2),
             "tau_max_s": np.tile(0.5 / f_min, 2),
             "frequency": np.tile(np.append(reduced["frequency"].values, np.nan), 2),
@@ -71,21 +88,32 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     )
 
 
-def _coherency(reduced: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows) -> tuple[Complex, Array]:
+def _coherency(
+    reduced: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows
+) -> tuple[Complex, Array]:
     """Coherency of each pair by (record), pair, window, band and over all bands last, and the complex ordinates in each.
 
-    Where both axes are loud in a few blocks only, these have all the weight: so many blocks of equal power would scatter as much.
+    Where both axes are loud in a few blocks only, these have all the weight: so many blocks of
+    equal power would scatter as much.
     """
     cross = values_of(reduced, "cross", "pair", "block", "band")
     if "cross" in baseline:
         cross = cross - values_of(baseline, "cross", "pair", "block", "band")
-    power, shape = values_of(reduced, "power", "axis", "block", "band"), values_of(reduced, "shape", "axis", "block", "band")
+    power, shape = (
+        values_of(reduced, "power", "axis", "block", "band"),
+        values_of(reduced, "shape", "axis", "block", "band"),
+    )
     spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
     with np.errstate(divide="ignore", invalid="ignore"):
         flat = power / spectrum
         cross = cross / np.sqrt(spectrum[left] * spectrum[right])
         weight = np.minimum(shape[..., left, :, :], shape[..., right, :, :])
-    there = np.isfinite(cross) & np.isfinite(flat[..., left, :, :]) & np.isfinite(flat[..., right, :, :]) & (weight > 0)
+    there = (
+        np.isfinite(cross)
+        & np.isfinite(flat[..., left, :, :])
+        & np.isfinite(flat[..., right, :, :])
+        & (weight > 0)
+    )
     weight = np.where(there, weight, 0.0)
 
     def summed(values: Complex) -> Complex:

@@ -10,15 +10,29 @@ import xarray as xr
 from scipy.special import log_ndtr
 
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, local_level
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, exponential_score, statistic_dataset, values_of
+from gyrostab.diagnose.statistics.scores import (
+    Array,
+    Windows,
+    cube_root_score,
+    exponential_score,
+    statistic_dataset,
+    values_of,
+)
 
 __all__ = ["score"]
 
 _STRETCHES = 8  # of the spectrum, in which a way begins and ends
 _FEWEST = 6  # parts of the record that a way must lead through
 _LEAST = 4  # lines that a line must move: less is no motion
-_BENDS = (-0.7, 0.0, 0.7)  # of a way, as a share of its length: it hastens, keeps its speed, or slows
-_CELL, _PART = 4.0, 3.0  # standard deviations that one line of one part, and one part, count for: a moving line is everywhere
+_BENDS = (
+    -0.7,
+    0.0,
+    0.7,
+)  # of a way, as a share of its length: it hastens, keeps its speed, or slows
+_CELL, _PART = (
+    4.0,
+    3.0,
+)  # standard deviations that one line of one part, and one part, count for: a moving line is everywhere
 _MOST = 250  # lines; more are averaged in groups
 _INDEPENDENT = 0.2  # of the ways that are looked at
 _USUAL = 20.0  # ways that do as much, beyond which a score is as low as any
@@ -28,11 +42,13 @@ _BUMP = 0.371  # averaging time times frequency where the Allan variance of a si
 def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     r"""Score the lines of the spectrum along ways: each part of the record at another frequency.
 
-    A line of power :math:`E` over the density of the noise in every block, moving over L lines while B blocks pass, is in each
-    line of each of P parts for B / L blocks only. There it raises the mean of B / P blocks by E P / L, which scatters by
+    A line of power :math:`E` over the density of the noise in every block, moving over L lines
+    while B blocks pass, is in each line of each of P parts for B / L blocks only. There it raises
+    the mean of B / P blocks by E P / L, which scatters by
     :math:`\sqrt{P / B}`; the L cells of its way together stand out by :math:`E \sqrt{P B / L}` standard deviations. The ways begin
-    anywhere, lead over 4 lines or more in either direction, and hasten or slow by up to a half of their mean speed; the largest of
-    those that lead from one eighth of the spectrum to another gives the score of that column.
+    anywhere, lead over 4 lines or more in either direction, and hasten or slow by up to a half of
+    their mean speed; the largest of those that lead from one eighth of the spectrum to another
+    gives the score of that column.
 
     Parameters
     ----------
@@ -42,32 +58,49 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     Returns
     -------
     xarray.Dataset or None
-        None without lines, or with spectra of fewer than 6 parts of the record. ``ratio`` is the power along the way over that of the
-        noise. Several axes have a row of all together.
+        None without lines, or with spectra of fewer than 6 parts of the record. ``ratio`` is the
+        power along the way over that of the noise. Several axes have a row of all together.
 
     Notes
     -----
-    Every line is seen relative to the lines around it in its part and to its own mean over the parts, and counts for little by itself:
-    a line that stands still, or a part of the record that is louder, is no motion.
+    Every line is seen relative to the lines around it in its part and to its own mean over the
+    parts, and counts for little by itself: a line that stands still, or a part of the record that
+    is louder, is no motion.
     """
     if "line_power" not in reduced:
         return None
-    power, weight = values_of(reduced, "line_power", "axis", "part", "line"), values_of(reduced, "line_weight", "axis", "part")
+    power, weight = (
+        values_of(reduced, "line_power", "axis", "part", "line"),
+        values_of(reduced, "line_weight", "axis", "part"),
+    )
     there = np.isfinite(power).reshape(-1, *power.shape[-3:]).all(axis=(0, 3)) & (weight > 0)
     parts = np.flatnonzero(there.all(axis=0))
     lines = power.shape[-1]
     if parts.size < _FEWEST or lines < 2 * _STRETCHES:
         return None
-    cells = _cells(power[..., parts, :], weight[:, parts, None], _expected(reduced, baseline)[:, parts])
+    cells = _cells(
+        power[..., parts, :], weight[:, parts, None], _expected(reduced, baseline)[:, parts]
+    )
     axes = [str(axis) for axis in reduced["axis"].values]
     if len(axes) > 1:
-        cells, axes = np.concatenate([cells, cells.sum(axis=-3, keepdims=True) / np.sqrt(len(axes))], axis=-3), [*axes, " ".join(axes)]
-    cells = cells / np.maximum(cells.std(axis=(-2, -1), keepdims=True), 1.0)  # axes with noise in common add up to more
+        cells, axes = (
+            np.concatenate(
+                [cells, cells.sum(axis=-3, keepdims=True) / np.sqrt(len(axes))], axis=-3
+            ),
+            [*axes, " ".join(axes)],
+        )
+    cells = cells / np.maximum(
+        cells.std(axis=(-2, -1), keepdims=True), 1.0
+    )  # axes with noise in common add up to more
     edges = np.stack([parts, parts + 1]) - parts[0]
     largest, ways = _largest(cells, edges / edges.max())
     with np.errstate(divide="ignore", invalid="ignore"):
-        more = np.exp(np.log(_INDEPENDENT * ways) + log_ndtr(-largest))  # ways of noise that would do as much
-        z = np.where(ways > 0, exponential_score(-np.log(-np.expm1(-np.minimum(more, _USUAL)))), np.nan)
+        more = np.exp(
+            np.log(_INDEPENDENT * ways) + log_ndtr(-largest)
+        )  # ways of noise that would do as much
+        z = np.where(
+            ways > 0, exponential_score(-np.log(-np.expm1(-np.minimum(more, _USUAL)))), np.nan
+        )
     blocks = -(-np.arange(power.shape[-2] + 1) * reduced.sizes["block"] // power.shape[-2])
     return statistic_dataset(
         "spectrum",
@@ -86,7 +119,9 @@ def _expected(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
     parts, blocks = reduced.sizes["part"], reduced.sizes["block"]
     of = np.arange(blocks) * parts // blocks
     lines = reduced["line_frequency"].values
-    return np.stack([expected_lines(baseline.isel(block=of == part), lines) for part in range(parts)], axis=1)
+    return np.stack(
+        [expected_lines(baseline.isel(block=of == part), lines) for part in range(parts)], axis=1
+    )
 
 
 def _cells(power: Array, weight: Array, expected: Array) -> Array:
@@ -97,7 +132,10 @@ def _cells(power: Array, weight: Array, expected: Array) -> Array:
     cells = np.clip(cube_root_score(flat, weight), -_CELL, _CELL)
     wide = -(-cells.shape[-1] // _MOST)
     lines = cells.shape[-1] // wide
-    return np.asarray(cells[..., : lines * wide].reshape(*cells.shape[:-1], lines, wide).sum(axis=-1) / np.sqrt(wide))
+    return np.asarray(
+        cells[..., : lines * wide].reshape(*cells.shape[:-1], lines, wide).sum(axis=-1)
+        / np.sqrt(wide)
+    )
 
 
 def _moves(lines: int) -> Iterator[tuple[int, float]]:
@@ -124,7 +162,9 @@ def _largest(cells: Array, edges: Array) -> tuple[Array, Array]:
         start = np.arange(begin, end, step)
         along = np.zeros((*cells.shape[:-2], start.size))
         for part in range(parts):
-            upper, lower = (slice(begin + edge, end + edge, step) for edge in (high[part], low[part]))
+            upper, lower = (
+                slice(begin + edge, end + edge, step) for edge in (high[part], low[part])
+            )
             inside = total[..., part, upper] - total[..., part, lower]
             along += np.minimum(inside / np.sqrt(high[part] - low[part]), _PART)
         column = start * _STRETCHES // lines * _STRETCHES + (start + move) * _STRETCHES // lines
@@ -139,7 +179,10 @@ def _columns(frequency: Array) -> dict[str, Any]:
     """From the middle of one stretch of the spectrum to that of another, and the averaging times between."""
     edges = np.linspace(frequency[0], frequency[-1], _STRETCHES + 1)
     middle = (edges[1:] + edges[:-1]) / 2.0
-    one, other = (part.ravel() for part in np.meshgrid(np.arange(_STRETCHES), np.arange(_STRETCHES), indexing="ij"))
+    one, other = (
+        part.ravel()
+        for part in np.meshgrid(np.arange(_STRETCHES), np.arange(_STRETCHES), indexing="ij")
+    )
     return {
         "what": [f"glide {middle[a]:.3g} {middle[b]:.3g}" for a, b in zip(one, other, strict=True)],
         "tau_min_s": _BUMP / edges[np.maximum(one, other) + 1],

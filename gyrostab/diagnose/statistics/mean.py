@@ -8,12 +8,32 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.evidence.wandering import known_wander, mean_share
-from gyrostab.diagnose.statistics.scores import Array, Windows, over_windows, statistic_dataset, values_of, window_set
-from gyrostab.kernels.regression.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
+from gyrostab.diagnose.statistics.scores import (
+    Array,
+    Windows,
+    over_windows,
+    statistic_dataset,
+    values_of,
+    window_set,
+)
+from gyrostab.kernels.regression.boxcars import (
+    boxcar_information,
+    filter_gains,
+    precision_times,
+    remaining_information,
+)
 from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.noise import HOUR
 
-__all__ = ["LENGTHS", "MeanNoise", "mean_noise", "precision", "region_mean", "score", "window_means"]
+__all__ = [
+    "LENGTHS",
+    "MeanNoise",
+    "mean_noise",
+    "precision",
+    "region_mean",
+    "score",
+    "window_means",
+]
 
 #: Lengths of the windows [blocks].
 LENGTHS = (1, 5, 15, 45)
@@ -32,9 +52,9 @@ class MeanNoise(NamedTuple):
 def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Score the mean of windows of four lengths against the rest of the record, with the noise of the simulation.
 
-    The score is that of a constant which is added inside the window alone, by generalised least squares beside a constant
-    of the record: where the noise is white it is the window's mean less that of the rest, over its standard deviation; where it
-    wanders, the neighbours count for more.
+    The score is that of a constant which is added inside the window alone, by generalised least
+    squares beside a constant of the record: where the noise is white it is the window's mean less
+    that of the rest, over its standard deviation; where it wanders, the neighbours count for more.
 
     Parameters
     ----------
@@ -44,7 +64,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        See `gyrostab.diagnose.statistics.scores.statistic_dataset`; ``estimate`` is the constant [degree hour-1].
+        See `gyrostab.diagnose.statistics.scores.statistic_dataset`; ``estimate`` is the constant
+        [degree hour-1].
     """
     windows = window_set(reduced.sizes["block"], LENGTHS, whole=False)
     amount, information = window_means(reduced, baseline, windows)
@@ -55,7 +76,11 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         "mean",
         reduced,
         windows=windows,
-        columns={"what": "mean", "tau_min_s": [block], "tau_max_s": [block * max(windows.length, default=1)]},
+        columns={
+            "what": "mean",
+            "tau_min_s": [block],
+            "tau_max_s": [block * max(windows.length, default=1)],
+        },
         z=z,
         ratio=np.abs(z),
         estimate=estimate,
@@ -63,7 +88,9 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     )
 
 
-def window_means(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:
+def window_means(
+    reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows
+) -> tuple[Array, Array]:
     """Matched filter of every window and its information: their ratio is the constant that stands in the window alone.
 
     Parameters
@@ -78,7 +105,9 @@ def window_means(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) ->
     amount, information : ndarray ((record,) axis, window), (axis, window)
         [degree-1 hour], [degree-2 hour2]; NaN where too little of the window is there.
     """
-    residual = values_of(reduced, "mean", "axis", "block") - values_of(baseline, "known_mean", "axis", "block")
+    residual = values_of(reduced, "mean", "axis", "block") - values_of(
+        baseline, "known_mean", "axis", "block"
+    )
     amount = np.full((*residual.shape[:-1], windows.first.size), np.nan)
     information = np.full((residual.shape[-2], windows.first.size), np.nan)
     for axis in range(residual.shape[-2]):
@@ -95,7 +124,9 @@ def _matched(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array
     total = one.sum()
     weighted = weighted - one * (weighted.sum(axis=-1, keepdims=True) / total)
     own = np.empty(windows.first.size)
-    boxcar_information(windows.first, windows.stop, noise.innovation, noise.gain, noise.decay, noise.remaining, own)
+    boxcar_information(
+        windows.first, windows.stop, noise.innovation, noise.gain, noise.decay, noise.remaining, own
+    )
     across = over_windows(one[:, None], windows)[:, 0]
     count = over_windows(noise.present[:, None], windows)[:, 0]
     information = own - across**2 / total
@@ -116,20 +147,28 @@ def mean_noise(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, present: Ar
         Blocks whose mean is used.
     """
     terms = [str(term) for term in baseline["term"].values]
-    b, k = (float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)])) for term in ("B", "K"))
+    b, k = (
+        float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)]))
+        for term in ("B", "K")
+    )
     begin, end = reduced["begin"].values, reduced["end"].values
     step = np.diff((begin + end) / 2.0, append=end[-1])
     block, span = float(reduced.attrs["block_s"]), float(end[-1] - begin[0])
     share, times, white = flicker_states(block, span)
     known = known_wander(baseline, axis)
-    slow, times = np.append(b**2 * share, known.square * mean_share(block, known.time)), np.append(times, known.time)
+    slow, times = (
+        np.append(b**2 * share, known.square * mean_share(block, known.time)),
+        np.append(times, known.time),
+    )
     decay = np.exp(-step[:, None] / times)
     variance = baseline["mean_variance"].transpose(..., "axis", "block").values[axis] + b**2 * white
     present = present & np.isfinite(variance) & (variance > 0)
     n = variance.size
     innovation, gain = np.empty(n), np.empty((n, times.size + 1))
     remaining = np.empty((n + 1, times.size + 1, times.size + 1))
-    filter_gains(variance, present, (k**2 / HOUR + known.walk) * step, slow, decay, innovation, gain)
+    filter_gains(
+        variance, present, (k**2 / HOUR + known.walk) * step, slow, decay, innovation, gain
+    )
     remaining_information(innovation, gain, decay, remaining)
     return MeanNoise(present.astype(float), innovation, gain, decay, remaining)
 
@@ -144,7 +183,10 @@ def precision(series: Array, noise: MeanNoise) -> Array:
 
 def region_mean(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:
     """Constant that stands in some blocks of a recording alone, by generalised least squares beside one of the record [degree hour-1]."""
-    residual = values_of(reduced, "mean", "axis", "block")[axis] - values_of(baseline, "known_mean", "axis", "block")[axis]
+    residual = (
+        values_of(reduced, "mean", "axis", "block")[axis]
+        - values_of(baseline, "known_mean", "axis", "block")[axis]
+    )
     noise = mean_noise(reduced, baseline, axis, np.isfinite(residual))
     rows = precision(np.stack([np.ones(residual.size), inside.astype(float)]), noise)
     columns = np.stack([np.ones(residual.size), inside.astype(float)])

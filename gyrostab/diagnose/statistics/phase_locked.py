@@ -34,7 +34,8 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     Returns
     -------
     xarray.Dataset or None
-        None with neither channel. ``estimate`` is the amplitude, or the rms over the phase [degree hour-1].
+        None with neither channel. ``estimate`` is the amplitude, or the rms over the phase [degree
+        hour-1].
     """
     windows = window_set(reduced.sizes["block"], LENGTHS)
     rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
@@ -46,7 +47,9 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         what += [f"order {h}" for h in range(1, reduced.sizes["harmonic"] + 1)]
         turning = _turning(reduced)
         seen = turning[turning > 0]
-        low, high = (float(seen.min()), float(seen.max())) if seen.size else (1.0 / block, rate / 2.0)
+        low, high = (
+            (float(seen.min()), float(seen.max())) if seen.size else (1.0 / block, rate / 2.0)
+        )
         tau_min += [0.371 / (h * high) for h in range(1, reduced.sizes["harmonic"] + 1)]
         tau_max += [0.371 / (h * low) for h in range(1, reduced.sizes["harmonic"] + 1)]
     if "profile" in reduced:
@@ -82,16 +85,34 @@ def _orders(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tupl
     order = values_of(reduced, "order", "axis", "block", "harmonic")
     samples = values_of(reduced, "samples", "axis", "block")
     rate = float(reduced.attrs["sampling_rate_hz"])
-    turning, spectrum = _turning(reduced), baseline["spectrum"].transpose("axis", "block", "band").values
+    turning, spectrum = (
+        _turning(reduced),
+        baseline["spectrum"].transpose("axis", "block", "band").values,
+    )
     bands = np.log(baseline["frequency"].values)
-    at = np.log(np.clip(turning[:, None] * np.arange(1, order.shape[-1] + 1), np.exp(bands[0]), np.exp(bands[-1])))
+    at = np.log(
+        np.clip(
+            turning[:, None] * np.arange(1, order.shape[-1] + 1),
+            np.exp(bands[0]),
+            np.exp(bands[-1]),
+        )
+    )
     density = np.empty((*spectrum.shape[:2], order.shape[-1]))
     with np.errstate(divide="ignore", invalid="ignore"):
         for axis, block in np.ndindex(spectrum.shape[:2]):
-            density[axis, block] = np.exp(np.interp(at[block], bands, np.log(spectrum[axis, block])))
+            density[axis, block] = np.exp(
+                np.interp(at[block], bands, np.log(spectrum[axis, block]))
+            )
         density = noise_at_orders(reduced, density)
-        variance = 4.0 * density * rate / samples[..., None]  # of |order|^2 / 1: two components of 2 S rate / n each
-        there = np.isfinite(order) & np.isfinite(variance) & (variance > 0) & (turning > 0.5 / float(reduced.attrs["block_s"]))[:, None]
+        variance = (
+            4.0 * density * rate / samples[..., None]
+        )  # of |order|^2 / 1: two components of 2 S rate / n each
+        there = (
+            np.isfinite(order)
+            & np.isfinite(variance)
+            & (variance > 0)
+            & (turning > 0.5 / float(reduced.attrs["block_s"]))[:, None]
+        )
         weight = np.where(there, 1.0 / variance, 0.0)
         sums = over_windows(np.where(there, order, 0.0) * weight, windows)
         total = over_windows(weight, windows)
@@ -105,11 +126,19 @@ def _profile(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tup
     profile = values_of(reduced, "profile", "axis", "block", "phase")
     samples = values_of(reduced, "profile_samples", "axis", "block", "phase")
     width = (reduced["band_high"] - reduced["band_low"]).values
-    variance = 2.0 * (baseline["spectrum"].transpose("axis", "block", "band").values * width).sum(axis=-1)[..., None]
+    variance = (
+        2.0
+        * (baseline["spectrum"].transpose("axis", "block", "band").values * width).sum(axis=-1)[
+            ..., None
+        ]
+    )
     there = np.isfinite(profile) & (samples > 0) & np.isfinite(variance)
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = np.where(there, samples / variance, 0.0)
-        sums, total = over_windows(np.where(there, profile, 0.0) * weight, windows), over_windows(weight, windows)
+        sums, total = (
+            over_windows(np.where(there, profile, 0.0) * weight, windows),
+            over_windows(weight, windows),
+        )
         used = (total > 0).sum(axis=-1, keepdims=True)
         square = np.where(total > 0, sums**2 / total, 0.0).sum(axis=-1, keepdims=True)
         ratio = np.where(used > 1, square / used, np.nan)

@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of, window_set
+from gyrostab.diagnose.statistics.scores import (
+    Array,
+    Windows,
+    cube_root_score,
+    over_windows,
+    statistic_dataset,
+    values_of,
+    window_set,
+)
 from gyrostab.noise import LAWS
 
 __all__ = ["LENGTHS", "allan_surface", "score", "transfer"]
@@ -32,7 +40,8 @@ def transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
     Returns
     -------
     ndarray (tau, band)
-        Integral of ``4 sin(pi f tau)^4 / (k sin(pi f / rate))^2``, k = tau rate, over the band [Hz].
+        Integral of ``4 sin(pi f tau)^4 / (k sin(pi f / rate))^2``, k = tau rate, over the band
+        [Hz].
 
     Examples
     --------
@@ -47,15 +56,18 @@ def transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
         f = low[band] + share * (high[band] - low[band])
         angle = np.pi * f / rate
         k = np.rint(tau * rate)[:, None]
-        out[:, band] = np.mean(4.0 * np.sin(angle * k) ** 4 / (k * np.sin(angle)) ** 2, axis=1) * (high[band] - low[band])
+        out[:, band] = np.mean(4.0 * np.sin(angle * k) ** 4 / (k * np.sin(angle)) ** 2, axis=1) * (
+            high[band] - low[band]
+        )
     return out
 
 
 def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Score the Allan variance in windows of three lengths and of the whole record.
 
-    Inside a block it is taken from the powers of the bands, at octaves of the sampling interval up to a quarter of a block; the
-    column ``level`` weighs all bands alike, as the likelihood does. From a block on it is taken from the block means.
+    Inside a block it is taken from the powers of the bands, at octaves of the sampling interval up
+    to a quarter of a block; the column ``level`` weighs all bands alike, as the likelihood does.
+    From a block on it is taken from the block means.
 
     Parameters
     ----------
@@ -80,7 +92,9 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     )
 
 
-def allan_surface(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows | None = None) -> dict[str, Any]:
+def allan_surface(
+    reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows | None = None
+) -> dict[str, Any]:
     """Observed and expected Allan variance [degree2 hour-2] by (record), axis, window, tau, and the shape of their gamma law.
 
     Parameters
@@ -100,13 +114,19 @@ def allan_surface(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows | 
     joined: dict[str, Any] = {"windows": windows}
     for name in ("observed", "expected", "shape"):
         joined[name] = np.concatenate([part[name] for part in parts], axis=-1)
-    joined["columns"] = {name: np.concatenate([part["columns"][name] for part in parts]) for name in parts[0]["columns"]}
+    joined["columns"] = {
+        name: np.concatenate([part["columns"][name] for part in parts])
+        for name in parts[0]["columns"]
+    }
     return joined
 
 
 def _inside(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
     rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
-    power, shape = values_of(reduced, "power", "axis", "block", "band"), values_of(reduced, "shape", "axis", "block", "band")
+    power, shape = (
+        values_of(reduced, "power", "axis", "block", "band"),
+        values_of(reduced, "shape", "axis", "block", "band"),
+    )
     spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
     k = 2 ** np.arange(max(1, int(np.log2(block * rate / 4.0)) + 1))
     weights = transfer(reduced["band_low"].values, reduced["band_high"].values, k / rate, rate).T
@@ -114,11 +134,17 @@ def _inside(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(there, 1.0 / shape, 0.0)
         relative = np.where(there, power / spectrum * shape, 0.0).sum(axis=-1, keepdims=True)
-    power, spectrum, each = np.where(there, power, 0.0), np.where(there, spectrum, 0.0), np.where(there, shape, 0.0)
+    power, spectrum, each = (
+        np.where(there, power, 0.0),
+        np.where(there, spectrum, 0.0),
+        np.where(there, shape, 0.0),
+    )
     total = each.sum(axis=-1, keepdims=True)
     observed = over_windows(np.concatenate([power @ weights, relative], axis=-1), windows)
     expected = over_windows(np.concatenate([spectrum @ weights, total], axis=-1), windows)
-    variance = over_windows(np.concatenate([(spectrum**2 * inverse) @ weights**2, total], axis=-1), windows)
+    variance = over_windows(
+        np.concatenate([(spectrum**2 * inverse) @ weights**2, total], axis=-1), windows
+    )
     count = over_windows(there.any(axis=-1, keepdims=True).astype(float), windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         gamma = np.where(count >= 0.25 * windows.length[:, None], expected**2 / variance, np.nan)
@@ -137,7 +163,9 @@ def _inside(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict
 def _beyond(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
     """Averaging times of whole blocks: second differences of the block means, all that overlap."""
     block, blocks = float(reduced.attrs["block_s"]), reduced.sizes["block"]
-    means = values_of(reduced, "mean", "axis", "block") - values_of(baseline, "known_mean", "axis", "block")
+    means = values_of(reduced, "mean", "axis", "block") - values_of(
+        baseline, "known_mean", "axis", "block"
+    )
     white = values_of(baseline, "mean_variance", "axis", "block")
     sizes = [k for k in (1, 2, 4, 8, 16, 32) if 4 * k <= blocks]
     parts: dict[str, list[Array]] = {"observed": [], "expected": [], "shape": []}
@@ -149,31 +177,55 @@ def _beyond(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict
         count = over_windows(there[..., None].astype(float), pairs)[..., 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             fits = (count >= 0.5 * pairs.length) & (pairs.length > 0) & (windows.length >= 4 * k)
-            parts["observed"].append(over_windows(np.where(there, d2, 0.0)[..., None], pairs)[..., 0] / count)
-            parts["expected"].append(over_windows(np.where(there, expected, 0.0)[..., None], pairs)[..., 0] / count)
+            parts["observed"].append(
+                over_windows(np.where(there, d2, 0.0)[..., None], pairs)[..., 0] / count
+            )
+            parts["expected"].append(
+                over_windows(np.where(there, expected, 0.0)[..., None], pairs)[..., 0] / count
+            )
             table = _shape(np.arange(int(count.max(initial=0)) + 1), k)
             parts["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
     if not sizes:
         nothing = np.empty((*means.shape[:-1], windows.first.size, 0))
         joined: dict[str, Any] = dict.fromkeys(parts, nothing)
     else:
-        joined = {name: np.stack(np.broadcast_arrays(*values), axis=-1) for name, values in parts.items()}
+        joined = {
+            name: np.stack(np.broadcast_arrays(*values), axis=-1) for name, values in parts.items()
+        }
     tau = np.array(sizes, dtype=float) * block
-    joined["columns"] = {"what": np.array(["avar"] * tau.size, dtype="<U8"), "tau_min_s": tau, "tau_max_s": tau}
+    joined["columns"] = {
+        "what": np.array(["avar"] * tau.size, dtype="<U8"),
+        "tau_min_s": tau,
+        "tau_max_s": tau,
+    }
     return joined
 
 
 def _differences(means: Array, k: int) -> Array:
     """Mean of k blocks less that of the k before, all starts; NaN where one is missing. As long as the record."""
-    total = np.concatenate([np.zeros((*means.shape[:-1], 1)), np.cumsum(np.where(np.isfinite(means), means, 0.0), axis=-1)], axis=-1)
-    lost = np.concatenate([np.zeros((*means.shape[:-1], 1)), np.cumsum(~np.isfinite(means), axis=-1)], axis=-1)
+    total = np.concatenate(
+        [
+            np.zeros((*means.shape[:-1], 1)),
+            np.cumsum(np.where(np.isfinite(means), means, 0.0), axis=-1),
+        ],
+        axis=-1,
+    )
+    lost = np.concatenate(
+        [np.zeros((*means.shape[:-1], 1)), np.cumsum(~np.isfinite(means), axis=-1)], axis=-1
+    )
     difference = (total[..., 2 * k :] - 2.0 * total[..., k:-k] + total[..., : -2 * k]) / k
     difference[lost[..., 2 * k :] > lost[..., : -2 * k]] = np.nan
     return _padded(difference, means.shape[-1])
 
 
 def _pair_variance(white: Array, k: int) -> Array:
-    total = np.concatenate([np.zeros((*white.shape[:-1], 1)), np.cumsum(np.where(np.isfinite(white), white, 0.0), axis=-1)], axis=-1)
+    total = np.concatenate(
+        [
+            np.zeros((*white.shape[:-1], 1)),
+            np.cumsum(np.where(np.isfinite(white), white, 0.0), axis=-1),
+        ],
+        axis=-1,
+    )
     return _padded((total[..., 2 * k :] - total[..., : -2 * k]) / k**2, white.shape[-1])
 
 

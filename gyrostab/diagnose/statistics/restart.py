@@ -27,14 +27,17 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     Returns
     -------
     xarray.Dataset or None
-        None without restarts. ``estimate`` is the transient at the restart, or the jump [degree hour-1].
+        None without restarts. ``estimate`` is the transient at the restart, or the jump [degree
+        hour-1].
     """
     at = restart_blocks(reduced)
     if at.size == 0:
         return None
     block, blocks = float(reduced.attrs["block_s"]), reduced.sizes["block"]
     designs, windows = _designs(at, blocks)
-    residual = values_of(reduced, "mean", "axis", "block") - values_of(baseline, "known_mean", "axis", "block")
+    residual = values_of(reduced, "mean", "axis", "block") - values_of(
+        baseline, "known_mean", "axis", "block"
+    )
     z, estimate = (np.full((*residual.shape[:-1], len(designs)), np.nan) for _ in range(2))
     for axis in range(reduced.sizes["axis"]):
         present = np.isfinite(residual[..., axis, :]).reshape(-1, blocks).any(axis=0)
@@ -48,7 +51,10 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     column = np.concatenate([np.arange(len(_TIMES)), np.full(at.size, len(_TIMES))])
     spread = np.full((*z.shape, len(what)), np.nan)
     size = spread.copy()
-    spread[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = z, estimate
+    spread[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = (
+        z,
+        estimate,
+    )
     tau = np.array([*_TIMES, _BESIDE], dtype=float) * block
     return statistic_dataset(
         "restart",

@@ -10,7 +10,16 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtri_exp
 
-__all__ = ["Array", "Windows", "cube_root_score", "exponential_score", "over_windows", "statistic_dataset", "values_of", "window_set"]
+__all__ = [
+    "Array",
+    "Windows",
+    "cube_root_score",
+    "exponential_score",
+    "over_windows",
+    "statistic_dataset",
+    "values_of",
+    "window_set",
+]
 
 Array = NDArray[np.float64]
 #: A window moves by this share of its length, in records up to so many blocks, and in longer ones.
@@ -72,7 +81,9 @@ def over_windows(values: Any, windows: Windows) -> Any:
     >>> over_windows(np.ones((4, 1)), window_set(4, (2,), whole=False))[:, 0]
     array([2., 2., 2.])
     """
-    total = np.zeros((*values.shape[:-2], values.shape[-2] + 1, values.shape[-1]), dtype=values.dtype)
+    total = np.zeros(
+        (*values.shape[:-2], values.shape[-2] + 1, values.shape[-1]), dtype=values.dtype
+    )
     np.cumsum(values, axis=-2, out=total[..., 1:, :])
     return total[..., windows.stop, :] - total[..., windows.first, :]
 
@@ -130,12 +141,13 @@ def statistic_dataset(
     windows : Windows
         The windows.
     columns : dict
-        ``what`` (str), ``tau_min_s``, ``tau_max_s`` [s] and ``frequency`` [Hz] of each column, and ``floor``, the smallest standard
-        deviation that null records may give to a score.
+        ``what`` (str), ``tau_min_s``, ``tau_max_s`` [s] and ``frequency`` [Hz] of each column, and
+        ``floor``, the smallest standard deviation that null records may give to a score.
     z, ratio : ndarray (..., row, window, tau)
         Near-normal score; observed over expected.
     rows : sequence of str, optional
-        Axes of each row, those of one row parted by a blank; by default a row is an axis of the record.
+        Axes of each row, those of one row parted by a blank; by default a row is an axis of the
+        record.
     estimate : ndarray, optional
         The mismatch as a number of `units`.
     units : str
@@ -154,11 +166,21 @@ def statistic_dataset(
     label = {key: np.broadcast_to(np.asarray(value), size) for key, value in columns.items()}
     found = xr.Dataset(
         {
-            "z": (dims, z, {"units": "1", "long_name": "score, near-normal where recording and simulation agree"}),
+            "z": (
+                dims,
+                z,
+                {
+                    "units": "1",
+                    "long_name": "score, near-normal where recording and simulation agree",
+                },
+            ),
             "ratio": (dims, ratio, {"units": "1", "long_name": "observed over expected"}),
         },
         coords={
-            "axes": ("row", np.asarray(reduced["axis"].values if rows is None else rows, dtype=str)),
+            "axes": (
+                "row",
+                np.asarray(reduced["axis"].values if rows is None else rows, dtype=str),
+            ),
             "begin": ("window", begin[windows.first], {"units": "s"}),
             "end": ("window", end[windows.stop - 1], {"units": "s"}),
             "first": ("window", windows.first),

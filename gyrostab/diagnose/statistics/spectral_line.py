@@ -6,7 +6,14 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, over_windows, statistic_dataset, values_of
+from gyrostab.diagnose.statistics.scores import (
+    Array,
+    Windows,
+    cube_root_score,
+    over_windows,
+    statistic_dataset,
+    values_of,
+)
 
 __all__ = ["score"]
 
@@ -20,17 +27,21 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     Parameters
     ----------
     reduced, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects: its spectrum gives the slope of the surroundings, their
-        level is the recording's own.
+        Recording or null records, and what the simulation expects: its spectrum gives the slope of
+        the surroundings, their level is the recording's own.
 
     Returns
     -------
     xarray.Dataset or None
-        None without lines. ``estimate`` is the amplitude of a sine that would raise the line so far [degree hour-1].
+        None without lines. ``estimate`` is the amplitude of a sine that would raise the line so far
+        [degree hour-1].
     """
     if "line_power" not in reduced:
         return None
-    power, weight = values_of(reduced, "line_power", "axis", "part", "line"), values_of(reduced, "line_weight", "axis", "part")
+    power, weight = (
+        values_of(reduced, "line_power", "axis", "part", "line"),
+        values_of(reduced, "line_weight", "axis", "part"),
+    )
     frequency = reduced["line_frequency"].values
     windows = _parts(reduced)
     expected = expected_lines(baseline, frequency)[:, None, :]
@@ -65,13 +76,17 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 def _parts(reduced: xr.Dataset) -> Windows:
     """Blocks of the equal parts of the record, and of the whole last."""
     parts, blocks = reduced.sizes["part"], reduced.sizes["block"]
-    edge = -(-np.arange(parts + 1) * blocks // parts)  # as the blocks were shared out when the log was read
+    edge = -(
+        -np.arange(parts + 1) * blocks // parts
+    )  # as the blocks were shared out when the log was read
     return Windows(np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), blocks))
 
 
 def _evenness(reduced: xr.Dataset, windows: Windows) -> Array:
     """Blocks that a mean is as good as, over those in it, by window and line: one loud block among quiet ones scatters as one alone."""
-    power, shape = (values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape"))
+    power, shape = (
+        values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape")
+    )
     there = np.isfinite(power) & (shape > 0)
     power, one = np.where(there, power, 0.0), there.astype(float)
     square = np.where(there, power**2 * shape / (1.0 + shape), 0.0)
@@ -90,7 +105,9 @@ def _near(excess: Array) -> Array:
     n = excess.shape[-1]
     total = np.concatenate([np.zeros((*excess.shape[:-1], 1)), np.cumsum(excess, axis=-1)], axis=-1)
     place = np.arange(n)
-    return np.asarray(total[..., np.minimum(place + _NEAR + 1, n)] - total[..., np.maximum(place - _NEAR, 0)])
+    return np.asarray(
+        total[..., np.minimum(place + _NEAR + 1, n)] - total[..., np.maximum(place - _NEAR, 0)]
+    )
 
 
 def _surroundings(flat: Array) -> Array:

@@ -27,7 +27,9 @@ _SMALL = 2**21
 def take(column: NDArray[Any] | Pieces, rows: NDArray[np.int64]) -> NDArray[Any]:
     """The values of a few rows."""
     if isinstance(column, Pieces):
-        return np.concatenate([np.empty(0, column.dtype), *(column[row : row + 1] for row in rows.tolist())])
+        return np.concatenate(
+            [np.empty(0, column.dtype), *(column[row : row + 1] for row in rows.tolist())]
+        )
     return np.asarray(column[rows])
 
 
@@ -43,11 +45,13 @@ def put(column: NDArray[Any] | Pieces, rows: NDArray[np.int64], value: int) -> N
 class Buffers:
     """Columns of 8-byte numbers that grow block by block.
 
-    Up to `limit` bytes they stay in memory; beyond it they are appended to a spool. Where they are few and in memory, they end as
-    arrays, of which the columns `rows_of` are the rows of one.
+    Up to `limit` bytes they stay in memory; beyond it they are appended to a spool. Where they are
+    few and in memory, they end as arrays, of which the columns `rows_of` are the rows of one.
     """
 
-    def __init__(self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES, rows_of: Sequence[Any] = ()):
+    def __init__(
+        self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES, rows_of: Sequence[Any] = ()
+    ):
         self.rows_of = rows_of
         self.dtypes = {key: np.dtype(dtype) for key, dtype in dtypes.items()}
         self.limit = limit
@@ -83,14 +87,20 @@ class Buffers:
     def finish(self) -> dict[Any, NDArray[Any] | Pieces]:
         """The columns: arrays where they are small, or else in pieces."""
         found: dict[Any, NDArray[Any] | Pieces] = {}
-        stays = any(isinstance(piece, Stored) for pieces in self._pieces.values() for piece in pieces)
+        stays = any(
+            isinstance(piece, Stored) for pieces in self._pieces.values() for piece in pieces
+        )
         small = not stays and self._spool is None and self.rows * len(self._pieces) <= _SMALL
         matrix = np.empty((len(self.rows_of), self.rows if small else 0))
         for key, pieces in self._pieces.items():
             column = Pieces(self.dtypes[key], pieces)
             pieces.clear()
             if small:
-                plain = matrix[self.rows_of.index(key)] if key in self.rows_of else np.empty(self.rows, self.dtypes[key])
+                plain = (
+                    matrix[self.rows_of.index(key)]
+                    if key in self.rows_of
+                    else np.empty(self.rows, self.dtypes[key])
+                )
                 column.fill(0, 0, plain)
                 found[key] = plain
             else:
@@ -105,7 +115,12 @@ def together(columns: Sequence[Any]) -> Any:
         stacked.gyrostab_pieces = [pieces for column in columns for pieces in pieces_of(column)]
         return stacked
     whole = columns[0].base
-    same = whole is not None and whole.ndim == 2 and len(whole) == len(columns) and all(column.base is whole for column in columns)
+    same = (
+        whole is not None
+        and whole.ndim == 2
+        and len(whole) == len(columns)
+        and all(column.base is whole for column in columns)
+    )
     return whole if same else np.stack(columns)
 
 
@@ -116,7 +131,10 @@ def lazily(values: NDArray[Any] | Pieces) -> Any:
     import dask.array
 
     name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
-    lazy = with_fill(dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta), values.fill)
+    lazy = with_fill(
+        dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta),
+        values.fill,
+    )
     lazy.gyrostab_pieces = [values]
     lazy.gyrostab_line = values.find_line()
     return lazy

@@ -20,8 +20,13 @@ _BRACKET = re.compile(r"^(.*?)\s*\[([^\[\]]*)\]\s*$")
 _PARENTHESES = re.compile(r"^(.*?)\s*\(([^()]*)\)\s*$")
 AXIS = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")
 _TIME_SUFFIX = r"s|sec|seconds?|ms|milliseconds?|us|microseconds?|ns|nanoseconds?|utc|iso"
-TIME = re.compile(rf"^(?:(?:time|timestamp|t)(?:[_ ]({_TIME_SUFFIX}))?|(?:time|timestamp)(sec|ms|us|ns|utc))$")
-LOOKS_GYRO = [re.compile(pattern, re.IGNORECASE) for pattern in (r"gyr|angular_?(rate|vel)|omega", r"^[gw]_?[xyz](_|$)|^w_rs", r"rate|rot")]
+TIME = re.compile(
+    rf"^(?:(?:time|timestamp|t)(?:[_ ]({_TIME_SUFFIX}))?|(?:time|timestamp)(sec|ms|us|ns|utc))$"
+)
+LOOKS_GYRO = [
+    re.compile(pattern, re.IGNORECASE)
+    for pattern in (r"gyr|angular_?(rate|vel)|omega", r"^[gw]_?[xyz](_|$)|^w_rs", r"rate|rot")
+]
 
 #: Channel name, or the stem before an underscore -> quantity.
 QUANTITIES = {
@@ -35,7 +40,9 @@ QUANTITIES = {
     "mag": "magnetic",
     "ramp": "number",
 }
-KNOWN = re.compile(r"^(temperature|vibration|rotation_rate|supply_voltage|light_power|pressure|ramp|accel_[xyz]|mag_[xyz])$")
+KNOWN = re.compile(
+    r"^(temperature|vibration|rotation_rate|supply_voltage|light_power|pressure|ramp|accel_[xyz]|mag_[xyz])$"
+)
 
 
 @dataclass
@@ -46,7 +53,9 @@ class Header:
     header: str
     name: str
     unit: str | None
-    stored: str | None = None  # the unit that the format keeps beside the header, weaker than --unit
+    stored: str | None = (
+        None  # the unit that the format keeps beside the header, weaker than --unit
+    )
     calendar: str | None = None  # the CF calendar of that unit
     mapped: bool = False  # by the user
     preset: bool = False  # known from the program that wrote the file
@@ -62,7 +71,8 @@ class Header:
 def split_header(text: str) -> tuple[str, str | None]:
     """Name and unit of a header cell.
 
-    A unit is in square brackets, or in parentheses if it is a known one. A whole number in brackets is an index and stays in the name.
+    A unit is in square brackets, or in parentheses if it is a known one. A whole number in brackets
+    is an index and stays in the name.
 
     Examples
     --------
@@ -74,7 +84,12 @@ def split_header(text: str) -> tuple[str, str | None]:
     (('Gyroscope x', 'rad/s'), ('Supply (raw)', None))
     """
     match = _PARENTHESES.match(text.strip())
-    if match and match.group(1) and not match.group(2).strip().isdigit() and is_unit(match.group(2)):
+    if (
+        match
+        and match.group(1)
+        and not match.group(2).strip().isdigit()
+        and is_unit(match.group(2))
+    ):
         return match.group(1).strip(), match.group(2).strip()
     match = _BRACKET.match(text.strip())
     if not match or (match.group(2).strip().isdigit() and match.group(2).strip() != "1"):
@@ -143,7 +158,9 @@ def quantity_of(low: str) -> str | None:
     return (
         QUANTITIES.get(low)
         or QUANTITIES.get(low.split("_")[0])
-        or next((quantity for name, quantity in QUANTITIES.items() if low.startswith(name + "_")), None)
+        or next(
+            (quantity for name, quantity in QUANTITIES.items() if low.startswith(name + "_")), None
+        )
     )
 
 
@@ -154,7 +171,13 @@ def unit_quantity(quantity: str) -> str:
 
 def example_unit(quantity: str | None) -> str:
     """A unit for a message."""
-    return "1" if quantity is None else "deg/s" if quantity == "rotation_rate" else known_units(quantity).split(",")[0]
+    return (
+        "1"
+        if quantity is None
+        else "deg/s"
+        if quantity == "rotation_rate"
+        else known_units(quantity).split(",")[0]
+    )
 
 
 def is_contract_name(low: str) -> bool:

@@ -1,7 +1,8 @@
 """Columns of 8-byte values in pieces, packed where that loses nothing, in memory or in an unlinked temporary file.
 
-Files are read back with `os.preadv`, not mapped: pages of a mapped file would count as memory of this process, more and more of them
-as a long log is gone through, and every map holds a file handle of its own, of which hundreds of files would need thousands.
+Files are read back with `os.preadv`, not mapped: pages of a mapped file would count as memory of
+this process, more and more of them as a long log is gone through, and every map holds a file handle
+of its own, of which hundreds of files would need thousands.
 """
 
 from __future__ import annotations
@@ -85,7 +86,11 @@ class _Place:
 
     def write(self, number: int, value: int) -> None:
         """Change one value."""
-        os.pwrite(self.spool.handle, np.array(value, self.dtype).tobytes(), self.begin + self.dtype.itemsize * number)
+        os.pwrite(
+            self.spool.handle,
+            np.array(value, self.dtype).tobytes(),
+            self.begin + self.dtype.itemsize * number,
+        )
 
 
 _Kept = NDArray[Any] | _Place
@@ -96,7 +101,11 @@ def _held(kept: _Kept) -> int:
 
 
 def _spilled(kept: _Kept, spool: Spool) -> _Kept:
-    return _Place(spool, spool.add(kept), kept.size, kept.dtype) if isinstance(kept, np.ndarray) and kept.size else kept
+    return (
+        _Place(spool, spool.add(kept), kept.size, kept.dtype)
+        if isinstance(kept, np.ndarray) and kept.size
+        else kept
+    )
 
 
 def _part(kept: _Kept, first: int, size: int) -> NDArray[Any]:
@@ -301,7 +310,9 @@ class Pieces:
     def __init__(self, dtype: Any, pieces: Sequence[Piece]):
         self.dtype = np.dtype(dtype)
         self._pieces = [piece for piece in pieces if piece.rows]
-        self._rows = np.cumsum([0, *(piece.rows for piece in self._pieces)]).tolist()  # at which the pieces begin, and the end of the last
+        self._rows = np.cumsum(
+            [0, *(piece.rows for piece in self._pieces)]
+        ).tolist()  # at which the pieces begin, and the end of the last
         self.shape = (self._rows[-1],)
 
     def view(self, dtype: Any) -> Pieces:
@@ -317,7 +328,9 @@ class Pieces:
 
     def find_line(self) -> tuple[int, int] | None:
         """Return the first value and the step, where all values are even steps without a break; None where they are not."""
-        if not self._pieces or not all(isinstance(piece, Steps) and len(piece.table) == 1 for piece in self._pieces):
+        if not self._pieces or not all(
+            isinstance(piece, Steps) and len(piece.table) == 1 for piece in self._pieces
+        ):
             return None
         _, first, step = (int(number) for number in self._pieces[0].table[0])  # type: ignore[attr-defined]
         for row, piece in zip(self._rows, self._pieces, strict=False):

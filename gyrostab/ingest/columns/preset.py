@@ -1,8 +1,10 @@
 """What columns are in the files of known programs: small TOML files in ``presets``, recognised by the header and the lines above it.
 
-A preset has a `name`, the `times` that may be the time column (the first that is filled is taken), and `columns`: what a column is, in
-the form of ``--map``, and how the program heads it. `above` and `file` are patterns for a line above the header and for the file's name,
-`needs` are headers that must be there too, `drops` are columns that are not kept, and `rate` finds the sampling rate [Hz] above the header.
+A preset has a `name`, the `times` that may be the time column (the first that is filled is taken),
+and `columns`: what a column is, in the form of ``--map``, and how the program heads it. `above` and
+`file` are patterns for a line above the header and for the file's name, `needs` are headers that
+must be there too, `drops` are columns that are not kept, and `rate` finds the sampling rate [Hz]
+above the header.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ class Found:
 def _presets() -> dict[str, dict[str, Any]]:
     """The presets by the names of their files."""
     found = {}
-    for place in sorted(files("gyrostab.ingest.columns").joinpath("presets").iterdir(), key=lambda place: place.name):
+    for place in sorted(
+        files("gyrostab.ingest.columns").joinpath("presets").iterdir(), key=lambda place: place.name
+    ):
         if place.name.endswith(".toml"):
             preset = tomllib.loads(place.read_text(encoding="utf-8"))
             assert set(preset) <= _KEYS, f"{place.name}: {set(preset) - _KEYS}"
@@ -54,7 +58,11 @@ def preset_names() -> dict[str, str]:
 
 
 def find_preset(
-    path: Path, headers: Sequence[tuple[str, str]], *, above: Sequence[str] = (), is_filled: Callable[[int], bool] | None = None
+    path: Path,
+    headers: Sequence[tuple[str, str]],
+    *,
+    above: Sequence[str] = (),
+    is_filled: Callable[[int], bool] | None = None,
 ) -> Found | None:
     """Find the preset that fits a file.
 
@@ -80,19 +88,40 @@ def find_preset(
             places[name.strip().lower()] = place
     for key, preset in _presets().items():
         gyro = [names for target, names in preset["columns"].items() if target.startswith("gyro_")]
-        if not all(any(name.lower() in places for name in names) for names in [*gyro, *([name] for name in preset.get("needs", ()))]):
+        if not all(
+            any(name.lower() in places for name in names)
+            for names in [*gyro, *([name] for name in preset.get("needs", ()))]
+        ):
             continue
         if "file" in preset and not re.search(preset["file"], path.name, re.IGNORECASE):
             continue
         if "above" in preset and not any(re.search(preset["above"], line) for line in above):
             continue
-        return _apply(f"{preset['name']} (preset {key})", preset, places, above, is_filled or (lambda place: True))
+        return _apply(
+            f"{preset['name']} (preset {key})",
+            preset,
+            places,
+            above,
+            is_filled or (lambda place: True),
+        )
     return None
 
 
-def _apply(name: str, preset: dict[str, Any], places: dict[str, int], above: Sequence[str], is_filled: Callable[[int], bool]) -> Found:
-    columns = {places[drop.lower()]: "-" for drop in preset.get("drops", ()) if drop.lower() in places}
-    times = [(places[time["column"].lower()], time["unit"]) for time in preset["times"] if time["column"].lower() in places]
+def _apply(
+    name: str,
+    preset: dict[str, Any],
+    places: dict[str, int],
+    above: Sequence[str],
+    is_filled: Callable[[int], bool],
+) -> Found:
+    columns = {
+        places[drop.lower()]: "-" for drop in preset.get("drops", ()) if drop.lower() in places
+    }
+    times = [
+        (places[time["column"].lower()], time["unit"])
+        for time in preset["times"]
+        if time["column"].lower() in places
+    ]
     filled = [(place, unit) for place, unit in times if is_filled(place)]
     columns.update(dict.fromkeys([place for place, _ in times], "-"))
     if filled:
@@ -100,5 +129,9 @@ def _apply(name: str, preset: dict[str, Any], places: dict[str, int], above: Seq
     for target, names in preset["columns"].items():
         held = [places[name.lower()] for name in names if name.lower() in places]
         columns.update(dict.fromkeys(held[:1], target))
-    rates = [found[1] for line in above if "rate" in preset and (found := re.search(preset["rate"], line))]
+    rates = [
+        found[1]
+        for line in above
+        if "rate" in preset and (found := re.search(preset["rate"], line))
+    ]
     return Found(name, columns, float(rates[0]) if rates else None)

@@ -39,13 +39,15 @@ class Taken(NamedTuple):
     block : dict
         Column number -> values in the inner unit, or a piece of the column.
     ranges : dict
-        Column number -> values missing, range of the others as they stand in the file, whether these are whole numbers.
+        Column number -> values missing, range of the others as they stand in the file, whether
+        these are whole numbers.
     bad_rows, cell_rows : ndarray of int64
         Rows that are unreadable, and others in which a gyro cell is.
     bad_cells, cells : int
         Cells that are unreadable, and gyro cells of `cell_rows`.
     low, high : int
-        Range of the stamps of readable rows [ns since 1970]; the other way round where there are none.
+        Range of the stamps of readable rows [ns since 1970]; the other way round where there are
+        none.
     seen : Seen or None
         What a look at the values found, where they stay in the file.
     """
@@ -90,18 +92,24 @@ class Intake:
         self.plan, self.options = plan, options
         self.time = plan.time
         self.gyro, self.channels = plan.of("gyro"), plan.of("channel")
-        dtypes: dict[int, Any] = {column.source: np.float64 for column in [*self.gyro, *self.channels]}
+        dtypes: dict[int, Any] = {
+            column.source: np.float64 for column in [*self.gyro, *self.channels]
+        }
         if self.time is not None:
             dtypes[self.time.source] = np.int64
         self.buffers = Buffers(dtypes, limit=limit, rows_of=[column.source for column in self.gyro])
-        self.tens = {column.source: 1.0 for column in [*self.gyro, *self.channels]}  # powers of ten that are tried; 0 for none
+        self.tens = {
+            column.source: 1.0 for column in [*self.gyro, *self.channels]
+        }  # powers of ten that are tried; 0 for none
         self.bad_rows = self.bad_cells = self.cells = self.cell_rows = 0
         self.bad_places: list[str] = []
         self.cell_places: list[str] = []
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
         self.seen: list[Seen] = []
-        self.whole: dict[int, tuple[float, float] | None] = {column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]}
+        self.whole: dict[int, tuple[float, float] | None] = {
+            column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
+        }
 
     def prepare(self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0) -> Taken:
         """Convert one block, and pack what can be packed; several threads may do so side by side.
@@ -109,15 +117,19 @@ class Intake:
         Parameters
         ----------
         values : dict of int to ndarray
-            Column number -> values in the file's unit, NaN where unreadable or empty. Changed in place.
+            Column number -> values in the file's unit, NaN where unreadable or empty. Changed in
+            place.
         stamps : ndarray of int64 or None
             Stamps [ns since 1970], `NAT` where unreadable; None without a time column.
         words : int
-            Cells of channels that hold something that is no number (empty ones are not filled, which is no fault).
+            Cells of channels that hold something that is no number (empty ones are not filled,
+            which is no fault).
         """
         from gyrostab.kernels.encoding.decimals import even_steps
 
-        size = len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
+        size = (
+            len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
+        )
         if size == 0:
             return Taken(0, {}, {}, _NO_ROWS, _NO_ROWS, 0, 0, np.iinfo(np.int64).max, NAT)
         bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
@@ -126,7 +138,9 @@ class Intake:
         for column in [*self.gyro, *self.channels]:
             source = column.source
             block[source], ranges[source] = self._convert(column, values[source])
-            unknown = np.isnan if block[source] is values[source] else _not_finite  # what is packed is not converted yet
+            unknown = (
+                np.isnan if block[source] is values[source] else _not_finite
+            )  # what is packed is not converted yet
             masks.append(unknown(values[source]) if ranges[source][0] else None)
         gyro = [mask for mask in masks[: len(self.gyro)] if mask is not None]
         bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro)
@@ -173,7 +187,9 @@ class Intake:
         self.seen += [taken.seen] if taken.seen is not None else []
         self.buffers.add(taken.block)
 
-    def _convert(self, column: Column, values: NDArray[np.float64]) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
+    def _convert(
+        self, column: Column, values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
         """Convert to the inner unit, in place or packed, infinities to NaN; and what `Taken.ranges` tells of the column."""
         from gyrostab.kernels.encoding.decimals import decimals_of, to_decimals
         from gyrostab.kernels.encoding.rows import clean_column
@@ -185,7 +201,12 @@ class Intake:
                 fits, *found = to_decimals(values, tens, counts)
                 if fits:
                     self.tens[column.source] = tens
-                    return Counts(counts, tens, column.factor, column.offset), (found[0], found[1], found[2], found[3])
+                    return Counts(counts, tens, column.factor, column.offset), (
+                        found[0],
+                        found[1],
+                        found[2],
+                        found[3],
+                    )
             tens = decimals_of(values) if tens else 0.0
         self.tens[column.source] = 0.0  # no decimals: the next blocks are not tried
         missing, low, high, whole = clean_column(values, column.factor, column.offset)
@@ -223,11 +244,15 @@ class Intake:
         """
         name, rows = self.plan.path.name, self.buffers.rows
         if rows == 0:
-            raise FormatError(f"{name}: there is a header but no data row below it; copy it again, or look at what the logger wrote")
+            raise FormatError(
+                f"{name}: there is a header but no data row below it; copy it again, or look at what the logger wrote"
+            )
         if self.bad_rows > MAX_UNREADABLE * rows:
             share, first = self.bad_rows / rows, self.bad_places[0]
             what = "the separator, the columns that --map names and the unit of time (stamps lie in the years 1678 to 2262)"
-            raise FormatError(f"{name}: {share:.0%} of {rows} rows are unreadable, the first is {first}; look at it, and check {what}")
+            raise FormatError(
+                f"{name}: {share:.0%} of {rows} rows are unreadable, the first is {first}; look at it, and check {what}"
+            )
         columns = self.buffers.finish()
         stamps = self._stamps(columns)
         dataset = self._dataset({key: lazily(column) for key, column in columns.items()}, stamps)
@@ -249,7 +274,9 @@ class Intake:
         if self.bad_index and self.low <= self.high:
             rows = np.concatenate(self.bad_index)
             written = take(stamps, rows)
-            put(stamps, rows[(written < self.low) | (written > self.high)], NAT)  # scratch numbers in a junk row are no stamp
+            put(
+                stamps, rows[(written < self.low) | (written > self.high)], NAT
+            )  # scratch numbers in a junk row are no stamp
         return lazily(stamps.view("datetime64[ns]"))
 
     def _dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:
@@ -259,13 +286,25 @@ class Intake:
             axes = [column.name for column in self.gyro]
             stack = together([columns[column.source] for column in self.gyro])
             stack = with_seen(stack, self.seen) if self.seen else stack
-            data[self.plan.signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[self.plan.signal]}, self._packing(self.gyro))
+            data[self.plan.signal] = (
+                ("axis", "row"),
+                stack,
+                {"units": SIGNAL_UNITS[self.plan.signal]},
+                self._packing(self.gyro),
+            )
             coords["axis"] = np.array(axes, dtype=str)
         for column in self.channels:
-            data[column.name] = ("row", columns[column.source], {"units": column.units}, self._packing([column]))
+            data[column.name] = (
+                "row",
+                columns[column.source],
+                {"units": column.units},
+                self._packing([column]),
+            )
         if stamps is not None:
             coords["time"] = ("row", stamps)
-        dataset = xr.Dataset(data, coords=coords, attrs={"kind": self.plan.kind} if self.plan.kind else {})
+        dataset = xr.Dataset(
+            data, coords=coords, attrs={"kind": self.plan.kind} if self.plan.kind else {}
+        )
         if self.options.rate is not None:
             dataset.attrs["declared_rate_hz"] = float(self.options.rate)
         if self.options.start is not None and stamps is None:
@@ -275,10 +314,14 @@ class Intake:
     def _faults(self, rows: int) -> list[str]:
         notes = []
         if self.bad_rows:
-            notes.append(f"{self.bad_rows} of {rows} rows are unreadable: {_places(self.bad_places, self.bad_rows)}")
+            notes.append(
+                f"{self.bad_rows} of {rows} rows are unreadable: {_places(self.bad_places, self.bad_rows)}"
+            )
         if self.cell_places:
             where = _places(self.cell_places, self.cell_rows)
-            notes.append(f"{self.cells} gyro cells hold no number in rows that are readable otherwise: {where}")
+            notes.append(
+                f"{self.cells} gyro cells hold no number in rows that are readable otherwise: {where}"
+            )
         if self.options.start is not None and self.time is not None:
             notes.append("--start is not used: the file has its own time column")
         return notes
@@ -315,7 +358,10 @@ def summary_of(
     notes : sequence of str
         What the reader says.
     """
-    first, last = (next((np.datetime64(int(stamp), "ns") for stamp in end if stamp != NAT), None) for end in (head, tail[::-1]))
+    first, last = (
+        next((np.datetime64(int(stamp), "ns") for stamp in end if stamp != NAT), None)
+        for end in (head, tail[::-1])
+    )
     return FileSummary(
         path=plan.path,
         format=form,
@@ -325,5 +371,8 @@ def summary_of(
         first=first,
         last=last,
         n_rows=rows,
-        notes=(*(f"{plan.path.name}: {note}" for note in [*notes, *plan.notes]), *(str(problem) for problem in plan.problems)),
+        notes=(
+            *(f"{plan.path.name}: {note}" for note in [*notes, *plan.notes]),
+            *(str(problem) for problem in plan.problems),
+        ),
     )

@@ -51,11 +51,20 @@ _UNITS = {
     7 * 86400 * 10**9: ("week", "weeks"),
 }
 _NANOSECONDS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
-_ISO = re.compile(r"^\s*\d{4}-?\d\d-?\d\d([T ]\d\d(:?\d\d){0,2}([.,]\d+)?\s*(Z|[+-]\d\d(:?\d\d)?)?)?\s*$")
+_ISO = re.compile(
+    r"^\s*\d{4}-?\d\d-?\d\d([T ]\d\d(:?\d\d){0,2}([.,]\d+)?\s*(Z|[+-]\d\d(:?\d\d)?)?)?\s*$"
+)
 _SINCE = re.compile(r"\bsince\b", re.IGNORECASE)
-#: Calendars in which a date is an instant; the others are those of climate models, whose dates never were.
-_CALENDARS = {"standard": "standard", "gregorian": "standard", "proleptic_gregorian": "proleptic_gregorian", "julian": "julian"}
-#: Characters of a cell above which it is no stamp: a double written in full has at most 325 before and 1074 after the point.
+#: Calendars in which a date is an instant; the others are those of climate models, whose dates
+#: never were.
+_CALENDARS = {
+    "standard": "standard",
+    "gregorian": "standard",
+    "proleptic_gregorian": "proleptic_gregorian",
+    "julian": "julian",
+}
+#: Characters of a cell above which it is no stamp: a double written in full has at most 325 before
+#: and 1074 after the point.
 _MOST_DIGITS = 1400
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?$")
 
@@ -72,7 +81,8 @@ class TimeUnit:
     def digits(self) -> int | None:
         """Decimals that make one nanosecond (9 for seconds), or None when the unit is no power of ten of it.
 
-        Also None when the epoch is outside the years 1678 to 2262, so that sums with it exceed 64 bits.
+        Also None when the epoch is outside the years 1678 to 2262, so that sums with it exceed 64
+        bits.
         """
         if self.epoch is not None and abs(self.epoch) > _LIMIT:
             return None
@@ -97,8 +107,8 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     Raises
     ------
     UnitError
-        When the text is no time unit, when its epoch can be read in several ways or depends on the clock, or when the
-        calendar is not one of real dates.
+        When the text is no time unit, when its epoch can be read in several ways or depends on the
+        clock, or when the calendar is not one of real dates.
 
     Examples
     --------
@@ -110,13 +120,21 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     name, *since = (part.strip() for part in _SINCE.split(text, maxsplit=1))
     epoch = _epoch_ns(text, since[0], calendar) if since else None
     factor, _, bare = name.rpartition(" ")
-    ns = None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))  # Ms: a megasecond, or a slip
-    if ns is None or (factor and not (len(factor) <= _MOST_DIGITS and _NUMBER.match(factor.strip()))):
+    ns = (
+        None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))
+    )  # Ms: a megasecond, or a slip
+    if ns is None or (
+        factor and not (len(factor) <= _MOST_DIGITS and _NUMBER.match(factor.strip()))
+    ):
         known = "s, ms, us, ns, min, h, d, week, with a factor in front if needed"
-        raise UnitError(f"time unit {text!r} is not known; known are {known}; months and years have no fixed length")
+        raise UnitError(
+            f"time unit {text!r} is not known; known are {known}; months and years have no fixed length"
+        )
     scale = Fraction(factor.strip() or "1")
     if not 0 < ns * scale < 2**63 or (ns * scale).denominator >= 2**63:
-        raise UnitError(f"time unit {text!r}: the factor {factor} is not usable; give a number above 0, of less than 292 years")
+        raise UnitError(
+            f"time unit {text!r}: the factor {factor} is not usable; give a number above 0, of less than 292 years"
+        )
     return TimeUnit(text, ns * scale, epoch)
 
 
@@ -165,7 +183,9 @@ def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
     [-9223372036854775808, 86400000000000]
     """
     native = dates.astype(dates.dtype.newbyteorder("="), copy=False)
-    low, high = (np.datetime64(day, "D").astype(native.dtype) for day in ("1677-09-22", "2262-04-11"))
+    low, high = (
+        np.datetime64(day, "D").astype(native.dtype) for day in ("1677-09-22", "2262-04-11")
+    )
     outside = (native < low) | (native > high)
     if native.dtype == np.dtype("datetime64[ns]") or not outside.any():
         return native.astype("datetime64[ns]").view(np.int64)
@@ -174,21 +194,27 @@ def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
 
 def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
     """Stamps of ISO 8601 texts (UTC unless they say otherwise); unreadable ones are `NAT`."""
-    stamps = pd.to_datetime(pd.Series(list(texts), dtype=object), format="ISO8601", utc=True, errors="coerce")
+    stamps = pd.to_datetime(
+        pd.Series(list(texts), dtype=object), format="ISO8601", utc=True, errors="coerce"
+    )
     return dates_to_ns(stamps.dt.tz_convert(None).to_numpy())
 
 
 def _all_fit(values: NDArray[np.int64], units: int, up: int, rest: int) -> bool:
     """Whether no stamp, nor a step on the way to it, leaves 64 bits: as a rule, and found out by the range of the values alone."""
     ends = (int(values.min()) + units, int(values.max()) + units)
-    return all(abs(end) < _LIMIT and abs(end * up) < _LIMIT and abs(end * up + rest) < _LIMIT for end in ends)
+    return all(
+        abs(end) < _LIMIT and abs(end * up) < _LIMIT and abs(end * up + rest) < _LIMIT
+        for end in ends
+    )
 
 
 def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
     """Stamps of whole numbers of `unit` since `epoch`; a stamp outside the years 1678 to 2262 is `NAT`."""
     zero = epoch if unit.epoch is None else unit.epoch
     up, down = unit.ns.numerator, unit.ns.denominator
-    # Whole units of the epoch are added to the counts, so that no sum exceeds 64 bits however far back it is.
+    # Whole units of the epoch are added to the counts, so that no sum exceeds 64 bits however far
+    # back it is.
     units, rest = divmod(zero, up) if down == 1 else (0, zero)
     limit = (_LIMIT - down) // up - 1
     if max(abs(units), abs(rest)) > _LIMIT // 2:
@@ -205,11 +231,17 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
 
 def signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
     """Return whole numbers as int64; unsigned ones that exceed it become the largest, which is no stamp."""
-    wide = np.minimum(counts, np.uint64(_LIMIT)) if counts.dtype.kind == "u" and counts.dtype.itemsize == 8 else counts
+    wide = (
+        np.minimum(counts, np.uint64(_LIMIT))
+        if counts.dtype.kind == "u" and counts.dtype.itemsize == 8
+        else counts
+    )
     return wide.astype(np.int64)
 
 
-def floats_to_ns(values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
+def floats_to_ns(
+    values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int
+) -> NDArray[np.int64]:
     """Stamps of binary floating point numbers: whole units as integers, only the fraction as a float."""
     wide = np.asarray(values, dtype=np.float64)
     usable = np.isfinite(wide) & (np.abs(wide) < 2.0**62)

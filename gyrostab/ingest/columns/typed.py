@@ -14,12 +14,29 @@ from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.pieces import Steps, Stored
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import Intake, Taken, summary_of
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, dates_to_ns, floats_to_ns, integers_to_ns, looks_iso, signed_counts
+from gyrostab.ingest.columns.stamps import (
+    NAT,
+    cells_to_ns,
+    dates_to_ns,
+    floats_to_ns,
+    integers_to_ns,
+    looks_iso,
+    signed_counts,
+)
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.seen import look_at_cells
 from gyrostab.store.threads import in_order
 
-__all__ = ["Fetch", "batch_rows", "convert_batch", "holds_dates", "read_columns", "summarise", "to_floats", "to_stamps"]
+__all__ = [
+    "Fetch",
+    "batch_rows",
+    "convert_batch",
+    "holds_dates",
+    "read_columns",
+    "summarise",
+    "to_floats",
+    "to_stamps",
+]
 
 #: Rows and bytes of all columns that are taken at one time, at most.
 BATCH_ROWS = 2**20
@@ -59,7 +76,9 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
     if array.dtype.kind == "M":
         stamps = dates_to_ns(array)
     elif unit is None or array.dtype.kind not in "iuf":
-        stamps = cells_to_ns(["" if value is None else str(value) for value in array], unit, options.epoch_ns)
+        stamps = cells_to_ns(
+            ["" if value is None else str(value) for value in array], unit, options.epoch_ns
+        )
     elif array.dtype.kind == "f":
         stamps = floats_to_ns(array, unit, options.epoch_ns)
     else:
@@ -70,11 +89,20 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
 def holds_dates(values: Any) -> bool:
     """Whether a sample of a column is dates, or text that looks like dates."""
     array = np.asarray(values)
-    return array.dtype.kind == "M" or (array.dtype.kind in "OUST" and any(isinstance(v, str) and looks_iso(v) for v in array[:50]))
+    return array.dtype.kind == "M" or (
+        array.dtype.kind in "OUST" and any(isinstance(v, str) and looks_iso(v) for v in array[:50])
+    )
 
 
 def read_columns(
-    plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, *, notes: Sequence[str] = (), limit: int = SPILL_BYTES, lasting: bool = False
+    plan: Plan,
+    options: ReadOptions,
+    rows: int,
+    fetch: Fetch,
+    *,
+    notes: Sequence[str] = (),
+    limit: int = SPILL_BYTES,
+    lasting: bool = False,
 ) -> xr.Dataset:
     """Make the raw log of columns that can be fetched by ranges of rows.
 
@@ -93,7 +121,8 @@ def read_columns(
     limit : int
         Size [bytes] above which the columns are not held in memory.
     lasting : bool
-        Several threads may call `fetch`, and at any later time: then values above the limit stay in the file.
+        Several threads may call `fetch`, and at any later time: then values above the limit stay in
+        the file.
     """
     intake = Intake(plan.check(), options, limit=limit)
     stay = lasting and 8 * rows * len(plan.columns) > limit
@@ -118,25 +147,47 @@ def batch_rows(columns: int) -> int:
     return min(max(BATCH_BYTES // (8 * max(columns, 1)), 2**10), BATCH_ROWS) // 8 * 8
 
 
-def _take_rows(intake: Intake, plan: Plan, options: ReadOptions, fetch: Fetch, stay: bool, span: tuple[int, int]) -> Taken:
+def _take_rows(
+    intake: Intake,
+    plan: Plan,
+    options: ReadOptions,
+    fetch: Fetch,
+    stay: bool,
+    span: tuple[int, int],
+) -> Taken:
     """Convert one batch; where the values stay in the file, only what was found in them is kept."""
-    taken = convert_batch(intake, options, {column.source: fetch(column.source, *span) for column in plan.columns})
+    taken = convert_batch(
+        intake, options, {column.source: fetch(column.source, *span) for column in plan.columns}
+    )
     if not stay:
         return taken
     begin, rows = span[0], taken.rows
     seen = None
     if intake.gyro:
-        cells = np.stack([cast(NDArray[np.float64], taken.block[column.source]) for column in intake.gyro])
-        seen = look_at_cells(cells, {column.name: cast(NDArray[Any], taken.block[column.source]) for column in intake.channels}, begin)
+        cells = np.stack(
+            [cast(NDArray[np.float64], taken.block[column.source]) for column in intake.gyro]
+        )
+        seen = look_at_cells(
+            cells,
+            {
+                column.name: cast(NDArray[Any], taken.block[column.source])
+                for column in intake.channels
+            },
+            begin,
+        )
     block: dict[int, Any] = {}
     for column in plan.columns:
         piece = taken.block[column.source]
-        read = partial(_read_stamps if column.role == "time" else _read_values, column, options, fetch)
+        read = partial(
+            _read_stamps if column.role == "time" else _read_values, column, options, fetch
+        )
         block[column.source] = piece if isinstance(piece, Steps) else Stored(read, begin, rows)
     return taken._replace(block=block, seen=seen)
 
 
-def _read_values(column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int) -> NDArray[np.float64]:
+def _read_values(
+    column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int
+) -> NDArray[np.float64]:
     from gyrostab.kernels.encoding.rows import clean_column
 
     values, _ = to_floats(fetch(column.source, start, stop))
@@ -144,7 +195,9 @@ def _read_values(column: Column, options: ReadOptions, fetch: Fetch, start: int,
     return values
 
 
-def _read_stamps(column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int) -> NDArray[np.int64]:
+def _read_stamps(
+    column: Column, options: ReadOptions, fetch: Fetch, start: int, stop: int
+) -> NDArray[np.int64]:
     return to_stamps(fetch(column.source, start, stop), column, options)
 
 
@@ -154,7 +207,9 @@ def convert_batch(intake: Intake, options: ReadOptions, batch: dict[int, Any]) -
     for column in [*intake.gyro, *intake.channels]:
         values[column.source], odd = to_floats(batch[column.source])
         words += odd if column.role == "channel" else 0
-    stamps = None if intake.time is None else to_stamps(batch[intake.time.source], intake.time, options)
+    stamps = (
+        None if intake.time is None else to_stamps(batch[intake.time.source], intake.time, options)
+    )
     return intake.prepare(values, stamps, words=words)
 
 
@@ -168,10 +223,15 @@ def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:
     ]
 
 
-def summarise(form: str, plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, notes: Sequence[str] = ()) -> FileSummary:
+def summarise(
+    form: str, plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, notes: Sequence[str] = ()
+) -> FileSummary:
     """A summary with the first and last stamps fetched from the two ends."""
     time = plan.time
     if time is None or not rows:
         return summary_of(plan, form, rows, notes=notes)
-    head, tail = (to_stamps(fetch(time.source, *span), time, options) for span in ((0, min(ENDS, rows)), (max(0, rows - ENDS), rows)))
+    head, tail = (
+        to_stamps(fetch(time.source, *span), time, options)
+        for span in ((0, min(ENDS, rows)), (max(0, rows - ENDS), rows))
+    )
     return summary_of(plan, form, rows, head=head, tail=tail, notes=notes)

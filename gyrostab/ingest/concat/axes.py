@@ -48,7 +48,8 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
     Parameters
     ----------
     raw : xarray.Dataset
-        Raw log; its attribute ``axis_rows`` lists axes, first row and row after the last of each group.
+        Raw log; its attribute ``axis_rows`` lists axes, first row and row after the last of each
+        group.
 
     Returns
     -------
@@ -65,24 +66,41 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
         return [raw]
     parts = []
     if int(groups[-1][2]) != raw.sizes["row"]:
-        raise SchemaError("the rows of this raw log were selected after it was read; regularise the whole, and select from the regular log")
+        raise SchemaError(
+            "the rows of this raw log were selected after it was read; regularise the whole, and select from the regular log"
+        )
     name = signal_name(raw)
     signal, places = raw[name], [str(axis) for axis in raw["axis"].values]
-    files = list(zip(texts(raw, "source_files"), np.atleast_1d(raw.attrs["row_start"]).tolist(), strict=True))
+    files = list(
+        zip(texts(raw, "source_files"), np.atleast_1d(raw.attrs["row_start"]).tolist(), strict=True)
+    )
     for number, (axes, first, end) in enumerate(groups):
         rows = [cut(one_row(signal.data, places.index(axis)), first, end) for axis in axes]
         stacked = np.stack(rows) if isinstance(rows[0], np.ndarray) else stack_rows(rows)
         data: dict[Any, Any] = {name: (("axis", "row"), stacked, signal.attrs, signal.encoding)}
         for key, variable in raw.data_vars.items():
             if key != name and (variable.dims == ("row",) or number == 0):
-                kept = cut(variable.data, first, end) if variable.dims == ("row",) else variable.data
+                kept = (
+                    cut(variable.data, first, end) if variable.dims == ("row",) else variable.data
+                )
                 data[key] = (variable.dims, kept, variable.attrs, variable.encoding)
-        coords = {str(key): raw[key].variable for key in raw.coords if str(key).startswith("time_") and number == 0}
+        coords = {
+            str(key): raw[key].variable
+            for key in raw.coords
+            if str(key).startswith("time_") and number == 0
+        }
         if "time" in raw.variables:
             coords["time"] = xr.Variable("row", cut(raw["time"].data, first, end))
         own = [(file, start - first) for file, start in files if first <= start < end]
         attrs = {key: value for key, value in raw.attrs.items() if key != "axis_rows"}
-        attrs |= {"source_files": [file for file, _ in own], "row_start": [start for _, start in own]}
-        attrs |= {} if number == 0 else {"notes": [], "history": "", "unreadable_rows": 0, "unreadable_cells": 0}
+        attrs |= {
+            "source_files": [file for file, _ in own],
+            "row_start": [start for _, start in own],
+        }
+        attrs |= (
+            {}
+            if number == 0
+            else {"notes": [], "history": "", "unreadable_rows": 0, "unreadable_cells": 0}
+        )
         parts.append(xr.Dataset(data, {"axis": axes, **coords}, attrs))
     return parts

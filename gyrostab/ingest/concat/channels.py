@@ -20,17 +20,21 @@ from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["join_channels"]
 
-_SAME_STAMP = 0.75  # of a sampling period: the stamps of two copies differ by the rounding of each to its own grid
+# of a sampling period: the stamps of two copies differ by the rounding of each to its own grid
+_SAME_STAMP = 0.75
 _CUTS = 16  # slices for each log up to which values stay lazy
 
 
-def join_channels(pieces: Sequence[Piece], start: int, rate: float, size: int, chunk: int) -> tuple[dict[str, Any], dict[str, Any]]:
+def join_channels(
+    pieces: Sequence[Piece], start: int, rate: float, size: int, chunk: int
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Join the channels of logs that lie on one grid.
 
     Returns
     -------
     variables, coordinates : dict
-        Channels, NaN where a log has none, and the stamps ``time_<channel>`` of those that have their own.
+        Channels, NaN where a log has none, and the stamps ``time_<channel>`` of those that have
+        their own.
 
     Raises
     ------
@@ -49,14 +53,22 @@ def join_channels(pieces: Sequence[Piece], start: int, rate: float, size: int, c
         else:
             variables[name] = (
                 "time",
-                place_on_grid([[_on_time(piece, name, start, rate) for piece in holders]], size, chunk, flat=True),
+                place_on_grid(
+                    [[_on_time(piece, name, start, rate) for piece in holders]],
+                    size,
+                    chunk,
+                    flat=True,
+                ),
                 attributes,
             )
     return variables, coordinates
 
 
 def _attributes(holders: Sequence[Piece], name: str) -> dict[str, Any]:
-    units = {str(piece.source.log.variables[name].attrs.get("units", "1")): piece.source.name for piece in reversed(holders)}
+    units = {
+        str(piece.source.log.variables[name].attrs.get("units", "1")): piece.source.name
+        for piece in reversed(holders)
+    }
     if len(units) > 1:
         listed = ", ".join(f"{unit!r} in {file}" for unit, file in units.items())
         raise UnitError(
@@ -76,12 +88,16 @@ def _on_time(piece: Piece, name: str, start: int, rate: float) -> Part:
     stamps = _stamps(piece, name, start, rate)
     sample = np.rint(grid_index(start, rate, stamps)).astype(np.int64)
     inside = (sample >= piece.first) & (sample < piece.end)
-    spread = dask.delayed(_spread, pure=False)(channel.data, sample - piece.first, inside, piece.end - piece.first)
+    spread = dask.delayed(_spread, pure=False)(
+        channel.data, sample - piece.first, inside, piece.end - piece.first
+    )
     whole = da.from_delayed(spread, (piece.end - piece.first,), dtype=np.float64)
     return whole, None, np.array([[piece.first, 0, piece.end - piece.first]], dtype=np.int64)
 
 
-def _spread(values: NDArray[Any], at: NDArray[np.int64], inside: NDArray[np.bool_], size: int) -> NDArray[np.float64]:
+def _spread(
+    values: NDArray[Any], at: NDArray[np.int64], inside: NDArray[np.bool_], size: int
+) -> NDArray[np.float64]:
     out = np.full(size, np.nan)
     out[at[inside]] = np.asarray(values)[inside]
     return out
@@ -89,15 +105,21 @@ def _spread(values: NDArray[Any], at: NDArray[np.int64], inside: NDArray[np.bool
 
 def _stamps(piece: Piece, name: str, start: int, rate: float) -> NDArray[np.int64]:
     """Stamps of a channel [ns since 1970], moved with its log where that stands after a step of the clock."""
-    stamps = piece.source.log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
+    stamps = (
+        piece.source.log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
+    )
     moved = int(grid_times(start, rate, piece.first)) - piece.source.start
     return np.asarray(stamps + moved if abs(moved) > 1e9 / rate else stamps)
 
 
-def _own_time(holders: Sequence[Piece], name: str, start: int, rate: float) -> tuple[NDArray[np.int64], Any]:
+def _own_time(
+    holders: Sequence[Piece], name: str, start: int, rate: float
+) -> tuple[NDArray[np.int64], Any]:
     """Stamps and values in the order of time; of values that two logs have, those of the earlier log."""
     near = int(_SAME_STAMP * 1e9 / rate)
-    done: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []  # stamps and places among all values, in the order of time
+    done: list[
+        tuple[NDArray[np.int64], NDArray[np.int64]]
+    ] = []  # stamps and places among all values, in the order of time
     arrays, offset = [], 0
     for piece in holders:
         values = piece.source.log.variables[name].data
@@ -111,11 +133,17 @@ def _own_time(holders: Sequence[Piece], name: str, start: int, rate: float) -> t
             held, held_places = (np.concatenate(column) for column in zip(*touched, strict=True))
             cut = np.searchsorted(held, stamps[0] - near)
             after = np.searchsorted(held, stamps)
-            following, before = held[np.minimum(after, len(held) - 1)], held[np.maximum(after - 1, 0)]
+            following, before = (
+                held[np.minimum(after, len(held) - 1)],
+                held[np.maximum(after - 1, 0)],
+            )
             new = np.minimum(np.abs(following - stamps), np.abs(stamps - before)) > near
             if cut:
                 done.append((held[:cut], held_places[:cut]))
-            stamps, places = np.concatenate([held[cut:], stamps[new]]), np.concatenate([held_places[cut:], places[new]])
+            stamps, places = (
+                np.concatenate([held[cut:], stamps[new]]),
+                np.concatenate([held_places[cut:], places[new]]),
+            )
             order = np.argsort(stamps, kind="stable")
             stamps, places = stamps[order], places[order]
         if len(stamps):
@@ -138,7 +166,11 @@ def _taken(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
     if len(edges) > _CUTS * (len(arrays) + 1):
         return np.asarray(whole)[places]
     taken = da.concatenate([whole[places[a] : places[b - 1] + 1] for a, b in pairwise(edges)])
-    return with_fill(taken, partial(fill_parts, [_parts(arrays, places)])) if all(map(can_fill, arrays)) else taken
+    return (
+        with_fill(taken, partial(fill_parts, [_parts(arrays, places)]))
+        if all(map(can_fill, arrays))
+        else taken
+    )
 
 
 def _parts(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[Part]:
@@ -151,6 +183,8 @@ def _parts(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[Part]:
             place = int(places[at])
             owner = bisect_right(begins, place) - 1
             size = min(end - at, begins[owner + 1] - place)
-            parts.append((arrays[owner], None, np.array([[at, place - begins[owner], size]], dtype=np.int64)))
+            parts.append(
+                (arrays[owner], None, np.array([[at, place - begins[owner], size]], dtype=np.int64))
+            )
             at += size
     return parts

@@ -28,10 +28,12 @@ from gyrostab.time.grid import grid_times, time_coordinate
 
 __all__ = ["concatenate_logs", "log_span"]
 
-#: Share of a log without an axis that other logs hold, from which a note says so; recorders are started one after the other.
+#: Share of a log without an axis that other logs hold, from which a note says so; recorders are
+#: started one after the other.
 _NOTED_SHARE = 0.01
 
-#: What the clocks of two loggers, or of one that is now hot and now cold, may differ by; more is another rate.
+#: What the clocks of two loggers, or of one that is now hot and now cold, may differ by; more is
+#: another rate.
 RATE_TOLERANCE = 1e-4
 
 
@@ -48,29 +50,34 @@ def concatenate_logs(
     Parameters
     ----------
     logs : sequence of xarray.Dataset
-        Regular logs, in any order, overlapping or with gaps between them: ``rate(axis, time)`` [degree hour-1] or
-        ``angle(axis, time)`` [degree], channels, tables of gaps.
+        Regular logs, in any order, overlapping or with gaps between them: ``rate(axis, time)``
+        [degree hour-1] or ``angle(axis, time)`` [degree], channels, tables of gaps.
     paths : sequence of path
         Their files, for messages.
     max_gap : str or float
-        A longer pause is a step of the clock, and the log that follows comes after one missing sample; a number is in seconds.
+        A longer pause is a step of the clock, and the log that follows comes after one missing
+        sample; a number is in seconds.
     lost : sequence of (int, int)
-        First and last instant [ns since 1970] of files that cannot be read; the gaps there are of the cause "unreadable".
+        First and last instant [ns since 1970] of files that cannot be read; the gaps there are of
+        the cause "unreadable".
     limits : mapping of str to float, optional
-        Limits of `gyrostab.ingest.limits` with other values; ``grid_samples`` bounds the samples of an axis.
+        Limits of `gyrostab.ingest.limits` with other values; ``grid_samples`` bounds the samples of
+        an axis.
 
     Returns
     -------
     xarray.Dataset
-        One regular log on the grid of the first: a sample of another log takes the nearest sample of the grid. Of samples that two
-        logs have, that of the earlier counts, where it is not NaN. Logs that hold other axes over the same time are put side by side.
-        Axes and channels that a log lacks are NaN there. The table of gaps
-        holds those of the logs and those between them. The signal is one dask task for each chunk.
+        One regular log on the grid of the first: a sample of another log takes the nearest sample
+        of the grid. Of samples that two logs have, that of the earlier counts, where it is not NaN.
+        Logs that hold other axes over the same time are put side by side. Axes and channels that a
+        log lacks are NaN there. The table of gaps holds those of the logs and those between them.
+        The signal is one dask task for each chunk.
 
     Raises
     ------
     TimeError
-        When the sampling rates differ by more than 100 parts per million, or the common grid has far more samples than the logs.
+        When the sampling rates differ by more than 100 parts per million, or the common grid has
+        far more samples than the logs.
     UnitError
         When the logs hold different kinds of signal, or a channel has different units.
 
@@ -85,7 +92,10 @@ def concatenate_logs(
         return logs[0]
     for log in logs:
         check_log(log)
-    sources = sorted((source_of(log, Path(path).name) for log, path in zip(logs, paths, strict=True)), key=lambda source: source.start)
+    sources = sorted(
+        (source_of(log, Path(path).name) for log, path in zip(logs, paths, strict=True)),
+        key=lambda source: source.start,
+    )
     _check_same(sources)
     pieces, notes = place_logs(sources, max_gap=duration_seconds(max_gap, "max_gap"))
     rate = sources[0].rate
@@ -96,14 +106,28 @@ def concatenate_logs(
     chunk = chunk_of([source.log[name].data for source in sources])
     axes = sorted({axis for source in sources for axis in source.axes})
     signal = xr.Variable(
-        ("axis", "time"), place_on_grid([_parts(pieces, name, axis) for axis in axes], size, chunk), _signal_attributes(sources, name)
+        ("axis", "time"),
+        place_on_grid([_parts(pieces, name, axis) for axis in axes], size, chunk),
+        _signal_attributes(sources, name),
     )
     signal.encoding = common_packing(source.log[name].encoding for source in sources)
     channels, stamps = join_channels(pieces, start, rate, size, chunk)
-    coordinates = xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps}).merge(time_coordinate(start, rate, size)).coords
-    variables = {name: signal, **channels, **gap_variables(name_lost(join_gaps(pieces), lost, start, rate), start, rate)}
-    joined = xr.Dataset(variables, coordinates, _attributes(sources, size, [*notes, *_absent(sources, axes)]))
-    joined.set_close(partial(_close, [log._close for log in logs if log._close is not None]))  # and nothing else of them
+    coordinates = (
+        xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps})
+        .merge(time_coordinate(start, rate, size))
+        .coords
+    )
+    variables = {
+        name: signal,
+        **channels,
+        **gap_variables(name_lost(join_gaps(pieces), lost, start, rate), start, rate),
+    }
+    joined = xr.Dataset(
+        variables, coordinates, _attributes(sources, size, [*notes, *_absent(sources, axes)])
+    )
+    joined.set_close(
+        partial(_close, [log._close for log in logs if log._close is not None])
+    )  # and nothing else of them
     return joined
 
 
@@ -112,7 +136,9 @@ def _check_grid(pieces: Sequence[Piece], size: int, limits: Mapping[str, float] 
     if not is_absurd_grid(size, sum(piece.source.size for piece in pieces), limits):
         return
     ordered = sorted(pieces, key=lambda piece: piece.first)
-    widest = max(range(1, len(ordered)), key=lambda place: ordered[place].first - ordered[place - 1].end)
+    widest = max(
+        range(1, len(ordered)), key=lambda place: ordered[place].first - ordered[place - 1].end
+    )
     before, after = (ordered[place].source for place in (widest - 1, widest))
     raise TimeError(
         f"{before.name} ends at {stamp_text(before.end)} and {after.name} begins at {stamp_text(after.start)}: the grid of "
@@ -133,7 +159,9 @@ def _check_same(sources: Sequence[Source]) -> None:
     for source in sources[1:]:
         other = signal_name(source.log)
         if other != kind:
-            raise UnitError(f"{first.name} holds a gyro signal of kind {kind!r}, {source.name} of kind {other!r}; run them one by one")
+            raise UnitError(
+                f"{first.name} holds a gyro signal of kind {kind!r}, {source.name} of kind {other!r}; run them one by one"
+            )
         if abs(source.rate / first.rate - 1) > RATE_TOLERANCE:
             raise TimeError(
                 f"{first.name} is a log of {first.rate:.10g} Hz and {source.name} one of {source.rate:.10g} Hz; one log has one sampling "
@@ -156,11 +184,22 @@ def _signal_attributes(sources: Sequence[Source], name: str) -> dict[str, Any]:
 
 def _absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
     """Sentences on axes and channels that some of the logs lack; logs of other axes are not expected to have them."""
-    groups = [[sources[number] for number in group] for group in group_axes([source.axes for source in sources])]
-    names = {f"axis {axis}": _lacking(groups, [s for s in sources if axis in s.axes]) for axis in axes}
+    groups = [
+        [sources[number] for number in group]
+        for group in group_axes([source.axes for source in sources])
+    ]
+    names = {
+        f"axis {axis}": _lacking(groups, [s for s in sources if axis in s.axes]) for axis in axes
+    }
     for channel in dict.fromkeys(name for source in sources for name in log_channels(source.log)):
-        names[f"channel {channel}"] = _lacking(groups, [source for source in sources if channel in source.log])
-    return [f"{what} is not in {some(files)} and is missing there" for what, files in names.items() if files]
+        names[f"channel {channel}"] = _lacking(
+            groups, [source for source in sources if channel in source.log]
+        )
+    return [
+        f"{what} is not in {some(files)} and is missing there"
+        for what, files in names.items()
+        if files
+    ]
 
 
 def _lacking(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:
@@ -173,16 +212,27 @@ def _lacking(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> l
         is_same = any(source in holders for source in group)
         for source in group:
             absent = max(first - source.start, 0) + max(source.end - last, 0)
-            if source not in holders and (is_same or absent > _NOTED_SHARE * (source.end - source.start)):
+            if source not in holders and (
+                is_same or absent > _NOTED_SHARE * (source.end - source.start)
+            ):
                 names.append(source.name)
     return names
 
 
 def _attributes(sources: Sequence[Source], size: int, notes: Sequence[str]) -> dict[str, Any]:
     first = sources[0].log.attrs
-    kept = {key: value for key, value in first.items() if all(_equal(source.log.attrs.get(key), value) for source in sources)}
-    files, said = ([texts(source.log, name) for source in sources] for name in ("source_files", "notes"))
-    labels = [names[0] if len(names) == 1 else source.name for names, source in zip(files, sources, strict=True)]
+    kept = {
+        key: value
+        for key, value in first.items()
+        if all(_equal(source.log.attrs.get(key), value) for source in sources)
+    }
+    files, said = (
+        [texts(source.log, name) for source in sources] for name in ("source_files", "notes")
+    )
+    labels = [
+        names[0] if len(names) == 1 else source.name
+        for names, source in zip(files, sources, strict=True)
+    ]
     now = time_of_day()
     done = f"{now} gyrostab.read_log: {len(sources)} regular logs on {size} samples at {sources[0].rate:.10g} Hz"
     lost = [name for source in sources for name in texts(source.log, "unreadable_files")]

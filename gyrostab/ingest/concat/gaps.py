@@ -28,11 +28,21 @@ def _own_gaps(piece: Piece) -> Table:
     log, source = piece.source.log.variables, piece.source
     table = _NONE
     if "gap_start" in log and log["gap_start"].size:
-        ends = (log[name].values.astype("datetime64[ns]").view(np.int64) for name in ("gap_start", "gap_end"))
-        first, end = (piece.on_grid(np.rint(grid_index(source.start, source.rate, stamps)).astype(np.int64)) for stamps in ends)
+        ends = (
+            log[name].values.astype("datetime64[ns]").view(np.int64)
+            for name in ("gap_start", "gap_end")
+        )
+        first, end = (
+            piece.on_grid(np.rint(grid_index(source.start, source.rate, stamps)).astype(np.int64))
+            for stamps in ends
+        )
         samples = log["gap_samples"].values.astype(np.int64)
-        rows = log["gap_rows"].values.astype(np.int64) if "gap_rows" in log else np.zeros_like(samples)
-        table = np.stack([first, end, samples, rows, log["gap_cause"].values.astype(np.int64)], axis=1)
+        rows = (
+            log["gap_rows"].values.astype(np.int64) if "gap_rows" in log else np.zeros_like(samples)
+        )
+        table = np.stack(
+            [first, end, samples, rows, log["gap_cause"].values.astype(np.int64)], axis=1
+        )
     return np.concatenate([table, _slips(piece)]) if len(piece.runs) > 1 else table
 
 
@@ -47,7 +57,11 @@ def _slips(piece: Piece) -> Table:
 def _both(held: Table, new: Table) -> Table:
     """What is missing in both of two logs, with the cause that the first of them gives; its events stay."""
     lines = [held[held[:, FIRST] == held[:, END]]]
-    lines += [clip_table(held[held[:, END] > held[:, FIRST]], int(first), int(end)) for first, end in new[:, [FIRST, END]] if end > first]
+    lines += [
+        clip_table(held[held[:, END] > held[:, FIRST]], int(first), int(end))
+        for first, end in new[:, [FIRST, END]]
+        if end > first
+    ]
     return np.concatenate(lines)
 
 
@@ -64,14 +78,23 @@ def join_gaps(pieces: Sequence[Piece]) -> Table:
     ndarray of int64, shape (n, 5)
         Columns of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
     """
-    groups = [[pieces[number] for number in group] for group in group_axes([piece.source.axes for piece in pieces])]
-    spans = sorted((min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups)
+    groups = [
+        [pieces[number] for number in group]
+        for group in group_axes([piece.source.axes for piece in pieces])
+    ]
+    spans = sorted(
+        (min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups
+    )
     if len(groups) == 1 or any(later[0] >= earlier[1] for earlier, later in pairwise(spans)):
-        table = thinned(_join_group(pieces, pieces[0].first, None))  # the same axes, or others at another time
+        table = thinned(
+            _join_group(pieces, pieces[0].first, None)
+        )  # the same axes, or others at another time
     else:
         end = max(end for _, end in spans)
         tables = [_join_group(group, spans[0][0], end) for group in groups]
-        table = thinned(np.unique(np.concatenate(tables), axis=0))  # a gap of several axes is one line
+        table = thinned(
+            np.unique(np.concatenate(tables), axis=0)
+        )  # a gap of several axes is one line
     return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
 
 
@@ -91,9 +114,15 @@ def _join_group(pieces: Sequence[Piece], begin: int, stop_at: int | None) -> Tab
         if piece.first < stop:
             for place in np.flatnonzero((np.array(ends) > piece.first) & (np.array(firsts) < stop)):
                 held = tables[place]
-                inside = _both(clip_table(held, piece.first, stop), clip_table(new, piece.first, stop))
-                tables[place] = np.concatenate([clip_table(held, -_FAR, piece.first), inside, clip_table(held, stop, _FAR)])
-            tables[-1] = np.concatenate([clip_table(new, -_FAR, piece.first), clip_table(new, stop, _FAR)])
+                inside = _both(
+                    clip_table(held, piece.first, stop), clip_table(new, piece.first, stop)
+                )
+                tables[place] = np.concatenate(
+                    [clip_table(held, -_FAR, piece.first), inside, clip_table(held, stop, _FAR)]
+                )
+            tables[-1] = np.concatenate(
+                [clip_table(new, -_FAR, piece.first), clip_table(new, stop, _FAR)]
+            )
         firsts.append(min(piece.first, end))
         ends.append(piece.end)
         end = max(end, piece.end)

@@ -53,7 +53,8 @@ class Piece:
     source : Source
         The log.
     runs : ndarray of int64, shape (n, 3)
-        First sample of the grid, first sample of the log, length; more than one where the log's rate differs from the grid's.
+        First sample of the grid, first sample of the log, length; more than one where the log's
+        rate differs from the grid's.
     off : float
         How far its samples lie from the grid's [samples].
     clock : tuple of int
@@ -81,7 +82,9 @@ class Piece:
     def on_grid(self, samples: Any) -> NDArray[np.int64]:
         """Samples of the grid that samples of the log take; beyond the ends of the log as if it went on."""
         samples = np.asarray(samples, dtype=np.int64)
-        which = np.clip(np.searchsorted(self.runs[:, 1], samples, side="right") - 1, 0, len(self.runs) - 1)
+        which = np.clip(
+            np.searchsorted(self.runs[:, 1], samples, side="right") - 1, 0, len(self.runs) - 1
+        )
         return np.asarray(self.runs[which, 0] + samples - self.runs[which, 1])
 
 
@@ -111,7 +114,9 @@ def source_of(log: xr.Dataset, name: str) -> Source:
     index = log.xindexes.get("time")
     if isinstance(index, TimeGridIndex):
         return Source(name, log, index.start, index.rate, log.sizes["time"])
-    return Source(name, log, first_stamp(log), float(log.attrs["sampling_rate_hz"]), log.sizes["time"])
+    return Source(
+        name, log, first_stamp(log), float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
+    )
 
 
 def log_span(log: xr.Dataset) -> tuple[int, int]:
@@ -123,8 +128,8 @@ def log_span(log: xr.Dataset) -> tuple[int, int]:
 def runs_of(first: int, off: float, size: int, ratio: float) -> NDArray[np.int64]:
     """Runs of a log whose sample n lies at ``first + off + n * ratio`` of the grid, each at the nearest sample.
 
-    Where the log is faster than the grid (ratio < 1) a sample is left out now and then; where it is slower a sample of the grid stays
-    empty.
+    Where the log is faster than the grid (ratio < 1) a sample is left out now and then; where it is
+    slower a sample of the grid stays empty.
 
     Examples
     --------

@@ -17,7 +17,8 @@ from gyrostab.store.direct import can_fill, fill_row, with_fill
 
 __all__ = ["Part", "chunk_of", "fill_parts", "place_on_grid"]
 
-#: An array (time), or (axis, time) with the row to take, and its runs: first sample of the grid, first of the array, length.
+#: An array (time), or (axis, time) with the row to take, and its runs: first sample of the grid,
+#: first of the array, length.
 Part = tuple[Any, int | None, NDArray[np.int64]]
 
 _LEAST_CHUNK, _MOST_CHUNK = 2**16, 2**22
@@ -25,11 +26,17 @@ _LEAST_CHUNK, _MOST_CHUNK = 2**16, 2**22
 
 def chunk_of(arrays: Sequence[Any]) -> int:
     """Samples of a chunk: as most chunks of the arrays have them, within reason."""
-    lengths = Counter(length for array in arrays for length in getattr(array, "chunks", [[array.shape[-1]]])[-1][:1])
+    lengths = Counter(
+        length
+        for array in arrays
+        for length in getattr(array, "chunks", [[array.shape[-1]]])[-1][:1]
+    )
     return int(np.clip(lengths.most_common(1)[0][0], _LEAST_CHUNK, _MOST_CHUNK))
 
 
-def _filled(size: int, lead: int, blocks: list[Any], spec: NDArray[np.int64]) -> NDArray[np.float64]:
+def _filled(
+    size: int, lead: int, blocks: list[Any], spec: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """One chunk: each line of `spec` puts a stretch of a block in its place; what an earlier line has put there stays."""
     out = np.full(size, np.nan)
     for which, row, begin, at, length, shared in spec.tolist():
@@ -50,7 +57,11 @@ class _Row:
         import dask.array as da
 
         array, row, runs = part
-        self.array = array if isinstance(array, da.Array) else da.from_array(array, chunks=(*(1,) * (array.ndim - 1), _MOST_CHUNK))
+        self.array = (
+            array
+            if isinstance(array, da.Array)
+            else da.from_array(array, chunks=(*(1,) * (array.ndim - 1), _MOST_CHUNK))
+        )
         self.edges = np.concatenate([[0], np.cumsum(self.array.chunks[-1])])
         self.row = -1
         self.lead: tuple[int, ...] = ()
@@ -72,18 +83,23 @@ class _Row:
             while a < b:
                 block = bisect_right(self.edges, at) - 1
                 n = min(b - a, int(self.edges[block + 1]) - at)
-                found.append(((self.array.name, *self.lead, block), at - int(self.edges[block]), a, n))
+                found.append(
+                    ((self.array.name, *self.lead, block), at - int(self.edges[block]), a, n)
+                )
                 a, at = a + n, at + n
         return found
 
 
-def place_on_grid(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = False) -> Any:
+def place_on_grid(
+    rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = False
+) -> Any:
     """Put arrays on one grid, float64, NaN where none has a sample; where two have one, the first of them that is not NaN counts.
 
     Parameters
     ----------
     rows : sequence of sequence of Part
-        For each row of the result, the arrays that have samples of it, the one that counts first in front.
+        For each row of the result, the arrays that have samples of it, the one that counts first in
+        front.
     size : int
         Samples of the grid.
     chunk : int
@@ -94,8 +110,8 @@ def place_on_grid(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat
     Returns
     -------
     dask.array.Array, shape (len(rows), size) or (size,)
-        Its graph has one task for each chunk, beside the tasks of the arrays. `gyrostab.store.direct.fill_row` reads it without them
-        where it can read the arrays so.
+        Its graph has one task for each chunk, beside the tasks of the arrays.
+        `gyrostab.store.direct.fill_row` reads it without them where it can read the arrays so.
     """
     import dask.array as da
     from dask.highlevelgraph import HighLevelGraph
@@ -116,9 +132,26 @@ def place_on_grid(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat
             for which in np.flatnonzero((first < begin + length) & (end > begin)):
                 earlier = spec.copy()  # the runs of one part do not overlap
                 for key, at, sample, n in placed[which].stretches(begin, begin + length):
-                    shared = any(sample - begin < s[3] + s[4] and s[3] < sample - begin + n for s in earlier)
-                    spec.append((keys.setdefault(key, len(keys)), placed[which].row, at, sample - begin, n, int(shared)))
-            task = (_filled, length, lead, list(keys), np.array(spec, dtype=np.int64).reshape(-1, 6))
+                    shared = any(
+                        sample - begin < s[3] + s[4] and s[3] < sample - begin + n for s in earlier
+                    )
+                    spec.append(
+                        (
+                            keys.setdefault(key, len(keys)),
+                            placed[which].row,
+                            at,
+                            sample - begin,
+                            n,
+                            int(shared),
+                        )
+                    )
+            task = (
+                _filled,
+                length,
+                lead,
+                list(keys),
+                np.array(spec, dtype=np.int64).reshape(-1, 6),
+            )
             layer[(name, place) if flat else (name, number, place)] = task
     graph = HighLevelGraph.from_collections(name, layer, dependencies=list(sources.values()))
     chunks = (lengths,) if flat else ((1,) * len(rows), lengths)
@@ -128,9 +161,15 @@ def place_on_grid(rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat
     return with_fill(joined, partial(fill_parts, rows))
 
 
-def fill_parts(rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]) -> None:
+def fill_parts(
+    rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]
+) -> None:
     """Samples of one row from `begin` on, as the tasks of `place_on_grid` make them."""
-    found = [(number, *one) for number, part in enumerate(rows[row]) for one in _reaching(part, begin, begin + out.size)]
+    found = [
+        (number, *one)
+        for number, part in enumerate(rows[row])
+        for one in _reaching(part, begin, begin + out.size)
+    ]
     ends = sorted((at, at + length) for *_, at, length in found)
     if any(stop > start for (_, stop), (start, _) in pairwise(ends)):
         out[:] = np.nan  # what two have is filled up

@@ -1,7 +1,8 @@
 """Where the samples of each log lie on the grid of the first: by stamps, by samples that two logs share, or after a step of the clock.
 
-The rules are those that hold for raw rows: rows that two files hold count once, files whose clocks merely cover the same hours are no
-copies of each other, and after a step of the clock the pause is of unknown length, so that one sample is taken as missing.
+The rules are those that hold for raw rows: rows that two files hold count once, files whose clocks
+merely cover the same hours are no copies of each other, and after a step of the clock the pause is
+of unknown length, so that one sample is taken as missing.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ __all__ = ["place_logs"]
 
 #: Distance from the grid that is not worth a word [samples].
 SMALL = 0.01
-#: Samples that may lie on those of the log before, with other values, before it is taken as a step of the clock (as among raw rows).
+#: Samples that may lie on those of the log before, with other values, before it is taken as a step
+#: of the clock (as among raw rows).
 FEW = 16
-#: Samples by which the grids of two logs with common samples may be displaced: the first stamp of each has its own jitter.
+#: Samples by which the grids of two logs with common samples may be displaced: the first stamp of
+#: each has its own jitter.
 REACH = 64
 
 _COMPARED = 2**13  # samples at each end of an overlap whose values are compared
@@ -86,12 +89,19 @@ def _stretches(held: Source, new: Source, lag: int) -> list[tuple[Stretch, Stret
     if high <= low:
         return []
     ends = dict.fromkeys([(low, min(high, low + _COMPARED)), (max(low, high - _COMPARED), high)])
-    return [((held, begin - REACH, end + REACH), (new, begin - lag, end - lag)) for begin, end in ends]
+    return [
+        ((held, begin - REACH, end + REACH), (new, begin - lag, end - lag)) for begin, end in ends
+    ]
 
 
 def _neighbours(sources: Sequence[Source]) -> _Cache:
     """What it takes to compare each log with the next, read at once."""
-    pairs = [pair for held, new in pairwise(sources) if held.end >= new.start for pair in _stretches(held, new, _lag(held, new))]
+    pairs = [
+        pair
+        for held, new in pairwise(sources)
+        if held.end >= new.start
+        for pair in _stretches(held, new, _lag(held, new))
+    ]
     return read_stretches(one for pair in pairs for one in pair)
 
 
@@ -109,7 +119,9 @@ def _match(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
         cache.update(read_stretches(one for one in (there, here) if one not in cache))
         found.append(_best(cache[there][rows_held], cache[here][rows_new]))
     surest = max(found, key=lambda match: (match.alike, match.same))
-    return _Match(sum(match.common for match in found), sum(match.same for match in found), surest.shift)
+    return _Match(
+        sum(match.common for match in found), sum(match.same for match in found), surest.shift
+    )
 
 
 def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Piece], list[str]]:
@@ -155,10 +167,18 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Piece
 def _moved(piece: Piece, by: int) -> Piece:
     if not by:
         return piece
-    return Piece(piece.source, piece.runs + np.array([by, 0, 0]), piece.off, (piece.clock[0], piece.clock[1] + by), piece.cause)
+    return Piece(
+        piece.source,
+        piece.runs + np.array([by, 0, 0]),
+        piece.off,
+        (piece.clock[0], piece.clock[1] + by),
+        piece.cause,
+    )
 
 
-def _next(pieces: list[Piece], source: Source, rate: float, max_gap: float, cache: _Cache) -> tuple[Piece, tuple[Piece, _Match] | None]:
+def _next(
+    pieces: list[Piece], source: Source, rate: float, max_gap: float, cache: _Cache
+) -> tuple[Piece, tuple[Piece, _Match] | None]:
     """The next log on the grid, and the log that it overlaps, if it does."""
     ratio = rate / source.rate
     if not pieces:
@@ -172,7 +192,10 @@ def _next(pieces: list[Piece], source: Source, rate: float, max_gap: float, cach
         match = _match(held.source, source, lag, cache)
         if match.alike:
             first = int(held.on_grid(lag + match.shift))
-            return Piece(source, runs_of(first, 0.0, source.size, ratio), 0.0, held.clock), (held, match)
+            return Piece(source, runs_of(first, 0.0, source.size, ratio), 0.0, held.clock), (
+                held,
+                match,
+            )
         if match.common:
             differing = differing or (held, match)
         else:
@@ -183,16 +206,23 @@ def _next(pieces: list[Piece], source: Source, rate: float, max_gap: float, cach
     back, ahead = end - first > FEW and differing is not None, first - end > max_gap * rate
     if back or ahead:
         cause = _RESTART if back and _begins_again(pieces, source) else _STEP
-        return Piece(source, runs_of(end + 1, 0.0, source.size, ratio), 0.0, (source.start, end + 1), cause), None
+        return Piece(
+            source, runs_of(end + 1, 0.0, source.size, ratio), 0.0, (source.start, end + 1), cause
+        ), None
     off = position - first
-    return Piece(source, runs_of(first, off, source.size, ratio), off, clock), (differing or silent) if first < end else None
+    return Piece(source, runs_of(first, off, source.size, ratio), off, clock), (
+        differing or silent
+    ) if first < end else None
 
 
 def _begins_again(pieces: list[Piece], source: Source) -> bool:
     """Whether a clock that was set back began anew, rather than being corrected."""
     latest = max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
     elapsed = latest - pieces[-1].clock[0]
-    return source.start <= pieces[0].source.start + 0.1 * elapsed or 2 * (latest - source.start) > elapsed
+    return (
+        source.start <= pieces[0].source.start + 0.1 * elapsed
+        or 2 * (latest - source.start) > elapsed
+    )
 
 
 def _grid_notes(pieces: Sequence[Piece], rate: float) -> list[str]:
@@ -223,8 +253,14 @@ def _overlap_note(piece: Piece, held: Piece, match: _Match, rate: float) -> str:
         what = "hold other values" if match.common else "are missing in one of them"
         return f"{name}: {max(end - first, 0)} samples lie on samples of {holder} and {what}; those of {holder} are kept where it has them"
     begin = stamp_text(int(grid_times(*held.clock[:1], rate, first - held.clock[1])))
-    whole = "all of it is" if end >= piece.end else f"{duration((end - first) / rate)} from {begin} are"
-    differ = f"; {match.common - match.same} of {match.common} compared samples differ" if match.same < match.common else ""
+    whole = (
+        "all of it is" if end >= piece.end else f"{duration((end - first) / rate)} from {begin} are"
+    )
+    differ = (
+        f"; {match.common - match.same} of {match.common} compared samples differ"
+        if match.same < match.common
+        else ""
+    )
     return f"{name}: {whole} in {holder} too, and counted once{differ}; the samples of {holder} are kept where it has them"
 
 

@@ -29,12 +29,27 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 __all__ = ["has_layout", "matches", "read", "scan"]
 
 SUFFIXES = (".bin", ".raw")
-TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
+TYPES = (
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+    "float32",
+    "float64",
+)
 
 
 def matches(path: Path) -> bool:
     """Whether a layout for it stands beside the file, or it is called ``.bin`` or ``.raw``."""
-    return path.is_file() and path.suffix.lower() != ".toml" and (path.suffix.lower() in SUFFIXES or has_layout(path))
+    return (
+        path.is_file()
+        and path.suffix.lower() != ".toml"
+        and (path.suffix.lower() in SUFFIXES or has_layout(path))
+    )
 
 
 def has_layout(path: Path) -> bool:
@@ -76,14 +91,23 @@ def _record(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], int]:
     """The type of a record, and the bytes before the first."""
     known = {"header_bytes", "byte_order", "fields"}
     if odd := sorted(set(layout) - known):
-        raise OptionError(f"{place.name}: {odd[0]!r} is no part of a layout; known are {', '.join(sorted(known))}")
+        raise OptionError(
+            f"{place.name}: {odd[0]!r} is no part of a layout; known are {', '.join(sorted(known))}"
+        )
     order = {"little": "<", "big": ">"}.get(layout.get("byte_order", "little"))
     header = layout.get("header_bytes", 0)
     if order is None or not isinstance(header, int) or header < 0:
-        raise OptionError(f'{place.name}: byte_order is "little" or "big", and header_bytes a whole number; correct the layout')
+        raise OptionError(
+            f'{place.name}: byte_order is "little" or "big", and header_bytes a whole number; correct the layout'
+        )
     names, types, offsets, size = [], [], [], 0
     for number, one in enumerate(layout.get("fields", ()), 1):
-        if isinstance(one, dict) and set(one) == {"skip"} and isinstance(one["skip"], int) and one["skip"] > 0:
+        if (
+            isinstance(one, dict)
+            and set(one) == {"skip"}
+            and isinstance(one["skip"], int)
+            and one["skip"] > 0
+        ):
             size += one["skip"]
             continue
         if not isinstance(one, dict) or set(one) != {"name", "type"} or one["type"] not in TYPES:
@@ -94,8 +118,12 @@ def _record(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], int]:
         offsets.append(size)
         size += types[-1].itemsize
     if not names or len(set(names)) < len(names):
-        raise OptionError(f"{place.name}: a layout needs fields with names of their own; correct it")
-    return np.dtype({"names": names, "formats": types, "offsets": offsets, "itemsize": size}), header
+        raise OptionError(
+            f"{place.name}: a layout needs fields with names of their own; correct it"
+        )
+    return np.dtype(
+        {"names": names, "formats": types, "offsets": offsets, "itemsize": size}
+    ), header
 
 
 def _table(path: Path) -> tuple[Table, list[str]]:
@@ -104,14 +132,24 @@ def _table(path: Path) -> tuple[Table, list[str]]:
     rows, rest = divmod(path.stat().st_size - header, record.itemsize)
     if rows < 1:
         what = f"{path.stat().st_size} bytes, but {header} of header and {record.itemsize} a record"
-        raise FormatError(f"{path.name}: it holds no record by the layout {place.name} ({what}); copy it again, or correct the layout")
-    notes = [f"the last {rest} bytes are no whole record of {record.itemsize} bytes; is the layout right?"] if rest else []
+        raise FormatError(
+            f"{path.name}: it holds no record by the layout {place.name} ({what}); copy it again, or correct the layout"
+        )
+    notes = (
+        [
+            f"the last {rest} bytes are no whole record of {record.itemsize} bytes; is the layout right?"
+        ]
+        if rest
+        else []
+    )
     names = tuple(record.names or ())
     columns = tuple(partial(_part, path, record, header, name) for name in names)
     return Table(rows, names, (None,) * len(names), columns), notes
 
 
 def _part(path: Path, record: np.dtype[Any], header: int, name: str, start: int, stop: int) -> Any:
-    records = np.memmap(path, dtype=record, mode="r", offset=header + start * record.itemsize, shape=(stop - start,))
+    records = np.memmap(
+        path, dtype=record, mode="r", offset=header + start * record.itemsize, shape=(stop - start,)
+    )
     values = np.array(records[name])
     return values.astype(values.dtype.newbyteorder("="))

@@ -1,6 +1,7 @@
 """LAS well logs (versions 1.2 and 2, text): a curve by its mnemonic, with the unit of its header.
 
-A curve ``TIME`` is the time; with a curve ``DATE`` in the same file (logs made in real time) it is the time of that day.
+A curve ``TIME`` is the time; with a curve ``DATE`` in the same file (logs made in real time) it is
+the time of that day.
 """
 
 from __future__ import annotations
@@ -52,19 +53,36 @@ def _table(path: Path, options: ReadOptions) -> Table:
     try:
         curves = lasio.read(str(path)).curves
     except Exception as error:  # of many kinds on damaged files
-        raise FormatError(f"{path.name}: this LAS file cannot be read ({error}); it may be cut off, copy it again") from error
-    units = tuple(None if holds_dates(curve.data) else str(curve.unit or "").strip() or None for curve in curves)
+        raise FormatError(
+            f"{path.name}: this LAS file cannot be read ({error}); it may be cut off, copy it again"
+        ) from error
+    units = tuple(
+        None if holds_dates(curve.data) else str(curve.unit or "").strip() or None
+        for curve in curves
+    )
     columns = tuple(partial(_part, np.asarray(curve.data)) for curve in curves)
-    clocks = [curve for curve in curves if curve.mnemonic.upper() in ("TIME", "DATETIME") and holds_dates(curve.data)][:1]
+    clocks = [
+        curve
+        for curve in curves
+        if curve.mnemonic.upper() in ("TIME", "DATETIME") and holds_dates(curve.data)
+    ][:1]
     dates = clocks[0].data if clocks else None
-    both = {curve.mnemonic.upper(): curve for curve in curves if curve.mnemonic.upper() in ("TIME", "DATE")}
+    both = {
+        curve.mnemonic.upper(): curve
+        for curve in curves
+        if curve.mnemonic.upper() in ("TIME", "DATE")
+    }
     named = {name.strip().upper() for name in options.map}
     if not clocks and len(both) == 2 and not named & both.keys():
         clocks = list(both.values())
         dates = _date_and_time(path, both["DATE"], both["TIME"])
-    names = tuple("" if any(curve is clock for clock in clocks) else str(curve.mnemonic) for curve in curves)
+    names = tuple(
+        "" if any(curve is clock for clock in clocks) else str(curve.mnemonic) for curve in curves
+    )
     rows = len(curves[0].data) if len(curves) else 0
-    return Table(rows, names, units, columns, None if dates is None else partial(_part, np.asarray(dates)))
+    return Table(
+        rows, names, units, columns, None if dates is None else partial(_part, np.asarray(dates))
+    )
 
 
 def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
@@ -73,19 +91,29 @@ def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
     Raises
     ------
     FormatError
-        When it is not clear in which order day, month and year stand, or the time is neither a clock's nor a number.
+        When it is not clear in which order day, month and year stand, or the time is neither a
+        clock's nor a number.
     """
     import pandas as pd
 
-    days = [str(int(cell)) if isinstance(cell, float) and np.isfinite(cell) else str(cell).strip() for cell in date.data]
+    days = [
+        str(int(cell)) if isinstance(cell, float) and np.isfinite(cell) else str(cell).strip()
+        for cell in date.data
+    ]
     order = _date_order(str(date.unit or ""), days[:1000])
     if order is None:
         fix = "write the dates as 2026-03-14, or drop the curve with --map DATE=-"
-        raise FormatError(f"{path.name}: the order of day and month in the curve DATE ({days[0]!r}) is not clear; {fix}")
-    start = dates_to_ns(pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy()).view("datetime64[ns]")
+        raise FormatError(
+            f"{path.name}: the order of day and month in the curve DATE ({days[0]!r}) is not clear; {fix}"
+        )
+    start = dates_to_ns(
+        pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy()
+    ).view("datetime64[ns]")
     clock = pd.Series(time.data)
     if clock.dtype.kind not in "iuf":
-        since = pd.to_timedelta(clock.astype(str).str.strip(), errors="coerce").to_numpy(dtype="timedelta64[ns]")
+        since = pd.to_timedelta(clock.astype(str).str.strip(), errors="coerce").to_numpy(
+            dtype="timedelta64[ns]"
+        )
     else:
         numbers = clock.to_numpy(dtype=np.float64)
         if "HHMM" in str(time.unit).upper():
@@ -98,12 +126,29 @@ def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
 
 def _date_order(unit: str, days: list[str]) -> str | None:
     """The format of the dates: as the unit of the curve says (``DD/MM/YY``), or the only one that fits them."""
-    said = re.sub(r"(?i)y{4}|y{2}|m{3}|m{2}|d{2}", lambda part: _CODES[part[0].lower()], unit) if re.search(r"(?i)yy", unit) else ""
-    known = ("%Y-%m-%d", "%Y%m%d", "%Y/%m/%d", "%d-%b-%y", "%d-%b-%Y", "%d/%b/%y", "%d/%b/%Y", "%d %b %Y")
+    said = (
+        re.sub(r"(?i)y{4}|y{2}|m{3}|m{2}|d{2}", lambda part: _CODES[part[0].lower()], unit)
+        if re.search(r"(?i)yy", unit)
+        else ""
+    )
+    known = (
+        "%Y-%m-%d",
+        "%Y%m%d",
+        "%Y/%m/%d",
+        "%d-%b-%y",
+        "%d-%b-%Y",
+        "%d/%b/%y",
+        "%d/%b/%Y",
+        "%d %b %Y",
+    )
     for order in (said, *known):
         if order and _fits(order, days):
             return order
-    unclear = [order for order in ("%d/%m/%Y", "%m/%d/%Y", "%d/%m/%y", "%m/%d/%y", "%d-%m-%Y", "%m-%d-%Y") if _fits(order, days)]
+    unclear = [
+        order
+        for order in ("%d/%m/%Y", "%m/%d/%Y", "%d/%m/%y", "%m/%d/%y", "%d-%m-%Y", "%m-%d-%Y")
+        if _fits(order, days)
+    ]
     return unclear[0] if len(unclear) == 1 else None
 
 

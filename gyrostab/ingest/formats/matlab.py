@@ -70,37 +70,68 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
         vectors, plan, fetch, notes = _look(path, options, stack)
         notes += float32_note(plan, [vector.array.dtype for vector in vectors])
         check_stored(path, vectors[0].rows, len(plan.columns), options.limits)
-        lasting = all(not isinstance(vectors[column.source].stored, LibraryRows) for column in plan.columns)
-        return read_columns(plan, options, vectors[0].rows, fetch, notes=notes, limit=limit, lasting=lasting)
+        lasting = all(
+            not isinstance(vectors[column.source].stored, LibraryRows) for column in plan.columns
+        )
+        return read_columns(
+            plan, options, vectors[0].rows, fetch, notes=notes, limit=limit, lasting=lasting
+        )
 
 
-def _look(path: Path, options: ReadOptions, stack: ExitStack) -> tuple[list[_Vector], Plan, Fetch, list[str]]:
+def _look(
+    path: Path, options: ReadOptions, stack: ExitStack
+) -> tuple[list[_Vector], Plan, Fetch, list[str]]:
     objects: list[str] = []
-    found = [vector for name, array in _arrays(path, stack, objects) for vector in _vectors(path, name, array, options)]
+    found = [
+        vector
+        for name, array in _arrays(path, stack, objects)
+        for vector in _vectors(path, name, array, options)
+    ]
     if not found and objects:
         what = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
         raise FormatError(f"{path.name}: {what}; save plain arrays instead: {_PLAIN_ARRAYS}")
     if not found:
-        raise FormatError(f"{path.name}: there is no vector or matrix of numbers in it; save plain arrays")
+        raise FormatError(
+            f"{path.name}: there is no vector or matrix of numbers in it; save plain arrays"
+        )
     rows = max(vector.rows for vector in found)
     kept = [vector for vector in found if vector.rows == rows]
     others = [vector.header for vector in found if vector.rows != rows]
-    notes = [f"left out, as they are shorter than the {rows} rows of the longest: {', '.join(others[:20])}"] if others else []
+    notes = (
+        [
+            f"left out, as they are shorter than the {rows} rows of the longest: {', '.join(others[:20])}"
+        ]
+        if others
+        else []
+    )
     if objects:
-        notes.append(f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to keep it, {_PLAIN_ARRAYS}")
+        notes.append(
+            f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to keep it, {_PLAIN_ARRAYS}"
+        )
     attributes = [_attributes(vector.array) for vector in kept]
     units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
     headers = [vector.header for vector in kept]
-    plan = plan_columns(path, headers, options, units=units, calendars=calendars, coded=_known_fields(headers))
+    plan = plan_columns(
+        path, headers, options, units=units, calendars=calendars, coded=_known_fields(headers)
+    )
     plan, decoders = fold_packing(plan, [vector.array.dtype for vector in kept], attributes)
-    return kept, plan, lambda source, start, stop: decoders[source](kept[source].stored.read(start, stop)), notes
+    return (
+        kept,
+        plan,
+        lambda source, start, stop: decoders[source](kept[source].stored.read(start, stop)),
+        notes,
+    )
 
 
 def _known_fields(headers: Sequence[str]) -> dict[int, str]:
     """Fields of structures whose own names are ours, ``gyro_x`` of ``S.gyro_x``, where no other field has that name."""
     names = [header.rpartition(".")[2] for header in headers]
     times = [place for place, name in enumerate(names) if TIME.match(name.lower())]
-    found = {place: name.lower() for place, name in enumerate(names) if AXIS.match(name.lower()) or KNOWN.match(name.lower())}
+    found = {
+        place: name.lower()
+        for place, name in enumerate(names)
+        if AXIS.match(name.lower()) or KNOWN.match(name.lower())
+    }
     found = {place: name for place, name in found.items() if list(found.values()).count(name) == 1}
     if len(times) == 1:
         suffix = next((text for text in TIME.match(names[times[0]].lower()).groups() if text), None)  # type: ignore[union-attr]
@@ -121,11 +152,15 @@ def _vectors(path: Path, name: str, array: Any, options: ReadOptions) -> Iterato
     if chunks := getattr(array, "chunks", None):
         check_chunk(path, name, array.dtype.itemsize * math.prod(chunks), options.limits)
     along, size = int(np.argmax(shape)), min(shape) if len(shape) == 2 else 1
-    locate = (None if isinstance(array, np.ndarray) else hdf5_rows(path, array)) or partial(LibraryRows, array)
+    locate = (None if isinstance(array, np.ndarray) else hdf5_rows(path, array)) or partial(
+        LibraryRows, array
+    )
     if size == 1:
         yield _Vector(name, array, locate(along, 0))
     elif size <= MAX_COLUMNS:
-        yield from (_Vector(f"{name}/{place}", array, locate(along, place)) for place in range(size))
+        yield from (
+            _Vector(f"{name}/{place}", array, locate(along, place)) for place in range(size)
+        )
 
 
 def _arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
@@ -141,7 +176,9 @@ def _arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[
     try:
         content = loadmat(path, simplify_cells=False, struct_as_record=True, chars_as_strings=True)
     except Exception as error:  # scipy raises bare errors of many kinds on damaged files
-        raise FormatError(f"{path.name}: this MATLAB file cannot be read ({error}); it may be cut off, copy it again") from error
+        raise FormatError(
+            f"{path.name}: this MATLAB file cannot be read ({error}); it may be cut off, copy it again"
+        ) from error
     for name, value in content.items():
         if not name.startswith("__"):
             yield from _flatten(name, value, objects)
@@ -154,7 +191,14 @@ def _flatten(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, A
     if isinstance(value, MatlabOpaque):
         entry = value.reshape(-1)[0] if value.size else None
         kind = _text(entry["s2"]) if entry is not None and fields and "s2" in fields else "object"
-        objects.append(f"a {kind}" + (f" {_text(entry['s0'])!r}" if entry is not None and fields and "s0" in fields else ""))
+        objects.append(
+            f"a {kind}"
+            + (
+                f" {_text(entry['s0'])!r}"
+                if entry is not None and fields and "s0" in fields
+                else ""
+            )
+        )
     elif isinstance(value, MatlabObject):
         objects.append(f"an object of class {value.classname!r}")
     elif fields and value.size == 1:
@@ -189,7 +233,12 @@ def _arrays_hdf(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tu
         if "MATLAB_object_decode" in item.attrs and not name.startswith("#"):
             objects.append(f"a {kind} {name!r}")
             return
-        if isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and kind != "char" and not name.startswith("#"):
+        if (
+            isinstance(item, h5py.Dataset)
+            and item.dtype.kind in "iuf"
+            and kind != "char"
+            and not name.startswith("#")
+        ):
             found.append((name.replace("/", "."), item))
 
     file.visititems(visit)

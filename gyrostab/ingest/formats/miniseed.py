@@ -1,6 +1,7 @@
 """miniSEED files: a channel by its code (``HJ3``), or by network, station and code where several stations have it. No units are in them.
 
-Channels whose code is that of a rotation sensor (instrument code J: ``HJZ``, ``BJ1``) are gyro axes, named by their orientation.
+Channels whose code is that of a rotation sensor (instrument code J: ``HJZ``, ``BJ1``) are gyro
+axes, named by their orientation.
 """
 
 from __future__ import annotations
@@ -26,8 +27,12 @@ __all__ = ["matches", "read", "scan"]
 
 SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
 _HEAD = re.compile(rb"\d{6}[DRQM][ \0]|MS\x03")
-_MOST_RECORD = 2**20  # longest record that is looked for [bytes]; version 2 allows more, nobody writes it
-_ROTATION = re.compile(r"(?:^|\.)[A-Z]J([A-Z0-9])$")  # band, instrument J, orientation: SEED manual, appendix A
+_MOST_RECORD = (
+    2**20
+)  # longest record that is looked for [bytes]; version 2 allows more, nobody writes it
+_ROTATION = re.compile(
+    r"(?:^|\.)[A-Z]J([A-Z0-9])$"
+)  # band, instrument J, orientation: SEED manual, appendix A
 _TOGETHER = 0.1  # channels that begin so near to each other share their stamps [samples]
 
 
@@ -52,12 +57,16 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Channels, and the stamps of the records' headers."""
-    return scan_tables(path, "miniseed", _tables(_traces(path, unpack=False)), options, _cut_note(path))
+    return scan_tables(
+        path, "miniseed", _tables(_traces(path, unpack=False)), options, _cut_note(path)
+    )
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a miniSEED file; see `gyrostab.ingest.read_log`."""
-    return read_tables(path, _tables(_traces(path, unpack=True)), options, notes=_cut_note(path), limit=limit)
+    return read_tables(
+        path, _tables(_traces(path, unpack=True)), options, notes=_cut_note(path), limit=limit
+    )
 
 
 def _cut_note(path: Path) -> list[str]:
@@ -71,8 +80,14 @@ def _cut_note(path: Path) -> list[str]:
         first = next(iter(pymseed.MS3Record.from_buffer(head)), None)
     except pymseed.MiniSEEDError:
         return []
-    rest = path.stat().st_size % first.reclen if first is not None and first.formatversion == 2 else 0
-    return [f"cut off in its last record: {rest} bytes are left out, the complete records are read"] if rest else []
+    rest = (
+        path.stat().st_size % first.reclen if first is not None and first.formatversion == 2 else 0
+    )
+    return (
+        [f"cut off in its last record: {rest} bytes are left out, the complete records are read"]
+        if rest
+        else []
+    )
 
 
 def _traces(path: Path, *, unpack: bool) -> list[_Trace]:
@@ -82,16 +97,24 @@ def _traces(path: Path, *, unpack: bool) -> list[_Trace]:
         found = pymseed.MS3TraceList.from_file(str(path), unpack_data=unpack)
         for trace in found:
             for piece in trace:
-                if piece.samplecnt < 1 or piece.samprate <= 0 or (unpack and piece.sampletype not in ("i", "f", "d")):
+                if (
+                    piece.samplecnt < 1
+                    or piece.samprate <= 0
+                    or (unpack and piece.sampletype not in ("i", "f", "d"))
+                ):
                     continue  # texts and logs of the station
                 code = pymseed.sourceid2nslc(trace.sourceid)
-                one = traces.setdefault((trace.sourceid, piece.samprate), _Trace(tuple(code), piece.samprate))
+                one = traces.setdefault(
+                    (trace.sourceid, piece.samprate), _Trace(tuple(code), piece.samprate)
+                )
                 one.starts.append(int(piece.starttime))
                 one.sizes.append(int(piece.samplecnt))
                 if unpack:
                     one.values.append(np.array(piece.np_datasamples))
     except pymseed.MiniSEEDError as error:
-        raise FormatError(f"{path.name}: this miniSEED file cannot be read ({error}); it may be cut off, copy it again") from error
+        raise FormatError(
+            f"{path.name}: this miniSEED file cannot be read ({error}); it may be cut off, copy it again"
+        ) from error
     return list(traces.values())
 
 
@@ -108,13 +131,26 @@ def _tables(traces: list[_Trace]) -> list[Table]:
         rows = sum(longest.sizes)
         values = tuple(partial(_part, trace.values, rows) for trace in group)
         own = tuple(names[id(trace)] for trace in group)
-        tables.append(Table(rows, own, (None,) * len(group), values, _stamps(longest), coded=tuple(map(_axis, own))))
+        tables.append(
+            Table(
+                rows,
+                own,
+                (None,) * len(group),
+                values,
+                _stamps(longest),
+                coded=tuple(map(_axis, own)),
+            )
+        )
     return tables
 
 
 def _in_step(one: _Trace, other: _Trace) -> bool:
     apart = _TOGETHER * 1e9 / one.rate
-    same = one.rate == other.rate and one.sizes[:-1] == other.sizes[:-1] and len(one.sizes) == len(other.sizes)
+    same = (
+        one.rate == other.rate
+        and one.sizes[:-1] == other.sizes[:-1]
+        and len(one.sizes) == len(other.sizes)
+    )
     return same and all(abs(a - b) <= apart for a, b in zip(one.starts, other.starts, strict=True))
 
 
@@ -127,7 +163,11 @@ def _axis(name: str) -> str | None:
 def _part(pieces: list[NDArray[Any]], rows: int, start: int, stop: int) -> NDArray[Any]:
     values = (pieces[0] if len(pieces) == 1 else np.concatenate(pieces))[start:stop]
     missing = min(stop, rows) - start - len(values)
-    return np.concatenate([values.astype(np.float64), np.full(missing, np.nan)]) if missing > 0 else values
+    return (
+        np.concatenate([values.astype(np.float64), np.full(missing, np.nan)])
+        if missing > 0
+        else values
+    )
 
 
 def _stamps(trace: _Trace) -> Part:
@@ -137,7 +177,9 @@ def _stamps(trace: _Trace) -> Part:
         rows = np.arange(start, min(stop, int(ends[-1])))
         piece = np.searchsorted(ends, rows, side="right")
         first = (ends - trace.sizes)[piece]
-        stamps: NDArray[np.datetime64] = (np.array(trace.starts)[piece] + grid_times(0, trace.rate, rows - first)).view("datetime64[ns]")
+        stamps: NDArray[np.datetime64] = (
+            np.array(trace.starts)[piece] + grid_times(0, trace.rate, rows - first)
+        ).view("datetime64[ns]")
         return stamps
 
     return part

@@ -1,7 +1,8 @@
 """NetCDF and Zarr: regular logs that gyrostab wrote (opened lazily), and foreign files of variables along one dimension.
 
-In a foreign file the columns of a two-dimensional variable are called ``name/label``, with the label from the coordinate of the
-short dimension, or ``name/0`` without one; ``gyro/x`` and ``rate/x`` are gyro axes.
+In a foreign file the columns of a two-dimensional variable are called ``name/label``, with the
+label from the coordinate of the short dimension, or ``name/0`` without one; ``gyro/x`` and
+``rate/x`` are gyro axes.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
-from gyrostab.ingest.formats.netcdf_variables import StoredVariable, open_variables, with_default_fill
+from gyrostab.ingest.formats.netcdf_variables import (
+    StoredVariable,
+    open_variables,
+    with_default_fill,
+)
 from gyrostab.ingest.formats.packing import Decoder, decode_variables, fold_packing, text_attributes
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
@@ -42,7 +47,12 @@ __all__ = ["matches", "read", "scan"]
 MAX_COLUMNS = 64
 CHECKED_BLOCKS = 33
 #: How xarray opens a file here: numbers and stamps are decoded as they are read.
-_UNDECODED: dict[str, Any] = {"chunks": None, "mask_and_scale": False, "decode_times": False, "create_default_indexes": False}
+_UNDECODED: dict[str, Any] = {
+    "chunks": None,
+    "mask_and_scale": False,
+    "decode_times": False,
+    "create_default_indexes": False,
+}
 _NO_LOGS = {"surface": "a dynamic Allan variance", "product": "a product"}
 
 
@@ -82,7 +92,9 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
         columns, rows, plan, decoders, notes = _look(path, variables, options)
         notes += float32_note(plan, [column.variable.dtype for column in columns])
         check_stored(path, rows, len(plan.columns), options.limits)
-        lasting = all(not isinstance(columns[column.source].rows, LibraryRows) for column in plan.columns)
+        lasting = all(
+            not isinstance(columns[column.source].rows, LibraryRows) for column in plan.columns
+        )
         fetch = partial(_fetch, columns, decoders)
         return read_columns(plan, options, rows, fetch, notes=notes, limit=limit, lasting=lasting)
 
@@ -90,16 +102,22 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
 def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     """The file as a regular log, of gyrostab or with a stamp for each sample, or None when it is something else."""
     if path.is_file():
-        read_classic_header(path)  # before the libraries take memory for what a damaged header claims
+        read_classic_header(
+            path
+        )  # before the libraries take memory for what a damaged header claims
     content = _content(path)
     if content == "log":
         return _open_own(path, options)
     if content in _NO_LOGS and not options.channels_only:
-        raise FormatError(f"{path.name}: is {_NO_LOGS[content]} that gyrostab wrote, and no log; give the log that it was made of")
+        raise FormatError(
+            f"{path.name}: is {_NO_LOGS[content]} that gyrostab wrote, and no log; give the log that it was made of"
+        )
     stored = _open_regular(path)
     if stored is None:
         return None
-    log = _as_in_memory(path, _chunked(decode_variables(path.name, name_file(stored, path))))  # an index would hold every stamp
+    log = _as_in_memory(
+        path, _chunked(decode_variables(path.name, name_file(stored, path)))
+    )  # an index would hold every stamp
     log.set_close(stored.close)
     check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
     try:
@@ -114,22 +132,33 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
 def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
     """Units, names of the axes and attributes as they are in memory."""
     if path.is_dir():
-        log = log[sorted(log.variables, key=str)]  # a directory keeps no order, and what is in it is looked at all at once
+        log = log[
+            sorted(log.variables, key=str)
+        ]  # a directory keeps no order, and what is in it is looked at all at once
     for name in log.variables:
         units = log[name].attrs.get("units")
         if units in ON_DISK.values():
-            log[name].attrs["units"] = next(inner for inner, disk in ON_DISK.items() if disk == units)
-    log = log.assign_coords(axis=_read_labels(path, log["axis"]) if log["axis"].ndim else str(log["axis"].values))
+            log[name].attrs["units"] = next(
+                inner for inner, disk in ON_DISK.items() if disk == units
+            )
+    log = log.assign_coords(
+        axis=_read_labels(path, log["axis"]) if log["axis"].ndim else str(log["axis"].values)
+    )
     for name in str(log.attrs.pop("json_attributes", "")).split():
         log.attrs[name] = json.loads(log.attrs[name])
-    log.attrs = {name: value.item() if isinstance(value, np.generic) else value for name, value in log.attrs.items()}
+    log.attrs = {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in log.attrs.items()
+    }
     log.attrs.setdefault("source_files", [path.name])
     return log
 
 
 def _open_regular(path: Path) -> xr.Dataset | None:
     """Open a regular log of another program without decoding it, with the fill values that its format implies."""
-    zarr_format, attributes = _read_group(path) if path.is_dir() else (0, {"sampling_rate_hz": None})
+    zarr_format, attributes = (
+        _read_group(path) if path.is_dir() else (0, {"sampling_rate_hz": None})
+    )
     if "sampling_rate_hz" not in attributes:
         return None
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
@@ -137,7 +166,9 @@ def _open_regular(path: Path) -> xr.Dataset | None:
     try:
         stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
-        raise FormatError(f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again") from error
+        raise FormatError(
+            f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again"
+        ) from error
     if not _is_regular(stored):
         stored.close()
         return None
@@ -152,8 +183,15 @@ def _open_regular(path: Path) -> xr.Dataset | None:
 def _is_regular(stored: xr.Dataset) -> bool:
     """Return whether a dataset has what a regular log has: a signal, its axes, a stamp for each sample, and the rate."""
     has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
-    has_stamps = "time" in stored.variables and names_epoch(str(stored.variables["time"].attrs.get("units", "")))
-    return has_signal and has_stamps and "sampling_rate_hz" in stored.attrs and "axis" in stored.variables
+    has_stamps = "time" in stored.variables and names_epoch(
+        str(stored.variables["time"].attrs.get("units", ""))
+    )
+    return (
+        has_signal
+        and has_stamps
+        and "sampling_rate_hz" in stored.attrs
+        and "axis" in stored.variables
+    )
 
 
 def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
@@ -177,7 +215,9 @@ def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
     """The names of the axes as text; numpy holds code points that are none, and Python fails on them."""
     values = np.atleast_1d(labels.values)
     if values.dtype.kind == "U" and values.size:
-        codes = np.ascontiguousarray(values).view(np.dtype(np.uint32).newbyteorder(values.dtype.byteorder))
+        codes = np.ascontiguousarray(values).view(
+            np.dtype(np.uint32).newbyteorder(values.dtype.byteorder)
+        )
         if codes.size and codes.max() > sys.maxunicode:
             raise FormatError(f"{path.name}: the names of its axes are damaged; copy it again")
     return np.array([str(label) for label in values], dtype=str)
@@ -209,8 +249,8 @@ def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
 def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
     """The log on a computed time axis; `TimeError` when its stamps lie on none.
 
-    Stamps that agree with the declared rate in `CHECKED_BLOCKS` stretches are not read in full: a sample that is lost or doubled moves
-    every stamp after it.
+    Stamps that agree with the declared rate in `CHECKED_BLOCKS` stretches are not read in full: a
+    sample that is lost or doubled moves every stamp after it.
     """
     rate, size = float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
     stored = log["time"].variable
@@ -222,7 +262,9 @@ def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
         begin = int(stamps(0, 1)[0])
         for first in np.unique(np.linspace(0, size - 1024, CHECKED_BLOCKS).astype(int)):
             found = stamps(int(first), int(first) + 1024)
-            if np.any(np.abs(found - grid_times(begin, rate, np.arange(first, first + len(found)))) > 1000):
+            if np.any(
+                np.abs(found - grid_times(begin, rate, np.arange(first, first + len(found)))) > 1000
+            ):
                 break
         else:
             log = log.drop_vars("time").assign_coords(time_coordinate(begin, rate, size))
@@ -232,8 +274,14 @@ def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
 def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
     channels = log_channels(log)
     signal = signal_name(log)
-    axes = [ColumnSummary(str(axis), f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal]) for axis in log["axis"].values]
-    others = [ColumnSummary(name, name, "channel", None, str(log[name].attrs.get("units", ""))) for name in channels]
+    axes = [
+        ColumnSummary(str(axis), f"gyro_{axis}", "gyro", signal, SIGNAL_UNITS[signal])
+        for axis in log["axis"].values
+    ]
+    others = [
+        ColumnSummary(name, name, "channel", None, str(log[name].attrs.get("units", "")))
+        for name in channels
+    ]
     return FileSummary(
         path=path,
         format="gyrostab log",
@@ -248,10 +296,14 @@ def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
 
 
 def _stamp(log: xr.Dataset, place: int) -> np.datetime64:
-    return np.datetime64(int(log["time"][place].values.astype("datetime64[ns]").view(np.int64)), "ns")
+    return np.datetime64(
+        int(log["time"][place].values.astype("datetime64[ns]").view(np.int64)), "ns"
+    )
 
 
-def _fetch(columns: list[_Column], decoders: dict[int, Decoder], source: int, start: int, stop: int) -> Any:
+def _fetch(
+    columns: list[_Column], decoders: dict[int, Decoder], source: int, start: int, stop: int
+) -> Any:
     return decoders[source](columns[source].rows.read(start, stop))
 
 
@@ -263,7 +315,9 @@ def _look(
     lines = Counter(v.dimensions[0] for v in numeric if len(v.shape) == 1)
     lines.update(max(v.dimensions, key=lambda d: sizes[d]) for v in numeric if len(v.shape) == 2)
     if not lines:
-        raise FormatError(f"{path.name}: there is no variable of numbers along a dimension; groups are not looked into, so put it in none")
+        raise FormatError(
+            f"{path.name}: there is no variable of numbers along a dimension; groups are not looked into, so put it in none"
+        )
     dim = max(lines, key=lambda d: (sizes[d], lines[d]))
     columns: list[_Column] = []
     notes: list[str] = []
@@ -276,12 +330,16 @@ def _look(
         notes.append(f"left out, as they do not run along {dim!r} alone: {', '.join(left[:20])}")
     attributes = [column.variable.attributes for column in columns]
     units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
-    plan = plan_columns(path, [column.header for column in columns], options, units=units, calendars=calendars)
+    plan = plan_columns(
+        path, [column.header for column in columns], options, units=units, calendars=calendars
+    )
     plan, decoders = fold_packing(plan, [column.variable.dtype for column in columns], attributes)
     return columns, sizes[dim], plan, decoders, notes
 
 
-def _columns(variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str) -> list[_Column]:
+def _columns(
+    variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str
+) -> list[_Column]:
     if variable.dimensions == (dim,):
         return [_Column(variable.name, variable, variable.locate(0, 0))]
     if dim not in variable.dimensions or len(variable.shape) != 2:
@@ -294,4 +352,7 @@ def _columns(variables: Mapping[str, StoredVariable], variable: StoredVariable, 
     if other in variables and variables[other].shape == (size,):
         labels = [str(label) for label in np.ma.getdata(variables[other].values[:])]
     stem = "gyro_" if variable.name.lower() in ("gyro", "rate") else f"{variable.name}/"
-    return [_Column(f"{stem}{label}", variable, variable.locate(along, place)) for place, label in enumerate(labels)]
+    return [
+        _Column(f"{stem}{label}", variable, variable.locate(along, place))
+        for place, label in enumerate(labels)
+    ]

@@ -1,7 +1,7 @@
 """The header of a classic NetCDF file (CDF-1, CDF-2, CDF-5), checked against the size of the file before its library reads it.
 
-The library allocates what a damaged header asks for. Here every count is compared with the bytes that are left, so a header that
-claims too much ends in one message.
+The library allocates what a damaged header asks for. Here every count is compared with the bytes
+that are left, so a header that claims too much ends in one message.
 
 References
 ----------
@@ -20,9 +20,22 @@ from gyrostab.errors import FormatError
 __all__ = ["ClassicVariable", "read_classic_header"]
 
 #: nc_type -> numpy type, big-endian.
-_TYPES = {1: "i1", 2: "S1", 3: ">i2", 4: ">i4", 5: ">f4", 6: ">f8", 7: "u1", 8: ">u2", 9: ">u4", 10: ">i8", 11: ">u8"}
+_TYPES = {
+    1: "i1",
+    2: "S1",
+    3: ">i2",
+    4: ">i4",
+    5: ">f4",
+    6: ">f8",
+    7: "u1",
+    8: ">u2",
+    9: ">u4",
+    10: ">i8",
+    11: ">u8",
+}
 _DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
-#: Bytes of the file that are read, more where the header is longer; the last number is room for thousands of variables.
+#: Bytes of the file that are read, more where the header is longer; the last number is room for
+#: thousands of variables.
 _HEAD_BYTES = (2**16, 2**20, 2**24)
 
 
@@ -45,7 +58,9 @@ class _Header:
         self.count_bytes, self.begin_bytes = (8 if wide else 4 for wide in (wide_count, wide_begin))
 
     def fail(self, what: str) -> FormatError:
-        return FormatError(f"{self.path.name}: the header of this NetCDF file is damaged or cut off ({what}); copy it again")
+        return FormatError(
+            f"{self.path.name}: the header of this NetCDF file is damaged or cut off ({what}); copy it again"
+        )
 
     def take(self, size: int) -> bytes:
         if size < 0 or self.at + size > len(self.data):
@@ -69,7 +84,9 @@ class _Header:
         if (found, count) == (0, 0):
             return range(0)
         if found != tag or 8 * count > len(self.data) - self.at:
-            raise self.fail(f"it claims a list of {count:,} items of kind {found} at byte {self.at:,}")
+            raise self.fail(
+                f"it claims a list of {count:,} items of kind {found} at byte {self.at:,}"
+            )
         return range(count)
 
     def skip_attributes(self) -> None:
@@ -135,7 +152,11 @@ def _take_dimensions(header: _Header, known: int) -> list[int]:
 
 
 def _lay_out(
-    header: _Header, size: int, records: int, lengths: list[int], found: list[tuple[str, np.dtype[np.generic], list[int], int]]
+    header: _Header,
+    size: int,
+    records: int,
+    lengths: list[int],
+    found: list[tuple[str, np.dtype[np.generic], list[int], int]],
 ) -> dict[str, ClassicVariable]:
     """Find the shapes and strides, and compare the last byte of each variable with the size of the file."""
     spans = {}
@@ -147,12 +168,17 @@ def _lay_out(
     stride = rows[0] if len(rows) == 1 else sum(-(-span // 4) * 4 for span in rows)
     variables = {}
     begins = [begin for name, _, _, begin in found if spans[name][0]]
-    if rows and records in (2**32 - 1, 2**64 - 1):  # written as a stream: the size of the file tells
+    if rows and records in (
+        2**32 - 1,
+        2**64 - 1,
+    ):  # written as a stream: the size of the file tells
         records = max(size - min(begins), 0) // max(stride, 1)
     for name, dtype, places, begin in found:
         is_record, span = spans[name]
         shape = [lengths[place] for place in places]
-        end = begin + (stride * (records - 1) + span if is_record and records else 0 if is_record else span)
+        end = begin + (
+            stride * (records - 1) + span if is_record and records else 0 if is_record else span
+        )
         if end > size:
             raise header.fail(f"{name!r} would end at byte {end:,} of {size:,}")
         shape = [records, *shape[1:]] if is_record else shape

@@ -35,7 +35,8 @@ class StoredVariable:
     shape : tuple of int
     dtype : dtype
     attributes : mapping
-        As the file holds them, with the fill value that the format gives to a variable without its own.
+        As the file holds them, with the fill value that the format gives to a variable without its
+        own.
     values : Any
         Gives the stored numbers when indexed, while the file is open.
     locate : callable
@@ -76,7 +77,10 @@ def open_variables(path: Path, limits: Mapping[str, float]) -> Iterator[dict[str
         file = netCDF4.Dataset(path)
     with file:
         with reading_of(path):
-            found = {name: _netcdf_variable(path, variable, limits) for name, variable in file.variables.items()}
+            found = {
+                name: _netcdf_variable(path, variable, limits)
+                for name, variable in file.variables.items()
+            }
             _locate_directly(path, found)
         yield found
 
@@ -84,41 +88,74 @@ def open_variables(path: Path, limits: Mapping[str, float]) -> Iterator[dict[str
 def _netcdf_variable(path: Path, variable: Any, limits: Mapping[str, float]) -> StoredVariable:
     variable.set_auto_maskandscale(False)
     dtype = variable.dtype if isinstance(variable.dtype, np.dtype) else np.dtype(object)
-    attributes = with_default_fill({name: variable.getncattr(name) for name in variable.ncattrs()}, dtype)
+    attributes = with_default_fill(
+        {name: variable.getncattr(name) for name in variable.ncattrs()}, dtype
+    )
     cut = variable.chunking()
     if isinstance(cut, list | tuple):
         check_chunk(path, variable.name, _bytes_of(cut, dtype), limits)
     locate = partial(LibraryRows, variable)
-    return StoredVariable(variable.name, variable.dimensions, variable.shape, dtype, attributes, variable, locate)
+    return StoredVariable(
+        variable.name, variable.dimensions, variable.shape, dtype, attributes, variable, locate
+    )
 
 
 def _locate_directly(path: Path, found: dict[str, StoredVariable]) -> None:
     """Find out where the numbers lie, so that they are read without the library where that is possible."""
     import h5py
 
-    numeric = [variable for variable in found.values() if variable.dtype.kind in "iuf" and len(variable.shape) in (1, 2)]
+    numeric = [
+        variable
+        for variable in found.values()
+        if variable.dtype.kind in "iuf" and len(variable.shape) in (1, 2)
+    ]
     classic = read_classic_header(path)
     for variable in numeric if classic is not None else ():
         assert classic is not None
         place = classic.get(variable.name)
         if place is not None and place.shape == variable.shape:
-            _replace_locate(found, variable, partial(_classic_rows, path.absolute(), place.dtype, place.begin, place.stride, place.shape))
+            _replace_locate(
+                found,
+                variable,
+                partial(
+                    _classic_rows,
+                    path.absolute(),
+                    place.dtype,
+                    place.begin,
+                    place.stride,
+                    place.shape,
+                ),
+            )
     if classic is not None or not h5py.is_hdf5(path):
         return
     with library_lock(), h5py.File(path, "r") as file:
         for variable in numeric:
             stored = file.get(variable.name)
-            if isinstance(stored, h5py.Dataset) and stored.shape == variable.shape and stored.dtype == variable.dtype:
+            if (
+                isinstance(stored, h5py.Dataset)
+                and stored.shape == variable.shape
+                and stored.dtype == variable.dtype
+            ):
                 located = hdf5_rows(path, stored)
                 if located is not None:
                     _replace_locate(found, variable, located)
 
 
-def _replace_locate(found: dict[str, StoredVariable], variable: StoredVariable, locate: Locate) -> None:
+def _replace_locate(
+    found: dict[str, StoredVariable], variable: StoredVariable, locate: Locate
+) -> None:
     found[variable.name] = replace(variable, locate=locate)
 
 
-def _classic_rows(path: Path, dtype: np.dtype[Any], begin: int, stride: int, shape: tuple[int, ...], along: int, place: int) -> EvenRows:
+def _classic_rows(
+    path: Path,
+    dtype: np.dtype[Any],
+    begin: int,
+    stride: int,
+    shape: tuple[int, ...],
+    along: int,
+    place: int,
+) -> EvenRows:
     if len(shape) == 1 or along == 0:
         return EvenRows(path, dtype, begin + place * dtype.itemsize, stride)
     return EvenRows(path, dtype, begin + place * stride, dtype.itemsize)
@@ -132,37 +169,74 @@ def _zarr_variables(path: Path, limits: Mapping[str, float]) -> Iterator[StoredV
     for name, array in arrays:
         with reading_of(path):
             attributes = dict(array.attrs)
-            named: Any = attributes.pop("_ARRAY_DIMENSIONS", None) or getattr(array.metadata, "dimension_names", None)
-            dims = [dim or f"rows_{size}" for dim, size in zip(named or [None] * array.ndim, array.shape, strict=True)]
+            named: Any = attributes.pop("_ARRAY_DIMENSIONS", None) or getattr(
+                array.metadata, "dimension_names", None
+            )
+            dims = [
+                dim or f"rows_{size}"
+                for dim, size in zip(named or [None] * array.ndim, array.shape, strict=True)
+            ]
             attributes |= _zarr_fill(array, attributes)
             chunks, dtype = tuple(array.chunks), np.dtype(array.dtype)
         check_chunk(path, name, _bytes_of(chunks, dtype), limits)
         load = partial(_load_zarr, path, array, chunks)
 
-        def locate(along: int, place: int, array: Any = array, load: Any = load, key: tuple[Any, ...] = (str(path), name)) -> ChunkedRows:
+        def locate(
+            along: int,
+            place: int,
+            array: Any = array,
+            load: Any = load,
+            key: tuple[Any, ...] = (str(path), name),
+        ) -> ChunkedRows:
             opened = (*key, id(array))
-            return ChunkedRows(load, array.shape, tuple(array.chunks), np.dtype(array.dtype), array.fill_value, along, place, opened)
+            return ChunkedRows(
+                load,
+                array.shape,
+                tuple(array.chunks),
+                np.dtype(array.dtype),
+                array.fill_value,
+                along,
+                place,
+                opened,
+            )
 
-        yield StoredVariable(name, tuple(map(str, dims)), array.shape, dtype, attributes, array, locate)
+        yield StoredVariable(
+            name, tuple(map(str, dims)), array.shape, dtype, attributes, array, locate
+        )
 
 
-def _load_zarr(path: Path, array: Any, chunks: tuple[int, ...], at: tuple[int, ...]) -> NDArray[Any]:
+def _load_zarr(
+    path: Path, array: Any, chunks: tuple[int, ...], at: tuple[int, ...]
+) -> NDArray[Any]:
     with reading_of(path):
-        return np.asarray(array[tuple(slice(number * length, (number + 1) * length) for number, length in zip(at, chunks, strict=True))])
+        return np.asarray(
+            array[
+                tuple(
+                    slice(number * length, (number + 1) * length)
+                    for number, length in zip(at, chunks, strict=True)
+                )
+            ]
+        )
 
 
 def _zarr_fill(array: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return the number that means "no value".
 
-    xarray keeps it as the fill value of the array in format 2, and as a coded attribute in format 3. A fill value of 0 is what Zarr
-    gives to arrays by default, and means nothing.
+    xarray keeps it as the fill value of the array in format 2, and as a coded attribute in format
+    3. A fill value of 0 is what Zarr gives to arrays by default, and means nothing.
     """
     if "_FillValue" in attributes:
         from xarray.backends.zarr import FillValueCoder
 
         value = attributes["_FillValue"]
-        return {"_FillValue": FillValueCoder.decode(value, np.dtype(array.dtype)) if isinstance(value, str) else value}
-    usable = array.metadata.zarr_format == 2 and array.fill_value is not None and bool(array.fill_value)
+        return {
+            "_FillValue": FillValueCoder.decode(value, np.dtype(array.dtype))
+            if isinstance(value, str)
+            else value
+        }
+    usable = (
+        array.metadata.zarr_format == 2 and array.fill_value is not None and bool(array.fill_value)
+    )
     return {"_FillValue": array.fill_value} if usable else {}
 
 
@@ -170,7 +244,11 @@ def with_default_fill(attributes: dict[str, Any], dtype: Any) -> dict[str, Any]:
     """Add the fill value that the NetCDF library gives to a variable without its own; bytes have none (users guide)."""
     import netCDF4
 
-    if {"_FillValue", "_Unsigned"} & set(attributes) or dtype.kind not in "iuf" or dtype.itemsize == 1:
+    if (
+        {"_FillValue", "_Unsigned"} & set(attributes)
+        or dtype.kind not in "iuf"
+        or dtype.itemsize == 1
+    ):
         return attributes
     return {**attributes, "_FillValue": dtype.type(netCDF4.default_fillvals[dtype.str[1:]])}
 

@@ -22,4 +22,6 @@ def library(name: str, path: Path, *, extra: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise OptionError(f"{path.name}: reading it needs {name}; install it with pip install 'gyrostab[{extra}]'") from error
+        raise OptionError(
+            f"{path.name}: reading it needs {name}; install it with pip install 'gyrostab[{extra}]'"
+        ) from error

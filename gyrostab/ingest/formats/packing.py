@@ -2,8 +2,8 @@
 
 References
 ----------
-CF conventions 1.11, sections 2.5.1 (missing data, valid ranges) and 8.1 (packed data); NetCDF users guide,
-appendix A (``_Unsigned``, and the units of valid ranges).
+CF conventions 1.11, sections 2.5.1 (missing data, valid ranges) and 8.1 (packed data); NetCDF users
+guide, appendix A (``_Unsigned``, and the units of valid ranges).
 """
 
 from __future__ import annotations
@@ -18,18 +18,48 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from xarray.backends import BackendArray
-from xarray.core.indexing import ExplicitIndexer, IndexingSupport, LazilyIndexedArray, explicit_indexing_adapter
+from xarray.core.indexing import (
+    ExplicitIndexer,
+    IndexingSupport,
+    LazilyIndexedArray,
+    explicit_indexing_adapter,
+)
 
 from gyrostab.errors import FormatError, UnitError
 from gyrostab.ingest.columns.plan import Column, Plan
-from gyrostab.ingest.columns.stamps import NAT, TimeUnit, floats_to_ns, integers_to_ns, names_epoch, parse_time_unit, signed_counts
+from gyrostab.ingest.columns.stamps import (
+    NAT,
+    TimeUnit,
+    floats_to_ns,
+    integers_to_ns,
+    names_epoch,
+    parse_time_unit,
+    signed_counts,
+)
 
-__all__ = ["ATTRIBUTES", "Decoder", "Packing", "attribute_text", "decode_variables", "fold_packing", "text_attributes"]
+__all__ = [
+    "ATTRIBUTES",
+    "Decoder",
+    "Packing",
+    "attribute_text",
+    "decode_variables",
+    "fold_packing",
+    "text_attributes",
+]
 
 #: Stored numbers -> counts or values.
 Decoder = Callable[[Any], Any]
 
-_PACKING = ("_Unsigned", "_FillValue", "missing_value", "valid_range", "valid_min", "valid_max", "scale_factor", "add_offset")
+_PACKING = (
+    "_Unsigned",
+    "_FillValue",
+    "missing_value",
+    "valid_range",
+    "valid_min",
+    "valid_max",
+    "scale_factor",
+    "add_offset",
+)
 #: Attributes of a variable that say how its numbers are read.
 ATTRIBUTES = (*_PACKING, "units", "calendar")
 
@@ -86,13 +116,22 @@ class Packing:
         if stored.kind in "iu" and (text := attribute_text(found.get("_Unsigned"))):
             stored = np.dtype(f"{'u' if text.lower() == 'true' else 'i'}{stored.itemsize}")
         wraps = "_Unsigned" in found
-        numbers = {key: _numbers(where, key, value, stored, wraps=wraps) for key, value in found.items() if key != "_Unsigned"}
+        numbers = {
+            key: _numbers(where, key, value, stored, wraps=wraps)
+            for key, value in found.items()
+            if key != "_Unsigned"
+        }
         scale, offset = (
-            float(numbers[key][0]) if key in numbers else neutral for key, neutral in (("scale_factor", 1.0), ("add_offset", 0.0))
+            float(numbers[key][0]) if key in numbers else neutral
+            for key, neutral in (("scale_factor", 1.0), ("add_offset", 0.0))
         )
         if not (np.isfinite([scale, offset]).all() and scale != 0.0):
-            raise FormatError(f"{where}: scale_factor {scale:g} and add_offset {offset:g} are not usable; correct them")
-        missing = [value for key in ("_FillValue", "missing_value") for value in numbers.get(key, ())]
+            raise FormatError(
+                f"{where}: scale_factor {scale:g} and add_offset {offset:g} are not usable; correct them"
+            )
+        missing = [
+            value for key in ("_FillValue", "missing_value") for value in numbers.get(key, ())
+        ]
         low, high = _valid_range(where, numbers, stored, scale, offset)
         return cls(stored, tuple(_representable(missing, stored)), low, high, scale, offset)
 
@@ -114,7 +153,11 @@ class Packing:
         invalid = self._find_invalid(counts)
         if invalid is None or not invalid.any():
             return counts
-        return np.where(invalid, self.dtype.type(np.nan), counts) if self.dtype.kind == "f" else np.ma.array(counts, mask=invalid)
+        return (
+            np.where(invalid, self.dtype.type(np.nan), counts)
+            if self.dtype.kind == "f"
+            else np.ma.array(counts, mask=invalid)
+        )
 
     def read_values(self, stored: Any) -> NDArray[np.float64]:
         """Return unpacked values, NaN where there is none."""
@@ -134,23 +177,38 @@ class Packing:
 def attribute_text(value: Any) -> str | None:
     """Return an attribute that is text, or None for others and for a missing one."""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
-    return value.decode(errors="replace") if isinstance(value, bytes) else value if isinstance(value, str) else None
+    return (
+        value.decode(errors="replace")
+        if isinstance(value, bytes)
+        else value
+        if isinstance(value, str)
+        else None
+    )
 
 
 def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[int, str]:
     """Return the text attribute `name` of those variables of several that have it, by their place."""
-    return {place: text for place, attrs in enumerate(attributes) if (text := attribute_text(attrs.get(name)))}
+    return {
+        place: text
+        for place, attrs in enumerate(attributes)
+        if (text := attribute_text(attrs.get(name)))
+    }
 
 
-def _numbers(where: str, key: str, value: Any, stored: np.dtype[Any], *, wraps: bool) -> NDArray[Any]:
+def _numbers(
+    where: str, key: str, value: Any, stored: np.dtype[Any], *, wraps: bool
+) -> NDArray[Any]:
     """Return the numbers of an attribute; if `wraps`, signed ones of an unsigned variable are taken by their bits (users guide)."""
     array = np.atleast_1d(np.asarray(value)).ravel()
     if array.dtype.kind not in "iuf" or not array.size:
-        raise FormatError(f"{where}: the attribute {key} is {value!r}, not a number; correct it or remove it")
+        raise FormatError(
+            f"{where}: the attribute {key} is {value!r}, not a number; correct it or remove it"
+        )
     native = array.astype(array.dtype.newbyteorder("="))
     if not wraps or native.dtype.kind == "f" or key in ("scale_factor", "add_offset"):
         return native
-    # By their bits, whatever type holds them: attributes of Zarr stores are JSON, whose whole numbers have none.
+    # By their bits, whatever type holds them: attributes of Zarr stores are JSON, whose whole
+    # numbers have none.
     if stored.itemsize == 8:
         return native.view(stored)
     wide, bits = native.astype(np.int64), 8 * stored.itemsize
@@ -168,34 +226,55 @@ def _representable(missing: Iterable[Any], stored: np.dtype[Any]) -> Iterable[An
 
 def _fits(value: Any, stored: np.dtype[Any]) -> bool:
     limits = np.iinfo(stored)
-    return bool(np.isfinite(value)) and float(value).is_integer() and limits.min <= int(value) <= limits.max
+    return (
+        bool(np.isfinite(value))
+        and float(value).is_integer()
+        and limits.min <= int(value) <= limits.max
+    )
 
 
 def _valid_range(
-    where: str, numbers: Mapping[str, NDArray[Any]], stored: np.dtype[Any], scale: float, offset: float
+    where: str,
+    numbers: Mapping[str, NDArray[Any]],
+    stored: np.dtype[Any],
+    scale: float,
+    offset: float,
 ) -> tuple[float, float]:
     """Return the range of valid stored numbers.
 
-    The attributes are in packed units. Only where they are floats as the scale factor is, and the variable holds integers,
-    are they in unpacked units (users guide); half a count on either side is then left for rounding.
+    The attributes are in packed units. Only where they are floats as the scale factor is, and the
+    variable holds integers, are they in unpacked units (users guide); half a count on either side
+    is then left for rounding.
     """
     pair = numbers.get("valid_range")
     if pair is not None and len(pair) != 2:
-        raise FormatError(f"{where}: the attribute valid_range has {len(pair)} numbers, not 2; correct it or remove it")
+        raise FormatError(
+            f"{where}: the attribute valid_range has {len(pair)} numbers, not 2; correct it or remove it"
+        )
     ends = {"low": pair[0], "high": pair[1]} if pair is not None else {}
-    ends |= {end: numbers[key][0] for end, key in (("low", "valid_min"), ("high", "valid_max")) if key in numbers}
+    ends |= {
+        end: numbers[key][0]
+        for end, key in (("low", "valid_min"), ("high", "valid_max"))
+        if key in numbers
+    }
     ends = {end: value for end, value in ends.items() if not np.isnan(value)}
     low, high = float(ends.get("low", -np.inf)), float(ends.get("high", np.inf))
     law = numbers.get("scale_factor", numbers.get("add_offset"))
     if stored.kind == "f":
         return float(stored.type(low)), float(stored.type(high))
-    if law is None or law.dtype.kind != "f" or not all(value.dtype.kind == "f" for value in ends.values()):
+    if (
+        law is None
+        or law.dtype.kind != "f"
+        or not all(value.dtype.kind == "f" for value in ends.values())
+    ):
         return low, high
     low, high = sorted(((low - offset) / scale, (high - offset) / scale))
     return low - 0.5, high + 0.5
 
 
-def fold_packing(plan: Plan, dtypes: Sequence[Any], attributes: Sequence[Mapping[str, Any]]) -> tuple[Plan, dict[int, Decoder]]:
+def fold_packing(
+    plan: Plan, dtypes: Sequence[Any], attributes: Sequence[Mapping[str, Any]]
+) -> tuple[Plan, dict[int, Decoder]]:
     """Put the laws of packed variables into the factors of the plan, so that counts stay counts.
 
     Parameters
@@ -210,7 +289,8 @@ def fold_packing(plan: Plan, dtypes: Sequence[Any], attributes: Sequence[Mapping
     plan : Plan
         With factors, offsets and time units that hold for what the decoders return.
     decoders : dict of int to callable
-        Source -> stored numbers to counts, or to values where the law of a time variable is not one of whole nanoseconds.
+        Source -> stored numbers to counts, or to values where the law of a time variable is not one
+        of whole nanoseconds.
 
     Raises
     ------
@@ -239,7 +319,13 @@ def fold_packing(plan: Plan, dtypes: Sequence[Any], attributes: Sequence[Mapping
 def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
     """Return the unit of the counts of a packed time variable, or None when it is none of whole nanoseconds."""
     step, shift = unit.ns * Fraction(repr(packing.scale)), unit.ns * Fraction(repr(packing.offset))
-    if packing.dtype.kind == "f" or step.denominator != 1 or step <= 0 or shift.denominator != 1 or (shift and unit.epoch is None):
+    if (
+        packing.dtype.kind == "f"
+        or step.denominator != 1
+        or step <= 0
+        or shift.denominator != 1
+        or (shift and unit.epoch is None)
+    ):
         return None
     return replace(unit, ns=step, epoch=None if unit.epoch is None else unit.epoch + int(shift))
 
@@ -257,15 +343,17 @@ def decode_variables(name: str, stored: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Packed numbers as float64 with NaN for what is missing or invalid, stamps as datetime64[ns]; the packing of whole
-        numbers is in the encoding.
+        Packed numbers as float64 with NaN for what is missing or invalid, stamps as datetime64[ns];
+        the packing of whole numbers is in the encoding.
 
     Raises
     ------
     FormatError, UnitError
         When an attribute has no usable value, or an epoch can be read in several ways.
     """
-    variables = {key: _decode_variable(name, key, variable) for key, variable in stored.variables.items()}
+    variables = {
+        key: _decode_variable(name, key, variable) for key, variable in stored.variables.items()
+    }
     coords = {key: variables.pop(key) for key in stored.coords}
     decoded = xr.Dataset(variables, xr.Coordinates(coords, indexes={}), stored.attrs)
     decoded.set_close(stored._close)
@@ -276,11 +364,15 @@ def _decode_variable(name: str, key: Any, variable: xr.Variable) -> xr.Variable:
     if variable.dtype.kind not in "iuf":
         return variable
     packing = Packing.from_attributes(f"{name}: variable {key!r}", variable.dtype, variable.attrs)
-    attrs = {attribute: value for attribute, value in variable.attrs.items() if attribute not in _PACKING}
+    attrs = {
+        attribute: value for attribute, value in variable.attrs.items() if attribute not in _PACKING
+    }
     chunks = {key: value for key, value in variable.encoding.items() if key == "preferred_chunks"}
     if names_epoch(str(attrs.get("units", ""))):
         try:
-            unit = parse_time_unit(str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None)))
+            unit = parse_time_unit(
+                str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None))
+            )
         except UnitError as error:
             raise UnitError(f"{name}: variable {key!r}: {error}") from error
         stamps = _DecodedArray(variable, partial(_read_stamps, packing, unit), "datetime64[ns]")
@@ -313,5 +405,9 @@ def _read_stamps(packing: Packing, unit: TimeUnit, stored: Any) -> NDArray[np.da
     folded = unit if packing.is_plain else _fold_time(unit, packing)
     counts = packing.read_values(stored) if folded is None else packing.read_counts(stored)
     array = np.ma.getdata(counts)
-    stamps = floats_to_ns(array, unit, 0) if array.dtype.kind == "f" else integers_to_ns(signed_counts(array), folded or unit, 0)
+    stamps = (
+        floats_to_ns(array, unit, 0)
+        if array.dtype.kind == "f"
+        else integers_to_ns(signed_counts(array), folded or unit, 0)
+    )
     return np.where(np.ma.getmaskarray(counts), NAT, stamps).view("datetime64[ns]")

@@ -13,14 +13,21 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import Intake, Taken
-from gyrostab.ingest.columns.typed import batch_rows, convert_batch, float32_note, holds_dates, summarise
+from gyrostab.ingest.columns.typed import (
+    batch_rows,
+    convert_batch,
+    float32_note,
+    holds_dates,
+    summarise,
+)
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.threads import in_order
 
 __all__ = ["matches", "read", "scan"]
 
-#: Bytes of a column that are read at one time: without a buffer, those of a whole row group, which may be a whole log.
+#: Bytes of a column that are read at one time: without a buffer, those of a whole row group, which
+#: may be a whole log.
 _BUFFER_BYTES = 2**20
 
 
@@ -38,7 +45,9 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
     def fetch(source: int, start: int, stop: int) -> Any:
         group = 0 if start == 0 else file.num_row_groups - 1
-        parts = file.iter_batches(batch_size=batch_rows(1), row_groups=[group], columns=[file.schema_arrow.names[source]])
+        parts = file.iter_batches(
+            batch_size=batch_rows(1), row_groups=[group], columns=[file.schema_arrow.names[source]]
+        )
         part = next(parts) if start == 0 else deque(parts, maxlen=1)[0]
         values = _plain(part.column(0))
         return values[: stop - start] if start == 0 else values[start - stop :]
@@ -56,9 +65,15 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
 
     def convert(batch: Any) -> Taken:
         found = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
-        return convert_batch(intake, options, {column.source: _plain(found[names[column.source]]) for column in plan.columns})
+        return convert_batch(
+            intake,
+            options,
+            {column.source: _plain(found[names[column.source]]) for column in plan.columns},
+        )
 
-    for taken in in_order(convert, file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted)):
+    for taken in in_order(
+        convert, file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted)
+    ):
         intake.add(taken)
     return intake.finish(float32_note(plan, file.schema_arrow.types))
 
@@ -72,13 +87,19 @@ def _look(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
         schema = file.schema_arrow
         head = next(file.iter_batches(batch_size=50), None)
     except (pa.ArrowException, OSError) as error:
-        raise FormatError(f"{path.name}: this Parquet file cannot be opened ({error}); it may be cut off, copy it again") from error
+        raise FormatError(
+            f"{path.name}: this Parquet file cannot be opened ({error}); it may be cut off, copy it again"
+        ) from error
     units = {}
     for index, entry in enumerate(schema):
         text = (entry.metadata or {}).get(b"units")
         if text is not None:
             units[index] = text.decode()
-    dates = [index for index in range(len(schema)) if head is not None and holds_dates(_plain(head.column(index)))]
+    dates = [
+        index
+        for index in range(len(schema))
+        if head is not None and holds_dates(_plain(head.column(index)))
+    ]
     return file, plan_columns(path, schema.names, options, units=units, stamped=dates)
 
 
@@ -89,9 +110,16 @@ def _plain(column: Any) -> Any:
     column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     kind = column.type
     if pa.types.is_timestamp(kind):
-        return column.cast(pa.timestamp(kind.unit)).to_numpy(zero_copy_only=False)  # in UTC; `to_stamps` converts the unit
+        return column.cast(pa.timestamp(kind.unit)).to_numpy(
+            zero_copy_only=False
+        )  # in UTC; `to_stamps` converts the unit
     if pa.types.is_integer(kind) and column.null_count:
-        return np.ma.array(column.fill_null(0).to_numpy(zero_copy_only=False), mask=column.is_null().to_numpy(zero_copy_only=False))
+        return np.ma.array(
+            column.fill_null(0).to_numpy(zero_copy_only=False),
+            mask=column.is_null().to_numpy(zero_copy_only=False),
+        )
     if pa.types.is_decimal(kind):
-        return np.array([None if value is None else str(value) for value in column.to_pylist()], dtype=object)
+        return np.array(
+            [None if value is None else str(value) for value in column.to_pylist()], dtype=object
+        )
     return column.to_numpy(zero_copy_only=False)

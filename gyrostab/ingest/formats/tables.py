@@ -27,8 +27,9 @@ Part = Callable[[int, int], Any]
 class Table:
     """Columns of one length.
 
-    `names` and `units` are those of the columns; `stamps` are in the unit `time_unit`, or dates where that is None; without stamps
-    a column of the table may hold the time. `coded` is what a column is by a code of the format, in the form of ``--map``.
+    `names` and `units` are those of the columns; `stamps` are in the unit `time_unit`, or dates
+    where that is None; without stamps a column of the table may hold the time. `coded` is what a
+    column is by a code of the format, in the form of ``--map``.
     """
 
     rows: int
@@ -49,7 +50,10 @@ def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
     ['wx', 'imu.temp', 'probe.temp']
     """
     seen = Counter(name[-1] for name in names)
-    return [name[-1] if seen[name[-1]] == 1 else ".".join(part for part in name if part) for name in names]
+    return [
+        name[-1] if seen[name[-1]] == 1 else ".".join(part for part in name if part)
+        for name in names
+    ]
 
 
 @dataclass(frozen=True)
@@ -64,8 +68,16 @@ class _Planned:
     def part(self, place: int) -> tuple[Plan, Any]:
         """The plan of one table's columns, and how to fetch them."""
         table, begin = self.tables[place], self.first[place]
-        clocks = [replace(column, source=begin) for column in self.plan.of("time") if table.stamps is not None]
-        own = [column for column in self.plan.columns if begin <= column.source < begin + 1 + len(table.names)]
+        clocks = [
+            replace(column, source=begin)
+            for column in self.plan.of("time")
+            if table.stamps is not None
+        ]
+        own = [
+            column
+            for column in self.plan.columns
+            if begin <= column.source < begin + 1 + len(table.names)
+        ]
         columns = clocks + [column for column in own if not (clocks and column.role == "time")]
 
         def fetch(source: int, start: int, stop: int) -> Any:
@@ -79,40 +91,68 @@ class _Planned:
 def _plan(path: Path, tables: Sequence[Table], options: ReadOptions) -> _Planned:
     kept = [table for table in tables if table.rows and table.names]
     if not kept:
-        raise FormatError(f"{path.name}: it holds no values; copy it again, or look at what the logger wrote")
+        raise FormatError(
+            f"{path.name}: it holds no values; copy it again, or look at what the logger wrote"
+        )
     headers: list[str] = []
     units: dict[int, str] = {}
     coded: dict[int, str] = {}
     first = []
     for table in kept:
         first.append(len(headers))
-        named = table.stamps is not None and not any(one.stamps is not None for one in kept[: len(first) - 1])
+        named = table.stamps is not None and not any(
+            one.stamps is not None for one in kept[: len(first) - 1]
+        )
         if named and table.time_unit:
             units[len(headers)] = table.time_unit
         for offset, unit in enumerate(table.units, 1):
             if unit:
                 units[len(headers) + offset] = unit
-        coded.update({len(headers) + offset: meaning for offset, meaning in enumerate(table.coded, 1) if meaning})
+        coded.update(
+            {
+                len(headers) + offset: meaning
+                for offset, meaning in enumerate(table.coded, 1)
+                if meaning
+            }
+        )
         headers += ["time" if named else "", *table.names]
-    stamped = [begin for begin, table in zip(first, kept, strict=True) if table.stamps is not None and table.time_unit is None]
+    stamped = [
+        begin
+        for begin, table in zip(first, kept, strict=True)
+        if table.stamps is not None and table.time_unit is None
+    ]
     plan = plan_columns(path, headers, options, units=units, stamped=stamped, coded=coded)
     wanted = plan.of("gyro") or plan.of("channel")
-    holders = {max(place for place, begin in enumerate(first) if begin <= column.source) for column in wanted}
-    return _Planned(kept, first, plan, sorted(holders) if plan.of("gyro") else [min(holders, default=0)])
+    holders = {
+        max(place for place, begin in enumerate(first) if begin <= column.source)
+        for column in wanted
+    }
+    return _Planned(
+        kept, first, plan, sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
+    )
 
 
-def scan_tables(path: Path, form: str, tables: Sequence[Table], options: ReadOptions, notes: Sequence[str] = ()) -> FileSummary:
+def scan_tables(
+    path: Path, form: str, tables: Sequence[Table], options: ReadOptions, notes: Sequence[str] = ()
+) -> FileSummary:
     """A summary, with the first and last stamps of the table of the gyro axes."""
     planned = _plan(path, tables, options)
     main = planned.main[0]
     plan, fetch = planned.part(main)
     summary = summarise(form, plan, options, planned.tables[main].rows, fetch, notes)
-    axes, channels = (tuple(column.name for column in planned.plan.of(role)) for role in ("gyro", "channel"))
+    axes, channels = (
+        tuple(column.name for column in planned.plan.of(role)) for role in ("gyro", "channel")
+    )
     return replace(summary, axes=axes, channels=channels)
 
 
 def read_tables(
-    path: Path, tables: Sequence[Table], options: ReadOptions, *, notes: Sequence[str] = (), limit: int = SPILL_BYTES
+    path: Path,
+    tables: Sequence[Table],
+    options: ReadOptions,
+    *,
+    notes: Sequence[str] = (),
+    limit: int = SPILL_BYTES,
 ) -> xr.Dataset:
     """Return the raw log of the tables with gyro axes; channels of the other tables are on stamps of their own.
 
@@ -129,9 +169,22 @@ def read_tables(
         plan, fetch = planned.part(place)
         if place in planned.main:
             told = notes if not main else ()
-            main.append(read_columns(plan if not main else replace(plan, notes=()), options, table.rows, fetch, notes=told, limit=limit))
+            main.append(
+                read_columns(
+                    plan if not main else replace(plan, notes=()),
+                    options,
+                    table.rows,
+                    fetch,
+                    notes=told,
+                    limit=limit,
+                )
+            )
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=())
             others.append(read_columns(plan, options, table.rows, fetch, limit=limit))
     log = with_channels(concatenate(main) if len(main) > 1 else main[0], others)
-    return log.assign_attrs(source_files=[path.name], row_start=[0]) if "axis_rows" not in log.attrs else log
+    return (
+        log.assign_attrs(source_files=[path.name], row_start=[0])
+        if "axis_rows" not in log.attrs
+        else log
+    )

@@ -1,6 +1,7 @@
 """TDMS files (LabVIEW): a channel by its name, or with its group (``imu.wx``) where several have it, with its unit.
 
-Channels with waveform properties have stamps from these; otherwise a channel of times in the same group is the time.
+Channels with waveform properties have stamps from these; otherwise a channel of times in the same
+group is the time.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
-_NO_DATE = np.datetime64("1950-01-01", "us")  # LabVIEW counts from 1904, and writes that where it has no clock
+_NO_DATE = np.datetime64(
+    "1950-01-01", "us"
+)  # LabVIEW counts from 1904, and writes that where it has no clock
 
 
 def matches(path: Path) -> bool:
@@ -54,14 +57,20 @@ def _tables(path: Path) -> Iterator[list[Table]]:
     try:
         file = nptdms.TdmsFile.open(str(path))
     except Exception as error:  # of many kinds on damaged files
-        raise FormatError(f"{path.name}: this TDMS file cannot be read ({error}); it may be cut off, copy it again") from error
+        raise FormatError(
+            f"{path.name}: this TDMS file cannot be read ({error}); it may be cut off, copy it again"
+        ) from error
     with file:
-        channels = [channel for group in file.groups() for channel in group.channels() if len(channel)]
+        channels = [
+            channel for group in file.groups() for channel in group.channels() if len(channel)
+        ]
         names = plain_names([(channel.group_name, channel.name) for channel in channels])
         found: dict[Any, list[tuple[str, Any]]] = {}
         for name, channel in zip(names, channels, strict=True):
             clock = _clock(path, channel)
-            found.setdefault((len(channel), clock or channel.group_name), []).append((name, channel))
+            found.setdefault((len(channel), clock or channel.group_name), []).append(
+                (name, channel)
+            )
         yield [_table(members, _clock(path, members[0][1])) for members in found.values()]
 
 
@@ -72,7 +81,11 @@ def _clock(path: Path, channel: Any) -> tuple[float, Any] | None:
     start = properties.get("wf_start_time")
     if step <= 0.0:
         return None
-    start = None if start is None or np.datetime64(start, "us") < _NO_DATE else np.datetime64(start, "us")
+    start = (
+        None
+        if start is None or np.datetime64(start, "us") < _NO_DATE
+        else np.datetime64(start, "us")
+    )
     if start is not None:
         began = int(dates_to_ns(np.array(start)))
         if began == NAT:
@@ -90,17 +103,28 @@ def _table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> T
     if clock is None:
         dates = next((channel for _, channel in own if np.dtype(channel.dtype).kind == "M"), None)
         own = [(name, channel) for name, channel in own if channel is not dates]
-    units = tuple(str(channel.properties.get("unit_string") or "").strip() or None for _, channel in own)
+    units = tuple(
+        str(channel.properties.get("unit_string") or "").strip() or None for _, channel in own
+    )
     stamps = _stamps(*clock) if clock else None if dates is None else partial(_part, dates)
     dated = clock is None or isinstance(clock[1], np.datetime64)
     columns = tuple(partial(_part, channel) for _, channel in own)
-    return Table(len(members[0][1]), tuple(name for name, _ in own), units, columns, stamps, None if dated else "ns")
+    return Table(
+        len(members[0][1]),
+        tuple(name for name, _ in own),
+        units,
+        columns,
+        stamps,
+        None if dated else "ns",
+    )
 
 
 def _stamps(step: float, start: Any) -> Part:
     def part(begin: int, stop: int) -> NDArray[Any]:
         since = np.rint(np.arange(begin, stop) * (step * 1e9)).astype(np.int64)
-        stamps: NDArray[Any] = start + (since.view("timedelta64[ns]") if isinstance(start, np.datetime64) else since)
+        stamps: NDArray[Any] = start + (
+            since.view("timedelta64[ns]") if isinstance(start, np.datetime64) else since
+        )
         return stamps
 
     return part

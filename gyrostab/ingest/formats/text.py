@@ -1,7 +1,8 @@
 """Text logs: comma, semicolon, tab or blank separated, plain or gzipped, in one pass of bounded memory.
 
-Plain rows are read by a kernel, several blocks of the file side by side. From a row on that it does not know, a piece goes another
-way, and the more of them the longer it gets: a short one cell by cell, a long one to pyarrow, and only if that fails cell by cell.
+Plain rows are read by a kernel, several blocks of the file side by side. From a row on that it does
+not know, a piece goes another way, and the more of them the longer it gets: a short one cell by
+cell, a long one to pyarrow, and only if that fails cell by cell.
 """
 
 from __future__ import annotations
@@ -27,14 +28,30 @@ from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import Intake, Taken, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.ingest.text.cells import VOID, Typing, parse_cells, parse_fast, parse_plain, stamp_types
-from gyrostab.ingest.text.layout import BLANK, Layout, find_layout, is_number, is_text, split_line, unit_of_duration
+from gyrostab.ingest.text.cells import (
+    VOID,
+    Typing,
+    parse_cells,
+    parse_fast,
+    parse_plain,
+    stamp_types,
+)
+from gyrostab.ingest.text.layout import (
+    BLANK,
+    Layout,
+    find_layout,
+    is_number,
+    is_text,
+    split_line,
+    unit_of_duration,
+)
 from gyrostab.store.threads import in_order
 
 __all__ = ["matches", "read", "read_head", "scan"]
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
-#: Bytes of the file in which the layout is looked for; more, up to the second number, where they hold fewer lines than the third.
+#: Bytes of the file in which the layout is looked for; more, up to the second number, where they
+#: hold fewer lines than the third.
 HEAD_BYTES, MOST_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
 PIECE_BYTES = 2**18
@@ -61,23 +78,43 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(layout.offset, size - 2**14))
-            ends = [split_line(line, layout.separator) for line in file.read().decode("latin-1").splitlines()]
+            ends = [
+                split_line(line, layout.separator)
+                for line in file.read().decode("latin-1").splitlines()
+            ]
             if time is not None:
-                tail = _stamps(layout, time, [row for row in ends if _is_solid(row, layout, time.source)], options)
+                tail = _stamps(
+                    layout,
+                    time,
+                    [row for row in ends if _is_solid(row, layout, time.source)],
+                    options,
+                )
             if size <= COUNTED_BYTES:
                 file.seek(layout.offset)
-                rows = sum(1 for line in file if line.strip() and not line.lstrip().startswith((b"#", b"%")))
+                rows = sum(
+                    1
+                    for line in file
+                    if line.strip() and not line.lstrip().startswith((b"#", b"%"))
+                )
     return summary_of(plan, "text", rows, head=head, tail=tail, notes=layout.notes)
 
 
-def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES, stop: Callable[[], bool] | None = None) -> xr.Dataset:
+def read(
+    path: Path,
+    options: ReadOptions,
+    *,
+    limit: int = SPILL_BYTES,
+    stop: Callable[[], bool] | None = None,
+) -> xr.Dataset:
     """The raw log of a text file; see `gyrostab.ingest.read_log`. Ends with `CancelledError` where `stop` comes to be true."""
     layout, plan = _look(path, options)
     options = options if plan.rate is None else replace(options, rate=plan.rate)
     intake = Intake(plan.check(), options, limit=limit)
     typing = Typing(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
-    for parts in in_order(partial(_take, typing=typing, intake=intake), _blocks(path, layout.offset)):
+    for parts in in_order(
+        partial(_take, typing=typing, intake=intake), _blocks(path, layout.offset)
+    ):
         if stop is not None and stop():
             raise CancelledError
         for part in parts:
@@ -89,12 +126,16 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES, stop: Ca
 def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
     with _open(path) as file:
         size, head = HEAD_BYTES, _chunk(path, file, HEAD_BYTES, 0)
-        while len(head) == size and size < MOST_HEAD_BYTES and head.count(b"\n") < HEAD_LINES:  # lines of very many cells
+        while (
+            len(head) == size and size < MOST_HEAD_BYTES and head.count(b"\n") < HEAD_LINES
+        ):  # lines of very many cells
             head += _chunk(path, file, size, size)
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
     stamped = [
-        column for column in range(layout.width) if any(looks_iso(row[column]) for row in layout.samples if len(row) == layout.width)
+        column
+        for column in range(layout.width)
+        if any(looks_iso(row[column]) for row in layout.samples if len(row) == layout.width)
     ]
     plan = plan_columns(
         path,
@@ -104,7 +145,9 @@ def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         stamped=stamped,
         rising=partial(_rises, layout),
         above=layout.above,
-        is_filled=lambda column: any(row[column].strip() not in VOID for row in layout.samples if len(row) == layout.width),
+        is_filled=lambda column: any(
+            row[column].strip() not in VOID for row in layout.samples if len(row) == layout.width
+        ),
     )
     return layout, plan
 
@@ -112,13 +155,23 @@ def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
 def _durations(layout: Layout) -> dict[int, str]:
     """The units of columns whose cells carry them, ``0.01 sec``."""
     rows = [row for row in layout.samples if len(row) == layout.width]
-    found = {column: unit for column, cell in enumerate(rows[0]) if (unit := unit_of_duration(cell))} if rows else {}
-    return {column: unit for column, unit in found.items() if all(unit_of_duration(row[column]) == unit for row in rows)}
+    found = (
+        {column: unit for column, cell in enumerate(rows[0]) if (unit := unit_of_duration(cell))}
+        if rows
+        else {}
+    )
+    return {
+        column: unit
+        for column, unit in found.items()
+        if all(unit_of_duration(row[column]) == unit for row in rows)
+    }
 
 
 def _rises(layout: Layout, column: int) -> bool:
     """Whether the first cells of a column that hold something rise from row to row."""
-    cells = [row[column] for row in layout.samples if len(row) == layout.width and row[column].strip()]
+    cells = [
+        row[column] for row in layout.samples if len(row) == layout.width and row[column].strip()
+    ]
     if all(is_number(cell, comma=layout.decimal_comma) for cell in cells):
         steps = np.diff([float(cell.replace(",", ".")) for cell in cells])
     else:
@@ -127,7 +180,9 @@ def _rises(layout: Layout, column: int) -> bool:
     return bool(len(steps) and (steps >= 0).all() and steps.any())
 
 
-def _stamps(layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions) -> NDArray[np.int64]:
+def _stamps(
+    layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions
+) -> NDArray[np.int64]:
     cells = [row[time.source] for row in rows if len(row) == layout.width]
     if layout.decimal_comma:
         cells = [cell.replace(",", ".") for cell in cells]
@@ -137,7 +192,9 @@ def _stamps(layout: Layout, time: Column, rows: Sequence[Sequence[str]], options
 def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
     """Whether a row holds a number beside its stamp."""
     others = (cell for at, cell in enumerate(row) if at != time)
-    return len(row) == layout.width and (layout.width == 1 or any(is_number(cell, comma=layout.decimal_comma) for cell in others))
+    return len(row) == layout.width and (
+        layout.width == 1 or any(is_number(cell, comma=layout.decimal_comma) for cell in others)
+    )
 
 
 def _gzipped(path: Path) -> bool:
@@ -195,7 +252,9 @@ def _blocks(path: Path, offset: int) -> Iterator[bytes]:
             if cut == 0:
                 rest += chunk
                 if len(rest) > 4 * BLOCK_BYTES:
-                    raise FormatError(f"{path.name}: a line is longer than {len(rest):,} bytes; this is no text log with line ends")
+                    raise FormatError(
+                        f"{path.name}: a line is longer than {len(rest):,} bytes; this is no text log with line ends"
+                    )
                 continue
             yield b"".join((rest, memoryview(chunk)[:cut]))
             rest = chunk[cut:]
@@ -241,8 +300,14 @@ def _take_piece(piece: bytes, typing: Typing, intake: Intake) -> _Part:
     parsed = parse_fast(piece, typing) if len(piece) > SHORT_BYTES else None
     if parsed is not None:
         rows = _rows(*parsed)
-        if rows == lines or b'"' not in piece or rows == sum(1 for text in piece.split(b"\n") if text.strip()):
-            return _Part(intake.prepare(*parsed), lines, piece, slice(None))  # otherwise a stray quote has swallowed line ends
+        if (
+            rows == lines
+            or b'"' not in piece
+            or rows == sum(1 for text in piece.split(b"\n") if text.strip())
+        ):
+            return _Part(
+                intake.prepare(*parsed), lines, piece, slice(None)
+            )  # otherwise a stray quote has swallowed line ends
     values, stamps, words = parse_cells(piece, typing)
     return _Part(intake.prepare(values, stamps, words=words), lines, piece, slice(None))
 
@@ -265,7 +330,9 @@ def _tidy(block: bytes, separator: str) -> bytes:
         block = re.sub(rb"(?m)^[ \t]*[#%][^\n]*", b"", block)
     if separator != BLANK:
         return block
-    data: NDArray[Any] = np.frombuffer(block.replace(b"\t", b" ").replace(b"\r", b""), dtype=np.uint8)
+    data: NDArray[Any] = np.frombuffer(
+        block.replace(b"\t", b" ").replace(b"\r", b""), dtype=np.uint8
+    )
     blank, end = data == 32, data == 10
     drop = np.zeros(len(data), dtype=bool)
     drop[1:] = blank[1:] & (blank[:-1] | end[:-1])

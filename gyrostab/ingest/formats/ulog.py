@@ -48,7 +48,9 @@ def _tables(path: Path) -> tuple[list[Table], list[str]]:
     try:
         log = pyulog.ULog(str(path))
     except Exception as error:  # of many kinds on damaged files
-        raise FormatError(f"{path.name}: this PX4 log cannot be read ({error}); it may be cut off, copy it again") from error
+        raise FormatError(
+            f"{path.name}: this PX4 log cannot be read ({error}); it may be cut off, copy it again"
+        ) from error
     found = []
     for message in log.data_list:
         name = message.name + (f"_{message.multi_id}" if message.multi_id else "")
@@ -60,11 +62,29 @@ def _tables(path: Path) -> tuple[list[Table], list[str]]:
         columns = tuple(partial(_part, values) for _, values in fields)
         clock = None if stamps is None else partial(_part, stamps)
         tables.append(
-            Table(len(fields[0][1]) if fields else 0, tuple(next(names) for _ in fields), (None,) * len(fields), columns, clock, "us")
+            Table(
+                len(fields[0][1]) if fields else 0,
+                tuple(next(names) for _ in fields),
+                (None,) * len(fields),
+                columns,
+                clock,
+                "us",
+            )
         )
     lost = [dropout.duration for dropout in log.dropouts]
-    notes = [f"the logger says that it lost data {len(lost)} times, {sum(lost)} ms in all"] if lost else []
-    return tables, [*notes, *(["the log is damaged in places; messages there are missing"] if log.file_corruption else [])]
+    notes = (
+        [f"the logger says that it lost data {len(lost)} times, {sum(lost)} ms in all"]
+        if lost
+        else []
+    )
+    return tables, [
+        *notes,
+        *(
+            ["the log is damaged in places; messages there are missing"]
+            if log.file_corruption
+            else []
+        ),
+    ]
 
 
 def _part(values: Any, start: int, stop: int) -> Any:

@@ -27,21 +27,32 @@ _FORMATS: list[tuple[str, Callable[[bytes], bool], str]] = [
     ),
     (
         "a WITSML document",
-        lambda head: head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<") and bool(re.search(rb"(?i)witsml", head)),
+        lambda head: (
+            head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<")
+            and bool(re.search(rb"(?i)witsml", head))
+        ),
         "export the log as LAS or CSV from the WITSML server or its client",
     ),
     (
         "a NovAtel log",
-        lambda head: head.startswith((b"\xaa\x44\x12", b"\xaa\x44\x13")) or bool(_NOVATEL_TEXT.search(head)),
+        lambda head: (
+            head.startswith((b"\xaa\x44\x12", b"\xaa\x44\x13")) or bool(_NOVATEL_TEXT.search(head))
+        ),
         "convert its RAWIMU or CORRIMU messages to CSV with NovAtel Convert; the scale of a count is in the manual of the IMU, "
         'and is given as --unit "gyro=FACTOR deg/s"',
     ),
     (
         "a file of R data",
-        lambda head: _unpack(head).startswith((b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")),
+        lambda head: _unpack(head).startswith(
+            (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
+        ),
         "save it as CSV in R: write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)",
     ),
-    ("a ROS bag", lambda head: head.startswith(b"#ROSBAG V"), "convert it to CSV: rostopic echo -b FILE -p /imu/data > imu.csv"),
+    (
+        "a ROS bag",
+        lambda head: head.startswith(b"#ROSBAG V"),
+        "convert it to CSV: rostopic echo -b FILE -p /imu/data > imu.csv",
+    ),
     (
         "an MCAP file",
         lambda head: head.startswith(b"\x89MCAP0\r\n"),
@@ -69,7 +80,9 @@ def refuse_unread(path: Path) -> None:
         head = file.read(HEAD_BYTES)
     for name, is_one, advice in _FORMATS:
         if is_one(head):
-            raise FormatError(f"{path.name}: this is {name}, which is not read yet; {advice.replace('FILE', path.name)}")
+            raise FormatError(
+                f"{path.name}: this is {name}, which is not read yet; {advice.replace('FILE', path.name)}"
+            )
 
 
 def _unpack(head: bytes) -> bytes:

@@ -40,12 +40,20 @@ def regularise_axes(
     logs = [regularise(part) for part in parts]
     labels = [some(texts(part, "source_files")) for part in parts]
     if len(set(labels)) < len(labels):
-        labels = [f"{label} ({', '.join(axes)})" for label, (axes, _, _) in zip(labels, raw.attrs["axis_rows"], strict=True)]
+        labels = [
+            f"{label} ({', '.join(axes)})"
+            for label, (axes, _, _) in zip(labels, raw.attrs["axis_rows"], strict=True)
+        ]
     log = concatenate_logs(logs, labels, max_gap=max_gap, limits=limits)
     starts = [first_stamp(each) for each in logs]
     held = []
     for label, start, (axes, _, _) in zip(labels, starts, raw.attrs["axis_rows"], strict=True):
         later = (start - min(starts)) / 1e9 * log.attrs["sampling_rate_hz"]
-        held.append(f"{', '.join(axes)} in {label}" + (f" (begins {later:.3g} samples later)" if start > min(starts) else ""))
-    note = f"the axes have stamps of their own over the same time and form one log: {'; '.join(held)}"
+        held.append(
+            f"{', '.join(axes)} in {label}"
+            + (f" (begins {later:.3g} samples later)" if start > min(starts) else "")
+        )
+    note = (
+        f"the axes have stamps of their own over the same time and form one log: {'; '.join(held)}"
+    )
     return log.assign_attrs(notes=[*texts(raw, "notes"), *texts(log, "notes"), note])

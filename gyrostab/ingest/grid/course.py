@@ -1,8 +1,9 @@
 """Rows with noisy stamps: the period that explains them best, and the place of every row in order.
 
-A stamp that is the time of arrival tells the time of its sample up to jitter, but thousands of stamps tell the sampling period to parts
-per million and the number of lost samples exactly. Rows stay in order; `gyrostab.kernels.grid.course` finds where samples are missing.
-Where rows arrive in packets, or a slow clock gives many rows one stamp, only one row of each group is looked at.
+A stamp that is the time of arrival tells the time of its sample up to jitter, but thousands of
+stamps tell the sampling period to parts per million and the number of lost samples exactly. Rows
+stay in order; `gyrostab.kernels.grid.course` finds where samples are missing. Where rows arrive in
+packets, or a slow clock gives many rows one stamp, only one row of each group is looked at.
 """
 
 from __future__ import annotations
@@ -17,25 +18,37 @@ from numpy.typing import NDArray
 from gyrostab.kernels.grid.course import find_breaks, find_phase, follow, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP, piece_sums
 
-__all__ = ["LEAST_SIGMA", "Course", "count_along", "find_course", "follow_course", "observe_rows", "place_rows"]
+__all__ = [
+    "LEAST_SIGMA",
+    "Course",
+    "count_along",
+    "find_course",
+    "follow_course",
+    "observe_rows",
+    "place_rows",
+]
 
 Integers = NDArray[np.int64]
 Part = tuple[Integers, Integers]
 
 #: Standard deviation of the jitter that the kernel is given at least [samples].
 LEAST_SIGMA = 0.1
-#: Share of a deviation that the phase takes over, while the period is sought, and once it is known. A sample that is not found missing
-#: costs 1 / (4 gain sigma^2) nats before the phase has taken it over: 140 at a scatter of 0.6, against 5 for the loss and 30 for a row
+#: Share of a deviation that the phase takes over, while the period is sought, and once it is known.
+#: A sample that is not found missing
+#: costs 1 / (4 gain sigma^2) nats before the phase has taken it over: 140 at a scatter of 0.6,
+#: against 5 for the loss and 30 for a row
 #: that has no sample.
 _SEARCH_GAIN, _GAIN = 0.02, 0.005
 #: Beyond this scatter [samples] those are less than 80.
 _MOST_SIGMA = 0.8
-#: Share of rows without a sample, and cost of a row [nats], beyond which stamps have no course. Jitter alone costs 0.5 nats, and every
+#: Share of rows without a sample, and cost of a row [nats], beyond which stamps have no course.
+#: Jitter alone costs 0.5 nats, and every
 #: second sample missing at random 2.5 more.
 _MOST_DROPPED, _MOST_NATS = 0.01, 3.0
 #: Rows that a course is sought in, candidates for its period, and those of them that are refined.
 _SEARCH_ROWS, _MOST_CANDIDATES, _MOST_REFINED = 8_000, 200, 4
-#: A period wrong by half of this share lags by a fortieth of a sample behind the phase, which follows with a gain of 0.02.
+#: A period wrong by half of this share lags by a fortieth of a sample behind the phase, which
+#: follows with a gain of 0.02.
 _PERIOD_STEP = 0.001
 _TRACE_ROWS = 1 << 13
 _AHEAD_ROWS = 1 << 12
@@ -55,7 +68,8 @@ class Course:
     sigma : float
         Standard deviation of the jitter [samples].
     observe : str
-        Rows whose stamps are looked at: ``"all"``, the ``"first"`` or the ``"last"`` of each group of rows with one stamp.
+        Rows whose stamps are looked at: ``"all"``, the ``"first"`` or the ``"last"`` of each group
+        of rows with one stamp.
     group : float
         Rows to one that is looked at.
     nats : float
@@ -92,7 +106,9 @@ def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
     return np.asarray(known[np.concatenate([edge, apart] if observe == "first" else [apart, edge])])
 
 
-def find_course(parts: list[Integers], guesses: list[float], observe: str, *, sure: float) -> Course | None:
+def find_course(
+    parts: list[Integers], guesses: list[float], observe: str, *, sure: float
+) -> Course | None:
     """Find the period [ns] that explains stretches of stamps best, each row being the next sample but for rare losses.
 
     Parameters
@@ -112,7 +128,9 @@ def find_course(parts: list[Integers], guesses: list[float], observe: str, *, su
         None where nothing explains the stamps.
     """
     seen = _take(parts, observe, guesses[0])
-    lengths = (32, 16) if observe == "all" else (8,)  # few groups in a row are whole where samples are lost
+    lengths = (
+        (32, 16) if observe == "all" else (8,)
+    )  # few groups in a row are whole where samples are lost
     lines = next(filter(None, (_fit_lines(seen, length) for length in lengths)), None)
     if lines is None or not (lines[0] > 0).any():
         return None
@@ -125,23 +143,38 @@ def find_course(parts: list[Integers], guesses: list[float], observe: str, *, su
     periods = _candidates(seen, slope, group)
     sample = _shorten(seen, _SEARCH_ROWS)
     best = sorted(periods, key=lambda period: _cost(sample, period, sigma_ns, sure))[:_MOST_REFINED]
-    started = [*((period, sigma_ns / period) for period in best), *((guess, LEAST_SIGMA) for guess in guesses)]
-    found = [_refine(seen, Course(period, sigma, observe, group, np.inf), sure) for period, sigma in started]
+    started = [
+        *((period, sigma_ns / period) for period in best),
+        *((guess, LEAST_SIGMA) for guess in guesses),
+    ]
+    found = [
+        _refine(seen, Course(period, sigma, observe, group, np.inf), sure)
+        for period, sigma in started
+    ]
     explained = min(filter(None, found), key=lambda course: course.code_length, default=None)
-    return explained if explained is not None and explained.fits else None  # the best may be stamps of rows that are given twice
+    return (
+        explained if explained is not None and explained.fits else None
+    )  # the best may be stamps of rows that are given twice
 
 
-def follow_course(parts: list[Integers], period: float, observe: str, *, sure: float) -> Course | None:
+def follow_course(
+    parts: list[Integers], period: float, observe: str, *, sure: float
+) -> Course | None:
     """Give the course with a period near the one given [ns], None where the stamps do not follow it."""
     seen = _take(parts, observe, period)
     group = _group(seen)
-    found = _refine(seen, Course(period, 0.5, observe, group, np.inf), sure * max(1.0, group), most_off=0.02)
+    found = _refine(
+        seen, Course(period, 0.5, observe, group, np.inf), sure * max(1.0, group), most_off=0.02
+    )
     return found if found is not None and found.fits else None
 
 
 def _group(seen: list[Part]) -> float:
     """Rows to one that is looked at."""
-    return float(sum(count[-1] - count[0] for count, _ in seen) / max(1, sum(len(count) - 1 for count, _ in seen)))
+    return float(
+        sum(count[-1] - count[0] for count, _ in seen)
+        / max(1, sum(len(count) - 1 for count, _ in seen))
+    )
 
 
 def _take(parts: list[Integers], observe: str, period: float) -> list[Part]:
@@ -153,14 +186,20 @@ def _take(parts: list[Integers], observe: str, period: float) -> list[Part]:
     return taken
 
 
-def _fit_lines(seen: list[Part], length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def _fit_lines(
+    seen: list[Part], length: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], standard deviations of the residuals [ns]."""
     tables = []
     for count, stamps in seen:
         if len(count) >= length:
             first = np.arange(0, len(count) - length + 1, length // 2)
             at = first[:, None] + np.arange(length)
-            tables.append(np.stack([count[at] - count[first, None], stamps[at] - stamps[first, None]]).astype(np.float64))
+            tables.append(
+                np.stack([count[at] - count[first, None], stamps[at] - stamps[first, None]]).astype(
+                    np.float64
+                )
+            )
     if not tables:
         return None
     count, stamps = np.concatenate(tables, axis=1)
@@ -190,11 +229,16 @@ def _shorten(seen: list[Part], rows: int) -> list[Part]:
 def _cost(seen: list[Part], period: float, sigma_ns: float, sure: float) -> float:
     """Cost of a row [nats] with a period [ns]."""
     sigma = max(sigma_ns / period, LEAST_SIGMA)
-    total = sum(follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, _TRACE_ROWS)[3] for count, stamps in seen)
+    total = sum(
+        follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, _TRACE_ROWS)[3]
+        for count, stamps in seen
+    )
     return float(total / sum(len(count) for count, _ in seen))
 
 
-def _refine(seen: list[Part], course: Course, sure: float, *, most_off: float = 0.05) -> Course | None:
+def _refine(
+    seen: list[Part], course: Course, sure: float, *, most_off: float = 0.05
+) -> Course | None:
     """Fit period and scatter along the course; None where it is none."""
     if not seen:
         return None
@@ -204,7 +248,9 @@ def _refine(seen: list[Part], course: Course, sure: float, *, most_off: float = 
         offs = []
         for count, stamps in seen:
             known = max(sigma, LEAST_SIGMA)
-            sample, piece, off, cost = follow(count, stamps, period, known, gain, sure * period, _TRACE_ROWS)
+            sample, piece, off, cost = follow(
+                count, stamps, period, known, gain, sure * period, _TRACE_ROWS
+            )
             near = _is_near(off, sigma)
             sums = piece_sums(stamps[near], sample[near], piece[near], period)
             cc, ct = cc + sums[:, 3].sum(), ct + sums[:, 4].sum()
@@ -219,7 +265,12 @@ def _refine(seen: list[Part], course: Course, sure: float, *, most_off: float = 
         sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
         if not abs(period / course.period - 1) < most_off or sigma > 2 * _MOST_SIGMA:
             return None
-    fits = sigma < _MOST_SIGMA and dropped <= 2 + _MOST_DROPPED * rows and nats < _MOST_NATS * rows and single > 0.1 * steps
+    fits = (
+        sigma < _MOST_SIGMA
+        and dropped <= 2 + _MOST_DROPPED * rows
+        and nats < _MOST_NATS * rows
+        and single > 0.1 * steps
+    )
     return Course(period, sigma, course.observe, course.group, nats / rows, fits)
 
 
@@ -228,12 +279,22 @@ def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
     return np.asarray(np.abs(off) <= 4 * max(sigma, LEAST_SIGMA))
 
 
-def count_along(rows: Integers, stamps: Integers, course: Course, longest: float) -> tuple[Integers, Integers, Integers]:
+def count_along(
+    rows: Integers, stamps: Integers, course: Course, longest: float
+) -> tuple[Integers, Integers, Integers]:
     """Stamps [ns], sample numbers and numbers of the piece of the rows of a block that are looked at, without outliers."""
     at = observe_rows(stamps, course.observe, course.period)
     if course.observe != "all":
         at = at[1:-1]  # the groups at both ends may be cut
-    sample, piece, off, _ = follow(rows[at], stamps[at], course.period, max(course.sigma, LEAST_SIGMA), _GAIN, longest, _TRACE_ROWS)
+    sample, piece, off, _ = follow(
+        rows[at],
+        stamps[at],
+        course.period,
+        max(course.sigma, LEAST_SIGMA),
+        _GAIN,
+        longest,
+        _TRACE_ROWS,
+    )
     near = _is_near(off, course.sigma)
     return stamps[at][near], sample[near], piece[near]
 
@@ -258,19 +319,33 @@ class _Placer:
         if self.start is None:
             self.latest = int(stamps[at[0]])
         reach = _LATE_SAMPLES * max(self.period, self.course.group * self.period)
-        breaks, self.latest = find_breaks(stamps[at], int(np.searchsorted(at, n)), self.latest, reach, self.max_gap_ns)
+        breaks, self.latest = find_breaks(
+            stamps[at], int(np.searchsorted(at, n)), self.latest, reach, self.max_gap_ns
+        )
         cuts = [0, *at[breaks[:, 0]].tolist(), n]
         for number, (begin, end) in enumerate(pairwise(cuts)):
             beyond = len(rows) if end == n else end
             if number > 0:
                 self._break(int(rows[begin]), int(breaks[number - 1, 1]), int(stamps[begin]))
             if begin < end:
-                self._place(rows[begin:beyond], count[begin:beyond], stamps[begin:beyond], end - begin, begins=number > 0)
+                self._place(
+                    rows[begin:beyond],
+                    count[begin:beyond],
+                    stamps[begin:beyond],
+                    end - begin,
+                    begins=number > 0,
+                )
 
     def _break(self, row: int, before: int, stamp: int) -> None:
         elapsed = before - self.origin
-        again = stamp < before and (stamp <= self.origin + 0.1 * elapsed or 2 * (before - stamp) > elapsed)
-        self.events.append(np.array([[RESTART if again else STEP, self.last + 1, row, before, stamp]], dtype=np.int64))
+        again = stamp < before and (
+            stamp <= self.origin + 0.1 * elapsed or 2 * (before - stamp) > elapsed
+        )
+        self.events.append(
+            np.array(
+                [[RESTART if again else STEP, self.last + 1, row, before, stamp]], dtype=np.int64
+            )
+        )
 
     def _begin(self, count: Integers, stamps: Integers, at: Integers) -> None:
         """Begin a piece: its first row is the next sample but one, or the first of the log."""
@@ -288,7 +363,9 @@ class _Placer:
         else:
             self.base += self.last + 2
 
-    def _place(self, rows: Integers, count: Integers, stamps: Integers, n: int, *, begins: bool) -> None:
+    def _place(
+        self, rows: Integers, count: Integers, stamps: Integers, n: int, *, begins: bool
+    ) -> None:
         at = observe_rows(stamps, self.course.observe, self.period)
         begins = begins or self.start is None
         if begins:
@@ -301,13 +378,19 @@ class _Placer:
             )  # fmt: skip
         if begins:
             self._anchor(int(levels[0]))
-        nearest = np.searchsorted(at, np.arange(n), side="left" if self.course.observe == "last" else "right")
+        nearest = np.searchsorted(
+            at, np.arange(n), side="left" if self.course.observe == "last" else "right"
+        )
         nearest -= self.course.observe != "last"
         known = np.append(levels, self.level if len(at) == 0 else levels[-1])
         level = np.where(nearest < 0, self.level, known[np.clip(nearest, 0, len(at))])
         done = int(np.searchsorted(at, n))
         if done:
-            self.level, self.phase, self.seen = int(levels[done - 1]), float(phases[done - 1]), self.seen + done
+            self.level, self.phase, self.seen = (
+                int(levels[done - 1]),
+                float(phases[done - 1]),
+                self.seen + done,
+            )
         self._fill(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
 
     def _fill(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
@@ -317,7 +400,12 @@ class _Placer:
         if not kept.all():
             lost = np.flatnonzero(~kept)
             same = np.full(len(lost), DUPLICATE)
-            self.events.append(np.stack([same, np.maximum(sample[lost], 0), rows[lost], stamps[lost], stamps[lost]], axis=1))
+            self.events.append(
+                np.stack(
+                    [same, np.maximum(sample[lost], 0), rows[lost], stamps[lost], stamps[lost]],
+                    axis=1,
+                )
+            )
             rows, sample = rows[kept], sample[kept]
         if len(rows):
             self.last = int(sample[-1])
@@ -330,14 +418,24 @@ def join_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integer
     first = np.concatenate([[0], new])
     table = np.stack([sample[first], rows[first], np.diff(np.append(first, len(rows)))], axis=1)
     before = runs[-1][-1] if runs and len(runs[-1]) else None
-    if before is not None and before[0] + before[2] == table[0, 0] and before[1] + before[2] == table[0, 1]:
+    if (
+        before is not None
+        and before[0] + before[2] == table[0, 0]
+        and before[1] + before[2] == table[0, 1]
+    ):
         before[2] += table[0, 2]
         table = table[1:]
     return table
 
 
 def place_rows(
-    blocks: Iterator[tuple[Integers, Integers]], course: Course, period: float, *, hold: float, max_gap_ns: float, by_row: bool
+    blocks: Iterator[tuple[Integers, Integers]],
+    course: Course,
+    period: float,
+    *,
+    hold: float,
+    max_gap_ns: float,
+    by_row: bool,
 ) -> tuple[int | None, list[Integers], list[Integers]]:
     """Place rows in order along the course of their stamps.
 

@@ -23,7 +23,14 @@ __all__ = ["SMALL", "count_present", "gathered", "on_grid", "samples_of"]
 SMALL = 2_000_000
 
 
-def _fill(rows: NDArray[Any], *, runs: NDArray[np.int64], size: int, scale: float, unit: float | None = None) -> NDArray[np.float64]:
+def _fill(
+    rows: NDArray[Any],
+    *,
+    runs: NDArray[np.int64],
+    size: int,
+    scale: float,
+    unit: float | None = None,
+) -> NDArray[np.float64]:
     """Rows (last dimension) to samples; `runs` count samples and rows from the beginning of both."""
     out = np.full((*rows.shape[:-1], size), np.nan)
     for sample, row, length in runs:
@@ -53,15 +60,21 @@ def _fill_samples(
     _scaled(out, scale, unit)
 
 
-def _cut(runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int) -> NDArray[np.int64]:
+def _cut(
+    runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int
+) -> NDArray[np.int64]:
     """Cut out the parts of the runs that lie in the samples from `begin` to `end`."""
-    part = runs[np.searchsorted(ends, begin, side="right") : np.searchsorted(runs[:, 0], end, side="left")]
+    part = runs[
+        np.searchsorted(ends, begin, side="right") : np.searchsorted(runs[:, 0], end, side="left")
+    ]
     first = np.maximum(part[:, 0], begin)
     last = np.minimum(part[:, 0] + part[:, 2], end)
     return np.stack([first - begin, part[:, 1] + first - part[:, 0], last - first], axis=1)
 
 
-def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, unit: float | None = None) -> Any:
+def on_grid(
+    rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, unit: float | None = None
+) -> Any:
     """Turn an array by row into an array by sample, float64, NaN where there is no row and where a value is infinite.
 
     Parameters
@@ -74,12 +87,14 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, 
     scale : float
         Factor on the values.
     unit : float, optional
-        The values are whole multiples of this; they remain whole multiples of ``unit * scale``, to the last bit.
+        The values are whole multiples of this; they remain whole multiples of ``unit * scale``, to
+        the last bit.
 
     Returns
     -------
     ndarray or dask.array.Array, shape (..., n_samples)
-        A numpy array when the result is small; chunks that are nothing but gap take no memory until they are computed.
+        A numpy array when the result is small; chunks that are nothing but gap take no memory until
+        they are computed.
     """
     size, lead = placement.size, rows.shape[:-1]
     if size * max(1, int(np.prod(lead))) <= SMALL:
@@ -107,7 +122,17 @@ def on_grid(rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, 
         runs[:, 1] -= first
         source = lazy[..., first:last].rechunk(-1)
         shape = (*((n,) for n in lead), (end - begin,))
-        parts.append(source.map_blocks(_fill, runs=runs, size=end - begin, scale=scale, unit=unit, dtype=np.float64, chunks=shape))
+        parts.append(
+            source.map_blocks(
+                _fill,
+                runs=runs,
+                size=end - begin,
+                scale=scale,
+                unit=unit,
+                dtype=np.float64,
+                chunks=shape,
+            )
+        )
     flush()
     placed = da.concatenate(parts, axis=-1)
     placed.gyrostab_filled = filled
@@ -124,7 +149,11 @@ def count_present(array: Any) -> int:
     >>> count_present(np.array([[1.0, np.nan, 2.0]]))
     2
     """
-    filled = getattr(array, "gyrostab_filled", [(begin, begin + BLOCK) for begin in range(0, array.shape[-1], BLOCK)])
+    filled = getattr(
+        array,
+        "gyrostab_filled",
+        [(begin, begin + BLOCK) for begin in range(0, array.shape[-1], BLOCK)],
+    )
 
     def count(ends: tuple[int, int]) -> int:
         return int(np.count_nonzero(~np.isnan(stretch(array, *ends))))
@@ -140,22 +169,32 @@ def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int6
     return np.where(inside, runs[which, 0] + rows - runs[which, 1], -1)
 
 
-def gathered(raw: xr.Dataset, name: str, placement: Placement, rate: float) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
+def gathered(
+    raw: xr.Dataset, name: str, placement: Placement, rate: float
+) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
     """Stamps and values of the filled rows of a slow channel; rows without a sample keep their stamp, moved with their piece."""
     channel = raw[name].data
     clock = raw["time"].data if "time" in raw.variables else None
     breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]
     breaks = breaks[np.argsort(breaks[:, 2], kind="stable")]
-    moved = np.concatenate([[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]])
+    moved = np.concatenate(
+        [[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]]
+    )
     stamps, values = [], []
     for begin in range(0, channel.shape[0], BLOCK):
-        block = stretch(channel, begin, min(begin + BLOCK, channel.shape[0])).astype(np.float64, copy=False)
+        block = stretch(channel, begin, min(begin + BLOCK, channel.shape[0])).astype(
+            np.float64, copy=False
+        )
         rows = np.flatnonzero(np.isfinite(block))
         sample = samples_of(placement, rows + begin)
         known = sample >= 0
         when = grid_times(placement.start, rate, sample)
         if clock is not None and not known.all():
-            written = stretch(clock, begin, min(begin + BLOCK, channel.shape[0])).astype("datetime64[ns]").view(np.int64)[rows]
+            written = (
+                stretch(clock, begin, min(begin + BLOCK, channel.shape[0]))
+                .astype("datetime64[ns]")
+                .view(np.int64)[rows]
+            )
             own = written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
             when = np.where(known, when, own)
             known |= written != NO_STAMP

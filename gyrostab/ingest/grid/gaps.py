@@ -17,7 +17,9 @@ from gyrostab.schema import GAP_CAUSES
 
 __all__ = ["find_gaps", "gap_table"]
 
-_MISSING, _UNREADABLE, _OUTSIDE = (GAP_CAUSES.index(name) for name in ("missing", "unreadable", "outside_range"))
+_MISSING, _UNREADABLE, _OUTSIDE = (
+    GAP_CAUSES.index(name) for name in ("missing", "unreadable", "outside_range")
+)
 
 
 def _holes(placement: Placement, found: Survey) -> NDArray[np.int64]:
@@ -25,8 +27,12 @@ def _holes(placement: Placement, found: Survey) -> NDArray[np.int64]:
     runs, events = placement.runs, placement.events
     end, row_end = runs[:-1, 0] + runs[:-1, 2], runs[:-1, 1] + runs[:-1, 2]
     start, row_start = runs[1:, 0], runs[1:, 1]
-    told = np.sort(events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2])  # rows whose fate is known otherwise
-    skipped = row_start - row_end - (np.searchsorted(told, row_start) - np.searchsorted(told, row_end))
+    told = np.sort(
+        events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2]
+    )  # rows whose fate is known otherwise
+    skipped = (
+        row_start - row_end - (np.searchsorted(told, row_start) - np.searchsorted(told, row_end))
+    )
     skipped = np.where(row_start > row_end, np.maximum(skipped, 0), 0)
     broken = events[np.isin(events[:, 0], (STEP, RESTART))]
     at = np.searchsorted(broken[:, 1], end)
@@ -87,7 +93,8 @@ def gap_table(log: xr.Dataset) -> pd.DataFrame:
     Parameters
     ----------
     log : xarray.Dataset
-        From `regularise`, with the variables ``gap_start``, ``gap_end``, ``gap_samples``, ``gap_rows``, ``gap_cause`` on ``gap``.
+        From `regularise`, with the variables ``gap_start``, ``gap_end``, ``gap_samples``,
+        ``gap_rows``, ``gap_cause`` on ``gap``.
 
     Returns
     -------
@@ -109,10 +116,21 @@ def gap_table(log: xr.Dataset) -> pd.DataFrame:
     0     0.02        2     0  missing
     """
     if "gap_start" not in log.variables:
-        raise SchemaError("this log has no table of gaps (gap_start, gap_end, ...); it comes with a log made by gyrostab.regularise")
+        raise SchemaError(
+            "this log has no table of gaps (gap_start, gap_end, ...); it comes with a log made by gyrostab.regularise"
+        )
     start, end = log["gap_start"].values, log["gap_end"].values
     cause = np.array(GAP_CAUSES, dtype=object)[log["gap_cause"].values.astype(int)]
     samples = log["gap_samples"].values
     rows = log["gap_rows"].values if "gap_rows" in log.variables else np.zeros_like(samples)
     seconds = (end - start) / np.timedelta64(1, "s")
-    return pd.DataFrame({"start": start, "end": end, "seconds": seconds, "samples": samples, "rows": rows, "cause": cause})
+    return pd.DataFrame(
+        {
+            "start": start,
+            "end": end,
+            "seconds": seconds,
+            "samples": samples,
+            "rows": rows,
+            "cause": cause,
+        }
+    )

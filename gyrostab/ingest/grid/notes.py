@@ -29,14 +29,22 @@ def describe_channels(log: xr.Dataset) -> list[str]:
             continue
         stamps = log[f"time_{name}"].values
         if not ((stamps >= start) & (stamps <= end)).any():
-            of = f"{_count(len(stamps), 'value')}, {_span(stamps.min(), stamps.max())}" if len(stamps) else "0 values"
+            of = (
+                f"{_count(len(stamps), 'value')}, {_span(stamps.min(), stamps.max())}"
+                if len(stamps)
+                else "0 values"
+            )
             advice = "check its time column, its unit and --epoch"
-            notes.append(f"channel {name}: none of its {of}, lies within the log, {_span(start, end)}; {advice}")
+            notes.append(
+                f"channel {name}: none of its {of}, lies within the log, {_span(start, end)}; {advice}"
+            )
     return notes
 
 
 def _span(first: np.datetime64, last: np.datetime64) -> str:
-    return " to ".join(stamp_text(int(stamp.astype("datetime64[ns]").view(np.int64))) for stamp in (first, last))
+    return " to ".join(
+        stamp_text(int(stamp.astype("datetime64[ns]").view(np.int64))) for stamp in (first, last)
+    )
 
 
 def _count(number: int, what: str) -> str:
@@ -44,19 +52,37 @@ def _count(number: int, what: str) -> str:
 
 
 def describe_rate(
-    raw: xr.Dataset, estimate: RateEstimate, rate: float, odd: list[tuple[int, int, float]], placement: Placement
+    raw: xr.Dataset,
+    estimate: RateEstimate,
+    rate: float,
+    odd: list[tuple[int, int, float]],
+    placement: Placement,
 ) -> list[str]:
     """Sentences on the sampling rate."""
     where = file_of(raw)[0]
     notes = []
     if estimate.counted:
-        why = "many rows share one stamp" if estimate.coarse else "the stamps come in bursts, as rows arrive and not as they are sampled"
-        reach = f"; stamps and samples differ by up to {duration(placement.wander / rate)} in the long run" if placement.wander >= 1 else ""
+        why = (
+            "many rows share one stamp"
+            if estimate.coarse
+            else "the stamps come in bursts, as rows arrive and not as they are sampled"
+        )
+        reach = (
+            f"; stamps and samples differ by up to {duration(placement.wander / rate)} in the long run"
+            if placement.wander >= 1
+            else ""
+        )
         notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
     course = estimate.course
     if course is not None and course.group >= 2:
-        why = "many rows share one stamp" if estimate.coarse else "the stamps come in bursts, as rows arrive and not as they are sampled"
-        notes.append(f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are missing where a group comes late")
+        why = (
+            "many rows share one stamp"
+            if estimate.coarse
+            else "the stamps come in bursts, as rows arrive and not as they are sampled"
+        )
+        notes.append(
+            f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are missing where a group comes late"
+        )
     elif course is not None:
         notes.append(
             f"{where}: the stamps scatter by {duration(course.sigma / rate)}, {course.sigma:.2g} of a sampling interval, "
@@ -76,7 +102,9 @@ def describe_rate(
         )
     off = abs(estimate.raw / rate - 1)
     if off * placement.size > 1 and off > 2 * estimate.stderr / rate:
-        notes.append(f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million from {rate:.10g} Hz")
+        notes.append(
+            f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million from {rate:.10g} Hz"
+        )
     for row, stamp, own in odd[:_NAMED]:
         file, local = file_of(raw, row)
         notes.append(
@@ -88,7 +116,9 @@ def describe_rate(
 
 def _breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
     notes = []
-    events = placement.events[placement.events[:, 0] >= min(GAP_CAUSES.index("clock_step"), RESTART)]
+    events = placement.events[
+        placement.events[:, 0] >= min(GAP_CAUSES.index("clock_step"), RESTART)
+    ]
     for cause, _sample, row, before, after in events[:_NAMED].tolist():
         file, local = file_of(raw, row)
         jump = (after - before) / 1e9
@@ -100,11 +130,15 @@ def _breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
             + ("" if jump < 0 else "; if the pause is real, raise max_gap")
         )
     if len(events) > _NAMED:
-        notes.append(f"{file_of(raw)[0]}: {len(events) - _NAMED} more restarts and steps of the clock are in the table of gaps")
+        notes.append(
+            f"{file_of(raw)[0]}: {len(events) - _NAMED} more restarts and steps of the clock are in the table of gaps"
+        )
     return notes
 
 
-def _missing(raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], rate: float) -> list[str]:
+def _missing(
+    raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], rate: float
+) -> list[str]:
     holes = table[(table[:, 4] == GAP_CAUSES.index("missing")) & (table[:, 2] > 0)]
     if len(holes) == 0:
         return []
@@ -117,7 +151,9 @@ def _missing(raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], ra
         row = int(before[1] + before[2] - 1)
         file, local = file_of(raw, row)
         since = stamp_text(int(grid_times(placement.start, rate, first)))
-        notes.append(f"{file}: {duration(samples / rate)} without samples from {since} (after row {local})")
+        notes.append(
+            f"{file}: {duration(samples / rate)} without samples from {since} (after row {local})"
+        )
     if len(holes) > len(longest):
         total = int(holes[:, 2].sum())
         share = total / placement.size
@@ -129,7 +165,9 @@ def _missing(raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], ra
     return notes
 
 
-def describe(raw: xr.Dataset, found: Survey, placement: Placement, table: NDArray[np.int64], rate: float) -> list[str]:
+def describe(
+    raw: xr.Dataset, found: Survey, placement: Placement, table: NDArray[np.int64], rate: float
+) -> list[str]:
     """Sentences on gaps, restarts, and rows and cells that were dropped or moved."""
     where = file_of(raw)[0]
     notes = [*_breaks(raw, placement), *_missing(raw, placement, table, rate)]
@@ -137,7 +175,9 @@ def describe(raw: xr.Dataset, found: Survey, placement: Placement, table: NDArra
     twice = events[events[:, 0] == DUPLICATE]
     if len(twice):
         file, local = file_of(raw, int(twice[:, 2].min()))
-        notes.append(f"{file}: dropped as their sample is taken: {_count(len(twice), 'row')}, first row {local}")
+        notes.append(
+            f"{file}: dropped as their sample is taken: {_count(len(twice), 'row')}, first row {local}"
+        )
     late = events[events[:, 0] == OUT_OF_ORDER]
     if len(late):
         kept = int((samples_of(placement, late[:, 2]) >= 0).sum())
@@ -146,7 +186,13 @@ def describe(raw: xr.Dataset, found: Survey, placement: Placement, table: NDArra
             f"{file}: out of order: {_count(len(late), 'row')}, first row {local}; "
             f"{kept} were put in their place, {len(late) - kept} dropped"
         )
-    lost = found.rows - found.absent - placement.placed - len(twice) - (len(late) - kept if len(late) else 0)
+    lost = (
+        found.rows
+        - found.absent
+        - placement.placed
+        - len(twice)
+        - (len(late) - kept if len(late) else 0)
+    )
     if lost > 0:
         notes.append(
             f"{where}: dropped for want of a readable time stamp: {_count(lost, 'row')} whose neighbours do not tell where they belong"
@@ -154,5 +200,8 @@ def describe(raw: xr.Dataset, found: Survey, placement: Placement, table: NDArra
     infinite = int((found.infinite[:, 1] - found.infinite[:, 0]).sum())
     if infinite:
         notes.append(f"{where}: infinite values in {_count(infinite, 'row')}, taken as missing")
-    notes += [f"{where}: axis {axis} never changes its value; is the sensor dead, or the column the wrong one?" for axis in found.constant]
+    notes += [
+        f"{where}: axis {axis} never changes its value; is the sensor dead, or the column the wrong one?"
+        for axis in found.constant
+    ]
     return notes

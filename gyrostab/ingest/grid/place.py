@@ -20,7 +20,14 @@ from gyrostab.kernels.grid.stamps import DUPLICATE, LOOK, NO_STAMP, OUT_OF_ORDER
 from gyrostab.store.direct import stretch
 from gyrostab.time.grid import period_ns
 
-__all__ = ["Placement", "check_grid", "place_by_count", "place_by_course", "place_by_stamp", "place_without_time"]
+__all__ = [
+    "Placement",
+    "check_grid",
+    "place_by_count",
+    "place_by_course",
+    "place_by_stamp",
+    "place_without_time",
+]
 
 _NO_STAMPS = "{where}: no row has a readable stamp; check the time column and its unit (--map), or give --rate HZ for a log without time"
 #: Rows that the placement kernel takes at a time.
@@ -38,9 +45,11 @@ class Placement:
     runs : ndarray of int64, shape (n, 3)
         First sample, first row, length; sorted by sample, without overlap.
     events : ndarray of int64, shape (n, 5)
-        Cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns]; sorted by sample.
+        Cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns]; sorted by
+        sample.
     wander : float
-        Largest distance of a stamp's long-term course from the grid [samples]; only where rows are counted.
+        Largest distance of a stamp's long-term course from the grid [samples]; only where rows are
+        counted.
     """
 
     start: int
@@ -65,14 +74,18 @@ class Placement:
         return bool((rows[2:] - rows[:-2] == 2).any())
 
 
-def _placement(start: int, runs: list[NDArray[np.int64]], events: list[NDArray[np.int64]], wander: float = 0.0) -> Placement:
+def _placement(
+    start: int, runs: list[NDArray[np.int64]], events: list[NDArray[np.int64]], wander: float = 0.0
+) -> Placement:
     table = np.concatenate([part for part in runs if len(part)])
     happened = np.concatenate([*events, np.empty((0, 5), dtype=np.int64)])
     table = table[np.argsort(table[:, 0], kind="stable")]
     return Placement(start, table, happened[np.argsort(happened[:, 1], kind="stable")], wander)
 
 
-def check_grid(raw: xr.Dataset, placement: Placement, rate: float, max_gap: float, limits: Mapping[str, float]) -> None:
+def check_grid(
+    raw: xr.Dataset, placement: Placement, rate: float, max_gap: float, limits: Mapping[str, float]
+) -> None:
     """Refuse a grid that is out of proportion to the rows, before anything is done for each of its samples.
 
     Parameters
@@ -97,13 +110,17 @@ def check_grid(raw: xr.Dataset, placement: Placement, rate: float, max_gap: floa
     holes = runs[1:, 0] - runs[:-1, 0] - runs[:-1, 2]
     widest = int(np.argmax(holes))
     rows = [int(runs[widest, 1] + runs[widest, 2] - 1), int(runs[widest + 1, 1])]
-    stamps = [int(stretch(raw["time"].data, row, row + 1).astype("datetime64[ns]").view(np.int64)[0]) for row in rows]
-    places = [f"{stamp_text(stamp)} (row {file_of(raw, row)[1]})" for stamp, row in zip(stamps, rows, strict=True)]
+    stamps = [
+        int(stretch(raw["time"].data, row, row + 1).astype("datetime64[ns]").view(np.int64)[0])
+        for row in rows
+    ]
+    places = [
+        f"{stamp_text(stamp)} (row {file_of(raw, row)[1]})"
+        for stamp, row in zip(stamps, rows, strict=True)
+    ]
     gap = holes[widest] / rate
     if gap >= 1.0:
-        fix = (
-            f"correct the stamp or the unit of the time column, or give --max-gap {min(max_gap, gap) / 2:.2g}s to take it for a clock step"
-        )
+        fix = f"correct the stamp or the unit of the time column, or give --max-gap {min(max_gap, gap) / 2:.2g}s to take it for a clock step"
     else:
         fix = f"other stamps are {duration(1.0 / rate)} apart, too close for a log of that length: correct them or the unit of time"
     raise TimeError(
@@ -122,7 +139,10 @@ def _stretches(stamps: Stamps) -> Iterator[tuple[NDArray[np.int64], NDArray[np.i
     """Rows and stamps in stretches, each with `LOOK` more rows to look at than the number that is to be placed."""
     rest_rows, rest_stamps = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     for rows, values in stamps():
-        rest_rows, rest_stamps = np.concatenate([rest_rows, rows]), np.concatenate([rest_stamps, values])
+        rest_rows, rest_stamps = (
+            np.concatenate([rest_rows, rows]),
+            np.concatenate([rest_stamps, values]),
+        )
         at = 0
         while len(rest_rows) - at > LOOK:
             n = min(_STRETCH, len(rest_rows) - at - LOOK)
@@ -133,17 +153,21 @@ def _stretches(stamps: Stamps) -> Iterator[tuple[NDArray[np.int64], NDArray[np.i
         yield rest_rows, rest_stamps, len(rest_rows)
 
 
-def place_by_stamp(stamps: Stamps, rate: float, *, tolerance: float, max_gap: float, where: str) -> Placement:
+def place_by_stamp(
+    stamps: Stamps, rate: float, *, tolerance: float, max_gap: float, where: str
+) -> Placement:
     """Place rows by their stamps.
 
     Parameters
     ----------
     stamps : callable
-        Gives an iterator over blocks of (row numbers, stamps [ns]); the size of the blocks makes no difference.
+        Gives an iterator over blocks of (row numbers, stamps [ns]); the size of the blocks makes no
+        difference.
     rate : float
         Sampling rate [Hz].
     tolerance : float
-        How much further than half a sample the slow course of the stamps may depart from the grid before a sample is left out [samples].
+        How much further than half a sample the slow course of the stamps may depart from the grid
+        before a sample is left out [samples].
     max_gap : float
         A longer step ahead is a step of the clock [s].
     where : str
@@ -160,7 +184,9 @@ def place_by_stamp(stamps: Stamps, rate: float, *, tolerance: float, max_gap: fl
     runs: list[NDArray[np.int64]] = []
     events: list[NDArray[np.int64]] = []
     for rows, values, n in _stretches(stamps):
-        new, happened = kernel.place(rows, values, n, period, 0.5 + tolerance, max_gap * rate, state, ring)
+        new, happened = kernel.place(
+            rows, values, n, period, 0.5 + tolerance, max_gap * rate, state, ring
+        )
         runs.append(new)
         events.append(happened)
     if not state[kernel.STARTED]:
@@ -192,12 +218,22 @@ def _windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
         table = values.reshape(-1, width) if len(values) >= width else values[None]
         ahead = (table - zero) / period - (np.arange(values.size) + before).reshape(table.shape)
         ahead[table == NO_STAMP] = np.nan
-        known = np.where(np.isnan(ahead), np.nanmedian(ahead) if np.isfinite(ahead).any() else 0.0, ahead)
+        known = np.where(
+            np.isnan(ahead), np.nanmedian(ahead) if np.isfinite(ahead).any() else 0.0, ahead
+        )
         step = np.diff(known.ravel(), prepend=last[0] if last else known[0, 0]).reshape(known.shape)
         last[:] = [known[-1, -1]]
         at = np.arange(len(table)) * width + before
         low, high = known.min(axis=1), known.max(axis=1)
-        parts.append((low, high, np.quantile(known, 0.9, axis=1) - low, at + step.argmax(axis=1), at + step.argmin(axis=1)))
+        parts.append(
+            (
+                low,
+                high,
+                np.quantile(known, 0.9, axis=1) - low,
+                at + step.argmax(axis=1),
+                at + step.argmin(axis=1),
+            )
+        )
 
     for _, values in stamps():
         rest = np.concatenate([rest, values])
@@ -224,7 +260,11 @@ def _jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]], floa
     while b < len(low):
         after = low[b : b + 3]
         size = float(np.median(after)) - course
-        if abs(size) > least and abs(low[b] - course) > least and (after - course > least).all() | (after - course < -least).all():
+        if (
+            abs(size) > least
+            and abs(low[b] - course) > least
+            and (after - course > least).all() | (after - course < -least).all()
+        ):
             # a loss late in the window before leaves that window's lowest point where it was
             rows = (windows.up if size > 0 else windows.down)[b - 1 : b + 1]
             tops = windows.high[b - 1] - course if size > 0 else course - low[b - 1]
@@ -240,7 +280,9 @@ def _jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]], floa
     return found, wander
 
 
-def place_by_count(stamps: Stamps, estimate: RateEstimate, rate: float, *, max_gap: float) -> Placement:
+def place_by_count(
+    stamps: Stamps, estimate: RateEstimate, rate: float, *, max_gap: float
+) -> Placement:
     """Place rows by their count, where stamps only tell when they arrived; a lasting delay is a loss of samples.
 
     Parameters
@@ -269,7 +311,11 @@ def place_by_count(stamps: Stamps, estimate: RateEstimate, rate: float, *, max_g
         if size < 0 or size > max_gap * rate:
             back = -size
             elapsed = row + course - begun
-            cause = RESTART if size < 0 and (2 * back > elapsed or row + course + size < 0.1 * elapsed) else STEP
+            cause = (
+                RESTART
+                if size < 0 and (2 * back > elapsed or row + course + size < 0.1 * elapsed)
+                else STEP
+            )
             events.append((cause, row + shifts[-1], row, before, before + int((size + 1) * period)))
             extra, begun = 1, row + course + size
         shifts.append(shifts[-1] + extra)
@@ -282,7 +328,14 @@ def place_by_count(stamps: Stamps, estimate: RateEstimate, rate: float, *, max_g
 
 
 def place_by_course(
-    stamps: Stamps, course: Course, rate: float, *, tolerance: float, max_gap: float, by_row: bool, where: str
+    stamps: Stamps,
+    course: Course,
+    rate: float,
+    *,
+    tolerance: float,
+    max_gap: float,
+    by_row: bool,
+    where: str,
 ) -> Placement:
     """Place rows in order where single stamps do not tell the sample: see `gyrostab.ingest.grid.course`.
 
@@ -301,7 +354,14 @@ def place_by_course(
         When no stamp can be read.
     """
     whole, fraction = period_ns(rate)
-    start, runs, events = place_rows(stamps(), course, whole + fraction, hold=0.5 + tolerance, max_gap_ns=max_gap * SECOND, by_row=by_row)
+    start, runs, events = place_rows(
+        stamps(),
+        course,
+        whole + fraction,
+        hold=0.5 + tolerance,
+        max_gap_ns=max_gap * SECOND,
+        by_row=by_row,
+    )
     if start is None:
         raise TimeError(_NO_STAMPS.format(where=where))
     return _placement(start, runs, events)
@@ -317,7 +377,9 @@ def _rows_at(stamps: Stamps, counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def _counted_runs(stamps: Stamps, cuts: NDArray[np.int64], shifts: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _counted_runs(
+    stamps: Stamps, cuts: NDArray[np.int64], shifts: NDArray[np.int64]
+) -> list[NDArray[np.int64]]:
     """Make runs of rows by count, where from count ``cuts[i]`` on the sample is the count plus ``shifts[i]``."""
     runs: list[NDArray[np.int64]] = []
     done = 0
@@ -330,7 +392,11 @@ def _counted_runs(stamps: Stamps, cuts: NDArray[np.int64], shifts: NDArray[np.in
         first = np.concatenate([[0], new])
         last = np.append(new, len(rows))
         table = np.stack([grid[first], rows[first], last - first], axis=1)
-        if runs and runs[-1][-1, 0] + runs[-1][-1, 2] == table[0, 0] and runs[-1][-1, 1] + runs[-1][-1, 2] == table[0, 1]:
+        if (
+            runs
+            and runs[-1][-1, 0] + runs[-1][-1, 2] == table[0, 0]
+            and runs[-1][-1, 1] + runs[-1][-1, 2] == table[0, 1]
+        ):
             runs[-1][-1, 2] += table[0, 2]
             table = table[1:]
         if len(table):

@@ -1,8 +1,9 @@
 """The sampling rate that a file's stamps stand for.
 
-Two hypotheses. *Lattice*: stamps lie near multiples of a period, with jitter, rounding, and rows missing or doubled; the
-row's place follows from its stamp. *Counted*: stamps tell when the rows arrived (in bursts) or are shared by many rows
-(whole seconds); only the number of rows over a long stretch tells the rate, and the row's place is its count.
+Two hypotheses. *Lattice*: stamps lie near multiples of a period, with jitter, rounding, and rows
+missing or doubled; the row's place follows from its stamp. *Counted*: stamps tell when the rows
+arrived (in bursts) or are shared by many rows (whole seconds); only the number of rows over a long
+stretch tells the rate, and the row's place is its count.
 """
 
 from __future__ import annotations
@@ -21,17 +22,30 @@ from gyrostab.ingest.grid.steps import cut, finer_period, refined
 from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
 from gyrostab.store.threads import in_order
 
-__all__ = ["RateEstimate", "Stamps", "estimate_near", "estimate_rate", "is_far_worse", "odd_stretches", "starting_period"]
+__all__ = [
+    "RateEstimate",
+    "Stamps",
+    "estimate_near",
+    "estimate_rate",
+    "is_far_worse",
+    "odd_stretches",
+    "starting_period",
+]
 
 SECOND = 1e9
 #: Gives the blocks of row numbers and stamps, from the first on, as often as asked.
 Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 _GAIN = 0.1
 _SURE = 500.0  # samples, of a long log
-_SHARED_SHARE = 0.05  # share of rows with the stamp of the row before from which on stamps may be shared
-_DISORDER = 0.35  # share of steps backwards that no jitter makes: 0.12 at a scatter of 0.6 samples, 0.5 in random order
+_SHARED_SHARE = (
+    0.05  # share of rows with the stamp of the row before from which on stamps may be shared
+)
+# share of steps backwards that no jitter makes: 0.12 at a scatter of 0.6 samples, 0.5 in random
+# order
+_DISORDER = 0.35
 _SINGLE = 0.1  # share of the steps that must be one sample of a rate that is given
-#: Scatter of the steps about whole samples up to which single stamps tell the sample: jitter of 0.08 samples, so that half a sample is
+#: Scatter of the steps about whole samples up to which single stamps tell the sample: jitter of
+#: 0.08 samples, so that half a sample is
 #: 6 standard deviations.
 _SHARP_SCATTER = 0.12
 _MAX_PIECES = 200_000
@@ -56,11 +70,14 @@ class RateEstimate:
     raw : float
         The rate before it was rounded to a plain number [Hz].
     even : float or None
-        Rate [Hz] that the stamps would have if no rows were missing that seem to be missing again and again; None where none do.
+        Rate [Hz] that the stamps would have if no rows were missing that seem to be missing again
+        and again; None where none do.
     finer : float or None
-        Rate [Hz] that the stamps would have if the same rows were missing again and again; None where nothing speaks for one.
+        Rate [Hz] that the stamps would have if the same rows were missing again and again; None
+        where nothing speaks for one.
     course : Course or None
-        How the stamps scatter about the samples, where single stamps do not tell the sample but many together do.
+        How the stamps scatter about the samples, where single stamps do not tell the sample but
+        many together do.
     """
 
     rate: float
@@ -91,7 +108,9 @@ def _recut(stamps: Stamps, size: int) -> Iterator[tuple[NDArray[np.int64], NDArr
         yield _in_one(held)
 
 
-def _in_one(held: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _in_one(
+    held: list[tuple[NDArray[np.int64], NDArray[np.int64]]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Blocks of rows and stamps one after the other; a single one, or what alone is not empty, is not copied."""
     held = [block for block in held if len(block[0])]
     if len(held) == 1:
@@ -117,7 +136,9 @@ def _pools(stamps: Stamps, *, size: int = 8192, most: int = 64) -> list[NDArray[
     return [part for part in found if len(part) > 1]
 
 
-def _residual_range(parts: list[NDArray[np.int64]], length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _residual_range(
+    parts: list[NDArray[np.int64]], length: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slope [ns a row] and range of the residuals [ns] of straight lines through stretches of `length` stamps."""
     values = cut(parts, length)
     x = np.arange(length) - (length - 1) / 2
@@ -162,7 +183,10 @@ def _on_a_line(parts: list[NDArray[np.int64]]) -> float | None:
         for part in parts:
             count, piece = track(part, period, gain, 20 * period)
             same = np.diff(piece) == 0
-            time, samples = time + int(np.diff(part)[same].sum()), samples + int(np.diff(count)[same].sum())
+            time, samples = (
+                time + int(np.diff(part)[same].sum()),
+                samples + int(np.diff(count)[same].sum()),
+            )
         if samples <= 0:
             return None
         period = time / samples
@@ -178,10 +202,16 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
     period = _on_a_line(parts)
     if period is None:
         period = refined(steps, float(np.quantile(rising, 0.5, method="lower")))
-        if _misfit(steps, period) > 0.2:  # with most rows missing, the median step is not one sample
+        if (
+            _misfit(steps, period) > 0.2
+        ):  # with most rows missing, the median step is not one sample
             shorter = refined(steps, float(np.quantile(rising, 0.1)))
             period = shorter if _misfit(steps, shorter) < 0.15 else period
-    return (_throughput(parts), True, False) if _bursty(parts, steps, period) else (period, False, False)
+    return (
+        (_throughput(parts), True, False)
+        if _bursty(parts, steps, period)
+        else (period, False, False)
+    )
 
 
 def _bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
@@ -195,7 +225,9 @@ def _bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: 
     length = min(256, len(steps) // 16)
     if np.median(long) < 3 * period or length < 16:
         return False
-    spans = np.concatenate([(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]).astype(np.float64)
+    spans = np.concatenate(
+        [(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]
+    ).astype(np.float64)
     scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
     return bool(scatter**2 < 0.2 * length * near.var())  # samples lost at random would add up
 
@@ -221,8 +253,8 @@ def _throughput(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float
 def _ticks(steps: NDArray[np.float64]) -> tuple[float, int]:
     """Time [ns] and rows between changes of a shared stamp; changes that take three times as long a row as usual are gaps.
 
-    A change and the rows that share the stamp before it are kept or left out together: some stamps may be shared by one row and
-    others by five.
+    A change and the rows that share the stamp before it are kept or left out together: some stamps
+    may be shared by one row and others by five.
     """
     rising = np.flatnonzero(steps > 0)
     times, counts = steps[rising[1:]], np.diff(rising)
@@ -238,12 +270,19 @@ def _longest(parts: list[NDArray[np.int64]], period: float) -> float:
 
 
 def _pieces(
-    stamps: Stamps, period: float, counted: bool, coarse: bool, longest: float, course: Course | None = None
+    stamps: Stamps,
+    period: float,
+    counted: bool,
+    coarse: bool,
+    longest: float,
+    course: Course | None = None,
 ) -> NDArray[np.float64]:
     """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
     table = np.empty((0, 6))
     zero: int | None = None
-    work = partial(_piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, course=course)
+    work = partial(
+        _piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, course=course
+    )
     for first, sums in in_order(work, stamps()):
         if first is None:
             continue
@@ -273,26 +312,34 @@ def _piece_sums(
     first = int(block[0])
     if course is not None:
         block, count, piece = count_along(np.arange(len(found[1])), found[1], course, longest)
-        return (first, int(block[0])) if len(block) else None, piece_sums(block, count, piece, period)
+        return (first, int(block[0])) if len(block) else None, piece_sums(
+            block, count, piece, period
+        )
     if counted:
         known = np.flatnonzero(rows != NO_STAMP)
         piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
         count = known  # a row counts, with or without a stamp
     else:
         count, piece = track(block, period, _GAIN, longest)
-    if coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1:  # only there the true time is known
+    if (
+        coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1
+    ):  # only there the true time is known
         block, count, piece = block[tick], count[tick], piece[tick]
     return (first, int(block[0])), piece_sums(block, count, piece, period)
 
 
-def _pooled(pieces: NDArray[np.float64], period: float, counted: bool) -> tuple[float, float, float]:
+def _pooled(
+    pieces: NDArray[np.float64], period: float, counted: bool
+) -> tuple[float, float, float]:
     """Period [ns], its standard error [ns], and the samples of the longest joined stretch."""
     n, cc, ct, rest = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
     if cc.sum() <= 0:
         return period, period, 1.0
     noise = np.sqrt(rest.sum() / max(1.0, n.sum() - 2 * len(n)))
     slope = ct / np.where(cc > 0, cc, 1.0)
-    sane = (cc > 0) & (np.abs(slope / period - 1) < 0.02 + 5 * noise / period / np.sqrt(np.maximum(cc, 1e-9)))
+    sane = (cc > 0) & (
+        np.abs(slope / period - 1) < 0.02 + 5 * noise / period / np.sqrt(np.maximum(cc, 1e-9))
+    )
     if sane.any():
         period = float(ct[sane].sum() / cc[sane].sum())
     error = 3.0 * noise / np.sqrt(cc[sane].sum() if sane.any() else cc.sum())
@@ -301,7 +348,9 @@ def _pooled(pieces: NDArray[np.float64], period: float, counted: bool) -> tuple[
     return _joined(pieces[sane], period, error, noise)
 
 
-def _joined(pieces: NDArray[np.float64], period: float, error: float, noise: float) -> tuple[float, float, float]:
+def _joined(
+    pieces: NDArray[np.float64], period: float, error: float, noise: float
+) -> tuple[float, float, float]:
     """Join pieces whose distance is surely a known number of samples, and fit again."""
     for _ in range(3):
         total_cc = total_ct = longest = 0.0
@@ -377,7 +426,9 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             if backwards
             else "all stamps are the same"
         )
-        raise TimeError(f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ")
+        raise TimeError(
+            f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ"
+        )
     period, counted, coarse = starting_period(parts)
     sure = _sure(len(steps))
     finer = None if counted else finer_period(parts, period)
@@ -393,12 +444,15 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     return estimate if finer is None else replace(estimate, finer=float(f"{SECOND / finer:.4g}"))
 
 
-def _find_course(parts: list[NDArray[np.int64]], period: float, coarse: bool, sure: float) -> Course | None:
+def _find_course(
+    parts: list[NDArray[np.int64]], period: float, coarse: bool, sure: float
+) -> Course | None:
     """Find the course of noisy stamps: of all rows, or of one row of each group.
 
-    A row with the stamp of the row before is the next sample, which arrived together with it, or the same sample given twice. Where few
-    rows are of that kind, both readings are tried, and the one that tells a stamp in fewer nats is right. The wrong one has a row
-    without a sample, or a loss, wherever two rows share a stamp, or a wrong period.
+    A row with the stamp of the row before is the next sample, which arrived together with it, or
+    the same sample given twice. Where few rows are of that kind, both readings are tried, and the
+    one that tells a stamp in fewer nats is right. The wrong one has a row without a sample, or a
+    loss, wherever two rows share a stamp, or a wrong period.
     """
     if not coarse:
         once = [part[np.append(np.diff(part) != 0, True)] for part in parts]
@@ -420,7 +474,9 @@ def _estimate_along(stamps: Stamps, course: Course, coarse: bool, sure: float) -
 
 def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
     """Rows in a second, those without pauses."""
-    rates = [SECOND * (len(part) - 1) / (part[-1] - part[0]) for part in parts if part[-1] > part[0]]
+    rates = [
+        SECOND * (len(part) - 1) / (part[-1] - part[0]) for part in parts if part[-1] > part[0]
+    ]
     return float(f"{np.median(rates):.4g}")
 
 
@@ -429,18 +485,27 @@ def _sure(steps: int) -> float:
     return min(_SURE, max(5.0, steps / 20))
 
 
-def _estimate(pieces: NDArray[np.float64], period: float, counted: bool, coarse: bool) -> RateEstimate:
+def _estimate(
+    pieces: NDArray[np.float64], period: float, counted: bool, coarse: bool
+) -> RateEstimate:
     period, error, samples = _pooled(pieces, period, counted and not coarse)
     rate = SECOND / period
     stderr = rate * error / period
-    return RateEstimate(_plain(rate, stderr + 1e-12 * rate, samples, counted and not coarse), stderr, counted, coarse, rate)
+    return RateEstimate(
+        _plain(rate, stderr + 1e-12 * rate, samples, counted and not coarse),
+        stderr,
+        counted,
+        coarse,
+        rate,
+    )
 
 
 def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     """The rate near a nominal one [Hz], where the stamps are samples of it of which some are missing, however regularly.
 
-    They can be samples of `rate` when their steps are whole numbers of its period and some are one period, or when rows of that rate
-    with lost samples and jitter explain them (see `gyrostab.ingest.grid.course`); otherwise the answer is None.
+    They can be samples of `rate` when their steps are whole numbers of its period and some are one
+    period, or when rows of that rate with lost samples and jitter explain them (see
+    `gyrostab.ingest.grid.course`); otherwise the answer is None.
 
     Examples
     --------
@@ -467,7 +532,8 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
 def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> bool:
     """Tell whether a rate explains the stamps much worse than the rate found from them: by 20 nats in 100 rows, so by 2000 in 10 000.
 
-    Both are compared along the most likely course of the stamps, also where single stamps tell the sample of the rate found.
+    Both are compared along the most likely course of the stamps, also where single stamps tell the
+    sample of the rate found.
 
     Examples
     --------
@@ -478,11 +544,19 @@ def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> boo
     theirs = found.course
     if theirs is None and not found.counted:
         parts = _pools(partial(_recut, stamps, _BLOCK))
-        theirs = follow_course(parts, SECOND / found.raw, "all", sure=_sure(sum(len(part) - 1 for part in parts)))
-    return near.course is not None and theirs is not None and near.course.code_length > theirs.code_length + _FAR_WORSE_NATS
+        theirs = follow_course(
+            parts, SECOND / found.raw, "all", sure=_sure(sum(len(part) - 1 for part in parts))
+        )
+    return (
+        near.course is not None
+        and theirs is not None
+        and near.course.code_length > theirs.code_length + _FAR_WORSE_NATS
+    )
 
 
-def _estimate_sharp(stamps: Stamps, parts: list[NDArray[np.int64]], rate: float) -> RateEstimate | None:
+def _estimate_sharp(
+    stamps: Stamps, parts: list[NDArray[np.int64]], rate: float
+) -> RateEstimate | None:
     """The rate near a nominal one [Hz] where steps are whole numbers of its period, and some are one period."""
     period = SECOND / rate
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
@@ -491,10 +565,14 @@ def _estimate_sharp(stamps: Stamps, parts: list[NDArray[np.int64]], rate: float)
         return None
     if abs(np.median(single) / period - 1) > 0.02:  # another rate, not this one with rows missing
         return None
-    return _estimate(_pieces(stamps, period, False, False, _sure(len(steps)) * period), period, False, False)
+    return _estimate(
+        _pieces(stamps, period, False, False, _sure(len(steps)) * period), period, False, False
+    )
 
 
-def odd_stretches(stamps: Stamps, period: float, *, size: int = 1024) -> list[tuple[int, int, float]]:
+def odd_stretches(
+    stamps: Stamps, period: float, *, size: int = 1024
+) -> list[tuple[int, int, float]]:
     """Stretches whose own rate is more than 2 % off: first row, its stamp [ns], rate [Hz].
 
     Rows that are merely missing or doubled do not make a stretch odd; steps of another length do.

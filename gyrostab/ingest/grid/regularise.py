@@ -1,6 +1,7 @@
 """Raw rows with their stamps to a regular log: uniform time, NaN at every missing sample, a table of gaps.
 
-No value is ever interpolated, averaged or moved by a fraction of a sample: a sample is a row of the file, bit for bit, or NaN.
+No value is ever interpolated, averaged or moved by a fraction of a sample: a sample is a row of the
+file, bit for bit, or NaN.
 """
 
 from __future__ import annotations
@@ -20,8 +21,22 @@ from gyrostab.ingest.grid.course import Course
 from gyrostab.ingest.grid.fill import gathered, on_grid
 from gyrostab.ingest.grid.gaps import find_gaps, gap_table
 from gyrostab.ingest.grid.notes import describe, describe_channels, describe_rate
-from gyrostab.ingest.grid.place import Placement, check_grid, place_by_count, place_by_course, place_by_stamp, place_without_time
-from gyrostab.ingest.grid.rate import RateEstimate, Stamps, estimate_near, estimate_rate, is_far_worse, odd_stretches
+from gyrostab.ingest.grid.place import (
+    Placement,
+    check_grid,
+    place_by_count,
+    place_by_course,
+    place_by_stamp,
+    place_without_time,
+)
+from gyrostab.ingest.grid.rate import (
+    RateEstimate,
+    Stamps,
+    estimate_near,
+    estimate_rate,
+    is_far_worse,
+    odd_stretches,
+)
 from gyrostab.ingest.grid.repeats import find_repeats, with_repeats
 from gyrostab.ingest.grid.survey import BLOCK, Survey, blocks, file_of, survey
 from gyrostab.ingest.limits import check_limits
@@ -37,11 +52,21 @@ __all__ = ["gap_table", "regularise"]
 
 _DISAGREE = 0.02  # a declared rate further off than this is a mistake
 _EVEN_ROWS = 2**18  # rows at the beginning of a log with even stamps that tell its rate
-_SHARP_SIGMA = 0.2  # jitter up to which a stamp tells its sample, for all rows but one in 100; then they are tried first [samples]
+# jitter up to which a stamp tells its sample, for all rows but one in 100; then they are tried
+# first [samples]
+_SHARP_SIGMA = 0.2
 _MANY_DROPPED = 10  # rows without a sample by their stamps, from which on their order is tried
 _LATE_SHARE = 0.9  # of those rows that the order must give a sample
 _ROUNDS = 4  # a repetition within another shows only when the latter is gone
-_OWN_ATTRIBUTES = ("declared_rate_hz", "start", "row_start", "kind", "notes", "history", "unreadable_spans")
+_OWN_ATTRIBUTES = (
+    "declared_rate_hz",
+    "start",
+    "row_start",
+    "kind",
+    "notes",
+    "history",
+    "unreadable_spans",
+)
 
 
 def _checked(*, rate: float | None, tolerance: float, chunk: int | None, block: int) -> None:
@@ -50,7 +75,9 @@ def _checked(*, rate: float | None, tolerance: float, chunk: int | None, block: 
     if not 0 <= tolerance < 0.5:
         raise OptionError(f"tolerance={tolerance!r} must be at least 0 and below 0.5 samples")
     if (chunk is not None and chunk < 1) or block < 64:
-        raise OptionError(f"chunk={chunk!r} and block={block!r} count samples and rows; give at least 1 and 64")
+        raise OptionError(
+            f"chunk={chunk!r} and block={block!r} count samples and rows; give at least 1 and 64"
+        )
 
 
 def _declared(raw: xr.Dataset, rate: float | None) -> float | None:
@@ -61,20 +88,33 @@ def _declared(raw: xr.Dataset, rate: float | None) -> float | None:
 def _start(raw: xr.Dataset, notes: list[str]) -> int:
     text = raw.attrs.get("start")
     if not text:
-        notes.append(f"{file_of(raw)[0]}: no time in the file and no --start: the log is said to start at 1970-01-01T00:00:00")
+        notes.append(
+            f"{file_of(raw)[0]}: no time in the file and no --start: the log is said to start at 1970-01-01T00:00:00"
+        )
         return 0
     return stamp_ns(text)
 
 
 def _place(
-    raw: xr.Dataset, found: Survey, declared: float | None, *, tolerance: float, max_gap: float, block: int, notes: list[str]
+    raw: xr.Dataset,
+    found: Survey,
+    declared: float | None,
+    *,
+    tolerance: float,
+    max_gap: float,
+    block: int,
+    notes: list[str],
 ) -> tuple[Placement, float]:
     where = file_of(raw)[0]
     if "time" not in raw.variables:
         if declared is None:
-            raise TimeError(f"{where}: the file has no time column; give the sampling rate with --rate HZ")
+            raise TimeError(
+                f"{where}: the file has no time column; give the sampling rate with --rate HZ"
+            )
         return place_without_time(found.rows, _start(raw, notes)), declared
-    everything = found.absent <= 0.01 * found.rows  # single unreadable rows took their time all the same
+    everything = (
+        found.absent <= 0.01 * found.rows
+    )  # single unreadable rows took their time all the same
     stamps: Stamps = partial(blocks, raw, found, block=block)
     counted: Stamps = partial(blocks, raw, found, block=block, all_rows=everything)
     try:
@@ -85,18 +125,29 @@ def _place(
         estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
     if declared is not None and abs(declared / estimate.raw - 1) > _DISAGREE:
         near = estimate_near(stamps, declared)
-        named = estimate.even is not None and abs(declared / estimate.even - 1) <= _DISAGREE  # the other reading of recurring losses
-        if near is None or abs(declared / near.raw - 1) > _DISAGREE or (not named and is_far_worse(stamps, near, estimate)):
+        named = (
+            estimate.even is not None and abs(declared / estimate.even - 1) <= _DISAGREE
+        )  # the other reading of recurring losses
+        if (
+            near is None
+            or abs(declared / near.raw - 1) > _DISAGREE
+            or (not named and is_far_worse(stamps, near, estimate))
+        ):
             raise TimeError(
                 f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz, and neither "
                 "lost samples nor jitter explain the difference; "
                 "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of the time column"
             )
-        notes.append(f"{where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, {declared:.10g} Hz, which is used")
+        notes.append(
+            f"{where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, {declared:.10g} Hz, which is used"
+        )
         estimate = near
     rate = estimate.rate
     if declared is not None:
-        rate, estimate = declared, replace(estimate, finer=None, even=None)  # who gives a rate has decided
+        rate, estimate = (
+            declared,
+            replace(estimate, finer=None, even=None),
+        )  # who gives a rate has decided
     if estimate.counted:
         placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
         odd: list[tuple[int, int, float]] = []
@@ -107,24 +158,39 @@ def _place(
     return placement, rate
 
 
-def _place_even(raw: xr.Dataset, found: Survey, place: Callable[..., tuple[Placement, float]]) -> tuple[Placement, float] | None:
+def _place_even(
+    raw: xr.Dataset, found: Survey, place: Callable[..., tuple[Placement, float]]
+) -> tuple[Placement, float] | None:
     """Place the rows of a long log whose stamps are even steps of the sampling period, by a look at its beginning alone.
 
-    None where they are not, where a row has no sample, or where there is anything to be told of the beginning.
+    None where they are not, where a row has no sample, or where there is anything to be told of the
+    beginning.
     """
-    line: tuple[int, int] | None = getattr(raw["time"].data, "gyrostab_line", None) if "time" in raw.variables else None
+    line: tuple[int, int] | None = (
+        getattr(raw["time"].data, "gyrostab_line", None) if "time" in raw.variables else None
+    )
     if line is None or found.absent or found.repeated or found.rows <= _EVEN_ROWS:
         return None
     start, step = line
     stamps = (start + step * np.arange(_EVEN_ROWS)).view("datetime64[ns]")
     signal = signal_name(raw)
     values = stretch(raw[signal].data, 0, _EVEN_ROWS)
-    head = xr.Dataset({signal: (("axis", "row"), values)}, {"time": ("row", stamps), "axis": raw["axis"].values}, raw.attrs)
+    head = xr.Dataset(
+        {signal: (("axis", "row"), values)},
+        {"time": ("row", stamps), "axis": raw["axis"].values},
+        raw.attrs,
+    )
     present = replace(found, rows=_EVEN_ROWS, present=found.present[: _EVEN_ROWS // 8].copy())
     notes: list[str] = []
     placement, rate = place(head, present, notes=notes)
     whole, fraction = period_ns(rate)
-    if notes or fraction or whole != step or placement.runs.tolist() != [[0, 0, _EVEN_ROWS]] or len(placement.events):
+    if (
+        notes
+        or fraction
+        or whole != step
+        or placement.runs.tolist() != [[0, 0, _EVEN_ROWS]]
+        or len(placement.events)
+    ):
         return None
     return replace(placement, runs=np.array([[0, 0, found.rows]], dtype=np.int64)), rate
 
@@ -139,23 +205,39 @@ class _Limits(NamedTuple):
 
 
 def _place_stamped(
-    raw: xr.Dataset, found: Survey, stamps: Stamps, estimate: RateEstimate, rate: float, limits: _Limits
+    raw: xr.Dataset,
+    found: Survey,
+    stamps: Stamps,
+    estimate: RateEstimate,
+    rate: float,
+    limits: _Limits,
 ) -> tuple[Placement, list[tuple[int, int, float]]]:
     """Place the rows by their stamps, or in their order where stamps scatter; and the stretches that have another rate."""
     course = estimate.course
 
     def place_along(course: Course) -> Placement:
         def place() -> Placement:
-            return place_by_course(stamps, course, rate, **limits._replace(by_row=limits.by_row and not found.repeated)._asdict())
+            return place_by_course(
+                stamps,
+                course,
+                rate,
+                **limits._replace(by_row=limits.by_row and not found.repeated)._asdict(),
+            )
 
         return _place_once(raw, found, place)
 
     if course is not None and course.sigma > _SHARP_SIGMA:
         return place_along(course), []
     tolerance, max_gap, where = limits.tolerance, limits.max_gap, limits.where
-    placement = _place_once(raw, found, partial(place_by_stamp, stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where))
+    placement = _place_once(
+        raw,
+        found,
+        partial(place_by_stamp, stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where),
+    )
     dropped = found.rows - found.absent - found.repeated - placement.placed
-    if not found.repeated and (dropped >= _MANY_DROPPED or placement.has_late_rows):  # their order may tell more than their stamps
+    if not found.repeated and (
+        dropped >= _MANY_DROPPED or placement.has_late_rows
+    ):  # their order may tell more than their stamps
         along = place_along(course or Course.of_sharp(1e9 / rate))
         if along.placed - placement.placed >= _LATE_SHARE * dropped:
             placement = along
@@ -176,14 +258,21 @@ def _place_once(raw: xr.Dataset, found: Survey, place: Callable[[], Placement]) 
     return with_repeats(placement, raw, known) if len(known) else placement
 
 
-def _channels(raw: xr.Dataset, found: Survey, placement: Placement, rate: float, chunk: int) -> tuple[dict[str, Any], dict[str, Any]]:
+def _channels(
+    raw: xr.Dataset, found: Survey, placement: Placement, rate: float, chunk: int
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Channels and their own time coordinates."""
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {}
     for name, rows in found.filled.items():
         channel = raw[name]
         if rows > 0.5 * (found.rows - found.absent):
-            variables[name] = ("time", on_grid(channel.data, placement, chunk=chunk), channel.attrs, channel.encoding)
+            variables[name] = (
+                "time",
+                on_grid(channel.data, placement, chunk=chunk),
+                channel.attrs,
+                channel.encoding,
+            )
         elif rows:
             time, values = gathered(raw, name, placement, rate)
             variables[name] = (f"time_{name}", values, channel.attrs, channel.encoding)
@@ -195,12 +284,23 @@ def _channels(raw: xr.Dataset, found: Survey, placement: Placement, rate: float,
     return variables, coordinates
 
 
-def _attributes(raw: xr.Dataset, kind: str, rate: float, done: str, notes: list[str]) -> dict[str, Any]:
+def _attributes(
+    raw: xr.Dataset, kind: str, rate: float, done: str, notes: list[str]
+) -> dict[str, Any]:
     kept = {key: value for key, value in raw.attrs.items() if key not in _OWN_ATTRIBUTES}
     now = time_of_day()
-    history = "\n".join(filter(None, [raw.attrs.get("history"), f"{now} gyrostab.regularise: {done}"]))
+    history = "\n".join(
+        filter(None, [raw.attrs.get("history"), f"{now} gyrostab.regularise: {done}"])
+    )
     said = [*texts(raw, "notes"), *notes]
-    return {"source_files": [], **kept, "kind": kind, "sampling_rate_hz": rate, "history": history, "notes": said}
+    return {
+        "source_files": [],
+        **kept,
+        "kind": kind,
+        "sampling_rate_hz": rate,
+        "history": history,
+        "notes": said,
+    }
 
 
 def regularise(
@@ -218,32 +318,37 @@ def regularise(
     Parameters
     ----------
     raw : xarray.Dataset
-        From `gyrostab.read_log`: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)`` [degree], ``time(row)``, channels.
-        A regular log is returned as it is, or brought back onto its uniform time by `gyrostab.ingest.uniform.as_uniform`.
+        From `gyrostab.read_log`: ``rate(axis, row)`` [degree hour-1] or ``angle(axis, row)``
+        [degree], ``time(row)``, channels. A regular log is returned as it is, or brought back onto
+        its uniform time by `gyrostab.ingest.uniform.as_uniform`.
     rate : float, optional
         Sampling rate [Hz]. Found from the stamps when not given; checked against them when given.
     tolerance : float
-        How much further than half a sample the slow course of the stamps may depart from the grid before a sample is left out [samples].
+        How much further than half a sample the slow course of the stamps may depart from the grid
+        before a sample is left out [samples].
     max_gap : str or float
-        A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number is in seconds.
+        A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number is
+        in seconds.
     chunk : int, optional
         Samples of a chunk of the lazy arrays; about 20 minutes by default, as in a stored log.
     block : int
         Rows in memory at one time; the result does not depend on it.
     limits : mapping of str to float, optional
-        Limits of `gyrostab.ingest.limits` with other values; ``grid_samples`` bounds the samples of an axis.
+        Limits of `gyrostab.ingest.limits` with other values; ``grid_samples`` bounds the samples of
+        an axis.
 
     Returns
     -------
     xarray.Dataset
-        ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], channels, ``gap_start``, ``gap_end``, ``gap_samples``,
-        ``gap_rows``, ``gap_cause`` on ``gap``; attributes ``sampling_rate_hz``, ``kind``, ``source_files``, ``history``, ``notes``.
+        ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], channels,
+        ``gap_start``, ``gap_end``, ``gap_samples``, ``gap_rows``, ``gap_cause`` on ``gap``;
+        attributes ``sampling_rate_hz``, ``kind``, ``source_files``, ``history``, ``notes``.
 
     Raises
     ------
     TimeError
-        When no sampling rate can be found, or the one given is more than 2 % from what the stamps say; or when the grid has far more
-        samples than there are rows.
+        When no sampling rate can be found, or the one given is more than 2 % from what the stamps
+        say; or when the grid has far more samples than there are rows.
     FormatError
         When no row holds a number.
     OptionError, SchemaError
@@ -251,7 +356,8 @@ def regularise(
 
     Notes
     -----
-    Angle increments (kind "increment") become the mean rate over their sampling interval, increment times sampling rate.
+    Angle increments (kind "increment") become the mean rate over their sampling interval, increment
+    times sampling rate.
 
     Examples
     --------
@@ -269,19 +375,31 @@ def regularise(
     check_raw(raw)
     _checked(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
     if "axis_rows" in raw.attrs:
-        each = partial(regularise, rate=rate, tolerance=tolerance, max_gap=max_gap, chunk=chunk, block=block, limits=limits)
+        each = partial(
+            regularise,
+            rate=rate,
+            tolerance=tolerance,
+            max_gap=max_gap,
+            chunk=chunk,
+            block=block,
+            limits=limits,
+        )
         return regularise_axes(raw, each, max_gap=max_gap, limits=limits)
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     allowed = check_limits(limits)
     found = survey(raw, name, block=block)
     notes: list[str] = []
-    place = partial(_place, declared=_declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block)
+    place = partial(
+        _place, declared=_declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block
+    )
     placement, hertz = _place_even(raw, found, place) or place(raw, found, notes=notes)
     check_grid(raw, placement, hertz, gap_limit, allowed)
     check_span(placement.start, hertz, placement.size, file_of(raw)[0])
     chunk = chunk or chunk_samples(hertz)
-    table = name_lost(find_gaps(placement, found), raw.attrs.get("unreadable_spans", ()), placement.start, hertz)
+    table = name_lost(
+        find_gaps(placement, found), raw.attrs.get("unreadable_spans", ()), placement.start, hertz
+    )
     notes += describe(raw, found, placement, table, hertz)
 
     increments = raw.attrs.get("kind") == "increment"
@@ -292,12 +410,19 @@ def regularise(
     packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}
     variables, own = _channels(raw, found, placement, hertz, chunk)
     variables = {
-        signal: (("axis", "time"), on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit), attributes, packing),
+        signal: (
+            ("axis", "time"),
+            on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit),
+            attributes,
+            packing,
+        ),
         **variables,
         **gap_variables(table, placement.start, hertz),
     }
     coordinates = (
-        xr.Coordinates({"axis": raw["axis"].variable, **own}).merge(time_coordinate(placement.start, hertz, placement.size)).coords
+        xr.Coordinates({"axis": raw["axis"].variable, **own})
+        .merge(time_coordinate(placement.start, hertz, placement.size))
+        .coords
     )
     done = f"{placement.placed} of {found.rows} rows on {placement.size} samples at {hertz:.10g} Hz"
     log = xr.Dataset(variables, coordinates, _attributes(raw, signal, hertz, done, notes))

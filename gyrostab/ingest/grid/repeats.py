@@ -22,8 +22,9 @@ _SAME = 0.9  # share of the rows whose values must be alike; a copy may have bee
 def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np.int64]:
     """Look for the rows after each set-back of the clock among the rows before it.
 
-    Rows are the same when stamps and values are. A clock that starts anew may well write the same stamps, but the values are others;
-    where they never change, nothing can be told, and nothing is taken for a repetition.
+    Rows are the same when stamps and values are. A clock that starts anew may well write the same
+    stamps, but the values are others; where they never change, nothing can be told, and nothing is
+    taken for a repetition.
 
     Parameters
     ----------
@@ -61,7 +62,9 @@ def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
     """The first few rows with a stamp."""
     rows: list[int] = []
     for begin in range(0, before, BLOCK):
-        rows += (np.flatnonzero(_stamps(raw, begin, min(begin + BLOCK, before)) == stamp) + begin).tolist()
+        rows += (
+            np.flatnonzero(_stamps(raw, begin, min(begin + BLOCK, before)) == stamp) + begin
+        ).tolist()
         if len(rows) >= _TRIED:
             break
     return rows[:_TRIED]
@@ -72,7 +75,9 @@ def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
     room = min(raw.sizes["row"] - row, row - source)
     for begin in range(0, room, BLOCK):
         end = min(begin + BLOCK, room)
-        other = np.flatnonzero(_stamps(raw, source + begin, source + end) != _stamps(raw, row + begin, row + end))
+        other = np.flatnonzero(
+            _stamps(raw, source + begin, source + end) != _stamps(raw, row + begin, row + end)
+        )
         if len(other):
             return begin + int(other[0])
     return room
@@ -84,12 +89,16 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
     changes = False
     for begin in range(0, length, BLOCK):
         end = min(begin + BLOCK, length)
-        left, right = (stretch(raw[name].data, first + begin, first + end) for first in (source, row))
+        left, right = (
+            stretch(raw[name].data, first + begin, first + end) for first in (source, row)
+        )
         known = np.isfinite(left) & np.isfinite(right)
         rows = known.any(axis=0)
         told += int(rows.sum())
         alike += int(((left == right) | ~known).all(axis=0)[rows].sum())
-        changes = changes or bool(((np.diff(left, axis=1) != 0) & known[:, 1:] & known[:, :-1]).any())
+        changes = changes or bool(
+            ((np.diff(left, axis=1) != 0) & known[:, 1:] & known[:, :-1]).any()
+        )
     return changes and told >= 2 and alike >= _SAME * told
 
 
@@ -104,4 +113,9 @@ def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int6
         table = np.stack([np.full(length, DUPLICATE), sample, rows + row, stamps, stamps], axis=1)
         events.append(table[known])
     table = np.concatenate(events)
-    return Placement(placement.start, placement.runs, table[np.argsort(table[:, 1], kind="stable")], placement.wander)
+    return Placement(
+        placement.start,
+        placement.runs,
+        table[np.argsort(table[:, 1], kind="stable")],
+        placement.wander,
+    )

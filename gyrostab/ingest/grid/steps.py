@@ -7,7 +7,10 @@ from numpy.typing import NDArray
 
 __all__ = ["cut", "finer_period", "refined"]
 
-_PATTERN, _ROWS = 8, 17  # rows after which a pattern of steps recurs at most, and those that it must hold for beside
+_PATTERN, _ROWS = (
+    8,
+    17,
+)  # rows after which a pattern of steps recurs at most, and those that it must hold for beside
 _WHOLE = 0.15  # samples that a step of a pattern may be off
 _LONGEST = 5.0  # samples that it may take
 
@@ -15,7 +18,11 @@ _LONGEST = 5.0  # samples that it may take
 def cut(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
     """Stretches of `length` stamps, each from its first on [ns]."""
     stride = length if sum(map(len, parts)) > 200 * length else 1  # of a short log, every stretch
-    several = [np.lib.stride_tricks.sliding_window_view(part, length)[::stride] for part in parts if len(part) >= length]
+    several = [
+        np.lib.stride_tricks.sliding_window_view(part, length)[::stride]
+        for part in parts
+        if len(part) >= length
+    ]
     table = np.concatenate([*several, np.empty((0, length), dtype=np.int64)])
     return np.asarray(table - table[:, :1], dtype=np.float64)
 
@@ -38,8 +45,9 @@ def refined(steps: NDArray[np.float64], period: float) -> float:
 def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
     """Period [ns] of which the steps are 1, 1, 3 and again 1, 1, 3, as if of every five rows the same two were missing.
 
-    Stamps alone do not tell such a log from one whose rows are read in groups. The rounding of even stamps makes patterns, too, but of
-    steps that differ by one tick; steps by jitter do not recur; and pauses between bursts are longer.
+    Stamps alone do not tell such a log from one whose rows are read in groups. The rounding of even
+    stamps makes patterns, too, but of steps that differ by one tick; steps by jitter do not recur;
+    and pauses between bursts are longer.
     """
     table = np.diff(cut(parts, _PATTERN + _ROWS))
     rising = table[table > 0]

@@ -71,14 +71,20 @@ def _join(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     spans = np.concatenate([*parts, np.empty((0, 2), dtype=np.int64)])
     if len(spans) < 2:
         return spans
-    new = np.concatenate([[True], spans[1:, 0] != spans[:-1, 1]])  # a span that goes on in the next block is one span
+    new = np.concatenate(
+        [[True], spans[1:, 0] != spans[:-1, 1]]
+    )  # a span that goes on in the next block is one span
     starts = np.flatnonzero(new)
     ends = np.append(starts[1:], len(spans)) - 1
     return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
 
 
 def _look_at(raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]) -> Seen:
-    return look_at_cells(stretch(raw[name].data, *ends), {key: stretch(raw[key].data, *ends) for key in channels}, ends[0])
+    return look_at_cells(
+        stretch(raw[name].data, *ends),
+        {key: stretch(raw[key].data, *ends) for key in channels},
+        ends[0],
+    )
 
 
 def _looks(raw: xr.Dataset, name: str, channels: Sequence[str], block: int) -> Iterable[Seen]:
@@ -88,7 +94,10 @@ def _looks(raw: xr.Dataset, name: str, channels: Sequence[str], block: int) -> I
     whole = sum(one.rows for one in seen) == rows and all(one.rows % 8 == 0 for one in seen[:-1])
     if seen and whole and all(one.filled.keys() == set(channels) for one in seen):
         return seen
-    return in_order(partial(_look_at, raw, name, channels), ((at, min(rows, at + block)) for at in range(0, rows, block)))
+    return in_order(
+        partial(_look_at, raw, name, channels),
+        ((at, min(rows, at + block)) for at in range(0, rows, block)),
+    )
 
 
 def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
@@ -120,7 +129,11 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
             f"{_sources(raw)}: none of the {rows} rows holds a number for any gyro axis; check the columns, the units and --map"
         )
     axes = [str(axis) for axis in raw["axis"].values]
-    still = [axis for axis, least, most in zip(axes, low, high, strict=True) if least == most and rows - absent > 1]
+    still = [
+        axis
+        for axis, least, most in zip(axes, low, high, strict=True)
+        if least == most and rows - absent > 1
+    ]
     packed = np.concatenate(bits)
     return Survey(rows, packed, absent, _join(unreadable), _join(infinite), still, filled)
 
@@ -132,11 +145,15 @@ def blocks(
     return in_order(_same, _blocks(raw, found, block, all_rows=all_rows), workers=1)
 
 
-def _same(block: tuple[NDArray[np.int64], NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _same(
+    block: tuple[NDArray[np.int64], NDArray[np.int64]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return block
 
 
-def _blocks(raw: xr.Dataset, found: Survey, block: int, *, all_rows: bool) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _blocks(
+    raw: xr.Dataset, found: Survey, block: int, *, all_rows: bool
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     stamps = raw["time"].data
     for begin in range(0, found.rows, block):
         end = min(found.rows, begin + block)

@@ -42,7 +42,9 @@ class Typing:
         self.gyro = frozenset(column.source for column in self.plan.of("gyro"))
         self.time = self.plan.time.source if self.plan.time else None
         unit = self.unit
-        self.digits = unit.digits if unit is not None and unit.digits is not None and unit.digits <= 9 else 0
+        self.digits = (
+            unit.digits if unit is not None and unit.digits is not None and unit.digits <= 9 else 0
+        )
 
     @property
     def unit(self) -> TimeUnit | None:
@@ -62,7 +64,9 @@ def parse_plain(block: bytes, start: int, rows: int, typing: Typing) -> tuple[Pa
     separator = BLANKS if layout.separator == BLANK else ord(layout.separator)
     point = ord("," if layout.decimal_comma else ".")
     text = np.frombuffer(block, dtype=np.uint8)
-    numbers, stamps, stop = read_rows(text, start, roles, separator=separator, point=point, digits=typing.digits, rows=rows)
+    numbers, stamps, stop = read_rows(
+        text, start, roles, separator=separator, point=point, digits=typing.digits, rows=rows
+    )
     values = dict(zip(sorted(typing.sources), numbers, strict=True))
     return (values, None if typing.time is None else _since_epoch(stamps, typing)), stop
 
@@ -75,14 +79,19 @@ def _since_epoch(counts: NDArray[np.int64], typing: Typing) -> NDArray[np.int64]
     if unit.digits is None or unit.ns != 10**typing.digits:
         return np.where(counts == NAT, NAT, integers_to_ns(counts, unit, typing.options.epoch_ns))
     zero = typing.options.epoch_ns if unit.epoch is None else unit.epoch
-    return counts if zero == 0 else np.where((counts != NAT) & _sum_fits(counts, zero), counts + np.int64(zero), NAT)
+    return (
+        counts
+        if zero == 0
+        else np.where((counts != NAT) & _sum_fits(counts, zero), counts + np.int64(zero), NAT)
+    )
 
 
 def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
     """The pyarrow types to try for the time column, fastest first; every one is exact to the nanosecond.
 
-    Whole numbers are int64. Decimals are decimal128 with the digits of a nanosecond, then with more of them, for texts like
-    ``0.35000000000000003``. Without a fitting type the time column is read cell by cell.
+    Whole numbers are int64. Decimals are decimal128 with the digits of a nanosecond, then with more
+    of them, for texts like ``0.35000000000000003``. Without a fitting type the time column is read
+    cell by cell.
     """
     import pyarrow as pa
 
@@ -93,7 +102,11 @@ def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
     if time.time_unit is None:
         return (pa.timestamp("ns"), pa.timestamp("ns", tz="UTC"))
     digits = time.time_unit.digits
-    integer = (pa.int64(),) if all(cell.strip().isdigit() or not is_number(cell) for cell in cells) else ()
+    integer = (
+        (pa.int64(),)
+        if all(cell.strip().isdigit() or not is_number(cell) for cell in cells)
+        else ()
+    )
     if digits is None or digits > 9:
         return integer
     return (*integer, pa.decimal128(38, digits), pa.decimal128(38, digits + 11))
@@ -127,7 +140,9 @@ def _table(piece: bytes, typing: Typing, stamp_type: Any) -> Any:
         types[str(typing.time)] = stamp_type
     return arrow_csv.read_csv(
         pa.BufferReader(piece),
-        read_options=arrow_csv.ReadOptions(column_names=[str(index) for index in range(layout.width)]),
+        read_options=arrow_csv.ReadOptions(
+            column_names=[str(index) for index in range(layout.width)]
+        ),
         parse_options=arrow_csv.ParseOptions(delimiter=layout.separator),
         convert_options=arrow_csv.ConvertOptions(
             column_types=types,
@@ -162,10 +177,16 @@ def _chunk_stamps(chunk: Any, typing: Typing) -> NDArray[np.int64]:
     import pyarrow as pa
 
     unit = typing.unit
-    valid = np.ones(len(chunk), dtype=bool) if chunk.null_count == 0 else chunk.is_valid().to_numpy(zero_copy_only=False)
+    valid = (
+        np.ones(len(chunk), dtype=bool)
+        if chunk.null_count == 0
+        else chunk.is_valid().to_numpy(zero_copy_only=False)
+    )
     buffer = chunk.buffers()[1]
     if pa.types.is_decimal(chunk.type):
-        words = np.frombuffer(buffer, dtype=np.int64)[2 * chunk.offset :][: 2 * len(chunk)].reshape(-1, 2)
+        words = np.frombuffer(buffer, dtype=np.int64)[2 * chunk.offset :][: 2 * len(chunk)].reshape(
+            -1, 2
+        )
         low, high = words[:, 0], words[:, 1]
         valid = valid & (high == low >> 63)
         zero = typing.options.epoch_ns if unit is None or unit.epoch is None else unit.epoch
@@ -181,7 +202,9 @@ def _sum_fits(counts: NDArray[np.int64], zero: int) -> NDArray[np.bool_]:
     return (counts <= limit) & (counts >= -limit)
 
 
-def parse_cells(piece: bytes, typing: Typing) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None, int]:
+def parse_cells(
+    piece: bytes, typing: Typing
+) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None, int]:
     """Read a piece of text line by line.
 
     Returns
@@ -204,11 +227,15 @@ def parse_cells(piece: bytes, typing: Typing) -> tuple[dict[int, NDArray[np.floa
     for source in typing.sources:
         numbers = np.empty(len(rows))
         for index, row in enumerate(rows):
-            numbers[index] = np.nan if row is None else _number(row[source], comma=typing.layout.decimal_comma)
+            numbers[index] = (
+                np.nan if row is None else _number(row[source], comma=typing.layout.decimal_comma)
+            )
         if source not in typing.gyro:
             bad = np.flatnonzero(~np.isfinite(numbers))
             cells = (rows[index] for index in bad)
-            words += sum(1 for row in cells if row is not None and row[source].strip().lower() not in _VOID)
+            words += sum(
+                1 for row in cells if row is not None and row[source].strip().lower() not in _VOID
+            )
         values[source] = numbers
     return values, _cell_stamps(rows, typing), words
 

@@ -13,12 +13,21 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import looks_iso
 from gyrostab.ingest.limits import check_columns
 
-__all__ = ["BLANK", "Layout", "find_layout", "is_number", "is_text", "split_line", "unit_of_duration"]
+__all__ = [
+    "BLANK",
+    "Layout",
+    "find_layout",
+    "is_number",
+    "is_text",
+    "split_line",
+    "unit_of_duration",
+]
 
 #: Stands for any run of blanks as the separator.
 BLANK = " "
 HEAD_LINES = 200
-#: Lines that are looked at: those among which the header may be, those that follow one, and the first rows of data.
+#: Lines that are looked at: those among which the header may be, those that follow one, and the
+#: first rows of data.
 MOST_LINES = 2 * HEAD_LINES + 20
 
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
@@ -31,7 +40,8 @@ _COMMENT = re.compile(r"^\s*[#%]")
 class Layout:
     """Where things are in a text log.
 
-    `offset` [bytes] and `line` (counted from 1) are those of the first data row; `samples` holds the cells of the first few.
+    `offset` [bytes] and `line` (counted from 1) are those of the first data row; `samples` holds
+    the cells of the first few.
     """
 
     headers: tuple[str, ...]
@@ -76,7 +86,9 @@ def split_line(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in line.split(separator)]
 
 
-def find_layout(path: Path, head: bytes, *, complete: bool, limits: Mapping[str, float] | None = None) -> Layout:
+def find_layout(
+    path: Path, head: bytes, *, complete: bool, limits: Mapping[str, float] | None = None
+) -> Layout:
     """Find the layout of a text log in its first bytes.
 
     Parameters
@@ -93,19 +105,28 @@ def find_layout(path: Path, head: bytes, *, complete: bool, limits: Mapping[str,
     Raises
     ------
     FormatError
-        When the file is empty, is not text, has no data rows, or has more columns than the limit allows.
+        When the file is empty, is not text, has no data rows, or has more columns than the limit
+        allows.
     """
     lines, notes = _decode(path, head, complete=complete)
-    filled = (index for index, line in enumerate(lines) if line.strip() and not _COMMENT.match(line))
+    filled = (
+        index for index, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)
+    )
     content = list(islice(filled, MOST_LINES))
     if not content:
-        raise FormatError(f"{path.name}: there is no row of data, only {len(lines)} blank or comment lines; copy it again")
-    check_columns(path, 1 + max(lines[index].count(mark) for index in content for mark in "\t;,"), limits)
+        raise FormatError(
+            f"{path.name}: there is no row of data, only {len(lines)} blank or comment lines; copy it again"
+        )
+    check_columns(
+        path, 1 + max(lines[index].count(mark) for index in content for mark in "\t;,"), limits
+    )
     header, separator, above, first = _find_header(path, lines, content)
     offset = sum(len(line) for line in head.splitlines(keepends=True)[:first])
     data = [lines[index] for index in content if index >= first]
     if not data:
-        raise FormatError(f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; copy it again")
+        raise FormatError(
+            f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; copy it again"
+        )
     rows = [tuple(split_line(re.split("[#%]", line)[0], separator)) for line in data[:HEAD_LINES]]
     width = max((len(row) for row in rows), key=[len(row) for row in rows].count)
     headers = list(header) if header is not None else [str(column) for column in range(width)]
@@ -115,19 +136,29 @@ def find_layout(path: Path, head: bytes, *, complete: bool, limits: Mapping[str,
         notes.append(f"the header has {len(headers)} names, the rows have {width} cells")
     skipped = [index + 1 for index in content if index < above]
     if skipped:
-        notes.append(f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line {skipped[0]})")
+        notes.append(
+            f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line {skipped[0]})"
+        )
     comma = separator == ";" and _has_decimal_comma(rows)
     top = tuple(lines[:above]) if header is not None else ()
-    return Layout(tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes), top)
+    return Layout(
+        tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes), top
+    )
 
 
 def _decode(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list[str]]:
     if not head.strip():
         raise FormatError(f"{path.name}: the file is empty; copy it again")
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise FormatError(f"{path.name}: the file is UTF-16 text; save it as UTF-8 (iconv -f utf-16 -t utf-8)")
-    if not is_text(head[:4096]):  # further down, junk such as a block of zeros after a loss of power spoils single rows only
-        raise FormatError(f"{path.name}: this is not text but binary data; if it is a known format, give the file its right suffix")
+        raise FormatError(
+            f"{path.name}: the file is UTF-16 text; save it as UTF-8 (iconv -f utf-16 -t utf-8)"
+        )
+    if not is_text(
+        head[:4096]
+    ):  # further down, junk such as a block of zeros after a loss of power spoils single rows only
+        raise FormatError(
+            f"{path.name}: this is not text but binary data; if it is a known format, give the file its right suffix"
+        )
     notes = []
     lines = head.splitlines()
     if not complete and len(lines) > 1:
@@ -136,7 +167,9 @@ def _decode(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list
         text = b"\n".join(lines).decode("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
         number = next(index for index, line in enumerate(lines) if not _is_utf8(line)) + 1
-        notes.append(f"line {number} is not UTF-8 ({error.object[error.start : error.start + 1]!r}); the text was read as Latin-1")
+        notes.append(
+            f"line {number} is not UTF-8 ({error.object[error.start : error.start + 1]!r}); the text was read as Latin-1"
+        )
         text = [line.decode("latin-1") for line in lines]
     return text, notes
 
@@ -155,14 +188,22 @@ def _separator(line: str) -> str:
 
 
 def _header_cells(line: str, separator: str) -> list[str]:
-    return [cell.strip() for cell in _HEADER_CELLS.findall(line)] if separator == BLANK else split_line(line, separator)
+    return (
+        [cell.strip() for cell in _HEADER_CELLS.findall(line)]
+        if separator == BLANK
+        else split_line(line, separator)
+    )
 
 
 def _is_data(cells: list[str], *, comma: bool) -> bool:
     """Whether a row is data: a number or date somewhere, and no cell that looks like a name."""
     void = ("", "nan", "-nan", "inf", "-inf", "null", "na", "n/a", "none")
     solid = [cell for cell in cells if cell.lower() not in void and not set(cell) <= set("*-")]
-    values = [cell for cell in solid if is_number(cell, comma=comma) or looks_iso(cell) or unit_of_duration(cell)]
+    values = [
+        cell
+        for cell in solid
+        if is_number(cell, comma=comma) or looks_iso(cell) or unit_of_duration(cell)
+    ]
     return (
         bool(values)
         and 2 * len(values) >= len(solid)
@@ -170,7 +211,9 @@ def _is_data(cells: list[str], *, comma: bool) -> bool:
     )
 
 
-def _find_header(path: Path, lines: list[str], content: list[int]) -> tuple[list[str] | None, str, int, int]:
+def _find_header(
+    path: Path, lines: list[str], content: list[int]
+) -> tuple[list[str] | None, str, int, int]:
     """Header cells (None without one), separator, index of the header line and of the first data line."""
     for place, index in enumerate(content[:HEAD_LINES]):
         separator = _separator(lines[index])
@@ -182,10 +225,16 @@ def _find_header(path: Path, lines: list[str], content: list[int]) -> tuple[list
         rows = [(mark, split_line(line, mark)) for mark, line in following]
         solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark == ";")]
         widths = {len(row) for mark, row in solid or rows if mark == separator}
-        if not following or len(names) in widths or (separator != BLANK and len(names) + 1 in widths):
+        if (
+            not following
+            or len(names) in widths
+            or (separator != BLANK and len(names) + 1 in widths)
+        ):
             return names, separator, index, index + 1
     what = f"no header row or row of numbers in the first {len(lines)} lines"
-    raise FormatError(f"{path.name}: {what}; if this is a gyro log, put # before the lines above its header row, or delete them")
+    raise FormatError(
+        f"{path.name}: {what}; if this is a gyro log, put # before the lines above its header row, or delete them"
+    )
 
 
 def _commented_header(lines: list[str], first: int, separator: str, width: int) -> list[str] | None:
@@ -205,4 +254,6 @@ def _commented_header(lines: list[str], first: int, separator: str, width: int) 
 
 def _has_decimal_comma(rows: list[tuple[str, ...]]) -> bool:
     cells = [cell for row in rows for cell in row]
-    return any("," in cell and is_number(cell, comma=True) for cell in cells) and not any("." in cell and is_number(cell) for cell in cells)
+    return any("," in cell and is_number(cell, comma=True) for cell in cells) and not any(
+        "." in cell and is_number(cell) for cell in cells
+    )

@@ -12,7 +12,13 @@ from gyrostab.errors import SchemaError, TimeError
 from gyrostab.ingest.gap_table import clip_table
 from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
 from gyrostab.ingest.uniform.place import place_samples
-from gyrostab.ingest.uniform.table import add_holes, change_rate, has_gap_table, read_table, with_table
+from gyrostab.ingest.uniform.table import (
+    add_holes,
+    change_rate,
+    has_gap_table,
+    read_table,
+    with_table,
+)
 from gyrostab.schema import check_log, signal_name
 from gyrostab.time.grid import TimeGridIndex, time_coordinate
 
@@ -22,20 +28,22 @@ __all__ = ["as_uniform", "grid_of"]
 def as_uniform(log: xr.Dataset) -> xr.Dataset:
     """Bring a log onto the uniform time axis that its stamps lie on.
 
-    xarray keeps attributes through every operation, and tables of gaps through most of them. This function trusts neither: the
-    sampling rate comes from ``time``, and the table of gaps is clipped, converted or dropped. A log whose time axis is computed
-    (see `gyrostab.time.grid`) is known to be uniform, and costs nothing. Explicit stamps are checked in blocks.
+    xarray keeps attributes through every operation, and tables of gaps through most of them. This
+    function trusts neither: the sampling rate comes from ``time``, and the table of gaps is
+    clipped, converted or dropped. A log whose time axis is computed (see `gyrostab.time.grid`) is
+    known to be uniform, and costs nothing. Explicit stamps are checked in blocks.
 
     Parameters
     ----------
     log : xarray.Dataset
-        ``rate`` or ``angle`` on ``time`` and ``axis``, in any order of dimensions, or on ``time`` alone; in memory or lazy.
+        ``rate`` or ``angle`` on ``time`` and ``axis``, in any order of dimensions, or on ``time``
+        alone; in memory or lazy.
 
     Returns
     -------
     xarray.Dataset
-        The same log where nothing is to be changed. Otherwise ``(axis, time)`` with a computed time axis, NaN at every sample that is
-        missing between its stamps, and attributes that are true.
+        The same log where nothing is to be changed. Otherwise ``(axis, time)`` with a computed time
+        axis, NaN at every sample that is missing between its stamps, and attributes that are true.
 
     Raises
     ------
@@ -73,10 +81,14 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
     if isinstance(index, TimeGridIndex):
         if index.rate < 0:
             raise TimeError("the time of the log runs backwards; sort it: log.sortby('time')")
-        return UniformGrid(index.start, index.rate, size, np.array([[0, 0, size]], dtype=np.int64)), True
+        return UniformGrid(
+            index.start, index.rate, size, np.array([[0, 0, size]], dtype=np.int64)
+        ), True
     time = log.variables["time"]
     if time.dtype.kind != "M":
-        raise SchemaError(f"the time of the log is of type {time.dtype}, not dates; give it datetime64 stamps: log.assign_coords(time=...)")
+        raise SchemaError(
+            f"the time of the log is of type {time.dtype}, not dates; give it datetime64 stamps: log.assign_coords(time=...)"
+        )
 
     def read(begin: int, end: int) -> NDArray[np.int64]:
         return np.asarray(time[begin:end].values).astype("datetime64[ns]").view(np.int64)
@@ -87,9 +99,13 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
 def _with_dimensions(log: Any) -> xr.Dataset:
     """The log with its signal on ``(axis, time)``, if it has those dimensions in another order, or one axis without a dimension."""
     if not isinstance(log, xr.Dataset):
-        raise SchemaError(f"this is a {type(log).__name__}, not a log (an xarray.Dataset); make one with gyrostab.make_log")
+        raise SchemaError(
+            f"this is a {type(log).__name__}, not a log (an xarray.Dataset); make one with gyrostab.make_log"
+        )
     if "row" in log.dims:
-        raise SchemaError("these are raw rows with their stamps as written; call gyrostab.regularise(raw) first")
+        raise SchemaError(
+            "these are raw rows with their stamps as written; call gyrostab.regularise(raw) first"
+        )
     name = signal_name(log)
     dims = log.variables[name].dims
     if dims == ("time",):
@@ -119,14 +135,18 @@ def _onto_grid(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
     return timed
 
 
-def _with_true_table(log: xr.Dataset, grid: UniformGrid, declared: float | None, *, computed: bool) -> xr.Dataset:
+def _with_true_table(
+    log: xr.Dataset, grid: UniformGrid, declared: float | None, *, computed: bool
+) -> xr.Dataset:
     """The log with a table of gaps that fits its time; without one where it cannot be known."""
     table = read_table(log, grid.start, grid.rate)
     if table is None:
         return with_table(log, None, grid.start, grid.rate)
     same_rate = declared is not None and abs(declared / grid.rate - 1) < 1e-9
     if not same_rate and not (computed and declared is not None):
-        return with_table(log, None, grid.start, grid.rate)  # samples that were averaged have other gaps than those that were picked
+        return with_table(
+            log, None, grid.start, grid.rate
+        )  # samples that were averaged have other gaps than those that were picked
     fitting = table if same_rate else change_rate(table, log, declared, grid.start, grid.rate)  # type: ignore[arg-type]
     fitting = clip_table(fitting, 0, grid.size)
     if len(grid.runs) > 1:

@@ -41,7 +41,8 @@ def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | 
     Parameters
     ----------
     value : str, timedelta, datetime or float
-        ISO 8601 text (UTC unless it says otherwise), a duration such as ``"10min"``, a number of seconds after the start.
+        ISO 8601 text (UTC unless it says otherwise), a duration such as ``"10min"``, a number of
+        seconds after the start.
     option : str
         Name of the option, for messages.
     example : str
@@ -59,7 +60,9 @@ def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | 
     """
     text = value.strip() if isinstance(value, str) else value
     try:
-        is_date = isinstance(text, date | np.datetime64) or (isinstance(text, str) and bool(_DATE.match(text)))
+        is_date = isinstance(text, date | np.datetime64) or (
+            isinstance(text, str) and bool(_DATE.match(text))
+        )
         if is_date:
             return stamp_ns(text, option)
         if isinstance(text, str) and ":" in text:  # a time of day, of which day is not said
@@ -68,7 +71,9 @@ def parse_instant(value: Any, option: str, *, example: str = _EXAMPLE) -> int | 
             return 0.0
         return duration_seconds(text, option, example=example)
     except OptionError as error:
-        raise OptionError(f"{option} {value!r} is neither a time nor a duration; write {example}") from error
+        raise OptionError(
+            f"{option} {value!r} is neither a time nor a duration; write {example}"
+        ) from error
 
 
 def _is_zero(value: Any) -> bool:
@@ -78,7 +83,13 @@ def _is_zero(value: Any) -> bool:
         return False
 
 
-def cut_log(log: xr.Dataset, *, time_from: Any = None, time_to: Any = None, exclude: Span | Sequence[Span] = ()) -> xr.Dataset:
+def cut_log(
+    log: xr.Dataset,
+    *,
+    time_from: Any = None,
+    time_to: Any = None,
+    exclude: Span | Sequence[Span] = (),
+) -> xr.Dataset:
     """Cut a log to the samples from `time_from` up to, but not including, `time_to`, and take those of excluded spans as missing.
 
     Parameters
@@ -86,20 +97,23 @@ def cut_log(log: xr.Dataset, *, time_from: Any = None, time_to: Any = None, excl
     log : xarray.Dataset
         Regular log, in memory or lazy; what is lazy stays lazy.
     time_from, time_to : str, datetime or duration, optional
-        Ends of the part that is kept: a date and time (ISO 8601, UTC), or a duration after the first sample of the log.
+        Ends of the part that is kept: a date and time (ISO 8601, UTC), or a duration after the
+        first sample of the log.
     exclude : span or sequence of spans
-        Each ``"START/END"`` or a pair of instants as above. The samples from START up to, but not including, END become NaN on every
-        axis and in every channel.
+        Each ``"START/END"`` or a pair of instants as above. The samples from START up to, but not
+        including, END become NaN on every axis and in every channel.
 
     Returns
     -------
     xarray.Dataset
-        The part, with the table of gaps of that part. An excluded span is a gap of the cause "outside_range".
+        The part, with the table of gaps of that part. An excluded span is a gap of the cause
+        "outside_range".
 
     Raises
     ------
     OptionError
-        When an end cannot be read, lies outside the record, comes before the other end, or nothing is left.
+        When an end cannot be read, lies outside the record, comes before the other end, or nothing
+        is left.
 
     Examples
     --------
@@ -108,18 +122,24 @@ def cut_log(log: xr.Dataset, *, time_from: Any = None, time_to: Any = None, excl
     >>> cut_log(log, time_from="2s", time_to="8s", exclude="3s/5s").rate.values
     array([[ 2., nan, nan,  5.,  6.,  7.]])
     """
-    spans: list[Span] = [exclude] if isinstance(exclude, str) or _is_pair(exclude) else list(exclude)  # type: ignore[list-item]
+    spans: list[Span] = (
+        [exclude] if isinstance(exclude, str) or _is_pair(exclude) else list(exclude)
+    )  # type: ignore[list-item]
     if time_from is None and time_to is None and not spans:
         return log
     check_log(log)
     grid, computed = grid_of(log)
     if not computed:
-        raise SchemaError("the time axis of this log is not computed; bring it onto one first, with gyrostab.ingest.uniform.as_uniform")
+        raise SchemaError(
+            "the time axis of this log is not computed; bring it onto one first, with gyrostab.ingest.uniform.as_uniform"
+        )
     clock = _Clock(grid)
     low = 0 if time_from is None else clock.sample_of(time_from, "--from", last=grid.size - 1)
     high = grid.size if time_to is None else clock.sample_of(time_to, "--to", last=grid.size)
     if low >= high:
-        raise OptionError(f"nothing is left between --from {time_from} and --to {time_to}; {clock.describe()}")
+        raise OptionError(
+            f"nothing is left between --from {time_from} and --to {time_to}; {clock.describe()}"
+        )
     excluded = _merge([clock.span_of(span, low, high) for span in spans])
     kept = _kept_runs(low, high, excluded)
     if not len(kept):
@@ -133,7 +153,9 @@ def cut_log(log: xr.Dataset, *, time_from: Any = None, time_to: Any = None, excl
 
 
 def _is_pair(value: Any) -> bool:
-    return isinstance(value, tuple) and len(value) == 2 and not any("/" in str(end) for end in value)
+    return (
+        isinstance(value, tuple) and len(value) == 2 and not any("/" in str(end) for end in value)
+    )
 
 
 class _Clock:
@@ -144,7 +166,10 @@ class _Clock:
 
     def describe(self) -> str:
         """Say from when to when the record goes."""
-        first, end = (np.datetime64(int(grid_times(self.grid.start, self.grid.rate, n)), "ns") for n in (0, self.grid.size))
+        first, end = (
+            np.datetime64(int(grid_times(self.grid.start, self.grid.rate, n)), "ns")
+            for n in (0, self.grid.size)
+        )
         return f"the record goes from {_short(first)} to {_short(end)} ({self.grid.size / self.grid.rate:.6g} s)"
 
     def sample_of(self, value: Any, option: str, *, last: int, example: str = _EXAMPLE) -> int:
@@ -158,7 +183,9 @@ class _Clock:
         """First sample of the grid, which goes on beyond the ends of the record, at or after an instant."""
         instant = parse_instant(value, option, example=example)
         stamp = instant if isinstance(instant, int) else self.grid.start + round(instant * 1e9)
-        sample = int(np.ceil(grid_index(self.grid.start, self.grid.rate, stamp))) - 1  # which rounding may put one too high
+        sample = (
+            int(np.ceil(grid_index(self.grid.start, self.grid.rate, stamp))) - 1
+        )  # which rounding may put one too high
         while int(grid_times(self.grid.start, self.grid.rate, sample)) < stamp:
             sample += 1
         return sample
@@ -171,7 +198,9 @@ class _Clock:
             raise OptionError(f"--exclude {text!r}: write START/END, for instance {_SPAN_EXAMPLE}")
         first, end = (self.first_at(value, "--exclude", example=_SPAN_EXAMPLE) for value in ends)
         if end < first:
-            raise OptionError(f"--exclude {text}: its end comes before its start; write START/END, for instance {_SPAN_EXAMPLE}")
+            raise OptionError(
+                f"--exclude {text}: its end comes before its start; write START/END, for instance {_SPAN_EXAMPLE}"
+            )
         if first >= self.grid.size or end <= 0:
             raise OptionError(f"--exclude {text} lies outside the record; {self.describe()}")
         return max(first, low), min(end, high)
@@ -201,15 +230,23 @@ def _kept_runs(low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.i
     return np.stack([first - low, first, end - first], axis=1)[kept]
 
 
-def _cut_samples(log: xr.Dataset, kept: NDArray[np.int64], start: int, grid: UniformGrid, low: int, size: int) -> xr.Dataset:
-    lazy = any(variable.chunks is not None for variable in log.data_vars.values() if "time" in variable.dims)
+def _cut_samples(
+    log: xr.Dataset, kept: NDArray[np.int64], start: int, grid: UniformGrid, low: int, size: int
+) -> xr.Dataset:
+    lazy = any(
+        variable.chunks is not None
+        for variable in log.data_vars.values()
+        if "time" in variable.dims
+    )
     whole = len(kept) == 1 and kept[0, 2] == size
     if whole and (size == grid.size or not lazy):
         return log.isel(time=slice(low, low + size))
     return place_samples(log, kept, start, grid.rate, size)
 
 
-def _cut_channels(part: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]) -> xr.Dataset:
+def _cut_channels(
+    part: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]
+) -> xr.Dataset:
     """Channels on their own time, cut too."""
     edges = grid_times(grid.start, grid.rate, np.concatenate([[low, high], excluded.ravel()]))
     for dim in [dim for dim in part.dims if str(dim).startswith("time_") and dim in part.coords]:
@@ -222,7 +259,9 @@ def _cut_channels(part: xr.Dataset, grid: UniformGrid, low: int, high: int, excl
     return part
 
 
-def _cut_table(log: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.int64]:
+def _cut_table(
+    log: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]
+) -> NDArray[np.int64]:
     table = read_table(log, grid.start, grid.rate) if has_gap_table(log) else None
     pieces = [np.empty((0, 5), dtype=np.int64)]
     edges = [low, *excluded.ravel().tolist(), high]
@@ -234,8 +273,16 @@ def _cut_table(log: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded
     return cut
 
 
-def _history(log: xr.Dataset, time_from: Any, time_to: Any, spans: Sequence[Span], size: int) -> str:
-    given = [f"{name} {value}" for name, value in (("from", time_from), ("to", time_to)) if value is not None]
-    given += [f"without {span if isinstance(span, str) else '/'.join(map(str, span))}" for span in spans]
+def _history(
+    log: xr.Dataset, time_from: Any, time_to: Any, spans: Sequence[Span], size: int
+) -> str:
+    given = [
+        f"{name} {value}"
+        for name, value in (("from", time_from), ("to", time_to))
+        if value is not None
+    ]
+    given += [
+        f"without {span if isinstance(span, str) else '/'.join(map(str, span))}" for span in spans
+    ]
     done = f"{time_of_day()} gyrostab.cut_log: {', '.join(given)}: {size} samples"
     return "\n".join(filter(None, [str(log.attrs.get("history", "")), done]))

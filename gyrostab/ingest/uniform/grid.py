@@ -17,8 +17,10 @@ __all__ = ["ReadStamps", "UniformGrid", "find_grid"]
 
 #: Stamps that are held in memory at one time.
 BLOCK_STAMPS = 2**20
-#: A stamp belongs to the sample of the grid that it lies within this distance of [samples]. It leaves room for stamps that were
-#: rounded, and bounds the harm of two pieces that are a fraction of a sample apart: the rate found over n samples is off by 0.1 / n.
+#: A stamp belongs to the sample of the grid that it lies within this distance of [samples]. It
+#: leaves room for stamps that were
+#: rounded, and bounds the harm of two pieces that are a fraction of a sample apart: the rate found
+#: over n samples is off by 0.1 / n.
 #: `gyrostab.regularise` copes with more, and notes it.
 MAX_DEPARTURE_SAMPLES = 0.1
 
@@ -56,7 +58,8 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
     count : int
         Number of stamps.
     nominal : float, optional
-        Sampling rate that the log declares [Hz]. The stamps decide; the declared rate only says which steps may be whole samples.
+        Sampling rate that the log declares [Hz]. The stamps decide; the declared rate only says
+        which steps may be whole samples.
 
     Returns
     -------
@@ -79,7 +82,9 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
     steps = _measure_steps(read, count)
     if count == 1:
         if nominal is None:
-            raise TimeError("the log has one sample and no attribute 'sampling_rate_hz': its sampling rate is not known")
+            raise TimeError(
+                "the log has one sample and no attribute 'sampling_rate_hz': its sampling rate is not known"
+            )
         return UniformGrid(start, nominal, 1, np.array([[0, 0, 1]], dtype=np.int64))
     bases = [steps.median, float(steps.smallest)]
     if nominal is not None and 0 < nominal < math.inf:
@@ -92,7 +97,9 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
         placed = _place_stamps(read, count, start, NANOSECONDS / period)
         if placed is None:
             continue
-        slack_ns = 2 * placed[0] * period + 1  # the ends of the record say no more of the period than that
+        slack_ns = (
+            2 * placed[0] * period + 1
+        )  # the ends of the record say no more of the period than that
         for rate in _plain_rates(period, samples, slack_ns, nominal):
             plain = _place_stamps(read, count, start, rate)
             if plain is not None:
@@ -115,7 +122,9 @@ def _measure_steps(read: ReadStamps, count: int) -> _Steps:
     smallest, medians, first, last = np.iinfo(np.int64).max, [], 0, 0
     for begin, stamps in _blocks(read, count):
         if np.any(stamps == _NAT):
-            raise TimeError(f"sample {begin + int(np.argmax(stamps == _NAT))} of the log has no time (NaT); drop it: log.dropna('time')")
+            raise TimeError(
+                f"sample {begin + int(np.argmax(stamps == _NAT))} of the log has no time (NaT); drop it: log.dropna('time')"
+            )
         first = int(stamps[0]) if begin == 0 else first
         last = int(stamps[-1])
         steps = np.diff(stamps)
@@ -162,7 +171,9 @@ def _fit_period(read: ReadStamps, count: int, span: int, base: float) -> tuple[f
     return span / samples, samples
 
 
-def _place_stamps(read: ReadStamps, count: int, start: int, rate: float) -> tuple[float, NDArray[np.int64]] | None:
+def _place_stamps(
+    read: ReadStamps, count: int, start: int, rate: float
+) -> tuple[float, NDArray[np.int64]] | None:
     """Largest departure from the grid [samples] and the runs of samples; None when a stamp is too far from it."""
     worst, firsts, samples = 0.0, [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
     for begin, stamps in _blocks(read, count):
@@ -179,13 +190,17 @@ def _place_stamps(read: ReadStamps, count: int, start: int, rate: float) -> tupl
     return worst, np.stack([sample, first, np.diff(np.append(first, count))], axis=1)
 
 
-def _plain_rates(period: float, samples: int, slack_ns: float, nominal: float | None) -> Iterator[float]:
+def _plain_rates(
+    period: float, samples: int, slack_ns: float, nominal: float | None
+) -> Iterator[float]:
     """Rates [Hz] that agree with a period over so many samples to `slack_ns`: the declared one or a fraction, plain numbers, the period."""
     rate = NANOSECONDS / period
     candidates = [] if nominal is None else [nominal / max(1, round(nominal / rate))]
     for digits in range(1, 16):
         candidates += [NANOSECONDS / float(f"{period:.{digits}g}"), float(f"{rate:.{digits}g}")]
-    yield from (plain for plain in candidates if abs(NANOSECONDS / plain - period) * samples <= slack_ns)
+    yield from (
+        plain for plain in candidates if abs(NANOSECONDS / plain - period) * samples <= slack_ns
+    )
     yield rate
 
 

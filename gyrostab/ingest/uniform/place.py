@@ -50,8 +50,12 @@ def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: in
             continue
         turned = variable.transpose(..., "time")
         array = _place_array(turned.data, runs, size)
-        placed[name] = xr.Variable(turned.dims, array, variable.attrs, variable.encoding).transpose(*variable.dims)
-    whole = log.drop_vars(list(moved)).assign(placed).assign_coords(time_coordinate(start, rate, size))
+        placed[name] = xr.Variable(turned.dims, array, variable.attrs, variable.encoding).transpose(
+            *variable.dims
+        )
+    whole = (
+        log.drop_vars(list(moved)).assign(placed).assign_coords(time_coordinate(start, rate, size))
+    )
     whole = whole[[name for name in log.data_vars if name in whole.data_vars]]
     whole.set_close(log._close)
     if left_out:
@@ -66,8 +70,14 @@ def _place_array(array: Any, runs: Runs, size: int) -> Any:
         out = np.full((*array.shape[:-1], size), np.nan)
         length = runs[:, 2]
         within = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
-        out[..., np.repeat(runs[:, 0], length) + within] = array[..., np.repeat(runs[:, 1], length) + within]
+        out[..., np.repeat(runs[:, 0], length) + within] = array[
+            ..., np.repeat(runs[:, 1], length) + within
+        ]
         return out
     lazy = held(array, CHUNK_SAMPLES) if isinstance(array, np.ndarray) else array
-    rows = [[(lazy, None, runs)]] if array.ndim == 1 else [[(lazy, row, runs)] for row in range(array.shape[0])]
+    rows = (
+        [[(lazy, None, runs)]]
+        if array.ndim == 1
+        else [[(lazy, row, runs)] for row in range(array.shape[0])]
+    )
     return place_on_grid(rows, size, chunk_of([lazy]), flat=array.ndim == 1)

@@ -29,13 +29,25 @@ def read_table(log: xr.Dataset, start: int, rate: float) -> Table | None:
     if found is None:
         return None
     first, end, *rest = found
-    return np.stack([*(np.rint(grid_index(start, rate, stamps)).astype(np.int64) for stamps in (first, end)), *rest], axis=1)
+    return np.stack(
+        [
+            *(np.rint(grid_index(start, rate, stamps)).astype(np.int64) for stamps in (first, end)),
+            *rest,
+        ],
+        axis=1,
+    )
 
 
 def _read_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
     """Stamps of the two ends [ns since 1970], samples, rows, cause."""
     columns: list[NDArray[np.int64]] = []
-    for name, kind in (("gap_start", "M"), ("gap_end", "M"), ("gap_samples", "iu"), ("gap_rows", "iu"), ("gap_cause", "iu")):
+    for name, kind in (
+        ("gap_start", "M"),
+        ("gap_end", "M"),
+        ("gap_samples", "iu"),
+        ("gap_rows", "iu"),
+        ("gap_cause", "iu"),
+    ):
         variable = log.variables.get(name)
         if variable is None and name == "gap_rows":
             columns.append(np.zeros_like(columns[-1]))
@@ -44,10 +56,20 @@ def _read_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
             return None
         values = np.asarray(variable.values)
         if kind == "M" and np.isnat(values).any():
-            raise SchemaError(f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time must be known")
-        columns.append(values.astype("datetime64[ns]").view(np.int64) if kind == "M" else values.astype(np.int64))
+            raise SchemaError(
+                f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time must be known"
+            )
+        columns.append(
+            values.astype("datetime64[ns]").view(np.int64)
+            if kind == "M"
+            else values.astype(np.int64)
+        )
     first, end, samples, _, cause = columns
-    spoilt = np.any(end < first) or np.any(samples < 0) or np.any((cause < 0) | (cause >= len(GAP_CAUSES)))
+    spoilt = (
+        np.any(end < first)
+        or np.any(samples < 0)
+        or np.any((cause < 0) | (cause >= len(GAP_CAUSES)))
+    )
     return None if spoilt else columns
 
 
@@ -70,7 +92,9 @@ def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate
     table = table.copy()
     old_length = np.rint((columns[1] - columns[0]) * (old_rate / 1e9)).astype(np.int64)
     for column, stamps in ((FIRST, columns[0]), (END, columns[1])):
-        table[:, column] = np.ceil(grid_index(start, rate, stamps) - 1e-6)  # the first picked sample at or after it
+        table[:, column] = np.ceil(
+            grid_index(start, rate, stamps) - 1e-6
+        )  # the first picked sample at or after it
     length = table[:, END] - table[:, FIRST]
     share = np.divide(table[:, SAMPLES], old_length, out=np.zeros(len(table)), where=old_length > 0)
     lost = (table[:, SAMPLES] > 0) & (length == 0)  # it lay between two samples that were picked
@@ -89,7 +113,9 @@ def add_holes(table: Table, runs: Table) -> Table:
         which = np.minimum(np.searchsorted(stop, end, side="left"), len(stop) - 1)
         end = np.where((begin[which] < end) & (end <= stop[which]), begin[which], end)
         listed = np.concatenate([[0], np.cumsum(stop - begin)])
-        within = listed[np.searchsorted(stop, end, side="right")] - listed[np.searchsorted(begin, first)]
+        within = (
+            listed[np.searchsorted(stop, end, side="right")] - listed[np.searchsorted(begin, first)]
+        )
     else:
         within = np.zeros_like(first)
     samples = end - first - np.maximum(within, 0)
@@ -102,7 +128,10 @@ def add_holes(table: Table, runs: Table) -> Table:
 def _merged(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First samples and ends of the stretches that the lines of a table cover together."""
     order = np.argsort(table[:, FIRST], kind="stable")
-    first, end = table[order, FIRST], np.maximum.accumulate(table[order, END]) if len(table) else table[:, END]
+    first, end = (
+        table[order, FIRST],
+        np.maximum.accumulate(table[order, END]) if len(table) else table[:, END],
+    )
     new = np.concatenate([[True], first[1:] > end[:-1]]) if len(table) else np.zeros(0, np.bool_)
     last = np.concatenate([new[1:], [True]]) if len(table) else new
     return first[new], end[last]
@@ -110,7 +139,10 @@ def _merged(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def add_spans(table: Table, spans: Table, cause: int) -> Table:
     """The table with spans of samples (first, end) of one cause, in place of what it says of them."""
-    rows = [np.array([[first, end, end - first, 0, cause]], dtype=np.int64) for first, end in spans.tolist()]
+    rows = [
+        np.array([[first, end, end - first, 0, cause]], dtype=np.int64)
+        for first, end in spans.tolist()
+    ]
     return _sorted(np.concatenate([table, *rows]))
 
 
@@ -121,5 +153,7 @@ def _sorted(table: Table) -> Table:
 
 def with_table(log: xr.Dataset, table: Table | None, start: int, rate: float) -> xr.Dataset:
     """The log with this table of gaps in place of its own; None for no table."""
-    bare = log.drop_vars([name for name, variable in log.variables.items() if "gap" in variable.dims])
+    bare = log.drop_vars(
+        [name for name, variable in log.variables.items() if "gap" in variable.dims]
+    )
     return bare if table is None else bare.assign(gap_variables(table, start, rate))

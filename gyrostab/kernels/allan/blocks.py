@@ -1,13 +1,15 @@
 """Improved fast DAVAR by two-part block sums: every second difference once, additions only.
 
-Windows start on multiples of the step S and hold ``L = W - 2k + 1`` second differences of the angle. Per block of S
-samples and per averaging factor k two sums are kept: the *head*, the first ``L mod S`` terms, and the *tail*, the
-rest. A window is then a number of whole blocks plus one head, for every window and exactly. Nothing is subtracted, so
-a shock does not stay behind in the sums as it does in a recursion (Wang et al., Sensors 16 (2016), Eq. 19).
+Windows start on multiples of the step S and hold ``L = W - 2k + 1`` second differences of the
+angle. Per block of S samples and per averaging factor k two sums are kept: the *head*, the first
+``L mod S`` terms, and the *tail*, the rest. A window is then a number of whole blocks plus one
+head, for every window and exactly. Nothing is subtracted, so a shock does not stay behind in the
+sums as it does in a recursion (Wang et al., Sensors 16 (2016), Eq. 19).
 
-The angle is integrated anew for each unit of work from the rate less a constant: the Allan variance is blind to a
-constant rate, and a short integral keeps its digits on a rotating tool. Where even the short integral is too large for
-double precision (a shock of 10^6 sigma) the angle is kept as a sum of two doubles.
+The angle is integrated anew for each unit of work from the rate less a constant: the Allan variance
+is blind to a constant rate, and a short integral keeps its digits on a rotating tool. Where even
+the short integral is too large for double precision (a shock of 10^6 sigma) the angle is kept as a
+sum of two doubles.
 
 Missing samples never enter the loops: valid terms are intervals between gaps.
 """
@@ -24,7 +26,8 @@ from gyrostab.kernels.compiled import INNER, KERNEL
 
 __all__ = ["full_counts", "grouped_blocks", "groups", "held_points", "windows_from_blocks"]
 
-# Points that a group of averaging factors goes through before the next one does: so few that they stay in the second-level cache, so many
+# Points that a group of averaging factors goes through before the next one does: so few that they
+# stay in the second-level cache, so many
 # that the processor can foresee where the loops of short blocks end.
 _STRETCH = 65536
 
@@ -32,7 +35,8 @@ _STRETCH = 65536
 def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
     """First averaging factor of each group that goes through the angle together, and the end.
 
-    The factors of a group have one shift; there are `TOGETHER` of them at most, or `IN_A_ROW` that follow each other.
+    The factors of a group have one shift; there are `TOGETHER` of them at most, or `IN_A_ROW` that
+    follow each other.
     """
     starts = np.flatnonzero(np.diff(shifts)) + 1
     lags = ks >> shifts
@@ -48,7 +52,22 @@ def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64
 
 
 @njit(**INNER)
-def _limit(i, count, first, high, stop, step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):  # type: ignore[no-untyped-def]
+def _limit(
+    i,
+    count,
+    first,
+    high,
+    stop,
+    step,
+    block,
+    n_windows,
+    ks,
+    shifts,
+    head_lengths,
+    whole,
+    splits,
+    sizes,
+):  # type: ignore[no-untyped-def]
     """Terms of the head and of head and tail, from `first` on, of `count` averaging factors from number i on; the most of them."""
     shift = shifts[i]
     up = (1 << shift) - 1
@@ -86,9 +105,35 @@ def _add_stretch(  # type: ignore[no-untyped-def]
                 if starts[r] >= high:
                     break
                 first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
-                if _limit(i, count, first, high, stops[r], step, block, n_windows, ks, shifts, head_lengths, whole, splits, sizes):
+                if _limit(
+                    i,
+                    count,
+                    first,
+                    high,
+                    stops[r],
+                    step,
+                    block,
+                    n_windows,
+                    ks,
+                    shifts,
+                    head_lengths,
+                    whole,
+                    splits,
+                    sizes,
+                ):
                     place = places[i] + first - (base >> shift)
-                    split_sums(flat, place, count, lags, i, splits, sizes, heads, tails, block * ks.size + i)
+                    split_sums(
+                        flat,
+                        place,
+                        count,
+                        lags,
+                        i,
+                        splits,
+                        sizes,
+                        heads,
+                        tails,
+                        block * ks.size + i,
+                    )
                     if out.shape[0] > 2:
                         for q in range(count):
                             out[2, block, i + q] += splits[q]
@@ -121,7 +166,8 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Heads and tails of every block and averaging factor, and their numbers of terms, into `out` (2 or 4, n_blocks, n_tau).
 
-    The angle is integrated as the blocks need it, and of what has been integrated only so much is held that it stays in the cache.
+    The angle is integrated as the blocks need it, and of what has been integrated only so much is
+    held that it stays in the cache.
 
     Parameters
     ----------
@@ -130,13 +176,14 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
     offset : float
         Taken from each rate.
     flat, capacity, places : float64, int, int64 (n_tau,)
-        Room for so many points of the angle (see `held_points`) and their thinned levels (see `pyramid_places`); where the level of each
-        averaging factor begins.
+        Room for so many points of the angle (see `held_points`) and their thinned levels (see
+        `pyramid_places`); where the level of each averaging factor begins.
     starts, stops : int64 (n_runs,)
         Runs of present points of the angle, one more each than of present rates.
     step, ks, shifts, groups, head_lengths, whole, n_windows
-        Samples of a block; averaging factors, their thinning (`flat` holds the angle thinned by ``2**shifts[i]``) and groups; terms of a
-        head; blocks of a window, not rising; windows: there are ``n_windows + whole[0]`` blocks.
+        Samples of a block; averaging factors, their thinning (`flat` holds the angle thinned by
+        ``2**shifts[i]``) and groups; terms of a head; blocks of a window, not rising; windows:
+        there are ``n_windows + whole[0]`` blocks.
     out : float64 (2 or 4, n_blocks, n_tau)
         Overwritten.
 
@@ -167,7 +214,9 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
                     by = (first >> levels << levels) - base
                     _move_to_front(flat, capacity, levels, by, done + 1 - base)
                     base += by
-                total, reached, run = integrate_tile(x, offset, starts, ends, done, b, total, run, flat[done - base : b + 1 - base])
+                total, reached, run = integrate_tile(
+                    x, offset, starts, ends, done, b, total, run, flat[done - base : b + 1 - base]
+                )
                 largest = max(largest, reached)
                 thin_pyramid(flat, capacity, levels, done + 1 - base, b + 1 - base)
                 done = b
@@ -217,7 +266,9 @@ def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-de
         first = stop
 
 
-def full_counts(window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.float64]:
+def full_counts(
+    window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Terms of each window without gaps, (n_windows, n_tau)."""
     lengths = window - 2 * ks + 1
     if not shifts.any():

@@ -1,12 +1,14 @@
 """Weighted cluster means: the Allan variance of a rate log so full of gaps that few unbroken runs are left.
 
-Each cluster mean uses the samples that are there; a pair of clusters with n1 and n2 samples has weight n1 n2, and both
-must be at least half full. Random walk and flicker come out right. White and quantization noise come out too high by factors
-that the mask alone determines, and so does a ramp, slightly, as lost samples move the centres of the clusters; those responses are
-returned, so that a fit can use them as its columns.
+Each cluster mean uses the samples that are there; a pair of clusters with n1 and n2 samples has
+weight n1 n2, and both must be at least half full. Random walk and flicker come out right. White and
+quantization noise come out too high by factors that the mask alone determines, and so does a ramp,
+slightly, as lost samples move the centres of the clusters; those responses are returned, so that a
+fit can use them as its columns.
 
-What a pair of clusters adds does not depend on the window, so it is summed in blocks as the other terms are (see
-`gyrostab.kernels.allan.blocks`). Samples and runs are counted in a mask of one bit a sample, which stays in the cache.
+What a pair of clusters adds does not depend on the window, so it is summed in blocks as the other
+terms are (see `gyrostab.kernels.allan.blocks`). Samples and runs are counted in a mask of one bit a
+sample, which stays in the cache.
 """
 
 from __future__ import annotations
@@ -23,19 +25,25 @@ __all__ = ["cluster_cells", "cluster_factor", "cluster_strides", "integrate_plac
 
 # Reassociation lets the inner loop run on vectors; NaN and infinity keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
-# First terms of the pairs that are summed for the degrees of freedom, at most; where there are more, sections of so many.
+# First terms of the pairs that are summed for the degrees of freedom, at most; where there are
+# more, sections of so many.
 _TERMS = 384
 _SECTION = 8
 # Places of the sections: spread evenly, but in step with no regular loss.
 _GOLDEN = 0.6180339887498949
 # Bits of a word whose place has the bit 1, 2, 4, 8, 16 or 32.
-_BITS = np.array([sum(1 << place for place in range(64) if place >> i & 1) for i in range(6)], dtype=np.uint64).view(np.int64)
+_BITS = np.array(
+    [sum(1 << place for place in range(64) if place >> i & 1) for i in range(6)], dtype=np.uint64
+).view(np.int64)
 
 
-def cluster_strides(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
+def cluster_strides(
+    window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
+) -> NDArray[np.int64]:
     """Distance of the pairs of clusters that are used, a power of two: every `2**shift`-th, or as many as have something to add.
 
-    Pairs closer than k/16 add next to nothing where many of them fit the window; where 256 or fewer do, all are used.
+    Pairs closer than k/16 add next to nothing where many of them fit the window; where 256 or fewer
+    do, all are used.
     """
     largest = np.maximum(np.minimum(ks // 16, (window - 2 * ks + 1) // 256), 1)
     return np.maximum(2 ** np.floor(np.log2(largest)).astype(np.int64), 2**shifts).astype(np.int64)
@@ -70,8 +78,8 @@ def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
     Returns
     -------
     int64 (n // 64 + 1, 5)
-        Samples present, and those of them that begin a run, as bits; how many there are of both before these 64; sum of the numbers
-        (0 to n - 1) of the samples present before these 64.
+        Samples present, and those of them that begin a run, as bits; how many there are of both
+        before these 64; sum of the numbers (0 to n - 1) of the samples present before these 64.
     """
     mask = np.zeros((n // 64 + 1, 5), np.int64)
     one = np.int64(1)
@@ -122,7 +130,11 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
     count = 0
     for m in range((a + stride - 1) // stride * stride, b, stride):
         row0, row1, row2 = np.uint64(m >> 6), np.uint64((m + k) >> 6), np.uint64((m + 2 * k) >> 6)
-        low0, low1, low2 = (one << (m & 63)) - one, (one << ((m + k) & 63)) - one, (one << ((m + 2 * k) & 63)) - one
+        low0, low1, low2 = (
+            (one << (m & 63)) - one,
+            (one << ((m + k) & 63)) - one,
+            (one << ((m + 2 * k) & 63)) - one,
+        )
         middle = mask[row1, 2] + _ones(mask[row1, 0] & low1)
         n1 = middle - mask[row0, 2] - _ones(mask[row0, 0] & low0)
         n2 = mask[row2, 2] + _ones(mask[row2, 0] & low2) - middle
@@ -130,16 +142,24 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
             continue
         f1, f2 = float(n1), float(n2)
         at0, at1, at2 = np.uint64(m), np.uint64(m + k), np.uint64(m + 2 * k)
-        d = (theta[at2] - theta[at1]) * f1 - (theta[at1] - theta[at0]) * f2  # n1 n2 times the difference of the means
+        d = (theta[at2] - theta[at1]) * f1 - (
+            theta[at1] - theta[at0]
+        ) * f2  # n1 n2 times the difference of the means
         if places.size:
             before, behind = places[at1] - places[at0], places[at2] - places[at1]
         else:
             place1 = _places_before(mask, row1, low1)
-            before, behind = float(place1 - _places_before(mask, row0, low0)), float(_places_before(mask, row2, low2) - place1)
+            before, behind = (
+                float(place1 - _places_before(mask, row0, low0)),
+                float(_places_before(mask, row2, low2) - place1),
+            )
         apart = behind * f1 - before * f2  # and that of their centres
         # a run that a cluster cuts counts in both
         runs = mask[row1, 3] + _ones(mask[row1, 1] & low1)
-        cut0, cut1 = mask[row0, 0] & ~mask[row0, 1] & (low0 + one) != 0, mask[row1, 0] & ~mask[row1, 1] & (low1 + one) != 0
+        cut0, cut1 = (
+            mask[row0, 0] & ~mask[row0, 1] & (low0 + one) != 0,
+            mask[row1, 0] & ~mask[row1, 1] & (low1 + one) != 0,
+        )
         r1 = runs - mask[row0, 3] - _ones(mask[row0, 1] & low0) + cut0
         r2 = mask[row2, 3] + _ones(mask[row2, 1] & low2) - runs + cut1
         inverse = 1.0 / (f1 * f2)
@@ -166,7 +186,8 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
     theta : float64 (n + 1,)
         Integral of the rate over present samples, gaps adding nothing.
     places : float64 (n + 1,) or (0,)
-        As from `integrate_places`, which pays where there are more pairs than samples; without it the same numbers come from the mask.
+        As from `integrate_places`, which pays where there are more pairs than samples; without it
+        the same numbers come from the mask.
     mask
         As from `pack_mask`.
     window, step, k, stride : int
@@ -177,9 +198,10 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
     Returns
     -------
     float64 (n_windows, 6)
-        Weighted mean of ``(mean2 - mean1)^2 / 2`` [square of the rate's unit]; responses to unit white and quantization
-        noise, relative to the gap-free laws; weight used, as a share of the gap-free weight; number of pairs used, 0 where
-        there are none or the window is not wanted; response to a ramp.
+        Weighted mean of ``(mean2 - mean1)^2 / 2`` [square of the rate's unit]; responses to unit
+        white and quantization noise, relative to the gap-free laws; weight used, as a share of the
+        gap-free weight; number of pairs used, 0 where there are none or the window is not wanted;
+        response to a ramp.
     """
     length = window - 2 * k + 1
     whole = length // step
@@ -214,8 +236,8 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
 def _look(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
     """Fill the columns of `places` for m on a grid from `begin` on.
 
-    Rows: present samples before m, m + k and m + 2k, those of the two clusters, and the reciprocal of the product of these
-    two, or zero where a cluster is less than half full.
+    Rows: present samples before m, m + k and m + 2k, those of the two clusters, and the reciprocal
+    of the product of these two, or zero where a cluster is less than half full.
     """
     for i in range(places.shape[1]):
         m = begin + i * grid
@@ -231,10 +253,16 @@ def _look(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
 def _overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
     """Sum over the terms ``first <= j < stop`` of weight times squared covariance with term i, less than k before them.
 
-    Of the means of clusters of n1 and n2 samples, and p1 and p2 of the other term, those share samples that overlap.
+    Of the means of clusters of n1 and n2 samples, and p1 and p2 of the other term, those share
+    samples that overlap.
     """
     a1, a2, n1, n2 = places[1, i], places[2, i], places[3, i], places[4, i]
-    b0, b1, p1, p2 = places[0, first:stop], places[1, first:stop], places[3, first:stop], places[4, first:stop]
+    b0, b1, p1, p2 = (
+        places[0, first:stop],
+        places[1, first:stop],
+        places[3, first:stop],
+        places[4, first:stop],
+    )
     inverse = places[5, first:stop]
     total = 0.0
     for j in range(inverse.size):
@@ -259,8 +287,9 @@ def _touching(places, i, first, stop):  # type: ignore[no-untyped-def]
 def _add_section(places, lags, close, many, sums):  # type: ignore[no-untyped-def]
     """Add the pairs of terms whose first is one of the first `many` of `places`: of the mask, and of a full window.
 
-    `sums` gets the weight, the pairs, and both of a full window; `lags` are the running sums of the squared correlations of a full
-    window, and `close` of them belong to clusters that overlap their own shifted selves.
+    `sums` gets the weight, the pairs, and both of a full window; `lags` are the running sums of the
+    squared correlations of a full window, and `close` of them belong to clusters that overlap their
+    own shifted selves.
     """
     size = places.shape[1]
     for i in range(many):
@@ -272,7 +301,9 @@ def _add_section(places, lags, close, many, sums):  # type: ignore[no-untyped-de
         own = places[3, i] + places[4, i]
         near = min(i + close, stop)
         sums[0] += own
-        sums[1] += own * own + 2.0 * places[5, i] * (_overlapping(places, i, i + 1, near) + _touching(places, i, near, stop))
+        sums[1] += own * own + 2.0 * places[5, i] * (
+            _overlapping(places, i, i + 1, near) + _touching(places, i, near, stop)
+        )
 
 
 @njit(**INNER)
@@ -300,8 +331,9 @@ def _pair_sums(mask, begin, end, grid, k, sums):  # type: ignore[no-untyped-def]
 def cluster_factor(mask, first, window, k, stride):  # type: ignore[no-untyped-def]
     """Degrees of freedom of a cell under white noise, seen through its mask, as a share of the gap-free window's.
 
-    The pairs of terms are taken on a grid of k/8 to k/4, finer where few terms fit the window or all of the grid are lost.
-    Arguments as `cluster_cells`, `first` being the first sample of the window.
+    The pairs of terms are taken on a grid of k/8 to k/4, finer where few terms fit the window or
+    all of the grid are lost. Arguments as `cluster_cells`, `first` being the first sample of the
+    window.
     """
     end = first + window - 2 * k + 1
     grid = stride

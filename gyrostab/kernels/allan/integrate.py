@@ -1,7 +1,8 @@
 """From samples to the angle: which are present, their sums per block, the integral, and the integral thinned by octaves.
 
-Missing samples never enter an inner loop: a sum that is not finite tells that a stretch has some, and only then are its
-samples looked at one by one. After that everything works on runs of present samples.
+Missing samples never enter an inner loop: a sum that is not finite tells that a stretch has some,
+and only then are its samples looked at one by one. After that everything works on runs of present
+samples.
 """
 
 from __future__ import annotations
@@ -36,8 +37,10 @@ _LOOK = 512
 _STRIP = 64
 # Samples in which the first present one is looked for at once.
 _SEARCH = 4096
-# Largest angle, over the median change from sample to sample, up to which doubles do: cells are then wrong by 2e-11 at most, and a
-# bias that drifts by ten times the noise within a unit of work does not cost the time of two doubles.
+# Largest angle, over the median change from sample to sample, up to which doubles do: cells are
+# then wrong by 2e-11 at most, and a
+# bias that drifts by ten times the noise within a unit of work does not cost the time of two
+# doubles.
 _PLAIN = 1e7
 
 
@@ -97,7 +100,10 @@ def _edges(x, step, known, starts, stops):  # type: ignore[no-untyped-def]
     run = 0
     inside = False
     for block in range(known.size):
-        first, last = block * step, min((block + 1) * step, x.size) if block + 1 < known.size else x.size
+        first, last = (
+            block * step,
+            min((block + 1) * step, x.size) if block + 1 < known.size else x.size,
+        )
         if inside and known[block] == last - first:
             continue
         for a in range(first, last, _STRIP):
@@ -135,7 +141,8 @@ def present_runs(x, step, known):  # type: ignore[no-untyped-def]
     step : int
         Samples of a block; the last one has the rest.
     known : float64 (n_blocks,)
-        Finite samples of each block, or -1 where that is not known; of a whole block none is looked at.
+        Finite samples of each block, or -1 where that is not known; of a whole block none is looked
+        at.
     """
     runs = np.empty((2, x.size // 256 + 16), np.int64)
     count = _edges(x, step, known, runs[0], runs[1])
@@ -218,7 +225,9 @@ def integrate(x, offset, starts, stops, theta):  # type: ignore[no-untyped-def]
     run = 0
     for a in range(0, x.size, TILE):
         b = min(a + TILE, x.size)
-        total, reached, run = integrate_tile(x, offset, starts, stops, a, b, total, run, theta[a : b + 1])
+        total, reached, run = integrate_tile(
+            x, offset, starts, stops, a, b, total, run, theta[a : b + 1]
+        )
         largest = max(largest, reached)
     return largest
 
@@ -258,11 +267,13 @@ def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:
     return bool(change.size > 0 and largest > _PLAIN * np.median(change))
 
 
-def pyramid_places(n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+def pyramid_places(
+    n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], int]:
     """Where ``theta[:: 2**shift]`` of every shift (not falling) begins in one array, and the size of that array.
 
-    Behind the angles there is room for what `gyrostab.kernels.allan.vectors.split_sums` reads and ignores: it goes as far with
-    the longest of its lags as with the shortest.
+    Behind the angles there is room for what `gyrostab.kernels.allan.vectors.split_sums` reads and
+    ignores: it goes as far with the longest of its lags as with the shortest.
     """
     apart = 0
     for i in range(ks.size):

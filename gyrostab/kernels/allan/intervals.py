@@ -1,6 +1,7 @@
 """Block sums interval by interval, one averaging factor at a time: where the angle needs two doubles or has gaps itself.
 
-`gyrostab.kernels.allan.blocks` is several times faster and does the rest; both fill the same heads and tails.
+`gyrostab.kernels.allan.blocks` is several times faster and does the rest; both fill the same heads
+and tails.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ def valid_intervals(starts, stops, k, angle):  # type: ignore[no-untyped-def]
 @njit(fastmath=_FAST, **INNER)
 def _energy(theta, a, b, k):  # type: ignore[no-untyped-def]
     """Sum of squared second differences over ``a <= m < b``."""
-    # Three slices: with theta[m + k] the signed index costs a wraparound test that blocks vectorisation.
+    # Three slices: with theta[m + k] the signed index costs a wraparound test that blocks
+    # vectorisation.
     first = theta[a:b]
     middle = theta[a + k : b + k]
     last = theta[a + 2 * k : b + 2 * k]
@@ -125,7 +127,9 @@ def _part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: i
 
 
 @njit(**KERNEL)
-def single_blocks(high, low, places, starts, stops, angle, step, ks, shifts, head_lengths, whole, n_windows):  # type: ignore[no-untyped-def]
+def single_blocks(
+    high, low, places, starts, stops, angle, step, ks, shifts, head_lengths, whole, n_windows
+):  # type: ignore[no-untyped-def]
     """Heads and tails as `gyrostab.kernels.allan.blocks.grouped_blocks`; `low` is the remainder of `high`, or empty."""
     n_blocks = n_windows + whole[0]
     heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
@@ -140,7 +144,31 @@ def single_blocks(high, low, places, starts, stops, angle, step, ks, shifts, hea
             b = a + head_lengths[i]
             while near < end.size and end[near] <= a:
                 near += 1
-            _part(theta, rest, begin, end, near, a, b, ks[i], shifts[i], heads[block, i : i + 1], head_counts[block, i : i + 1])
+            _part(
+                theta,
+                rest,
+                begin,
+                end,
+                near,
+                a,
+                b,
+                ks[i],
+                shifts[i],
+                heads[block, i : i + 1],
+                head_counts[block, i : i + 1],
+            )
             if whole[i] > 0 and block < last:
-                _part(theta, rest, begin, end, near, b, a + step, ks[i], shifts[i], tails[block, i : i + 1], tail_counts[block, i : i + 1])
+                _part(
+                    theta,
+                    rest,
+                    begin,
+                    end,
+                    near,
+                    b,
+                    a + step,
+                    ks[i],
+                    shifts[i],
+                    tails[block, i : i + 1],
+                    tail_counts[block, i : i + 1],
+                )
     return heads, tails, head_counts, tail_counts

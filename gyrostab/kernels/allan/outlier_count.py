@@ -1,9 +1,10 @@
 """Count the single samples of each window that stand far from both neighbours.
 
-A sample is an outlier where it exceeds both neighbours, or falls below both, by more than `LIMIT_SIGMA` standard deviations
-of the difference of two samples, measured over its segment and again over the samples around it, so that noise which is
-louder for a while is not counted. In white noise both differences reach 8 standard deviations with a probability of about
-exp(-8**2 * 2 / 3), which is 3e-19: never in a record.
+A sample is an outlier where it exceeds both neighbours, or falls below both, by more than
+`LIMIT_SIGMA` standard deviations of the difference of two samples, measured over its segment and
+again over the samples around it, so that noise which is louder for a while is not counted. In white
+noise both differences reach 8 standard deviations with a probability of about exp(-8**2 * 2 / 3),
+which is 3e-19: never in a record.
 """
 
 from __future__ import annotations
@@ -16,12 +17,15 @@ from gyrostab.kernels.compiled import INNER, KERNEL
 __all__ = ["LIMIT_SIGMA", "count_outliers"]
 
 LIMIT_SIGMA = 8.0
-#: Samples of a segment, and second differences, spread over it, whose median gives its noise: to 10 %, which 8 sigma bear.
+#: Samples of a segment, and second differences, spread over it, whose median gives its noise: to 10
+#: %, which 8 sigma bear.
 _SEGMENT_SAMPLES, _MEDIAN_OF = 8192, 128
-#: Samples on either side of an outlier that give the noise around it: several bit errors in a damaged packet leave most of
+#: Samples on either side of an outlier that give the noise around it: several bit errors in a
+#: damaged packet leave most of
 #: them good, while noise that is louder for longer raises their median.
 _AROUND_SAMPLES = 128
-#: From the median of absolute second differences of white noise to the standard deviation of first differences:
+#: From the median of absolute second differences of white noise to the standard deviation of first
+#: differences:
 #: sqrt(2) / (sqrt(6) * 0.6745).
 _TO_DIFFERENCE = 0.8560
 
@@ -73,7 +77,9 @@ def count_outliers(x, starts, length):  # type: ignore[no-untyped-def]
     total = 0
     for begin in range(1, x.size - 1, _SEGMENT_SAMPLES):
         end = min(begin + _SEGMENT_SAMPLES, x.size - 1)
-        limit = LIMIT_SIGMA * _measure_noise(x, begin, end, max(1, (end - begin) // _MEDIAN_OF), room)
+        limit = LIMIT_SIGMA * _measure_noise(
+            x, begin, end, max(1, (end - begin) // _MEDIAN_OF), room
+        )
         if limit == 0.0 or _count_beyond(x[begin - 1 : end + 1], limit) == 0:
             continue
         for i in range(begin, end):

@@ -1,8 +1,9 @@
 """Sums over pairs of second differences: how many independent ones an overlapping Allan variance is worth.
 
-For Gaussian second differences with autocorrelation ``rho(l)`` a mean of n squares has ``n^2 / v(n)`` equivalent degrees
-of freedom, ``v(n) = sum_ij rho(i - j)^2`` (Greenhall and Riley, PTTI 2003). For angle random walk rho is piecewise linear
-and the sum has a closed form; runs between gaps of a rate log share no samples and so simply add their v.
+For Gaussian second differences with autocorrelation ``rho(l)`` a mean of n squares has ``n^2 /
+v(n)`` equivalent degrees of freedom, ``v(n) = sum_ij rho(i - j)^2`` (Greenhall and Riley, PTTI
+2003). For angle random walk rho is piecewise linear and the sum has a closed form; runs between
+gaps of a rate log share no samples and so simply add their v.
 """
 
 from __future__ import annotations

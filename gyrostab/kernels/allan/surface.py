@@ -8,8 +8,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.allan.blocks import full_counts, grouped_blocks, groups, held_points, windows_from_blocks
-from gyrostab.kernels.allan.clusters import cluster_cells, cluster_factor, cluster_strides, integrate_places, pack_mask
+from gyrostab.kernels.allan.blocks import (
+    full_counts,
+    grouped_blocks,
+    groups,
+    held_points,
+    windows_from_blocks,
+)
+from gyrostab.kernels.allan.clusters import (
+    cluster_cells,
+    cluster_factor,
+    cluster_strides,
+    integrate_places,
+    pack_mask,
+)
 from gyrostab.kernels.allan.integrate import (
     block_sums,
     first_present,
@@ -29,7 +41,16 @@ __all__ = ["CELL_FIELDS", "NONE", "STRICT", "WEIGHTED", "Unit", "surface_unit", 
 
 NONE, STRICT, WEIGHTED = 0, 1, 2
 #: Order of the fields of a cell in the array that `surface_unit` returns.
-CELL_FIELDS = ("avar", "count", "coverage", "gap_factor", "estimator", "white_response", "quantization_response", "ramp_response")
+CELL_FIELDS = (
+    "avar",
+    "count",
+    "coverage",
+    "gap_factor",
+    "estimator",
+    "white_response",
+    "quantization_response",
+    "ramp_response",
+)
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -46,7 +67,8 @@ class Unit(NamedTuple):
     window, step : int
         Window and step [samples].
     ks, shifts : int64 (n_tau,)
-        Averaging factors, rising, and the powers of two that thin their second differences, not falling.
+        Averaging factors, rising, and the powers of two that thin their second differences, not
+        falling.
     angle : bool
         The samples are cumulative angles, ``window + 1`` of them to a window, instead of rates.
     interval : float
@@ -95,7 +117,9 @@ def _share_gaps(starts, stops, angle, window, step, ks, shifts, counts, full, ce
                 cells[3, j, i] = counts[j, i] / full[j, i]
             continue
         begin, end = valid_intervals(starts, stops, ks[i], angle)
-        factors = strict_gap_factors(begin, end, counts[:, i], full[:, i], ks[i], shifts[i], window, step)
+        factors = strict_gap_factors(
+            begin, end, counts[:, i], full[:, i], ks[i], shifts[i], window, step
+        )
         for j in range(factors.size):
             cells[3, j, i] = factors[j]
 
@@ -118,7 +142,9 @@ def _bridge_gaps(theta, starts, stops, window, step, ks, strides, poor, cells): 
                 cells[0, j, i] = bridged[j, 0] if found else np.nan
                 cells[1, j, i] = bridged[j, 4]
                 cells[2, j, i] = bridged[j, 3]
-                cells[3, j, i] = cluster_factor(mask, j * step, window, ks[i], strides[i]) if found else 0.0
+                cells[3, j, i] = (
+                    cluster_factor(mask, j * step, window, ks[i], strides[i]) if found else 0.0
+                )
                 cells[4, j, i] = WEIGHTED
                 cells[5, j, i] = bridged[j, 1]
                 cells[6, j, i] = bridged[j, 2]
@@ -137,12 +163,19 @@ def _line_removed(x: NDArray[np.generic], starts: Integers, stops: Integers) -> 
     """Angle less the line through its first and last present points, zero where it is missing."""
     first, last = starts[0], stops[-1] - 1
     values = np.asarray(x, dtype=np.float64)
-    line = values[first] + (values[last] - values[first]) / max(last - first, 1) * (np.arange(values.size) - first)
+    line = values[first] + (values[last] - values[first]) / max(last - first, 1) * (
+        np.arange(values.size) - first
+    )
     return np.where(np.isfinite(values), values - line, 0.0)
 
 
 def _strict_sums(
-    x: NDArray[np.generic], unit: Unit, present: _Present, n_windows: int, gaps: bool, space: Workspace
+    x: NDArray[np.generic],
+    unit: Unit,
+    present: _Present,
+    n_windows: int,
+    gaps: bool,
+    space: Workspace,
 ) -> tuple[Floats, Floats]:
     """Sums of squared second differences of every window and averaging factor, and numbers of terms (empty where all are there)."""
     lengths = unit.window - 2 * unit.ks + 1
@@ -157,7 +190,14 @@ def _strict_sums(
     return sums[0], sums[1] if gaps else np.empty((0, 0))
 
 
-def _rate_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tuple[Any, ...], blocks: Floats, space: Workspace) -> None:
+def _rate_blocks(
+    x: NDArray[np.generic],
+    unit: Unit,
+    present: _Present,
+    cut: tuple[Any, ...],
+    blocks: Floats,
+    space: Workspace,
+) -> None:
     """Heads and tails of rates, from an angle that is held as far as terms reach; or, where that is too large, from one of two doubles."""
     starts, stops, offset = present
     ks, shifts = unit.ks, unit.shifts
@@ -165,7 +205,9 @@ def _rate_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tup
     places, size = pyramid_places(points, ks, shifts)
     flat = space.array("angle", size)
     runs, order = (starts, stops + 1), (ks, shifts, groups(ks, shifts))
-    largest = grouped_blocks(x, offset, flat, points, places, *runs, unit.step, *order, *cut, blocks)
+    largest = grouped_blocks(
+        x, offset, flat, points, places, *runs, unit.step, *order, *cut, blocks
+    )
     if not needs_two_doubles(largest, x):
         return
     places, size = pyramid_places(x.size + 1, ks, shifts)
@@ -173,10 +215,14 @@ def _rate_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tup
     integrate_two(x, offset, starts, stops, high[: x.size + 1], low[: x.size + 1])
     for part in (high, low):
         thin_pyramid(part, x.size + 1, int(shifts[-1]), 0, x.size + 1)
-    blocks[:] = single_blocks(high, low, places, starts, stops, unit.angle, unit.step, ks, shifts, *cut)[: len(blocks)]
+    blocks[:] = single_blocks(
+        high, low, places, starts, stops, unit.angle, unit.step, ks, shifts, *cut
+    )[: len(blocks)]
 
 
-def _angle_of(x: NDArray[np.generic], present: _Present, windows: Integers, unit: Unit, space: Workspace) -> Floats:
+def _angle_of(
+    x: NDArray[np.generic], present: _Present, windows: Integers, unit: Unit, space: Workspace
+) -> Floats:
     """Angle of all samples, (n + 1,), in some windows and the block behind each of them; each stretch of windows begins at zero."""
     angle = space.array("angle", x.size + 1)
     begins, ends = windows * unit.step, np.minimum((windows + 1) * unit.step + unit.window, x.size)
@@ -188,7 +234,14 @@ def _angle_of(x: NDArray[np.generic], present: _Present, windows: Integers, unit
     return angle
 
 
-def _angle_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tuple[Any, ...], blocks: Floats, space: Workspace) -> None:
+def _angle_blocks(
+    x: NDArray[np.generic],
+    unit: Unit,
+    present: _Present,
+    cut: tuple[Any, ...],
+    blocks: Floats,
+    space: Workspace,
+) -> None:
     """Heads and tails of angles, which are all there already."""
     starts, stops, _ = present
     ks, shifts = unit.ks, unit.shifts
@@ -197,24 +250,31 @@ def _angle_blocks(x: NDArray[np.generic], unit: Unit, present: _Present, cut: tu
     flat[: x.size] = _line_removed(x, starts, stops)
     thin_pyramid(flat, x.size, int(shifts[-1]), 0, x.size)
     if starts.size > 1:
-        blocks[:] = single_blocks(flat, flat[:0], places, starts, stops, unit.angle, unit.step, ks, shifts, *cut)[: len(blocks)]
+        blocks[:] = single_blocks(
+            flat, flat[:0], places, starts, stops, unit.angle, unit.step, ks, shifts, *cut
+        )[: len(blocks)]
     else:
         order = (ks, shifts, groups(ks, shifts))
-        grouped_blocks(np.empty(0), 0.0, flat, x.size, places, starts, stops, unit.step, *order, *cut, blocks)
+        grouped_blocks(
+            np.empty(0), 0.0, flat, x.size, places, starts, stops, unit.step, *order, *cut, blocks
+        )
 
 
 def _native(x: NDArray[np.generic]) -> NDArray[np.generic]:
     return np.ascontiguousarray(x if x.dtype in _NATIVE else x.astype(np.float64))
 
 
-def surface_unit(x: NDArray[np.generic], unit: Unit, space: Workspace | None = None) -> tuple[Floats, Floats]:
+def surface_unit(
+    x: NDArray[np.generic], unit: Unit, space: Workspace | None = None
+) -> tuple[Floats, Floats]:
     """Cells and means of the windows that start in a stretch of one axis.
 
     Parameters
     ----------
     x : ndarray (n,)
-        Rates, or cumulative angles where ``unit.angle``; NaN marks a missing sample; integer or float of any size.
-        Windows start at samples 0, step, 2 step ... and every window lies inside the stretch.
+        Rates, or cumulative angles where ``unit.angle``; NaN marks a missing sample; integer or
+        float of any size. Windows start at samples 0, step, 2 step ... and every window lies inside
+        the stretch.
     unit : Unit
         Window, step, averaging factors and rules.
     space : Workspace, optional
@@ -223,8 +283,8 @@ def surface_unit(x: NDArray[np.generic], unit: Unit, space: Workspace | None = N
     Returns
     -------
     cells : ndarray (8, n_windows, n_tau)
-        The fields of `CELL_FIELDS`, in the memory of `space`; the variance is in the square of the rate's unit (for angles: of angle
-        per second).
+        The fields of `CELL_FIELDS`, in the memory of `space`; the variance is in the square of the
+        rate's unit (for angles: of angle per second).
     means : ndarray (2, n_windows)
         As `window_means`.
     """
@@ -239,18 +299,39 @@ def surface_unit(x: NDArray[np.generic], unit: Unit, space: Workspace | None = N
         cells[0], cells[5:] = np.nan, np.nan
         return cells, means
     gaps = present < x.size
-    starts, stops = present_runs(x, unit.step if known.size > 1 else x.size, known) if gaps else (np.zeros(1, np.int64), np.full(1, x.size))
-    offset = float(np.rint(mean)) if counts_only else mean  # integers less an integer: every sum is exact
+    starts, stops = (
+        present_runs(x, unit.step if known.size > 1 else x.size, known)
+        if gaps
+        else (np.zeros(1, np.int64), np.full(1, x.size))
+    )
+    offset = (
+        float(np.rint(mean)) if counts_only else mean
+    )  # integers less an integer: every sum is exact
     sums, counts = _strict_sums(x, unit, _Present(starts, stops, offset), n_windows, gaps, space)
     full = full_counts(unit.window, unit.step, n_windows, unit.ks, unit.shifts)
     _fill(sums, counts, full, unit.zero_fill, unit.ks, unit.interval if unit.angle else 1.0, cells)
     if gaps:
-        _share_gaps(starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, counts, full, cells)
+        _share_gaps(
+            starts,
+            stops,
+            unit.angle,
+            unit.window,
+            unit.step,
+            unit.ks,
+            unit.shifts,
+            counts,
+            full,
+            cells,
+        )
         poor = counts < unit.min_strict * full
         if not unit.zero_fill and not unit.angle and poor.any():
             strides = cluster_strides(unit.window, unit.ks, unit.shifts)
-            angle = _angle_of(x, _Present(starts, stops, offset), np.flatnonzero(poor.any(axis=1)), unit, space)
-            _bridge_gaps(angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells)
+            angle = _angle_of(
+                x, _Present(starts, stops, offset), np.flatnonzero(poor.any(axis=1)), unit, space
+            )
+            _bridge_gaps(
+                angle, starts, stops, unit.window, unit.step, unit.ks, strides, poor, cells
+            )
     if gaps and not unit.zero_fill:
         blank = ~(cells[2] >= unit.min_coverage)
         cells[0][blank] = cells[5][blank] = cells[6][blank] = cells[7][blank] = np.nan
@@ -270,7 +351,9 @@ def _means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> tuple[Floats, 
     base = first_present(x)
     if np.isnan(base):
         return np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)]), np.nan, np.zeros(1)
-    heads, tails = block_sums(x, base, unit.window, unit.step, n_windows)  # less the first sample: small on a tool that turns
+    heads, tails = block_sums(
+        x, base, unit.window, unit.step, n_windows
+    )  # less the first sample: small on a tool that turns
     total, present = heads.sum(axis=0) + tails.sum(axis=0)
     windows = np.empty((n_windows, 2))
     windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), windows)
@@ -287,7 +370,9 @@ def _angle_means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> Floats:
         where = np.flatnonzero(np.isfinite(part))
         out[1, j] = where.size / part.size
         if where.size > 1:
-            out[0, j] = (part[where[-1]] - part[where[0]]) / ((where[-1] - where[0]) * unit.interval)
+            out[0, j] = (part[where[-1]] - part[where[0]]) / (
+                (where[-1] - where[0]) * unit.interval
+            )
     return out
 
 
@@ -297,7 +382,8 @@ def window_means(x: NDArray[np.generic], unit: Unit) -> Floats:
     Returns
     -------
     ndarray (2, n_windows)
-        Mean [unit of the rate; for angles: of angle per second], NaN where nothing is present; share of samples present.
+        Mean [unit of the rate; for angles: of angle per second], NaN where nothing is present;
+        share of samples present.
     """
     x = _native(x)
     return _means(x, unit, _number_of_windows(x, unit))[0]

@@ -1,9 +1,10 @@
 """The inner loop of the Allan variance in vectors of eight: squared second differences of several lags in one pass.
 
-Left alone, a compiler takes one lag at a time, in vectors half as wide as many processors have. Here several lags share
-the loads of ``theta[m]``, and vectors of a stated width are used whole: twice to three times the terms per second. Most of
-the time then goes to loads that begin in one line of the cache and end in the next. Lags that follow each other need few of
-these, as each takes its elements out of two vectors that all of them share. Where the processor has shorter vectors, the
+Left alone, a compiler takes one lag at a time, in vectors half as wide as many processors have.
+Here several lags share the loads of ``theta[m]``, and vectors of a stated width are used whole:
+twice to three times the terms per second. Most of the time then goes to loads that begin in one
+line of the cache and end in the next. Lags that follow each other need few of these, as each takes
+its elements out of two vectors that all of them share. Where the processor has shorter vectors, the
 compiler splits these. The order of additions is the same on every machine.
 """
 
@@ -42,7 +43,9 @@ def _places(places: list[int]) -> ir.Constant:
 
 def _splat(builder: Any, value: Any) -> Any:
     empty = ir.Constant(_INDICES, ir.Undefined)
-    return builder.shuffle_vector(builder.insert_element(empty, value, ir.Constant(_SHORT, 0)), empty, _places([0] * LANES))
+    return builder.shuffle_vector(
+        builder.insert_element(empty, value, ir.Constant(_SHORT, 0)), empty, _places([0] * LANES)
+    )
 
 
 def _extreme(builder: Any, values: list[Any], sign: str) -> Any:
@@ -65,12 +68,18 @@ def _while(builder: Any, goes_on: Callable[[], Any]) -> Iterator[None]:
 
 
 def _vector(builder: Any, theta: Any, index: Any) -> Any:
-    return builder.load(builder.bitcast(builder.gep(theta, [index]), _DOUBLES.as_pointer()), align=8)
+    return builder.load(
+        builder.bitcast(builder.gep(theta, [index]), _DOUBLES.as_pointer()), align=8
+    )
 
 
 def _second(builder: Any, first: Any, middle: Any, last: Any) -> Any:
     minus_two = ir.Constant(_DOUBLES, [-2.0] * LANES)
-    return builder.fadd(builder.fadd(builder.fmul(middle, minus_two, flags=_FAST), last, flags=_FAST), first, flags=_FAST)
+    return builder.fadd(
+        builder.fadd(builder.fmul(middle, minus_two, flags=_FAST), last, flags=_FAST),
+        first,
+        flags=_FAST,
+    )
 
 
 def _differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
@@ -89,16 +98,27 @@ def _differences_in_a_row(builder: Any, theta: Any, at: Any, lags: list[Any]) ->
     last_needed = len(lags) + LANES - 2
 
     def vectors(index: Any, reach: int) -> list[Any]:
-        return [_vector(builder, theta, builder.add(index, ir.Constant(_INDEX, by))) for by in range(0, reach + 1, LANES)]
+        return [
+            _vector(builder, theta, builder.add(index, ir.Constant(_INDEX, by)))
+            for by in range(0, reach + 1, LANES)
+        ]
 
     def taken(found: list[Any], by: int) -> Any:
         place, by = divmod(by, LANES)
-        return builder.shuffle_vector(found[place], found[place + 1], _places(list(range(by, by + LANES)))) if by else found[place]
+        return (
+            builder.shuffle_vector(
+                found[place], found[place + 1], _places(list(range(by, by + LANES)))
+            )
+            if by
+            else found[place]
+        )
 
     first = _vector(builder, theta, at)
     middles = vectors(builder.add(at, lags[0]), last_needed)
     lasts = vectors(builder.add(at, builder.add(lags[0], lags[0])), last_needed + len(lags) - 1)
-    return [_second(builder, first, taken(middles, i), taken(lasts, 2 * i)) for i in range(len(lags))]
+    return [
+        _second(builder, first, taken(middles, i), taken(lasts, 2 * i)) for i in range(len(lags))
+    ]
 
 
 def _add_square(builder: Any, place: Any, value: Any, where: Any = None) -> None:
@@ -110,7 +130,10 @@ def _add_square(builder: Any, place: Any, value: Any, where: Any = None) -> None
 def _halves(builder: Any, first: Any, second: Any, width: int) -> Any:
     """Two vectors as one: in each group of `width` elements the halves are added, those of the two vectors side by side."""
     low = [at for at in range(2 * LANES) if at % width < width // 2]
-    left, right = (builder.shuffle_vector(first, second, _places([at + by for at in low])) for by in (0, width // 2))
+    left, right = (
+        builder.shuffle_vector(first, second, _places([at + by for at in low]))
+        for by in (0, width // 2)
+    )
     return builder.fadd(left, right)
 
 
@@ -124,7 +147,10 @@ def _totals(builder: Any, sums: list[list[Any]]) -> Any:
         vectors.append(vector)
     width = LANES
     while len(vectors) > 1:
-        vectors = [_halves(builder, vectors[at], vectors[at + 1], width) for at in range(0, len(vectors), 2)]
+        vectors = [
+            _halves(builder, vectors[at], vectors[at + 1], width)
+            for at in range(0, len(vectors), 2)
+        ]
         width //= 2
     return vectors[0]
 
@@ -135,23 +161,41 @@ def _all_totals(builder: Any, heads: list[list[Any]], tails: list[list[Any]]) ->
     if 2 * count > LANES:
         return [_totals(builder, sums) for sums in (heads, tails)]
     both = heads + tails
-    found = _totals(builder, [both[place % len(both)] for place in range(LANES)])  # what is left over is filled with any
-    return [builder.shuffle_vector(found, found, _places(list(range(begin, begin + count)))) for begin in (0, count)]
+    found = _totals(
+        builder, [both[place % len(both)] for place in range(LANES)]
+    )  # what is left over is filled with any
+    return [
+        builder.shuffle_vector(found, found, _places(list(range(begin, begin + count))))
+        for begin in (0, count)
+    ]
 
 
-def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: list[Any], *, in_a_row: bool) -> list[Any]:
+def _loop(
+    builder: Any,
+    theta: Any,
+    lags: list[Any],
+    splits: list[Any],
+    sizes: list[Any],
+    *,
+    in_a_row: bool,
+) -> list[Any]:
     """Vector with the sum of every lag over ``m < split``, and that over ``split <= m < size``."""
     steps = 1 if in_a_row else _STEPS[len(lags)]
     differences = _differences_in_a_row if in_a_row else _differences
     nothing = ir.Constant(_DOUBLES, [0.0] * LANES)
-    heads, tails = ([[cgutils.alloca_once(builder, _DOUBLES) for _ in range(steps)] for _ in lags] for _ in range(2))
+    heads, tails = (
+        [[cgutils.alloca_once(builder, _DOUBLES) for _ in range(steps)] for _ in lags]
+        for _ in range(2)
+    )
     for place in [place for sums in heads + tails for place in sums]:
         builder.store(nothing, place)
     position = cgutils.alloca_once(builder, _INDEX)
     builder.store(ir.Constant(_INDEX, 0), position)
     first_split, last_split = _extreme(builder, splits, "<"), _extreme(builder, splits, ">")
     first_size, last_size = _extreme(builder, sizes, "<"), _extreme(builder, sizes, ">")
-    wide_splits, wide_sizes = ([_splat(builder, value) for value in values] for values in (splits, sizes))
+    wide_splits, wide_sizes = (
+        [_splat(builder, value) for value in values] for values in (splits, sizes)
+    )
 
     def advanced(by: int) -> Any:
         return builder.add(builder.load(position), ir.Constant(_INDEX, by))
@@ -159,7 +203,9 @@ def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: l
     def whole_vectors(limit: Any, sums: list[list[Any]]) -> None:
         with _while(builder, lambda: builder.icmp_signed("<=", advanced(steps * LANES), limit)):
             for step in range(steps):
-                for lag, value in enumerate(differences(builder, theta, advanced(step * LANES), lags)):
+                for lag, value in enumerate(
+                    differences(builder, theta, advanced(step * LANES), lags)
+                ):
                     _add_square(builder, sums[lag][step], value)
             builder.store(advanced(steps * LANES), position)
 
@@ -174,7 +220,9 @@ def _loop(builder: Any, theta: Any, lags: list[Any], splits: list[Any], sizes: l
                 before = builder.icmp_signed("<", index, wide_splits[lag])
                 inside = builder.icmp_signed("<", index, wide_sizes[lag])
                 _add_square(builder, heads[lag][0], value, where=before)
-                _add_square(builder, tails[lag][0], value, where=builder.and_(inside, builder.not_(before)))
+                _add_square(
+                    builder, tails[lag][0], value, where=builder.and_(inside, builder.not_(before))
+                )
             builder.store(advanced(LANES), position)
     return _all_totals(builder, heads, tails)
 
@@ -185,18 +233,27 @@ def _of_lags(count: int, *, in_a_row: bool = False) -> Any:
     def sums(typing_context, theta, first, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             arrays = zip(signature.args, args, strict=True)
-            starts = [context.make_array(kind)(context, builder, value).data for kind, value in arrays if isinstance(kind, types.Array)]
+            starts = [
+                context.make_array(kind)(context, builder, value).data
+                for kind, value in arrays
+                if isinstance(kind, types.Array)
+            ]
             theta, lags = builder.gep(starts[0], [args[1]]), builder.gep(starts[1], [args[3]])
             values = [
-                [builder.load(builder.gep(start, [ir.Constant(_INDEX, i)])) for i in range(count)] for start in (lags, starts[2], starts[3])
+                [builder.load(builder.gep(start, [ir.Constant(_INDEX, i)])) for i in range(count)]
+                for start in (lags, starts[2], starts[3])
             ]
             some = ir.VectorType(ir.DoubleType(), count).as_pointer()
-            for total, start in zip(_loop(builder, theta, *values, in_a_row=in_a_row), starts[4:], strict=True):
+            for total, start in zip(
+                _loop(builder, theta, *values, in_a_row=in_a_row), starts[4:], strict=True
+            ):
                 row = builder.bitcast(builder.gep(start, [args[8]]), some)
                 builder.store(builder.fadd(builder.load(row, align=8), total), row, align=8)
             return context.get_dummy_value()
 
-        return types.void(theta, types.int64, lags, types.int64, splits, sizes, heads, tails, types.int64), generate
+        return types.void(
+            theta, types.int64, lags, types.int64, splits, sizes, heads, tails, types.int64
+        ), generate
 
     return intrinsic(sums)
 
@@ -212,8 +269,8 @@ def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place
     Parameters
     ----------
     theta : float64 (n,)
-        Angle, contiguous. Elements below ``first + max(sizes) + 2 * max(lags) + 2 * LANES`` are read; those that no term needs may
-        have any value.
+        Angle, contiguous. Elements below ``first + max(sizes) + 2 * max(lags) + 2 * LANES`` are
+        read; those that no term needs may have any value.
     first : int
         Index of m = 0.
     count : int

@@ -13,7 +13,9 @@ from gyrostab.kernels.compiled import KERNEL
 __all__ = ["from_counts", "to_counts"]
 
 
-def to_counts(values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill: int) -> NDArray[np.integer[Any]] | None:
+def to_counts(
+    values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill: int
+) -> NDArray[np.integer[Any]] | None:
     """Integers of which ``from_counts`` makes the very same values (of a zero, without its sign); None when there are none.
 
     Parameters
@@ -49,7 +51,11 @@ def to_counts(values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill:
 
 
 def from_counts(
-    counts: NDArray[np.integer[Any]], scale: float, fill: int, *, out: NDArray[np.floating[Any]] | None = None
+    counts: NDArray[np.integer[Any]],
+    scale: float,
+    fill: int,
+    *,
+    out: NDArray[np.floating[Any]] | None = None,
 ) -> NDArray[np.floating[Any]]:
     """Counts times their factor, NaN for `fill`; into `out`, which is contiguous, or into a new array of doubles.
 
@@ -59,7 +65,9 @@ def from_counts(
     array([0.1, nan, 0.3])
     """
     values = np.empty(counts.shape) if out is None else out
-    _from_counts(np.ascontiguousarray(counts).reshape(-1), float(scale), int(fill), values.reshape(-1))
+    _from_counts(
+        np.ascontiguousarray(counts).reshape(-1), float(scale), int(fill), values.reshape(-1)
+    )
     return values
 
 

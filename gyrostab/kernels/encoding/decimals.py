@@ -45,7 +45,12 @@ def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
         Whether the others are whole numbers.
     """
     n = values.size
-    missing, smallest, largest, all_whole = np.int64(0), np.int32(2147483647), np.int32(-2147483647), True
+    missing, smallest, largest, all_whole = (
+        np.int64(0),
+        np.int32(2147483647),
+        np.int32(-2147483647),
+        True,
+    )
     for begin in range(0, n, _STRETCH):
         off, absent, odd = np.int64(0), np.int64(0), np.int64(0)
         for i in range(begin, min(begin + _STRETCH, n)):
@@ -104,7 +109,9 @@ def decimals_of(values: NDArray[np.float64]) -> float:
     """
     some = np.ascontiguousarray(values[np.isfinite(values)][:_LOOKED_AT])
     counts = np.empty(some.size, np.int32)
-    return next((10.0**n for n in range(_MOST_DECIMALS + 1) if to_decimals(some, 10.0**n, counts)[0]), 0.0)
+    return next(
+        (10.0**n for n in range(_MOST_DECIMALS + 1) if to_decimals(some, 10.0**n, counts)[0]), 0.0
+    )
 
 
 @njit(**KERNEL)

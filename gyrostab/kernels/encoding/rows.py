@@ -1,7 +1,8 @@
 """Rows of plain text to numbers and stamps: what nearly every row of nearly every log looks like, and nothing else.
 
-Cells are decimal numbers, dates as ISO 8601 writes them, or void. The first row that holds anything else ends the work, and the
-caller reads that row in another way. Numbers are rounded as `float` rounds them, to the last bit; stamps are whole nanoseconds.
+Cells are decimal numbers, dates as ISO 8601 writes them, or void. The first row that holds anything
+else ends the work, and the caller reads that row in another way. Numbers are rounded as `float`
+rounds them, to the last bit; stamps are whole nanoseconds.
 """
 
 from __future__ import annotations
@@ -25,7 +26,19 @@ BLANKS = 32
 
 _NAT = np.iinfo(np.int64).min
 _TAB, _LINE, _RETURN, _BLANK, _QUOTE, _HASH, _PERCENT = 9, 10, 13, 32, 34, 35, 37
-_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _E, _SMALL_E, _SMALL_A, _SMALL_N = 43, 45, 46, 48, 58, 84, 90, 69, 101, 97, 110
+_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _E, _SMALL_E, _SMALL_A, _SMALL_N = (
+    43,
+    45,
+    46,
+    48,
+    58,
+    84,
+    90,
+    69,
+    101,
+    97,
+    110,
+)
 _DIGITS = 19  # that surely fit into 64 bits
 _EXACT = np.uint64(1) << np.uint64(53)
 _TENS = 10.0 ** np.arange(23)
@@ -33,8 +46,16 @@ _WHOLE_TENS = np.array([10**n for n in range(20)], dtype=np.uint64)
 _LEAST, _MOST = -60, 40
 _HALF = np.uint64(2**32 - 1)
 _FULL = np.uint64(2**64 - 1)
-_ZEROS, _TO_TEN, _TOPS = np.uint64(0x3030303030303030), np.uint64(0x7676767676767676), np.uint64(0x8080808080808080)
-_FIRST_PAIRS, _FIRST_SCALE, _SECOND_SCALE = np.uint64(0xFF000000FF), np.uint64(0xF424000000064), np.uint64(0x271000000001)
+_ZEROS, _TO_TEN, _TOPS = (
+    np.uint64(0x3030303030303030),
+    np.uint64(0x7676767676767676),
+    np.uint64(0x8080808080808080),
+)
+_FIRST_PAIRS, _FIRST_SCALE, _SECOND_SCALE = (
+    np.uint64(0xFF000000FF),
+    np.uint64(0xF424000000064),
+    np.uint64(0x271000000001),
+)
 _LONGEST_NS = np.uint64(2**63 - 1)
 
 
@@ -71,7 +92,9 @@ def _eight(typing, text, at):  # type: ignore[no-untyped-def]
     """Eight bytes from an address on; the first is the lowest."""
 
     def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        return builder.load(builder.inttoptr(builder.add(*arguments), ir.IntType(64).as_pointer()), align=1)
+        return builder.load(
+            builder.inttoptr(builder.add(*arguments), ir.IntType(64).as_pointer()), align=1
+        )
 
     return types.uint64(types.intp, types.intp), load
 
@@ -121,7 +144,12 @@ def _rounded(mantissa, power):  # type: ignore[no-untyped-def]
     top = np.int64(high >> np.uint64(63))
     shift = np.uint64(top + 9)
     kept = high >> shift
-    if low <= np.uint64(1) and -4 <= power <= 23 and kept & np.uint64(3) == np.uint64(1) and kept << shift == high:
+    if (
+        low <= np.uint64(1)
+        and -4 <= power <= 23
+        and kept & np.uint64(3) == np.uint64(1)
+        and kept << shift == high
+    ):
         kept &= ~np.uint64(1)
     kept += kept & np.uint64(1)
     kept >>= np.uint64(1)
@@ -170,10 +198,17 @@ def _decimal(text, at, size, point):  # type: ignore[no-untyped-def]
         decimals = at - after
         count += decimals
     if count > _DIGITS:
-        while _byte(text, first) == _ZERO or _byte(text, first) == point:  # zeros in front do not count
+        while (
+            _byte(text, first) == _ZERO or _byte(text, first) == point
+        ):  # zeros in front do not count
             count -= _byte(text, first) == _ZERO
             first += 1
-    return negative, mantissa, decimals, at if 0 < count <= _DIGITS or (count == 0 and decimals > 0) else np.int64(-1)
+    return (
+        negative,
+        mantissa,
+        decimals,
+        at if 0 < count <= _DIGITS or (count == 0 and decimals > 0) else np.int64(-1),
+    )
 
 
 @njit(**INNER)
@@ -182,7 +217,11 @@ def _number(text, at, size, point):  # type: ignore[no-untyped-def]
     negative, mantissa, decimals, end = _decimal(text, at, size, point)
     if end < 0:
         here = at + (_byte(text, at) == _MINUS)
-        if _byte(text, here) | 32 == _SMALL_N and _byte(text, here + 1) | 32 == _SMALL_A and _byte(text, here + 2) | 32 == _SMALL_N:
+        if (
+            _byte(text, here) | 32 == _SMALL_N
+            and _byte(text, here + 1) | 32 == _SMALL_A
+            and _byte(text, here + 2) | 32 == _SMALL_N
+        ):
             return np.nan, here + 3
         return 0.0, end
     power = -decimals
@@ -219,7 +258,10 @@ def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-de
 @njit(**INNER)
 def _two(text, at):  # type: ignore[no-untyped-def]
     """A number of two digits, or one above 99."""
-    tens, ones = np.uint8(_byte(text, at) - np.uint8(_ZERO)), np.uint8(_byte(text, at + 1) - np.uint8(_ZERO))
+    tens, ones = (
+        np.uint8(_byte(text, at) - np.uint8(_ZERO)),
+        np.uint8(_byte(text, at + 1) - np.uint8(_ZERO)),
+    )
     return np.int64(10 * tens + ones) if tens < 10 and ones < 10 else np.int64(1000)
 
 
@@ -242,9 +284,16 @@ def _iso(text, at, size):  # type: ignore[no-untyped-def]
     month, day, hour, minute, second = (
         _two(text, at + 5), _two(text, at + 8), _two(text, at + 11), _two(text, at + 14), _two(text, at + 17),
     )  # fmt: skip
-    if _byte(text, at + 4) != _MINUS or _byte(text, at + 7) != _MINUS or _byte(text, at + 13) != _COLON or _byte(text, at + 16) != _COLON:
+    if (
+        _byte(text, at + 4) != _MINUS
+        or _byte(text, at + 7) != _MINUS
+        or _byte(text, at + 13) != _COLON
+        or _byte(text, at + 16) != _COLON
+    ):
         return none
-    if (_byte(text, at + 10) != _T and _byte(text, at + 10) != _BLANK) or not (1700 <= year < 2200 and 1 <= month <= 12 and day >= 1):
+    if (_byte(text, at + 10) != _T and _byte(text, at + 10) != _BLANK) or not (
+        1700 <= year < 2200 and 1 <= month <= 12 and day >= 1
+    ):
         return none
     short = month == 4 or month == 6 or month == 9 or month == 11
     leap = year % 4 == 0 and (year % 100 != 0 or year % 400 == 0)
@@ -287,7 +336,11 @@ def _cell_end(text, at, separator, last):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _skipped(text, at, separator):  # type: ignore[no-untyped-def]
     """The end of a cell that is not wanted; negative where quotes or comments make it unsure."""
-    while _byte(text, at) != _LINE and _byte(text, at) != separator and not (separator == BLANKS and _byte(text, at) == _TAB):
+    while (
+        _byte(text, at) != _LINE
+        and _byte(text, at) != separator
+        and not (separator == BLANKS and _byte(text, at) == _TAB)
+    ):
         if _byte(text, at) == _QUOTE or _byte(text, at) == _HASH:
             return np.int64(-1)
         at += 1
@@ -309,7 +362,9 @@ def _cell(text, at, size, role, separator, point, digits):  # type: ignore[no-un
     if role == NUMBER:
         value, end = _number(text, at, size, point)
         return value, np.int64(0), end
-    stamp, end = _iso(text, at, size) if role == ISO else _count_of_time(text, at, size, point, digits)
+    stamp, end = (
+        _iso(text, at, size) if role == ISO else _count_of_time(text, at, size, point, digits)
+    )
     return 0.0, stamp, end
 
 
@@ -354,7 +409,14 @@ def _read_rows(lines, start, roles, separator, point, digits, values, stamps):  
 
 
 def read_rows(
-    text: NDArray[np.uint8], start: int, roles: NDArray[np.int64], *, separator: int, point: int, digits: int, rows: int
+    text: NDArray[np.uint8],
+    start: int,
+    roles: NDArray[np.int64],
+    *,
+    separator: int,
+    point: int,
+    digits: int,
+    rows: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
     """Read rows up to the first that is not plain.
 
@@ -369,7 +431,8 @@ def read_rows(
     separator, point : int
         Codes of the separator (`BLANKS` for runs of them) and of the decimal point.
     digits : int
-        Numbers of time are rounded to so many decimals and given as whole numbers of the last; with 0 they must be whole.
+        Numbers of time are rounded to so many decimals and given as whole numbers of the last; with
+        0 they must be whole.
     rows : int
         Room for rows: as many lines as there are.
 

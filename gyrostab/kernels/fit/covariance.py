@@ -1,15 +1,17 @@
 """Covariance of overlapping Allan variance estimates between averaging factors, exact for Gaussian noise.
 
-A second difference is ``d_k[m] = theta[m + 2k] - 2 theta[m + k] + theta[m]``; its covariances follow from the generalised
-autocovariance of the angle (Greenhall and Riley, PTTI 2003), in units of one sample and unit squared coefficient:
+A second difference is ``d_k[m] = theta[m + 2k] - 2 theta[m + k] + theta[m]``; its covariances
+follow from the generalised autocovariance of the angle (Greenhall and Riley, PTTI 2003), in units
+of one sample and unit squared coefficient:
 
     quantization         delta(t)                  Allan variance 3 / k^2
     angle random walk    -|t| / 2                                 1 / k
     bias instability     t^2 ln|t| / (2 pi)                       2 ln 2 / pi
     rate random walk     |t|^3 / 12                               k / 3
 
-By Isserlis' theorem the covariance of two mean squares is twice the mean squared covariance of their terms. Because the
-terms add, a mixture of noises needs only the tables of products made here, once per window length.
+By Isserlis' theorem the covariance of two mean squares is twice the mean squared covariance of
+their terms. Because the terms add, a mixture of noises needs only the tables of products made here,
+once per window length.
 """
 
 from __future__ import annotations
@@ -147,7 +149,9 @@ def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no
     n = b = k = nn = bb = kk = nb = nk = bk = 0.0
     for u in range(np.uint64(0), np.uint64(reach + 1)):
         lag = float(u)
-        weight = max(terms - (apart + lag) - max(apart - lag, 0.0), 0.0) * (2.0 if lag > 0.0 else 1.0)
+        weight = max(terms - (apart + lag) - max(apart - lag, 0.0), 0.0) * (
+            2.0 if lag > 0.0 else 1.0
+        )
         r1 = (white[near + u] - 2.0 * white[here + u] + white[far + u]) * scale
         r2 = (flicker[near + u] - 2.0 * flicker[here + u] + flicker[far + u]) * scale
         r3 = (walk[near + u] - 2.0 * walk[here + u] + walk[far + u]) * scale
@@ -199,7 +203,16 @@ def _tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
         else:
             differences = np.empty((3, 0))
         for j in range(i, n_tau):
-            _sum_pairs(window, ks[i], ks[j], 1 << min(shifts[i], shifts[j]), logarithm, differences, one, mean)
+            _sum_pairs(
+                window,
+                ks[i],
+                ks[j],
+                1 << min(shifts[i], shifts[j]),
+                logarithm,
+                differences,
+                one,
+                mean,
+            )
             for a in range(STOCHASTIC):
                 means[a, i, j] = means[a, j, i] = mean[a]
                 for b in range(STOCHASTIC):
@@ -207,7 +220,9 @@ def _tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     return products, means
 
 
-def product_tables(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def product_tables(
+    window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Covariance of Allan variances per product of squared coefficients, and per product with a ramp.
 
     Parameters
@@ -222,8 +237,8 @@ def product_tables(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
     Returns
     -------
     pairs : ndarray (4, 4, n_tau, n_tau)
-        ``P[a, b]``, such that noise with squared coefficients s (in sample units) gives estimates with the covariance
-        ``sum_ab s[a] s[b] P[a, b]``.
+        ``P[a, b]``, such that noise with squared coefficients s (in sample units) gives estimates
+        with the covariance ``sum_ab s[a] s[b] P[a, b]``.
     ramps : ndarray (4, n_tau, n_tau)
         ``D[a]``, such that a rate that grows by rho per sample adds ``rho^2 sum_a s[a] D[a]``.
     """
@@ -247,10 +262,14 @@ def _diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     return products, means
 
 
-def diagonal_products(window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def diagonal_products(
+    window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Diagonals of `product_tables`, shape (4, 4, n_tau), and of its second part, shape (4, n_tau), without the rest."""
     products, means = _diagonals(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
-    return np.asarray(2.0 * products), np.asarray(2.0 * np.asarray(ks, dtype=np.float64) ** 2 * means)
+    return np.asarray(2.0 * products), np.asarray(
+        2.0 * np.asarray(ks, dtype=np.float64) ** 2 * means
+    )
 
 
 def _logarithms(window: int) -> NDArray[np.float64]:

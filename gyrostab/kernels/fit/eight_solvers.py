@@ -1,8 +1,9 @@
 """Dense linear algebra of eight small problems side by side: elimination, and least squares that cannot be negative.
 
-Matrices and vectors are arrays of `gyrostab.kernels.fit.eights`; element (i, j) of a matrix of w columns is row ``w i + j``.
-A set of terms is one row per term: above one half in the places whose problem has the term. What `gyrostab.kernels.regression.nonnegative`
-does for one problem is done here for eight that differ in their sets.
+Matrices and vectors are arrays of `gyrostab.kernels.fit.eights`; element (i, j) of a matrix of w
+columns is row ``w i + j``. A set of terms is one row per term: above one half in the places whose
+problem has the term. What `gyrostab.kernels.regression.nonnegative` does for one problem is done
+here for eight that differ in their sets.
 """
 
 from __future__ import annotations
@@ -12,7 +13,13 @@ from numba import njit
 from gyrostab.kernels.compiled import INNER
 from gyrostab.kernels.fit.eights import PLACES, put, root, take, where_above
 
-__all__ = ["back_substitute", "eliminate", "scale_equations", "solve_nonnegative_eights", "solve_terms"]
+__all__ = [
+    "back_substitute",
+    "eliminate",
+    "scale_equations",
+    "solve_nonnegative_eights",
+    "solve_terms",
+]
 
 #: Terms at most, of which a problem has a set.
 _TERMS = 5
@@ -29,7 +36,11 @@ def _finish_pivot(system, width, p, end, ok):  # type: ignore[no-untyped-def]
     for i in range(p + 1, end):
         share = take(system, width * p + i)
         for j in range(i, width):
-            put(system, width * i + j, take(system, width * i + j) - share * take(system, width * p + j))
+            put(
+                system,
+                width * i + j,
+                take(system, width * i + j) - share * take(system, width * p + j),
+            )
 
 
 @njit(**INNER)
@@ -39,8 +50,9 @@ def eliminate(system, n, width, ok):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     system : eights (n * width,)
-        The upper triangle of C, n a multiple of 4, and right-hand sides beside it. Four rows at a time are taken out of
-        four of those below, so that each of these is read and written once for the four.
+        The upper triangle of C, n a multiple of 4, and right-hand sides beside it. Four rows at a
+        time are taken out of four of those below, so that each of these is read and written once
+        for the four.
     ok : eights (1,)
         One where C was positive definite, zero where the result means nothing.
     """
@@ -48,9 +60,19 @@ def eliminate(system, n, width, ok):  # type: ignore[no-untyped-def]
     for k in range(0, n, 4):
         for p in range(k, k + 4):
             _finish_pivot(system, width, p, k + 4, ok)
-        first, second, third, fourth = width * k, width * k + width, width * (k + 2), width * (k + 3)
+        first, second, third, fourth = (
+            width * k,
+            width * k + width,
+            width * (k + 2),
+            width * (k + 3),
+        )
         for i in range(k + 4, n, 2):
-            a, b, c, d = take(system, first + i), take(system, second + i), take(system, third + i), take(system, fourth + i)
+            a, b, c, d = (
+                take(system, first + i),
+                take(system, second + i),
+                take(system, third + i),
+                take(system, fourth + i),
+            )
             after, above, below = i + 1, width * i, width * i + width
             e, f, g, h = (
                 take(system, first + after),
@@ -59,7 +81,12 @@ def eliminate(system, n, width, ok):  # type: ignore[no-untyped-def]
                 take(system, fourth + after),
             )
             for j in range(i, width):
-                s, t, u, v = take(system, first + j), take(system, second + j), take(system, third + j), take(system, fourth + j)
+                s, t, u, v = (
+                    take(system, first + j),
+                    take(system, second + j),
+                    take(system, third + j),
+                    take(system, fourth + j),
+                )
                 put(system, above + j, take(system, above + j) - a * s - b * t - c * u - d * v)
                 put(system, below + j, take(system, below + j) - e * s - f * t - g * u - h * v)
 
@@ -70,7 +97,13 @@ def back_substitute(system, n, width):  # type: ignore[no-untyped-def]
     for i in range(n - 1, -1, -1):
         at = width * i
         own = at + n
-        a, b, c, d, e = take(system, own), take(system, own + 1), take(system, own + 2), take(system, own + 3), take(system, own + 4)
+        a, b, c, d, e = (
+            take(system, own),
+            take(system, own + 1),
+            take(system, own + 2),
+            take(system, own + 3),
+            take(system, own + 4),
+        )
         for j in range(i + 1, n):
             share, right = take(system, at + j), width * j + n
             a = a - share * take(system, right)
@@ -113,9 +146,13 @@ def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untype
         Scratch.
     """
     ok = take(terms, 0) * 0.0 + 1.0
-    for i in range(_TERMS):  # Cholesky factor, its diagonal inverted, and forward solution, row by row
+    for i in range(
+        _TERMS
+    ):  # Cholesky factor, its diagonal inverted, and forward solution, row by row
         here = take(terms, i)
-        pivot = take(scaled, 6 * i) * (1.0 + 1e-12) * here + (1.0 - here)  # a term outside the set stands alone
+        pivot = take(scaled, 6 * i) * (1.0 + 1e-12) * here + (
+            1.0 - here
+        )  # a term outside the set stands alone
         total = take(right, i) * here
         for j in range(i):
             share = take(scaled, 5 * i + j) * here * take(terms, j)
@@ -187,8 +224,8 @@ def solve_nonnegative_eights(normal, right, allowed, terms, squares, room):  # t
     allowed : int
         Bit set of the terms that may be used, in every place.
     terms : eights (5,)
-        Sets of terms that are tried first; where one holds the minimiser, no other is tried. Overwritten with the terms
-        above zero.
+        Sets of terms that are tried first; where one holds the minimiser, no other is tried.
+        Overwritten with the terms above zero.
     squares : eights (5,)
         Overwritten with the minimiser.
     room : eights (75,)

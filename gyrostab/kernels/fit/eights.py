@@ -1,10 +1,12 @@
 """Eight float64 as one number, for kernels that do the same small problem many times: eight problems side by side.
 
-A matrix of forty rows is too small for vector code along its rows: most vectors are part filled, and every sum waits for the one before.
-With a problem in each of the eight places all vectors are full, nothing is added across places, and so a problem has the same result,
-bit for bit, whatever its neighbours are. Where the processor has shorter vectors, the compiler splits these.
+A matrix of forty rows is too small for vector code along its rows: most vectors are part filled,
+and every sum waits for the one before. With a problem in each of the eight places all vectors are
+full, nothing is added across places, and so a problem has the same result, bit for bit, whatever
+its neighbours are. Where the processor has shorter vectors, the compiler splits these.
 
-Arrays of eights are float64 (n, 8), `eights` makes them; ``a[k, place]`` is one number of them, as always.
+Arrays of eights are float64 (n, 8), `eights` makes them; ``a[k, place]`` is one number of them, as
+always.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ PLACES = 8
 
 _VECTOR = ir.VectorType(ir.DoubleType(), PLACES)
 _SHORT = ir.IntType(32)
-#: A product that is added may be rounded once instead of twice, as in the code of the compiler's own making.
+#: A product that is added may be rounded once instead of twice, as in the code of the compiler's
+#: own making.
 _FUSE = ("contract",)
 
 
@@ -54,7 +57,9 @@ def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) ->
     """A plain number beside eights stands for eight of it."""
     wide = context.cast(builder, value, source, types.float64)
     first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), wide, ir.Constant(_SHORT, 0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_SHORT, PLACES), [0] * PLACES))
+    return builder.shuffle_vector(
+        first, first, ir.Constant(ir.VectorType(_SHORT, PLACES), [0] * PLACES)
+    )
 
 
 def _operator(symbol: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
@@ -63,7 +68,10 @@ def _operator(symbol: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
     class Typing(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: Any, kws: Any) -> Any:
             known = [isinstance(one, _EightType) for one in args]
-            if any(known) and all(eight or isinstance(one, types.Float) for eight, one in zip(known, args, strict=True)):
+            if any(known) and all(
+                eight or isinstance(one, types.Float)
+                for eight, one in zip(known, args, strict=True)
+            ):
                 return signature(_EIGHT, _EIGHT, _EIGHT)
             return None
 
@@ -87,7 +95,12 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> A
 
 
 def _is_array_of_eights(array: Any) -> bool:
-    return isinstance(array, types.Array) and array.ndim == 2 and array.layout == "C" and array.dtype == types.float64
+    return (
+        isinstance(array, types.Array)
+        and array.ndim == 2
+        and array.layout == "C"
+        and array.dtype == types.float64
+    )
 
 
 @intrinsic
@@ -118,7 +131,12 @@ def put(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 @intrinsic
 def number(typing_context: Any, array: Any, index: Any) -> Any:
     """Element `index`, not negative, of a flat array: a plain number for all eight. Indexing would test for a negative index."""
-    if not (isinstance(array, types.Array) and array.ndim == 1 and array.layout == "C" and isinstance(index, types.Integer)):
+    if not (
+        isinstance(array, types.Array)
+        and array.ndim == 1
+        and array.layout == "C"
+        and isinstance(index, types.Integer)
+    ):
         return None
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -134,7 +152,9 @@ def root(typing_context: Any, value: Any) -> Any:
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{PLACES}f64"), args)
+        return builder.call(
+            cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{PLACES}f64"), args
+        )
 
     return _EIGHT(_EIGHT), emit
 

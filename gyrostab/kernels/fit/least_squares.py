@@ -1,9 +1,10 @@
 """Generalised non-negative least squares of Allan variances, one small problem per window.
 
-The Allan variance is linear in the squared coefficients, so a window is ``y = X s + e`` with ``s >= 0``. Overlapping
-estimates at neighbouring averaging factors share data; the covariance of e follows from the noise itself
-(`gyrostab.kernels.fit.covariance`), so it is taken from the fit and iterated. Eight windows are fitted side by side
-(`gyrostab.kernels.fit.eights`); each has the same numbers whatever its neighbours are.
+The Allan variance is linear in the squared coefficients, so a window is ``y = X s + e`` with ``s >=
+0``. Overlapping estimates at neighbouring averaging factors share data; the covariance of e follows
+from the noise itself (`gyrostab.kernels.fit.covariance`), so it is taken from the fit and iterated.
+Eight windows are fitted side by side (`gyrostab.kernels.fit.eights`); each has the same numbers
+whatever its neighbours are.
 """
 
 from __future__ import annotations
@@ -15,7 +16,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.fit.eight_solvers import back_substitute, eliminate, scale_equations, solve_nonnegative_eights, solve_terms
+from gyrostab.kernels.fit.eight_solvers import (
+    back_substitute,
+    eliminate,
+    scale_equations,
+    solve_nonnegative_eights,
+    solve_terms,
+)
 from gyrostab.kernels.fit.eights import PLACES, eights, put, root, take, where_above
 from gyrostab.kernels.fit.mixture import (
     DATA,
@@ -34,7 +41,15 @@ from gyrostab.kernels.fit.mixture import (
 __all__ = ["FIT_FIELDS", "fit_windows", "identify_noise"]
 
 #: Rows of the per-term result of `fit_windows`.
-FIT_FIELDS = ("square", "square_stderr", "free", "variance_null", "variance_linear", "variance_square", "separation")
+FIT_FIELDS = (
+    "square",
+    "square_stderr",
+    "free",
+    "variance_null",
+    "variance_linear",
+    "variance_square",
+    "separation",
+)
 
 
 class _Cells(NamedTuple):
@@ -52,7 +67,8 @@ class _Fit(NamedTuple):
     squares: NDArray[np.float64]
     terms: NDArray[np.float64]
     basis: NDArray[np.float64]
-    #: Whether a fit still moves (row 0), was hopeless (1); its jitter (2), whether its covariance was positive definite (3).
+    #: Whether a fit still moves (row 0), was hopeless (1); its jitter (2), whether its covariance
+    #: was positive definite (3).
     state: NDArray[np.float64]
 
 
@@ -83,8 +99,9 @@ def _make_room(size):  # type: ignore[no-untyped-def]
 def _quick(cells, weight, allowed, normal, right, fit, scratch):  # type: ignore[no-untyped-def]
     """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise.
 
-    No noise falls faster than quantization noise does. A cell that lies below the fall from a shorter averaging time
-    is low by chance, and must not count for as much as its own square would have it.
+    No noise falls faster than quantization noise does. A cell that lies below the fall from a
+    shorter averaging time is low by chance, and must not count for as much as its own square would
+    have it.
     """
     system, inverse, terms = cells.system, cells.inverse, fit.terms
     for row in range(25):
@@ -124,7 +141,9 @@ def _mirror(normal):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_samples, pairs, ramps):  # type: ignore[no-untyped-def]
+def identify_noise(
+    avar, white, quantization, ramp, factor, columns, weight, to_samples, pairs, ramps
+):  # type: ignore[no-untyped-def]
     """Degrees of freedom of each cell with the noise mixture identified by a quick fit of the window.
 
     Parameters
@@ -151,17 +170,41 @@ def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_
         table = 0
         for a in range(4):
             for b in range(a, 5):
-                diagonal[i, table] = ramps[a, i] if b == 4 else pairs[a, b, i] * (1.0 if a == b else 2.0)
+                diagonal[i, table] = (
+                    ramps[a, i] if b == 4 else pairs[a, b, i] * (1.0 if a == b else 2.0)
+                )
                 table += 1
     cells, fit = _make_cells(n_tau), _Fit(eights(5), eights(5), eights(5), eights(4))
     normal, right, scratch, squares = eights(25), eights(5), eights(75), np.empty(5)
     for start in range(0, n_windows, PLACES):
-        _observe_eight(start, avar, white, quantization, ramp, factor, columns, to_samples, cells, np.empty(PLACES, np.int64))
+        _observe_eight(
+            start,
+            avar,
+            white,
+            quantization,
+            ramp,
+            factor,
+            columns,
+            to_samples,
+            cells,
+            np.empty(PLACES, np.int64),
+        )
         _quick(cells, weight, np.int64(31), normal, right, fit, scratch)
         for w in range(start, min(start + PLACES, n_windows)):
             for a in range(5):
                 squares[a] = fit.squares[a, w - start]
-            degrees_of_freedom(squares, avar[w], white[w], quantization[w], ramp[w], factor[w], columns, to_samples, diagonal, out[w])
+            degrees_of_freedom(
+                squares,
+                avar[w],
+                white[w],
+                quantization[w],
+                ramp[w],
+                factor[w],
+                columns,
+                to_samples,
+                diagonal,
+                out[w],
+            )
             for i in range(n_tau):
                 if cells.system[WIDTH * i + DATA, w - start] == 0.0:
                     out[w, i] = np.nan
@@ -169,14 +212,27 @@ def identify_noise(avar, white, quantization, ramp, factor, columns, weight, to_
 
 
 @njit(**INNER)
-def _observe_eight(start, avar, white, quantization, ramp, factor, columns, to_samples, cells, valid):  # type: ignore[no-untyped-def]
+def _observe_eight(
+    start, avar, white, quantization, ramp, factor, columns, to_samples, cells, valid
+):  # type: ignore[no-untyped-def]
     """Describe the windows from number `start` on, beyond the last ones without cells; numbers of valid cells to `valid`."""
     system, seen, inverse, facts = cells
     for place in range(PLACES):
         w = min(start + place, avar.shape[0] - 1)
         end = avar.shape[1] if start + place < avar.shape[0] else 0
         valid[place] = observe(
-            avar[w, :end], white[w], quantization[w], ramp[w], factor[w], columns, to_samples, place, system, seen, inverse, facts
+            avar[w, :end],
+            white[w],
+            quantization[w],
+            ramp[w],
+            factor[w],
+            columns,
+            to_samples,
+            place,
+            system,
+            seen,
+            inverse,
+            facts,
         )
 
 
@@ -225,7 +281,14 @@ def _normal_equations(whole, n, normal, right):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _refit(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
     """Refit until the covariance is that of the fitted noise. A fit that has arrived keeps its numbers, and its matrices are made anew."""
-    squares, terms, basis, state, trial, tried = fit.squares, fit.terms, fit.basis, fit.state, eights(5), eights(5)
+    squares, terms, basis, state, trial, tried = (
+        fit.squares,
+        fit.terms,
+        fit.basis,
+        fit.state,
+        eights(5),
+        eights(5),
+    )
     n = cells.inverse.shape[0]
     put(state, 0, 1.0)
     put(state, 1, 0.0)
@@ -263,7 +326,13 @@ def _estimate(a, allowed, squares, terms, normal, right, scratch, row, found):  
 
     Everything is NaN, and the separation zero, where the term cannot be told from the chosen ones.
     """
-    scaled, work, scale, unit, tried = scratch[:25], scratch[25:50], scratch[50:55], scratch[55:60], scratch[60:65]
+    scaled, work, scale, unit, tried = (
+        scratch[:25],
+        scratch[25:50],
+        scratch[50:55],
+        scratch[55:60],
+        scratch[60:65],
+    )
     scale_equations(normal, scale, scaled)
     for b in range(5):
         put(unit, b, take(scale, b) if a == b else take(scale, b) * 0.0)
@@ -276,12 +345,18 @@ def _estimate(a, allowed, squares, terms, normal, right, scratch, row, found):  
     put(tried, a, 1.0)
     apart = solve_terms(scaled, unit, tried, row, work)
     free = apart * 0.0
-    for b in range(5):  # row a of the inverse normal matrix: the estimator is the sum of row[b] right[b]
+    for b in range(
+        5
+    ):  # row a of the inverse normal matrix: the estimator is the sum of row[b] right[b]
         put(row, b, take(row, b) * take(scale, b))
         free = free + take(row, b) * take(right, b)
     variance = take(row, a)
     put(found, 5 * 0 + a, where_above(apart, 0.5, take(squares, a), np.nan))
-    put(found, 5 * 1 + a, where_above(apart, 0.5, root(where_above(variance, 0.0, variance, 0.0)), np.nan))
+    put(
+        found,
+        5 * 1 + a,
+        where_above(apart, 0.5, root(where_above(variance, 0.0, variance, 0.0)), np.nan),
+    )
     put(found, 5 * 2 + a, where_above(apart, 0.5, free, np.nan))
     put(found, 5 * 6 + a, where_above(apart, 0.5, separation, 0.0))
     return apart
@@ -291,8 +366,8 @@ def _estimate(a, allowed, squares, terms, normal, right, scratch, row, found):  
 def _without(a, squares, facts, trial):  # type: ignore[no-untyped-def]
     """The noise if term `a` were not there and the neighbour most like it had made the same Allan variance instead.
 
-    A ramp or a flicker floor is claimed only against a random walk that would reach as high at the longest averaging
-    time, quantization against angle random walk at the shortest.
+    A ramp or a flicker floor is claimed only against a random walk that would reach as high at the
+    longest averaging time, quantization against angle random walk at the shortest.
     """
     for b in range(5):
         put(trial, b, take(squares, b))
@@ -305,7 +380,13 @@ def _without(a, squares, facts, trial):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _growth(a, apart, cells, fit, room, tables, found):  # type: ignore[no-untyped-def]
     """Variance of the estimate of term `a` as a polynomial in its square, to rows 3, 4 and 5 of `found`."""
-    seen, inverse, units, roots, weights = cells.seen, cells.inverse, room.units, room.roots, room.weights
+    seen, inverse, units, roots, weights = (
+        cells.seen,
+        cells.inverse,
+        room.units,
+        room.roots,
+        room.weights,
+    )
     trial, parts = room.scratch[:5], room.scratch[5:8]
     _without(a, fit.squares, cells.facts, trial)
     root_squares(trial, seen, units, roots)
@@ -319,7 +400,13 @@ def _growth(a, apart, cells, fit, room, tables, found):  # type: ignore[no-untyp
 @njit(**INNER)
 def _joint_growth(a, trial, cells, room, tables, parts):  # type: ignore[no-untyped-def]
     """Quantization noise that counts as white (see `observe`) makes the terms one; the growth is that of the first unit."""
-    seen, inverse, units, roots, weights = cells.seen, cells.inverse, room.units, room.roots, room.weights
+    seen, inverse, units, roots, weights = (
+        cells.seen,
+        cells.inverse,
+        room.units,
+        room.roots,
+        room.weights,
+    )
     joint = take(cells.facts, 5)
     if a == 1:
         joint = where_above(take(trial, 0), 0.0, joint, 0.0)
@@ -353,7 +440,9 @@ def _judge(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore
     for a in range(5):
         if not allowed >> a & 1:
             continue
-        apart = _estimate(a, allowed, squares, fit.terms, room.normal, room.right, room.scratch, row, found)
+        apart = _estimate(
+            a, allowed, squares, fit.terms, room.normal, room.right, room.scratch, row, found
+        )
         for i in range(n):  # estimator as weights on the cells
             weight = take(row, 0) * take(whole, width * i + n)
             for b in range(1, 5):
@@ -363,7 +452,9 @@ def _judge(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore
 
 
 @njit(**KERNEL)
-def fit_windows(avar, white, quantization, ramp, gap_factor, columns, to_samples, pairs, ramps, weight, allowed):  # type: ignore[no-untyped-def]
+def fit_windows(
+    avar, white, quantization, ramp, gap_factor, columns, to_samples, pairs, ramps, weight, allowed
+):  # type: ignore[no-untyped-def]
     """Fit every window.
 
     Parameters
@@ -384,9 +475,9 @@ def fit_windows(avar, white, quantization, ramp, gap_factor, columns, to_samples
     Returns
     -------
     result : float64 (n_windows, 7, 5)
-        Rows as `FIT_FIELDS`: squared coefficient; its standard error; its estimate free of sign; variance of that
-        estimate without the term, growth per unit of the square, per unit of its square; separation, the share of the
-        column that the other terms cannot imitate.
+        Rows as `FIT_FIELDS`: squared coefficient; its standard error; its estimate free of sign;
+        variance of that estimate without the term, growth per unit of the square, per unit of its
+        square; separation, the share of the column that the other terms cannot imitate.
     misfit : float64 (n_windows, 2)
         Chi-square and degrees of freedom.
     dof : float64 (n_windows, n_tau)
@@ -403,10 +494,22 @@ def fit_windows(avar, white, quantization, ramp, gap_factor, columns, to_samples
     result = np.full((n_windows, len(FIT_FIELDS), 5), np.nan)
     misfit = np.full((n_windows, 2), np.nan)
     dof = np.full((n_windows, n_tau), np.nan)
-    cells, fit, room = _make_cells(size), _Fit(eights(5), eights(5), eights(5), eights(4)), _make_room(size)
-    found, row, chi2, squares, valid = eights(5 * len(FIT_FIELDS)), eights(5), eights(1), np.empty(5), np.empty(PLACES, np.int64)
+    cells, fit, room = (
+        _make_cells(size),
+        _Fit(eights(5), eights(5), eights(5), eights(4)),
+        _make_room(size),
+    )
+    found, row, chi2, squares, valid = (
+        eights(5 * len(FIT_FIELDS)),
+        eights(5),
+        eights(1),
+        np.empty(5),
+        np.empty(PLACES, np.int64),
+    )
     for start in range(0, n_windows, PLACES):
-        _observe_eight(start, avar, white, quantization, ramp, gap_factor, columns, to_samples, cells, valid)
+        _observe_eight(
+            start, avar, white, quantization, ramp, gap_factor, columns, to_samples, cells, valid
+        )
         root_units(cells.seen, room.units)
         _quick(cells, weight, allowed, room.normal, room.right, fit, room.scratch)
         _refit(allowed, cells, fit, room, tables)
@@ -416,8 +519,21 @@ def fit_windows(avar, white, quantization, ramp, gap_factor, columns, to_samples
             misfit[w, 1] = 0.0
             if valid[place] == 0 or fit.state[1, place] > 0.5:
                 continue
-            _write_window(allowed, valid[place], place, found, fit, chi2, result[w], misfit[w], squares)
-            degrees_of_freedom(squares, avar[w], white[w], quantization[w], ramp[w], gap_factor[w], columns, to_samples, diagonal, dof[w])
+            _write_window(
+                allowed, valid[place], place, found, fit, chi2, result[w], misfit[w], squares
+            )
+            degrees_of_freedom(
+                squares,
+                avar[w],
+                white[w],
+                quantization[w],
+                ramp[w],
+                gap_factor[w],
+                columns,
+                to_samples,
+                diagonal,
+                dof[w],
+            )
     return result, misfit, dof
 
 

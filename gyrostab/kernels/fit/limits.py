@@ -22,7 +22,9 @@ def _quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
         return 0.0
     before, here = curve[i - 1], curve[i]
     after, beyond = curve[i + 1], curve[i + 2]
-    value = -t * (t - 1.0) * (t - 2.0) / 6.0 * before + (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 * here
+    value = (
+        -t * (t - 1.0) * (t - 2.0) / 6.0 * before + (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 * here
+    )
     value += -(t + 1.0) * t * (t - 2.0) / 2.0 * after + (t + 1.0) * t * (t - 1.0) / 6.0 * beyond
     return np.exp(value / freedom)
 
@@ -52,7 +54,9 @@ def _see(columns, white, quantization, ramp, squares, seen):  # type: ignore[no-
     """Allan variance of one cell under the fitted model; per squared coefficient, seen through the gaps, to `seen`."""
     model = 0.0
     for a in range(5):
-        seen[a] = columns[a] * (quantization if a == 0 else white if a == 1 else ramp if a == 4 else 1.0)
+        seen[a] = columns[a] * (
+            quantization if a == 0 else white if a == 1 else ramp if a == 4 else 1.0
+        )
         if squares[a] > 0.0:
             model += seen[a] * squares[a]
     return model
@@ -67,10 +71,27 @@ def _cell_quantile(a, whole, own_dof, share, dof, most, start, step, curve):  # 
 
 
 @njit(**KERNEL)
-def cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, own_dof, ks, span, most, start, step, curve):  # type: ignore[no-untyped-def]
+def cell_limits(
+    avar,
+    white,
+    quantization,
+    ramp,
+    factor,
+    squares,
+    dof,
+    columns,
+    own_dof,
+    ks,
+    span,
+    most,
+    start,
+    step,
+    curve,
+):  # type: ignore[no-untyped-def]
     """Upper limit of each squared coefficient from one cell, which cannot be less than the term's own part of it.
 
-    The cell is the one where the fitted model promises the lowest limit, so that its own scatter does not choose it.
+    The cell is the one where the fitted model promises the lowest limit, so that its own scatter
+    does not choose it.
 
     Parameters
     ----------
@@ -81,11 +102,13 @@ def cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, 
     columns : float64 (n_tau, 5)
         Allan variance per squared coefficient.
     own_dof : float64 (5, n_tau)
-        Degrees of freedom of a cell in which a term is alone; infinite for a ramp, which is bounded by `dof`.
+        Degrees of freedom of a cell in which a term is alone; infinite for a ramp, which is bounded
+        by `dof`.
     ks : float64 (n_tau,)
         Averaging factors, rising.
     span : float64 (5,)
-        A cell may bound a term if the longest averaging factor of its window is at most so many times its own.
+        A cell may bound a term if the longest averaging factor of its window is at most so many
+        times its own.
     most : float
         Degrees of freedom are not taken above this.
     start, step, curve
@@ -115,10 +138,22 @@ def cell_limits(avar, white, quantization, ramp, factor, squares, dof, columns, 
             for a in range(5):
                 if ks[i] * span[a] < ks[last]:
                     continue
-                best = whole[i, a] if share <= 1.0 else 1.0  # fewer degrees of freedom have a lower quantile
+                best = (
+                    whole[i, a] if share <= 1.0 else 1.0
+                )  # fewer degrees of freedom have a lower quantile
                 if model >= lowest[a] * best * seen[a]:
                     continue
-                quantile = _cell_quantile(a, whole[i, a], own_dof[a, i] * share, share, dof[w, i], most, start, step, curve)
+                quantile = _cell_quantile(
+                    a,
+                    whole[i, a],
+                    own_dof[a, i] * share,
+                    share,
+                    dof[w, i],
+                    most,
+                    start,
+                    step,
+                    curve,
+                )
                 reach = 1.0 / (quantile * seen[a]) if quantile > 0.0 else np.inf
                 if model * reach < lowest[a]:
                     lowest[a] = model * reach

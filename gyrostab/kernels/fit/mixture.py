@@ -1,7 +1,8 @@
 """Eight windows as mixtures of noises: what each cell sees of every term, and the covariance of the cells.
 
-Everything here is an array of `gyrostab.kernels.fit.eights`, a window in each place. A cell that is missing, or that pads the
-averaging factors, is one without noise and without signal: zeros everywhere. So every window has the same shape.
+Everything here is an array of `gyrostab.kernels.fit.eights`, a window in each place. A cell that is
+missing, or that pads the averaging factors, is one without noise and without signal: zeros
+everywhere. So every window has the same shape.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ __all__ = [
     "variance_parts",
 ]
 
-#: Products of the four stochastic terms with each other and with a ramp, which has no scatter of its own:
+#: Products of the four stochastic terms with each other and with a ramp, which has no scatter of
+#: its own:
 #: (a, b) for a in 0..3 and b in a..4.
 PRODUCTS = 14
 #: Column of the data behind those of the five terms in a system of equations.
@@ -35,8 +37,15 @@ DATA = 5
 WIDTH = 6
 #: Row of `seen` that holds the unit of each term.
 _SEEN = (0, 1, 3, 4, 5)
-#: Number of the product of two terms among the tables; that of a ramp with itself, which there is not, gives any.
-_TABLE = ((0, 1, 2, 3, 4), (1, 5, 6, 7, 8), (2, 6, 9, 10, 11), (3, 7, 10, 12, 13), (4, 8, 11, 13, 13))
+#: Number of the product of two terms among the tables; that of a ramp with itself, which there is
+#: not, gives any.
+_TABLE = (
+    (0, 1, 2, 3, 4),
+    (1, 5, 6, 7, 8),
+    (2, 6, 9, 10, 11),
+    (3, 7, 10, 12, 13),
+    (4, 8, 11, 13, 13),
+)
 
 
 @njit(**INNER)
@@ -47,19 +56,36 @@ def combine_products(pairs, ramps, n, tables):  # type: ignore[no-untyped-def]
             table = PRODUCTS * (i * n + j)
             for a in range(4):
                 for b in range(a, 5):
-                    tables[table] = ramps[a, i, j] if b == 4 else pairs[a, b, i, j] * (1.0 if a == b else 2.0)
+                    tables[table] = (
+                        ramps[a, i, j] if b == 4 else pairs[a, b, i, j] * (1.0 if a == b else 2.0)
+                    )
                     table += 1
 
 
 @njit(**INNER)
-def observe(avar, white, quantization, ramp, factor, columns, to_samples, place, system, seen, inverse, facts):  # type: ignore[no-untyped-def]
+def observe(
+    avar,
+    white,
+    quantization,
+    ramp,
+    factor,
+    columns,
+    to_samples,
+    place,
+    system,
+    seen,
+    inverse,
+    facts,
+):  # type: ignore[no-untyped-def]
     """Describe the cells of a window in one place; returns how many are valid.
 
-    Design matrix and data go to `system` (row ``6 cell + column``); what a unit of each squared coefficient is in sample
-    units, as the cell sees it through the gaps, to `seen` (``6 cell + row``); the reciprocal of `factor` to `inverse`. What
-    the gaps add to quantization noise comes from the ends of many runs spread over each cluster, so it scatters like white
-    noise and is counted there (row 2). To `facts` go the columns of Q over N at the shortest valid averaging time (row 0), of
-    B over K (2) and of R over K (4) at the longest, and the most that gaps add to quantization noise (5).
+    Design matrix and data go to `system` (row ``6 cell + column``); what a unit of each squared
+    coefficient is in sample units, as the cell sees it through the gaps, to `seen` (``6 cell +
+    row``); the reciprocal of `factor` to `inverse`. What the gaps add to quantization noise comes
+    from the ends of many runs spread over each cluster, so it scatters like white noise and is
+    counted there (row 2). To `facts` go the columns of Q over N at the shortest valid averaging
+    time (row 0), of B over K (2) and of R over K (4) at the longest, and the most that gaps add to
+    quantization noise (5).
     """
     n, last = 0, 0
     for fact in range(6):
@@ -80,7 +106,9 @@ def observe(avar, white, quantization, ramp, factor, columns, to_samples, place,
         system[at + DATA, place] = avar[i]
         seen[at, place] = min(quantization[i], 1.0) * to_samples[0]
         seen[at + 1, place] = white[i] * to_samples[1]
-        seen[at + 2, place] = max(quantization[i] - 1.0, 0.0) * columns[i, 0] / columns[i, 1] * to_samples[1]
+        seen[at + 2, place] = (
+            max(quantization[i] - 1.0, 0.0) * columns[i, 0] / columns[i, 1] * to_samples[1]
+        )
         seen[at + 3, place] = to_samples[2]
         seen[at + 4, place] = to_samples[3]
         seen[at + 5, place] = ramp[i] * to_samples[4]
@@ -107,7 +135,12 @@ def root_units(seen, units):  # type: ignore[no-untyped-def]
 def root_squares(squares, seen, units, roots):  # type: ignore[no-untyped-def]
     """Square roots of the squared coefficients in sample units, cell by cell: row ``5 cell + term``."""
     s0, s1 = take(squares, 0), take(squares, 1)
-    r0, r2, r3, r4 = root(s0), root(take(squares, 2)), root(take(squares, 3)), root(take(squares, 4))
+    r0, r2, r3, r4 = (
+        root(s0),
+        root(take(squares, 2)),
+        root(take(squares, 3)),
+        root(take(squares, 4)),
+    )
     for i in range(seen.shape[0] // 6):
         put(roots, 5 * i, r0 * take(units, 5 * i))
         put(roots, 5 * i + 1, root(s1 * take(seen, 6 * i + 1) + s0 * take(seen, 6 * i + 2)))
@@ -119,9 +152,21 @@ def root_squares(squares, seen, units, roots):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _sum_products(tables, at, a0, a1, a2, a3, a4):  # type: ignore[no-untyped-def]
     """Covariance of two cells without their share of degrees of freedom; the a are products of the roots of both."""
-    first = a0 * number(tables, at) + a1 * number(tables, at + 1) + a2 * number(tables, at + 2) + a3 * number(tables, at + 3)
-    second = a1 * number(tables, at + 5) + a2 * number(tables, at + 6) + a3 * number(tables, at + 7) + a4 * number(tables, at + 8)
-    third = a2 * number(tables, at + 9) + a3 * number(tables, at + 10) + a4 * number(tables, at + 11)
+    first = (
+        a0 * number(tables, at)
+        + a1 * number(tables, at + 1)
+        + a2 * number(tables, at + 2)
+        + a3 * number(tables, at + 3)
+    )
+    second = (
+        a1 * number(tables, at + 5)
+        + a2 * number(tables, at + 6)
+        + a3 * number(tables, at + 7)
+        + a4 * number(tables, at + 8)
+    )
+    third = (
+        a2 * number(tables, at + 9) + a3 * number(tables, at + 10) + a4 * number(tables, at + 11)
+    )
     fourth = a3 * number(tables, at + 12) + a4 * number(tables, at + 13)
     return a0 * (first + a4 * number(tables, at + 4)) + a1 * second + a2 * third + a3 * fourth
 
@@ -134,10 +179,20 @@ def covariance_rows(roots, inverse, tables, out, width):  # type: ignore[no-unty
         s0, s1, s2 = take(roots, 5 * i), take(roots, 5 * i + 1), take(roots, 5 * i + 2)
         s3, s4, share = take(roots, 5 * i + 3), take(roots, 5 * i + 4), take(inverse, i)
         for j in range(i, n):
-            a0, a1, a2 = s0 * take(roots, 5 * j), s1 * take(roots, 5 * j + 1), s2 * take(roots, 5 * j + 2)
-            a3, a4, other = s3 * take(roots, 5 * j + 3), s4 * take(roots, 5 * j + 4), take(inverse, j)
+            a0, a1, a2 = (
+                s0 * take(roots, 5 * j),
+                s1 * take(roots, 5 * j + 1),
+                s2 * take(roots, 5 * j + 2),
+            )
+            a3, a4, other = (
+                s3 * take(roots, 5 * j + 3),
+                s4 * take(roots, 5 * j + 4),
+                take(inverse, j),
+            )
             total = _sum_products(tables, PRODUCTS * (i * n + j), a0, a1, a2, a3, a4)
-            put(out, width * i + j, total * where_above(share, other, other, share))  # the poorer cell uses a part of what the richer uses
+            put(
+                out, width * i + j, total * where_above(share, other, other, share)
+            )  # the poorer cell uses a part of what the richer uses
 
 
 @njit(**INNER)
@@ -150,9 +205,21 @@ def total_variance(roots, inverse, tables, weights):  # type: ignore[no-untyped-
         s3, s4, share = take(roots, 5 * i + 3), take(roots, 5 * i + 4), take(inverse, i)
         line = total * 0.0
         for j in range(i, n):
-            a0, a1, a2 = s0 * take(roots, 5 * j), s1 * take(roots, 5 * j + 1), s2 * take(roots, 5 * j + 2)
-            a3, a4, other = s3 * take(roots, 5 * j + 3), s4 * take(roots, 5 * j + 4), take(inverse, j)
-            weight = take(weights, j) * where_above(share, other, other, share) * (1.0 if i == j else 2.0)
+            a0, a1, a2 = (
+                s0 * take(roots, 5 * j),
+                s1 * take(roots, 5 * j + 1),
+                s2 * take(roots, 5 * j + 2),
+            )
+            a3, a4, other = (
+                s3 * take(roots, 5 * j + 3),
+                s4 * take(roots, 5 * j + 4),
+                take(inverse, j),
+            )
+            weight = (
+                take(weights, j)
+                * where_above(share, other, other, share)
+                * (1.0 if i == j else 2.0)
+            )
             line = line + _sum_products(tables, PRODUCTS * (i * n + j), a0, a1, a2, a3, a4) * weight
         total = total + line * take(weights, i)
     return total
@@ -162,11 +229,18 @@ def total_variance(roots, inverse, tables, weights):  # type: ignore[no-untyped-
 def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: ignore[no-untyped-def]
     """Variance of the cells added with `weights`, as a polynomial in the squared coefficient of `term`.
 
-    `roots` are those of the noise without the term, `units` those of `root_units`. To the rows of `out` go the variance
-    without the term, its growth per unit, and per unit squared.
+    `roots` are those of the noise without the term, `units` those of `root_units`. To the rows of
+    `out` go the variance without the term, its growth per unit, and per unit squared.
     """
     n = inverse.shape[0]
-    t0, t1, t2, t3, t4, itself = _TABLE[term][0], _TABLE[term][1], _TABLE[term][2], _TABLE[term][3], _TABLE[term][4], _TABLE[term][term]
+    t0, t1, t2, t3, t4, itself = (
+        _TABLE[term][0],
+        _TABLE[term][1],
+        _TABLE[term][2],
+        _TABLE[term][3],
+        _TABLE[term][4],
+        _TABLE[term][term],
+    )
     scatters = 0.0 if term == 4 else 1.0
     null = take(weights, 0) * 0.0
     linear, square = null, null
@@ -176,13 +250,35 @@ def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: 
         unit, factor = take(units, 5 * i + term), take(weights, i)
         for j in range(i, n):
             at = PRODUCTS * (i * n + j)
-            a0, a1, a2 = s0 * take(roots, 5 * j), s1 * take(roots, 5 * j + 1), s2 * take(roots, 5 * j + 2)
-            a3, a4, other = s3 * take(roots, 5 * j + 3), s4 * take(roots, 5 * j + 4), take(inverse, j)
-            weight = factor * take(weights, j) * where_above(share, other, other, share) * (1.0 if i == j else 2.0)
+            a0, a1, a2 = (
+                s0 * take(roots, 5 * j),
+                s1 * take(roots, 5 * j + 1),
+                s2 * take(roots, 5 * j + 2),
+            )
+            a3, a4, other = (
+                s3 * take(roots, 5 * j + 3),
+                s4 * take(roots, 5 * j + 4),
+                take(inverse, j),
+            )
+            weight = (
+                factor
+                * take(weights, j)
+                * where_above(share, other, other, share)
+                * (1.0 if i == j else 2.0)
+            )
             null = null + _sum_products(tables, at, a0, a1, a2, a3, a4) * weight
             step = unit * take(units, 5 * j + term)
-            line = a0 * number(tables, at + t0) + a1 * number(tables, at + t1) + a2 * number(tables, at + t2)
-            linear = linear + (line + a3 * number(tables, at + t3) + a4 * number(tables, at + t4)) * step * weight
+            line = (
+                a0 * number(tables, at + t0)
+                + a1 * number(tables, at + t1)
+                + a2 * number(tables, at + t2)
+            )
+            linear = (
+                linear
+                + (line + a3 * number(tables, at + t3) + a4 * number(tables, at + t4))
+                * step
+                * weight
+            )
             square = square + step * step * number(tables, at + itself) * weight
     put(out, 0, null)
     put(out, 1, linear)
@@ -190,7 +286,9 @@ def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: 
 
 
 @njit(**INNER)
-def degrees_of_freedom(squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
+def degrees_of_freedom(
+    squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal, out
+):  # type: ignore[no-untyped-def]
     """Equivalent degrees of freedom of each finite cell of a window under a mixture of noises, ``2 mean^2 / variance``."""
     amounts = np.empty(5)
     for i in range(avar.size):

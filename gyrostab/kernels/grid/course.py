@@ -1,8 +1,10 @@
 """The most likely course of noisy stamps along a grid: which rows are the next sample, and where samples are missing.
 
-A stamp is the time of its sample plus jitter. How far the stamps are ahead of the row count, in samples, is then a whole number (the
-samples lost so far) plus jitter, plus a slow phase of the clock. The whole number changes rarely. `trace` finds its most likely course:
-hypotheses are kept side by side until the rows that follow decide between them (a Viterbi search), so no single stamp decides anything.
+A stamp is the time of its sample plus jitter. How far the stamps are ahead of the row count, in
+samples, is then a whole number (the samples lost so far) plus jitter, plus a slow phase of the
+clock. The whole number changes rarely. `trace` finds its most likely course: hypotheses are kept
+side by side until the rows that follow decide between them (a Viterbi search), so no single stamp
+decides anything.
 """
 
 from __future__ import annotations
@@ -19,8 +21,10 @@ Integers = NDArray[np.int64]
 
 #: Most hypotheses kept side by side: each row that comes late is the possible end of a loss.
 _MOST = 64
-#: Costs, in nats. A stamp beyond 5 standard deviations (12.5 nats) is an outlier, whatever its size. One row in 150 (5 nats) comes after
-#: a loss; a loss of k samples is k times less likely than that of one. A row that has no sample on the grid is as unlikely as 1e-13,
+#: Costs, in nats. A stamp beyond 5 standard deviations (12.5 nats) is an outlier, whatever its
+#: size. One row in 150 (5 nats) comes after
+#: a loss; a loss of k samples is k times less likely than that of one. A row that has no sample on
+#: the grid is as unlikely as 1e-13,
 #: much more than an outlier: rows that are late by many samples for a while are kept.
 _OUTLIER_NATS, _LOSS_NATS, _DROP_NATS = 12.5, 5.0, 30.0
 #: Standard deviations within which the end of a loss is looked for.
@@ -37,7 +41,8 @@ _PERSIST_ROWS = 16
 def _keep(table, n, level, phase, cost, parent):  # type: ignore[no-untyped-def]
     """Add a hypothesis to the first `n` of a table, each level once; returns how many there are then.
 
-    The one with the fewest losses stays whatever it costs: while rows are late, all others are cheaper.
+    The one with the fewest losses stays whatever it costs: while rows are late, all others are
+    cheaper.
     """
     lowest, worst = np.int64(0), np.int64(-1)
     for h in range(n):
@@ -112,7 +117,9 @@ def _extend(new, kept, old, h, position, following, sigma, gain, hold, most):  #
             kept = _keep(new, kept, level + far, phase + gain * rest, dear, h)
         far -= 1.0
     ahead = np.rint(following - level - phase)
-    if 1.0 <= ahead <= most and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5:  # a loss of which the next row shows the end
+    if (
+        1.0 <= ahead <= most and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5
+    ):  # a loss of which the next row shows the end
         dear = cost + _switch_nats(ahead) + _stamp_nats(off - ahead, weight)
         kept = _keep(new, kept, level + ahead, phase, dear, h)
     return kept
@@ -127,12 +134,29 @@ def _seed(table, level, phase, first, most):  # type: ignore[no-untyped-def]
         for lost in range(1, 1 + _EARLY_LOSSES):
             size = _keep(table, size, level - lost, phase, 0.0, np.int64(0))
         if np.rint(first - phase) <= most:
-            size = _keep(table, size, np.rint(first - phase), phase, _LOSS_NATS, np.int64(0))  # or many, just after the first
+            size = _keep(
+                table, size, np.rint(first - phase), phase, _LOSS_NATS, np.int64(0)
+            )  # or many, just after the first
     return size
 
 
 @njit(**KERNEL)
-def trace(count, stamps, count0, stamp0, period, sigma, gain, hold, most, level0, phase0, seen, levels, phases):  # type: ignore[no-untyped-def]
+def trace(
+    count,
+    stamps,
+    count0,
+    stamp0,
+    period,
+    sigma,
+    gain,
+    hold,
+    most,
+    level0,
+    phase0,
+    seen,
+    levels,
+    phases,
+):  # type: ignore[no-untyped-def]
     """Find the most likely course of the stamps of rows.
 
     Parameters
@@ -146,15 +170,19 @@ def trace(count, stamps, count0, stamp0, period, sigma, gain, hold, most, level0
     sigma : float
         Standard deviation of the jitter [samples].
     gain : float
-        Share of a deviation that the phase takes over: it averages the jitter of the last ``1 / gain`` rows.
+        Share of a deviation that the phase takes over: it averages the jitter of the last ``1 /
+        gain`` rows.
     hold : float
-        A phase further from zero than this is turned into a sample left out, or a row dropped [samples].
+        A phase further from zero than this is turned into a sample left out, or a row dropped
+        [samples].
     most : float
-        Samples that may be lost at one time: damaged stamps far ahead are outliers, and not the end of a loss.
+        Samples that may be lost at one time: damaged stamps far ahead are outliers, and not the end
+        of a loss.
     level0, phase0 : int, float
         Samples lost so far, and phase of the clock [samples].
     seen : int
-        Rows that `phase0` averages; 0 at the beginning, where `level0` and fewer by up to 3 are all as likely.
+        Rows that `phase0` averages; 0 at the beginning, where `level0` and fewer by up to 3 are all
+        as likely.
     levels, phases : ndarray of int64 and float64, shape (n,)
         Filled with the samples lost up to each row, and the phase after it.
 
@@ -246,8 +274,8 @@ def find_breaks(stamps, n, latest, reach, longest):  # type: ignore[no-untyped-d
 def find_phase(count, stamps, period, sigma):  # type: ignore[no-untyped-def]
     """Find how far the first stamps are ahead of the count of rows, from the first of them [samples].
 
-    Lost samples and late rows put stamps ahead, so of up to 33 rows those count that are least ahead; three of them at least, as one
-    stamp may be damaged.
+    Lost samples and late rows put stamps ahead, so of up to 33 rows those count that are least
+    ahead; three of them at least, as one stamp may be damaged.
     """
     n = min(len(count), 33)
     ahead = np.empty(n)

@@ -1,8 +1,9 @@
 """From stamps to samples: which row belongs to which sample of a uniform grid.
 
-The rows come in blocks; all that must be remembered between two blocks is in three arrays (`new_state`), so the
-result does not depend on where a block ends. A run is a stretch of rows without a break that fills a stretch of the
-grid without a break: ``(first sample, first row, length)``.
+The rows come in blocks; all that must be remembered between two blocks is in three arrays
+(`new_state`), so the result does not depend on where a block ends. A run is a stretch of rows
+without a break that fills a stretch of the grid without a break: ``(first sample, first row,
+length)``.
 """
 
 from __future__ import annotations
@@ -43,7 +44,21 @@ _ORDER = 16  # rows within which an out-of-order row is followed by one past the
 _ON_TIME, _BY_COUNT, DUPLICATE, OUT_OF_ORDER, STEP, RESTART = 0, 1, 2, 3, 5, 6
 
 # places in the state: integers and stamps
-_HEAD, _ROW, _RUN_GRID, _RUN_ROW, _RUN_LENGTH, _PENDING, _PENDING_ROW, _GRID0, _STAMP0, _LATEST, FIRST, STARTED, _PHASE = range(13)
+(
+    _HEAD,
+    _ROW,
+    _RUN_GRID,
+    _RUN_ROW,
+    _RUN_LENGTH,
+    _PENDING,
+    _PENDING_ROW,
+    _GRID0,
+    _STAMP0,
+    _LATEST,
+    FIRST,
+    STARTED,
+    _PHASE,
+) = range(13)
 #: Where the state keeps the run that is still open: first sample, first row, length.
 OPEN_RUN = slice(_RUN_GRID, _RUN_LENGTH + 1)
 _RING = 1 << 14
@@ -61,7 +76,8 @@ def new_state() -> tuple[np.ndarray, np.ndarray]:
 def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
     """Count the samples between stamps that lie near a lattice of `period`.
 
-    The phase follows the stamps with `gain`, so that neither jitter nor a slightly wrong period breaks the count.
+    The phase follows the stamps with `gain`, so that neither jitter nor a slightly wrong period
+    breaks the count.
 
     Parameters
     ----------
@@ -94,7 +110,9 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
             phase = 0.0
             continue
         moved = step + phase
-        if least < moved < most:  # one sample, as nearly always: told without a division that the next stamp would wait for
+        if (
+            least < moved < most
+        ):  # one sample, as nearly always: told without a division that the next stamp would wait for
             count[i] = count[i - 1] + 1
             phase = (1.0 - gain) * (moved - period)
             continue
@@ -118,8 +136,8 @@ def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
     Returns
     -------
     ndarray, shape (pieces, 6)
-        Stamps in the piece, mean count, mean stamp [ns from the first of the stretch], sums of squares of the counts and of counts times
-        stamps about their means, and of the residuals.
+        Stamps in the piece, mean count, mean stamp [ns from the first of the stretch], sums of
+        squares of the counts and of counts times stamps about their means, and of the residuals.
     """
     n = len(stamps)
     pieces = np.int64(n > 0)
@@ -144,8 +162,14 @@ def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
             products += c * t
         slope = products / squares if squares > 0.0 else period
         for i in range(begin, end):
-            rest += (stamps[i] - stamp0 - mean_stamp - slope * (count[i] - count0 - mean_count)) ** 2
-        table[row, 0], table[row, 1], table[row, 2] = size, mean_count + count0, mean_stamp + (stamp0 - stamps[0])
+            rest += (
+                stamps[i] - stamp0 - mean_stamp - slope * (count[i] - count0 - mean_count)
+            ) ** 2
+        table[row, 0], table[row, 1], table[row, 2] = (
+            size,
+            mean_count + count0,
+            mean_stamp + (stamp0 - stamps[0]),
+        )
         table[row, 3], table[row, 4], table[row, 5] = squares, products, rest
         begin = end
     return table
@@ -260,7 +284,11 @@ def _settle(row, position, state, ring):  # type: ignore[no-untyped-def]
     """Place the rows without a stamp that come just before `row`, if it leaves exactly their room."""
     pending = state[_PENDING]
     state[_PENDING] = 0
-    if pending > 0 and state[_ROW] + 1 + pending == row and abs(position - (state[_HEAD] + 1 + pending)) <= 0.5:
+    if (
+        pending > 0
+        and state[_ROW] + 1 + pending == row
+        and abs(position - (state[_HEAD] + 1 + pending)) <= 0.5
+    ):
         for sample in range(state[_HEAD] + 1, state[_HEAD] + 1 + pending):
             _occupy(ring, sample - 1, sample)
         state[_RUN_LENGTH] += pending
@@ -273,7 +301,8 @@ def _ahead(stamps, j, position, period, max_gap, state):  # type: ignore[no-unty
     """Judge row j, whose stamp is later than the next sample: verdict and sample."""
     expected = state[_HEAD] + 1
     soon = position - expected < 1.5
-    # a late stamp stands apart from the one after it; of a doubled row, which follows a missing one, both are the same
+    # a late stamp stands apart from the one after it; of a doubled row, which follows a missing
+    # one, both are the same
     apart = j + 1 < len(stamps) and stamps[j + 1] > stamps[j] + 0.05 * period
     if (apart or not soon) and _fits(stamps, j, expected, period, state):
         return _BY_COUNT, expected
@@ -289,7 +318,9 @@ def _behind(stamps, j, position, period, state, ring):  # type: ignore[no-untype
     target = np.int64(np.rint(position))
     if _persists(stamps, j, len(stamps), state[_LATEST]):
         elapsed = state[_LATEST] - state[_STAMP0]
-        begins_again = stamps[j] <= state[FIRST] + 0.1 * elapsed or 2 * (state[_LATEST] - stamps[j]) > elapsed
+        begins_again = (
+            stamps[j] <= state[FIRST] + 0.1 * elapsed or 2 * (state[_LATEST] - stamps[j]) > elapsed
+        )
         return RESTART if begins_again else STEP, expected + 1
     if _is_free(ring, state, target):
         return OUT_OF_ORDER, target
@@ -326,7 +357,13 @@ def _add_run(runs, n, sample, row, length):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _note(events, n, cause, sample, row, before, stamp):  # type: ignore[no-untyped-def]
-    events[n, 0], events[n, 1], events[n, 2], events[n, 3], events[n, 4] = cause, sample, row, before, stamp
+    events[n, 0], events[n, 1], events[n, 2], events[n, 3], events[n, 4] = (
+        cause,
+        sample,
+        row,
+        before,
+        stamp,
+    )
     return n + 1
 
 
@@ -337,7 +374,11 @@ def _even(rows, stamps, j, n, period, expected, row, stamp0):  # type: ignore[no
     No row waits here for what the ones before did to the phase, which they leave at zero.
     """
     first = j
-    while j < n and rows[j] == row + 1 + j - first and (stamps[j] - stamp0) / period == expected + j - first:
+    while (
+        j < n
+        and rows[j] == row + 1 + j - first
+        and (stamps[j] - stamp0) / period == expected + j - first
+    ):
         j += 1
     return j
 
@@ -395,9 +436,22 @@ def _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  
         head = state[_HEAD]
         verdict, target = _judge(stamps, j, position, period, hold, max_gap, state, ring)
         if verdict > _BY_COUNT:
-            n_events = _note(events, n_events, verdict, head + 1 if verdict >= STEP else target, row, state[_LATEST], stamp)
+            n_events = _note(
+                events,
+                n_events,
+                verdict,
+                head + 1 if verdict >= STEP else target,
+                row,
+                state[_LATEST],
+                stamp,
+            )
         if verdict >= STEP:
-            state[_GRID0], state[_STAMP0], state[_LATEST], state[_PHASE] = target, _origin(stamps, j, period), stamp, 0
+            state[_GRID0], state[_STAMP0], state[_LATEST], state[_PHASE] = (
+                target,
+                _origin(stamps, j, period),
+                stamp,
+                0,
+            )
         elif verdict == OUT_OF_ORDER and _is_free(ring, state, target):
             ring[target % len(ring)] = True
             n_runs = _add_run(runs, n_runs, target, row, np.int64(1))
@@ -417,14 +471,22 @@ def _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  
 
 
 def place(
-    rows: Integers, stamps: Integers, n: int, period: float, hold: float, max_gap: float, state: Integers, ring: NDArray[np.bool_]
+    rows: Integers,
+    stamps: Integers,
+    n: int,
+    period: float,
+    hold: float,
+    max_gap: float,
+    state: Integers,
+    ring: NDArray[np.bool_],
 ) -> tuple[Integers, Integers]:
     """Give rows their samples.
 
-    The next row takes the next sample while its stamp is within half a sample of it; otherwise the sample is found anew
-    from the stamp, counted from the start of the piece, so nothing accumulates. Stamps are seen from their own slow
-    course along the grid (the phase), so that jitter on top of a slightly wrong rate does not double or skip samples; only
-    when the course itself is more than `hold` off, one sample is left out, or one row.
+    The next row takes the next sample while its stamp is within half a sample of it; otherwise the
+    sample is found anew from the stamp, counted from the start of the piece, so nothing
+    accumulates. Stamps are seen from their own slow course along the grid (the phase), so that
+    jitter on top of a slightly wrong rate does not double or skip samples; only when the course
+    itself is more than `hold` off, one sample is left out, or one row.
 
     Parameters
     ----------
@@ -448,6 +510,9 @@ def place(
     events : ndarray of int64, shape (n_events, 5)
         Cause, sample, row, stamp before [ns], stamp [ns].
     """
-    runs, events = np.empty((2 * n + 2, 3), dtype=np.int64), np.empty((2 * n + 2, 5), dtype=np.int64)
+    runs, events = (
+        np.empty((2 * n + 2, 3), dtype=np.int64),
+        np.empty((2 * n + 2, 5), dtype=np.int64),
+    )
     n_runs, n_events = _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events)
     return runs[:n_runs].copy(), events[:n_events].copy()

@@ -1,8 +1,9 @@
 """Gaussian processes of continuous time, a resonance or a band, read at the samples or averaged over them, without approximation.
 
-A process is white noise behind second-order sections in series. Its state is known from one sample to the next by the matrix
-exponential, and so are the joint distribution of the state and of the mean over the interval between (Van Loan 1978). So a process far
-above half of the sampling rate folds down as it does in a logger that samples it, and needs no finer time.
+A process is white noise behind second-order sections in series. Its state is known from one sample
+to the next by the matrix exponential, and so are the joint distribution of the state and of the
+mean over the interval between (Van Loan 1978). So a process far above half of the sampling rate
+folds down as it does in a logger that samples it, and needs no finer time.
 
 References
 ----------
@@ -22,7 +23,17 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["ORDER", "Reading", "band", "band_psd", "folded_psd", "march", "oscillator", "oscillator_psd", "rest"]
+__all__ = [
+    "ORDER",
+    "Reading",
+    "band",
+    "band_psd",
+    "folded_psd",
+    "march",
+    "oscillator",
+    "oscillator_psd",
+    "rest",
+]
 
 Array = NDArray[np.float64]
 
@@ -35,7 +46,9 @@ class Reading(NamedTuple):
 
     step: Array  # (d, d): state at the next sample from the state at this one
     read: Array  # (d,): reading from the state at this sample
-    kick: Array  # (d + 1, d + 1): lower triangle; from standard normal numbers to the fresh parts of state and reading
+    # (d + 1, d + 1): lower triangle; from standard normal numbers to the fresh parts of state and
+    # reading
+    kick: Array
     spread: Array  # (d, d): from standard normal numbers to a state of the stationary process
 
 
@@ -88,7 +101,9 @@ def _reading(a: Array, covariance: Array, c: Array, rate: float, *, average: boo
         crossed = once @ covariance @ c - step @ (covariance @ read)
         total[:size, size] = total[size, :size] = crossed
         total[size, size] = c @ twice @ covariance @ c - read @ covariance @ read
-    return Reading(np.ascontiguousarray(step), np.ascontiguousarray(read), _factor(total), _factor(covariance))
+    return Reading(
+        np.ascontiguousarray(step), np.ascontiguousarray(read), _factor(total), _factor(covariance)
+    )
 
 
 def oscillator(frequency: float, quality: float, rate: float, *, average: bool = True) -> Reading:
@@ -118,10 +133,20 @@ def _band_sections(low: float, high: float) -> list[_Section]:
     root = np.sqrt(half**2 - centre**2 + 0j)
     poles = np.concatenate([half + root, half - root])
     poles = poles[poles.imag > 0.0]  # one of each pair, whose product is real
-    return [_Section(float(abs(pole)), float(-2.0 * pole.real), True) for pole in sorted(poles, key=abs)]
+    return [
+        _Section(float(abs(pole)), float(-2.0 * pole.real), True) for pole in sorted(poles, key=abs)
+    ]
 
 
-def band(low: float, high: float, rate: float, *, resonance: float = 0.0, quality: float = 1.0, average: bool = False) -> Reading:
+def band(
+    low: float,
+    high: float,
+    rate: float,
+    *,
+    resonance: float = 0.0,
+    quality: float = 1.0,
+    average: bool = False,
+) -> Reading:
     """Noise of unit variance in a band, behind an optional mount.
 
     Parameters
@@ -131,7 +156,8 @@ def band(low: float, high: float, rate: float, *, resonance: float = 0.0, qualit
     rate : float
         Sampling rate [Hz].
     resonance, quality : float
-        Frequency [Hz] and quality of a mass on a spring that the noise goes through; its gain is one at low frequency. None at 0 Hz.
+        Frequency [Hz] and quality of a mass on a spring that the noise goes through; its gain is
+        one at low frequency. None at 0 Hz.
     average : bool
         Mean over each sample instead of the value at its beginning.
     """
@@ -152,7 +178,9 @@ def rest(reading: Reading, normal: Array) -> Array:
 
 
 @njit(**KERNEL)
-def march(step: Array, read: Array, kick: Array, normal: Array, position: Array) -> tuple[Array, Array]:
+def march(
+    step: Array, read: Array, kick: Array, normal: Array, position: Array
+) -> tuple[Array, Array]:
     """Read the process at the samples.
 
     Parameters
@@ -191,7 +219,8 @@ def march(step: Array, read: Array, kick: Array, normal: Array, position: Array)
     return values, here
 
 
-# ------------------------------------------------------------------------------------------------------------- the same in frequency
+# -------------------------------------------------------------------------------------------------------------
+# the same in frequency
 
 
 def oscillator_psd(f: Array, frequency: float, quality: float) -> Array:
@@ -200,17 +229,23 @@ def oscillator_psd(f: Array, frequency: float, quality: float) -> Array:
     return np.asarray(width * f**2 / (math.pi * ((f**2 - frequency**2) ** 2 + (width * f) ** 2)))
 
 
-def band_psd(f: Array, low: float, high: float, *, resonance: float = 0.0, quality: float = 1.0) -> Array:
+def band_psd(
+    f: Array, low: float, high: float, *, resonance: float = 0.0, quality: float = 1.0
+) -> Array:
     """Two-sided density [Hz-1] of `band` in continuous time."""
     x = (f**2 - low * high) / ((high - low) * np.maximum(np.abs(f), 1e-9 * low))
     share = math.pi / (2 * ORDER)
     density = 0.5 / ((high - low) * share / math.sin(share)) / (1.0 + x ** (2 * ORDER))
     if resonance:
-        density = density * resonance**4 / ((f**2 - resonance**2) ** 2 + (f * resonance / quality) ** 2)
+        density = (
+            density * resonance**4 / ((f**2 - resonance**2) ** 2 + (f * resonance / quality) ** 2)
+        )
     return np.asarray(density)
 
 
-def folded_psd(density: Callable[[Array], Array], f: Array, rate: float, highest: float, *, average: bool) -> Array:
+def folded_psd(
+    density: Callable[[Array], Array], f: Array, rate: float, highest: float, *, average: bool
+) -> Array:
     """Two-sided density of the samples of a process: the sum over the frequencies that look the same in them.
 
     Parameters

@@ -1,8 +1,9 @@
 """Noise as an ideal gyro gives it, sample after sample: each sample is the mean rate over its own interval.
 
-All processes are exact in continuous time: their means over any number of samples have the Allan variance of the continuous law, not
-of a sampled one. All go on where they stopped, bit for bit, however the samples are cut into calls, because every sample uses its own
-fresh numbers, in their order. Strength one throughout; the caller gives units.
+All processes are exact in continuous time: their means over any number of samples have the Allan
+variance of the continuous law, not of a sampled one. All go on where they stopped, bit for bit,
+however the samples are cut into calls, because every sample uses its own fresh numbers, in their
+order. Strength one throughout; the caller gives units.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-#: Ratio of neighbouring correlation times in `flicker_times`: the Allan variance of their sum departs from flat by 0.2 %.
+#: Ratio of neighbouring correlation times in `flicker_times`: the Allan variance of their sum
+#: departs from flat by 0.2 %.
 RATIO = 5.0
 #: Shorter correlation times than this share of a sample are white noise to the samples.
 SHORTEST = 1.0 / 12.0
@@ -48,13 +50,15 @@ def running_sum(steps: Array, carry: float) -> tuple[Array, float]:
 def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, float]:
     """Means over the samples of a Brownian motion with the increments `steps`.
 
-    The mean over an interval with the increment d is the start plus d / 2 plus an independent part of variance 1/12 of the increment's; so
-    the mean over k samples has the Allan variance k / 3, with no correction for sampling.
+    The mean over an interval with the increment d is the start plus d / 2 plus an independent part
+    of variance 1/12 of the increment's; so the mean over k samples has the Allan variance k / 3,
+    with no correction for sampling.
 
     Parameters
     ----------
     steps, inner : ndarray, shape (n,)
-        Increment of every sample, and the part inside of it: standard normal numbers times the standard deviation of the increment.
+        Increment of every sample, and the part inside of it: standard normal numbers times the
+        standard deviation of the increment.
     carry : float
         Position at the start of the first sample.
 
@@ -69,13 +73,16 @@ def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, flo
 
 
 @njit(**KERNEL)
-def ornstein_uhlenbeck(normal: Array, decay: Array, weight: Array, rest: float, position: Array) -> tuple[Array, Array]:
+def ornstein_uhlenbeck(
+    normal: Array, decay: Array, weight: Array, rest: float, position: Array
+) -> tuple[Array, Array]:
     """Sum of the means over every sample of Ornstein-Uhlenbeck processes of unit variance.
 
     Parameters
     ----------
     normal : ndarray, shape (n, m + 1)
-        Standard normal numbers for each sample: one for each process, one for what the means do beyond their ends.
+        Standard normal numbers for each sample: one for each process, one for what the means do
+        beyond their ends.
     decay : ndarray, shape (m,)
         ``1 - exp(-1 / T)`` for the correlation times T [samples].
     weight : ndarray, shape (m,)
@@ -113,7 +120,9 @@ def _moments(samples: Array) -> tuple[Array, Array, Array]:
     weight = np.tanh(a / 2.0) / a
     with np.errstate(over="ignore"):
         exact = 2.0 * (a - decay) / a**2 - 2.0 * weight * decay / a
-    rest = np.where(a < 0.01, a / 6.0 - a**3 / 60.0, exact)  # the difference loses its digits where the process is slow
+    rest = np.where(
+        a < 0.01, a / 6.0 - a**3 / 60.0, exact
+    )  # the difference loses its digits where the process is slow
     return decay, weight, rest
 
 
@@ -142,15 +151,18 @@ def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> 
     (array([0.6321, 0.2325, 0.0855]), 0.0498)
     """
     decay, weight, rest = _moments(np.array([float(samples)]))
-    total, last = ornstein_uhlenbeck(normal, decay, weight, math.sqrt(rest[0]), np.array([position]))
+    total, last = ornstein_uhlenbeck(
+        normal, decay, weight, math.sqrt(rest[0]), np.array([position])
+    )
     return total, float(last[0])
 
 
 def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Array:
     """Correlation times [s] of the processes that make flicker noise in samples at `rate` [Hz].
 
-    They stand in even log spacing, beginning at ``1 / (2 pi low)`` [s], so that another `rate` adds or takes only the short ones.
-    The sum has the two-sided density B^2 / (2 pi f) from about 3 times `low` to a third of `high` [Hz].
+    They stand in even log spacing, beginning at ``1 / (2 pi low)`` [s], so that another `rate` adds
+    or takes only the short ones. The sum has the two-sided density B^2 / (2 pi f) from about 3
+    times `low` to a third of `high` [Hz].
     """
     longest = 1.0 / (2.0 * math.pi * low)
     shortest = max(1.0 / (2.0 * math.pi * high), SHORTEST / rate)
@@ -158,7 +170,9 @@ def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Array:
     return np.asarray(longest * RATIO ** -np.arange(count, dtype=np.float64))
 
 
-def flicker_means(normal: Array, times: Array, rate: float, position: Array, *, endless: bool = True) -> tuple[Array, Array]:
+def flicker_means(
+    normal: Array, times: Array, rate: float, position: Array, *, endless: bool = True
+) -> tuple[Array, Array]:
     """Means over the samples of flicker noise with B = 1.
 
     Parameters
@@ -172,7 +186,8 @@ def flicker_means(normal: Array, times: Array, rate: float, position: Array, *, 
     position : ndarray, shape (m,)
         Where the processes are at the start; standard normal numbers at the very start.
     endless : bool
-        The spectrum goes on above what `times` hold; what is faster than a sample is white noise to it.
+        The spectrum goes on above what `times` hold; what is faster than a sample is white noise to
+        it.
 
     Returns
     -------

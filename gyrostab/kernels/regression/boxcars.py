@@ -1,11 +1,13 @@
 """Boxcars in white noise with a random walk and relaxing processes: matched filters at every place, in linear time.
 
-For the covariance C of the series these kernels give ``C^-1 y`` (the disturbance smoother of de Jong) and ``x' C^-1 x`` for
-every boxcar x, so that the matched filter of a boxcar is a sum of ``C^-1 y`` over it. Nothing of the size of C is made.
+For the covariance C of the series these kernels give ``C^-1 y`` (the disturbance smoother of de
+Jong) and ``x' C^-1 x`` for every boxcar x, so that the matched filter of a boxcar is a sum of
+``C^-1 y`` over it. Nothing of the size of C is made.
 
 References
 ----------
-Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. (2012), sections 4.5 and 4.12.
+Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. (2012), sections 4.5 and
+4.12.
 """
 
 from __future__ import annotations

@@ -30,10 +30,12 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-#: Correlation times of the slow part [share of the record], and its spectral density against the white part's at one cycle per record.
+#: Correlation times of the slow part [share of the record], and its spectral density against the
+#: white part's at one cycle per record.
 _TIMES = (0.03, 0.1, 0.3, 1.0, 10.0)
 _RATIOS = (1.0, 4.0, 16.0, 64.0, 1e3, 1e4, 1e6)
-_WHITE_PRIOR = 150.0  # against the correlation time for each slow law: a short memory must show itself in the data
+# against the correlation time for each slow law: a short memory must show itself in the data
+_WHITE_PRIOR = 150.0
 _TAIL = 60  # smallest of the simulated p-values, from which the law of still smaller ones is taken
 _STEEPEST = 1.5  # power of the share against the p-value in the tail, at most
 
@@ -58,7 +60,9 @@ class LagFit(NamedTuple):
     freedom: int
 
 
-def averages(block: NDArray[np.int64], time: Array, length: float, share: Array) -> tuple[Any, Array, Array]:
+def averages(
+    block: NDArray[np.int64], time: Array, length: float, share: Array
+) -> tuple[Any, Array, Array]:
     """Average windows into blocks, and say how the white noise of the blocks is correlated.
 
     Parameters
@@ -84,19 +88,28 @@ def averages(block: NDArray[np.int64], time: Array, length: float, share: Array)
     mean = csr_array((1.0 / sizes[block], (block, np.arange(n))), shape=(count, n))
     last = np.searchsorted(time, time + length, side="left")
     rows = np.repeat(np.arange(n), last - np.arange(n))
-    columns = np.arange(rows.size) - np.repeat(np.cumsum(last - np.arange(n)) - last, last - np.arange(n))
+    columns = np.arange(rows.size) - np.repeat(
+        np.cumsum(last - np.arange(n)) - last, last - np.arange(n)
+    )
     overlap = (1.0 - (time[columns] - time[rows]) / length) / np.sqrt(share[rows] * share[columns])
     upper = csr_array((overlap, (rows, columns)), shape=(n, n))
     half = (mean @ upper @ mean.T).toarray()
-    white = half + half.T - (mean @ csr_array((1.0 / share, (np.arange(n), np.arange(n))), shape=(n, n)) @ mean.T).toarray()
+    white = (
+        half
+        + half.T
+        - (
+            mean @ csr_array((1.0 / share, (np.arange(n), np.arange(n))), shape=(n, n)) @ mean.T
+        ).toarray()
+    )
     return mean, np.asarray(mean @ time), white
 
 
 def noise_laws(centre: Array, white: Array) -> Laws:
     """Noise laws of the blocks that are weighed, and the weight each has beforehand.
 
-    White noise alone, and white noise with a slow part: an Ornstein-Uhlenbeck process, which is a random walk when its
-    correlation time is longer than the record. Mixtures of several look like flicker noise.
+    White noise alone, and white noise with a slow part: an Ornstein-Uhlenbeck process, which is a
+    random walk when its correlation time is longer than the record. Mixtures of several look like
+    flicker noise.
 
     Parameters
     ----------
@@ -115,7 +128,12 @@ def noise_laws(centre: Array, white: Array) -> Laws:
     density = float(np.mean(np.diag(white))) / centre.size
     family, prior = [white], [_WHITE_PRIOR]
     for length in _TIMES:
-        slow = np.exp(-distance / length) * density * (1.0 + (2.0 * np.pi * length) ** 2) / (2.0 * length)
+        slow = (
+            np.exp(-distance / length)
+            * density
+            * (1.0 + (2.0 * np.pi * length) ** 2)
+            / (2.0 * length)
+        )
         family += [white + ratio * slow for ratio in _RATIOS]
         prior += [length] * len(_RATIOS)
     return decompose(family, np.log(prior))
@@ -124,7 +142,9 @@ def noise_laws(centre: Array, white: Array) -> Laws:
 def decompose(family: list[Array], prior: Array) -> Laws:
     """Factors of covariances (n, n), each with the logarithm of its weight beforehand."""
     factor, n = np.linalg.cholesky(np.array(family)), family[0].shape[0]
-    whiten = np.array([solve_triangular(one, np.eye(n), lower=True, check_finite=False) for one in factor])
+    whiten = np.array(
+        [solve_triangular(one, np.eye(n), lower=True, check_finite=False) for one in factor]
+    )
     log_det = 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
     return Laws(factor, whiten, log_det, np.asarray(prior), n - 1)
 
@@ -134,7 +154,13 @@ def beside(laws: Laws, nuisance: Array) -> Laws:
     q, r = np.linalg.qr(laws.whiten @ nuisance)
     free = laws.whiten - q @ (np.swapaxes(q, 1, 2) @ laws.whiten)
     log_h = 2.0 * np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))).sum(axis=1)
-    return Laws(laws.factor, free, laws.log_det + log_h, laws.prior, nuisance.shape[0] - nuisance.shape[1] - 1)
+    return Laws(
+        laws.factor,
+        free,
+        laws.log_det + log_h,
+        laws.prior,
+        nuisance.shape[0] - nuisance.shape[1] - 1,
+    )
 
 
 def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
@@ -150,12 +176,15 @@ def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
     Returns
     -------
     LagFit
-        By (law, series, lag); ``log_weight`` is the restricted log likelihood with the slope in the model, ``log_without``
-        that without it.
+        By (law, series, lag); ``log_weight`` is the restricted log likelihood with the slope in the
+        model, ``log_without`` that without it.
     """
     n = series.shape[0]
     flat = laws.whiten.reshape(-1, n)  # one large product is faster than one for each law
-    y, x = (flat @ series).reshape(-1, n, series.shape[1]), (flat @ driver).reshape(-1, n, driver.shape[1])
+    y, x = (
+        (flat @ series).reshape(-1, n, series.shape[1]),
+        (flat @ driver).reshape(-1, n, driver.shape[1]),
+    )
     xx = np.maximum((x * x).sum(axis=1), 1e-30)[:, None, :]
     yy = (y * y).sum(axis=1)[:, :, None]
     xy = np.swapaxes(y, 1, 2) @ x
@@ -211,10 +240,16 @@ def chances(laws: Laws, driver: Array, weight: Array, draws: int = 300, seed: in
         What `p_values` says of them.
     """
     normal = np.random.default_rng(seed).normal(size=(driver.shape[0], draws))
-    law = np.searchsorted(np.cumsum(weight), (np.arange(draws) + 0.5) / draws * weight.sum() * (1.0 - 1e-12))
-    made = np.concatenate([laws.factor[one] @ normal[:, law == one] for one in np.unique(law)], axis=1)
+    law = np.searchsorted(
+        np.cumsum(weight), (np.arange(draws) + 0.5) / draws * weight.sum() * (1.0 - 1e-12)
+    )
+    made = np.concatenate(
+        [laws.factor[one] @ normal[:, law == one] for one in np.unique(law)], axis=1
+    )
     # single precision takes half the time, and is enough for a share
-    short = laws._replace(whiten=laws.whiten.astype(np.float32), log_det=laws.log_det.astype(np.float32))
+    short = laws._replace(
+        whiten=laws.whiten.astype(np.float32), log_det=laws.log_det.astype(np.float32)
+    )
     short = short._replace(prior=laws.prior.astype(np.float32))
     return p_values(fit_lags(short, made.astype(np.float32), driver.astype(np.float32)))
 
@@ -225,7 +260,11 @@ def calibrated(p: float, chance: Array) -> float:
     edge, share, power = _lower_tail(sample)
     if p < edge:
         return float(share * (p / edge) ** power)
-    return float(np.interp(p, np.append(sample, 1.0), np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0)))
+    return float(
+        np.interp(
+            p, np.append(sample, 1.0), np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0)
+        )
+    )
 
 
 def uncalibrated(share: float, chance: Array) -> float:
@@ -234,7 +273,13 @@ def uncalibrated(share: float, chance: Array) -> float:
     edge, least, power = _lower_tail(sample)
     if share < least:
         return float(edge * (share / least) ** (1.0 / power))
-    return float(np.interp(share, np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0), np.append(sample, 1.0)))
+    return float(
+        np.interp(
+            share,
+            np.append((np.arange(sample.size) + 1.0) / sample.size, 1.0),
+            np.append(sample, 1.0),
+        )
+    )
 
 
 def _lower_tail(sample: Array) -> tuple[float, float, float]:
@@ -245,7 +290,9 @@ def _lower_tail(sample: Array) -> tuple[float, float, float]:
     return edge, count / sample.size, min(1.0 / max(spread, 1e-9), _STEEPEST)
 
 
-def slope_interval(fit: LagFit, series: int, lag: int, share: float) -> tuple[float, float, float, float]:
+def slope_interval(
+    fit: LagFit, series: int, lag: int, share: float
+) -> tuple[float, float, float, float]:
     """Slope, standard error and interval of one entry: the slopes against which `p_values` is at least `share`."""
     mean, spread = (float(part[series, lag]) for part in mixture(fit))
     reach = float(stdtrit(fit.freedom, 1.0 - 0.5 * share)) * spread

@@ -1,7 +1,8 @@
 """Evidence for designs whose sizes are unknown, by the products of whitened data and designs.
 
-A design has columns x with unknown factors beta. The prior of beta is a mixture of normal distributions of several widths; with
-eigenvalues of ``x' x`` the marginal likelihood of each width is a sum.
+A design has columns x with unknown factors beta. The prior of beta is a mixture of normal
+distributions of several widths; with eigenvalues of ``x' x`` the marginal likelihood of each width
+is a sum.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from gyrostab.kernels.compiled import KERNEL
 __all__ = ["chosen_products", "mixed_evidence"]
 
 Array = NDArray[np.float64]
-#: What is this much less likely than the best, as a logarithm, adds nothing that counts: it is taken for so likely.
+#: What is this much less likely than the best, as a logarithm, adds nothing that counts: it is
+#: taken for so likely.
 _NEGLIGIBLE = 40.0
 
 
@@ -68,11 +70,15 @@ def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Arra
     -------
     ndarray, shape (design, record)
     """
-    spread = 1.0 + widths[:, None, None] * eigenvalues.transpose(0, 2, 1)[:, None]  # (design, width, p, grid)
+    spread = (
+        1.0 + widths[:, None, None] * eigenvalues.transpose(0, 2, 1)[:, None]
+    )  # (design, width, p, grid)
     share = 0.5 * widths[:, None, None] / spread
     constant = -np.log(widths.size) - 0.5 * np.log(spread).sum(axis=2)
     terms, best = _terms(base, rotated, constant, share)
-    return np.asarray(best + np.log(np.exp(terms, out=terms).sum(axis=2)))  # numpy takes many exponentials at once
+    return np.asarray(
+        best + np.log(np.exp(terms, out=terms).sum(axis=2))
+    )  # numpy takes many exponentials at once
 
 
 @njit(**KERNEL)

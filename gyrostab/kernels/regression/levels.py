@@ -1,7 +1,7 @@
 """Block means of a bias that hops between two levels, as a hidden Markov model: forward and backward through many records.
 
-The state is the level at the end of a block. A block is cut into parts, in each of which the bias stands on one level, so that blocks
-with hops inside have the laws of their means.
+The state is the level at the end of a block. A block is cut into parts, in each of which the bias
+stands on one level, so that blocks with hops inside have the laws of their means.
 """
 
 from __future__ import annotations
@@ -53,20 +53,26 @@ def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
         for old in range(2):
             for new in range(2):
                 by = move[old][new][:, None, None]
-                come, fell = before[:, :, old, : parts + 1 - new], counted[:, :, old, : parts + 1 - new]
+                come, fell = (
+                    before[:, :, old, : parts + 1 - new],
+                    counted[:, :, old, : parts + 1 - new],
+                )
                 chance[:, :, new, new:] += come * by
                 rises[:, :, new, new:] += (fell + (come if new > old else 0.0)) * by
     return chance, rises
 
 
 @njit(**KERNEL)
-def levels_smooth(like: Array, chance: Array, rises: Array, start: Array) -> tuple[Array, Array, Array, Array]:
+def levels_smooth(
+    like: Array, chance: Array, rises: Array, start: Array
+) -> tuple[Array, Array, Array, Array]:
     """Evidence of block means, and what they say of the share of each block on the upper level.
 
     Parameters
     ----------
     like : ndarray, shape (record, n, parts + 1)
-        Likelihood of each block mean by the number of parts on the upper level, over anything; 1 where it is missing.
+        Likelihood of each block mean by the number of parts on the upper level, over anything; 1
+        where it is missing.
     chance, rises : ndarray, shape (record, 2, 2, parts + 1)
         From `level_tables`.
     start : ndarray, shape (record, 2)
@@ -93,7 +99,9 @@ def levels_smooth(like: Array, chance: Array, rises: Array, start: Array) -> tup
             to_low, to_high = 0.0, 0.0
             for m in range(width):
                 to_low += (first * chance[r, 0, 0, m] + second * chance[r, 1, 0, m]) * like[r, t, m]
-                to_high += (first * chance[r, 0, 1, m] + second * chance[r, 1, 1, m]) * like[r, t, m]
+                to_high += (first * chance[r, 0, 1, m] + second * chance[r, 1, 1, m]) * like[
+                    r, t, m
+                ]
             scale[t] = max(to_low + to_high, _TINY)
             first, second = to_low / scale[t], to_high / scale[t]
             log[r] += np.log(scale[t])

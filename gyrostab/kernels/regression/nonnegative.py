@@ -12,7 +12,8 @@ from gyrostab.kernels.compiled import INNER, KERNEL
 
 __all__ = ["REORDER", "solve_nonnegative"]
 
-#: Lets the compiler add in another order, which it needs for vector code; the order is the same on every call.
+#: Lets the compiler add in another order, which it needs for vector code; the order is the same on
+#: every call.
 REORDER = {"reassoc", "contract", "nsz"}
 
 
@@ -94,18 +95,29 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
     solution : float64 (n,)
         Overwritten with the minimiser.
     guess : int
-        Bit set that is tried first; if it holds the minimiser, no other is tried. None where it is 0.
+        Bit set that is tried first; if it holds the minimiser, no other is tried. None where it is
+        0.
     """
     n = right.size
     room, members = np.empty((2 * n + 3, n)), np.empty(n, np.int64)
-    scaled, work, scale, scaled_right, trial = room[:n], room[n : 2 * n], room[2 * n], room[2 * n + 1], room[2 * n + 2]
+    scaled, work, scale, scaled_right, trial = (
+        room[:n],
+        room[n : 2 * n],
+        room[2 * n],
+        room[2 * n + 1],
+        room[2 * n + 2],
+    )
     for i in range(n):
         scale[i] = 1.0 / np.sqrt(normal[i, i]) if normal[i, i] > 0.0 else 0.0
     for i in range(n):
         scaled_right[i] = right[i] * scale[i]
         for j in range(n):
             scaled[i, j] = normal[i, j] * scale[i] * scale[j]
-    if guess and _solve_subset(scaled, scaled_right, guess, trial, work, members) and _optimal(scaled, scaled_right, allowed, guess, trial):
+    if (
+        guess
+        and _solve_subset(scaled, scaled_right, guess, trial, work, members)
+        and _optimal(scaled, scaled_right, allowed, guess, trial)
+    ):
         for i in range(n):
             solution[i] = trial[i] * scale[i]
         return guess
@@ -113,7 +125,9 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
     chosen = 0
     solution[:] = 0.0
     for subset in range(1, 1 << n):
-        if subset & ~allowed or not _solve_subset(scaled, scaled_right, subset, trial, work, members):
+        if subset & ~allowed or not _solve_subset(
+            scaled, scaled_right, subset, trial, work, members
+        ):
             continue
         gain = 0.0
         feasible = True

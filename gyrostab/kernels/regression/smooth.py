@@ -17,14 +17,16 @@ _DIFFERENCE = (1.0, -2.0, 1.0)
 def smooth_curve(values: Array, *, longest: float) -> Array:
     """Values without their white noise: least squares of the deviations plus a penalty times the squares of second differences.
 
-    The penalty is the one with the least generalised cross-validation, so that a curve with little noise stays as it is.
+    The penalty is the one with the least generalised cross-validation, so that a curve with little
+    noise stays as it is.
 
     Parameters
     ----------
     values : ndarray, shape (n,)
         Equally spaced, all finite.
     longest : float
-        Longest length over which the curve may be smoothed, in steps: the fourth root of the penalty.
+        Longest length over which the curve may be smoothed, in steps: the fourth root of the
+        penalty.
 
     Returns
     -------
@@ -32,7 +34,8 @@ def smooth_curve(values: Array, *, longest: float) -> Array:
 
     References
     ----------
-    Whittaker 1923, Proc. Edinburgh Math. Soc. 41, 63; Golub, Heath and Wahba 1979, Technometrics 21, 215.
+    Whittaker 1923, Proc. Edinburgh Math. Soc. 41, 63; Golub, Heath and Wahba 1979, Technometrics
+    21, 215.
 
     Examples
     --------

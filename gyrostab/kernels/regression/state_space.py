@@ -1,7 +1,8 @@
 """Block means of a random bias in one pass: whitening by a Kalman filter with a free constant.
 
-The bias is a random walk from an unknown start (the free constant), plus Ornstein-Uhlenbeck processes, plus white noise. What is
-observed are means over blocks that follow each other, so the moments are those of means, not of points.
+The bias is a random walk from an unknown start (the free constant), plus Ornstein-Uhlenbeck
+processes, plus white noise. What is observed are means over blocks that follow each other, so the
+moments are those of means, not of points.
 """
 
 from __future__ import annotations
@@ -46,15 +47,19 @@ def flicker_states(step: float, span: float) -> tuple[Array, Array, float]:
     time = LONGEST * span * RATIO ** -np.arange(count, dtype=np.float64)
     variance = np.full(count, np.log(RATIO) / np.pi)
     faster = step / (time[-1] * RATIO ** -np.arange(1.0, 20.0))
-    return variance, time, float(variance[0] * (2.0 * (faster + np.expm1(-faster)) / faster**2).sum())
+    return (
+        variance,
+        time,
+        float(variance[0] * (2.0 * (faster + np.expm1(-faster)) / faster**2).sum()),
+    )
 
 
 @njit(**INNER)
 def _moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared):  # type: ignore[no-untyped-def]
     """Variance of the mean over a block of `step` seconds when the states at its start are known.
 
-    Fills in how each state goes on, its weight in the mean, the variance of what is new at the end, and the covariance of that with
-    the mean.
+    Fills in how each state goes on, its weight in the mean, the variance of what is new at the end,
+    and the covariance of that with the mean.
     """
     decay[0], weight[0], drive[0], shared[0] = 1.0, 1.0, K2 * step, K2 * step / 2.0
     rest = K2 * step / 3.0
@@ -129,7 +134,8 @@ def whiten(
 ) -> tuple[Array, float]:
     """Whiten columns of block means by the covariance V of their noise, a constant of unknown size taken out.
 
-    Products of whitened columns a, b are ``a' W b`` with ``W = V^-1 - V^-1 1 (1' V^-1 1)^-1 1' V^-1`` over the blocks present.
+    Products of whitened columns a, b are ``a' W b`` with ``W = V^-1 - V^-1 1 (1' V^-1 1)^-1 1'
+    V^-1`` over the blocks present.
 
     Parameters
     ----------
@@ -173,7 +179,9 @@ def whiten(
                     state[j, c] *= decay[j]
             _advance(covariance, decay, drive)
             continue
-        F = variance[i] + rest + _project(covariance, weight, 0 if known else 1, gain)  # of the innovation; the level counts once known
+        F = (
+            variance[i] + rest + _project(covariance, weight, 0 if known else 1, gain)
+        )  # of the innovation; the level counts once known
         if not known:  # the level becomes what the mean says, with the error of all the rest
             known = True
             _advance(covariance, decay, drive)

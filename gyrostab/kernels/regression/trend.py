@@ -51,7 +51,8 @@ def window_trend(values, seconds, first, last):  # type: ignore[no-untyped-def]
     Returns
     -------
     float64 (2, n_windows)
-        Mean [unit of the channel], NaN where nothing is there; slope [unit per s], NaN with fewer than two instants.
+        Mean [unit of the channel], NaN where nothing is there; slope [unit per s], NaN with fewer
+        than two instants.
     """
     out = np.full((2, first.size), np.nan)
     for j in range(first.size):
@@ -60,7 +61,10 @@ def window_trend(values, seconds, first, last):  # type: ignore[no-untyped-def]
             begin += 1
         if begin >= end:
             continue
-        origin, start = values[begin], seconds[begin]  # near the mean, so that the sums lose no digits
+        origin, start = (
+            values[begin],
+            seconds[begin],
+        )  # near the mean, so that the sums lose no digits
         here, there = values[begin:end], seconds[begin:end]
         count, total, elapsed = _sums(here, there, origin, start)
         out[0, j] = mean = origin + total / count

@@ -10,19 +10,23 @@ from numpy.typing import NDArray
 __all__ = ["expected_powers", "sample_covariance"]
 
 Array = NDArray[np.float64]
-_EXACT = 48  # ordinates that are computed one by one; above, the ratio to the plain spectrum is interpolated
+# ordinates that are computed one by one; above, the ratio to the plain spectrum is interpolated
+_EXACT = 48
 _SPARSE = 48
 
 
 def _second_difference(integral: Array) -> Array:
     """``F(l + 1) - 2 F(l) + F(l - 1)`` for an even F given at 0, 1, 2, ..."""
-    return np.concatenate([[2.0 * (integral[1] - integral[0])], integral[2:] - 2.0 * integral[1:-1] + integral[:-2]])
+    return np.concatenate(
+        [[2.0 * (integral[1] - integral[0])], integral[2:] - 2.0 * integral[1:-1] + integral[:-2]]
+    )
 
 
 def sample_covariance(size: int, rate: float) -> Array:
     """Covariance of samples l apart of unit Q, N, B and K, where the samples are means over their intervals.
 
-    That of B and K is one of differences: it has an unknown constant, which no block statistic sees.
+    That of B and K is one of differences: it has an unknown constant, which no block statistic
+    sees.
 
     Parameters
     ----------
@@ -34,7 +38,8 @@ def sample_covariance(size: int, rate: float) -> Array:
     Returns
     -------
     ndarray, shape (4, size)
-        For angles of unit variance [1 s-2], a density of 1 [Hz], ``B = 1`` and ``variance of the walk 1 / s`` [s].
+        For angles of unit variance [1 s-2], a density of 1 [Hz], ``B = 1`` and ``variance of the
+        walk 1 / s`` [s].
     """
     lag = np.arange(size + 1, dtype=np.float64)
     out = np.zeros((4, size))
@@ -43,7 +48,9 @@ def sample_covariance(size: int, rate: float) -> Array:
     inner = np.log(np.maximum(lag, 1.0)) * lag**2
     far = np.maximum(lag[:-1], 1.0)
     out[2] = _second_difference(0.75 * lag**2 - 0.5 * inner) / math.pi
-    series = -(np.log(far) - 1.0 / (12.0 * far**2)) / math.pi  # of the second difference, which loses its digits far out
+    series = (
+        -(np.log(far) - 1.0 / (12.0 * far**2)) / math.pi
+    )  # of the second difference, which loses its digits far out
     out[2] = np.where(lag[:-1] > 1000.0, series, out[2])
     out[3] = np.where(lag[:-1] > 0.0, -lag[:-1] / 2.0, -1.0 / 6.0) / rate
     return out
@@ -52,7 +59,14 @@ def sample_covariance(size: int, rate: float) -> Array:
 def _spectra(frequency: Array, rate: float) -> Array:
     """Plain two-sided densities of the four terms, shape (4, frequency)."""
     bend = np.sin(math.pi * frequency / rate)
-    return np.stack([4.0 * rate * bend**2, np.ones_like(frequency), 0.5 / (math.pi * frequency), 1.0 / (2.0 * rate * bend) ** 2])
+    return np.stack(
+        [
+            4.0 * rate * bend**2,
+            np.ones_like(frequency),
+            0.5 / (math.pi * frequency),
+            1.0 / (2.0 * rate * bend) ** 2,
+        ]
+    )
 
 
 def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
@@ -70,7 +84,8 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     Returns
     -------
     ndarray, shape (4, ordinates)
-        Q, N, B, K in the units of `sample_covariance`; the power of white noise is exactly its density.
+        Q, N, B, K in the units of `sample_covariance`; the power of white noise is exactly its
+        density.
 
     Examples
     --------
@@ -80,9 +95,18 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     array([2., 2., 2.])
     """
     size = weights.size
-    places = np.unique(np.concatenate([np.arange(1, min(_EXACT, ordinates) + 1), np.geomspace(1, ordinates, _SPARSE).round().astype(int)]))
+    places = np.unique(
+        np.concatenate(
+            [
+                np.arange(1, min(_EXACT, ordinates) + 1),
+                np.geomspace(1, ordinates, _SPARSE).round().astype(int),
+            ]
+        )
+    )
     covariance = sample_covariance(size + 1, rate)
-    wrapped = np.concatenate([covariance[:, :size], np.zeros((4, 1)), covariance[:, size - 1 : 0 : -1]], axis=1)
+    wrapped = np.concatenate(
+        [covariance[:, :size], np.zeros((4, 1)), covariance[:, size - 1 : 0 : -1]], axis=1
+    )
     density = np.fft.fft(wrapped, axis=1).real
     taper, box = np.fft.fft(weights, 2 * size), np.fft.fft(np.ones(size), 2 * size)
     found = np.empty((4, places.size))

@@ -1,8 +1,9 @@
 """How far samples stand from those about them, and which stand alone.
 
-The departure of a sample is what it has beyond the median of the four samples on either side, of which only pairs at the same distance
-are taken: so a slope makes none, and a sample that jumps out makes none in its neighbours. At the edges of a block and of gaps, where
-no two pairs are, it is the smaller of what goes beyond the level and beyond the slope of four samples on one side.
+The departure of a sample is what it has beyond the median of the four samples on either side, of
+which only pairs at the same distance are taken: so a slope makes none, and a sample that jumps out
+makes none in its neighbours. At the edges of a block and of gaps, where no two pairs are, it is the
+smaller of what goes beyond the level and beyond the slope of four samples on one side.
 """
 
 from __future__ import annotations
@@ -98,7 +99,9 @@ def _one_sided(row, i):  # type: ignore[no-untyped-def]
         if 0 <= i + _PAIRS * side < row.size:
             one, two = row[i + side], row[i + 2 * side]
             _, low, high, _ = _sorted_four(one, two, row[i + 3 * side], row[i + 4 * side])
-            level = (row[i] - 0.5 * (low + high)) * math.sqrt((1.0 + _MEDIANS[4]) / (1.0 + _MEDIANS[2]))
+            level = (row[i] - 0.5 * (low + high)) * math.sqrt(
+                (1.0 + _MEDIANS[4]) / (1.0 + _MEDIANS[2])
+            )
             slope = (row[i] - 2.0 * one + two) * math.sqrt((1.0 + _MEDIANS[4]) / 6.0)
             both = one + two + row[i + 3 * side] + row[i + 4 * side]
             if both == both:
@@ -117,7 +120,8 @@ def departures(x, out, histogram):  # type: ignore[no-untyped-def]
     x : ndarray, shape (block, sample)
         Values, NaN where missing.
     out : ndarray, shape (block, sample)
-        Is filled with the departures, NaN where there are none; those from fewer samples are smaller, so that all scatter alike.
+        Is filled with the departures, NaN where there are none; those from fewer samples are
+        smaller, so that all scatter alike.
     histogram : ndarray of uint32, shape (block, `HISTOGRAM`)
         The number of absolute departures by size is added to it.
     """
@@ -131,7 +135,16 @@ def departures(x, out, histogram):  # type: ignore[no-untyped-def]
         for i in range(size):
             middle, pairs = np.nan, _PAIRS
             if _PAIRS <= i < size - _PAIRS:
-                total = row[i - 4] + row[i - 3] + row[i - 2] + row[i - 1] + row[i + 1] + row[i + 2] + row[i + 3] + row[i + 4]
+                total = (
+                    row[i - 4]
+                    + row[i - 3]
+                    + row[i - 2]
+                    + row[i - 1]
+                    + row[i + 1]
+                    + row[i + 2]
+                    + row[i + 3]
+                    + row[i + 4]
+                )
                 if total == total:
                     middle = _median_eight(row, i)
             if middle != middle:
@@ -163,7 +176,11 @@ def _loudest(away, i, room):  # type: ignore[no-untyped-def]
     """How loud the noise right before or right after a sample is at least."""
     found = 0.0
     for window in _WINDOWS:
-        found = max(found, _level(away, i - 1 - window, i - 1, room), _level(away, i + 2, i + 2 + window, room))
+        found = max(
+            found,
+            _level(away, i - 1 - window, i - 1, room),
+            _level(away, i + 2, i + 2 + window, room),
+        )
     return found
 
 
@@ -173,7 +190,10 @@ def _stands_out(row, away, i, limit):  # type: ignore[no-untyped-def]
     side = 1.0 if away[i] > 0.0 else -1.0
     least = _ALONE * abs(away[i])
     for j in range(max(i - 2, 0), min(i + 3, row.size)):
-        if j != i and (abs(away[j]) > max(limit, 0.5 * abs(away[i])) or (abs(i - j) == 1 and side * (row[i] - row[j]) < least)):
+        if j != i and (
+            abs(away[j]) > max(limit, 0.5 * abs(away[i]))
+            or (abs(i - j) == 1 and side * (row[i] - row[j]) < least)
+        ):
             return False
     return True
 
@@ -189,7 +209,8 @@ def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
     deviation : ndarray, shape (block,)
         Of the departures of a block; 0 where there are none.
     limit : float
-        Deviations beyond which a departure may be a peak: of the block, and of the samples right before and right after it.
+        Deviations beyond which a departure may be a peak: of the block, and of the samples right
+        before and right after it.
 
     Returns
     -------
@@ -197,8 +218,9 @@ def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
     size : ndarray, shape (peak,)
         Absolute departure.
     level : ndarray, shape (peak,)
-        Standard deviation of departures that the noise of the block has there at least: the largest of those right before and right
-        after it, and before and after the others that jump out within 16 samples, for a burst of noise is hardly longer.
+        Standard deviation of departures that the noise of the block has there at least: the largest
+        of those right before and right after it, and before and after the others that jump out
+        within 16 samples, for a burst of noise is hardly longer.
     """
     count = 0
     for b in range(x.shape[0]):
@@ -220,7 +242,9 @@ def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
             for other in range(max(k - _NEAR, 0), min(k + _NEAR + 1, beyond)):
                 if abs(place[other] - i) <= _NEAR:
                     level_here = max(level_here, loud[other])
-            if abs(away[b, i]) > limit * level_here and _stands_out(x[b], away[b], i, limit * deviation[b]):
+            if abs(away[b, i]) > limit * level_here and _stands_out(
+                x[b], away[b], i, limit * deviation[b]
+            ):
                 block[found], size[found], level[found] = b, abs(away[b, i]), level_here
                 found += 1
     return block[:found], size[:found], level[:found]

@@ -8,8 +8,9 @@ With a = w m, A = FFT(a), V = FFT(a^2) and n samples present, white noise of var
 
     E |F_k|^2 = s (V_0 - |A_k|^2 / n),    cov(F_k, F_l) = s (V_(k-l) - A_k conj(A_l) / n),
 
-and E F_k F_l follows with -l for l. So the power of a band, the sum of |F_k|^2 over the sum of their expectations, is unbiased with
-any gaps, and its variance gives the shape of the gamma distribution that it follows.
+and E F_k F_l follows with -l for l. So the power of a band, the sum of |F_k|^2 over the sum of
+their expectations, is unbiased with any gaps, and its variance gives the shape of the gamma
+distribution that it follows.
 """
 
 from __future__ import annotations
@@ -50,7 +51,9 @@ def taper(size: int, share: float = 0.2) -> Array:
     """
     middle = (np.arange(size) + 0.5) / size
     inside = np.minimum(middle, 1.0 - middle) / (share / 2.0)
-    return np.asarray(np.where(inside < 1.0, 0.5 - 0.5 * np.cos(math.pi * np.minimum(inside, 1.0)), 1.0))
+    return np.asarray(
+        np.where(inside < 1.0, 0.5 - 0.5 * np.cos(math.pi * np.minimum(inside, 1.0)), 1.0)
+    )
 
 
 def ordinates(size: int) -> int:
@@ -82,11 +85,13 @@ def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
     centred : ndarray, shape (block, sample)
         Is filled with the values less their block's mean, 0 where missing.
     moments : ndarray, shape (block, 5)
-        Is filled with mean, second and fourth central moment, smallest and largest value; NaN in an empty block.
+        Is filled with mean, second and fourth central moment, smallest and largest value; NaN in an
+        empty block.
     counts : ndarray of int64, shape (block, 9)
-        Is filled with the samples present, exact zeros, samples equal to the one before but for zeros, samples equal to the smallest
-        and to the largest value of the block, how many of these two are equal to the one before and no zeros, and the runs of samples
-        that are equal to the one before and no zeros, and of zeros.
+        Is filled with the samples present, exact zeros, samples equal to the one before but for
+        zeros, samples equal to the smallest and to the largest value of the block, how many of
+        these two are equal to the one before and no zeros, and the runs of samples that are equal
+        to the one before and no zeros, and of zeros.
     """
     size = x.shape[1]
     for b in range(x.shape[0]):
@@ -127,15 +132,32 @@ def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
             if i > 0 and value == row[i - 1] and value != 0.0:
                 lows_again += value == low
                 highs_again += value == high
-        counts[b, 0], counts[b, 1], counts[b, 2], counts[b, 3], counts[b, 4] = present, zeros, repeats, lows, highs
-        counts[b, 5], counts[b, 6], counts[b, 7], counts[b, 8] = lows_again, highs_again, runs, zero_runs
-        moments[b, 0], moments[b, 1], moments[b, 2] = mean, second / max(present, 1), fourth / max(present, 1)
+        counts[b, 0], counts[b, 1], counts[b, 2], counts[b, 3], counts[b, 4] = (
+            present,
+            zeros,
+            repeats,
+            lows,
+            highs,
+        )
+        counts[b, 5], counts[b, 6], counts[b, 7], counts[b, 8] = (
+            lows_again,
+            highs_again,
+            runs,
+            zero_runs,
+        )
+        moments[b, 0], moments[b, 1], moments[b, 2] = (
+            mean,
+            second / max(present, 1),
+            fourth / max(present, 1),
+        )
         moments[b, 3], moments[b, 4] = low, high
         if present == 0:
             moments[b, :] = np.nan
 
 
-def gap_spectra(present: NDArray[np.bool_], weights: Array) -> tuple[Array, NDArray[np.complex128], NDArray[np.complex128]]:
+def gap_spectra(
+    present: NDArray[np.bool_], weights: Array
+) -> tuple[Array, NDArray[np.complex128], NDArray[np.complex128]]:
     """Expected power of each ordinate in white noise, and the spectra of the mask that it comes from.
 
     Parameters
@@ -196,7 +218,11 @@ def shape_of_bands(mask, squared, expected, present, edges, size):  # type: igno
                     for other in range(first, stop):
                         share = mask[b, k] / present[b]
                         back = np.conj(mask[b, other])
-                        at = np.conj(_squared_at(squared, b, k - other, size)) if k < other else _squared_at(squared, b, k - other, size)
+                        at = (
+                            np.conj(_squared_at(squared, b, k - other, size))
+                            if k < other
+                            else _squared_at(squared, b, k - other, size)
+                        )
                         one = at - share * back
                         two = _squared_at(squared, b, k + other, size) - share * mask[b, other]
                         variance += one.real**2 + one.imag**2 + two.real**2 + two.imag**2
@@ -211,7 +237,8 @@ def shape_of_bands(mask, squared, expected, present, edges, size):  # type: igno
 def band_covariance(size: int) -> Array:
     """Relative covariance of the powers of different bands of a whole block in white noise, (band, band); 0 on the diagonal.
 
-    The taper spreads each ordinate over its neighbours, so that bands which touch have some percent of their scatter in common.
+    The taper spreads each ordinate over its neighbours, so that bands which touch have some percent
+    of their scatter in common.
 
     Parameters
     ----------
@@ -224,8 +251,12 @@ def band_covariance(size: int) -> Array:
     array([0.027, 0.026, 0.   , 0.019, 0.012, 0.004])
     """
     edges, n = band_edges(size), ordinates(size)
-    expected, mask, squared = (part[0] for part in gap_spectra(np.ones((1, size), np.bool_), taper(size)))
-    squared = np.concatenate([squared, squared[1 : (size + 1) // 2][::-1].conj()])  # of all frequencies
+    expected, mask, squared = (
+        part[0] for part in gap_spectra(np.ones((1, size), np.bool_), taper(size))
+    )
+    squared = np.concatenate(
+        [squared, squared[1 : (size + 1) // 2][::-1].conj()]
+    )  # of all frequencies
     band = np.searchsorted(edges, np.arange(1, n + 1), side="right") - 1
     out = np.zeros((edges.size - 1, edges.size - 1))
     for apart in range(1, min(_APART, n)):

@@ -2,8 +2,20 @@
 
 from gyrostab.store.output.check import check_folder, check_output, resolve_link
 from gyrostab.store.output.content import find_foreign_item
-from gyrostab.store.output.inputs import describe_file, find_sources, pass_sources, protect_inputs, remember_source
-from gyrostab.store.output.write import is_leftover, new_folder, new_output, remove_leftovers, replace_file
+from gyrostab.store.output.inputs import (
+    describe_file,
+    find_sources,
+    pass_sources,
+    protect_inputs,
+    remember_source,
+)
+from gyrostab.store.output.write import (
+    is_leftover,
+    new_folder,
+    new_output,
+    remove_leftovers,
+    replace_file,
+)
 
 __all__ = [
     "check_folder",

@@ -32,7 +32,9 @@ def resolve_link(path: str | os.PathLike[str]) -> Path:
         if not target.is_symlink():
             return target
         target = target.parent / os.readlink(target)
-    raise OutputError(f"output {str(path)!r} is a symbolic link in a loop; give another name with -o")
+    raise OutputError(
+        f"output {str(path)!r} is a symbolic link in a loop; give another name with -o"
+    )
 
 
 def check_output(
@@ -45,8 +47,8 @@ def check_output(
 ) -> Path:
     """Make sure, before the long work starts, that a result can be written and that nothing else is lost by it.
 
-    A symbolic link stands for its target. An output that exists is replaced with `overwrite` only, and a folder only when all
-    that it holds was made by gyrostab or belongs to a Zarr store.
+    A symbolic link stands for its target. An output that exists is replaced with `overwrite` only,
+    and a folder only when all that it holds was made by gyrostab or belongs to a Zarr store.
 
     Parameters
     ----------
@@ -57,10 +59,11 @@ def check_output(
     overwrite : bool
         Whether an existing output may be replaced.
     inputs : iterable of path-like
-        Files that a lazy dataset reads, in addition to those of `gyrostab.store.output.protect_inputs`.
+        Files that a lazy dataset reads, in addition to those of
+        `gyrostab.store.output.protect_inputs`.
     find_foreign : callable, optional
-        Makes the output a folder: finds what it holds that must not be removed. By default the output is a Zarr store when its
-        name ends in ``.zarr``, else a file.
+        Makes the output a folder: finds what it holds that must not be removed. By default the
+        output is a Zarr store when its name ends in ``.zarr``, else a file.
 
     Returns
     -------
@@ -70,7 +73,8 @@ def check_output(
     Raises
     ------
     OptionError
-        When the name has the wrong ending, is an input, or is a folder around an input or inside one.
+        When the name has the wrong ending, is an input, or is a folder around an input or inside
+        one.
     OutputError
         When the output exists and may not be replaced, or its folder cannot be written to.
 
@@ -82,7 +86,9 @@ def check_output(
     """
     path = Path(path)
     if suffixes and path.suffix.lower() not in suffixes:
-        raise OptionError(f"output {str(path)!r} must end in {' or '.join(suffixes)}; give another name with -o")
+        raise OptionError(
+            f"output {str(path)!r} must end in {' or '.join(suffixes)}; give another name with -o"
+        )
     if find_foreign is None and path.suffix.lower() == ".zarr":
         find_foreign = find_foreign_item
     target = check_target(path, overwrite=overwrite, inputs=inputs, find_foreign=find_foreign)
@@ -90,7 +96,9 @@ def check_output(
     return path
 
 
-def check_folder(folder: str | os.PathLike[str], names: Iterable[str], *, overwrite: bool = False) -> Path:
+def check_folder(
+    folder: str | os.PathLike[str], names: Iterable[str], *, overwrite: bool = False
+) -> Path:
     """Make sure that files can be written into a folder, which may hold others and need not exist yet.
 
     Parameters
@@ -130,35 +138,54 @@ def check_folder(folder: str | os.PathLike[str], names: Iterable[str], *, overwr
 
 
 def check_target(
-    path: Path, *, overwrite: bool, inputs: Iterable[str | os.PathLike[str]] = (), find_foreign: FindForeign | None = None
+    path: Path,
+    *,
+    overwrite: bool,
+    inputs: Iterable[str | os.PathLike[str]] = (),
+    find_foreign: FindForeign | None = None,
 ) -> Path:
     """As `check_output`, without trying whether the folder around it can be written to; what the path stands for."""
     said = f"output {str(path)!r}"
     target = resolve_link(path)
     if not target.parent.is_dir():
-        raise OutputError(f"{said}: there is no directory {str(target.parent)!r}; make it first or choose another name with -o")
+        raise OutputError(
+            f"{said}: there is no directory {str(target.parent)!r}; make it first or choose another name with -o"
+        )
     _check_inputs(said, target, protected_inputs(), "give another name with -o")
-    _check_inputs(said, target, match_files(inputs), "load the dataset first, with its load(), or give another name")
+    _check_inputs(
+        said,
+        target,
+        match_files(inputs),
+        "load the dataset first, with its load(), or give another name",
+    )
     try:
         mode = os.lstat(target).st_mode
     except FileNotFoundError:
         return target
     except OSError as error:
-        raise OutputError(f"{said} cannot be written ({error.strerror}); give another name with -o") from error
+        raise OutputError(
+            f"{said} cannot be written ({error.strerror}); give another name with -o"
+        ) from error
     if find_foreign is None:
         if stat.S_ISDIR(mode):
             raise OutputError(f"{said} is a directory; give another name with -o")
         if not stat.S_ISREG(mode):
-            raise OutputError(f"{said} is no regular file and is not replaced; give another name with -o")
+            raise OutputError(
+                f"{said} is no regular file and is not replaced; give another name with -o"
+            )
     elif not stat.S_ISDIR(mode):
-        raise OutputError(f"{said} is a file, and a folder is to be written; give another name with -o")
+        raise OutputError(
+            f"{said} is a file, and a folder is to be written; give another name with -o"
+        )
     elif (foreign := _find_foreign(said, target, find_foreign)) is not None:
         raise OutputError(
             f"{said} holds {foreign!r}, which gyrostab did not make, so it is not replaced, not even with --overwrite; "
             "give another name with -o"
         )
     if not overwrite:
-        raise OutputError(f"{said} exists already; give --overwrite (overwrite=True) to replace it, or another name with -o")
+        raise OutputError(
+            f"{said} exists already; give --overwrite (overwrite=True) to replace it, or another name with -o"
+        )
     return target
 
 
@@ -166,7 +193,9 @@ def _find_foreign(said: str, target: Path, find_foreign: FindForeign) -> str | N
     try:
         return find_foreign(target)
     except OSError as error:
-        raise OutputError(f"{said}: its content cannot be listed ({error.strerror}); give another name with -o") from error
+        raise OutputError(
+            f"{said}: its content cannot be listed ({error.strerror}); give another name with -o"
+        ) from error
 
 
 def _check_inputs(said: str, target: Path, inputs: Sequence[Path], advice: str) -> None:
@@ -180,10 +209,16 @@ def _check_inputs(said: str, target: Path, inputs: Sequence[Path], advice: str) 
         if own is not None and os.path.samestat(own, found):
             raise OptionError(f"{said} is also an input and would be destroyed; {advice}")
         if folder and os.path.realpath(item).startswith(os.path.join(place, "")):
-            raise OptionError(f"{said} is a folder around the input {str(item)!r}, which would be destroyed; {advice}")
-        inside = stat.S_ISDIR(found.st_mode) and place.startswith(os.path.join(os.path.realpath(item), ""))
+            raise OptionError(
+                f"{said} is a folder around the input {str(item)!r}, which would be destroyed; {advice}"
+            )
+        inside = stat.S_ISDIR(found.st_mode) and place.startswith(
+            os.path.join(os.path.realpath(item), "")
+        )
         if inside and is_store(item):
-            raise OptionError(f"{said} lies inside the input {str(item)!r}, which would be changed; {advice}")
+            raise OptionError(
+                f"{said} lies inside the input {str(item)!r}, which would be changed; {advice}"
+            )
 
 
 def _find_status(path: Path) -> os.stat_result | None:
@@ -199,4 +234,6 @@ def _check_writable(path: Path, folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise OutputError(f"output {str(path)!r}: nothing can be written in {str(folder)!r} ({error.strerror})") from error
+        raise OutputError(
+            f"output {str(path)!r}: nothing can be written in {str(folder)!r} ({error.strerror})"
+        ) from error

@@ -11,11 +11,13 @@ from typing import Any
 
 __all__ = ["FindForeign", "find_foreign_item", "is_store", "read_json"]
 
-#: Gives the name of an item of a folder that must not be removed; None where all of the folder may go.
+#: Gives the name of an item of a folder that must not be removed; None where all of the folder may
+#: go.
 FindForeign = Callable[[Path], str | None]
 
 _METADATA = {".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json"}
-#: Keys of chunks of formats 2 and 3, ``1.0``, ``c.1.0``, or one level of ``c/1/0``; and chunks that a killed writer left.
+#: Keys of chunks of formats 2 and 3, ``1.0``, ``c.1.0``, or one level of ``c/1/0``; and chunks that
+#: a killed writer left.
 _CHUNK = re.compile(r"(c|(c\.)?\d+(\.\d+)*)(\.[0-9a-f]{32}\.partial)?")
 
 
@@ -52,7 +54,8 @@ def find_foreign_item(folder: Path) -> str | None:
     Returns
     -------
     str or None
-        Path of the first such item inside the folder; None for a Zarr store with nothing else in it, and for an empty folder.
+        Path of the first such item inside the folder; None for a Zarr store with nothing else in
+        it, and for an empty folder.
 
     Examples
     --------
@@ -84,7 +87,11 @@ def _find_in_node(folder: str) -> str | None:
 
 def _find_in_chunks(folder: str) -> str | None:
     for entry in _list_entries(folder):
-        if entry.is_symlink() or not _CHUNK.fullmatch(entry.name) or not (entry.is_dir() or entry.is_file()):
+        if (
+            entry.is_symlink()
+            or not _CHUNK.fullmatch(entry.name)
+            or not (entry.is_dir() or entry.is_file())
+        ):
             return entry.path
         if entry.is_dir() and (found := _find_in_chunks(entry.path)) is not None:
             return found

@@ -26,8 +26,11 @@ __all__ = [
     "remember_source",
 ]
 
-#: Inputs of the work under way, each with what `describe_file` said of it at first; None where a change does no harm.
-_PROTECTED: ContextVar[dict[Path, dict[str, Any] | None] | None] = ContextVar("_PROTECTED", default=None)
+#: Inputs of the work under way, each with what `describe_file` said of it at first; None where a
+#: change does no harm.
+_PROTECTED: ContextVar[dict[Path, dict[str, Any] | None] | None] = ContextVar(
+    "_PROTECTED", default=None
+)
 #: Names of lazy arrays -> files that they read.
 _SOURCES: dict[str, set[Path]] = {}
 
@@ -65,17 +68,23 @@ def match_files(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
     found: dict[Path, None] = {}
     for path in [paths] if isinstance(paths, str | os.PathLike) else paths:
         item = os.fspath(path)
-        names = [item] if os.path.lexists(item) or not glob.has_magic(item) else glob.glob(item, recursive=True)
+        names = (
+            [item]
+            if os.path.lexists(item) or not glob.has_magic(item)
+            else glob.glob(item, recursive=True)
+        )
         found.update((Path(name), None) for name in names if os.path.lexists(name))
     return list(found)
 
 
 @contextlib.contextmanager
-def protect_inputs(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> Iterator[None]:
+def protect_inputs(
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+) -> Iterator[None]:
     """Refuse, for the length of the ``with`` block, every output that would replace one of these files or a folder around it.
 
-    An output is also refused where one of them has changed before the output is complete, except for TOML files, which are read
-    at once.
+    An output is also refused where one of them has changed before the output is complete, except
+    for TOML files, which are read at once.
 
     Parameters
     ----------
@@ -119,7 +128,9 @@ def check_unchanged() -> None:
     for path, before in (_PROTECTED.get() or {}).items():
         if before is not None and describe_file(path) != before:
             what = "has changed" if path.exists() else "has vanished"
-            raise FormatError(f"{path}: {what} while it was read, so nothing was written; start again once it is complete")
+            raise FormatError(
+                f"{path}: {what} while it was read, so nothing was written; start again once it is complete"
+            )
 
 
 def remember_source(array: Any, path: Path) -> None:
@@ -147,6 +158,16 @@ def find_sources(dataset: Any) -> list[Path]:
     []
     """
     lazy = [variable for variable in dataset.variables.values() if not variable._in_memory]
-    named = [variable.encoding.get("source") for variable in lazy] + [dataset.encoding.get("source") if lazy else None]
+    named = [variable.encoding.get("source") for variable in lazy] + [
+        dataset.encoding.get("source") if lazy else None
+    ]
     found = {Path(path) for path in named if path is not None}
-    return sorted(found.union(*(_find_array_sources(variable.data) for variable in lazy if variable.chunks is not None)))
+    return sorted(
+        found.union(
+            *(
+                _find_array_sources(variable.data)
+                for variable in lazy
+                if variable.chunks is not None
+            )
+        )
+    )

@@ -23,7 +23,8 @@ from gyrostab.store.output.inputs import check_unchanged
 
 __all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "replace_file"]
 
-#: Looks, 20 ms apart, after which what has gone stays gone: a busy machine may hold a thread up that long.
+#: Looks, 20 ms apart, after which what has gone stays gone: a busy machine may hold a thread up
+#: that long.
 _LOOKS = 15
 _MAX_NAME_BYTES = 255  # of one file name on the usual file systems
 _LEFTOVER = re.compile(r"\.(.*\.)?gyrostab-[0-9a-f]{8}\.part")
@@ -46,10 +47,11 @@ def new_output(
     overwrite : bool
         Replace what has this name.
     find_foreign : callable, optional
-        Makes the output a folder, and finds what an existing one holds that must not be removed; see
-        `gyrostab.store.output.check_output`.
+        Makes the output a folder, and finds what an existing one holds that must not be removed;
+        see `gyrostab.store.output.check_output`.
     inputs : iterable of path-like
-        Files that a lazy dataset reads, which must not be replaced, in addition to those of `gyrostab.store.output.protect_inputs`.
+        Files that a lazy dataset reads, which must not be replaced, in addition to those of
+        `gyrostab.store.output.protect_inputs`.
 
     Yields
     ------
@@ -81,7 +83,10 @@ def new_output(
 
     target = check()
     for left in _find_leftovers(target):
-        warnings.warn(f"{left} is being written now, or was left by a process that was killed: then delete it", stacklevel=3)
+        warnings.warn(
+            f"{left} is being written now, or was left by a process that was killed: then delete it",
+            stacklevel=3,
+        )
     hidden = target.with_name(_hide_name(target.name))
     with _temporary_output(target, hidden, make_folder=find_foreign is not None) as temporary:
         yield temporary
@@ -100,7 +105,9 @@ def new_output(
 @contextlib.contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
     """As `new_output`, of a file inside a folder that gyrostab made, which is replaced in any case."""
-    with _temporary_output(path, path.with_name(_hide_name(path.name)), make_folder=False) as temporary:
+    with _temporary_output(
+        path, path.with_name(_hide_name(path.name)), make_folder=False
+    ) as temporary:
         yield temporary
         _sync_tree(temporary)
         os.replace(temporary, path)
@@ -128,7 +135,8 @@ def new_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) -> It
     Raises
     ------
     OutputError
-        When the folder cannot be made or written to, or holds a file of one of the names and `overwrite` is not given.
+        When the folder cannot be made or written to, or holds a file of one of the names and
+        `overwrite` is not given.
 
     Examples
     --------
@@ -164,7 +172,9 @@ def _make_folder(folder: Path) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"folder {str(folder)!r} cannot be made ({error.strerror}); give another one with -o") from error
+        raise OutputError(
+            f"folder {str(folder)!r} cannot be made ({error.strerror}); give another one with -o"
+        ) from error
     return missing
 
 
@@ -180,7 +190,9 @@ def _temporary_output(target: Path, temporary: Path, *, make_folder: bool) -> It
         yield temporary
         complete = True
     except (OSError, RuntimeError) as error:
-        if isinstance(error, GyrostabError) or (isinstance(error, RuntimeError) and not str(error).startswith("NetCDF:")):
+        if isinstance(error, GyrostabError) or (
+            isinstance(error, RuntimeError) and not str(error).startswith("NetCDF:")
+        ):
             raise
         raise OutputError(f"{target}: cannot be written: {_reason(error, target)}") from error
     finally:
@@ -191,7 +203,9 @@ def _temporary_output(target: Path, temporary: Path, *, make_folder: bool) -> It
 def _hide_name(name: str) -> str:
     """A hidden name that no other process takes, of a file or folder that is being written."""
     mark = f".gyrostab-{secrets.token_hex(4)}.part"
-    return f".{name}{mark}" if name and len(os.fsencode(f".{name}{mark}")) <= _MAX_NAME_BYTES else mark
+    return (
+        f".{name}{mark}" if name and len(os.fsencode(f".{name}{mark}")) <= _MAX_NAME_BYTES else mark
+    )
 
 
 def is_leftover(name: str) -> bool:
@@ -219,9 +233,13 @@ def remove_leftovers(output: Path) -> None:
 def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) -> None:
     """Let a complete folder and an older one change places, and remove the older one."""
     if _rename(temporary, target, _EXCHANGE):
-        if find_foreign(temporary) is not None:  # someone has put something there since it was looked through
+        if (
+            find_foreign(temporary) is not None
+        ):  # someone has put something there since it was looked through
             _rename(temporary, target, _EXCHANGE)
-            raise OutputError(f"{target}: has changed while the new one was written, so it is not replaced; give another name with -o")
+            raise OutputError(
+                f"{target}: has changed while the new one was written, so it is not replaced; give another name with -o"
+            )
     else:
         aside = target.with_name(_hide_name(target.name))
         target.rename(aside)
@@ -234,7 +252,9 @@ def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) ->
     _sync(target.parent)
     _remove_tree(temporary)
     if temporary.exists():
-        warnings.warn(f"{temporary}: the folder that was replaced cannot be removed; delete it", stacklevel=4)
+        warnings.warn(
+            f"{temporary}: the folder that was replaced cannot be removed; delete it", stacklevel=4
+        )
 
 
 def _rename_new(source: Path, target: Path) -> None:
@@ -259,7 +279,11 @@ _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
 
 def _rename(source: Path, target: Path, flag: int) -> bool:
     """Rename with a flag of ``renameat2``; False where the system or the file system has no such call."""
-    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
+    call = (
+        getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+        if sys.platform == "linux"
+        else None
+    )
     if call is None:
         return False
     if call(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
@@ -320,5 +344,7 @@ def _reason(error: Exception, path: Path) -> str:
         return text
     with contextlib.suppress(OSError):  # the NetCDF and HDF5 libraries say no more than "HDF error"
         free = shutil.disk_usage(path.parent).free / 2**20
-        text += f"; {free:,.0f} MiB are free there: is the disk full, or a quota or size limit reached?"
+        text += (
+            f"; {free:,.0f} MiB are free there: is the disk full, or a quota or size limit reached?"
+        )
     return text

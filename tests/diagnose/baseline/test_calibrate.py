@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model, baseline_from_simulation, calibrate_noise
-from gyrostab.diagnose.baseline.expected_statistics import common_variance, noise_powers, white_variance
+from gyrostab.diagnose.baseline.calibrate import (
+    baseline_from_model,
+    baseline_from_simulation,
+    calibrate_noise,
+)
+from gyrostab.diagnose.baseline.expected_statistics import (
+    common_variance,
+    noise_powers,
+    white_variance,
+)
 from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
 from gyrostab.diagnose.nulls.records import null_records
@@ -22,31 +30,62 @@ from gyrostab.simulate import simulate
 from gyrostab.simulate.noise import make_noise
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
-SHAKEN = {"profile": "vibration", "points": [[0, 0.02], [1199, 0.02], [1200, 6.0], [1500, 6.0], [1501, 0.02], [3600, 0.02]]}
+SHAKEN = {
+    "profile": "vibration",
+    "points": [[0, 0.02], [1199, 0.02], [1200, 6.0], [1500, 6.0], [1501, 0.02], [3600, 0.02]],
+}
 
 
-def log(noise=NOISE, *, seed=0, rate=10.0, duration="1h", axes=("x",), lost=0.0, effects=(), environment=()) -> xr.Dataset:
-    model = {"log": {"axes": list(axes)}, "noise": noise, "effect": list(effects), "environment": list(environment)}
+def log(
+    noise=NOISE,
+    *,
+    seed=0,
+    rate=10.0,
+    duration="1h",
+    axes=("x",),
+    lost=0.0,
+    effects=(),
+    environment=(),
+) -> xr.Dataset:
+    model = {
+        "log": {"axes": list(axes)},
+        "noise": noise,
+        "effect": list(effects),
+        "environment": list(environment),
+    }
     made = simulate(model, duration=duration, rate=rate, seed=seed).compute()
     if lost:
         gone = np.random.default_rng(seed).random(made.sizes["time"]) < lost
-        made["rate"] = made["rate"].where(xr.DataArray(~gone, dims="time")).transpose("axis", "time").assign_attrs(made["rate"].attrs)
+        made["rate"] = (
+            made["rate"]
+            .where(xr.DataArray(~gone, dims="time"))
+            .transpose("axis", "time")
+            .assign_attrs(made["rate"].attrs)
+        )
     return made
 
 
-@pytest.mark.parametrize(("term", "size"), [("Q", 1.0 / URAD_PER_S), ("N", 1.0 / 60.0), ("B", 1.0), ("K", 60.0)])
+@pytest.mark.parametrize(
+    ("term", "size"), [("Q", 1.0 / URAD_PER_S), ("N", 1.0 / 60.0), ("B", 1.0), ("K", 60.0)]
+)
 def test_expected_powers_are_those_of_simulated_noise(term, size):
     length, rate, blocks = 500, 10.0, 800
     weights, edges = taper(length), band_edges(length)
-    noise = make_noise(rate=rate, size=length * blocks, seed=5, **{term: size}).reshape(blocks, length)
-    spectra = np.fft.rfft((noise - noise.mean(axis=1, keepdims=True)) * weights)[:, 1 : ordinates(length) + 1]
+    noise = make_noise(rate=rate, size=length * blocks, seed=5, **{term: size}).reshape(
+        blocks, length
+    )
+    spectra = np.fft.rfft((noise - noise.mean(axis=1, keepdims=True)) * weights)[
+        :, 1 : ordinates(length) + 1
+    ]
     ratio = (
         (np.abs(spectra) ** 2).mean(axis=0)
         / (rate * (weights**2).sum())
         / expected_powers(weights, rate, ordinates(length))["QNBK".index(term)]
     )
     for low, high in zip(edges[:-1] - 1, edges[1:] - 1, strict=True):
-        assert ratio[low:high].mean() == pytest.approx(1.0, abs=4.5 / np.sqrt(blocks * (high - low)) + 0.01)
+        assert ratio[low:high].mean() == pytest.approx(
+            1.0, abs=4.5 / np.sqrt(blocks * (high - low)) + 0.01
+        )
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
@@ -59,7 +98,10 @@ def test_coefficients_lie_within_their_errors(lost):
         assert (np.abs(z) < 2.0).mean() > 0.7, term
         assert np.abs(z.mean()) < 1.2, term
     assert float(baseline["stderr"].sel(term="N").max()) < 0.05 * noise["N"]
-    level = (reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3))["power"] / baseline["spectrum"]).mean(["axis", "block"])
+    level = (
+        reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3))["power"]
+        / baseline["spectrum"]
+    ).mean(["axis", "block"])
     np.testing.assert_allclose(level, 1.0, atol=0.12)
 
 
@@ -84,7 +126,12 @@ def test_powers_of_a_block_scatter_together_as_told():
 
 
 def test_shaken_turning_and_warming_blocks_are_not_quiet():
-    warm = {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 30], [2700, 30], [3600, 60]]}
+    warm = {
+        "profile": "ramps",
+        "channel": "temperature",
+        "unit": "degC",
+        "points": [[0, 30], [2700, 30], [3600, 60]],
+    }
     reduced = reduce_log(log(environment=[SHAKEN, warm], duration="1h"))
     quiet, reason = find_quiescent_blocks(reduced)
     middle = ((reduced["begin"] + reduced["end"]) / 2.0).values
@@ -97,15 +144,25 @@ def test_shaken_turning_and_warming_blocks_are_not_quiet():
 
 def test_a_loud_stretch_without_a_channel_is_not_calibrated_on():
     effect = {"name": "vibration_noise", "white": 0.0006, "driver": "vibration"}
-    loud = reduce_log(log(effects=[effect], environment=[SHAKEN], rate=100.0)).drop_vars("channel_vibration")
+    loud = reduce_log(log(effects=[effect], environment=[SHAKEN], rate=100.0)).drop_vars(
+        "channel_vibration"
+    )
     baseline = calibrate_noise(loud)
     middle = ((loud["begin"] + loud["end"]) / 2.0).values
     inside = (middle > 1220) & (middle < 1480)
     assert not baseline["quiet"].values[0, inside].any()
     assert baseline["quiet"].values[0, ~inside].mean() > 0.8
-    value, error = (float(baseline[name].sel(axis="x", term="N")) for name in ("coefficient", "stderr"))
+    value, error = (
+        float(baseline[name].sel(axis="x", term="N")) for name in ("coefficient", "stderr")
+    )
     assert abs(value - 0.003) < 4.0 * error
-    assert float(baseline["mean_variance"][0, inside].mean() / baseline["mean_variance"][0, middle < 1000].mean()) > 1.2
+    assert (
+        float(
+            baseline["mean_variance"][0, inside].mean()
+            / baseline["mean_variance"][0, middle < 1000].mean()
+        )
+        > 1.2
+    )
 
 
 def test_quiet_time_is_taken_as_named_and_checked():
@@ -117,7 +174,10 @@ def test_quiet_time_is_taken_as_named_and_checked():
     assert calibrate_noise(reduced, quiet=(0.0, 1200.0)).attrs["calibrated_on"] == [
         ["1970-01-01T00:00:00.000Z", "1970-01-01T00:20:00.000Z"]
     ]
-    with pytest.raises(OptionError, match=r"quiet holds 0 whole blocks of 20 s, 0 samples; .* name 40 s or more within the 3600 s"):
+    with pytest.raises(
+        OptionError,
+        match=r"quiet holds 0 whole blocks of 20 s, 0 samples; .* name 40 s or more within the 3600 s",
+    ):
         calibrate_noise(reduced, quiet=(0.0, 15.0))
     with pytest.raises(OptionError, match="'soon' is not a date and time"):
         calibrate_noise(reduced, quiet=("soon", "later"))
@@ -139,8 +199,18 @@ def test_a_model_is_taken_with_its_effects():
         {"name": "temperature_bias", "sensitivity": 0.01, "axes": ["y"]},
         {"name": "telegraph", "step": 0.1},
     ]
-    warm = {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 30], [3600, 60]]}
-    model = {"noise": {"N": 0.003, "R": 0.1}, "effect": effects, "environment": [SHAKEN, warm], "log": {"axes": ["x", "y"]}}
+    warm = {
+        "profile": "ramps",
+        "channel": "temperature",
+        "unit": "degC",
+        "points": [[0, 30], [3600, 60]],
+    }
+    model = {
+        "noise": {"N": 0.003, "R": 0.1},
+        "effect": effects,
+        "environment": [SHAKEN, warm],
+        "log": {"axes": ["x", "y"]},
+    }
     made = simulate({**model, "effect": effects[:2]}, duration="1h", rate=10.0, seed=4).compute()
     reduced = reduce_log(made)
     baseline = baseline_from_model(reduced, model)
@@ -148,14 +218,22 @@ def test_a_model_is_taken_with_its_effects():
     shaken = (reduced["begin"].values > 1200) & (reduced["end"].values < 1500)
     assert float(ratio.isel(block=shaken).mean()) == pytest.approx(1.0, abs=0.1)
     assert float(ratio.isel(block=~shaken).mean()) == pytest.approx(1.0, abs=0.1)
-    assert float(baseline["spectrum"].sel(axis="x")[shaken].mean() / baseline["spectrum"].sel(axis="x")[~shaken].mean()) > 2.0
+    assert (
+        float(
+            baseline["spectrum"].sel(axis="x")[shaken].mean()
+            / baseline["spectrum"].sel(axis="x")[~shaken].mean()
+        )
+        > 2.0
+    )
     z = ((reduced["mean"] - baseline["known_mean"]) / np.sqrt(baseline["mean_variance"])).values
     assert np.abs(z - z.mean(axis=1, keepdims=True)).max() < 5.0
     assert baseline.attrs["left_out"] == ["telegraph"]
     assert float(baseline["coefficient"].sel(axis="x", term="R")) == 0.1
     assert float(baseline["stderr"].max()) == 0.0
     nulls = next(iter(null_records(reduced, baseline, count=3, rng=np.random.default_rng(1))))
-    assert float((nulls["mean"] - baseline["known_mean"]).std()) < 2.0 * float(np.sqrt(baseline["mean_variance"].mean()))
+    assert float((nulls["mean"] - baseline["known_mean"]).std()) < 2.0 * float(
+        np.sqrt(baseline["mean_variance"].mean())
+    )
     with pytest.raises(SchemaError, match="temperature"):
         baseline_from_model(reduced.drop_vars("channel_temperature"), model)
     with pytest.raises(OptionError, match="no noise"):
@@ -207,16 +285,57 @@ def test_an_axis_without_spectra_is_named():
 def test_noise_is_fitted_where_the_likelihood_is_largest_also_where_no_sum_of_terms_fits():
     from scipy.optimize import minimize
 
-    f = np.array([0.025, 0.075, 0.125, 0.175, 0.225, 0.325, 0.475, 0.675, 0.975, 1.325, 1.875, 2.625, 3.675, 5.125, 7.175])
+    f = np.array(
+        [
+            0.025,
+            0.075,
+            0.125,
+            0.175,
+            0.225,
+            0.325,
+            0.475,
+            0.675,
+            0.975,
+            1.325,
+            1.875,
+            2.625,
+            3.675,
+            5.125,
+            7.175,
+        ]
+    )
     columns = np.stack([f**2, np.ones(f.size), 1.0 / f, 1.0 / f**2], axis=1)
-    bump = [2e4, 2e3, 700.0, 350.0, 160.0, 50.0, 11.0, 5.0, 6.0, 10.0, 19.0, 35.0, 60.0, 105.0, 31.0]  # waves below, a steep end above
-    fit = Fit(np.array(bump), columns, 26.0 * np.array([1, 1, 1, 1, 2, 3, 4, 6, 6.5, 10, 14, 19, 26, 37, 50]))
+    bump = [
+        2e4,
+        2e3,
+        700.0,
+        350.0,
+        160.0,
+        50.0,
+        11.0,
+        5.0,
+        6.0,
+        10.0,
+        19.0,
+        35.0,
+        60.0,
+        105.0,
+        31.0,
+    ]  # waves below, a steep end above
+    fit = Fit(
+        np.array(bump),
+        columns,
+        26.0 * np.array([1, 1, 1, 1, 2, 3, 4, 6, 6.5, 10, 14, 19, 26, 37, 50]),
+    )
 
     def worse(logarithms):
         expected = columns @ np.exp(logarithms)
         return float((fit.weight * (np.log(expected) + fit.power / expected)).sum())
 
     rng = np.random.default_rng(0)
-    best = min(minimize(worse, rng.uniform(-5, 5, 4), method="Nelder-Mead", options={"maxiter": 4000}).fun for _ in range(8))
+    best = min(
+        minimize(worse, rng.uniform(-5, 5, 4), method="Nelder-Mead", options={"maxiter": 4000}).fun
+        for _ in range(8)
+    )
     square, _ = fit_squares(fit)
     assert worse(np.log(np.maximum(square, 1e-12))) < best + 0.1

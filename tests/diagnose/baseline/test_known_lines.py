@@ -22,7 +22,9 @@ SIZE, PLACE = 0.3, 1.337
 
 
 def model(size: float, **more: object) -> dict[str, object]:
-    line = [{"name": "spectral_line", "amplitude": size, "frequency": PLACE, **more}] if size else []
+    line = (
+        [{"name": "spectral_line", "amplitude": size, "frequency": PLACE, **more}] if size else []
+    )
     return {"noise": NOISE, "effect": line, "log": {"axes": ["x", "y"]}}
 
 
@@ -33,7 +35,11 @@ def log_of(seed: int, size: float) -> xr.Dataset:
 
 def gain(reduced: xr.Dataset, baseline: xr.Dataset) -> float:
     expected = expected_lines(baseline, reduced["line_frequency"].values)
-    return float(line_evidence(reduced["line_power"].values[None], reduced["line_weight"].values, expected).max())
+    return float(
+        line_evidence(
+            reduced["line_power"].values[None], reduced["line_weight"].values, expected
+        ).max()
+    )
 
 
 @pytest.mark.parametrize("amplitude", [0.03, 0.3, 3.0])
@@ -47,7 +53,10 @@ def test_a_known_line_is_gone_wherever_it_lies_between_ordinates(amplitude, freq
     assert gain(freed, baseline) < 6.0
     assert float(np.nanmax(score(freed, baseline)["z"])) < 5.0
     if amplitude > 0.1:
-        assert gain(reduced, baseline_from_model(reduced, model(0.0) | {"log": {"axes": ["x"]}})) > 50.0
+        assert (
+            gain(reduced, baseline_from_model(reduced, model(0.0) | {"log": {"axes": ["x"]}}))
+            > 50.0
+        )
 
 
 def test_a_line_that_is_a_little_off_the_model_is_not_told_and_a_stronger_one_is():
@@ -71,7 +80,8 @@ def test_null_records_have_the_peaks_of_the_model():
 
 
 @pytest.mark.parametrize(
-    ("seed", "inside", "known", "left"), [(2, SIZE, SIZE, 0.0), (3, SIZE, 0.0, SIZE), (4, 2 * SIZE, SIZE, 3**0.5 * SIZE)]
+    ("seed", "inside", "known", "left"),
+    [(2, SIZE, SIZE, 0.0), (3, SIZE, 0.0, SIZE), (4, 2 * SIZE, SIZE, 3**0.5 * SIZE)],
 )
 def test_the_power_beyond_the_model_is_named(seed, inside, known, left):
     found = gyrostab.diagnose(log_of(seed, inside), simulation=model(known), nulls=100)
@@ -80,5 +90,7 @@ def test_the_power_beyond_the_model_is_named(seed, inside, known, left):
         return
     assert [effect["name"] for effect in found.effects] == ["spectral_line"]
     for axis in "xy":
-        assert found.effects[0]["parameters"][f"amplitude.{axis}"]["value"] == pytest.approx(left, rel=0.1)
+        assert found.effects[0]["parameters"][f"amplitude.{axis}"]["value"] == pytest.approx(
+            left, rel=0.1
+        )
     assert found.effects[0]["parameters"]["frequency"]["value"] == pytest.approx(PLACE, abs=0.03)

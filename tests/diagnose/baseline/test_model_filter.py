@@ -16,12 +16,21 @@ NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 def made(**filtering: float) -> dict[str, object]:
     oversampling = int(filtering.pop("oversampling", 1))
     effect = {"name": "logger_filter", **filtering}
-    return {"noise": NOISE, "effect": [effect], "log": {"axes": ["x", "y"], "oversampling": oversampling}}
+    return {
+        "noise": NOISE,
+        "effect": [effect],
+        "log": {"axes": ["x", "y"], "oversampling": oversampling},
+    }
 
 
 @pytest.mark.parametrize(
     "filtering",
-    [{"cutoff": 2.0}, {"cutoff": 2.0, "oversampling": 4}, {"length": 0.3}, {"cutoff": 6.0, "order": 1.0, "pick": 1.0, "oversampling": 8}],
+    [
+        {"cutoff": 2.0},
+        {"cutoff": 2.0, "oversampling": 4},
+        {"length": 0.3},
+        {"cutoff": 6.0, "order": 1.0, "pick": 1.0, "oversampling": 8},
+    ],
     ids=str,
 )
 def test_a_model_expects_its_own_filter(filtering):
@@ -35,11 +44,15 @@ def test_a_model_expects_its_own_filter(filtering):
 
 @pytest.mark.usefixtures("one_thread")
 def test_what_is_named_of_a_fast_instrument_simulates_as_it_was():
-    log = simulate(made(cutoff=6.0, order=4.0, oversampling=16), duration="30min", rate=10.0, seed=5).compute()
+    log = simulate(
+        made(cutoff=6.0, order=4.0, oversampling=16), duration="30min", rate=10.0, seed=5
+    ).compute()
     found = gyrostab.diagnose(log, nulls=100)
     (effect,) = found.effects
     assert effect["name"] == "logger_filter"
     assert found.model["log"] == {"oversampling": 16}
-    again = simulate(found.model, like=log, seed=6).compute()  # whose cutoff lies above half of the log's rate
+    again = simulate(
+        found.model, like=log, seed=6
+    ).compute()  # whose cutoff lies above half of the log's rate
     was, now = (reduce_log(one)["power"].mean(["axis", "block"]).values for one in (log, again))
     np.testing.assert_allclose(now, was, rtol=0.15)

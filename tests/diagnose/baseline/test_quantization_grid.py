@@ -24,13 +24,17 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SCATTER = 0.003 * 60.0 * np.sqrt(10.0)  # of a sample at 10 Hz [deg/h]
 
 
-def on_lattice(kind: str, steps: float, *, mean: float = 3.0, seed: int = 1, size: int = 18_000) -> xr.Dataset:
+def on_lattice(
+    kind: str, steps: float, *, mean: float = 3.0, seed: int = 1, size: int = 18_000
+) -> xr.Dataset:
     """White noise on two axes that stands on a lattice of so many scatters of its samples."""
     rng = np.random.default_rng(seed)
     rates = mean * np.array([[1.0], [-2.3]]) + SCATTER * rng.standard_normal((2, size))
     step = steps * SCATTER
     if kind == "angle":
-        counted = np.diff(np.floor(np.cumsum(rates, axis=1) / step + 0.3), axis=1, prepend=0.0) * step
+        counted = (
+            np.diff(np.floor(np.cumsum(rates, axis=1) / step + 0.3), axis=1, prepend=0.0) * step
+        )
         return reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
     return reduce_log(make_log(np.rint(rates / step) * step, rate=10.0, unit="deg/h"))
 
@@ -55,7 +59,9 @@ def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
     rng = np.random.default_rng(4)
     rates = 3.0 + SCATTER * rng.standard_normal((2, 18_001))
     step = 0.85 * SCATTER
-    smooth = 0.8 * rates[:, 1:] + 0.2 * rates[:, :-1]  # takes more from the highest frequencies than the steps add
+    smooth = (
+        0.8 * rates[:, 1:] + 0.2 * rates[:, :-1]
+    )  # takes more from the highest frequencies than the steps add
     counted = np.diff(np.floor(np.cumsum(smooth, axis=1) / step), axis=1, prepend=0.0) * step
     reduced = reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
     assert (reduced["lattice"] > 0).all()
@@ -65,7 +71,10 @@ def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
 def test_axes_tell_together_what_one_tells_not() -> None:
     reduced = on_lattice("rate", 0.7)
     baseline = calibrate_noise(reduced)
-    alone = [rounded_rates(reduced.isel(axis=[number]), baseline.isel(axis=[number])) for number in range(2)]
+    alone = [
+        rounded_rates(reduced.isel(axis=[number]), baseline.isel(axis=[number]))
+        for number in range(2)
+    ]
     assert not np.concatenate(alone).any()
     assert rounded_rates(reduced, baseline).all()
 
@@ -89,7 +98,9 @@ def test_the_share_of_a_counter_is_that_of_its_errors(mean: float, scatter: floa
     steps = mean + scatter * np.random.default_rng(1).standard_normal(400_000)
     angle = np.cumsum(steps)
     errors = np.diff(np.rint(angle + 0.37) - angle)
-    assert float(angle_share(np.array([mean]), scatter)[0]) == pytest.approx(np.var(errors) * 6.0, rel=0.02)
+    assert float(angle_share(np.array([mean]), scatter)[0]) == pytest.approx(
+        np.var(errors) * 6.0, rel=0.02
+    )
 
 
 @pytest.mark.parametrize(("kind", "names"), [("rate", ["rate_quantization"]), ("angle", [])])
@@ -101,11 +112,20 @@ def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
     assert ("lattice" in found.reasons.get("rate_quantization", "")) == (kind == "angle")
 
 
-def cut_record(how, *, step: float = 0.18, mean: tuple[float, float] = (0.3, -0.8), zone: float = 0.0, size: int = 24_000) -> xr.Dataset:
+def cut_record(
+    how,
+    *,
+    step: float = 0.18,
+    mean: tuple[float, float] = (0.3, -0.8),
+    zone: float = 0.0,
+    size: int = 24_000,
+) -> xr.Dataset:
     """White noise on two axes whose samples stand on a lattice, in scatters of a sample; on x a zone in which it sticks before that."""
     rates = np.array(mean)[:, None] + np.random.default_rng(3).standard_normal((2, size))
     rates[0] = np.where(np.abs(rates[0]) < zone * step, 0.0, rates[0])
-    return reduce_log(make_log(how(rates / step) * step * SCATTER, rate=10.0, unit="deg/h", axis=["x", "y"]))
+    return reduce_log(
+        make_log(how(rates / step) * step * SCATTER, rate=10.0, unit="deg/h", axis=["x", "y"])
+    )
 
 
 @pytest.mark.parametrize("step", [0.05, 0.18, 0.5])
@@ -129,16 +149,21 @@ def test_what_sticks_at_zero_is_missing_beside_it(zone: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("how", "zone", "names"), [(np.trunc, 0.0, ["rate_quantization"]), (np.rint, 1.0, ["dead_zone"]), (np.rint, 0.0, [])]
+    ("how", "zone", "names"),
+    [(np.trunc, 0.0, ["rate_quantization"]), (np.rint, 1.0, ["dead_zone"]), (np.rint, 0.0, [])],
 )
-def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(how, zone: float, names: list[str]) -> None:
+def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(
+    how, zone: float, names: list[str]
+) -> None:
     reduced = cut_record(how, zone=zone, size=15_000)
     baseline, records = nulls(reduced, 40)
     found = name_effects(reduced, baseline, records)
     assert [claim.effect for claim in found.claims] == names
     assert all(claim.alternatives == () for claim in found.claims)
     if names == ["rate_quantization"]:
-        assert {one.effect.mode for one in fit_identifications(found, baseline) if one.effect} == {"zero"}
+        assert {one.effect.mode for one in fit_identifications(found, baseline) if one.effect} == {
+            "zero"
+        }
 
 
 def test_where_the_cells_do_not_tell_both_names_stand() -> None:
@@ -151,4 +176,6 @@ def test_where_the_cells_do_not_tell_both_names_stand() -> None:
     state = begin_state(reduced, calibrate_noise(reduced))
     assert "rate_quantization" in find_equivalent_effects("dead_zone", [part], state)
     told = cut_record(np.rint, zone=1.0, size=15_000)
-    assert "rate_quantization" not in find_equivalent_effects("dead_zone", [part], begin_state(told, calibrate_noise(told)))
+    assert "rate_quantization" not in find_equivalent_effects(
+        "dead_zone", [part], begin_state(told, calibrate_noise(told))
+    )

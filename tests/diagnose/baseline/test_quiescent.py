@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import baseline_from_model, baseline_from_simulation, calibrate_noise
+from gyrostab.diagnose.baseline.calibrate import (
+    baseline_from_model,
+    baseline_from_simulation,
+    calibrate_noise,
+)
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from tests.diagnose.baseline.test_calibrate import NOISE, SHAKEN, log
 
@@ -14,14 +18,18 @@ SHAKE_NOISE = {"name": "vibration_noise", "white": 0.002, "axes": ["x"]}
 
 
 def value_of(baseline, term, axis="x"):
-    return tuple(float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr"))
+    return tuple(
+        float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr")
+    )
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 4, 15])
 def test_a_short_quiet_stretch_calibrates_with_a_note_on_its_precision(blocks):
     reduced = reduce_log(log({"N": 0.003}, duration="30min"))
     step = reduced.attrs["block_s"]
-    with pytest.warns(UserWarning, match=rf"holds {blocks} blocks? of {step:g} s: N is known to \d"):
+    with pytest.warns(
+        UserWarning, match=rf"holds {blocks} blocks? of {step:g} s: N is known to \d"
+    ):
         baseline = calibrate_noise(reduced, quiet=(0.0, blocks * step + 1.0))
     value, error = value_of(baseline, "N")
     assert 0.0 < error < 0.25 * value
@@ -44,20 +52,30 @@ def test_a_model_gives_the_proportions_and_quiet_time_the_level():
     recording = log(effects=[SHAKE_NOISE], environment=[SHAKEN])
     reduced = reduce_log(recording)
     model = {"noise": {name: 0.8 * size for name, size in NOISE.items()}, "effect": [SHAKE_NOISE]}
-    raw, scaled = baseline_from_model(reduced, model), baseline_from_model(reduced, model, quiet=(0.0, 1100.0))
+    raw, scaled = (
+        baseline_from_model(reduced, model),
+        baseline_from_model(reduced, model, quiet=(0.0, 1100.0)),
+    )
     assert value_of(raw, "N") == (pytest.approx(0.0024), 0.0)
     for term, size in NOISE.items():
         value, error = value_of(scaled, term)
         assert abs(value - size) < 4.0 * error
-        assert error == pytest.approx(value * value_of(scaled, "N")[1] / value_of(scaled, "N")[0], rel=1e-6)
+        assert error == pytest.approx(
+            value * value_of(scaled, "N")[1] / value_of(scaled, "N")[0], rel=1e-6
+        )
     assert scaled.attrs["source"] == "model"
-    assert scaled.attrs["calibrated_on"] == [["1970-01-01T00:00:00.000Z", "1970-01-01T00:18:20.000Z"]]
+    assert scaled.attrs["calibrated_on"] == [
+        ["1970-01-01T00:00:00.000Z", "1970-01-01T00:18:20.000Z"]
+    ]
     middle = ((reduced["begin"] + reduced["end"]) / 2.0).values
     shaken = (middle > 1220) & (middle < 1480)
     for expected, where in ((1.0, ~shaken), (1.0, shaken)):
         ratio = float((reduced["power"] / scaled["spectrum"])[0, where].mean())
         assert ratio == pytest.approx(expected, abs=0.1)
-    assert scaled["spectrum"].values[0, shaken].mean() > 1.5 * scaled["spectrum"].values[0, ~shaken].mean()
+    assert (
+        scaled["spectrum"].values[0, shaken].mean()
+        > 1.5 * scaled["spectrum"].values[0, ~shaken].mean()
+    )
 
 
 def test_quiet_time_calibrates_beside_an_effect_that_acts_in_it():
@@ -71,18 +89,28 @@ def test_quiet_time_calibrates_beside_an_effect_that_acts_in_it():
 
 
 def test_a_simulated_log_is_scaled_to_quiet_time():
-    reduced, simulated = reduce_log(log(seed=1)), reduce_log(log({name: 0.8 * size for name, size in NOISE.items()}, seed=2))
-    plain, scaled = baseline_from_simulation(reduced, simulated), baseline_from_simulation(reduced, simulated, quiet=(0.0, 1800.0))
+    reduced, simulated = (
+        reduce_log(log(seed=1)),
+        reduce_log(log({name: 0.8 * size for name, size in NOISE.items()}, seed=2)),
+    )
+    plain, scaled = (
+        baseline_from_simulation(reduced, simulated),
+        baseline_from_simulation(reduced, simulated, quiet=(0.0, 1800.0)),
+    )
     assert abs(value_of(plain, "N")[0] - 0.0024) < 1e-4
     value, error = value_of(scaled, "N")
     assert abs(value - 0.003) < 4.0 * error
     assert float((reduced["power"] / scaled["spectrum"]).mean()) == pytest.approx(1.0, abs=0.05)
-    assert scaled.attrs["calibrated_on"] == [["1970-01-01T00:00:00.000Z", "1970-01-01T00:30:00.000Z"]]
+    assert scaled.attrs["calibrated_on"] == [
+        ["1970-01-01T00:00:00.000Z", "1970-01-01T00:30:00.000Z"]
+    ]
 
 
 def test_a_simulation_and_quiet_time_go_together():
     recording = log({"N": 0.003}, duration="15min")
-    found = gyrostab.diagnose(recording, simulation={"noise": {"N": 0.002}}, quiet=(0.0, 200.0), nulls=100)
+    found = gyrostab.diagnose(
+        recording, simulation={"noise": {"N": 0.002}}, quiet=(0.0, 200.0), nulls=100
+    )
     assert found.verdict == "no mismatch"
     assert found.content["baseline"]["source"] == "model"
     assert found.content["baseline"]["calibrated_on"]

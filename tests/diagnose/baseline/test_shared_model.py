@@ -23,14 +23,22 @@ def shared(size: float, **more: object) -> dict[str, object]:
 
 @cache
 def log_of(seed: int, *sizes: float, minutes: int = 30) -> xr.Dataset:
-    model = {"noise": NOISE, "effect": [shared(size) for size in sizes], "log": {"axes": ["x", "y", "z"]}}
+    model = {
+        "noise": NOISE,
+        "effect": [shared(size) for size in sizes],
+        "log": {"axes": ["x", "y", "z"]},
+    }
     return simulate(model, duration=f"{minutes}min", rate=10.0, seed=seed).compute()
 
 
 def lossy(log: xr.Dataset, share: float) -> xr.Dataset:
     """The log with random samples lost, others on every axis."""
     gone = np.random.default_rng(5).random(log["rate"].shape) < share
-    return log.assign(rate=log["rate"].where(xr.DataArray(~gone, dims=log["rate"].dims)).assign_attrs(log["rate"].attrs))
+    return log.assign(
+        rate=log["rate"]
+        .where(xr.DataArray(~gone, dims=log["rate"].dims))
+        .assign_attrs(log["rate"].attrs)
+    )
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.2])
@@ -39,8 +47,16 @@ def test_null_records_share_what_the_model_says(lost):
     records = [reduce_log(lossy(log_of(seed, size, minutes=60), lost)) for seed in range(1, 5)]
     baseline = baseline_from_model(records[0], {"noise": NOISE, "effect": [shared(size)]})
     pieces = list(null_records(records[0], baseline, count=40, rng=np.random.default_rng(1)))
-    nulls = xr.concat(pieces, "record", data_vars="minimal", coords="minimal", compat="override", join="override")
-    raw = xr.concat([one[["cross", "power", "mean"]] for one in records], "record", coords="minimal", compat="override", join="override")
+    nulls = xr.concat(
+        pieces, "record", data_vars="minimal", coords="minimal", compat="override", join="override"
+    )
+    raw = xr.concat(
+        [one[["cross", "power", "mean"]] for one in records],
+        "record",
+        coords="minimal",
+        compat="override",
+        join="override",
+    )
     expected = baseline["cross"].mean("block")
     assert np.sign(expected.real.values[:, 3]).tolist() == [1.0, -1.0, -1.0]
     bands = slice(4, None)
@@ -48,29 +64,55 @@ def test_null_records_share_what_the_model_says(lost):
     for name, sample in (("raw", raw), ("drawn", nulls)):
         ratio = (sample["cross"].real.mean(["record", "block"]) / expected.real).isel(band=bands)
         assert float(np.abs(ratio - 1.0).max()) < 0.12, name
-        level = (sample["power"].mean(["record", "block"]) / baseline["spectrum"].mean("block")).isel(band=bands)
+        level = (
+            sample["power"].mean(["record", "block"]) / baseline["spectrum"].mean("block")
+        ).isel(band=bands)
         assert float(np.abs(level - 1.0).max()) < 0.08, name
         steps = sample["mean"].diff("block")
-        found[name] = float((steps[:, 0] * steps[:, 2]).sum() / np.sqrt((steps[:, 0] ** 2).sum() * (steps[:, 2] ** 2).sum()))
+        found[name] = float(
+            (steps[:, 0] * steps[:, 2]).sum()
+            / np.sqrt((steps[:, 0] ** 2).sum() * (steps[:, 2] ** 2).sum())
+        )
     assert found["raw"] == pytest.approx(found["drawn"], abs=0.07)
     assert found["drawn"] == pytest.approx(-0.41 * (1.0 - lost), abs=0.05)
-    for part in (lambda one: one["cross"].real, lambda one: one["cross"].imag, lambda one: one["power"]):
-        scatter = part(nulls).isel(band=bands).std(["record", "block"]) / part(raw).isel(band=bands).std(["record", "block"])
+    for part in (
+        lambda one: one["cross"].real,
+        lambda one: one["cross"].imag,
+        lambda one: one["power"],
+    ):
+        scatter = part(nulls).isel(band=bands).std(["record", "block"]) / part(raw).isel(
+            band=bands
+        ).std(["record", "block"])
         assert float(np.abs(scatter - 1.0).max()) < 0.15
-    other = (nulls["power"][:, 0] * nulls["power"][:, 1]).mean(["record", "block"]) / expected[0].real ** 2
-    seen = (raw["power"][:, 0] * raw["power"][:, 1]).mean(["record", "block"]) / expected[0].real ** 2
+    other = (nulls["power"][:, 0] * nulls["power"][:, 1]).mean(["record", "block"]) / expected[
+        0
+    ].real ** 2
+    seen = (raw["power"][:, 0] * raw["power"][:, 1]).mean(["record", "block"]) / expected[
+        0
+    ].real ** 2
     np.testing.assert_allclose(other[bands], seen[bands], rtol=0.12)
 
 
 def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
-    line = {"name": "spectral_line", "amplitude": [0.5, 0.5, -0.25], "frequency": 1.3, "phase": [0.0, 90.0, 0.0]}
+    line = {
+        "name": "spectral_line",
+        "amplitude": [0.5, 0.5, -0.25],
+        "frequency": 1.3,
+        "phase": [0.0, 90.0, 0.0],
+    }
     sway = {"name": "real_motion", "direction": [1.0, -0.5, 0.0], "sway": 0.5, "frequency": 0.4}
     model = {"noise": NOISE, "effect": [line, sway], "log": {"axes": ["x", "y", "z"]}}
     reduced = reduce_log(simulate(model, duration="1h", rate=10.0, seed=3).compute())
     baseline = baseline_from_model(reduced, model)
     for frequency in (1.3, 0.4):
-        band = int(np.flatnonzero((reduced["band_low"] <= frequency) & (frequency < reduced["band_high"]))[0])
-        seen, expected = (one["cross"].isel(band=band).mean("block").values for one in (reduced, baseline))
+        band = int(
+            np.flatnonzero((reduced["band_low"] <= frequency) & (frequency < reduced["band_high"]))[
+                0
+            ]
+        )
+        seen, expected = (
+            one["cross"].isel(band=band).mean("block").values for one in (reduced, baseline)
+        )
         scale = float(np.sqrt(baseline["spectrum"].isel(band=band).mean("block").max()) ** 2)
         assert np.abs(seen - expected).max() < 0.15 * scale
     assert baseline["cross"].isel(band=band).mean("block").values[0].real < 0.0
@@ -78,15 +120,23 @@ def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_what_the_model_shares_is_no_mismatch(seed):
-    found = gyrostab.diagnose(log_of(seed, 0.0015), simulation={"noise": NOISE, "effect": [shared(0.0015)]}, nulls=100)
+    found = gyrostab.diagnose(
+        log_of(seed, 0.0015), simulation={"noise": NOISE, "effect": [shared(0.0015)]}, nulls=100
+    )
     assert found.verdict == "no mismatch", found.content["mismatches"]
 
 
 def test_what_is_shared_beyond_the_model_is_named_with_its_size():
-    found = gyrostab.diagnose(log_of(3, 0.0015, 0.0012), simulation={"noise": NOISE, "effect": [shared(0.0015)]}, nulls=100)
+    found = gyrostab.diagnose(
+        log_of(3, 0.0015, 0.0012),
+        simulation={"noise": NOISE, "effect": [shared(0.0015)]},
+        nulls=100,
+    )
     assert [effect["name"] for effect in found.effects] == ["shared_source"]
     for axis, sign in zip("xyz", (1, 1, -1), strict=True):
-        assert found.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(sign * 0.0012, rel=0.2)
+        assert found.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(
+            sign * 0.0012, rel=0.2
+        )
 
 
 def test_what_a_model_lacks_is_named_and_in_the_powers_thereafter():
@@ -94,7 +144,9 @@ def test_what_a_model_lacks_is_named_and_in_the_powers_thereafter():
     assert [effect["name"] for effect in found.effects] == ["shared_source"]
     assert found.verdict == "explained", found.content["mismatches"]
     for axis, sign in zip("xyz", (1, 1, -1), strict=True):
-        assert found.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(sign * 0.0015, rel=0.15)
+        assert found.effects[0]["parameters"][f"N.{axis}"]["value"] == pytest.approx(
+            sign * 0.0015, rel=0.15
+        )
     held = found.content["held_out"]
     assert abs(held["misfit_after"] - 1.0) < 0.5 * abs(held["misfit_before"] - 1.0)
 
@@ -102,6 +154,8 @@ def test_what_a_model_lacks_is_named_and_in_the_powers_thereafter():
 def test_a_low_pass_of_what_two_axes_share_leaves_no_filter_and_nothing_unknown():
     slow = {"name": "shared_source", "N": [0.0, 0.004, 0.004], "bandwidth": 0.8}
     model = {"noise": NOISE, "effect": [slow], "log": {"axes": ["x", "y", "z"]}}
-    found = gyrostab.diagnose(simulate(model, duration="30min", rate=10.0, seed=5).compute(), nulls=100)
+    found = gyrostab.diagnose(
+        simulate(model, duration="30min", rate=10.0, seed=5).compute(), nulls=100
+    )
     assert [effect["name"] for effect in found.effects] == ["shared_source"]
     assert found.verdict == "explained", found.content["mismatches"]

@@ -18,7 +18,11 @@ from gyrostab.simulate import simulate
 from tests.support.named import nulls, record
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
-JUMP = {"name": "bias_jump", "step": [2.0], "at": 807.0}  # 50 standard deviations of a block's mean; blocks begin at 800 s and 820 s
+JUMP = {
+    "name": "bias_jump",
+    "step": [2.0],
+    "at": 807.0,
+}  # 50 standard deviations of a block's mean; blocks begin at 800 s and 820 s
 
 
 def _log(effects, seed):
@@ -29,7 +33,9 @@ def _log(effects, seed):
 def _diagnosed(log, effects=()):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return gyrostab.diagnose(log, simulation={"noise": NOISE, "effect": list(effects)}, nulls=100)
+        return gyrostab.diagnose(
+            log, simulation={"noise": NOISE, "effect": list(effects)}, nulls=100
+        )
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +48,9 @@ def test_a_jump_within_a_block_explains_the_power_that_it_has_there_and_at_the_l
     assert found.verdict == "explained"
     assert [effect["name"] for effect in found.effects] == ["bias_jump"]
     assert {"davar", "spectrum", "mean"} <= {box["view"] for box in found.content["mismatches"]}
-    assert {name for box in found.content["mismatches"] for name in box["explained_by"]} == {"bias_jump"}
+    assert {name for box in found.content["mismatches"] for name in box["explained_by"]} == {
+        "bias_jump"
+    }
 
 
 def test_what_is_loud_in_other_blocks_is_not_the_jump(jumped):
@@ -53,7 +61,13 @@ def test_what_is_loud_in_other_blocks_is_not_the_jump(jumped):
     left = [box for box in found.content["mismatches"] if not box["explained_by"]]
     assert found.verdict == "partly explained"
     start = np.datetime64(found.content["recording"]["start"].removesuffix("Z"))
-    spans = [[(np.datetime64(box[end].removesuffix("Z")) - start) / np.timedelta64(1, "s") for end in ("start", "end")] for box in left]
+    spans = [
+        [
+            (np.datetime64(box[end].removesuffix("Z")) - start) / np.timedelta64(1, "s")
+            for end in ("start", "end")
+        ]
+        for box in left
+    ]
     assert any(begin < 1300 and end > 1200 for begin, end in spans)
 
 
@@ -75,7 +89,10 @@ def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
     found = still_lines(task, reduced, known)
     assert found["line_weight"].values[0, 0] == 0.0
     np.testing.assert_allclose(found["line_power"][:, 2:], reduced["line_power"][:, 2:])
-    xr.testing.assert_identical(found.drop_vars(["line_power", "line_weight"]), reduced.drop_vars(["line_power", "line_weight"]))
+    xr.testing.assert_identical(
+        found.drop_vars(["line_power", "line_weight"]),
+        reduced.drop_vars(["line_power", "line_weight"]),
+    )
     assert still_lines(task, reduced, baseline) is reduced
 
 
@@ -92,8 +109,15 @@ def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_
         lost = out[name].isnull() & reduced[name].notnull()
         lost = lost.any("band") if "band" in lost.dims else lost
         np.testing.assert_array_equal(lost.transpose("axis", "block"), moving)
-    lost = (out["cross"].isnull() & reduced["cross"].notnull()).any("band").transpose("pair", "block").values
-    touched = ["y" in pair for pair in zip(reduced["first"].values, reduced["second"].values, strict=True)]
+    lost = (
+        (out["cross"].isnull() & reduced["cross"].notnull())
+        .any("band")
+        .transpose("pair", "block")
+        .values
+    )
+    touched = [
+        "y" in pair for pair in zip(reduced["first"].values, reduced["second"].values, strict=True)
+    ]
     np.testing.assert_array_equal(lost, np.outer(touched, moving[1]))
     xr.testing.assert_identical(out["mean"], reduced["mean"])
     assert remove_known_motion(reduced, baseline) is reduced

@@ -96,7 +96,9 @@ def test_zeros_of_a_lattice_are_expected_together_where_an_axis_is_lost():
     found = name_effects(reduced, baseline, records)
     assert found.claims == ()
     drawn = records[0]["filled"].mean("record").values[:, lost].mean(axis=1)
-    np.testing.assert_allclose(drawn[:2], reduced["filled"].values[:2, lost].mean(axis=1), atol=0.12)
+    np.testing.assert_allclose(
+        drawn[:2], reduced["filled"].values[:2, lost].mean(axis=1), atol=0.12
+    )
 
 
 def test_samples_that_were_filled_with_zeros_are_seen_where_an_axis_is_lost():
@@ -116,7 +118,11 @@ def test_an_axis_that_is_lost_early_keeps_blocks_where_all_that_are_left_have_od
     for first in range(100, 3_240, 162):
         noise[:, first : first + 6] = 0.0
     reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
-    assert (reduced["filled"].sel(axis="z") > 0).sum() == np.isfinite(reduced["mean"].sel(axis="z")).sum() == 20
+    assert (
+        (reduced["filled"].sel(axis="z") > 0).sum()
+        == np.isfinite(reduced["mean"].sel(axis="z")).sum()
+        == 20
+    )
     baseline, records = nulls(reduced, 40)
     (claim,) = name_effects(reduced, baseline, records).claims
     assert (claim.effect, claim.axes) == ("held_samples", ("x", "y", "z"))
@@ -127,7 +133,9 @@ def test_how_often_and_how_long_samples_were_held_is_told(fill):
     """Held stretches drawn here, 40 of 6 samples each and 20 of 2."""
     rng = np.random.default_rng(8)
     noise = SCATTER * rng.standard_normal((3, 15_000))
-    for number, first in enumerate(np.sort(rng.choice(np.arange(50, 14_900, 30), 60, replace=False))):
+    for number, first in enumerate(
+        np.sort(rng.choice(np.arange(50, 14_900, 30), 60, replace=False))
+    ):
         length = 6 if number < 40 else 2
         noise[:, first : first + length] = noise[:, first - 1 : first] if fill == "repeat" else 0.0
     reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
@@ -137,7 +145,9 @@ def test_how_often_and_how_long_samples_were_held_is_told(fill):
     hours = float(reduced["samples"].sel(axis="x").sum()) / 36_000.0
     for one in found:
         assert one.parameters["per_hour"].value == pytest.approx(60 / hours, rel=0.06)
-        assert one.parameters["length"].value == pytest.approx((40 * 6 + 20 * 2) / 60 / 10.0, rel=0.06)
+        assert one.parameters["length"].value == pytest.approx(
+            (40 * 6 + 20 * 2) / 60 / 10.0, rel=0.06
+        )
         for name, true in (("per_hour", 60 / hours), ("length", 0.467)):
             assert one.parameters[name].low < true < one.parameters[name].high
 
@@ -158,12 +168,23 @@ def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
 
 def test_noise_that_rises_within_a_block_is_no_outlier_beside_spikes_of_another_axis():
     rng = np.random.default_rng(6)
-    shaken = (np.arange(15_000) >= 31 * 162 + 120) & (np.arange(15_000) < 62 * 162 + 40)  # ends in the quiet half of a block
+    shaken = (np.arange(15_000) >= 31 * 162 + 120) & (
+        np.arange(15_000) < 62 * 162 + 40
+    )  # ends in the quiet half of a block
     noise = SCATTER * rng.standard_normal((3, 15_000)) * np.where(shaken, 8.0, 1.0)
     noise[1, rng.choice(4_000, 12, replace=False)] += 30.0
-    log = make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz"), channels={"vibration": (3.0 * shaken, "g")})
+    log = make_log(
+        noise,
+        rate=10.0,
+        unit="deg/h",
+        axis=list("xyz"),
+        channels={"vibration": (3.0 * shaken, "g")},
+    )
     baseline, records = nulls(reduce_log(log), 40)
-    axes = {claim.effect: claim.axes for claim in name_effects(reduce_log(log), baseline, records).claims}
+    axes = {
+        claim.effect: claim.axes
+        for claim in name_effects(reduce_log(log), baseline, records).claims
+    }
     assert axes.pop("spikes") == ("y",)
     assert list(axes.values()) == [("x", "y", "z")]  # of what vibration does
 
@@ -173,7 +194,14 @@ def test_noise_that_rises_and_falls_has_no_spikes():
     for edge in (40, 81, 120):
         shaken = (np.arange(15_000) >= 31 * 162 + edge) & (np.arange(15_000) < 62 * 162 + edge)
         noise = SCATTER * rng.standard_normal((2, 15_000)) * np.where(shaken, 5.0, 1.0)
-        assert int(reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xy")))["outliers"].sum()) <= 1
+        assert (
+            int(
+                reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xy")))[
+                    "outliers"
+                ].sum()
+            )
+            <= 1
+        )
 
 
 def test_spikes_of_six_deviations_are_named_and_counted():
@@ -193,7 +221,9 @@ def test_spikes_of_six_deviations_are_named_and_counted():
 def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_powers_of_the_model():
     rng = np.random.default_rng(11)
     hit = rng.random((1, 15_000)) < 0.009
-    noise = SCATTER * (rng.standard_normal((1, 15_000)) + 70.0 * rng.standard_normal((1, 15_000)) * hit)
+    noise = SCATTER * (
+        rng.standard_normal((1, 15_000)) + 70.0 * rng.standard_normal((1, 15_000)) * hit
+    )
     reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
     assert (reduced["peaks"] > 0).mean() > 0.6
     baseline, records = nulls(reduced, 40)
@@ -205,10 +235,18 @@ def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_power
     whole = add_outlier_power(clean, reduced, [fitted])["spectrum"].mean()
     assert float(whole) == pytest.approx(float(reduced["power"].mean()), rel=0.4)
     assert float(clean["spectrum"].mean()) < 0.1 * float(whole)
-    for lacking, known in (([fitted], []), ([], [fitted])):  # effects of the recording alone, or of the simulation too
-        surfaces = conclude._surfaces(reduced, conclude.Fit(found, clean, lacking, known), clean, clean)
+    for lacking, known in (
+        ([fitted], []),
+        ([], [fitted]),
+    ):  # effects of the recording alone, or of the simulation too
+        surfaces = conclude._surfaces(
+            reduced, conclude.Fit(found, clean, lacking, known), clean, clean
+        )
         short = surfaces["avar"].isel(tau=0).mean(["axis", "window"])
-        before, after = (float(short.sel(case=case) / short.sel(case="recording")) for case in ("before", "after"))
+        before, after = (
+            float(short.sel(case=case) / short.sel(case="recording"))
+            for case in ("before", "after")
+        )
         assert after == pytest.approx(1.0, rel=0.4)
         assert before == pytest.approx(1.0, rel=0.4) if known else before < 0.1
 
@@ -221,4 +259,6 @@ def test_bursts_of_noise_shorter_than_a_block_have_no_spikes():
     noise = SCATTER * loud * rng.standard_normal((3, 15_000))
     reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
     baseline, records = nulls(reduced, 40)
-    assert "spikes" not in [claim.effect for claim in name_effects(reduced, baseline, records).claims]
+    assert "spikes" not in [
+        claim.effect for claim in name_effects(reduced, baseline, records).claims
+    ]

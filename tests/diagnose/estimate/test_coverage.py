@@ -36,16 +36,26 @@ def slow(values: np.ndarray, time: float) -> np.ndarray:
     return out
 
 
-def fits(environment: tuple[dict[str, Any], ...], effect: str, column: str, shape: np.ndarray) -> list[dict[str, Any]]:
+def fits(
+    environment: tuple[dict[str, Any], ...], effect: str, column: str, shape: np.ndarray
+) -> list[dict[str, Any]]:
     """Numbers of an effect in records of noise to which its mean, of one value a second, is added."""
     reduced = record([], environment=environment)
     baseline = calibrate_noise(reduced)
     frame = claimed(reduced, baseline, effect, "mean", (column,))
-    drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
+    drawn = next(
+        iter(
+            null_records(
+                reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
+            )
+        )
+    )
     out = []
     for number in range(RECORDS):
         mean = drawn["mean"].isel(record=number).transpose("axis", "block") + in_blocks(shape)
-        state = condition_on(begin_state(reduced.assign(mean=mean), baseline), list(frame.claims[0].parts))
+        state = condition_on(
+            begin_state(reduced.assign(mean=mean), baseline), list(frame.claims[0].parts)
+        )
         out.append(dict(fit_identifications(replace(frame, state=state), baseline)[0].parameters))
     return out
 
@@ -61,11 +71,16 @@ def half_width(found: list[dict[str, Any]], name: str) -> float:
 def test_of_a_slow_and_bent_response_to_the_supply_the_sensitivity_at_rest_and_the_lag_are_held():
     time, size = 45.0, 0.12
     second = np.arange(SECONDS)
-    volt = np.array([level for _, level in VOLTS])[np.searchsorted([at for at, _ in VOLTS], second, side="right") - 1]
+    volt = np.array([level for _, level in VOLTS])[
+        np.searchsorted([at for at, _ in VOLTS], second, side="right") - 1
+    ]
     above = volt - volt.mean()
     bent = above - 0.3 * np.minimum(above, 0.0) ** 2
     at_rest = size * np.polyfit(above, bent, 1)[0]
-    environment = (*WORLD["usual"], {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": VOLTS})
+    environment = (
+        *WORLD["usual"],
+        {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": VOLTS},
+    )
     found = fits(environment, "supply_bias", "voltage", size * slow(bent, time))
     assert 0.9 <= held(found, "voltage", at_rest) <= 1.0
     assert 0.9 <= held(found, "lag", time) <= 1.0
@@ -75,7 +90,9 @@ def test_of_a_slow_and_bent_response_to_the_supply_the_sensitivity_at_rest_and_t
 
 def test_a_warm_up_that_is_quicker_than_those_of_the_grid_is_held():
     time, size = 25.0, 1.0
-    found = fits(WORLD["usual"], "warm_up", "amplitude", size * np.exp(-(np.arange(SECONDS) + 0.5) / time))
+    found = fits(
+        WORLD["usual"], "warm_up", "amplitude", size * np.exp(-(np.arange(SECONDS) + 0.5) / time)
+    )
     assert 0.9 <= held(found, "amplitude", size) <= 1.0
     assert 0.9 <= held(found, "time", time) <= 1.0
     assert half_width(found, "time") < 0.6 * time
@@ -88,7 +105,10 @@ def test_a_play_between_those_of_the_grid_is_held():
     last = heat[0]
     for place, value in enumerate(heat):
         slider[place] = last = min(max(last, value - width), value + width)
-    environment = ({"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT}, WORLD["usual"][1])
+    environment = (
+        {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT},
+        WORLD["usual"][1],
+    )
     found = fits(environment, "thermal_hysteresis", "sensitivity", size * (heat - slider))
     assert 0.9 <= held(found, "sensitivity", size) <= 1.0
     assert 0.9 <= held(found, "width", width) <= 1.0
@@ -98,16 +118,33 @@ def test_a_play_between_those_of_the_grid_is_held():
 def test_what_is_there_but_slower_than_others_is_below_its_limit():
     size, time = 0.25, 700.0
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
-    environment = ({"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT}, WORLD["usual"][1])
+    environment = (
+        {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT},
+        WORLD["usual"][1],
+    )
     reduced = record([], environment=environment)
     baseline = calibrate_noise(reduced)
     frame = claimed(reduced, baseline, "shupe", "mean", ("sensitivity",))
-    frame = replace(frame, claims=(), candidates=tuple(one for one in frame.candidates if one.effect == "shupe"))
-    drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
+    frame = replace(
+        frame, claims=(), candidates=tuple(one for one in frame.candidates if one.effect == "shupe")
+    )
+    drawn = next(
+        iter(
+            null_records(
+                reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
+            )
+        )
+    )
     there = in_blocks(size * slow(60.0 * np.gradient(heat), time))
     found = []
     for number in range(RECORDS):
-        seen = reduced.assign(mean=drawn["mean"].isel(record=number).transpose("axis", "block") + there)
-        found.append(find_upper_limits(replace(frame, state=begin_state(seen, baseline)))["shupe"].upper_limit)
+        seen = reduced.assign(
+            mean=drawn["mean"].isel(record=number).transpose("axis", "block") + there
+        )
+        found.append(
+            find_upper_limits(replace(frame, state=begin_state(seen, baseline)))[
+                "shupe"
+            ].upper_limit
+        )
     assert np.mean(np.array(found) >= size) >= 0.9
     assert np.median(found) < 4.0 * size

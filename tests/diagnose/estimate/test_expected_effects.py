@@ -15,8 +15,14 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
-SHAKE = {"profile": "vibration", "points": [[0, 0.02], [500, 0.02], [520, 6.0], [900, 6.0], [920, 0.02], [1500, 0.02]]}
-TURN = {"profile": "rotation", "points": [[0, 0.0], [300, 0.0], [330, 72.0], [800, 72.0], [830, 0.0], [1500, 0.0]]}
+SHAKE = {
+    "profile": "vibration",
+    "points": [[0, 0.02], [500, 0.02], [520, 6.0], [900, 6.0], [920, 0.02], [1500, 0.02]],
+}
+TURN = {
+    "profile": "rotation",
+    "points": [[0, 0.0], [300, 0.0], [330, 72.0], [800, 72.0], [830, 0.0], [1500, 0.0]],
+}
 JUMP = {"name": "bias_jump", "step": [1.0], "at": 700.0, "axes": ["x"]}
 
 
@@ -31,14 +37,24 @@ SCALE = {"name": "scale_factor", "linear": 1000.0, "axes": ["z"]}
 
 def diagnosed(effects, *, environment=(), more=(), axes="xyz", seed=2):
     """Diagnosis against the model without the effects in `more`."""
-    model = {"noise": NOISE, "effect": [*effects, *more], "environment": list(environment), "log": {"axes": list(axes)}}
+    model = {
+        "noise": NOISE,
+        "effect": [*effects, *more],
+        "environment": list(environment),
+        "log": {"axes": list(axes)},
+    }
     log = simulate(model, duration="25min", rate=10.0, seed=seed).compute()
     return gyrostab.diagnose(log, simulation={"noise": NOISE, "effect": list(effects)}, nulls=100)
 
 
 @pytest.mark.parametrize(
     ("effects", "environment", "axes"),
-    [([SPIKES, MEMORY, WALK], (SHAKE,), "xyz"), ([HELD], (), "xy"), ([SWAY], (), "xy"), ([EARTH, SCALE], (TURN,), "xyz")],
+    [
+        ([SPIKES, MEMORY, WALK], (SHAKE,), "xyz"),
+        ([HELD], (), "xy"),
+        ([SWAY], (), "xy"),
+        ([EARTH, SCALE], (TURN,), "xyz"),
+    ],
     ids=["spikes, memory, walk", "held samples", "sway", "turning"],
 )
 def test_what_the_model_holds_is_no_mismatch(effects, environment, axes):
@@ -49,7 +65,11 @@ def test_what_the_model_holds_is_no_mismatch(effects, environment, axes):
 def test_another_effect_beside_those_that_are_expected_is_named():
     found = diagnosed([SPIKES, MEMORY], more=[JUMP], axes="xy")
     assert [effect["name"] for effect in found.effects] == ["bias_jump"]
-    assert found.effects[0]["parameters"]["step"]["low"] < 1.0 < found.effects[0]["parameters"]["step"]["high"]
+    assert (
+        found.effects[0]["parameters"]["step"]["low"]
+        < 1.0
+        < found.effects[0]["parameters"]["step"]["high"]
+    )
     (expected,) = found.content["baseline"]["expected"]  # with the size that it has here
     assert (expected["name"], expected["axes"]) == ("spikes", ["x"])
     assert "an hour" in expected["statement"], expected["statement"]
@@ -67,31 +87,47 @@ def test_null_means_wander_as_the_model_does(reduced, memory, rms):
     """The covariance of block means is that of the double integral of the exponential memory."""
     effect = {"name": "gauss_markov", "rms": rms, "correlation_time": memory}
     baseline = baseline_from_model(reduced, {"noise": {"N": 1e-5}, "effect": [effect]})
-    drawn = np.concatenate([one["mean"].values[:, 0] for one in null_records(reduced, baseline, count=600, rng=np.random.default_rng(2))])
+    drawn = np.concatenate(
+        [
+            one["mean"].values[:, 0]
+            for one in null_records(reduced, baseline, count=600, rng=np.random.default_rng(2))
+        ]
+    )
     a = float(reduced.attrs["block_s"]) / memory
     own, next_one = 2.0 * (a + np.expm1(-a)) / a**2, (np.expm1(-a) / a) ** 2
     assert (drawn**2).mean() == pytest.approx(rms**2 * own, rel=0.05)
-    assert (drawn[:, 1:] * drawn[:, :-1]).mean() == pytest.approx(rms**2 * next_one, rel=0.08, abs=0.02 * rms**2)
+    assert (drawn[:, 1:] * drawn[:, :-1]).mean() == pytest.approx(
+        rms**2 * next_one, rel=0.08, abs=0.02 * rms**2
+    )
     assert mean_share(a, np.array([1.0])) == pytest.approx(own)
 
 
 def test_null_means_walk_while_it_shakes(reduced):
     effect = {"name": "vibration_random_walk", "sensitivity": 0.3}
     baseline = baseline_from_model(reduced, {"noise": {"N": 0.003}, "effect": [effect]})
-    nulls = np.concatenate([one["mean"].values[:, 0] for one in null_records(reduced, baseline, count=400, rng=np.random.default_rng(3))])
+    nulls = np.concatenate(
+        [
+            one["mean"].values[:, 0]
+            for one in null_records(reduced, baseline, count=400, rng=np.random.default_rng(3))
+        ]
+    )
     begin, end = reduced["begin"].values, reduced["end"].values
     still, shaken = end <= 500.0, (begin >= 520.0) & (end <= 900.0)
     span = (end[shaken][-1] - end[shaken][0]) / 3600.0
     moved = nulls[:, np.flatnonzero(shaken)[-1]] - nulls[:, np.flatnonzero(shaken)[0]]
     block = float(reduced.attrs["block_s"]) / 3600.0
-    assert moved.var() == pytest.approx((0.3 * 6.0) ** 2 * (span - block / 3.0), rel=0.15)  # K^2 t, less what the means smooth
+    assert moved.var() == pytest.approx(
+        (0.3 * 6.0) ** 2 * (span - block / 3.0), rel=0.15
+    )  # K^2 t, less what the means smooth
     assert np.diff(nulls[:, still]).var() < 0.02 * moved.var()
     walk = known_wander(baseline, "x").walk
     assert walk[shaken] == pytest.approx((0.3 * 6.0) ** 2 / 3600.0, rel=0.02)
 
 
 def test_blocks_in_which_a_known_rate_moves_are_left_out(reduced):
-    baseline = baseline_from_model(reduced, {"noise": NOISE, "effect": [{"name": "scale_factor", "linear": 1000.0}]})
+    baseline = baseline_from_model(
+        reduced, {"noise": NOISE, "effect": [{"name": "scale_factor", "linear": 1000.0}]}
+    )
     moving = expect_known_motion(reduced, baseline)[0]
     begin, end = reduced["begin"].values, reduced["end"].values
     ramp = ((begin < 330.0) & (end > 300.0)) | ((begin < 830.0) & (end > 800.0))
@@ -105,20 +141,28 @@ def test_a_narrow_resonance_is_expected_as_the_taper_shows_it(frequency, quality
     effect = {"name": "spectral_line", "amplitude": 1.0, "frequency": frequency, "quality": quality}
     rng = np.random.default_rng(5)
     rate, fine = 10.0, 40.0
-    poles = 2.0 * np.pi * frequency * np.array([-1.0, -1.0]) / (2.0 * quality) + 2j * np.pi * frequency * np.sqrt(
-        1.0 - 1.0 / (4.0 * quality**2)
-    ) * np.array([1.0, -1.0])
-    b, a = signal.cont2discrete(([1.0, 0.0], np.real(np.poly(poles))), 1.0 / fine, method="bilinear")[:2]
+    poles = 2.0 * np.pi * frequency * np.array([-1.0, -1.0]) / (
+        2.0 * quality
+    ) + 2j * np.pi * frequency * np.sqrt(1.0 - 1.0 / (4.0 * quality**2)) * np.array([1.0, -1.0])
+    b, a = signal.cont2discrete(
+        ([1.0, 0.0], np.real(np.poly(poles))), 1.0 / fine, method="bilinear"
+    )[:2]
     values = signal.lfilter(b[0], a, rng.standard_normal(int(40_000 * fine)))[int(2000 * fine) :]
     values *= np.sqrt(0.5) / values.std()
     means = values[: values.size // 4 * 4].reshape(-1, 4).mean(axis=1)
     log = gyrostab.make_log(means[None], rate=rate, unit="deg/h")
     reduced = reduce_log(log, block="20s")
     baseline = baseline_from_model(reduced, {"noise": {"N": 1e-4}, "effect": [effect]})
-    seen, expected = reduced["power"].values[0].mean(axis=0), baseline["spectrum"].values[0].mean(axis=0)
+    seen, expected = (
+        reduced["power"].values[0].mean(axis=0),
+        baseline["spectrum"].values[0].mean(axis=0),
+    )
     near = expected > 0.02 * expected.max()
     assert near.sum() >= 2
     np.testing.assert_allclose(seen[near], expected[near], rtol=0.25)
     scatter = reduced["power"].values[0, :, near].var(axis=1) / seen[near] ** 2
     assert (scatter / (1.0 / baseline["shape_alone"].values[0, 0, near]) > 0.4).all()
-    assert scatter[np.argmax(seen[near])] < 2.5 / baseline["shape_alone"].values[0, 0, np.flatnonzero(near)[np.argmax(seen[near])]]
+    assert (
+        scatter[np.argmax(seen[near])]
+        < 2.5 / baseline["shape_alone"].values[0, 0, np.flatnonzero(near)[np.argmax(seen[near])]]
+    )

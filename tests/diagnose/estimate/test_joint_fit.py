@@ -31,7 +31,9 @@ def quiet():
     return reduced, calibrate_noise(reduced)
 
 
-def claimed(reduced: xr.Dataset, baseline: xr.Dataset, effect: str, view: str, columns: tuple[str, ...]) -> Identifications:
+def claimed(
+    reduced: xr.Dataset, baseline: xr.Dataset, effect: str, view: str, columns: tuple[str, ...]
+) -> Identifications:
     """A naming of one effect on the first axis."""
     candidates, reasons = effect_candidates(reduced, COEFFICIENT)
     one = next(one for one in candidates if one.effect == effect and one.view == view)
@@ -39,13 +41,21 @@ def claimed(reduced: xr.Dataset, baseline: xr.Dataset, effect: str, view: str, c
     part = Component(one, variant, ("x",), 50.0)
     claim = Identification(effect, one.driver, ("x",), (part,), 50.0, 8.0)
     state = condition_on(begin_state(reduced, baseline), [part])
-    return Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced))
+    return Identifications(
+        (claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)
+    )
 
 
 def fits(quiet, change, effect, view, columns):
     """Fits of many records of noise to which `change` adds an effect."""
     reduced, baseline = quiet
-    drawn = next(iter(null_records(reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS)))
+    drawn = next(
+        iter(
+            null_records(
+                reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
+            )
+        )
+    )
     out = []
     frame = claimed(reduced, baseline, effect, view, columns)
     for number in range(RECORDS):
@@ -82,7 +92,9 @@ def test_intervals_of_vibration_noise_hold_the_truth(quiet, share):
     truth = 0.003 * np.sqrt(share) / 6.0
 
     def change(one):
-        return one.assign(power=one["power"] * xr.DataArray(1.0 + share * (g / 6.0) ** 2, dims="block"))
+        return one.assign(
+            power=one["power"] * xr.DataArray(1.0 + share * (g / 6.0) ** 2, dims="block")
+        )
 
     found = fits(quiet, change, "vibration_noise", "power", ("white",))
     assert 0.88 <= coverage(found, truth) <= 1.0
@@ -93,11 +105,17 @@ def test_intervals_of_vibration_noise_hold_the_truth(quiet, share):
 def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
     reduced, baseline = quiet
     place = np.linspace(0.0, 1.0, reduced.sizes["block"])
-    g = np.where((place > 0.2) & (place < 0.4), levels[0], np.where((place > 0.6) & (place < 0.8), levels[1], 0.0))
+    g = np.where(
+        (place > 0.2) & (place < 0.4),
+        levels[0],
+        np.where((place > 0.6) & (place < 0.8), levels[1], 0.0),
+    )
     g = g + 0.05 * np.random.default_rng(3).random(g.size)
     sensitivity, quartic = (0.05, -5e-4) if both else (0.005, 0.0)
     shape = xr.DataArray(sensitivity * g**2 + quartic * g**4, dims="block")
-    drawn = next(iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1)))
+    drawn = next(
+        iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
+    )
     one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
     one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
     frame = claimed(one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic"))
@@ -111,15 +129,25 @@ def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
 
 @pytest.mark.parametrize("column", ["sensitivity", "quartic"])
 @pytest.mark.parametrize("levels", [(5.0, 5.0), (3.0, 8.0)])
-def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_from_it(quiet, levels, column):
+def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_from_it(
+    quiet, levels, column
+):
     reduced, baseline = quiet
     place = np.linspace(0.0, 1.0, reduced.sizes["block"])
-    g = np.where((place > 0.2) & (place < 0.4), levels[0], np.where((place > 0.6) & (place < 0.8), levels[1], 0.0))
-    drawn = next(iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1)))
+    g = np.where(
+        (place > 0.2) & (place < 0.4),
+        levels[0],
+        np.where((place > 0.6) & (place < 0.8), levels[1], 0.0),
+    )
+    drawn = next(
+        iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
+    )
     shape = xr.DataArray(0.005 * g**2 if column == "sensitivity" else 1e-4 * g**4, dims="block")
     one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
     one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
-    (fitted,) = fit_identifications(claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline)
+    (fitted,) = fit_identifications(
+        claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline
+    )
     alike = levels[0] == levels[1]
     assert set(fitted.parameters) == ({"sensitivity"} if alike else {column})
     assert ("does not tell" in fitted.say()) is alike
@@ -141,11 +169,15 @@ def test_the_model_has_the_effect(shaken):
     assert fitted.effect is not None
     assert fitted.effect.axes == ("y",)
     assert "rectified" in fitted.say()
-    table = {"name": fitted.effect.name, "sensitivity": fitted.effect.sensitivity, "axes": list(fitted.effect.axes)}
+    table = {
+        "name": fitted.effect.name,
+        "sensitivity": fitted.effect.sensitivity,
+        "axes": list(fitted.effect.axes),
+    }
     again = record([table])["mean"].sel(axis="y") - record([])["mean"].sel(axis="y")
-    truth = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])["mean"].sel(axis="y") - record([])[
+    truth = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])[
         "mean"
-    ].sel(axis="y")
+    ].sel(axis="y") - record([])["mean"].sel(axis="y")
     np.testing.assert_allclose(again, truth, atol=0.25 * float(np.abs(truth).max()))
 
 
@@ -160,7 +192,9 @@ def test_the_prediction_fits_only_what_it_may_see(shaken):
     changed = replace(naming, state=replace(naming.state, reduced=naming.state.reduced.assign(
         mean=naming.state.reduced["mean"] + xr.DataArray(np.where(vibration < 1.0, 0.0, 5.0), dims="block")
     )))  # fmt: skip
-    np.testing.assert_allclose(predicted(changed, baseline, vibration < 1.0)["known_mean"], blind["known_mean"])
+    np.testing.assert_allclose(
+        predicted(changed, baseline, vibration < 1.0)["known_mean"], blind["known_mean"]
+    )
 
 
 def test_what_was_not_found_has_a_limit_or_a_reason(shaken):
@@ -187,12 +221,16 @@ def test_size_of_a_line():
 
 def test_where_a_line_is_is_known_to_a_step_of_its_spectrum():
     true = 4.013
-    reduced = record([{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}])
+    reduced = record(
+        [{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}]
+    )
     baseline = calibrate_noise(reduced)
     naming = claimed(reduced, baseline, "spectral_line", "line", ("amplitude",))
     place = int(reduced["line_power"].sel(axis="x").mean("part").values.argmax())
     part = replace(naming.claims[0].parts[0], place=place)
-    (fitted,) = fit_identifications(replace(naming, claims=(replace(naming.claims[0], parts=(part,)),)), baseline)
+    (fitted,) = fit_identifications(
+        replace(naming, claims=(replace(naming.claims[0], parts=(part,)),)), baseline
+    )
     found = fitted.parameters["frequency"]
     step = float(np.diff(reduced["line_frequency"].values[:2])[0])
     assert found.low < true < found.high
@@ -213,20 +251,42 @@ def test_simulation_of_named_effects_runs(shaken):
 
 def test_axes_that_the_strongest_view_lacks_have_their_sizes_from_the_next():
     """Two axes are named by what they share, the third by its power alone: its size is no nought."""
-    world = [{"profile": "vibration", "points": [[0, 0.02], [600, 0.02], [601, 6.0], [1200, 6.0], [1201, 0.02], [3600, 0.02]]}]
+    world = [
+        {
+            "profile": "vibration",
+            "points": [[0, 0.02], [600, 0.02], [601, 6.0], [1200, 6.0], [1201, 0.02], [3600, 0.02]],
+        }
+    ]
     truth = {"x": 0.2, "y": 0.3, "z": 0.1}
-    effect = {"name": "aliased_vibration", "low": 700.0, "high": 800.0, "sensitivity": list(truth.values()), "axes": list(truth)}
+    effect = {
+        "name": "aliased_vibration",
+        "low": 700.0,
+        "high": 800.0,
+        "sensitivity": list(truth.values()),
+        "axes": list(truth),
+    }
     reduced = record([effect], environment=world)
     baseline = calibrate_noise(reduced)
     candidates, reasons = effect_candidates(reduced, baseline["coefficient"])
-    power, cross = (next(one for one in candidates if (one.effect, one.view) == (effect["name"], view)) for view in ("power", "cross"))
-    parts = [Component(cross, cross.variants[0], ("x", "y"), 90.0), *(Component(power, power.variants[0], (axis,), 40.0) for axis in "yz")]
+    power, cross = (
+        next(one for one in candidates if (one.effect, one.view) == (effect["name"], view))
+        for view in ("power", "cross")
+    )
+    parts = [
+        Component(cross, cross.variants[0], ("x", "y"), 90.0),
+        *(Component(power, power.variants[0], (axis,), 40.0) for axis in "yz"),
+    ]
     claim = Identification(effect["name"], power.driver, tuple(truth), tuple(parts), 130.0, 8.0)
     state = condition_on(begin_state(reduced, baseline), parts)
     (fitted,) = fit_identifications(
-        Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)), baseline
+        Identifications(
+            (claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)
+        ),
+        baseline,
     )
-    assert fitted.effect.sensitivity == pytest.approx(tuple(fitted.parameters[f"sensitivity.{axis}"].value for axis in truth))
+    assert fitted.effect.sensitivity == pytest.approx(
+        tuple(fitted.parameters[f"sensitivity.{axis}"].value for axis in truth)
+    )
     for axis, size in truth.items():
         one = fitted.parameters[f"sensitivity.{axis}"]
         assert one.low - one.stderr < size < one.high + one.stderr

@@ -23,11 +23,18 @@ def quiet():
 
 
 def _variant(naming, part, values):
-    candidate = next(one for one in naming.candidates if one.key == part.candidate.key and one.view == part.candidate.view)
+    candidate = next(
+        one
+        for one in naming.candidates
+        if one.key == part.candidate.key and one.view == part.candidate.view
+    )
     return next(
         one
         for one in candidate.variants
-        if one.columns == part.variant.columns and all(one.values[name] == pytest.approx(value, rel=0.01) for name, value in values.items())
+        if one.columns == part.variant.columns
+        and all(
+            one.values[name] == pytest.approx(value, rel=0.01) for name, value in values.items()
+        )
     )
 
 
@@ -38,9 +45,15 @@ def fitted(quiet, effect, view, column, *, true, size, named):
     part = naming.claims[0].parts[0]
     design = _variant(naming, part, true).design
     if view == "mean":
-        seen = reduced.assign(mean=reduced["mean"] + size * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]]))
+        seen = reduced.assign(
+            mean=reduced["mean"]
+            + size * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
+        )
     else:
-        seen = reduced.assign(power=reduced["power"] + size**2 * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]]))
+        seen = reduced.assign(
+            power=reduced["power"]
+            + size**2 * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
+        )
     part = replace(part, variant=_variant(naming, part, named))
     claim = replace(naming.claims[0], parts=(part,))
     state = condition_on(begin_state(seen, baseline), [part])
@@ -51,7 +64,13 @@ def fitted(quiet, effect, view, column, *, true, size, named):
 def test_where_the_record_does_not_tell_a_lag_there_is_none_and_the_size_has_room_for_it(quiet):
     truth = 0.01
     found = fitted(
-        quiet, "shupe", "mean", "sensitivity", true={"lag": 1e-3, "sensor_lag": 0.0}, size=truth, named={"lag": 75.4, "sensor_lag": 60.0}
+        quiet,
+        "shupe",
+        "mean",
+        "sensitivity",
+        true={"lag": 1e-3, "sensor_lag": 0.0},
+        size=truth,
+        named={"lag": 75.4, "sensor_lag": 60.0},
     )
     lag, size = found.parameters["lag"], found.parameters["sensitivity"]
     assert (lag.value, lag.low, found.parameters["sensor_lag"].value) == (0.0, 0.0, 0.0)
@@ -63,7 +82,13 @@ def test_where_the_record_does_not_tell_a_lag_there_is_none_and_the_size_has_roo
 
 def test_a_lag_that_the_record_shows_is_told(quiet):
     found = fitted(
-        quiet, "shupe", "mean", "sensitivity", true={"lag": 475.5, "sensor_lag": 0.0}, size=0.3, named={"lag": 475.5, "sensor_lag": 0.0}
+        quiet,
+        "shupe",
+        "mean",
+        "sensitivity",
+        true={"lag": 475.5, "sensor_lag": 0.0},
+        size=0.3,
+        named={"lag": 475.5, "sensor_lag": 0.0},
     )
     assert found.parameters["lag"].low > 100.0
     assert found.parameters["lag"].value == pytest.approx(475.5, rel=0.2)
@@ -71,10 +96,22 @@ def test_a_lag_that_the_record_shows_is_told(quiet):
 
 
 def test_the_exponent_of_the_model_is_that_of_the_size(quiet):
-    found = fitted(quiet, "vibration_noise", "power", "white", true={"exponent": 1.0}, size=1e-4, named={"exponent": 2.0})
+    found = fitted(
+        quiet,
+        "vibration_noise",
+        "power",
+        "white",
+        true={"exponent": 1.0},
+        size=1e-4,
+        named={"exponent": 2.0},
+    )
     assert found.effect.exponent == 1.0
     assert "exponent" not in found.parameters
 
 
 def test_a_lag_of_nothing_is_no_lag():
-    assert make_effect({"name": "shupe", "sensitivity": 0.1, "lag": 1e-3, "axes": ["x"]}).say().endswith("(degC/min) without a lag.")
+    assert (
+        make_effect({"name": "shupe", "sensitivity": 0.1, "lag": 1e-3, "axes": ["x"]})
+        .say()
+        .endswith("(degC/min) without a lag.")
+    )

@@ -27,7 +27,12 @@ SHAKE = {"profile": "vibration", "points": [[0, 3.0], [850, 3.0], [851, 6.0], [1
 
 
 def reduced_of(*effects, axes=("x", "y"), environment=(), lost=0.0):
-    model = {"noise": NOISE, "effect": list(effects), "environment": list(environment), "log": {"axes": list(axes)}}
+    model = {
+        "noise": NOISE,
+        "effect": list(effects),
+        "environment": list(environment),
+        "log": {"axes": list(axes)},
+    }
     log = simulate(model, duration="30min", rate=10.0, seed=5).compute()
     there = xr.DataArray(np.random.default_rng(3).random(log.sizes["time"]) >= lost, dims="time")
     return reduce_log(log.assign(rate=log["rate"].where(there).assign_attrs(log["rate"].attrs)))
@@ -38,21 +43,33 @@ def naming_of(reduced, baseline, effect, view, columns, **values):
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
     one = next(one for one in known if one.effect == effect and one.view == view)
     fits = [each for each in one.variants if each.columns == columns]
-    variant = min(fits, key=lambda each: sum(abs(1.0 / (1.0 + each.values[name]) - 1.0 / (1.0 + size)) for name, size in values.items()))
+    variant = min(
+        fits,
+        key=lambda each: sum(
+            abs(1.0 / (1.0 + each.values[name]) - 1.0 / (1.0 + size))
+            for name, size in values.items()
+        ),
+    )
     rows = [("x", "y")] if view == "cross" else [("x",)]
     parts = tuple(Component(one, variant, row, 500.0) for row in rows)
     claim = Identification(effect, one.driver, rows[0], parts, 500.0, 8.0)
     state = condition_on(begin_state(reduced, baseline), list(parts))
-    return Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced))
+    return Identifications(
+        (claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced)
+    )
 
 
 def noise_of(baseline, term, axis="x"):
-    return tuple(float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr"))
+    return tuple(
+        float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr")
+    )
 
 
 @pytest.fixture(scope="module")
 def shaken():
-    reduced = reduced_of({"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, environment=[SHAKE])
+    reduced = reduced_of(
+        {"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, environment=[SHAKE]
+    )
     baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
     return naming, baseline, recalibrate(naming, baseline, fit_identifications(naming, baseline))
@@ -70,7 +87,9 @@ def test_vibration_at_two_levels_and_never_none(shaken):
 def test_a_diagnosis_tells_noise_and_effects_as_they_are_beside_each_other(shaken):
     """The first calibration has the vibration in its noise, and finds less of it than there is."""
     naming, baseline, after = shaken
-    fit = conclude.fitted_beside_their_noise(naming, baseline, first := fit_identifications(naming, baseline))
+    fit = conclude.fitted_beside_their_noise(
+        naming, baseline, first := fit_identifications(naming, baseline)
+    )
     assert noise_of(fit.noise, "N")[0] == noise_of(after, "N")[0] < 1.2 * 0.003
     (size,) = fit.fitted[0].parameters.values()
     assert size.low < 0.002 < size.high
@@ -86,7 +105,9 @@ def test_a_size_in_shares_of_the_noise_is_one_of_the_noise_beside_it():
         "unit": "degC",
         "points": [[0, 35], [600, 35], [601, 50], [1200, 50], [1201, 65], [1800, 65]],
     }
-    reduced = reduced_of({"name": "temperature_noise", "linear": 0.05, "axes": ["x"]}, environment=[heat])
+    reduced = reduced_of(
+        {"name": "temperature_noise", "linear": 0.05, "axes": ["x"]}, environment=[heat]
+    )
     baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "temperature_noise", "power", ("linear",))
     first = fit_identifications(naming, baseline)
@@ -109,7 +130,9 @@ def test_effect_and_new_noise_make_the_record(shaken):
     shape = naming.state.reduced["shape"].sel(axis="x")
     for blocks in (slice(0, 42), slice(43, None)):
         part = ratio.isel(block=blocks).weighted(shape.isel(block=blocks).fillna(0.0)).mean()
-        assert float(part) == pytest.approx(1.0, abs=5.0 / np.sqrt(float(shape.isel(block=blocks).sum())))
+        assert float(part) == pytest.approx(
+            1.0, abs=5.0 / np.sqrt(float(shape.isel(block=blocks).sum()))
+        )
 
 
 def test_noise_of_held_out_time_is_not_used(shaken):
@@ -118,7 +141,9 @@ def test_noise_of_held_out_time_is_not_used(shaken):
     blind = recalibrate(naming, baseline, [], known)
     spoiled = naming.state.reduced.copy()
     spoiled["power"] = spoiled["power"].where(xr.DataArray(known, dims="block"), 99.0)
-    other = recalibrate(replace(naming, state=replace(naming.state, reduced=spoiled)), baseline, [], known)
+    other = recalibrate(
+        replace(naming, state=replace(naming.state, reduced=spoiled)), baseline, [], known
+    )
     assert noise_of(blind, "N")[0] == pytest.approx(noise_of(other, "N")[0], rel=0.03)
 
 
@@ -131,7 +156,9 @@ def test_what_axes_share_is_no_noise_of_their_own():
         assert noise_of(baseline, "N", axis)[0] > 1.15 * 0.003
         value, error = noise_of(after, "N", axis)
         assert abs(value - 0.003) < 3.0 * error
-        assert error < 0.2 * value  # one pair of axes tells the product of what they share, not the part of either
+        assert (
+            error < 0.2 * value
+        )  # one pair of axes tells the product of what they share, not the part of either
     np.testing.assert_allclose(after["spectrum"].median(), baseline["spectrum"].median(), rtol=0.05)
 
 
@@ -141,26 +168,45 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
         "points": [[0, 0.02], [600, 0.02], [601, 6.0], [1200, 6.0], [1201, 0.02], [1800, 0.02]],
         "band": [17.5, 20.0],
     }
-    reduced = reduced_of({"name": "aliased_vibration", "sensitivity": 0.3, "low": 17.5, "high": 20.0}, environment=[shaken])
+    reduced = reduced_of(
+        {"name": "aliased_vibration", "sensitivity": 0.3, "low": 17.5, "high": 20.0},
+        environment=[shaken],
+    )
     baseline = calibrate_noise(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
     views = {one.view: one for one in known if one.effect == "aliased_vibration"}
-    variants = {view: next(each for each in one.variants if each.values["sampling"] == "point") for view, one in views.items()}
+    variants = {
+        view: next(each for each in one.variants if each.values["sampling"] == "point")
+        for view, one in views.items()
+    }
     places = [("power", ("x",)), ("power", ("y",)), ("cross", ("x", "y"))]
     parts = tuple(Component(views[view], variants[view], row, 500.0) for view, row in places)
-    claim = Identification("aliased_vibration", views["power"].driver, ("x", "y"), parts, 500.0, 8.0)
+    claim = Identification(
+        "aliased_vibration", views["power"].driver, ("x", "y"), parts, 500.0, 8.0
+    )
     state = condition_on(begin_state(reduced, baseline), list(parts))
-    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced))
+    naming = Identifications(
+        (claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced)
+    )
     first = fit_identifications(naming, baseline)
     noise = recalibrate(naming, baseline, first)
     for fitted in (first, fit_identifications(with_noise(naming, noise), noise)):
-        sizes = [one.value for name, one in fitted[0].parameters.items() if name.startswith("sensitivity")]
+        sizes = [
+            one.value
+            for name, one in fitted[0].parameters.items()
+            if name.startswith("sensitivity")
+        ]
         assert sizes
         assert sizes == pytest.approx([0.3] * len(sizes), rel=0.1)
     for axis in "xy":
         value, error = noise_of(noise, "N", axis)
         assert abs(value - 0.003) < 3.0 * error
-    again = {"name": "aliased_vibration", "sensitivity": 0.3, "low": first[0].effect.low, "high": first[0].effect.high}
+    again = {
+        "name": "aliased_vibration",
+        "sensitivity": 0.3,
+        "low": first[0].effect.low,
+        "high": first[0].effect.high,
+    }
     model = reduced_of(again, environment=[shaken])  # 17.5 to 20 Hz fold onto 0 to 2.5 Hz
     band, loud = model["frequency"].values, model["channel_vibration"].values > 3.0
     power = model["power"].mean("axis").values
@@ -170,7 +216,9 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
 
 @pytest.mark.parametrize("size", [10.0, 40.0])
 def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them(size):
-    reduced = reduced_of({"name": "spikes", "kind": "outlier", "per_hour": 60.0, "size": size}, axes=["x"])
+    reduced = reduced_of(
+        {"name": "spikes", "kind": "outlier", "per_hour": 60.0, "size": size}, axes=["x"]
+    )
     baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "spikes", "marks", ("outliers",))
     naming = replace(naming, tallies=CountEvidence({"outliers": (np.zeros(1), np.ones(1))}))
@@ -188,7 +236,10 @@ def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them
 @pytest.mark.parametrize(
     ("table", "grid"),
     [
-        ({"cutoff": 2.0, "order": 2}, {"cutoff": 2.0, "order": 2.0, "instrument": 1.0, "pick": 0.0, "length": 0.0}),
+        (
+            {"cutoff": 2.0, "order": 2},
+            {"cutoff": 2.0, "order": 2.0, "instrument": 1.0, "pick": 0.0, "length": 0.0},
+        ),
         ({"length": 0.5}, {"length": 0.5, "instrument": 1.0, "cutoff": 0.0}),
     ],
 )

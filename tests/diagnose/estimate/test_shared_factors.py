@@ -23,7 +23,11 @@ RECORDS = 8
 def quiet():
     reduced = record([])
     candidates, _ = effect_candidates(reduced, COEFFICIENT)
-    return reduced, calibrate_noise(reduced), next(one for one in candidates if one.effect == "shared_source")
+    return (
+        reduced,
+        calibrate_noise(reduced),
+        next(one for one in candidates if one.effect == "shared_source"),
+    )
 
 
 def sizes(quiet, factors, number, *, bandwidth=math.inf, axes=AXES):
@@ -38,11 +42,21 @@ def sizes(quiet, factors, number, *, bandwidth=math.inf, axes=AXES):
     for row, pair in enumerate(pair_rows(reduced)):
         i, j = (AXES.index(axis) for axis in pair)
         scatter = np.sqrt(spectrum[i] * spectrum[j] / (2.0 * shape[row]))
-        noise = scatter * (rng.standard_normal(shape[row].shape) + 1j * rng.standard_normal(shape[row].shape))
-        cross[row] = factors[i] * factors[j] * cross_column(density[None, None], row, reduced) + noise
-    state = begin_state(reduced.assign(cross=xr.DataArray(cross, dims=("pair", "block", "band"))), baseline)
+        noise = scatter * (
+            rng.standard_normal(shape[row].shape) + 1j * rng.standard_normal(shape[row].shape)
+        )
+        cross[row] = (
+            factors[i] * factors[j] * cross_column(density[None, None], row, reduced) + noise
+        )
+    state = begin_state(
+        reduced.assign(cross=xr.DataArray(cross, dims=("pair", "block", "band"))), baseline
+    )
     variant = candidate.variants[-1]
-    parts = [Component(candidate, variant, row, 10.0) for row in pair_rows(reduced) if set(row) <= set(axes)]
+    parts = [
+        Component(candidate, variant, row, 10.0)
+        for row in pair_rows(reduced)
+        if set(row) <= set(axes)
+    ]
     return estimate_shared_factors(parts, axes, state)
 
 
@@ -52,8 +66,13 @@ def test_intervals_hold_the_factors(quiet, bandwidth):
     held = []
     for number in range(RECORDS):
         found = sizes(quiet, truth, number, bandwidth=bandwidth)
-        sign = np.sign(sum(found[f"N.{axis}"][0] * one for axis, one in zip(AXES, truth, strict=True)))
-        held += [sorted((sign * low, sign * high)) for _, _, low, high in (found[f"N.{axis}"] for axis in AXES)]
+        sign = np.sign(
+            sum(found[f"N.{axis}"][0] * one for axis, one in zip(AXES, truth, strict=True))
+        )
+        held += [
+            sorted((sign * low, sign * high))
+            for _, _, low, high in (found[f"N.{axis}"] for axis in AXES)
+        ]
     inside = [low <= one <= high for (low, high), one in zip(held, truth * RECORDS, strict=True)]
     assert np.mean(inside) >= 0.8
 
@@ -82,5 +101,8 @@ def test_no_axis_shares_more_than_it_has(quiet):
 
 
 def test_other_pairs_of_axes_change_nothing(quiet):
-    one, other = sizes(quiet, (0.002, 0.0015, 0.0), 7, axes=("x", "y")), sizes(quiet, (0.002, 0.0015, 0.003), 7, axes=("x", "y"))
+    one, other = (
+        sizes(quiet, (0.002, 0.0015, 0.0), 7, axes=("x", "y")),
+        sizes(quiet, (0.002, 0.0015, 0.003), 7, axes=("x", "y")),
+    )
     assert one == other

@@ -6,7 +6,11 @@ import xarray as xr
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.evidence.fast_switching import SwitchingEvidence, switching_evidence, switching_powers
+from gyrostab.diagnose.evidence.fast_switching import (
+    SwitchingEvidence,
+    switching_evidence,
+    switching_powers,
+)
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 
@@ -14,7 +18,9 @@ BLOCKS, PIECES, STEP, WHITE = 60, 16, 20.0, 0.01
 WALKS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0])
 
 
-def course_of(rng: np.random.Generator, low: float, high: float, seconds: float, rate: float) -> np.ndarray:
+def course_of(
+    rng: np.random.Generator, low: float, high: float, seconds: float, rate: float
+) -> np.ndarray:
     """Mean level of each sample, by the times of the hops alone."""
     level, at, area = int(rng.integers(2)), [0.0], [0.0]
     while at[-1] < seconds:
@@ -60,7 +66,9 @@ def found_in(course: np.ndarray, rng: np.random.Generator) -> SwitchingEvidence:
     return found
 
 
-@pytest.mark.parametrize(("low", "high", "step"), [(4.0, 4.0, 2.0), (30.0, 3.0, 2.0), (8.0, 8.0, 0.5), (20.0, 3.0, 40.0)])
+@pytest.mark.parametrize(
+    ("low", "high", "step"), [(4.0, 4.0, 2.0), (30.0, 3.0, 2.0), (8.0, 8.0, 0.5), (20.0, 3.0, 40.0)]
+)
 def test_finds_hops_within_blocks_and_their_numbers(low: float, high: float, step: float) -> None:
     rng = np.random.default_rng(1)
     course = course_of(rng, low, high, BLOCKS * STEP, PIECES / STEP)
@@ -75,9 +83,21 @@ def test_finds_hops_within_blocks_and_their_numbers(low: float, high: float, ste
 def test_noise_of_the_same_second_order_does_not_hop() -> None:
     """Gauss-Markov noise of the variance and correlation time of the biases above, and noise that is louder than expected."""
     rng = np.random.default_rng(2)
-    for time, size in [(2.0, 1.0), (2.0, 20.0), (10.0, 0.5), (10.0, 20.0), (0.01, 0.1), (0.01, 1.0)]:
+    for time, size in [
+        (2.0, 1.0),
+        (2.0, 20.0),
+        (10.0, 0.5),
+        (10.0, 20.0),
+        (0.01, 0.1),
+        (0.01, 1.0),
+    ]:
         keep = np.exp(-STEP / PIECES / time)
-        bias = size * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(BLOCKS * PIECES + 500))[500:]
+        bias = (
+            size
+            * lfilter(
+                [np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(BLOCKS * PIECES + 500)
+            )[500:]
+        )
         assert found_in(bias, rng).gain < 3.0
 
 
@@ -92,7 +112,9 @@ def test_waves_and_bumps_of_any_height_do_not_hop_between_two_levels() -> None:
 def test_three_levels_are_not_two() -> None:
     rng = np.random.default_rng(4)
     for dwell in (4.0, 20.0):
-        first, second = (course_of(rng, dwell, dwell, BLOCKS * STEP, PIECES / STEP) for _ in range(2))
+        first, second = (
+            course_of(rng, dwell, dwell, BLOCKS * STEP, PIECES / STEP) for _ in range(2)
+        )
         assert found_in(2.0 * (first + second), rng).gain == -np.inf
 
 
@@ -119,7 +141,9 @@ def test_powers_within_blocks_are_those_of_the_samples() -> None:
     told = switching_powers(reduced["piece_mean"].values[0], 15.0, 6.0, size, 10.0)
     slow = reduced["frequency"].values < 0.3
     np.testing.assert_allclose(told[:, slow].mean(axis=0), seen[:, slow].mean(axis=0), rtol=0.05)
-    np.testing.assert_allclose(told.mean(axis=0), seen.mean(axis=0), rtol=0.25)  # the number of hops is one of chance
+    np.testing.assert_allclose(
+        told.mean(axis=0), seen.mean(axis=0), rtol=0.25
+    )  # the number of hops is one of chance
     assert np.corrcoef(np.log(told[:, 1] + 1e-3), np.log(seen[:, 1] + 1e-3))[0, 1] > 0.99
 
 
@@ -127,7 +151,11 @@ def test_powers_within_blocks_are_those_of_the_samples() -> None:
 def test_a_diagnosis_names_it_with_its_numbers(low: float, high: float, deviations: float) -> None:
     rng = np.random.default_rng(6)
     course = course_of(rng, low, high, 1800.0, 5.0)
-    log = make_log((0.5 * rng.standard_normal(course.size) + 0.5 * deviations * course)[None], rate=5.0, unit="deg/h")
+    log = make_log(
+        (0.5 * rng.standard_normal(course.size) + 0.5 * deviations * course)[None],
+        rate=5.0,
+        unit="deg/h",
+    )
     found = diagnose(log, nulls=100, seed=1)
     assert [one["name"] for one in found.effects] == ["telegraph"]
     assert found.verdict in ("explained", "partly explained")

@@ -10,7 +10,14 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.evidence.held_out import mean_evidence, mean_factors, noise_columns, power_evidence, power_factors, score
+from gyrostab.diagnose.evidence.held_out import (
+    mean_evidence,
+    mean_factors,
+    noise_columns,
+    power_evidence,
+    power_factors,
+    score,
+)
 from gyrostab.diagnose.evidence.products import WIDTHS
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
@@ -31,13 +38,19 @@ def frame(n: int) -> dict:
     return {"begin": ("block", edges[:-1]), "end": ("block", edges[1:])}
 
 
-def mean_case(n: int, *, records: int, missing: float = 0.2, seed: int = 1) -> tuple[xr.Dataset, xr.Dataset]:
+def mean_case(
+    n: int, *, records: int, missing: float = 0.2, seed: int = 1
+) -> tuple[xr.Dataset, xr.Dataset]:
     """Block means of one axis and their baseline."""
     rng = np.random.default_rng(seed)
     variance = rng.uniform(0.5, 2.0, (1, n)) * 1e-3
-    mean = np.sqrt(variance) * rng.standard_normal((records, 1, n)) + np.cumsum(3e-3 * rng.standard_normal((records, 1, n)), axis=-1)
+    mean = np.sqrt(variance) * rng.standard_normal((records, 1, n)) + np.cumsum(
+        3e-3 * rng.standard_normal((records, 1, n)), axis=-1
+    )
     mean[..., rng.random(n) < missing] = np.nan
-    data = xr.Dataset({"mean": (("record", "axis", "block"), mean)}, coords={**frame(n), "axis": ["x"]})
+    data = xr.Dataset(
+        {"mean": (("record", "axis", "block"), mean)}, coords={**frame(n), "axis": ["x"]}
+    )
     K, B = (part.ravel() for part in np.meshgrid([0.0, 0.02, 0.1], [0.0, 0.01]))
     grid = ("axis", "grid")
     weights = rng.uniform(-3.0, 0.0, (2, 1, K.size))
@@ -55,15 +68,24 @@ def mean_case(n: int, *, records: int, missing: float = 0.2, seed: int = 1) -> t
     return data, baseline
 
 
-def power_case(n: int, bands: int, *, records: int, seed: int = 2, axes: str = "x") -> tuple[xr.Dataset, xr.Dataset]:
+def power_case(
+    n: int, bands: int, *, records: int, seed: int = 2, axes: str = "x"
+) -> tuple[xr.Dataset, xr.Dataset]:
     rng = np.random.default_rng(seed)
     frequency = np.geomspace(0.05, 50.0, bands)
-    columns = np.stack([4e-4 * frequency**2, np.full(bands, 3600.0), 0.16 / frequency, 7e-6 / frequency**2], axis=-1)
+    columns = np.stack(
+        [4e-4 * frequency**2, np.full(bands, 3600.0), 0.16 / frequency, 7e-6 / frequency**2],
+        axis=-1,
+    )
     square = np.array([0.3, 9e-6, 1.6e-5, 4e-4])
     spectrum = np.broadcast_to(columns @ square, (len(axes), n, bands))
     shape = np.broadcast_to(np.maximum(1.0, frequency * STEP / 3.0), spectrum.shape).copy()
     shape[:, rng.random(n) < 0.1] = np.nan
-    power = spectrum * rng.gamma(np.where(np.isfinite(shape), shape, 1.0), size=(records, *spectrum.shape)) / shape
+    power = (
+        spectrum
+        * rng.gamma(np.where(np.isfinite(shape), shape, 1.0), size=(records, *spectrum.shape))
+        / shape
+    )
     dims = ("axis", "block", "band")
     data = xr.Dataset(
         {"power": (("record", *dims), power), "shape": (dims, shape)},
@@ -105,7 +127,8 @@ def dense_mean(data, baseline, design, given, subset, weights) -> float:
     share, times, white = flicker_states(STEP, n * STEP)
     walk, flicker = (
         walk_covariance(edges),
-        np.eye(n) * white + sum(v * relaxation_covariance(edges, t) for v, t in zip(share, times, strict=True)),
+        np.eye(n) * white
+        + sum(v * relaxation_covariance(edges, t) for v, t in zip(share, times, strict=True)),
     )
 
     def left(x, others):
@@ -116,18 +139,26 @@ def dense_mean(data, baseline, design, given, subset, weights) -> float:
         if others.shape[1]:
             Z = others[present]
             size = np.sqrt(np.diag(Z.T @ W @ Z))
-            W = W - W @ Z @ np.linalg.solve(Z.T @ W @ Z + np.diag((size / WIDTHS[-1]) ** 2), Z.T @ W)
+            W = W - W @ Z @ np.linalg.solve(
+                Z.T @ W @ Z + np.diag((size / WIDTHS[-1]) ** 2), Z.T @ W
+            )
         return np.einsum("ij,ik,kj->j", x[present], W, x[present])
 
     wide = WIDTHS[-1] ** 2 / left(given, np.empty((n, 0))) if given.shape[1] else np.empty(0)
     limit = 1.0 / left(design, given) if design.shape[1] else np.empty(0)
     use = present & subset
     total = []
-    for K, B, weight in zip(baseline.grid_K.values[0], baseline.grid_B.values[0], weights, strict=True):
+    for K, B, weight in zip(
+        baseline.grid_K.values[0], baseline.grid_B.values[0], weights, strict=True
+    ):
         V = np.diag(D) + K**2 / HOUR * walk + B**2 * flicker + (given * wide) @ given.T
         for width in WIDTHS if design.shape[1] else (0.0,):
             full = V + (design * limit * width**2) @ design.T
-            total.append(weight + density(y[use], full[np.ix_(use, use)], True) - np.log(len(WIDTHS) if design.shape[1] else 1))
+            total.append(
+                weight
+                + density(y[use], full[np.ix_(use, use)], True)
+                - np.log(len(WIDTHS) if design.shape[1] else 1)
+            )
     return float(np.logaddexp.reduce(total) - np.logaddexp.reduce(weights))
 
 
@@ -139,17 +170,23 @@ def test_factors_of_means_are_those_of_dense_marginal_likelihoods(tier, given_co
     rng = np.random.default_rng(5)
     given = np.cumsum(rng.standard_normal((n, given_columns)), axis=0)
     designs = [np.arange(n, dtype=float), np.sin(np.arange(n) / 3.0), rng.standard_normal((n, 3))]
-    factors = mean_factors(data, baseline, designs, axis="x", tier=tier, given=given if given_columns else None)
+    factors = mean_factors(
+        data, baseline, designs, axis="x", tier=tier, given=given if given_columns else None
+    )
     weights = baseline["grid_prior" if tier == "free" else "grid_calibrated"].values[0]
     subsets = fold_subsets(fold_blocks(data))
     assert factors.shape == (len(subsets), 4, 1)
     for number in (0, 5, 12):
         base = dense_mean(data, baseline, np.empty((n, 0)), given, subsets[number], weights)
         for place, design in enumerate(designs, start=1):
-            with_it = dense_mean(data, baseline, design.reshape(n, -1), given, subsets[number], weights)
+            with_it = dense_mean(
+                data, baseline, design.reshape(n, -1), given, subsets[number], weights
+            )
             assert factors[number, place, 0] == pytest.approx(with_it - base, abs=1e-6)
     difference = factors[3, 0, 0] - factors[0, 0, 0]
-    none = [dense_mean(data, baseline, np.empty((n, 0)), given, subsets[i], weights) for i in (0, 3)]
+    none = [
+        dense_mean(data, baseline, np.empty((n, 0)), given, subsets[i], weights) for i in (0, 3)
+    ]
     assert difference == pytest.approx(none[1] - none[0], abs=1e-6)
 
 
@@ -159,9 +196,15 @@ def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(tier):
     data, baseline = power_case(n, bands, records=2)
     if tier == "known":  # a model without quantization and flicker
         tier = "free"
-        baseline = baseline.assign(square=baseline["square"] * [0.0, 1.0, 0.0, 1.0], square_stderr=0.0 * baseline["square_stderr"])
+        baseline = baseline.assign(
+            square=baseline["square"] * [0.0, 1.0, 0.0, 1.0],
+            square_stderr=0.0 * baseline["square_stderr"],
+        )
     rng = np.random.default_rng(8)
-    designs = [np.repeat(np.arange(n)[:, None] / n, bands, axis=1), rng.standard_normal((n, bands, 2))]
+    designs = [
+        np.repeat(np.arange(n)[:, None] / n, bands, axis=1),
+        rng.standard_normal((n, bands, 2)),
+    ]
     factors = power_factors(data, baseline, designs, axis="x", tier=tier)
     level, precision = noise_columns(baseline, axis="x", tier=tier)
     weight = data["shape"].values[0].ravel()
@@ -169,17 +212,26 @@ def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(tier):
     Z = level.reshape(-1, precision.shape[0])
     shared = np.kron(np.diag(baseline["common"].values[0]), np.ones((bands, bands)))
     W = np.linalg.inv(np.diag(1.0 / weight[cells]) + shared[np.ix_(cells, cells)])
-    middle = W - W @ Z[cells] @ np.linalg.solve(Z[cells].T @ W @ Z[cells] + precision, Z[cells].T @ W)
+    middle = W - W @ Z[cells] @ np.linalg.solve(
+        Z[cells].T @ W @ Z[cells] + precision, Z[cells].T @ W
+    )
     for record in range(2):
         y = (data["power"] / baseline["spectrum"] - 1.0).values[record, 0].ravel()
         for number, subset in list(enumerate(fold_subsets(fold_blocks(data))))[record::4]:
             use = cells & np.repeat(subset, bands)
-            V = np.diag(1.0 / weight[use]) + shared[np.ix_(use, use)] + Z[use] @ np.linalg.solve(precision, Z[use].T)
+            V = (
+                np.diag(1.0 / weight[use])
+                + shared[np.ix_(use, use)]
+                + Z[use] @ np.linalg.solve(precision, Z[use].T)
+            )
             base = density(y[use], V, False)
             for place, design in enumerate(designs, start=1):
                 X = design.reshape(n * bands, -1)
                 limit = 1.0 / np.einsum("ij,ik,kj->j", X[cells], middle, X[cells])
-                each = [density(y[use], V + (X[use] * limit * width**2) @ X[use].T, False) for width in WIDTHS]
+                each = [
+                    density(y[use], V + (X[use] * limit * width**2) @ X[use].T, False)
+                    for width in WIDTHS
+                ]
                 expected = np.logaddexp.reduce(each) - np.log(len(WIDTHS)) - base
                 assert factors[number, place, record] == pytest.approx(expected, abs=1e-6)
 
@@ -190,9 +242,13 @@ def test_gain_is_what_the_folds_lose_at_the_best_length():
     gains = score(factors, [0, 0, 1])
     for record in range(5):
         mixed = np.log(np.exp(factors[:, :2, record]).mean(axis=1))
-        parts = [sum(mixed[0] - mixed[1 + 4 * length + fold] for fold in range(4)) for length in range(3)]
+        parts = [
+            sum(mixed[0] - mixed[1 + 4 * length + fold] for fold in range(4)) for length in range(3)
+        ]
         assert gains[0, record] == pytest.approx(max(parts))
-    assert gains[1, 0] == pytest.approx(max((factors[0, 2, 0] - factors[1 + 4 * i : 5 + 4 * i, 2, 0]).sum() for i in range(3)))
+    assert gains[1, 0] == pytest.approx(
+        max((factors[0, 2, 0] - factors[1 + 4 * i : 5 + 4 * i, 2, 0]).sum() for i in range(3))
+    )
 
 
 def test_what_is_there_gains_and_what_is_not_does_not():
@@ -203,9 +259,15 @@ def test_what_is_there_gains_and_what_is_not_does_not():
     trend = np.repeat((np.arange(n) / n)[:, None], 10, axis=1)
     candidates = {"step": [step], "sine": [np.sin(np.arange(n) / p) for p in (3.0, 9.0)]}
     loud = data.assign(mean=data["mean"] + xr.DataArray(0.2 * step, dims="block"))
-    spoken = power.assign(power=power["power"] * (1.0 + 0.1 * xr.DataArray(trend, dims=("block", "band"))))
-    quiet_means, loud_means = (mean_evidence(one, baseline, candidates, axis="x") for one in (data, loud))
-    quiet, risen = (power_evidence(one, level, {"trend": [trend]}, axis="x") for one in (power, spoken))
+    spoken = power.assign(
+        power=power["power"] * (1.0 + 0.1 * xr.DataArray(trend, dims=("block", "band")))
+    )
+    quiet_means, loud_means = (
+        mean_evidence(one, baseline, candidates, axis="x") for one in (data, loud)
+    )
+    quiet, risen = (
+        power_evidence(one, level, {"trend": [trend]}, axis="x") for one in (power, spoken)
+    )
     assert quiet_means.dims == ("candidate", "record")
     assert float(loud_means.sel(candidate="step").min()) > 8.0
     assert float(loud_means.sel(candidate="sine").max()) < 8.0
@@ -219,10 +281,17 @@ def test_designs_that_are_constant_or_empty_gain_nothing():
     data, baseline = mean_case(n, records=3)
     absent = np.zeros(n)
     absent[np.isnan(data["mean"].values[0, 0])] = 1.0
-    gains = mean_evidence(data, baseline, {"constant": [np.ones(n)], "nothing": [np.zeros(n)], "in a gap": [absent]}, axis="x")
+    gains = mean_evidence(
+        data,
+        baseline,
+        {"constant": [np.ones(n)], "nothing": [np.zeros(n)], "in a gap": [absent]},
+        axis="x",
+    )
     assert np.abs(gains).max() < 1e-9
     power, level = power_case(n, 6, records=3)
-    flat = power_evidence(power, level, {"level": [np.ones((n, 6)) * 3600.0 / level["spectrum"].values[0]]}, axis="x")
+    flat = power_evidence(
+        power, level, {"level": [np.ones((n, 6)) * 3600.0 / level["spectrum"].values[0]]}, axis="x"
+    )
     assert np.abs(flat).max() < 0.05
 
 
@@ -230,7 +299,10 @@ def test_units_of_a_design_do_not_matter():
     n = 80
     data, baseline = mean_case(n, records=4)
     design = np.random.default_rng(3).standard_normal((n, 2))
-    one, other = (mean_evidence(data, baseline, {"c": [design * unit]}, axis="x") for unit in (1.0, np.array([1e-9, 1e6])))
+    one, other = (
+        mean_evidence(data, baseline, {"c": [design * unit]}, axis="x")
+        for unit in (1.0, np.array([1e-9, 1e6]))
+    )
     np.testing.assert_allclose(one, other, atol=1e-7)
 
 
@@ -238,7 +310,12 @@ def test_folds_are_interleaved_and_scale_with_the_record():
     reduced = xr.Dataset(coords={name: value for name, value in frame(180).items()})
     fold = fold_blocks(reduced)
     assert fold["length"].values.tolist() == [100.0, 360.0, 900.0]
-    assert [int((fold == number).sum()) for number in range(4)] == [45 + 54 + 45, 45 + 54 + 45, 45 + 36 + 45, 45 + 36 + 45]
+    assert [int((fold == number).sum()) for number in range(4)] == [
+        45 + 54 + 45,
+        45 + 54 + 45,
+        45 + 36 + 45,
+        45 + 36 + 45,
+    ]
     assert len(np.unique(fold_subsets(fold), axis=0)) == 13
     short = fold_blocks(xr.Dataset(coords=frame(24)))
     assert short["length"].values.tolist() == [20.0, 40.0, 120.0]
@@ -272,24 +349,39 @@ def test_a_spectrum_that_falls_is_no_quantization_of_negative_power():
     raw = np.random.default_rng(12).standard_normal((1, 20_001))
     reduced = reduce_log(make_log(0.9 * raw[:, 1:] + 0.1 * raw[:, :-1], rate=10.0, unit="deg/h"))
     baseline = calibrate_noise(reduced)
-    design = [np.tile(np.sin(np.pi * reduced["frequency"].values / 10.0) ** 2, (reduced.sizes["block"], 1))]
+    design = [
+        np.tile(
+            np.sin(np.pi * reduced["frequency"].values / 10.0) ** 2, (reduced.sizes["block"], 1)
+        )
+    ]
     found = power_factors(reduced, baseline, design, axis="x")[0, 1, 0]
     beside_any = power_factors(reduced, baseline.drop_vars("posterior"), design, axis="x")[0, 1, 0]
     assert found > 20.0
     assert found > 1.3 * beside_any
-    assert np.diagonal(noise_columns(baseline, axis="x")[1])[0] > 2.0 / baseline["square_stderr"].sel(noise="Q").item() ** 2
+    assert (
+        np.diagonal(noise_columns(baseline, axis="x")[1])[0]
+        > 2.0 / baseline["square_stderr"].sel(noise="Q").item() ** 2
+    )
 
 
 @pytest.mark.parametrize(("share", "least", "most"), [(0.0, -np.inf, 2.0), (0.06, 10.0, np.inf)])
 def test_a_weak_filter_gains_more_than_noise_reaches(share, least, most):
     """Six per cent of every sample come late: the spectrum falls by a quarter towards its end."""
     raw = np.random.default_rng(12).standard_normal((2, 15_001))
-    reduced = reduce_log(make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h"))
+    reduced = reduce_log(
+        make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h")
+    )
     baseline = calibrate_noise(reduced)
-    filters = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == "logger_filter"]
+    filters = [
+        one
+        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        if one.effect == "logger_filter"
+    ]
     (noise,) = null_records(reduced, baseline, count=200, rng=np.random.default_rng(3), chunk=200)
     start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
     (found,) = totals(compute_evidence(filters, reduced, start, folds)).values()
-    (drawn,) = totals(compute_evidence(filters, noise, start, folds, rng=np.random.default_rng(1))).values()
+    (drawn,) = totals(
+        compute_evidence(filters, noise, start, folds, rng=np.random.default_rng(1))
+    ).values()
     assert least < found[0] < most
     assert np.quantile(drawn, 0.99) < 5.0

@@ -21,7 +21,12 @@ def test_products_of_columns_that_never_meet_are_not_needed():
     whole = mean_products(values, columns, **frame_of)
     some = mean_products(values, columns, **frame_of, pairs=pairs_of(7, numbers, 1))
     assert some.gram[0, 0, 1] == 0.0 != whole.gram[0, 0, 1]
-    wanted, got = (evidence(take_out(one, 1, np.eye(1)), numbers, np.full(6, 0.2), np.array([-1.0, -2.0])) for one in (whole, some))
+    wanted, got = (
+        evidence(take_out(one, 1, np.eye(1)), numbers, np.full(6, 0.2), np.array([-1.0, -2.0]))
+        for one in (whole, some)
+    )
     np.testing.assert_allclose(got, wanted, rtol=1e-12)
-    alone = evidence(take_out(whole, 1, np.eye(1)), numbers[3:], np.full(6, 0.2), np.array([-1.0, -2.0]))
+    alone = evidence(
+        take_out(whole, 1, np.eye(1)), numbers[3:], np.full(6, 0.2), np.array([-1.0, -2.0])
+    )
     np.testing.assert_allclose(alone[1], got[4], rtol=1e-12)

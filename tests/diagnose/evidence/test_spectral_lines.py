@@ -57,7 +57,9 @@ def test_a_line_under_a_level_that_changes_is_found_by_its_own_power() -> None:
     assert found.max(axis=-1).min() > 20.0
 
 
-def sines(amplitudes: dict[float, float], *, wander: float = 0.0, size: int = 18_000, axes: int = 2) -> xr.Dataset:
+def sines(
+    amplitudes: dict[float, float], *, wander: float = 0.0, size: int = 18_000, axes: int = 2
+) -> xr.Dataset:
     """White noise of 0.57 deg/h with sines on the first axis, the phase of which wanders by so many radians."""
     rng = np.random.default_rng(2)
     t = np.arange(size) / 10.0
@@ -93,7 +95,10 @@ def test_each_line_is_a_claim_of_its_own(lines: tuple[Identification, ...]) -> N
     assert all(claim.axes == ("x",) for claim in lines)
     assert all(len({part.place for part in claim.parts}) == 1 for claim in lines)
     assert len({claim.parts[0].place for claim in lines}) == 3
-    assert all({"real_motion", "supply_bias", "feedback_reset"} <= set(claim.alternatives) for claim in lines)  # three may be a comb
+    assert all(
+        {"real_motion", "supply_bias", "feedback_reset"} <= set(claim.alternatives)
+        for claim in lines
+    )  # three may be a comb
 
 
 def test_a_line_changes_no_gain_of_the_means() -> None:
@@ -110,11 +115,14 @@ def test_a_line_changes_no_gain_of_the_means() -> None:
     for one, other in zip(kept, again, strict=True):
         np.testing.assert_array_equal(one.gain, other.gain)
     assert not of_means(found, state, condition_on(state, [jump]))
-    lost = replace(state, reduced=reduced.assign(mean=reduced["mean"].where(reduced["begin"] > 0.0)))
+    lost = replace(
+        state, reduced=reduced.assign(mean=reduced["mean"].where(reduced["begin"] > 0.0))
+    )
     assert not of_means(found, state, lost)
 
 
-# ------------------------------------------------------------------------------------------------------------ bookkeeping
+# ------------------------------------------------------------------------------------------------------------
+# bookkeeping
 
 
 def part(effect: str, view: str, gain: float, place: int = -1) -> Component:
@@ -129,7 +137,10 @@ def claim(one: Component) -> Identification:
 def test_a_line_counts_for_the_plainest_name_only() -> None:
     found = {
         "spectral_line": [part("spectral_line", "line", 50.0)],
-        "supply_bias(supply)": [part("supply_bias", "line", 50.0), part("supply_bias", "mean", 9.0)],
+        "supply_bias(supply)": [
+            part("supply_bias", "line", 50.0),
+            part("supply_bias", "mean", 9.0),
+        ],
         "real_motion": [part("real_motion", "line", 50.0)],
     }
     kept = without_lines(found)
@@ -141,9 +152,18 @@ def test_a_line_counts_for_the_plainest_name_only() -> None:
 def test_claims_of_one_effect_become_one_but_for_lines_of_other_frequencies() -> None:
     first = claim(part("spectral_line", "line", 50.0, 3))
     assert len(add_identification([first], claim(part("spectral_line", "line", 20.0, 9)))) == 2
-    (both,) = add_identification([first], replace(claim(part("spectral_line", "line", 20.0, 3)), axes=("y",)))
+    (both,) = add_identification(
+        [first], replace(claim(part("spectral_line", "line", 20.0, 3)), axes=("y",))
+    )
     assert (both.axes, both.gain) == (("x", "y"), 70.0)
-    assert len(add_identification([claim(part("shupe", "mean", 9.0))], claim(part("shupe", "mean", 8.0)))) == 1
+    assert (
+        len(
+            add_identification(
+                [claim(part("shupe", "mean", 9.0))], claim(part("shupe", "mean", 8.0))
+            )
+        )
+        == 1
+    )
 
 
 def test_a_steady_line_leaves_no_error_of_its_form() -> None:
@@ -160,7 +180,9 @@ def test_the_spectrum_of_driven_noise_may_leave_a_filter_but_no_other_noise() ->
         (driven, "temperature_noise", 2.0),
         (steady, "logger_filter", 2.0),
     ):
-        assert form_error([part(effect, "power", 17.0)], [chosen], share=0.01) == pytest.approx(error)
+        assert form_error([part(effect, "power", 17.0)], [chosen], share=0.01) == pytest.approx(
+            error
+        )
 
 
 @pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])
@@ -168,7 +190,9 @@ def test_a_spectrum_is_straightened_by_as_much_as_its_filter_takes(weight: float
     """Weights of 1 - a and a take 4 a (1 - a) of what a mean of two takes; a line stays in, and no slope is left that looks like one."""
     rng = np.random.default_rng(8)
     raw = rng.standard_normal(60_001) + 0.15 * np.sin(2.0 * np.pi * 4.0 * np.arange(60_001) / 10.0)
-    record = reduce_log(make_log(((1.0 - weight) * raw[1:] + weight * raw[:-1])[None], rate=10.0, unit="deg/h"))
+    record = reduce_log(
+        make_log(((1.0 - weight) * raw[1:] + weight * raw[:-1])[None], rate=10.0, unit="deg/h")
+    )
     lines = record["line_frequency"].values
     mean_of_two = {"cutoff": 0.0, "order": 2.0, "length": 0.2, "pick": 0.0, "instrument": 1.0}
     found, stopped = straightened(record, "x", "logger_filter", mean_of_two, np.ones(lines.size))

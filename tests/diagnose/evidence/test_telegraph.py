@@ -9,7 +9,11 @@ from scipy.signal import lfilter
 
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.estimate.telegraph_sizes import estimate_telegraph
-from gyrostab.diagnose.evidence.telegraph import MEAN_SWITCHES, telegraph_courses, telegraph_evidence
+from gyrostab.diagnose.evidence.telegraph import (
+    MEAN_SWITCHES,
+    telegraph_courses,
+    telegraph_evidence,
+)
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.identification import Identification, Identifications
@@ -31,7 +35,11 @@ def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
     """Records (record, block) as reduced data of one axis, and a baseline in which K and B are free."""
     begin = np.arange(mean.shape[1]) * STEP
     data = xr.Dataset(
-        {"mean": (("record", "axis", "block"), mean[:, None]), "begin": ("block", begin), "end": ("block", begin + STEP)},
+        {
+            "mean": (("record", "axis", "block"), mean[:, None]),
+            "begin": ("block", begin),
+            "end": ("block", begin + STEP),
+        },
         {"axis": ["x"]},
         {"block_s": STEP},
     )
@@ -40,7 +48,10 @@ def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
         {
             "known_mean": (("axis", "block"), np.zeros((1, mean.shape[1]))),
             "mean_variance": (("axis", "block"), np.full((1, mean.shape[1]), WHITE)),
-            **{f"grid_{name}": (("axis", "grid"), one[None]) for name, one in (("K", K), ("B", B), ("prior", 0.0 * K))},
+            **{
+                f"grid_{name}": (("axis", "grid"), one[None])
+                for name, one in (("K", K), ("B", B), ("prior", 0.0 * K))
+            },
         },
         {"axis": ["x"]},
     )
@@ -97,8 +108,12 @@ def test_is_a_lower_bound_of_a_bayes_factor() -> None:
 def test_a_bias_on_a_spring_is_no_bias_of_two_levels(time: float, size: float) -> None:
     rng = np.random.default_rng(4)
     keep = np.exp(-1.0 / time)
-    fine = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal((30, BLOCKS * 20 + 3000)))[:, -BLOCKS * 20 :]
-    gain, _ = telegraph_evidence(*frame(size * fine.reshape(30, BLOCKS, 20).mean(axis=2) + white(rng, 30)), axis="x")
+    fine = lfilter(
+        [np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal((30, BLOCKS * 20 + 3000))
+    )[:, -BLOCKS * 20 :]
+    gain, _ = telegraph_evidence(
+        *frame(size * fine.reshape(30, BLOCKS, 20).mean(axis=2) + white(rng, 30)), axis="x"
+    )
     assert gain.max() < 3.0
 
 
@@ -126,8 +141,14 @@ def test_what_is_given_is_not_found_again_and_blocks_may_be_missing() -> None:
 def test_the_other_sign_is_the_same_bias() -> None:
     rng = np.random.default_rng(7)
     values = (hops(rng, 100.0, 300.0) + white(rng, 1)[0])[:, None]
-    variance, all_there, constant = np.full(BLOCKS, WHITE), np.ones(BLOCKS, bool), np.ones((BLOCKS, 1))
-    one, other = (telegraph_courses(sign * values, variance, all_there, constant) for sign in (1.0, -1.0))
+    variance, all_there, constant = (
+        np.full(BLOCKS, WHITE),
+        np.ones(BLOCKS, bool),
+        np.ones((BLOCKS, 1)),
+    )
+    one, other = (
+        telegraph_courses(sign * values, variance, all_there, constant) for sign in (1.0, -1.0)
+    )
     np.testing.assert_allclose(one.share, 1.0 - other.share, atol=0.02)
     np.testing.assert_allclose(one.times, other.times[:, ::-1], rtol=0.02)
     np.testing.assert_allclose(one.step, other.step, rtol=0.01)
@@ -140,7 +161,9 @@ def part(state: State, course: np.ndarray, axis: str = "x", gain: float = 50.0) 
 
 def state_of(mean: np.ndarray) -> State:
     data, baseline = frame(mean[None])
-    return State(data.isel(record=0), baseline, np.ones((1, BLOCKS, 1)), np.zeros((1, BLOCKS), np.bool_))
+    return State(
+        data.isel(record=0), baseline, np.ones((1, BLOCKS, 1)), np.zeros((1, BLOCKS), np.bool_)
+    )
 
 
 def test_a_bias_of_three_levels_is_not_possible() -> None:
@@ -167,15 +190,22 @@ def test_sizes_are_those_of_the_course() -> None:
 def led(course: np.ndarray, gain: float, axis: str = "x") -> Component:
     """A mean that follows the temperature."""
     variant = Variant({}, ("sensitivity",), course[None, None])
-    return Component(Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, (axis,), gain)
+    return Component(
+        Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, (axis,), gain
+    )
 
 
 def jump(place: int, gain: float) -> Component:
-    variant = Variant({"at": place * STEP}, ("step",), (np.arange(BLOCKS) >= place).astype(float)[None, None])
+    variant = Variant(
+        {"at": place * STEP}, ("step",), (np.arange(BLOCKS) >= place).astype(float)[None, None]
+    )
     return Component(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), gain)
 
 
-FOLLOWS, HOPS_FIRST = ["temperature_bias(temperature)"], ["telegraph", "temperature_bias(temperature)"]
+FOLLOWS, HOPS_FIRST = (
+    ["temperature_bias(temperature)"],
+    ["telegraph", "temperature_bias(temperature)"],
+)
 
 
 @pytest.mark.parametrize(
@@ -187,12 +217,18 @@ FOLLOWS, HOPS_FIRST = ["temperature_bias(temperature)"], ["telegraph", "temperat
         ("the same", 60.0, "y", HOPS_FIRST),
     ],
 )
-def test_what_follows_a_channel_that_may_hop_comes_first(kind: str, gain: float, axis: str, expected: list[str]) -> None:
+def test_what_follows_a_channel_that_may_hop_comes_first(
+    kind: str, gain: float, axis: str, expected: list[str]
+) -> None:
     rng = np.random.default_rng(10)
     course = hops(rng, 120.0, 180.0)
     state = state_of(0.6 * course + white(rng, 1)[0])
     channel = np.roll(course, 1) if kind == "the same" else np.sin(np.arange(BLOCKS) / 9.0)
-    parts = {"telegraph": [part(state, course)], FOLLOWS[0]: [led(channel, gain, axis)], "bias_jump": [jump(50, 20.0)]}
+    parts = {
+        "telegraph": [part(state, course)],
+        FOLLOWS[0]: [led(channel, gain, axis)],
+        "bias_jump": [jump(50, 20.0)],
+    }
     assert followed_first(HOPS_FIRST, parts, state) == expected
     assert followed_first(["telegraph", "bias_jump"], parts, state) == ["telegraph", "bias_jump"]
 
@@ -205,7 +241,9 @@ REAL, HOP = 41, -1  # blocks: a jump of another size than the hops; and the last
     [(0.0, (0, HOP), ()), (3.0, (REAL,), (REAL,)), (3.0, (REAL, HOP), (REAL,))],
     ids=["none", "one", "one of two"],
 )
-def test_jumps_that_are_hops_themselves_are_none(size: float, places: tuple[int, ...], kept: tuple[int, ...]) -> None:
+def test_jumps_that_are_hops_themselves_are_none(
+    size: float, places: tuple[int, ...], kept: tuple[int, ...]
+) -> None:
     """The first hop and the last one were taken for jumps before the hops were named; a jump that is four times as large is one."""
     rng = np.random.default_rng(12)
     course = hops(rng, 150.0, 200.0)
@@ -215,8 +253,20 @@ def test_jumps_that_are_hops_themselves_are_none(size: float, places: tuple[int,
 
     def gains(_: object, state: State) -> list[Found]:
         columns = state.given.get(("mean", "x"), [])
-        gain, found = telegraph_evidence(state.reduced, state.baseline, axis="x", given=np.stack(columns, axis=-1) if columns else None)
-        return [Found(candidate, [("x",)], gain[:, None], (Variant({}, ("step",), found.share[0][None, None]),))]
+        gain, found = telegraph_evidence(
+            state.reduced,
+            state.baseline,
+            axis="x",
+            given=np.stack(columns, axis=-1) if columns else None,
+        )
+        return [
+            Found(
+                candidate,
+                [("x",)],
+                gain[:, None],
+                (Variant({}, ("step",), found.share[0][None, None]),),
+            )
+        ]
 
     def state_with(some: Sequence[Identification]) -> State:
         return condition_on_components(start, [one for claim in some for one in claim.parts])
@@ -225,10 +275,14 @@ def test_jumps_that_are_hops_themselves_are_none(size: float, places: tuple[int,
     first = Identification("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
     (beside,) = gains((), state_with([first]))
     gain = float(beside.gain[0, 0])
-    hopping = Identification("telegraph", (), ("x",), (Component(candidate, beside.best[0], ("x",), gain),), gain, 8.0)
+    hopping = Identification(
+        "telegraph", (), ("x",), (Component(candidate, beside.best[0], ("x",), gain),), gain, 8.0
+    )
     left = hops_alone([first, hopping], state_with, gains, 8.0)
     assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
-    assert [one.variant.values["at"] for one in left[0].parts if one.candidate.effect == "bias_jump"] == [place * STEP for place in kept]
+    assert [
+        one.variant.values["at"] for one in left[0].parts if one.candidate.effect == "bias_jump"
+    ] == [place * STEP for place in kept]
     assert np.abs(np.corrcoef(left[-1].parts[0].variant.design[0, 0], course)[0, 1]) > 0.98
 
 
@@ -236,9 +290,15 @@ def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) ->
     """What a bias that switches between two levels, for so many blocks each, is named, beside a supply that does so with a scatter [V]."""
     course = np.repeat(np.arange(len(stays)) % 2, stays).astype(float)
     rng = np.random.default_rng(seed)
-    supply, noise = 24.0 + course + scatter * rng.standard_normal(course.size), rng.standard_normal(200 * course.size)
+    supply, noise = (
+        24.0 + course + scatter * rng.standard_normal(course.size),
+        rng.standard_normal(200 * course.size),
+    )
     log = make_log(
-        np.repeat(step * course, 200) + noise, rate=10.0, unit="deg/h", channels={"supply_voltage": (np.repeat(supply, 200), "V")}
+        np.repeat(step * course, 200) + noise,
+        rate=10.0,
+        unit="deg/h",
+        channels={"supply_voltage": (np.repeat(supply, 200), "V")},
     )
     reduced = reduce_log(log, block="20s")
     return name_effects(reduced, *nulls(reduced, 40))
@@ -281,6 +341,11 @@ def test_the_model_hops_and_its_noise_does_not(found) -> None:
     effect = next(one for one in found.model["effect"] if one["name"] == "telegraph")
     assert float(np.atleast_1d(effect["step"])[0]) == pytest.approx(0.4, rel=0.15)
     assert found.model["noise"]["y"]["K"] < 0.3  # with the hops for noise it is above 1
-    again = simulate(found.model, duration="30min", rate=5.0, seed=12)["rate"].coarsen(time=100).mean().std("time")
+    again = (
+        simulate(found.model, duration="30min", rate=5.0, seed=12)["rate"]
+        .coarsen(time=100)
+        .mean()
+        .std("time")
+    )
     assert 0.1 < float(again.sel(axis="y")) < 0.3
     assert float(again.sel(axis="x")) < 0.08

@@ -37,8 +37,12 @@ def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Datas
 def left(reduced: xr.Dataset, *columns: np.ndarray) -> float:
     """Unrest beside columns (block,) of added white power."""
     state: State = begin_state(reduced, calibrate_noise(reduced))
-    spread = [np.broadcast_to(one[:, None], state.weight.shape[1:]).astype(float) for one in columns]
-    return variance_fluctuation(reweighted(state.with_columns("power", "x", spread)) if columns else state, "x")
+    spread = [
+        np.broadcast_to(one[:, None], state.weight.shape[1:]).astype(float) for one in columns
+    ]
+    return variance_fluctuation(
+        reweighted(state.with_columns("power", "x", spread)) if columns else state, "x"
+    )
 
 
 @pytest.mark.parametrize("gaps", [False, True])
@@ -75,7 +79,9 @@ def test_blocks_that_are_masked_do_not_count() -> None:
 def test_a_smooth_name_for_bursts_is_taken_back() -> None:
     level = np.ones(BLOCKS)
     rng = np.random.default_rng(4)
-    level[60:] = np.where(rng.random(60) < 0.4, 1.35, 1.0)  # later is louder on average, and not at all steadily
+    level[60:] = np.where(
+        rng.random(60) < 0.4, 1.35, 1.0
+    )  # later is louder on average, and not at all steadily
     reduced = record(level)
     baseline, records = nulls(reduced, 40)
     found = name_effects(reduced, baseline, records)
@@ -83,14 +89,22 @@ def test_a_smooth_name_for_bursts_is_taken_back() -> None:
     assert found.verdict == "unknown"
     steady = record(np.linspace(0.9, 1.15, BLOCKS))
     baseline, records = nulls(steady, 40)
-    assert [claim.effect for claim in name_effects(steady, baseline, records).claims] == ["ageing_noise"]
+    assert [claim.effect for claim in name_effects(steady, baseline, records).claims] == [
+        "ageing_noise"
+    ]
 
 
 def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
     rng = np.random.default_rng(6)
     loud = np.ones(BLOCKS)
     loud[40:60] = 20.0
-    reduced = reduce_log(make_log(rng.standard_normal((2, BLOCKS * LENGTH)) * np.repeat(loud, LENGTH), rate=10.0, unit="deg/h"))
+    reduced = reduce_log(
+        make_log(
+            rng.standard_normal((2, BLOCKS * LENGTH)) * np.repeat(loud, LENGTH),
+            rate=10.0,
+            unit="deg/h",
+        )
+    )
     state = begin_state(reduced, calibrate_noise(reduced))
     search = _Search(nuisance_alternatives(reduced), fold_blocks(reduced), CountEvidence({}), 7.0)
 
@@ -104,7 +118,21 @@ def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
 def test_no_jump_and_no_ageing_is_named_beside_a_drift_of_no_name_that_brings_more():
     noise = 0.5 * np.random.default_rng(1).standard_normal((2, 9000))[1:]
     seconds = np.arange(9000) / 10.0
-    turned = [0, 300, 900, 500, 1200, 800, 1100, 950, 1190, 700, 1000, 400, 0]  # deg/h, with no channel to tell of it
+    turned = [
+        0,
+        300,
+        900,
+        500,
+        1200,
+        800,
+        1100,
+        950,
+        1190,
+        700,
+        1000,
+        400,
+        0,
+    ]  # deg/h, with no channel to tell of it
     noise += np.interp(seconds, np.linspace(0.0, 640.0, 13), turned)
     reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
     found = name_effects(reduced, *nulls(reduced, 40))

@@ -39,12 +39,19 @@ def reduced_of(rate: np.ndarray) -> xr.Dataset:
 
 def loud(factor: np.ndarray) -> np.ndarray:
     """White noise on one axis, its standard deviation times a factor for each block."""
-    return np.asarray(np.random.default_rng(1).standard_normal((1, BLOCKS * LENGTH)) * np.repeat(factor, LENGTH))
+    return np.asarray(
+        np.random.default_rng(1).standard_normal((1, BLOCKS * LENGTH)) * np.repeat(factor, LENGTH)
+    )
 
 
 def started(rate: np.ndarray) -> State:
     reduced = reduced_of(rate)
-    return begin_state(reduced, baseline_from_model(reduced, {**MODEL, "log": {"axes": [str(one) for one in reduced["axis"].values]}}))
+    return begin_state(
+        reduced,
+        baseline_from_model(
+            reduced, {**MODEL, "log": {"axes": [str(one) for one in reduced["axis"].values]}}
+        ),
+    )
 
 
 def candidate(state: State, effect: str, view: str) -> Candidate:
@@ -53,7 +60,9 @@ def candidate(state: State, effect: str, view: str) -> Candidate:
 
 
 def parts_of(state: State, one: Candidate) -> list[Component]:
-    return by_key(compute_evidence([one], state.reduced, state, fold_blocks(state.reduced)))[one.key]
+    return by_key(compute_evidence([one], state.reduced, state, fold_blocks(state.reduced)))[
+        one.key
+    ]
 
 
 @pytest.mark.parametrize("inside", [slice(0, 3), slice(-4, None)])
@@ -71,7 +80,9 @@ def test_noise_that_is_louder_for_one_stretch_does_not_age(inside: slice) -> Non
 
 
 @pytest.mark.parametrize(("first", "last", "named"), [(1.0, 1.3, ["ageing_noise"]), (1.3, 1.0, [])])
-def test_noise_gets_louder_with_age_and_not_the_other_way(first: float, last: float, named: list[str]) -> None:
+def test_noise_gets_louder_with_age_and_not_the_other_way(
+    first: float, last: float, named: list[str]
+) -> None:
     reduced = reduced_of(loud(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))
     found = name_effects(reduced, *nulls(reduced, 40))
     assert [claim.effect for claim in found.claims] == named
@@ -89,9 +100,18 @@ def test_stretches_of_all_lengths_are_tried_at_both_ends() -> None:
 @pytest.mark.parametrize(("size", "jump"), [(8.0, True), (0.0, False)])
 def test_waves_slower_than_a_block_are_no_jumps(size: float, jump: bool) -> None:
     """From half an hour on means scatter by twenty of their errors; beside them a level that stays is still seen."""
-    waves = np.repeat(np.random.default_rng(3).standard_normal(BLOCKS), LENGTH) * 20.0 * WHITE / np.sqrt(LENGTH)
+    waves = (
+        np.repeat(np.random.default_rng(3).standard_normal(BLOCKS), LENGTH)
+        * 20.0
+        * WHITE
+        / np.sqrt(LENGTH)
+    )
     waves[SECOND < 1800.0] = 0.0
-    state = started(WHITE * np.random.default_rng(4).standard_normal((1, SECOND.size)) + waves + size * (SECOND >= 1000.0))
+    state = started(
+        WHITE * np.random.default_rng(4).standard_normal((1, SECOND.size))
+        + waves
+        + size * (SECOND >= 1000.0)
+    )
     found = parts_of(state, candidate(state, "bias_jump", "mean"))
     assert sum_evidence(found) > 20.0
     assert bool(is_physical(found, state)) == jump
@@ -123,10 +143,16 @@ def test_only_motion_leaks(moves: bool) -> None:
     rng = np.random.default_rng(6)
     shared = WHITE * rng.standard_normal(SECOND.size) + WHITE * np.sin(2.0 * np.pi * 1.7 * SECOND)
     rate = WHITE * rng.standard_normal((2, SECOND.size)) + 0.5 * shared
-    sway = lfilter([1.0], [1.0, -1.8, 0.9], rng.standard_normal(SECOND.size)) * (SECOND % 800.0 < 300.0)
+    sway = lfilter([1.0], [1.0, -1.8, 0.9], rng.standard_normal(SECOND.size)) * (
+        SECOND % 800.0 < 300.0
+    )
     rate += 30.0 * WHITE * np.array([[0.015], [1.0]]) * sway * moves
     state = started(rate)
-    leaks = [one for one in effect_candidates(state.reduced, state.baseline["coefficient"])[0] if one.key == "misalignment(y)"]
+    leaks = [
+        one
+        for one in effect_candidates(state.reduced, state.baseline["coefficient"])[0]
+        if one.key == "misalignment(y)"
+    ]
     (found,) = compute_evidence(leaks, state.reduced, state, fold_blocks(state.reduced))
     assert (float(found.gain[0, 0]) > 20.0) == moves
     assert moves or float(found.gain.max()) < 3.0
@@ -139,7 +165,11 @@ def test_what_is_at_rest_cannot_leak(sway: float) -> None:
     rate = WHITE * rng.standard_normal((2, SECOND.size))
     rate[1] += sway * WHITE * np.sin(2.0 * np.pi * 1.7 * SECOND)
     state = started(rate)
-    one = next(each for each in effect_candidates(state.reduced, state.baseline["coefficient"])[0] if each.key == "misalignment(y)")
+    one = next(
+        each
+        for each in effect_candidates(state.reduced, state.baseline["coefficient"])[0]
+        if each.key == "misalignment(y)"
+    )
     part = Component(one, one.variants[0], ("x",), 20.0)
     assert is_physical([part], state) == ([part] if sway else [])
 
@@ -148,21 +178,29 @@ def test_what_is_at_rest_cannot_leak(sway: float) -> None:
 def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) -> None:
     rng = np.random.default_rng(8)
     turning = np.interp(SECOND, np.linspace(0.0, SECOND[-1], 25), 200.0 * rng.standard_normal(25))
-    state = started(WHITE * rng.standard_normal((2, SECOND.size)) + np.array([[leak], [1.0]]) * turning)
+    state = started(
+        WHITE * rng.standard_normal((2, SECOND.size)) + np.array([[leak], [1.0]]) * turning
+    )
     one = candidate(state, "misalignment", "mean")
     variant = next(each for each in one.variants if each.columns == ("y",))
-    beats, p_value = passes_time_shift_test([Component(one, variant, ("x",), 20.0)], state, fold_blocks(state.reduced))
+    beats, p_value = passes_time_shift_test(
+        [Component(one, variant, ("x",), 20.0)], state, fold_blocks(state.reduced)
+    )
     assert np.isfinite(p_value)
     assert beats == bool(leak)
 
 
 @pytest.mark.parametrize(("late", "named"), [(0.0, ["vibration_rectification"]), (0.7, [])])
-def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(late: float, named: list[str]) -> None:
+def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(
+    late: float, named: list[str]
+) -> None:
     """A bias swings as the square of the vibration does, or a ninth of a period before it: then half of all other times do as well."""
     phase = 2.0 * np.pi * SECOND / 200.0
     rate = WHITE * np.random.default_rng(9).standard_normal((1, SECOND.size)) + 0.3 * np.sin(phase)
     shaking = np.sqrt(2.0 + np.sin(phase - late))
-    reduced = reduce_log(make_log(rate, rate=RATE, unit="deg/h", channels={"vibration": (shaking, "g")}), block="20s")
+    reduced = reduce_log(
+        make_log(rate, rate=RATE, unit="deg/h", channels={"vibration": (shaking, "g")}), block="20s"
+    )
     found = name_effects(reduced, *nulls(reduced, 40))
     assert [claim.effect for claim in found.claims] == named
 
@@ -170,10 +208,16 @@ def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(late: floa
 def swelling(size: float) -> State:
     """Swell about 0.3 Hz that comes in groups, twenty times above the noise; a tool that turns as often, with a line of its turning."""
     rng = np.random.default_rng(5)
-    swell = lfilter([1.0], [1.0, -2.0 * 0.97 * np.cos(2.0 * np.pi * 0.03), 0.97**2], rng.standard_normal(SECOND.size))
+    swell = lfilter(
+        [1.0],
+        [1.0, -2.0 * 0.97 * np.cos(2.0 * np.pi * 0.03), 0.97**2],
+        rng.standard_normal(SECOND.size),
+    )
     swell *= np.where(SECOND % 900.0 < 350.0, 4.0, 0.2) * WHITE
     turns = 0.3 * SECOND + 0.3 * np.sin(2.0 * np.pi * SECOND / 400.0)
-    rate = WHITE * rng.standard_normal((1, SECOND.size)) + swell + size * np.sin(2.0 * np.pi * turns)
+    rate = (
+        WHITE * rng.standard_normal((1, SECOND.size)) + swell + size * np.sin(2.0 * np.pi * turns)
+    )
     return turned(rate, turns)
 
 
@@ -181,7 +225,9 @@ def turned(rate: np.ndarray, turns: np.ndarray) -> State:
     """Rates (axis, time) [deg/h] with the channel of a tool that has made so many turns."""
     log = make_log(rate, rate=RATE, unit="deg/h")
     turning = 360.0 * np.gradient(turns, SECOND)
-    reduced = reduce_log(log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block="20s")
+    reduced = reduce_log(
+        log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block="20s"
+    )
     return begin_state(reduced, baseline_from_model(reduced, {**MODEL, "log": {"axes": ["x"]}}))
 
 
@@ -198,8 +244,12 @@ def test_what_turns_with_the_tool_leaves_the_noise_about_it_alone() -> None:
     turns = 0.21 * SECOND + 0.2 * np.sin(2.0 * np.pi * SECOND / 300.0)
     rate = WHITE * rng.standard_normal(SECOND.size)
     quiet = rate.copy()
-    rate = rate + sum(size * np.sin(2.0 * np.pi * k * turns) for k, size in ((1, 3.0), (2, 5.0), (3, 2.0)))
-    level = [turned(values[None], turns).reduced["order_level"].values[0] for values in (rate, quiet)]
+    rate = rate + sum(
+        size * np.sin(2.0 * np.pi * k * turns) for k, size in ((1, 3.0), (2, 5.0), (3, 2.0))
+    )
+    level = [
+        turned(values[None], turns).reduced["order_level"].values[0] for values in (rate, quiet)
+    ]
     usual = 3600.0 * 0.003**2
     assert np.nanmean(level[1]) == pytest.approx(usual, rel=0.08)
     assert np.nanmedian(level[0]) < 3.0 * usual
@@ -207,7 +257,9 @@ def test_what_turns_with_the_tool_leaves_the_noise_about_it_alone() -> None:
 
 def test_what_is_scored_at_orders_is_as_wild_as_in_null_records() -> None:
     state = swelling(0.0)
-    (drawn,) = null_records(state.reduced, state.baseline, count=40, rng=np.random.default_rng(1), chunk=40)
+    (drawn,) = null_records(
+        state.reduced, state.baseline, count=40, rng=np.random.default_rng(1), chunk=40
+    )
     real, noise = (locked.score(one, state.baseline) for one in (state.reduced, drawn))
     assert real is not None
     assert noise is not None

@@ -64,28 +64,54 @@ def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
     (part,) = (one for one in claim.parts if one.candidate.view == "power")
     elsewhere = [replace(part, row=(axis,)) for axis in "yz"]
     sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
-    monkeypatch.setattr(sys.modules["gyrostab.diagnose.predict.sizes"], "part_size", lambda part, state: (sizes[part.row[0]], 0.01))
+    monkeypatch.setattr(
+        sys.modules["gyrostab.diagnose.predict.sizes"],
+        "part_size",
+        lambda part, state: (sizes[part.row[0]], 0.01),
+    )
     assert is_physical([part, *elsewhere], state) == [part, elsewhere[1]]
 
 
 def test_sizes_beyond_what_the_registry_allows_are_impossible(shaken):
     """A bias of 15 deg/h for each of some 40 degC is that of a broken instrument, or no effect of temperature."""
-    bias = next(one for one in shaken.candidates if one.effect == "temperature_bias" and one.view == "mean")
+    bias = next(
+        one for one in shaken.candidates if one.effect == "temperature_bias" and one.view == "mean"
+    )
     variant = next(one for one in bias.variants if one.columns == ("sensitivity",))
     part = Component(bias, variant, ("y",), 50.0)
     for size, answer in ((5.0, [part]), (15.0, [])):
         state = shaken.state
-        mean = state.reduced["mean"] + size * xr.DataArray(variant.design[0, 0], dims="block").where(state.reduced["axis"] == "y", 0.0)
-        assert is_physical([part], replace(state, reduced=state.reduced.assign(mean=mean))) == answer
+        mean = state.reduced["mean"] + size * xr.DataArray(
+            variant.design[0, 0], dims="block"
+        ).where(state.reduced["axis"] == "y", 0.0)
+        assert (
+            is_physical([part], replace(state, reduced=state.reduced.assign(mean=mean))) == answer
+        )
 
 
 @pytest.mark.parametrize(
     ("table", "environment", "others"),
     [
-        ({"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}, "usual", {"g_sensitivity"}),
-        ({"name": "shupe", "sensitivity": 0.4, "axes": ["x"]}, "usual", {"temperature_bias", "thermal_hysteresis", "warm_up"}),
-        ({"name": "shared_source", "N": [0.0012, 0.0012, -0.0012], "axes": ["x", "y", "z"]}, "usual", set()),
-        ({"name": "spikes", "per_hour": 100.0, "kind": "outlier", "size": 30.0, "axes": ["z"]}, "usual", set()),
+        (
+            {"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]},
+            "usual",
+            {"g_sensitivity"},
+        ),
+        (
+            {"name": "shupe", "sensitivity": 0.4, "axes": ["x"]},
+            "usual",
+            {"temperature_bias", "thermal_hysteresis", "warm_up"},
+        ),
+        (
+            {"name": "shared_source", "N": [0.0012, 0.0012, -0.0012], "axes": ["x", "y", "z"]},
+            "usual",
+            set(),
+        ),
+        (
+            {"name": "spikes", "per_hour": 100.0, "kind": "outlier", "size": 30.0, "axes": ["z"]},
+            "usual",
+            set(),
+        ),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else None,
 )
@@ -106,8 +132,13 @@ def test_without_its_channel_an_effect_is_not_named():
 
 
 def test_two_effects_are_both_named():
-    found = named([*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}])
-    assert {(claim.effect, claim.axes) for claim in found.claims} == {("vibration_noise", ("x",)), ("vibration_rectification", ("y",))}
+    found = named(
+        [*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}]
+    )
+    assert {(claim.effect, claim.axes) for claim in found.claims} == {
+        ("vibration_noise", ("x",)),
+        ("vibration_rectification", ("y",)),
+    }
 
 
 def test_slid_channels_do_worse(shaken):
@@ -141,7 +172,8 @@ def test_claims_are_plain(shaken):
     assert all(isinstance(claim, Identification) for claim in shaken.claims)
 
 
-# ---------------------------------------------------------------------------------------------------------------- parts
+# ----------------------------------------------------------------------------------------------------------------
+# parts
 
 
 def test_other_axes_must_pay_for_themselves():
@@ -178,7 +210,9 @@ def test_blocks_that_are_lost_are_expected_to_count_nothing():
     there = np.arange(120) < 60
     usual = rng.poisson(1.0 * there, (400, 1, 120))
     mean, spread = expected_counts(usual)
-    np.testing.assert_allclose([mean[0, there].mean(), mean[0, ~there].mean()], [1.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(
+        [mean[0, there].mean(), mean[0, ~there].mean()], [1.0, 0.0], atol=0.02
+    )
     assert (mean > 0.0).all()
     few = count_evidence(rng.poisson(0.5 * there, (50, 1, 120)), mean, spread, subsets(120))
     many = count_evidence(rng.poisson(3.0 * there, (50, 1, 120)), mean, spread, subsets(120))
@@ -188,12 +222,16 @@ def test_blocks_that_are_lost_are_expected_to_count_nothing():
 
 def test_every_line_of_a_comb_is_named():
     """More lines than other effects are looked for."""
-    quiet = reduce_log(make_log(np.random.default_rng(3).standard_normal((2, 24_000)), rate=10.0, unit="deg/h"))
+    quiet = reduce_log(
+        make_log(np.random.default_rng(3).standard_normal((2, 24_000)), rate=10.0, unit="deg/h")
+    )
     comb = np.arange(5, quiet.sizes["line"], 7)
     loud = np.ones(quiet.sizes["line"])
     loud[comb] = 4.0
     shape = xr.DataArray(np.stack([loud, np.ones_like(loud)]), dims=("axis", "line"))
-    reduced = quiet.assign(line_power=(quiet["line_power"] * shape).transpose(*quiet["line_power"].dims))
+    reduced = quiet.assign(
+        line_power=(quiet["line_power"] * shape).transpose(*quiet["line_power"].dims)
+    )
     baseline, chance = nulls(quiet, 40)
     found = name_effects(reduced, baseline, chance)
     assert {(claim.effect, claim.axes) for claim in found.claims} == {("spectral_line", ("x",))}

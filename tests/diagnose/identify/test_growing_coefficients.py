@@ -28,9 +28,21 @@ PLAN = tomllib.loads((ROOT / "pipelines" / "diagnose_p16.toml").read_text(encodi
 #: Four minutes of the axes across the vibration, on which the rectified bias is not hidden.
 SMALL: dict[str, Any] = {
     "log": {"duration": "240 s", "axes": ["y", "z"]},
-    "environment": [{"profile": "vibration", "points": [[0, 0.02], [85, 13.39], [165, 0.02]], "band": [700, 800]}],
+    "environment": [
+        {
+            "profile": "vibration",
+            "points": [[0, 0.02], [85, 13.39], [165, 0.02]],
+            "band": [700, 800],
+        }
+    ],
     "effect": [
-        {"name": "aliased_vibration", "axes": ["y", "z"], "sensitivity": 0.37, "low": 700, "high": 800},
+        {
+            "name": "aliased_vibration",
+            "axes": ["y", "z"],
+            "sensitivity": 0.37,
+            "low": 700,
+            "high": 800,
+        },
         {"name": "vibration_rectification", "sensitivity": 3e-3},
     ],
 }
@@ -44,7 +56,9 @@ def small() -> tuple[xr.Dataset, gyrostab.Diagnosis]:
 
 
 def test_the_fit_of_the_paper_says_that_everything_grows() -> None:
-    along = [{"name": "aliased_vibration", "axes": ["x"], "sensitivity": 3.73, "low": 700, "high": 800}]
+    along = [
+        {"name": "aliased_vibration", "axes": ["x"], "sensitivity": 3.73, "low": 700, "high": 800}
+    ]
     tables = {"noise": {"Q": 0.06, "N": 0.006, "B": 0.03, "K": 0.05}, **SMALL, "effect": along}
     tables["log"] = {"rate": 400, "duration": "240 s", "axes": ["x"]}
     log = gyrostab.simulate(tables, seed=1).compute()
@@ -57,11 +71,18 @@ def test_growing_coefficients_are_named_for_what_they_are(small) -> None:
     _, found = small
     named = {name for effect in found.effects for name in (effect["name"], *effect["alternatives"])}
     assert {"aliased_vibration", "vibration_rectification"} <= named
-    assert named <= {"aliased_vibration", "vibration_noise", "vibration_rectification", "g_sensitivity"}
+    assert named <= {
+        "aliased_vibration",
+        "vibration_noise",
+        "vibration_rectification",
+        "g_sensitivity",
+    }
     for effect in found.effects:
         if effect["name"] == "aliased_vibration":
             for axis in effect["axes"]:
-                entry = effect["parameters"].get(f"sensitivity.{axis}", effect["parameters"].get("sensitivity"))
+                entry = effect["parameters"].get(
+                    f"sensitivity.{axis}", effect["parameters"].get("sensitivity")
+                )
                 assert entry["low"] < 0.37 < entry["high"]
     held = found.content["held_out"]
     assert held["misfit_before"] > 10.0
@@ -85,15 +106,20 @@ def test_the_page_has_what_the_script_writes(small) -> None:
     assert (ROOT / "docs" / "figures" / "diagnosis-p16.png").stat().st_size > 1000
 
 
-# ------------------------------------------------------------------------------------------------- a name without a box
+# -------------------------------------------------------------------------------------------------
+# a name without a box
 
 
 def naming(view: str, *, place: int = -1, gain: float = 40.0) -> Identifications:
     there = np.zeros((1, 1, 40))
     there[..., 10:20] = 1.0
     variant = Variant({}, ("sensitivity",), there if view == "mean" else there[..., None])
-    part = Component(Candidate("shupe", view, ("temperature",), (variant,)), variant, ("y",), gain, place)
-    claim = Identification("shupe", ("temperature",), ("y",), (part, replace(part, gain=1.0)), gain, 7.0)
+    part = Component(
+        Candidate("shupe", view, ("temperature",), (variant,)), variant, ("y",), gain, place
+    )
+    claim = Identification(
+        "shupe", ("temperature",), ("y",), (part, replace(part, gain=1.0)), gain, 7.0
+    )
     null = np.sort(np.random.default_rng(1).exponential(1.0, 400))
     nothing: Any = None
     return Identifications((claim,), (), 7.0, null, {}, (), nothing, nothing)
@@ -102,15 +128,26 @@ def naming(view: str, *, place: int = -1, gain: float = 40.0) -> Identifications
 def reduced() -> xr.Dataset:
     begin = np.arange(40) * 20.0
     return xr.Dataset(
-        {"begin": ("block", begin), "end": ("block", begin + 20.0), "line_frequency": ("line", np.arange(1, 100) * 0.05)},
+        {
+            "begin": ("block", begin),
+            "end": ("block", begin + 20.0),
+            "line_frequency": ("line", np.arange(1, 100) * 0.05),
+        },
         attrs={"start_ns": 0, "block_s": 20.0, "sampling_rate_hz": 10.0},
     )
 
 
 @pytest.mark.parametrize(
-    ("view", "told", "taus"), [("mean", "mean", (20.0, 400.0)), ("power", "davar", (0.1, 20.0)), ("line", "spectrum", (0.371 / 0.5,) * 2)]
+    ("view", "told", "taus"),
+    [
+        ("mean", "mean", (20.0, 400.0)),
+        ("power", "davar", (0.1, 20.0)),
+        ("line", "spectrum", (0.371 / 0.5,) * 2),
+    ],
 )
-def test_an_effect_without_a_box_gets_one_where_it_acts(view: str, told: str, taus: tuple[float, float]) -> None:
+def test_an_effect_without_a_box_gets_one_where_it_acts(
+    view: str, told: str, taus: tuple[float, float]
+) -> None:
     (box,) = identification_tables(naming(view, place=9 if view == "line" else -1), reduced(), [])
     assert (box["view"], box["axes"], box["explained_by"]) == (told, ["y"], ["shupe"])
     assert (box["tau_min_s"], box["tau_max_s"]) == pytest.approx(taus)
@@ -124,10 +161,14 @@ def test_an_effect_without_a_box_gets_one_where_it_acts(view: str, told: str, ta
 def test_an_effect_with_a_box_gets_no_other() -> None:
     known = [{"explained_by": ["shupe"], "axes": ["x", "y"]}]
     assert identification_tables(naming("mean"), reduced(), known) == []
-    assert [box["id"] for box in identification_tables(naming("mean"), reduced(), [known[0] | {"axes": ["x"]}])] == [2]
+    assert [
+        box["id"]
+        for box in identification_tables(naming("mean"), reduced(), [known[0] | {"axes": ["x"]}])
+    ] == [2]
 
 
-# ------------------------------------------------------------------------------------------------- levels that change
+# -------------------------------------------------------------------------------------------------
+# levels that change
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +182,9 @@ def loud() -> xr.Dataset:
 
 def flat(reduced: xr.Dataset, level: np.ndarray) -> xr.Dataset:
     expected = np.broadcast_to(level[:, None] / 50.0, reduced["power"].shape)
-    return xr.Dataset({"spectrum": (("axis", "block", "band"), expected), "frequency": reduced["frequency"]})
+    return xr.Dataset(
+        {"spectrum": (("axis", "block", "band"), expected), "frequency": reduced["frequency"]}
+    )
 
 
 def test_one_loud_block_among_quiet_ones_makes_no_lines(loud) -> None:
@@ -151,10 +194,15 @@ def test_one_loud_block_among_quiet_ones_makes_no_lines(loud) -> None:
 
 
 def test_two_levels_in_a_block_make_no_tails(loud) -> None:
-    share = np.clip(np.minimum(loud["end"], 274.0) - np.maximum(loud["begin"], 204.0), 0.0, None).values / loud.attrs["block_s"]
+    share = (
+        np.clip(np.minimum(loud["end"], 274.0) - np.maximum(loud["begin"], 204.0), 0.0, None).values
+        / loud.attrs["block_s"]
+    )
     base = flat(loud, 1.0 + share * 899.0)
     calm = without_turns(loud, base["spectrum"].values)
-    before, after = (distribution.score(one, base).isel(tau=-1)["ratio"].max() for one in (loud, calm))
+    before, after = (
+        distribution.score(one, base).isel(tau=-1)["ratio"].max() for one in (loud, calm)
+    )
     assert before > 4.0
     assert after < 1.4  # of 324 samples: five standard deviations
 
@@ -164,15 +212,25 @@ def test_what_the_axes_share_by_the_model_is_no_mismatch(loud) -> None:
     own = np.random.default_rng(5).standard_normal((2, 30_000))
     shared = reduce_log(make_log(own + common, rate=50.0, unit="deg/h"))
     base = flat(shared, np.full(shared.sizes["block"], 2.0))
-    model = base.assign(cross=(("pair", "block", "band"), np.full(shared["cross"].shape, 1.0 / 50.0, complex)))
-    before, after = (np.nanmax(np.abs(cross_axis.score(shared, one)["z"].values)) for one in (base, model))
+    model = base.assign(
+        cross=(("pair", "block", "band"), np.full(shared["cross"].shape, 1.0 / 50.0, complex))
+    )
+    before, after = (
+        np.nanmax(np.abs(cross_axis.score(shared, one)["z"].values)) for one in (base, model)
+    )
     assert before > 30.0
     assert after < 8.0
 
 
 def test_odd_samples_count_on_held_out_time() -> None:
-    model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003}, "effect": [{"name": "spikes", "axes": ["x"], "per_hour": 300.0}]}
-    found = gyrostab.diagnose(gyrostab.simulate(model, duration="10min", rate=20.0, seed=2).compute(), nulls=100)
+    model = {
+        "log": {"axes": ["x"]},
+        "noise": {"N": 0.003},
+        "effect": [{"name": "spikes", "axes": ["x"], "per_hour": 300.0}],
+    }
+    found = gyrostab.diagnose(
+        gyrostab.simulate(model, duration="10min", rate=20.0, seed=2).compute(), nulls=100
+    )
     (effect,) = found.effects
     assert effect["name"] == "spikes"
     held = found.content["held_out"]

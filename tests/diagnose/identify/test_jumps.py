@@ -21,14 +21,23 @@ MODEL = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x", "y"
 MIDDLE = 905.0  # inside a block
 
 
-@pytest.mark.parametrize(("way", "size", "jump"), [(0.0, 0.4, True), (0.0, 4.0, True), (100.0, 0.8, False), (160.0, 4.0, False)])
+@pytest.mark.parametrize(
+    ("way", "size", "jump"),
+    [(0.0, 0.4, True), (0.0, 4.0, True), (100.0, 0.8, False), (160.0, 4.0, False)],
+)
 def test_what_goes_over_within_some_blocks_is_no_jump(way: float, size: float, jump: bool) -> None:
     second = np.arange(18_000) / 10.0
     course = np.clip((second - MIDDLE) / max(way, 1e-3) + 0.5, 0.0, 1.0)
-    noise = 0.003 * 60.0 * np.sqrt(10.0) * np.random.default_rng(4).standard_normal((2, second.size))
+    noise = (
+        0.003 * 60.0 * np.sqrt(10.0) * np.random.default_rng(4).standard_normal((2, second.size))
+    )
     reduced = reduce_log(make_log(noise + size * course * [[1.0], [-0.8]], rate=10.0, unit="deg/h"))
     baseline = baseline_from_model(reduced, MODEL)
-    (jumps,) = (one for one in effect_candidates(reduced, baseline["coefficient"])[0] if (one.effect, one.view) == ("bias_jump", "mean"))
+    (jumps,) = (
+        one
+        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        if (one.effect, one.view) == ("bias_jump", "mean")
+    )
     state = begin_state(reduced, baseline)
     parts = by_key(compute_evidence([jumps], reduced, state, fold_blocks(reduced)))[jumps.key]
     assert sum_evidence(parts) > 10.0
@@ -46,9 +55,16 @@ def test_where_power_came_back_a_jump_may_settle() -> None:
     rate[:, (second >= 850.0) & (second < 960.0)] = np.nan
     reduced = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
     baseline = baseline_from_model(reduced, MODEL)
-    (jumps,) = (one for one in effect_candidates(reduced, baseline["coefficient"])[0] if (one.effect, one.view) == ("bias_jump", "mean"))
+    (jumps,) = (
+        one
+        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        if (one.effect, one.view) == ("bias_jump", "mean")
+    )
     state = begin_state(reduced, baseline)
     at = np.array([one.values["at"] for one in jumps.variants])
-    parts = {instant: Component(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0) for instant in (960.0, 1010.0)}
+    parts = {
+        instant: Component(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0)
+        for instant in (960.0, 1010.0)
+    }
     assert [jumps_at_will(part, state) for part in parts.values()] == [False, True]
     assert [is_sudden([part], state) for part in parts.values()] == [True, False]

@@ -22,15 +22,27 @@ from gyrostab.ingest.make_log import make_log
 
 
 @pytest.mark.parametrize(
-    ("late", "one_filter"), [((0.1, 0.1, 0.1), True), ((0.1,), True), ((0.0, 0.0, 0.15), False), ((0.15, 0.15, 0.0), False)]
+    ("late", "one_filter"),
+    [
+        ((0.1, 0.1, 0.1), True),
+        ((0.1,), True),
+        ((0.0, 0.0, 0.15), False),
+        ((0.15, 0.15, 0.0), False),
+    ],
 )
 def test_a_filter_that_other_axes_deny_is_none_of_the_logger(late, one_filter):
     """So much of every sample comes with the next: one law for a logger, and a noise of their own for axes of which one has none of it."""
     share = np.array(late)[:, None]
     raw = np.random.default_rng(5).standard_normal((share.size, 18_001))
-    reduced = reduce_log(make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h"))
+    reduced = reduce_log(
+        make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h")
+    )
     baseline = calibrate_noise(reduced)
-    filters = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == "logger_filter"]
+    filters = [
+        one
+        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        if one.effect == "logger_filter"
+    ]
     state = begin_state(reduced, baseline)
     parts = by_key(compute_evidence(filters, reduced, state, fold_blocks(reduced)))["logger_filter"]
     assert sum_evidence(parts) > 10.0
@@ -42,14 +54,22 @@ def test_a_cutoff_that_the_record_does_not_tell_has_an_interval_of_all_that_suit
     """Samples with a little memory are a picked low-pass beyond half the rate; with free quantization noise one far down does the same."""
     share, rate = 0.05, 10.0
     raw = np.random.default_rng(2).standard_normal((2, 12_000))
-    low, high = _cutoff(make_log(lfilter([1.0 - share], [1.0, -share], raw, axis=1), rate=rate, unit="deg/h"))
+    low, high = _cutoff(
+        make_log(lfilter([1.0 - share], [1.0, -share], raw, axis=1), rate=rate, unit="deg/h")
+    )
     assert low <= -np.log(share) * rate / (2.0 * np.pi) <= high
     assert high > 3.0 * low
 
 
 def test_a_cutoff_that_the_record_tells_keeps_its_narrow_interval() -> None:
     raw = np.random.default_rng(3).standard_normal((2, 120_000))
-    low, high = _cutoff(make_log(sosfilt(butter(4, 2.0, fs=100.0, output="sos"), raw, axis=1)[:, ::10], rate=10.0, unit="deg/h"))
+    low, high = _cutoff(
+        make_log(
+            sosfilt(butter(4, 2.0, fs=100.0, output="sos"), raw, axis=1)[:, ::10],
+            rate=10.0,
+            unit="deg/h",
+        )
+    )
     assert (low + high) / 2.0 == pytest.approx(2.0, rel=0.05)
     assert high < 1.2 * low
 
@@ -58,7 +78,11 @@ def _cutoff(log: xr.Dataset) -> tuple[float, float]:
     """95 % interval of the cutoff of a filter on all axes of a record."""
     reduced = reduce_log(log)
     baseline = calibrate_noise(reduced)
-    candidate = next(one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect == "logger_filter")
+    candidate = next(
+        one
+        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        if one.effect == "logger_filter"
+    )
     variant = next(one for one in candidate.variants if is_filter("power", one))
     parts = [Component(candidate, variant, (str(axis),), 50.0) for axis in reduced["axis"].values]
     mean, error, *ends = filter_sizes(parts, begin_state(reduced, baseline))[0]["cutoff"]

@@ -23,7 +23,9 @@ BEGIN, END = 2000, 4000  # samples in which z turns
 
 @pytest.fixture(scope="module")
 def still() -> xr.Dataset:
-    return simulate({"log": {"axes": ["x", "y", "z"]}, "noise": {"N": N}}, duration="20min", rate=10.0, seed=5)
+    return simulate(
+        {"log": {"axes": ["x", "y", "z"]}, "noise": {"N": N}}, duration="20min", rate=10.0, seed=5
+    )
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,9 @@ def seen(turning) -> tuple[xr.Dataset, xr.Dataset]:
 def test_noise_and_drift_do_not_move(still):
     assert not moving_blocks(reduce_log(still)).any()
     ramp = np.linspace(0.0, 500.0, still.sizes["time"])
-    assert not moving_blocks(reduce_log(still.assign(rate=still["rate"] + xr.DataArray(ramp, dims="time")))).any()
+    assert not moving_blocks(
+        reduce_log(still.assign(rate=still["rate"] + xr.DataArray(ramp, dims="time")))
+    ).any()
 
 
 def test_the_axis_that_turns_is_found_where_it_does(seen):
@@ -63,7 +67,9 @@ def test_the_axis_that_turns_is_found_where_it_does(seen):
 def test_what_turns_most_of_the_time_has_no_rest(turning):
     rate = turning["rate"].transpose("axis", "time").values.copy()
     rate[2, 3000:] += 400.0 * np.arange(rate.shape[1] - 3000) / 1000.0
-    assert not moving_blocks(reduce_log(turning.assign(rate=(("axis", "time"), rate, turning["rate"].attrs))))[2].any()
+    assert not moving_blocks(
+        reduce_log(turning.assign(rate=(("axis", "time"), rate, turning["rate"].attrs)))
+    )[2].any()
 
 
 def test_left_out_on_the_axis_alone_and_kept_as_measured(seen):
@@ -87,17 +93,26 @@ def test_the_noise_is_that_of_the_rest(seen):
     assert (baseline["coefficient"].sel(term="K") < 1.0).all()
 
 
-def claim(effect: str, view: str, *row: str, column: str = "z", course: np.ndarray | None = None) -> SimpleNamespace:
+def claim(
+    effect: str, view: str, *row: str, column: str = "z", course: np.ndarray | None = None
+) -> SimpleNamespace:
     design = np.empty(0) if course is None else course[None, None]
-    variant, candidate = SimpleNamespace(columns=(column,), design=design), SimpleNamespace(view=view, witness=())
-    return SimpleNamespace(effect=effect, parts=(SimpleNamespace(candidate=candidate, row=row, variant=variant),))
+    variant, candidate = (
+        SimpleNamespace(columns=(column,), design=design),
+        SimpleNamespace(view=view, witness=()),
+    )
+    return SimpleNamespace(
+        effect=effect, parts=(SimpleNamespace(candidate=candidate, row=row, variant=variant),)
+    )
 
 
 def test_an_effect_explains_the_motion_if_it_leaves_next_to_nothing_of_it(seen):
     whole, _ = seen
     moving = moving_blocks(whole)
     bump = np.nan_to_num(whole["mean"].values[2] - np.nanmedian(whole["mean"].values[2]))
-    assert not unexplained_motion(whole, [claim("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)]).any()
+    assert not unexplained_motion(
+        whole, [claim("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)]
+    ).any()
     assert not unexplained_motion(whole, [claim("rotation_line", "order", "z")]).any()
     step = np.where(np.arange(bump.size) < np.flatnonzero(moving[2]).mean(), 0.0, 1.0)
     for other in (
@@ -143,10 +158,17 @@ def test_one_mismatch_says_where_it_moves_and_who_sees_it(seen):
 
 
 def test_what_moves_stays_in_where_the_rest_is_too_little_to_calibrate_on(turning):
-    sparse = np.random.default_rng(3).random(turning.sizes["time"]) < 0.85  # too few samples for spectra
+    sparse = (
+        np.random.default_rng(3).random(turning.sizes["time"]) < 0.85
+    )  # too few samples for spectra
     sparse[BEGIN:END] = False
     gone = xr.DataArray(sparse, dims="time") & (turning["axis"] == "z")
-    log = turning.assign(rate=turning["rate"].where(~gone).transpose("axis", "time").assign_attrs(turning["rate"].attrs))
+    log = turning.assign(
+        rate=turning["rate"]
+        .where(~gone)
+        .transpose("axis", "time")
+        .assign_attrs(turning["rate"].attrs)
+    )
     whole = reduce_log(log)
     with pytest.raises(SchemaError, match="axis z"):
         calibrate_noise(without_motion(log, whole, moving_blocks(whole)))

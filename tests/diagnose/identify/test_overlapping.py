@@ -20,17 +20,30 @@ VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
 
 
 def part(gain, *, row="x", witness=""):
-    return Component(Candidate("misalignment", "transfer", (), (VARIANT,), witness=(witness,)), VARIANT, (row,), gain)
+    return Component(
+        Candidate("misalignment", "transfer", (), (VARIANT,), witness=(witness,)),
+        VARIANT,
+        (row,),
+        gain,
+    )
 
 
 def test_rows_that_come_again_are_a_layer_of_their_own():
     parts = [part(9.0), part(8.0, row="y"), part(7.0), part(6.0, witness="seismometer"), part(5.0)]
-    assert [[one.gain for one in layer] for layer in layers(parts)] == [[9.0, 8.0, 6.0], [7.0], [5.0]]
+    assert [[one.gain for one in layer] for layer in layers(parts)] == [
+        [9.0, 8.0, 6.0],
+        [7.0],
+        [5.0],
+    ]
 
 
 def test_a_part_has_no_gain_of_another_witness():
     parts = [part(40.0, witness="z"), part(9.0, witness="seismometer")]
-    assert [evidence_of(parts, part(1.0, witness=name)) for name in ("z", "seismometer", "y")] == [40.0, 9.0, 1.0]
+    assert [evidence_of(parts, part(1.0, witness=name)) for name in ("z", "seismometer", "y")] == [
+        40.0,
+        9.0,
+        1.0,
+    ]
 
 
 def test_a_claim_keeps_the_axes_that_show_it_beside_the_others():
@@ -44,7 +57,10 @@ def test_a_claim_keeps_the_axes_that_show_it_beside_the_others():
 
 
 def test_two_opposite_jumps_gain_together_what_none_gains_alone():
-    jumps = [{"name": "bias_jump", "step": [step], "at": at, "axes": ["x"]} for step, at in ((0.3, 600.0), (-0.3, 1300.0))]
+    jumps = [
+        {"name": "bias_jump", "step": [step], "at": at, "axes": ["x"]}
+        for step, at in ((0.3, 600.0), (-0.3, 1300.0))
+    ]
     model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003, "K": 0.005}, "effect": jumps}
     reduced = reduce_log(simulate(model, duration="30min", rate=10.0, seed=4).compute())
     baseline = calibrate_noise(reduced)

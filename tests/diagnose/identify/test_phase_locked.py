@@ -29,7 +29,16 @@ def claim(*parts: Component) -> Identification:
 
 def test_only_waves_are_taken_out_with_what_they_gain() -> None:
     mean, wave, comb = part("mean", 5.0), part("order", 20.0), part("phase_locked", 7.0)
-    naming = Identifications((claim(mean, wave), claim(comb), claim(mean)), (), 6.0, np.zeros(1), {}, (), None, xr.DataArray())  # type: ignore[arg-type]
+    naming = Identifications(
+        (claim(mean, wave), claim(comb), claim(mean)),
+        (),
+        6.0,
+        np.zeros(1),
+        {},
+        (),
+        None,
+        xr.DataArray(),
+    )  # type: ignore[arg-type]
     left, gain = without_waves(naming)
     assert gain == 27.0
     assert [one.parts for one in left.claims] == [(mean,), (mean,)]
@@ -41,16 +50,22 @@ def model(size: float, seconds: float) -> dict[str, Any]:
     return {
         "noise": {"N": N, "B": 0.002, "K": 0.01},
         "effect": [{"name": "rotation_line", "amplitude": size, "axes": ["x"]}],
-        "environment": [{"profile": "rotation", "points": [[0, 70.0], [seconds / 2.0, 75.0], [seconds, 72.0]]}],
+        "environment": [
+            {"profile": "rotation", "points": [[0, 70.0], [seconds / 2.0, 75.0], [seconds, 72.0]]}
+        ],
         "log": {"axes": ["x", "y"]},
     }
 
 
 def test_a_wave_locked_to_the_rotation_is_worth_what_the_normal_law_says() -> None:
     size, seconds = 0.07, 1200.0
-    found = diagnose(simulate(model(size, seconds), duration=seconds, rate=10.0, seed=4).compute(), nulls=100)
+    found = diagnose(
+        simulate(model(size, seconds), duration=seconds, rate=10.0, seed=4).compute(), nulls=100
+    )
     assert [one["name"] for one in found.effects] == ["rotation_line"]
-    assert found.content["held_out"]["log_likelihood_gain"] == pytest.approx(size**2 * seconds / (4.0 * 3600.0 * N**2), rel=0.5)
+    assert found.content["held_out"]["log_likelihood_gain"] == pytest.approx(
+        size**2 * seconds / (4.0 * 3600.0 * N**2), rel=0.5
+    )
 
 
 def test_the_allan_variance_is_held_against_the_model_with_the_wave() -> None:

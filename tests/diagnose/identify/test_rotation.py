@@ -18,7 +18,18 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 from tests.support.named import nulls
 
-_TURNS = [[0, 0.0], [300, 0.0], [310, 108.0], [600, 108.0], [610, 40.0], [800, 40.0], [810, 0.0], [1000, 0.0], [1010, 90.0], [1200, 90.0]]
+_TURNS = [
+    [0, 0.0],
+    [300, 0.0],
+    [310, 108.0],
+    [600, 108.0],
+    [610, 40.0],
+    [800, 40.0],
+    [810, 0.0],
+    [1000, 0.0],
+    [1010, 90.0],
+    [1200, 90.0],
+]
 
 
 def _reduced(share: float) -> xr.Dataset:
@@ -35,13 +46,24 @@ def _reduced(share: float) -> xr.Dataset:
 
 def _parts(reduced: xr.Dataset):
     baseline = calibrate_noise(reduced)
-    known = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.effect in ("scale_factor", "real_motion")]
+    known = [
+        one
+        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        if one.effect in ("scale_factor", "real_motion")
+    ]
     state = begin_state(reduced, baseline)
-    parts = by_key(compute_evidence([one for one in known if one.view == "mean"], reduced, state, fold_blocks(reduced)))
+    parts = by_key(
+        compute_evidence(
+            [one for one in known if one.view == "mean"], reduced, state, fold_blocks(reduced)
+        )
+    )
     return {several[0].candidate.effect: several for several in parts.values()}, state
 
 
-@pytest.mark.parametrize(("share", "plainer", "allowed"), [(3e-6, "scale_factor", False), (1e-3, "scale_factor", True), (0.5, None, True)])
+@pytest.mark.parametrize(
+    ("share", "plainer", "allowed"),
+    [(3e-6, "scale_factor", False), (1e-3, "scale_factor", True), (0.5, None, True)],
+)
 def test_the_share_of_the_turning_tells_what_it_is(share, plainer, allowed):
     parts, state = _parts(_reduced(share))
     motion, error = parts["real_motion"], parts["scale_factor"]

@@ -28,11 +28,19 @@ def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], S
     white = 0.003 * 60.0 * np.sqrt(10.0) * rng.standard_normal(SECOND.size)
     keep = np.exp(-0.2)
     bias = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(SECOND.size))
-    reduced = reduce_log(make_log(white + size * bias * (share * 600.0 > SECOND % 600.0), rate=10.0, unit="deg/h"))
+    reduced = reduce_log(
+        make_log(white + size * bias * (share * 600.0 > SECOND % 600.0), rate=10.0, unit="deg/h")
+    )
     baseline = baseline_from_model(reduced, MODEL)
-    biases = [one for one in effect_candidates(reduced, baseline["coefficient"])[0] if one.key == "gauss_markov" and one.view == "power"]
+    biases = [
+        one
+        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        if one.key == "gauss_markov" and one.view == "power"
+    ]
     state = begin_state(reduced, baseline)
-    return by_key(compute_evidence(biases, reduced, state, fold_blocks(reduced)))["gauss_markov"], state
+    return by_key(compute_evidence(biases, reduced, state, fold_blocks(reduced)))[
+        "gauss_markov"
+    ], state
 
 
 @pytest.mark.parametrize("size", [0.12, 0.18])
@@ -45,4 +53,7 @@ def test_what_comes_and_goes_is_no_steady_wander(size: float, share: float, stea
 
 
 def test_chance_takes_no_steady_wander_away() -> None:
-    assert all(is_always_present(parts[0], state) for parts, state in (_wandering(0.2, 1.0, seed) for seed in range(8)))
+    assert all(
+        is_always_present(parts[0], state)
+        for parts, state in (_wandering(0.2, 1.0, seed) for seed in range(8))
+    )

@@ -16,19 +16,33 @@ from gyrostab.simulate import simulate
 
 def _slides(sensitivity: float, period: float) -> tuple[bool, float]:
     """Of a bias that follows a temperature which swings with this period [s]."""
-    swing = [[t, 40.0 + 20.0 * np.sin(2.0 * np.pi * t / period)] for t in np.arange(0.0, 1801.0, 15.0).tolist()]
+    swing = [
+        [t, 40.0 + 20.0 * np.sin(2.0 * np.pi * t / period)]
+        for t in np.arange(0.0, 1801.0, 15.0).tolist()
+    ]
     model = {
         "log": {"axes": ["x"]},
         "noise": {"N": 0.003, "B": 0.004, "K": 0.02},
         "effect": [{"name": "temperature_bias", "sensitivity": sensitivity}],
-        "environment": [{"profile": "ramps", "channel": "temperature", "unit": "degree_Celsius", "points": swing}],
+        "environment": [
+            {
+                "profile": "ramps",
+                "channel": "temperature",
+                "unit": "degree_Celsius",
+                "points": swing,
+            }
+        ],
     }
     reduced = reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
     baseline = calibrate_noise(reduced)
     known, _ = effect_candidates(reduced, baseline["coefficient"])
     one = next(one for one in known if one.effect == "temperature_bias" and one.view == "mean")
     variant = next(each for each in one.variants if each.columns == ("sensitivity",))
-    return passes_time_shift_test([Component(one, variant, ("x",), 50.0)], begin_state(reduced, baseline), fold_blocks(reduced))
+    return passes_time_shift_test(
+        [Component(one, variant, ("x",), 50.0)],
+        begin_state(reduced, baseline),
+        fold_blocks(reduced),
+    )
 
 
 def test_a_channel_that_swings_is_no_worse_for_its_mirror_image():

@@ -31,12 +31,22 @@ def _log(*effects, points=((0, 108.0), (1200, 108.0))):
 def _table(effect, *names):
     """Some parameters of an effect, as a model has them."""
     values = {name: getattr(effect, name) for name in names}
-    return {"name": effect.name} | {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+    return {"name": effect.name} | {
+        name: list(value) if isinstance(value, tuple) else value for name, value in values.items()
+    }
 
 
 @pytest.mark.parametrize("around", [90.0, -90.0])
 def test_earth_rate_is_taken_out_and_made_again(around):
-    log = _log({"name": "earth_rate", "latitude": 45.0, "toolface": 40.0, "off": [90.0, 90.0], "around": [0.0, around]})
+    log = _log(
+        {
+            "name": "earth_rate",
+            "latitude": 45.0,
+            "toolface": 40.0,
+            "off": [90.0, 90.0],
+            "around": [0.0, around],
+        }
+    )
     reduced = reduce_log(log)
     baseline = calibrate_noise(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
@@ -45,8 +55,16 @@ def test_earth_rate_is_taken_out_and_made_again(around):
     parts = by_key(compute_evidence(orders, reduced, start, folds))["earth_rate(rotation_rate)"]
     assert sum_evidence(parts) > 1000.0
     state = condition_on(start, parts)
-    assert max(sum_evidence(one) for one in by_key(compute_evidence(orders, reduced, state, folds)).values()) < 5.0
-    claim = Identification("earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0)
+    assert (
+        max(
+            sum_evidence(one)
+            for one in by_key(compute_evidence(orders, reduced, state, folds)).values()
+        )
+        < 5.0
+    )
+    claim = Identification(
+        "earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0
+    )
     naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds)
     (fitted,) = fit_identifications(naming, baseline)
     again = _log(_table(fitted.effect, "latitude", "toolface", "off", "around"))
@@ -56,14 +74,28 @@ def test_earth_rate_is_taken_out_and_made_again(around):
 @pytest.mark.parametrize(("latitude", "most"), [(60.0, 4.5), (89.8, 0.3)])
 def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most):
     """Of 4 % of the earth's rate across the tool, not of the angle itself, which depends on where it is counted from."""
-    log = _log({"name": "earth_rate", "latitude": latitude, "toolface": 150.0, "off": [90.0, 90.0], "around": [0.0, 90.0]})
+    log = _log(
+        {
+            "name": "earth_rate",
+            "latitude": latitude,
+            "toolface": 150.0,
+            "off": [90.0, 90.0],
+            "around": [0.0, 90.0],
+        }
+    )
     reduced = reduce_log(log)
     baseline = calibrate_noise(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
     start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    parts = by_key(compute_evidence([one for one in known if one.view == "order"], reduced, start, folds))["earth_rate(rotation_rate)"]
-    claim = Identification("earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0)
-    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), condition_on(start, parts), folds)
+    parts = by_key(
+        compute_evidence([one for one in known if one.view == "order"], reduced, start, folds)
+    )["earth_rate(rotation_rate)"]
+    claim = Identification(
+        "earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0
+    )
+    naming = Identifications(
+        (claim,), (), 8.0, np.zeros(1), reasons, tuple(known), condition_on(start, parts), folds
+    )
     found = fit_identifications(naming, baseline)[0].parameters
     assert found["latitude"].low < latitude < found["latitude"].high
     by_size = np.degrees(1.96 * 0.04 / np.tan(np.radians(latitude)))
@@ -75,19 +107,50 @@ def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most
 def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
     """The second line is the strongest, the third a half of it; x has them all, y the first alone."""
     points = ((0, 108.0), (600, 108.0), (610, 66.0), (1200, 66.0))
-    both = {"name": "rotation_line", "amplitude": [0.5, 0.4], "phase": [40.0, -60.0], "axes": ["x", "y"]}
+    both = {
+        "name": "rotation_line",
+        "amplitude": [0.5, 0.4],
+        "phase": [40.0, -60.0],
+        "axes": ["x", "y"],
+    }
     x = {"name": "rotation_line", "axes": ["x"]}
-    log = _log(both, {**x, "order": 2.0, "amplitude": [0.8], "phase": [100.0]}, {**x, "order": 3.0, "amplitude": [0.4]}, points=points)
+    log = _log(
+        both,
+        {**x, "order": 2.0, "amplitude": [0.8], "phase": [100.0]},
+        {**x, "order": 3.0, "amplitude": [0.4]},
+        points=points,
+    )
     reduced = reduce_log(log)
     baseline = calibrate_noise(reduced)
     known, reasons = effect_candidates(reduced, baseline["coefficient"])
     orders = [one for one in known if one.view == "order" and one.effect == "rotation_line"]
     start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
     parts = by_key(compute_evidence(orders, reduced, start, folds))["rotation_line(rotation_rate)"]
-    claim = Identification("rotation_line", parts[0].candidate.driver, ("x", "y"), tuple(parts), sum_evidence(parts), 8.0)
-    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), condition_on(start, parts), folds)
+    claim = Identification(
+        "rotation_line",
+        parts[0].candidate.driver,
+        ("x", "y"),
+        tuple(parts),
+        sum_evidence(parts),
+        8.0,
+    )
+    naming = Identifications(
+        (claim,), (), 8.0, np.zeros(1), reasons, tuple(known), condition_on(start, parts), folds
+    )
     fitted = fit_identifications(naming, baseline)
-    assert [(one.effect.order, one.axes) for one in fitted] == [(1.0, ("x", "y")), (2.0, ("x",)), (3.0, ("x",))]
-    again = _log(*({**_table(one.effect, "amplitude", "phase", "order"), "axes": list(one.axes)} for one in fitted), points=points)
-    left, whole = ((one["rate"] - log["rate"]).std("time").values for one in (again, _log(points=points)))
+    assert [(one.effect.order, one.axes) for one in fitted] == [
+        (1.0, ("x", "y")),
+        (2.0, ("x",)),
+        (3.0, ("x",)),
+    ]
+    again = _log(
+        *(
+            {**_table(one.effect, "amplitude", "phase", "order"), "axes": list(one.axes)}
+            for one in fitted
+        ),
+        points=points,
+    )
+    left, whole = (
+        (one["rate"] - log["rate"]).std("time").values for one in (again, _log(points=points))
+    )
     assert (left < 0.05 * whole).all()

@@ -36,13 +36,18 @@ def _overlap(found, begin, end):
 
 def test_false_alarms_come_as_often_as_asked(base, null):
     """Over all views, by other records than those that set the limits."""
-    p = np.concatenate([smallest_p(chunk, base, null) for chunk in chunks(base, 300, np.random.default_rng(22))])
+    p = np.concatenate(
+        [smallest_p(chunk, base, null) for chunk in chunks(base, 300, np.random.default_rng(22))]
+    )
     for level in (0.02, 0.1):
         low, high = stats.binom.ppf([0.001, 0.999], 300, level)
         slack = 1.0 + 2.0 / np.sqrt(200 * level)  # what 200 null records leave open
         assert low / slack <= (p < level).sum() <= high * slack, level
     alarms = [
-        locate_mismatches(records(base, 1, np.random.default_rng(seed)).isel(record=0), base, null).sizes["mismatch"] for seed in range(15)
+        locate_mismatches(
+            records(base, 1, np.random.default_rng(seed)).isel(record=0), base, null
+        ).sizes["mismatch"]
+        for seed in range(15)
     ]
     assert sum(alarms) <= 2
 
@@ -75,7 +80,9 @@ def test_a_burst_of_noise_has_its_box(share, missing):
         found["power"][1, 75:90] *= 1.0 + share**2
         boxes = locate_mismatches(found, base, null)
         boxes = boxes.sel(mismatch=(boxes["view"] == "davar") & (boxes["axes"] == "y"))
-        overlaps.append(_overlap(boxes.isel(mismatch=0), 1500.0, 1800.0) if boxes.sizes["mismatch"] else 0.0)
+        overlaps.append(
+            _overlap(boxes.isel(mismatch=0), 1500.0, 1800.0) if boxes.sizes["mismatch"] else 0.0
+        )
         if share == 0.5:
             assert boxes.sizes["mismatch"] == 1
             assert float(boxes["ratio"][0]) == pytest.approx(1.25, abs=0.08)
@@ -95,7 +102,10 @@ def test_a_step_of_the_mean_has_its_box(base, null):
         boxes = boxes.sel(mismatch=boxes["view"] == "mean")
         assert boxes.sizes["mismatch"] == 2
         assert set(boxes["axes"].values) == {"x"}
-        for box, begin, end in ((boxes["sign"] > 0, 600.0, 900.0), (boxes["sign"] < 0, 2400.0, 2800.0)):
+        for box, begin, end in (
+            (boxes["sign"] > 0, 600.0, 900.0),
+            (boxes["sign"] < 0, 2400.0, 2800.0),
+        ):
             one = boxes.sel(mismatch=box).isel(mismatch=0)
             overlaps.append(_overlap(one, begin, end))
             assert abs(float(one["estimate"])) == pytest.approx(0.1, abs=0.045)
@@ -148,18 +158,41 @@ def test_a_mean_that_wanders_is_one_mismatch(base, null):
 
 
 def test_pieces_become_one_box_and_strangers_do_not():
-    box = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 100.0, "tau_min_s": 0.01, "tau_max_s": 0.1}
+    box = {
+        "view": "davar",
+        "axes": "x",
+        "what": "avar",
+        "begin": 0.0,
+        "end": 100.0,
+        "tau_min_s": 0.01,
+        "tau_max_s": 0.1,
+    }
     box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
-    near, far = box | {"begin": 120.0, "end": 160.0, "z": 6.0}, box | {"begin": 400.0, "end": 460.0, "z": 6.0}
-    assert [(one["begin"], one["end"]) for one in merge_regions([far, near, box])] == [(0.0, 160.0), (400.0, 460.0)]
+    near, far = (
+        box | {"begin": 120.0, "end": 160.0, "z": 6.0},
+        box | {"begin": 400.0, "end": 460.0, "z": 6.0},
+    )
+    assert [(one["begin"], one["end"]) for one in merge_regions([far, near, box])] == [
+        (0.0, 160.0),
+        (400.0, 460.0),
+    ]
     assert len(merge_regions([box, box | {"sign": -1}])) == 2
     assert len(merge_regions([box, box | {"tau_min_s": 1.0, "tau_max_s": 2.0}])) == 2
-    line = box | {"view": "spectrum", "what": "line", "frequency": 13.35, "tau_min_s": 0.028, "tau_max_s": 0.028}
-    assert len(merge_regions([line, line | {"frequency": 13.45, "begin": 100.0, "end": 200.0}])) == 1
+    line = box | {
+        "view": "spectrum",
+        "what": "line",
+        "frequency": 13.35,
+        "tau_min_s": 0.028,
+        "tau_max_s": 0.028,
+    }
+    assert (
+        len(merge_regions([line, line | {"frequency": 13.45, "begin": 100.0, "end": 200.0}])) == 1
+    )
     assert len(merge_regions([line, line | {"frequency": 14.35}])) == 2
 
 
-# -- the whole way from samples ------------------------------------------------------------------------------------------------
+# -- the whole way from samples
+# ------------------------------------------------------------------------------------------------
 
 
 def _log(seed, effect, missing=0.0):
@@ -193,18 +226,44 @@ def _nulls(reduced, base, count, rng):
     """Null records on the bands of a real reduction."""
     shape, weight = reduced["shape"].values, reduced["line_weight"].values[..., None]
     lines = (25, *reduced["line_power"].shape)
-    drop = ["mean", "power", "cross", "line_power", "kurtosis", "outliers", "repeats", "extremes", "zeros"]
+    drop = [
+        "mean",
+        "power",
+        "cross",
+        "line_power",
+        "kurtosis",
+        "outliers",
+        "repeats",
+        "extremes",
+        "zeros",
+    ]
     for _ in range(count // 25):
         made = reduced.drop_vars(drop)
-        power = base["spectrum"].values * rng.gamma(np.broadcast_to(shape, (25, *shape.shape))) / shape
+        power = (
+            base["spectrum"].values * rng.gamma(np.broadcast_to(shape, (25, *shape.shape))) / shape
+        )
         squared = rng.beta(1.0, np.maximum(shape[0] - 1.0, 1e-9), (25, *shape.shape))
-        across = np.sqrt(power * np.roll(power, -1, axis=1) * squared) * np.exp(2j * np.pi * rng.random(power.shape))
+        across = np.sqrt(power * np.roll(power, -1, axis=1) * squared) * np.exp(
+            2j * np.pi * rng.random(power.shape)
+        )
         made["power"] = (("record", "axis", "block", "band"), power)
-        made["cross"] = (("record", "pair", "block", "band"), across[:, [0, 2, 1]])  # x y, z x, y z: the order of the pairs but for a sign
-        made["line_power"] = (("record", "axis", "part", "line"), base["spectrum"].values[0, 0, 0] * rng.gamma(weight, size=lines) / weight)
+        made["cross"] = (
+            ("record", "pair", "block", "band"),
+            across[:, [0, 2, 1]],
+        )  # x y, z x, y z: the order of the pairs but for a sign
+        made["line_power"] = (
+            ("record", "axis", "part", "line"),
+            base["spectrum"].values[0, 0, 0] * rng.gamma(weight, size=lines) / weight,
+        )
         plane = (25, *reduced["mean"].shape)
-        made["mean"] = (("record", "axis", "block"), rng.normal(size=plane) * np.sqrt(base["mean_variance"].values))
-        made["kurtosis"] = (("record", "axis", "block"), rng.normal(size=plane) * np.sqrt(24.0 / 2000.0))
+        made["mean"] = (
+            ("record", "axis", "block"),
+            rng.normal(size=plane) * np.sqrt(base["mean_variance"].values),
+        )
+        made["kurtosis"] = (
+            ("record", "axis", "block"),
+            rng.normal(size=plane) * np.sqrt(24.0 / 2000.0),
+        )
         for name in ("outliers", "repeats", "zeros"):
             made[name] = (("record", "axis", "block"), np.zeros(plane))
         two = rng.integers(0, plane[-1], (2, *plane[:2], 1))
@@ -273,5 +332,14 @@ def test_the_table_says_what_the_contract_needs(raw):
     assert np.all(np.diff(boxes["p_value"].values) >= 0)
     start = boxes["start_time"].values[0] - np.datetime64(0, "ns")
     assert start / np.timedelta64(1, "s") == pytest.approx(float(boxes["begin"][0]))
-    assert {"view", "axes", "tau_min_s", "tau_max_s", "ratio", "p_value", "sign", "end_time"} <= set(boxes.variables)
+    assert {
+        "view",
+        "axes",
+        "tau_min_s",
+        "tau_max_s",
+        "ratio",
+        "p_value",
+        "sign",
+        "end_time",
+    } <= set(boxes.variables)
     assert boxes.attrs["null_records"] == 100

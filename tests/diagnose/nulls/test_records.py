@@ -23,15 +23,26 @@ RECORDS = 30
 def raw(seed: int, lost: float, *, axes: str = "x", lattice: float = 0.0) -> xr.Dataset:
     """One hour at 10 Hz with the same gaps for every seed."""
     effect = [{"name": "rate_quantization", "step": lattice}] if lattice else []
-    log = simulate({"log": {"axes": list(axes)}, "noise": NOISE, "effect": effect}, duration="1h", rate=10.0, seed=seed).compute()
+    log = simulate(
+        {"log": {"axes": list(axes)}, "noise": NOISE, "effect": effect},
+        duration="1h",
+        rate=10.0,
+        seed=seed,
+    ).compute()
     gone = np.random.default_rng(7).random((len(axes), log.sizes["time"])) < lost
     gone[:, 9000 : 9000 + int(4000 * lost)] = True
-    log["rate"] = log["rate"].where(xr.DataArray(~gone, dims=("axis", "time"))).assign_attrs(log["rate"].attrs)
+    log["rate"] = (
+        log["rate"]
+        .where(xr.DataArray(~gone, dims=("axis", "time")))
+        .assign_attrs(log["rate"].attrs)
+    )
     return reduce_log(log)
 
 
 def joined(records: list[xr.Dataset]) -> xr.Dataset:
-    return xr.concat(records, "record", data_vars="minimal", coords="minimal", compat="override", join="override")
+    return xr.concat(
+        records, "record", data_vars="minimal", coords="minimal", compat="override", join="override"
+    )
 
 
 @functools.cache
@@ -39,9 +50,17 @@ def both(lost: float) -> tuple[xr.Dataset, xr.Dataset]:
     """Raw records, and null records with the same noise, known exactly."""
     records = [raw(seed, lost, axes="xy") for seed in range(RECORDS)]
     baseline = baseline_from_model(records[0], {"noise": NOISE})
-    nulls = joined(list(null_records(records[0], baseline, count=160, rng=np.random.default_rng(3))))
+    nulls = joined(
+        list(null_records(records[0], baseline, count=160, rng=np.random.default_rng(3)))
+    )
     names = [name for name in nulls.data_vars if "record" in nulls[name].dims]
-    return xr.concat([one[names] for one in records], "record", coords="minimal", compat="override", join="override"), nulls
+    return xr.concat(
+        [one[names] for one in records],
+        "record",
+        coords="minimal",
+        compat="override",
+        join="override",
+    ), nulls
 
 
 def close(one: xr.DataArray, other: xr.DataArray, *, rel: float) -> None:
@@ -55,22 +74,38 @@ def close(one: xr.DataArray, other: xr.DataArray, *, rel: float) -> None:
 def test_statistics_are_those_of_raw_logs(lost):
     found, nulls = both(lost)
     for name in ("power", "mean", "cross", "line_power", "kurtosis"):
-        np.testing.assert_array_equal(np.isnan(found[name].isel(record=0)), np.isnan(nulls[name].isel(record=0)))
+        np.testing.assert_array_equal(
+            np.isnan(found[name].isel(record=0)), np.isnan(nulls[name].isel(record=0))
+        )
     for band in (0, 4, -1):
         close(found["power"].isel(band=band), nulls["power"].isel(band=band), rel=0.06)
-        close(np.abs(found["cross"].isel(band=band)) ** 2, np.abs(nulls["cross"].isel(band=band)) ** 2, rel=0.12)
+        close(
+            np.abs(found["cross"].isel(band=band)) ** 2,
+            np.abs(nulls["cross"].isel(band=band)) ** 2,
+            rel=0.12,
+        )
     share = found["power"] / nulls["power"].mean(["record", "axis", "block"])
     other = nulls["power"] / nulls["power"].mean(["record", "axis", "block"])
-    close(share.isel(band=slice(-4, None)).mean("band"), other.isel(band=slice(-4, None)).mean("band"), rel=0.06)
+    close(
+        share.isel(band=slice(-4, None)).mean("band"),
+        other.isel(band=slice(-4, None)).mean("band"),
+        rel=0.06,
+    )
     close(found["mean"].diff("block"), nulls["mean"].diff("block"), rel=0.05)
     drift = [
-        one["mean"].isel(block=slice(60, 90)).mean("block") - one["mean"].isel(block=slice(0, 20)).mean("block") for one in (found, nulls)
+        one["mean"].isel(block=slice(60, 90)).mean("block")
+        - one["mean"].isel(block=slice(0, 20)).mean("block")
+        for one in (found, nulls)
     ]
     close(*drift, rel=0.35)
     close(found["kurtosis"], nulls["kurtosis"], rel=0.1)
     close(found["line_power"].max("line"), nulls["line_power"].max("line"), rel=0.15)
     assert set(np.unique(nulls["extremes"].sum("block"))) == {2}
-    assert 0.0 < float(nulls["outliers"].sum(["axis", "block"]).mean()) < 5.0 * CHANCE * nulls.sizes["axis"]
+    assert (
+        0.0
+        < float(nulls["outliers"].sum(["axis", "block"]).mean())
+        < 5.0 * CHANCE * nulls.sizes["axis"]
+    )
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
@@ -78,7 +113,9 @@ def test_neighbouring_bands_scatter_together_as_in_raw_logs(lost):
     shares = []
     for records in both(lost):
         left = (
-            (records["power"] / records["power"].mean(["record", "block"])).transpose("band", ...).values.reshape(records.sizes["band"], -1)
+            (records["power"] / records["power"].mean(["record", "block"]))
+            .transpose("band", ...)
+            .values.reshape(records.sizes["band"], -1)
         )
         left = left[:, np.isfinite(left).all(axis=0)]
         shares.append(np.corrcoef(left[:10]))
@@ -88,10 +125,16 @@ def test_neighbouring_bands_scatter_together_as_in_raw_logs(lost):
 
 
 def test_lowest_bands_scatter_with_the_third_above_as_the_taper_says():
-    record = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute())
+    record = reduce_log(
+        simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute()
+    )
     baseline = calibrate_noise(record)
     nulls = joined(list(null_records(record, baseline, count=400, rng=np.random.default_rng(2))))
-    left = nulls["power"].transpose("axis", "band", ...).values.reshape(record.sizes["axis"] * record.sizes["band"], -1)
+    left = (
+        nulls["power"]
+        .transpose("axis", "band", ...)
+        .values.reshape(record.sizes["axis"] * record.sizes["band"], -1)
+    )
     shape = baseline["shape_alone"].isel(axis=0, block=5).values
     share = band_covariance(int(record.attrs["block_samples"]))[0, 3] * np.sqrt(shape[0] * shape[3])
     assert share == pytest.approx(0.018, abs=0.002)
@@ -99,19 +142,27 @@ def test_lowest_bands_scatter_with_the_third_above_as_the_taper_says():
 
 
 def test_rare_kurtoses_are_as_rare_as_in_samples():
-    record = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute())
-    nulls = joined(list(null_records(record, calibrate_noise(record), count=200, rng=np.random.default_rng(2))))
+    record = reduce_log(
+        simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute()
+    )
+    nulls = joined(
+        list(null_records(record, calibrate_noise(record), count=200, rng=np.random.default_rng(2)))
+    )
     size = int(record.attrs["block_samples"])
     samples = np.random.default_rng(3).standard_normal((50_000, size))
     square = (samples - samples.mean(axis=1, keepdims=True)) ** 2
     found = (square**2).mean(axis=1) / square.mean(axis=1) ** 2 - 3.0
     for share, tolerance in ((1e-3, 0.025), (1e-2, 0.02), (0.5, 0.02), (0.99, 0.06), (0.999, 0.2)):
-        assert float(nulls["kurtosis"].quantile(share)) == pytest.approx(np.quantile(found, share), abs=tolerance)
+        assert float(nulls["kurtosis"].quantile(share)) == pytest.approx(
+            np.quantile(found, share), abs=tolerance
+        )
 
 
 def test_lattices_give_repeats_zeros_and_extremes():
     record = raw(1, 0.0, lattice=0.5)
-    nulls = joined(list(null_records(record, calibrate_noise(record), count=50, rng=np.random.default_rng(1))))
+    nulls = joined(
+        list(null_records(record, calibrate_noise(record), count=50, rng=np.random.default_rng(1)))
+    )
     for name, scatter in (("repeats", 4.0), ("zeros", 4.0), ("stuck", 4.0), ("filled", 6.0)):
         many = float(nulls[name].sum("block").mean())
         assert float(record[name].sum()) == pytest.approx(many, abs=scatter * np.sqrt(many))
@@ -121,11 +172,15 @@ def test_lattices_give_repeats_zeros_and_extremes():
 
 
 def test_blocks_of_few_samples_may_repeat_them_too():
-    log = simulate({"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=4).compute()
+    log = simulate(
+        {"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=4
+    ).compute()
     lost = np.zeros(log.sizes["time"], bool)
     for first in range(9000, 27_000, 200):  # four fifths of every block
         lost[first : first + 160] = True
-    values = np.round((log["rate"] + 2.0) / 0.2) * 0.2  # no zero in these blocks, where the mean is not known
+    values = (
+        np.round((log["rate"] + 2.0) / 0.2) * 0.2
+    )  # no zero in these blocks, where the mean is not known
     log["rate"] = values.where(~xr.DataArray(lost, dims="time")).assign_attrs(log["rate"].attrs)
     record = reduce_log(log)
     sparse = np.isnan(record["neighbours"].values[0]) & (record["samples"].values[0] > 0)
@@ -138,7 +193,9 @@ def test_blocks_of_few_samples_may_repeat_them_too():
     assert found == pytest.approx(many, abs=4.0 * np.sqrt(many))
     assert ((nulls["repeats"] > nulls["adjacent"]).sum()) == 0
     zeros = nulls["zeros"].values[:, 0, sparse].sum(axis=1)
-    assert float(record["zeros"].values[0, sparse].sum()) <= zeros.mean() + 5.0 * np.sqrt(zeros.mean() + 1.0)
+    assert float(record["zeros"].values[0, sparse].sum()) <= zeros.mean() + 5.0 * np.sqrt(
+        zeros.mean() + 1.0
+    )
 
 
 def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
@@ -146,7 +203,9 @@ def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
     seconds = np.arange(36_000) / 10.0
 
     def made(seed: int) -> xr.Dataset:
-        log = simulate({"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=seed).compute()
+        log = simulate(
+            {"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=seed
+        ).compute()
         log["ramp"] = ("time", (seconds * 0.3) % 1.0, {"units": "1"})
         log["rotation_rate"] = ("time", np.full(seconds.size, 360.0 * 0.7), {"units": "degree s-1"})
         log["accel_x"] = ("time", rng.standard_normal(seconds.size), {"units": "g"})
@@ -154,7 +213,14 @@ def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
 
     records = [made(seed) for seed in range(6)]
     nulls = joined(
-        list(null_records(records[0], baseline_from_model(records[0], {"noise": {"N": 0.003}}), count=50, rng=np.random.default_rng(1)))
+        list(
+            null_records(
+                records[0],
+                baseline_from_model(records[0], {"noise": {"N": 0.003}}),
+                count=50,
+                rng=np.random.default_rng(1),
+            )
+        )
     )
     for name, rel in (("order", 0.08), ("profile", 0.05), ("witness_cross", 0.1)):
         found = np.concatenate([np.abs(one[name].values.ravel()) ** 2 for one in records])
@@ -165,7 +231,10 @@ def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
 def test_the_same_generator_gives_the_same_records():
     record = raw(1, 0.3)
     baseline = calibrate_noise(record)
-    one, other = (next(null_records(record, baseline, count=2, rng=np.random.default_rng(5))) for _ in range(2))
+    one, other = (
+        next(null_records(record, baseline, count=2, rng=np.random.default_rng(5)))
+        for _ in range(2)
+    )
     xr.testing.assert_identical(one, other)
 
 
@@ -174,13 +243,20 @@ def candidates(record: xr.Dataset) -> tuple[dict, dict]:
     t, x = np.arange(n) / n, np.linspace(0.0, 1.0, bands)
     knots = np.stack([np.interp(t, np.linspace(0, 1, 9), one) for one in np.eye(9)], axis=1)
     event = ((t > 0.4) & (t < 0.5)).astype(float)
-    means = {"step": [(t > edge).astype(float) for edge in np.arange(0.1, 0.95, 0.1)], "trend": [t], "event": [event], "any": [knots]}
+    means = {
+        "step": [(t > edge).astype(float) for edge in np.arange(0.1, 0.95, 0.1)],
+        "trend": [t],
+        "event": [event],
+        "any": [knots],
+    }
     flat = np.ones((n, bands))
     powers = {
         "trend": [t[:, None] * flat],
         "event": [event[:, None] * flat],
         "filter": [-(x**4) * flat],
-        "band": [np.exp(-0.5 * ((x - place) / 0.07) ** 2) * event[:, None] for place in (0.5, 0.7, 0.9)],
+        "band": [
+            np.exp(-0.5 * ((x - place) / 0.07) ** 2) * event[:, None] for place in (0.5, 0.7, 0.9)
+        ],
         "any": [knots[:, None, :] * flat[..., None]],
     }
     return means, powers
@@ -194,11 +270,18 @@ def test_largest_gains_of_raw_logs_are_those_of_their_own_null_records(lost):
     for seed in range(records):
         record = raw(100 + seed, lost)
         baseline = calibrate_noise(record)
-        nulls = joined(list(null_records(record, baseline, count=count, rng=np.random.default_rng(seed))))
+        nulls = joined(
+            list(null_records(record, baseline, count=count, rng=np.random.default_rng(seed)))
+        )
         means, powers = candidates(record)
-        for view, gains, tried in (("mean", mean_evidence, means), ("power", power_evidence, powers)):
+        for view, gains, tried in (
+            ("mean", mean_evidence, means),
+            ("power", power_evidence, powers),
+        ):
             own = float(gains(record, baseline, tried, axis="x").max())
-            ranks[view].append(int((gains(nulls, baseline, tried, axis="x").max("candidate") >= own).sum()))
+            ranks[view].append(
+                int((gains(nulls, baseline, tried, axis="x").max("candidate") >= own).sum())
+            )
     for view, found in ranks.items():
         share = (np.array(found) + 0.5) / (count + 1)
         assert share.mean() == pytest.approx(0.5, abs=3.5 * np.sqrt(1.0 / 12.0 / records)), view

@@ -9,8 +9,19 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import linear_model_factors, power_factors
-from gyrostab.diagnose.predict.candidates import STATISTIC_NAMES, effect_candidates, term_density, windows_of
-from gyrostab.diagnose.predict.linear_model import begin_state, build_linear_model, drawn, effective, power_column
+from gyrostab.diagnose.predict.candidates import (
+    STATISTIC_NAMES,
+    effect_candidates,
+    term_density,
+    windows_of,
+)
+from gyrostab.diagnose.predict.linear_model import (
+    begin_state,
+    build_linear_model,
+    drawn,
+    effective,
+    power_column,
+)
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives, splines
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
@@ -71,20 +82,32 @@ def test_without_a_channel_the_reason_names_it(plain):
     assert "ramp" in reasons["feedback_reset"]
 
 
-@pytest.mark.parametrize(("told", "tried"), [([120.0, 160.0], (120.0, 160.0)), (None, (700.0, 800.0)), ("wide", (700.0, 800.0))])
+@pytest.mark.parametrize(
+    ("told", "tried"),
+    [([120.0, 160.0], (120.0, 160.0)), (None, (700.0, 800.0)), ("wide", (700.0, 800.0))],
+)
 def test_vibration_folds_from_the_band_that_its_channel_tells(told, tried):
     shaking = np.random.default_rng(2).uniform(0.0, 5.0, 60_000)
-    log = make_log(np.random.default_rng(1).standard_normal((1, 60_000)), rate=100.0, unit="deg/h", channels={"vibration": (shaking, "g")})
+    log = make_log(
+        np.random.default_rng(1).standard_normal((1, 60_000)),
+        rate=100.0,
+        unit="deg/h",
+        channels={"vibration": (shaking, "g")},
+    )
     if told is not None:
         log["vibration"].attrs["band_hz"] = told
     known, _ = effect_candidates(reduce_log(log), COEFFICIENT)
-    variants = [variant for one in known if one.effect == "aliased_vibration" for variant in one.variants]
+    variants = [
+        variant for one in known if one.effect == "aliased_vibration" for variant in one.variants
+    ]
     assert variants
     assert {(one.values["low"], one.values["high"]) for one in variants} == {tried}
 
 
 def test_a_channel_that_stands_still_excites_nothing(plain):
-    still = plain.assign({name: plain[name] * 0.0 + 20.0 for name in ("channel_temperature", "fine_temperature")})
+    still = plain.assign(
+        {name: plain[name] * 0.0 + 20.0 for name in ("channel_temperature", "fine_temperature")}
+    )
     candidates, reasons = effect_candidates(still, COEFFICIENT)
     assert not [one for one in candidates if one.effect == "shupe"]
     assert reasons["shupe"] == "not identifiable: temperature does not change"
@@ -93,18 +116,28 @@ def test_a_channel_that_stands_still_excites_nothing(plain):
 def test_no_axis_is_explained_by_its_own_reading(plain, found):
     turning = 500.0 * np.sin(np.linspace(0.0, 6.0, plain.sizes["block"]))
     moving = plain.assign(mean=plain["mean"] + turning)
-    leak = next(one for one in effect_candidates(moving, COEFFICIENT)[0] if one.effect == "misalignment" and one.view == "mean")
+    leak = next(
+        one
+        for one in effect_candidates(moving, COEFFICIENT)[0]
+        if one.effect == "misalignment" and one.view == "mean"
+    )
     for variant in leak.variants:
         for name, design in zip(variant.columns, variant.design, strict=True):
             assert not design["xyz".index(name)].any()
-    assert not [one for one in found[0] if one.effect in ("dead_zone", "clock_error") and one.view == "mean"]
+    assert not [
+        one for one in found[0] if one.effect in ("dead_zone", "clock_error") and one.view == "mean"
+    ]
 
 
 def test_axes_at_rest_cannot_leak(plain, found):
     assert not [one for one in found[0] if one.effect == "misalignment" and one.view == "mean"]
     course = xr.DataArray(np.linspace(0.0, 500.0, plain.sizes["block"]), dims="block")
     turning = plain.assign(mean=plain["mean"] + course.where(plain["axis"] == "z", 0.0))
-    leak = next(one for one in effect_candidates(turning, COEFFICIENT)[0] if one.effect == "misalignment" and one.view == "mean")
+    leak = next(
+        one
+        for one in effect_candidates(turning, COEFFICIENT)[0]
+        if one.effect == "misalignment" and one.view == "mean"
+    )
     assert [variant.columns for variant in leak.variants] == [("z",)]
 
 
@@ -123,41 +156,58 @@ def test_earth_rate_is_in_quadrature_between_the_cross_axes(rich):
     pattern = one.variants[0].design[0, :, 0]
     turning = [*WORLD["turning"]]
     table = {"name": "earth_rate", "latitude": 60.0}
-    seen = (record([table], environment=turning)["order"] - record([], environment=turning)["order"]).isel(harmonic=0)
+    seen = (
+        record([table], environment=turning)["order"] - record([], environment=turning)["order"]
+    ).isel(harmonic=0)
     good = np.isfinite(seen.values).all(axis=0)
     x, y, z = seen.values[:, good]
-    assert np.median(np.abs(y / x - pattern[1] / pattern[0])) < 0.01  # but for blocks with a broken number of turns
+    assert (
+        np.median(np.abs(y / x - pattern[1] / pattern[0])) < 0.01
+    )  # but for blocks with a broken number of turns
     assert np.abs(z).max() < 0.02 * np.abs(x).min()
 
 
 def test_laws_of_the_terms(plain):
     frequency = np.array([0.01, 0.1, 1.0])
     np.testing.assert_allclose(term_density("N", frequency, 100.0), 3600.0)
-    np.testing.assert_allclose(term_density("K", frequency, 100.0), 1.0 / (3600.0 * (2 * np.pi * frequency) ** 2), rtol=1e-3)
+    np.testing.assert_allclose(
+        term_density("K", frequency, 100.0),
+        1.0 / (3600.0 * (2 * np.pi * frequency) ** 2),
+        rtol=1e-3,
+    )
     with pytest.raises(ValueError, match="no density"):
         term_density("R", frequency, 100.0)
 
 
 def test_gaps_mix_a_density_with_its_mean(plain):
     density = np.linspace(1.0, 2.0, plain.sizes["band"])
-    half = plain.assign(neighbours=plain["neighbours"] * 0.25)  # a quarter of what a block without gaps has
+    half = plain.assign(
+        neighbours=plain["neighbours"] * 0.25
+    )  # a quarter of what a block without gaps has
     mixed = effective(density, half)
     assert np.ptp(mixed[0, 0]) == pytest.approx(0.25)
-    np.testing.assert_allclose(effective(density, plain.assign(neighbours=plain["neighbours"] * 0.0 + 1.0))[0, 0], density)
+    np.testing.assert_allclose(
+        effective(density, plain.assign(neighbours=plain["neighbours"] * 0.0 + 1.0))[0, 0], density
+    )
 
 
 def test_channels_with_holes_are_bridged(plain):
     values = plain["channel_temperature"].values.copy()
     values[10:14] = np.nan
-    seen = windows_of(plain.assign(channel_temperature=("block", values)), {"temperature": "temperature"}).drivers["temperature"]
-    np.testing.assert_allclose(seen[10:14], np.interp(np.arange(10, 14), [9, 14], [values[9], values[14]]))
+    seen = windows_of(
+        plain.assign(channel_temperature=("block", values)), {"temperature": "temperature"}
+    ).drivers["temperature"]
+    np.testing.assert_allclose(
+        seen[10:14], np.interp(np.arange(10, 14), [9, 14], [values[9], values[14]])
+    )
 
 
 def test_splines_add_to_one():
     np.testing.assert_allclose(splines(np.arange(50.0), np.arange(1.0, 51.0)).sum(axis=0), 1.0)
 
 
-# ----------------------------------------------------------------------------------------------------------------- cells
+# -----------------------------------------------------------------------------------------------------------------
+# cells
 
 
 @pytest.mark.parametrize("common", [0.0, 0.05])
@@ -169,17 +219,26 @@ def test_cells_of_powers_are_scored_as_powers(plain, common):
     state = begin_state(plain, baseline)
     cells = build_linear_model(generic, 0, plain, state)
     mine = linear_model_factors(cells, folds)[:, 1:]
-    designs = [power_column(one, 0, state) / baseline["spectrum"].values[0] for one in generic[0].variants[0].design]
-    theirs = power_factors(plain, baseline, [np.stack(designs, axis=-1)], axis="x", folds=folds)[:, 1:]
+    designs = [
+        power_column(one, 0, state) / baseline["spectrum"].values[0]
+        for one in generic[0].variants[0].design
+    ]
+    theirs = power_factors(plain, baseline, [np.stack(designs, axis=-1)], axis="x", folds=folds)[
+        :, 1:
+    ]
     np.testing.assert_allclose(mine, theirs, atol=1e-6)
 
 
 @pytest.mark.parametrize("view", ["cross", "order"])
 def test_noise_has_the_variance_that_the_weights_say(rich, view):
     baseline = calibrate_noise(rich)
-    candidates = [one for one in effect_candidates(rich, COEFFICIENT)[0] if one.view == view and one.each][:1]
+    candidates = [
+        one for one in effect_candidates(rich, COEFFICIENT)[0] if one.view == view and one.each
+    ][:1]
     cells = build_linear_model(candidates, 0, rich, begin_state(rich, baseline))
-    z = (cells.values[..., 0] * np.sqrt(cells.weight))[(cells.weight > 0) & np.isfinite(cells.values[..., 0])]
+    z = (cells.values[..., 0] * np.sqrt(cells.weight))[
+        (cells.weight > 0) & np.isfinite(cells.values[..., 0])
+    ]
     assert np.mean(z**2) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / z.size) + 0.03)
     some = drawn(cells, np.random.default_rng(1), 3)
     assert some.values.shape[2] == 3
@@ -189,15 +248,24 @@ def test_noise_has_the_variance_that_the_weights_say(rich, view):
 def test_a_filter_is_a_candidate_only_as_a_change_of_shape(found):
     one = next(one for one in found[0] if one.effect == "logger_filter")
     assert all(variant.columns == () for variant in one.variants)
-    assert all((variant.design <= 1e-9).all() for variant in one.variants if not variant.values["pick"])
-    assert all((variant.design[..., 0] > variant.design[..., -1]).all() for variant in one.variants if variant.values["pick"])
+    assert all(
+        (variant.design <= 1e-9).all() for variant in one.variants if not variant.values["pick"]
+    )
+    assert all(
+        (variant.design[..., 0] > variant.design[..., -1]).all()
+        for variant in one.variants
+        if variant.values["pick"]
+    )
 
 
 def test_simulated_wander_has_the_variance_of_the_face():
     kind = effects()["gauss_markov"]
     effect = kind(rms=0.1, correlation_time=50.0)
     log = simulate(
-        {"noise": {}, "effect": [{"name": "gauss_markov", "rms": 0.1, "correlation_time": 50.0}]}, duration="4h", rate=1.0, seed=5
+        {"noise": {}, "effect": [{"name": "gauss_markov", "rms": 0.1, "correlation_time": 50.0}]},
+        duration="4h",
+        rate=1.0,
+        seed=5,
     )
     reduced = reduce_log(log)
     time, variance = effect.explain(windows_of(reduced, {})).wander["rms"]

@@ -7,7 +7,11 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Component, condition_on_component, mask_anomalous_blocks
+from gyrostab.diagnose.predict.condition import (
+    Component,
+    condition_on_component,
+    mask_anomalous_blocks,
+)
 from gyrostab.diagnose.predict.linear_model import begin_state, cross_without
 from tests.support.reduced_records import baseline, records
 
@@ -18,7 +22,9 @@ PAIRS = [("x", "y"), ("x", "z"), ("y", "z")]
 @pytest.fixture
 def reduced() -> xr.Dataset:
     """Noise on x, y and z; an outlier on y in blocks 5 and 9, and one on z in block 9."""
-    found = records(baseline(blocks=BLOCKS), 1, np.random.default_rng(1), blocks=BLOCKS).isel(record=0)
+    found = records(baseline(blocks=BLOCKS), 1, np.random.default_rng(1), blocks=BLOCKS).isel(
+        record=0
+    )
     outliers = np.zeros((3, BLOCKS), np.int64)
     outliers[1, [5, 9]] = outliers[2, 9] = 1
     return found.assign(outliers=(("axis", "block"), outliers))
@@ -31,7 +37,9 @@ def spikes(axis: str) -> Component:
 
 def lost(found: xr.DataArray, before: xr.DataArray) -> set[tuple[str, int]]:
     """Rows and blocks that are there no more; the bands of a block go together."""
-    gone = (found.isnull() & before.notnull()).transpose(..., "block", *(["band"] if "band" in before.dims else []))
+    gone = (found.isnull() & before.notnull()).transpose(
+        ..., "block", *(["band"] if "band" in before.dims else [])
+    )
     if "band" in gone.dims:
         assert (gone.all("band") == gone.any("band")).all()
         gone = gone.any("band")
@@ -49,13 +57,24 @@ def test_what_two_axes_share_is_left_out_where_either_of_them_is(reduced: xr.Dat
     assert cross_without(reduced, np.zeros((3, BLOCKS), np.bool_)).identical(reduced["cross"])
 
 
-def test_blocks_of_named_spikes_are_left_out_of_means_powers_and_what_axes_share(reduced: xr.Dataset) -> None:
-    on_y, on_both = mask_anomalous_blocks(reduced, [spikes("y")]), mask_anomalous_blocks(reduced, [spikes("y"), spikes("z")])
+def test_blocks_of_named_spikes_are_left_out_of_means_powers_and_what_axes_share(
+    reduced: xr.Dataset,
+) -> None:
+    on_y, on_both = (
+        mask_anomalous_blocks(reduced, [spikes("y")]),
+        mask_anomalous_blocks(reduced, [spikes("y"), spikes("z")]),
+    )
     for name in ("mean", "power"):
         assert lost(on_y[name], reduced[name]) == {("y", 5), ("y", 9)}
         assert lost(on_both[name], reduced[name]) == {("y", 5), ("y", 9), ("z", 9)}
     assert lost(on_y["cross"], reduced["cross"]) == {("xy", 5), ("yz", 5), ("xy", 9), ("yz", 9)}
-    assert lost(on_both["cross"], reduced["cross"]) == {("xy", 5), ("yz", 5), ("xy", 9), ("xz", 9), ("yz", 9)}
+    assert lost(on_both["cross"], reduced["cross"]) == {
+        ("xy", 5),
+        ("yz", 5),
+        ("xy", 9),
+        ("xz", 9),
+        ("yz", 9),
+    }
     assert mask_anomalous_blocks(reduced, [spikes("x")]) is reduced  # it has none
 
 

@@ -17,7 +17,11 @@ from gyrostab.simulate import simulate
 
 @pytest.fixture(scope="module")
 def log():
-    model = {"log": {"axes": ["x", "y"]}, "noise": {"N": 0.003}, "effect": [{"name": "shared_source", "N": 0.003, "bandwidth": 0.5}]}
+    model = {
+        "log": {"axes": ["x", "y"]},
+        "noise": {"N": 0.003},
+        "effect": [{"name": "shared_source", "N": 0.003, "bandwidth": 0.5}],
+    }
     return simulate(model, duration="30min", rate=10.0, seed=5).compute()
 
 
@@ -31,7 +35,9 @@ def test_random_gaps_do_not_make_a_shared_band_smaller(log, rows):
     known, _ = effect_candidates(reduced, baseline["coefficient"])
     one = next(one for one in known if one.effect == "shared_source" and one.view == "cross")
     variant = next(each for each in one.variants if each.values["bandwidth"] == 0.5)
-    mean, covariance = component_mixture(Component(one, variant, ("x", "y"), 1.0), begin_state(reduced, baseline)).moments()
+    mean, covariance = component_mixture(
+        Component(one, variant, ("x", "y"), 1.0), begin_state(reduced, baseline)
+    ).moments()
     error = float(np.sqrt(covariance[0, 0]))
     assert abs(mean[0] - 9e-6) < 3.0 * error
     assert error < 0.1 * mean[0]

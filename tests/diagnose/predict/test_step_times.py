@@ -22,12 +22,20 @@ _BACK = 1913.0  # s, between two values of the thinned grid
 @pytest.fixture(scope="module")
 def restarted():
     """An hour whose power was lost for 7 s."""
-    reduced = record([]).drop_vars([name for name in ("restart_begin", "restart_end") if name in record([])])
-    return reduced.assign(restart_begin=("restart", [_BACK - 7.0]), restart_end=("restart", [_BACK]))
+    reduced = record([]).drop_vars(
+        [name for name in ("restart_begin", "restart_end") if name in record([])]
+    )
+    return reduced.assign(
+        restart_begin=("restart", [_BACK - 7.0]), restart_end=("restart", [_BACK])
+    )
 
 
 def _jumps(reduced):
-    return next(one for one in effect_candidates(reduced, COEFFICIENT)[0] if one.effect == "bias_jump" and one.view == "mean")
+    return next(
+        one
+        for one in effect_candidates(reduced, COEFFICIENT)[0]
+        if one.effect == "bias_jump" and one.view == "mean"
+    )
 
 
 def test_a_restart_weighs_as_much_as_all_other_times(restarted):
@@ -41,8 +49,13 @@ def test_a_restart_weighs_as_much_as_all_other_times(restarted):
 
 def test_each_time_weighs_as_much_as_the_time_that_it_stands_for():
     variants = sorted(_jumps(record([])).variants, key=lambda one: one.values["at"])
-    at, weight = (np.array(several) for several in zip(*((one.values["at"], one.weight) for one in variants), strict=True))
-    np.testing.assert_allclose(weight[1:-1] / weight[1], (at[2:] - at[:-2]) / (at[2] - at[0]), rtol=1e-9)
+    at, weight = (
+        np.array(several)
+        for several in zip(*((one.values["at"], one.weight) for one in variants), strict=True)
+    )
+    np.testing.assert_allclose(
+        weight[1:-1] / weight[1], (at[2:] - at[:-2]) / (at[2] - at[0]), rtol=1e-9
+    )
     assert weight.mean() == pytest.approx(1.0)
 
 
@@ -50,7 +63,9 @@ def test_each_time_weighs_as_much_as_the_time_that_it_stands_for():
 def test_a_large_jump_is_found_at_any_time_of_a_long_record(at):
     blocks = 2_000
     windows = 20.0 * np.arange(blocks)
-    means = np.random.default_rng(2).standard_normal(blocks) + 30.0 * np.clip((windows + 20.0 - at) / 20.0, 0.0, 1.0)
+    means = np.random.default_rng(2).standard_normal(blocks) + 30.0 * np.clip(
+        (windows + 20.0 - at) / 20.0, 0.0, 1.0
+    )
     frame = Windows(windows, windows + 20.0, np.ones(1), 10.0, ("x",), own={"x": means})
     possible = np.unique(np.concatenate([windows[1:], windows + 10.0]))
     tried = np.array(tried_instants(possible, frame))
@@ -60,7 +75,9 @@ def test_a_large_jump_is_found_at_any_time_of_a_long_record(at):
 
 def test_two_restarts_share_their_weight(restarted):
     twice = restarted.drop_vars(["restart_begin", "restart_end"])
-    twice = twice.assign(restart_begin=("restart", [900.0, _BACK]), restart_end=("restart", [905.0, _BACK + 7.0]))
+    twice = twice.assign(
+        restart_begin=("restart", [900.0, _BACK]), restart_end=("restart", [905.0, _BACK + 7.0])
+    )
     variants = _jumps(twice).variants
     weight = np.array([one.weight for one in variants])
     known = np.array([one.values["at"] in (905.0, _BACK + 7.0) for one in variants])
@@ -74,6 +91,8 @@ def test_a_jump_where_power_came_back_needs_less_to_be_seen(restarted):
     state = begin_state(moved, calibrate_noise(moved))
     weighed = _jumps(moved)
     alike = replace(weighed, variants=tuple(replace(one, weight=1.0) for one in weighed.variants))
-    found = [compute_evidence([one], moved, state, fold_blocks(moved))[0] for one in (weighed, alike)]
+    found = [
+        compute_evidence([one], moved, state, fold_blocks(moved))[0] for one in (weighed, alike)
+    ]
     assert (found[0].gain > found[1].gain + 0.5).any()
     assert {one.values["at"] for one in found[0].best} == {_BACK}

@@ -31,10 +31,14 @@ def log_of(size: int = SIZE, *, seed: int = 0) -> xr.Dataset:
     return make_log(rate, rate=RATE, unit="deg/h", start="2026-03-14T08:00:00")
 
 
-def with_channel(log: xr.Dataset, name: str, seconds: Any, values: Any, unit: str = "1", **attrs: Any) -> xr.Dataset:
+def with_channel(
+    log: xr.Dataset, name: str, seconds: Any, values: Any, unit: str = "1", **attrs: Any
+) -> xr.Dataset:
     """Add a channel whose values are taken so many seconds after the start."""
     stamps = START + np.rint(np.asarray(seconds) * 1e9).astype("timedelta64[ns]")
-    return log.assign_coords({f"time_{name}": stamps}).assign({name: (f"time_{name}", values, {"units": unit, **attrs})})
+    return log.assign_coords({f"time_{name}": stamps}).assign(
+        {name: (f"time_{name}", values, {"units": unit, **attrs})}
+    )
 
 
 @pytest.mark.parametrize("skew", [0.0, 1 / 3, -1 / 3, 0.45])
@@ -49,7 +53,10 @@ def test_a_channel_sampled_like_the_gyro_has_the_nearest_value(skew: float):
     assert not aligned.unused
     where = "after" if skew > 0 else "before"
     assert bool(aligned.notes) == (skew != 0.0)
-    assert all(f"channel ramp: its stamps are {abs(skew) * 10:.3g} ms {where} those of the gyro" in note for note in aligned.notes)
+    assert all(
+        f"channel ramp: its stamps are {abs(skew) * 10:.3g} ms {where} those of the gyro" in note
+        for note in aligned.notes
+    )
 
 
 def test_samples_without_a_value_near_them_are_missing():
@@ -77,11 +84,16 @@ def test_a_slower_channel_lies_on_straight_lines_but_not_across_gaps():
     np.testing.assert_allclose(found[inside], 2.0 * at[inside], atol=1e-9)
     assert np.isnan(found[gap]).all()
     assert "interpolated from 33.33 Hz" in aligned.notes[0]
-    held = align_channels(with_channel(log_of(), "accel_x", seconds, seconds, "g", interpolation="previous"))
+    held = align_channels(
+        with_channel(log_of(), "accel_x", seconds, seconds, "g", interpolation="previous")
+    )
     assert set(np.unique(held.log["accel_x"].values[inside])) <= set(seconds)
 
 
-@pytest.mark.parametrize(("name", "period"), [("temperature", 1.0), ("vibration", 0.01), ("vibration_x", 0.0025), ("pressure", 0.05)])
+@pytest.mark.parametrize(
+    ("name", "period"),
+    [("temperature", 1.0), ("vibration", 0.01), ("vibration_x", 0.0025), ("pressure", 0.05)],
+)
 def test_slow_channels_and_vibration_keep_their_stamps(name: str, period: float):
     seconds = np.arange(0.0, 30.0, period)
     aligned = align_channels(log := with_channel(log_of(), name, seconds, seconds, "g"))
@@ -94,7 +106,9 @@ def test_channels_that_turn_with_the_tool_keep_their_stamps_beside_its_rotation(
     """Gravity is then a wave at the rotation, coherent with any line there; a toolface wraps and has no mean."""
     seconds = np.arange(0.0, 30.0, period)
     accel = with_channel(log_of(), "accel_x", seconds, np.sin(2 * np.pi * seconds), "g")
-    turning = with_channel(accel, "rotation_rate", seconds, np.full(seconds.size, 360.0), "degree s-1")
+    turning = with_channel(
+        accel, "rotation_rate", seconds, np.full(seconds.size, 360.0), "degree s-1"
+    )
     assert align_channels(turning).log.identical(turning)
     assert align_channels(accel).log["accel_x"].dims == ("time",)
     toolface = with_channel(log_of(), "toolface", seconds, np.mod(360.0 * seconds, 360.0), "degree")
@@ -105,7 +119,9 @@ def test_channels_that_turn_with_the_tool_keep_their_stamps_beside_its_rotation(
 
 def test_a_fast_toolface_is_not_called_too_slow():
     seconds = np.arange(0.0, 600.0, 0.01)
-    reduced, _, _ = candidates_of(with_channel(log_of(60_000), "toolface", seconds, np.mod(70.0 * seconds, 360.0), "degree"))
+    reduced, _, _ = candidates_of(
+        with_channel(log_of(60_000), "toolface", seconds, np.mod(70.0 * seconds, 360.0), "degree")
+    )
     assert [one["reason"] for one in unused_channels(reduced, ())] == [
         "no effect follows a channel of this name; lines at the rotation are found with the channel rotation_rate"
     ]
@@ -136,7 +152,9 @@ def test_a_channel_of_no_use_is_left_out_with_the_reason(name: str, seconds: Any
     lost=st.sets(st.integers(0, 400), max_size=60),
     grid=st.booleans(),
 )
-def test_pieces_of_a_lazy_log_give_what_the_whole_gives(ratio: float, skew: float, chunk: int, lost: set[int], grid: bool):
+def test_pieces_of_a_lazy_log_give_what_the_whole_gives(
+    ratio: float, skew: float, chunk: int, lost: set[int], grid: bool
+):
     log = log_of(400)
     count = int(400 / ratio)
     values = np.random.default_rng(2).standard_normal(count)
@@ -145,9 +163,13 @@ def test_pieces_of_a_lazy_log_give_what_the_whole_gives(ratio: float, skew: floa
     one = with_channel(log, "accel_x", seconds, values, "g")
     if grid:
         start = int((START + np.timedelta64(round(skew / RATE * 1e9), "ns")).view(np.int64))
-        one = one.drop_vars("time_accel_x").assign_coords(time_coordinate(start, RATE / ratio, count, name="time_accel_x"))
+        one = one.drop_vars("time_accel_x").assign_coords(
+            time_coordinate(start, RATE / ratio, count, name="time_accel_x")
+        )
     whole = align_channels(one).log["accel_x"]
-    lazy = one.assign(rate=one["rate"].chunk(time=chunk), accel_x=one["accel_x"].chunk(time_accel_x=31))
+    lazy = one.assign(
+        rate=one["rate"].chunk(time=chunk), accel_x=one["accel_x"].chunk(time_accel_x=31)
+    )
     pieces = align_channels(lazy).log["accel_x"]
     assert isinstance(pieces.data, da.Array)
     np.testing.assert_allclose(pieces.values, whole.values, rtol=1e-9, atol=1e-9)
@@ -172,7 +194,8 @@ def test_a_lazy_channel_is_read_in_parts():
     assert min(low for low, _ in read) >= 39_000
 
 
-# ------------------------------------------------------------------------------------------------------------ the diagnosis
+# ------------------------------------------------------------------------------------------------------------
+# the diagnosis
 
 
 def kicked(skew: float, *, size: int = 60_000) -> xr.Dataset:
@@ -197,16 +220,22 @@ def test_a_ramp_of_another_file_reaches_the_search():
     assert {one.view for one in found if one.effect == "feedback_reset"} >= {"phase_locked"}
     profile = reduced["profile"].mean("block").values[0]
     late = 4.17 / RATE / 3.0  # turns between a sample and its value of the ramp
-    assert profile[-2:].mean() - profile[2:36].mean() == pytest.approx(2.0 * (1.0 - late / 0.05), abs=0.15)
+    assert profile[-2:].mean() - profile[2:36].mean() == pytest.approx(
+        2.0 * (1.0 - late / 0.05), abs=0.15
+    )
 
 
 def test_the_reason_of_an_effect_names_the_channel_that_is_not_used():
     log = kicked(0.0)
-    slow = with_channel(log.drop_vars(["ramp", "time_ramp"]), "ramp", np.arange(0.0, 600.0, 0.5), np.zeros(1200))
+    slow = with_channel(
+        log.drop_vars(["ramp", "time_ramp"]), "ramp", np.arange(0.0, 600.0, 0.5), np.zeros(1200)
+    )
     reduced, found, reasons = candidates_of(slow)
     assert "the channel ramp is not used: it is sampled at 2 Hz" in reasons["feedback_reset"]
     assert "no channel temperature" in reasons["shupe"]
-    (one,) = unused_channels(reduced, {name for each in found for name in (*each.driver, *each.witness)})
+    (one,) = unused_channels(
+        reduced, {name for each in found for name in (*each.driver, *each.witness)}
+    )
     assert one["name"] == "ramp"
 
 
@@ -214,15 +243,32 @@ def test_the_reason_of_an_effect_names_the_channel_that_is_not_used():
     ("name", "unit", "values", "reason"),
     [
         ("temperature", "degree_Celsius", np.full(600, 20.0), "does not change"),
-        ("temperature", "V", np.arange(600.0), "its unit is 'V', and effects need 'degree_Celsius'"),
-        ("humidity", "1", np.arange(600.0), "no effect follows a channel of this name, and it is too slow"),
-        ("temperature", "degree_Celsius", np.where(np.arange(600) < 200, np.arange(600.0), np.nan), "% of the blocks, and 50% are needed"),
+        (
+            "temperature",
+            "V",
+            np.arange(600.0),
+            "its unit is 'V', and effects need 'degree_Celsius'",
+        ),
+        (
+            "humidity",
+            "1",
+            np.arange(600.0),
+            "no effect follows a channel of this name, and it is too slow",
+        ),
+        (
+            "temperature",
+            "degree_Celsius",
+            np.where(np.arange(600) < 200, np.arange(600.0), np.nan),
+            "% of the blocks, and 50% are needed",
+        ),
     ],
 )
 def test_every_channel_that_is_not_used_is_named(name: str, unit: str, values: Any, reason: str):
     log = with_channel(log_of(60_000), name, np.arange(600.0), values, unit)
     reduced, found, reasons = candidates_of(log)
-    (one,) = unused_channels(reduced, {each for candidate in found for each in (*candidate.driver, *candidate.witness)})
+    (one,) = unused_channels(
+        reduced, {each for candidate in found for each in (*candidate.driver, *candidate.witness)}
+    )
     assert one["name"] == name
     assert reason in one["reason"]
     if name == "temperature" and "change" not in reason:
@@ -234,14 +280,20 @@ def test_a_seismometer_on_its_own_stamps_is_compared_sample_by_sample():
     ground = np.random.default_rng(4).standard_normal(60_000)
     log["rate"] = log["rate"] + ground
     log["rate"].attrs["units"] = "degree hour-1"
-    reduced, found, _ = candidates_of(with_channel(log, "seismometer_z", (np.arange(60_000) + 0.37) / RATE, ground))
-    assert ("real_motion", ("seismometer_z",)) in {(one.effect, one.witness) for one in found if one.view == "transfer"}
+    reduced, found, _ = candidates_of(
+        with_channel(log, "seismometer_z", (np.arange(60_000) + 0.37) / RATE, ground)
+    )
+    assert ("real_motion", ("seismometer_z",)) in {
+        (one.effect, one.witness) for one in found if one.view == "transfer"
+    }
     assert unused_channels(reduced, {"seismometer_z"}) == []
 
 
 def test_the_diagnosis_says_which_channels_it_used(recwarn: pytest.WarningsRecorder):
     log = with_channel(kicked(1 / 3, size=30_000), "humidity", np.arange(300.0), np.arange(300.0))
-    with pytest.warns(UserWarning, match=r"channel ramp: its stamps are 3\.33 ms after those of the gyro"):
+    with pytest.warns(
+        UserWarning, match=r"channel ramp: its stamps are 3\.33 ms after those of the gyro"
+    ):
         found = gyrostab.diagnose(log, nulls=100)
     assert found.effects[0]["name"] == "feedback_reset"
     assert [one["name"] for one in found.content["unused_channels"]] == ["humidity"]
@@ -250,8 +302,16 @@ def test_the_diagnosis_says_which_channels_it_used(recwarn: pytest.WarningsRecor
 
 def test_one_file_a_channel_is_diagnosed_like_one_file_for_all(recordings: Callable[[str], Path]):
     """The real ramp of a fibre-optic gyro, in a file of its own."""
-    path, ramp = recordings("fog-blueseis-ramp/FOG.mseed"), recordings("fog-blueseis-ramp/RAMP.mseed")
-    raw = gyrostab.read_log([path], channel=[ramp], map={"HJ3": "gyro_z", "YR3": "ramp"}, unit={"gyro": "1 nrad/s", "ramp": "1"})
+    path, ramp = (
+        recordings("fog-blueseis-ramp/FOG.mseed"),
+        recordings("fog-blueseis-ramp/RAMP.mseed"),
+    )
+    raw = gyrostab.read_log(
+        [path],
+        channel=[ramp],
+        map={"HJ3": "gyro_z", "YR3": "ramp"},
+        unit={"gyro": "1 nrad/s", "ramp": "1"},
+    )
     aligned = align_channels(gyrostab.regularise(raw))
     assert aligned.log["ramp"].dims == ("time",)
     turns = reduce_log(aligned.log.isel(time=slice(0, 12_000)))["ramp_turns"].values

@@ -19,11 +19,19 @@ from gyrostab.simulate import simulate
 RATE = 100.0
 
 
-def log_of(values: np.ndarray, *, rate: float = RATE, channels: dict[str, tuple[np.ndarray, str]] | None = None, **options) -> xr.Dataset:
+def log_of(
+    values: np.ndarray,
+    *,
+    rate: float = RATE,
+    channels: dict[str, tuple[np.ndarray, str]] | None = None,
+    **options,
+) -> xr.Dataset:
     return make_log(np.atleast_2d(values), rate=rate, unit="deg/h", channels=channels, **options)
 
 
-def with_gaps(values: np.ndarray, kind: str, rng: np.random.Generator, size: int = 400) -> np.ndarray:
+def with_gaps(
+    values: np.ndarray, kind: str, rng: np.random.Generator, size: int = 400
+) -> np.ndarray:
     """Samples lost at random, or in one stretch of every block."""
     values = values.copy()
     if kind == "random":
@@ -35,11 +43,17 @@ def with_gaps(values: np.ndarray, kind: str, rng: np.random.Generator, size: int
     return values
 
 
-# ------------------------------------------------------------------------------------------------------------- the spectrum
+# -------------------------------------------------------------------------------------------------------------
+# the spectrum
 
 
 @settings(max_examples=12, deadline=None)
-@given(seed=st.integers(0, 2**31), size=st.sampled_from([96, 100, 135]), lost=st.floats(0.0, 0.6), offset=st.floats(-1e5, 1e5))
+@given(
+    seed=st.integers(0, 2**31),
+    size=st.sampled_from([96, 100, 135]),
+    lost=st.floats(0.0, 0.6),
+    offset=st.floats(-1e5, 1e5),
+)
 def test_powers_are_the_sums_of_their_definition(seed: int, size: int, lost: float, offset: float):
     rng = np.random.default_rng(seed)
     x = rng.standard_normal((2, 24 * size)) + offset
@@ -55,7 +69,10 @@ def test_powers_are_the_sums_of_their_definition(seed: int, size: int, lost: flo
             continue
         mean = part[row][there].mean()
         # every ordinate is a sum c . y over the samples; the mean is in c
-        c = angle[:, there] * weights[there] - (angle[:, there] @ weights[there])[:, None] / there.sum()
+        c = (
+            angle[:, there] * weights[there]
+            - (angle[:, there] @ weights[there])[:, None] / there.sum()
+        )
         ordinate, expected = c @ (part[row][there] - mean), (np.abs(c) ** 2).sum(axis=1)
         for band in range(edges.size - 1):
             k = slice(edges[band], edges[band + 1])
@@ -86,13 +103,20 @@ def test_white_noise_has_its_density_and_the_gamma_distribution_of_the_shape(gap
     spread = ((power - 1.0) ** 2 * shape).mean(axis=0)  # 1 for a gamma distribution of this shape
     assert np.all(np.abs(spread - 1.0) < 0.13)
     for band in range(3, power.shape[1]):
-        assert stats.kstest(stats.gamma.cdf(power[:, band] * shape[:, band], shape[:, band]), "uniform").pvalue > 1e-4
+        assert (
+            stats.kstest(
+                stats.gamma.cdf(power[:, band] * shape[:, band], shape[:, band]), "uniform"
+            ).pvalue
+            > 1e-4
+        )
 
 
 def test_bands_share_scatter_as_the_taper_says():
     size, blocks = 50, 40_000
     x = np.random.default_rng(4).standard_normal((blocks, size))
-    spectrum = np.fft.rfft((x - x.mean(axis=1, keepdims=True)) * taper(size), axis=1)[:, 1 : ordinates(size) + 1]
+    spectrum = np.fft.rfft((x - x.mean(axis=1, keepdims=True)) * taper(size), axis=1)[
+        :, 1 : ordinates(size) + 1
+    ]
     power = np.add.reduceat(np.abs(spectrum) ** 2, band_edges(size)[:-1] - 1, axis=1)
     found = np.cov((power / power.mean(axis=0)).T)
     scatter = np.sqrt(np.outer(np.diag(found), np.diag(found)) / blocks)
@@ -102,16 +126,24 @@ def test_bands_share_scatter_as_the_taper_says():
 
 
 def test_whole_blocks_lose_little_to_the_taper():
-    reduced = reduce_log(log_of(np.random.default_rng(0).standard_normal(40_000)), block="1000samples")
+    reduced = reduce_log(
+        log_of(np.random.default_rng(0).standard_normal(40_000)), block="1000samples"
+    )
     widths = np.diff(band_edges(1000))
     share = reduced["shape"].values[0, 0] / widths
     assert np.all((share > 0.8) & (share <= 1.0))
     assert reduced.neighbours.values == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize(("noise", "tolerance"), [({"Q": 5.0}, 0.05), ({"N": 0.003, "K": 5.0}, 0.12)])
-def test_densities_through_random_gaps_are_mixed_by_the_share_of_neighbours(noise: dict[str, float], tolerance: float):
-    log = simulate({"noise": noise, "log": {"axes": ["x"]}}, duration="2h", rate=50.0, seed=8).compute()
+@pytest.mark.parametrize(
+    ("noise", "tolerance"), [({"Q": 5.0}, 0.05), ({"N": 0.003, "K": 5.0}, 0.12)]
+)
+def test_densities_through_random_gaps_are_mixed_by_the_share_of_neighbours(
+    noise: dict[str, float], tolerance: float
+):
+    log = simulate(
+        {"noise": noise, "log": {"axes": ["x"]}}, duration="2h", rate=50.0, seed=8
+    ).compute()
     lost = np.random.default_rng(1).random(log.rate.shape) < 0.4
     reduced = reduce_log(log.assign(rate=log.rate.where(~lost)), block="10s")
     f = reduced.frequency.values
@@ -140,7 +172,9 @@ def test_a_sine_lands_in_its_band_and_on_its_line():
     power, width = reduced.power.values[0], (reduced.band_high - reduced.band_low).values
     band = int(np.searchsorted(reduced.band_low.values, 13.0) - 1)
     assert np.all(np.argmax(power, axis=1) == band)
-    assert power[:, band] * width[band] * 2.0 == pytest.approx(2.0, rel=0.1)  # a square of 2**2 / 2, less or more by the taper's shape
+    assert power[:, band] * width[band] * 2.0 == pytest.approx(
+        2.0, rel=0.1
+    )  # a square of 2**2 / 2, less or more by the taper's shape
     lines = reduced.line_power.values[0]
     assert lines.shape[0] == 8
     assert np.all(reduced.line_frequency.values[np.argmax(lines, axis=1)] == 13.0)
@@ -164,7 +198,10 @@ def test_what_axes_and_channels_share_is_in_their_cross_spectra(gaps: str):
     x = np.stack([with_gaps(row, gaps, rng) for row in x])
     witness = with_gaps(witness, gaps, rng)
     reduced = reduce_log(log_of(x, channels={"accel_x": (witness, "g")}), block="500samples")
-    assert [(str(a), str(b)) for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)] == [
+    assert [
+        (str(a), str(b))
+        for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)
+    ] == [
         ("x", "y"),
         ("x", "z"),
         ("y", "z"),
@@ -175,10 +212,13 @@ def test_what_axes_and_channels_share_is_in_their_cross_spectra(gaps: str):
     assert np.abs(np.mean(cross[:, -6:], axis=1)[1:]).max() < 0.02
     coupling = (reduced.witness_cross.sel(axis="x", witness="accel_x").mean("block") * RATE).values
     assert np.mean(coupling[-6:]) == pytest.approx(0.5, abs=0.02)
-    assert (reduced.witness_power.mean("block").values[0] * RATE)[-6:] == pytest.approx(1.01, abs=0.03)
+    assert (reduced.witness_power.mean("block").values[0] * RATE)[-6:] == pytest.approx(
+        1.01, abs=0.03
+    )
 
 
-# ------------------------------------------------------------------------------------------------- what is locked, and counts
+# -------------------------------------------------------------------------------------------------
+# what is locked, and counts
 
 
 def test_orders_are_the_amplitudes_that_turn_with_the_tool():
@@ -186,7 +226,11 @@ def test_orders_are_the_amplitudes_that_turn_with_the_tool():
     seconds = np.arange(size) / RATE
     speed = 90.0 + 40.0 * np.sin(2 * np.pi * seconds / 300.0)  # deg/s
     turns = (np.cumsum(speed) - speed / 2.0) / 360.0 / RATE
-    x = 5.0 * np.cos(2 * np.pi * turns + 0.7) + 2.0 * np.cos(6 * np.pi * turns - 1.0) + 0.5 * rng.standard_normal(size)
+    x = (
+        5.0 * np.cos(2 * np.pi * turns + 0.7)
+        + 2.0 * np.cos(6 * np.pi * turns - 1.0)
+        + 0.5 * rng.standard_normal(size)
+    )
     x[rng.random(size) < 0.2] = np.nan
     reduced = reduce_log(log_of(x, channels={"rotation_rate": (speed, "deg/s")}), block="20s")
     order = reduced.order.values[0]
@@ -200,7 +244,13 @@ def test_orders_follow_a_rotation_sensor_with_its_own_slower_time_and_are_silent
         "noise": {"N": 1e-4},
         "log": {"axes": ["x", "y"]},
         "effect": [{"name": "earth_rate", "latitude": 45.0}],
-        "environment": [{"profile": "rotation", "points": [[0, 0], [590, 0], [600, 360], [1200, 360]], "sensor_rate": 10}],
+        "environment": [
+            {
+                "profile": "rotation",
+                "points": [[0, 0], [590, 0], [600, 360], [1200, 360]],
+                "sensor_rate": 10,
+            }
+        ],
     }
     log = simulate(model, duration="20min", rate=RATE, seed=1).compute()
     reduced = reduce_log(log, block="20s")
@@ -225,7 +275,8 @@ def test_a_profile_shows_the_error_by_phase_of_the_ramp():
     assert profile == pytest.approx(np.where(reduced.phase.values > 0.75, 3.0, -1.0), abs=0.15)
 
 
-# -------------------------------------------------------------------------------------------------------- channels and spans
+# --------------------------------------------------------------------------------------------------------
+# channels and spans
 
 
 def test_channels_are_averaged_over_blocks_whatever_their_own_time():
@@ -233,8 +284,20 @@ def test_channels_are_averaged_over_blocks_whatever_their_own_time():
         "noise": {"N": 0.01},
         "log": {"axes": ["x"]},
         "environment": [
-            {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": [[0, 20], [1200, 60]], "sensor_rate": 0.1},
-            {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": [[0, 28], [600, 24]], "sensor_rate": 2.0},
+            {
+                "profile": "ramps",
+                "channel": "temperature",
+                "unit": "degC",
+                "points": [[0, 20], [1200, 60]],
+                "sensor_rate": 0.1,
+            },
+            {
+                "profile": "steps",
+                "channel": "supply_voltage",
+                "unit": "V",
+                "points": [[0, 28], [600, 24]],
+                "sensor_rate": 2.0,
+            },
         ],
     }
     log = simulate(model, duration="20min", rate=RATE, seed=1).compute()
@@ -245,7 +308,9 @@ def test_channels_are_averaged_over_blocks_whatever_their_own_time():
     assert warm.attrs["units"] == "degree_Celsius"
     assert np.isfinite(warm.values[:-2]).all()  # the last sample of the sensor lies before the end
     assert warm.values[:-2] == pytest.approx(20.0 + centre[:-2] / 30.0, abs=0.1)
-    assert reduced.channel_supply_voltage.values == pytest.approx(np.where(centre < 600, 28.0, 24.0))
+    assert reduced.channel_supply_voltage.values == pytest.approx(
+        np.where(centre < 600, 28.0, 24.0)
+    )
     assert reduced.channel_vibration.values == pytest.approx(np.sqrt(12.5))
 
 
@@ -274,7 +339,9 @@ def test_temperatures_keep_their_course_inside_of_blocks_and_lose_their_noise(ow
     assert error.std() < 0.6 * raw
     assert "fine_temperature_2" not in reduced  # slower than the parts
     parts = true.reshape(*fine.shape, -1).mean(axis=2)
-    np.testing.assert_allclose(reduced.fine_supply_voltage.values, parts, atol=0.05)  # a supply as well, but for its corners
+    np.testing.assert_allclose(
+        reduced.fine_supply_voltage.values, parts, atol=0.05
+    )  # a supply as well, but for its corners
 
 
 def test_a_channel_that_falls_silent_is_missing_there():
@@ -295,8 +362,13 @@ def test_long_gaps_and_restarts_are_listed_in_seconds():
     x[0, 30_000:32_000] = np.nan  # one axis only
     x[:, 39_950:41_000] = np.nan  # over the edge of a block
     reduced = reduce_log(log_of(x), block="10s")
-    assert np.stack([reduced.gap_begin, reduced.gap_end], axis=1).tolist() == [[200.0, 203.0], [399.5, 410.0]]
-    assert np.stack([reduced.restart_begin, reduced.restart_end], axis=1).tolist() == [[399.5, 410.0]]
+    assert np.stack([reduced.gap_begin, reduced.gap_end], axis=1).tolist() == [
+        [200.0, 203.0],
+        [399.5, 410.0],
+    ]
+    assert np.stack([reduced.restart_begin, reduced.restart_end], axis=1).tolist() == [
+        [399.5, 410.0]
+    ]
     assert reduced.samples.values[0, 30:32].tolist() == [0, 0]
     assert np.isnan(reduced["mean"].values[0, 30:32]).all()
     assert np.isfinite(reduced["mean"].values[1, 30:32]).all()
@@ -304,7 +376,11 @@ def test_long_gaps_and_restarts_are_listed_in_seconds():
 
 
 def test_restarts_that_the_log_tells_are_taken():
-    model = {"noise": {"N": 0.01}, "log": {"axes": ["x"]}, "environment": [{"profile": "power_cuts", "cuts": [[300, 302], [900, 930]]}]}
+    model = {
+        "noise": {"N": 0.01},
+        "log": {"axes": ["x"]},
+        "environment": [{"profile": "power_cuts", "cuts": [[300, 302], [900, 930]]}],
+    }
     log = simulate(model, duration="20min", rate=10.0, seed=1)
     reduced = reduce_log(log)
     assert reduced.restart_begin.values == pytest.approx([300.0, 900.0])
@@ -322,7 +398,9 @@ def test_chunks_change_nothing(chunk: int, seed: int):
     whole, cut = reduce_log(log), reduce_log(log.chunk(time=chunk))
     for name in whole.variables:
         if whole[name].dtype.kind in "fc":
-            np.testing.assert_allclose(cut[name].values, whole[name].values, rtol=1e-9, atol=1e-12, err_msg=str(name))
+            np.testing.assert_allclose(
+                cut[name].values, whole[name].values, rtol=1e-9, atol=1e-12, err_msg=str(name)
+            )
         else:
             assert whole[name].identical(cut[name]), name
 
@@ -336,7 +414,8 @@ def test_an_angle_log_is_that_of_its_rates():
     assert other["mean"].values == pytest.approx(one["mean"].values, abs=1e-6)
 
 
-# -------------------------------------------------------------------------------------------------------------------- manners
+# --------------------------------------------------------------------------------------------------------------------
+# manners
 
 
 def test_blocks_suit_the_length_of_the_record():
@@ -357,9 +436,14 @@ def test_a_record_that_is_too_short_is_told_how_long_it_must_be():
 
 
 def test_a_single_name_of_a_file_stays_whole():
-    log = log_of(np.random.default_rng(1).standard_normal(24 * 100)).assign_attrs(source_files="run7.csv", notes="after a repair")
+    log = log_of(np.random.default_rng(1).standard_normal(24 * 100)).assign_attrs(
+        source_files="run7.csv", notes="after a repair"
+    )
     reduced = reduce_log(log)
-    assert (reduced.attrs["source_files"], reduced.attrs["notes"]) == (["run7.csv"], ["after a repair"])
+    assert (reduced.attrs["source_files"], reduced.attrs["notes"]) == (
+        ["run7.csv"],
+        ["after a repair"],
+    )
 
 
 def test_what_is_no_log_is_refused():
@@ -369,5 +453,8 @@ def test_what_is_no_log_is_refused():
 
 def test_progress_reaches_its_end():
     told = []
-    reduce_log(log_of(np.random.default_rng(0).standard_normal((3, 50_000))), progress=lambda *given: told.append(given))
+    reduce_log(
+        log_of(np.random.default_rng(0).standard_normal((3, 50_000))),
+        progress=lambda *given: told.append(given),
+    )
     assert told[-1][2] == told[-1][1] > 0.98 * 3 * 50_000

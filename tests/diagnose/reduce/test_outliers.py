@@ -22,7 +22,9 @@ def counted(x: np.ndarray, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
 
 
 def total(make, records: int = 20) -> int:
-    return sum(int(counted(make(np.random.default_rng([7, seed])))[0].sum()) for seed in range(records))
+    return sum(
+        int(counted(make(np.random.default_rng([7, seed])))[0].sum()) for seed in range(records)
+    )
 
 
 def slow(rng: np.random.Generator) -> np.ndarray:
@@ -36,7 +38,8 @@ def spiked(rng: np.random.Generator, size: float, number: int) -> np.ndarray:
     return x
 
 
-# ---------------------------------------------------------------------------------------------------------------- departures
+# ----------------------------------------------------------------------------------------------------------------
+# departures
 
 
 @settings(max_examples=25, deadline=None)
@@ -47,7 +50,12 @@ def test_a_departure_is_from_the_median_of_the_pairs_about_a_sample(seed: int, l
     x[rng.random(x.shape) < lost] = np.nan
     away, histogram = np.empty_like(x), np.zeros((2, HISTOGRAM), np.uint32)
     departures(x, away, histogram)
-    smaller = {1: 0.5, 2: 0.2982, 3: 0.2147, 4: 0.1682}  # variance of the median of so many pairs of normal numbers
+    smaller = {
+        1: 0.5,
+        2: 0.2982,
+        3: 0.2147,
+        4: 0.1682,
+    }  # variance of the median of so many pairs of normal numbers
     checked = 0
     for b, i in np.ndindex(*x.shape):
         pairs = [(x[b, i - k], x[b, i + k]) for k in range(1, 5) if i - k >= 0 and i + k < 60]
@@ -78,14 +86,19 @@ def test_a_slope_departs_nowhere_and_a_spike_only_where_it_is():
     away = np.empty_like(x)
     departures(x, away, np.zeros((2, HISTOGRAM), np.uint32))
     np.testing.assert_allclose(away[0], 0.0, atol=1e-9)
-    np.testing.assert_array_equal(np.flatnonzero(np.abs(away[1]) > 20.0), [0, 50, 99])  # beside it medians are off by some steps
+    np.testing.assert_array_equal(
+        np.flatnonzero(np.abs(away[1]) > 20.0), [0, 50, 99]
+    )  # beside it medians are off by some steps
 
 
-# -------------------------------------------------------------------------------------------------------------------- counts
+# --------------------------------------------------------------------------------------------------------------------
+# counts
 
 
 def test_gaussian_noise_has_no_more_than_chance():
-    assert total(lambda rng: rng.standard_normal(SIZE), 40) <= 40 * CHANCE + 3.0 * np.sqrt(40 * CHANCE)
+    assert total(lambda rng: rng.standard_normal(SIZE), 40) <= 40 * CHANCE + 3.0 * np.sqrt(
+        40 * CHANCE
+    )
 
 
 @pytest.mark.parametrize(("size", "least"), [(5.0, 0.2), (6.0, 0.5), (8.0, 0.9)])
@@ -105,16 +118,32 @@ def test_one_that_is_far_counts_three_times_wherever_in_a_block():
 TIME = np.arange(SIZE) / RATE
 LIVELY = {
     "twice as loud for a while": lambda rng: slow(rng) * np.where(TIME % 300.0 < 70.0, 2.0, 1.0),
-    "five times as loud, from within a block": lambda rng: slow(rng) * np.where(TIME % 300.0 < 77.3, 5.0, 1.0),
-    "swelling within seconds": lambda rng: slow(rng) * np.exp(0.4 * np.sin(2.0 * np.pi * TIME / 3.1)),
-    "swelling at random": lambda rng: slow(rng) * np.exp(0.2 * np.convolve(rng.standard_normal(SIZE + 9), np.ones(10) / 10**0.5, "valid")),
-    "a line that beats": lambda rng: slow(rng) + 3.0 * np.sin(13.2 * TIME) * (1.0 + 0.5 * np.sin(0.9 * TIME)),
-    "steps": lambda rng: slow(rng) + 20.0 * np.cumsum((rng.random(SIZE) < 20.0 / SIZE) * rng.choice([-1.0, 1.0], SIZE)),
+    "five times as loud, from within a block": lambda rng: (
+        slow(rng) * np.where(TIME % 300.0 < 77.3, 5.0, 1.0)
+    ),
+    "swelling within seconds": lambda rng: (
+        slow(rng) * np.exp(0.4 * np.sin(2.0 * np.pi * TIME / 3.1))
+    ),
+    "swelling at random": lambda rng: (
+        slow(rng)
+        * np.exp(0.2 * np.convolve(rng.standard_normal(SIZE + 9), np.ones(10) / 10**0.5, "valid"))
+    ),
+    "a line that beats": lambda rng: (
+        slow(rng) + 3.0 * np.sin(13.2 * TIME) * (1.0 + 0.5 * np.sin(0.9 * TIME))
+    ),
+    "steps": lambda rng: (
+        slow(rng)
+        + 20.0 * np.cumsum((rng.random(SIZE) < 20.0 / SIZE) * rng.choice([-1.0, 1.0], SIZE))
+    ),
     "few levels": lambda rng: np.round(slow(rng) / 3.0) * 3.0,
-    "angles in counts": lambda rng: np.diff(np.round(np.cumsum(np.append(0.0, slow(rng))) / 3.0)) * 3.0,
+    "angles in counts": lambda rng: (
+        np.diff(np.round(np.cumsum(np.append(0.0, slow(rng))) / 3.0)) * 3.0
+    ),
     "a moving mean": lambda rng: np.convolve(slow(rng), np.ones(3) / 3.0, "same"),
     "single samples lost": lambda rng: np.where(rng.random(SIZE) < 0.3, np.nan, slow(rng)),
-    "held": lambda rng: np.where(np.arange(SIZE) % 97 < 5, slow(rng)[np.arange(SIZE) // 97 * 97], slow(rng)),
+    "held": lambda rng: np.where(
+        np.arange(SIZE) % 97 < 5, slow(rng)[np.arange(SIZE) // 97 * 97], slow(rng)
+    ),
 }
 
 
@@ -131,7 +160,10 @@ def test_bursts_of_noise_are_no_spikes(samples, louder):
             loud[first : first + samples] = louder
         return slow(rng) * loud
 
-    jumping = [int((np.abs(x) > 5.0).sum()) for x in (make(np.random.default_rng([7, seed])) for seed in range(8))]
+    jumping = [
+        int((np.abs(x) > 5.0).sum())
+        for x in (make(np.random.default_rng([7, seed])) for seed in range(8))
+    ]
     assert total(make, 8) < max(12, 0.02 * sum(jumping))
 
 

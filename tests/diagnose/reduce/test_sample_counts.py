@@ -89,8 +89,15 @@ def test_held_samples_do_not_make_outliers_of_the_others():
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**31), step=st.floats(0.01, 3.0), offset=st.floats(-5e4, 5e4), single=st.booleans())
-def test_the_lattice_is_found_whatever_its_offset(seed: int, step: float, offset: float, single: bool):
+@given(
+    seed=st.integers(0, 2**31),
+    step=st.floats(0.01, 3.0),
+    offset=st.floats(-5e4, 5e4),
+    single=st.booleans(),
+)
+def test_the_lattice_is_found_whatever_its_offset(
+    seed: int, step: float, offset: float, single: bool
+):
     noise = np.random.default_rng(seed).standard_normal(8000)
     values = np.round(noise / step) * step + offset
     values = values.astype(np.float32).astype(np.float64) if single else values
@@ -105,5 +112,7 @@ def test_the_lattice_shows_where_spikes_off_it_are_as_common_as_its_rare_levels(
     values = np.round(rng.standard_normal(4000) / 0.1) * 0.1
     off = np.concatenate([values[:12] + 7.03, np.full(8, 6.777)])
     assert quantization_step(np.concatenate([values, off])) == pytest.approx(0.1, rel=1e-9)
-    half = np.where(np.arange(4000) < 2000, values, rng.standard_normal(4000))  # half of the values have none
+    half = np.where(
+        np.arange(4000) < 2000, values, rng.standard_normal(4000)
+    )  # half of the values have none
     assert quantization_step(half) == 0.0

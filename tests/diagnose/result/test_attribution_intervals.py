@@ -16,7 +16,11 @@ from tests.support.named import COEFFICIENT, WORLD, record
 
 @pytest.fixture(scope="module")
 def turning():
-    speed = {"profile": "rotation", "points": [[0, 0], [1200, 0], [1210, 180], [2500, 180], [2510, 60], [3600, 60]], "sensor_rate": 10.0}
+    speed = {
+        "profile": "rotation",
+        "points": [[0, 0], [1200, 0], [1210, 180], [2500, 180], [2510, 60], [3600, 60]],
+        "sensor_rate": 10.0,
+    }
     return record([], environment=(*WORLD["usual"], speed))
 
 
@@ -28,18 +32,30 @@ def claim(reduced, effect, view):
 
 
 def test_what_is_locked_to_the_rotation_acts_while_the_tool_turns(turning):
-    found = spans(active_spans(claim(turning, "rotation_line", "order"), turning), turning["begin"].values, turning["end"].values)
+    found = spans(
+        active_spans(claim(turning, "rotation_line", "order"), turning),
+        turning["begin"].values,
+        turning["end"].values,
+    )
     assert found == [(1200.0, 3600.0)]
 
 
 def test_what_stands_at_rest_as_well_acts_at_rest_as_well(turning):
     one = claim(turning, "earth_rate", "order")
     both = replace(one, parts=(*one.parts, *claim(turning, "earth_rate", "mean").parts))
-    assert spans(active_spans(both, turning), turning["begin"].values, turning["end"].values) == [(0.0, 3600.0)]
+    assert spans(active_spans(both, turning), turning["begin"].values, turning["end"].values) == [
+        (0.0, 3600.0)
+    ]
 
 
-def test_an_effect_of_a_channel_that_rests_less_than_half_of_the_time_acts_while_it_does_not_rest(turning):
-    (span,) = spans(active_spans(claim(turning, "scale_factor", "mean"), turning), turning["begin"].values, turning["end"].values)
+def test_an_effect_of_a_channel_that_rests_less_than_half_of_the_time_acts_while_it_does_not_rest(
+    turning,
+):
+    (span,) = spans(
+        active_spans(claim(turning, "scale_factor", "mean"), turning),
+        turning["begin"].values,
+        turning["end"].values,
+    )
     assert span == (1200.0, 3600.0)
 
 
@@ -50,4 +66,6 @@ def test_a_tenth_of_the_largest_counts_as_there(level, there):
     g[40:60], g[100:120] = 5.0, 5.0 * level
     shaken = reduced.assign(channel_vibration=reduced["channel_vibration"].copy(data=g))
     found = active_spans(claim(shaken, "vibration_rectification", "mean"), shaken)
-    np.testing.assert_array_equal(np.flatnonzero(found), [*range(40, 60), *(range(100, 120) if there else ())])
+    np.testing.assert_array_equal(
+        np.flatnonzero(found), [*range(40, 60), *(range(100, 120) if there else ())]
+    )

@@ -22,13 +22,23 @@ from gyrostab.diagnose.result.attribution_weights import needed
 from gyrostab.diagnose.statistics import mean
 from tests.support.named import COEFFICIENT, nulls, record
 
-NAMES = (("vibration_noise", "power", "white"), ("vibration_rectification", "mean", "sensitivity"), ("spikes", "marks", "outliers"))
+NAMES = (
+    ("vibration_noise", "power", "white"),
+    ("vibration_rectification", "mean", "sensitivity"),
+    ("spikes", "marks", "outliers"),
+)
 
 
 def _claim(candidates, effect, view, column):
     one = next(one for one in candidates if (one.effect, one.view) == (effect, view))
-    variant = next(one for one in one.variants if one.columns == (column,) and one.values.get("exponent", 1.0) == 1.0)
-    return Identification(effect, one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0)
+    variant = next(
+        one
+        for one in one.variants
+        if one.columns == (column,) and one.values.get("exponent", 1.0) == 1.0
+    )
+    return Identification(
+        effect, one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,21 +61,29 @@ def shaken():
     state = begin_state(changed, baseline)
     for claim in claims[::-1]:  # odd samples are named first
         state = condition_on(state, list(claim.parts))
-    naming = Identifications(claims, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed))
+    naming = Identifications(
+        claims, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed)
+    )
     return changed, baseline, naming, null_scores(baseline, chance)
 
 
 def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(shaken):
     reduced, baseline, naming, _ = shaken
     loud, bias, _ = naming.claims
-    whole, silent, level = (predicted(naming, baseline, left_out=out) for out in ([], [loud], [bias]))
+    whole, silent, level = (
+        predicted(naming, baseline, left_out=out) for out in ([], [loud], [bias])
+    )
     quiet = reduced["channel_vibration"].values < 1.0
     np.testing.assert_allclose(silent["known_mean"], whole["known_mean"])
     np.testing.assert_allclose(level["spectrum"], whole["spectrum"])
-    np.testing.assert_allclose(level["known_mean"], baseline["known_mean"].transpose("axis", "block"))
+    np.testing.assert_allclose(
+        level["known_mean"], baseline["known_mean"].transpose("axis", "block")
+    )
     np.testing.assert_allclose(silent["spectrum"][0][quiet], whole["spectrum"][0][quiet], rtol=0.02)
     ratio = (whole["spectrum"] / silent["spectrum"]).values[0, ~quiet, -1]
-    np.testing.assert_allclose(ratio, 1.0 + 0.05 * reduced["channel_vibration"].values[~quiet] ** 2, rtol=0.15)
+    np.testing.assert_allclose(
+        ratio, 1.0 + 0.05 * reduced["channel_vibration"].values[~quiet] ** 2, rtol=0.15
+    )
     np.testing.assert_allclose((silent["spectrum"] / baseline["spectrum"])[0], 1.0, atol=0.2)
 
 
@@ -75,8 +93,14 @@ def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
     after = predicted(naming, baseline)
 
     def told(view, **options):
-        lists = attribute_mismatches(found, naming.claims, reduced, after, null, level=0.005, **options)
-        return {frozenset(names) for box, names in zip(found["view"].values, lists, strict=True) if box == view}
+        lists = attribute_mismatches(
+            found, naming.claims, reduced, after, null, level=0.005, **options
+        )
+        return {
+            frozenset(names)
+            for box, names in zip(found["view"].values, lists, strict=True)
+            if box == view
+        }
 
     def without(out):
         return predicted(naming, baseline, left_out=out)
@@ -94,7 +118,9 @@ def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
     assert find_anomalous_blocks(spikes.parts[0], reduced).sum() == 2
     found = locate_mismatches(reduced, baseline, null)
     after = predicted(naming, baseline)
-    one = attribute_mismatches(found, [loud], reduced, after, null, level=0.005)  # the loudest two blocks are still there
+    one = attribute_mismatches(
+        found, [loud], reduced, after, null, level=0.005
+    )  # the loudest two blocks are still there
     both = attribute_mismatches(found, naming.claims, reduced, after, null, level=0.005)
     davar = found["view"].values.tolist().index("davar")
     assert (one[davar], "vibration_noise" in both[davar]) == ([], True)
@@ -106,20 +132,36 @@ def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
     _, baseline, _, null = shaken
     reduced = record([])
     after_it = reduced["begin"].values >= 1800.0
-    moved = reduced.assign(mean=reduced["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it]))
+    moved = reduced.assign(
+        mean=reduced["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it])
+    )
     candidates, reasons = effect_candidates(moved, COEFFICIENT)
     one = next(one for one in candidates if (one.effect, one.view) == ("bias_jump", "mean"))
     variant = next(variant for variant in one.variants if variant.values["at"] == 1800.0)
-    claim = Identification("bias_jump", one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0)
+    claim = Identification(
+        "bias_jump", one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
+    )
     state = condition_on(begin_state(moved, baseline), list(claim.parts))
-    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(moved))
-    fields = {"view": "mean", "axes": "x", "what": "mean", "begin": 1200.0, "end": 1800.0, "tau_min_s": 20.0, "tau_max_s": 600.0}
+    naming = Identifications(
+        (claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(moved)
+    )
+    fields = {
+        "view": "mean",
+        "axes": "x",
+        "what": "mean",
+        "begin": 1200.0,
+        "end": 1800.0,
+        "tau_min_s": 20.0,
+        "tau_max_s": 600.0,
+    }
     fields |= {"frequency": np.nan, "sign": -1, "z": -8.0}
     box = xr.Dataset({name: ("mismatch", [value]) for name, value in fields.items()})
     assert mean.score(moved, baseline)["what"].values.tolist() == ["mean"]
 
     def explained(**options):
-        return attribute_mismatches(box, [claim], moved, predicted(naming, baseline), null, level=0.005, **options)[0]
+        return attribute_mismatches(
+            box, [claim], moved, predicted(naming, baseline), null, level=0.005, **options
+        )[0]
 
     assert explained() == []  # by its time alone
     assert explained(without=lambda out: predicted(naming, baseline, left_out=out)) == told
@@ -130,7 +172,10 @@ BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
 
 def _shown(*views):
     variant = SimpleNamespace(columns=("white",))
-    return [(f"effect {n}", [SimpleNamespace(candidate=SimpleNamespace(view=view), variant=variant)]) for n, view in enumerate(views)]
+    return [
+        (f"effect {n}", [SimpleNamespace(candidate=SimpleNamespace(view=view), variant=variant)])
+        for n, view in enumerate(views)
+    ]
 
 
 def _brought(**sizes):
@@ -152,15 +197,22 @@ def _brought(**sizes):
         ((0.0, 0.0), [0]),  # one of them does it for the two
     ],
 )
-def test_an_effect_is_needed_without_which_it_is_a_mismatch_or_that_brings_a_fair_share(sizes, kept):
+def test_an_effect_is_needed_without_which_it_is_a_mismatch_or_that_brings_a_fair_share(
+    sizes, kept
+):
     shown = _shown("power", "mean")
     found = needed(BOX, shown, _brought(effect_0=sizes[0], effect_1=sizes[1]))
     assert found == [f"effect {number}" for number in kept]
 
 
 def test_what_a_view_does_not_hold_stays():
-    assert needed(BOX | {"view": "spectrum"}, _shown("power", "line"), _brought(effect_0=0.0, effect_1=0.0)) == ["effect 0", "effect 1"]
-    assert needed(BOX, _shown("power", "wander"), _brought(effect_0=9.0, effect_1=0.0)) == ["effect 0", "effect 1"]
+    assert needed(
+        BOX | {"view": "spectrum"}, _shown("power", "line"), _brought(effect_0=0.0, effect_1=0.0)
+    ) == ["effect 0", "effect 1"]
+    assert needed(BOX, _shown("power", "wander"), _brought(effect_0=9.0, effect_1=0.0)) == [
+        "effect 0",
+        "effect 1",
+    ]
     low_pass = _shown("power", "power")
     low_pass[1][1][0].variant = SimpleNamespace(columns=())
     assert needed(BOX, low_pass, _brought(effect_0=9.0, effect_1=0.0)) == ["effect 0", "effect 1"]
@@ -168,7 +220,15 @@ def test_what_a_view_does_not_hold_stays():
 
 @pytest.mark.parametrize(("begin", "boxes"), [(70.0, 2), (85.0, 1)])
 def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near(begin, boxes):
-    long = {"view": "davar", "axes": "x y", "what": "level", "begin": 100.0, "end": 400.0, "tau_min_s": 0.01, "tau_max_s": 2.0}
+    long = {
+        "view": "davar",
+        "axes": "x y",
+        "what": "level",
+        "begin": 100.0,
+        "end": 400.0,
+        "tau_min_s": 0.01,
+        "tau_max_s": 2.0,
+    }
     long |= {"frequency": float("nan"), "sign": 1, "z": 90.0, "p_value": 1e-9}
     short = long | {"axes": "x", "begin": begin, "end": begin + 10.0, "z": 80.0}
     assert len(merge_regions([long, short])) == boxes
@@ -179,16 +239,27 @@ def test_a_line_on_two_axes_is_why_they_vary_together(shaken, axes, told):
     _, baseline, _, null = shaken
     quiet = record([])
     band = int(np.flatnonzero(quiet["band_low"].values < 2.0)[-1])
-    level = np.sqrt((baseline["spectrum"][0] * baseline["spectrum"][1]).transpose("block", "band").values[:, band])
+    level = np.sqrt(
+        (baseline["spectrum"][0] * baseline["spectrum"][1])
+        .transpose("block", "band")
+        .values[:, band]
+    )
     cross = quiet["cross"].transpose("pair", "block", "band").copy()
-    pair = [(str(a), str(b)) for a, b in zip(quiet["first"].values, quiet["second"].values, strict=True)].index(("x", "y"))
+    pair = [
+        (str(a), str(b)) for a, b in zip(quiet["first"].values, quiet["second"].values, strict=True)
+    ].index(("x", "y"))
     cross.values[pair, :, band] += 0.5 * level
     shared = quiet.assign(cross=cross)
     place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
     candidates, _ = effect_candidates(shared, COEFFICIENT)
     one = next(one for one in candidates if (one.effect, one.view) == ("spectral_line", "line"))
     claim = Identification(
-        "spectral_line", (), tuple(axes), tuple(Component(one, one.variants[0], (axis,), 50.0, place) for axis in axes), 50.0, 8.0
+        "spectral_line",
+        (),
+        tuple(axes),
+        tuple(Component(one, one.variants[0], (axis,), 50.0, place) for axis in axes),
+        50.0,
+        8.0,
     )
     found = locate_mismatches(shared, baseline, null)
     found = found.isel(mismatch=found["view"].values == "cross_axis")

@@ -16,7 +16,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.result.diagnosis import VERDICTS, Diagnosis, check_diagnosis, effect_table, model_text, plain
+from gyrostab.diagnose.result.diagnosis import (
+    VERDICTS,
+    Diagnosis,
+    check_diagnosis,
+    effect_table,
+    model_text,
+    plain,
+)
 from gyrostab.diagnose.result.text import (
     chance,
     clock,
@@ -43,7 +50,8 @@ def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 plain_pages = pytest.mark.usefixtures("without_figures")
 
-# ------------------------------------------------------------------------------------------------------------------- schema
+# -------------------------------------------------------------------------------------------------------------------
+# schema
 
 
 def test_what_is_made_by_hand_after_the_contract_passes():
@@ -52,7 +60,9 @@ def test_what_is_made_by_hand_after_the_contract_passes():
 
 
 def test_every_key_is_explained_on_the_page():
-    text = (Path(__file__).resolve().parents[3] / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[3] / "docs" / "diagnosis.md").read_text(
+        encoding="utf-8"
+    )
     section = text[text.index("## What stands in `diagnosis.json`") :].split("\n## ")[0]
     keys = {str(key) for place in _places(content()) for key in place[-1:] if isinstance(key, str)}
     assert keys > {"verdict", "held_out", "nats"}
@@ -62,9 +72,17 @@ def test_every_key_is_explained_on_the_page():
 def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Every key of the content, apart from what may have any name."""
     found = []
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    items = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     for key, item in items:
-        free = (place and place[-1] in ("noise", "parameters", "not_found")) or (len(place) > 1 and place[-2] == "noise")
+        free = (place and place[-1] in ("noise", "parameters", "not_found")) or (
+            len(place) > 1 and place[-2] == "noise"
+        )
         if isinstance(value, dict) and not free:
             found.append((*place, key))
         found += _places(item, (*place, key))
@@ -94,7 +112,10 @@ def test_nothing_may_be_left_out_or_be_of_another_kind(place: tuple[Any, ...]):
         (lambda c: c.update(schema="gyrostab.diagnosis/9"), "expected 'gyrostab.diagnosis/1'"),
         (lambda c: c["mismatches"][0].update(view="taste"), "view is 'taste'"),
         (lambda c: c["mismatches"][0].update(p_value=1.5), "no probability"),
-        (lambda c: c["mismatches"][0].update(explained_by=["shupe"]), "'shupe', which is not among the effects"),
+        (
+            lambda c: c["mismatches"][0].update(explained_by=["shupe"]),
+            "'shupe', which is not among the effects",
+        ),
         (lambda c: c["mismatches"][1].update(id=1), "each must be there once"),
         (lambda c: c["mismatches"][0].update(start="yesterday"), "no time of ISO 8601"),
         (lambda c: c.update(unexplained=[7]), "mismatch 7"),
@@ -110,7 +131,11 @@ def test_what_contradicts_itself_is_named(change, complaint: str):
 
 
 def test_json_knows_no_infinities():
-    assert json.loads(json.dumps(plain({"a": np.array([1.0, np.inf]), "b": np.bool_(True), "c": (np.float32(2),)}))) == {
+    assert json.loads(
+        json.dumps(
+            plain({"a": np.array([1.0, np.inf]), "b": np.bool_(True), "c": (np.float32(2),)})
+        )
+    ) == {
         "a": [1.0, None],
         "b": True,
         "c": [2.0],
@@ -120,7 +145,8 @@ def test_json_knows_no_infinities():
         broken.to_json()
 
 
-# -------------------------------------------------------------------------------------------------------------------- model
+# --------------------------------------------------------------------------------------------------------------------
+# model
 
 
 @pytest.mark.parametrize("name", list(effects()))
@@ -134,10 +160,17 @@ def test_every_effect_comes_back_from_its_table(name: str):
 @settings(max_examples=60, deadline=None)
 @given(
     noise=st.dictionaries(st.sampled_from("QNBK"), st.floats(0.0, 1e6), min_size=1),
-    axes=st.lists(st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=6), min_size=1, unique=True),
+    axes=st.lists(
+        st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=6),
+        min_size=1,
+        unique=True,
+    ),
 )
 def test_models_are_valid_toml_with_the_same_numbers(noise: dict[str, float], axes: list[str]):
-    tables = {"noise": {axis: noise for axis in axes}, "effect": [{"name": "warm_up", "axes": axes, "amplitude": 0.1}]}
+    tables = {
+        "noise": {axis: noise for axis in axes},
+        "effect": [{"name": "warm_up", "axes": axes, "amplitude": 0.1}],
+    }
     assert tomllib.loads(model_text(tables, heading="made\nby hand")) == tables
 
 
@@ -153,7 +186,8 @@ def test_the_model_runs(tmp_path: Path):
     assert loud.mean() - quiet.mean() == pytest.approx(0.0022 * (6.0**2 - 0.02**2), abs=0.06)
 
 
-# -------------------------------------------------------------------------------------------------------------------- files
+# --------------------------------------------------------------------------------------------------------------------
+# files
 
 
 @plain_pages
@@ -168,7 +202,9 @@ def test_a_folder_holds_the_four_files_and_comes_back(tmp_path: Path):
     assert again.model == made.model
     for name in made.surfaces.data_vars:
         np.testing.assert_array_equal(
-            again.surfaces[name].transpose(*made.surfaces[name].dims).values, made.surfaces[name].values, err_msg=str(name)
+            again.surfaces[name].transpose(*made.surfaces[name].dims).values,
+            made.surfaces[name].values,
+            err_msg=str(name),
         )
 
 
@@ -220,7 +256,8 @@ def test_what_is_no_diagnosis_is_said(tmp_path: Path, spoil: str):
         open_diagnosis(folder)
 
 
-# --------------------------------------------------------------------------------------------------------------------- page
+# ---------------------------------------------------------------------------------------------------------------------
+# page
 
 
 class Page(HTMLParser):
@@ -239,7 +276,9 @@ class Page(HTMLParser):
         given_attrs = dict(attrs)
         if tag not in ("meta", "img", "br"):
             self.open.append(tag)
-        self.addresses += [str(given_attrs[name]) for name in ("src", "href") if name in given_attrs]
+        self.addresses += [
+            str(given_attrs[name]) for name in ("src", "href") if name in given_attrs
+        ]
         if tag == "img":
             self.pictures.append(str(given_attrs["alt"]))
 
@@ -282,7 +321,12 @@ def test_the_page_says_what_where_when_how_much_how_sure_what_else_and_what_next
 
 @plain_pages
 def test_a_page_without_findings_says_so(tmp_path: Path):
-    nothing = content() | {"verdict": "no mismatch", "mismatches": [], "effects": [], "unexplained": []}
+    nothing = content() | {
+        "verdict": "no mismatch",
+        "mismatches": [],
+        "effects": [],
+        "unexplained": [],
+    }
     write_diagnosis_report(Diagnosis(nothing, surfaces(), {"noise": {}}), tmp_path / "report.html")
     text = " ".join(Page((tmp_path / "report.html").read_text(encoding="utf-8")).words)
     assert "nothing differs from the simulation" in text
@@ -301,13 +345,17 @@ def test_the_page_escapes_names(tmp_path: Path):
 def test_the_page_takes_any_number_of_axes(tmp_path: Path, axes: str):
     one = content()
     one["recording"]["axes"] = list(axes)
-    page = write_diagnosis_report(Diagnosis(one, surfaces(axes=axes), model()), tmp_path / "report.html")
+    page = write_diagnosis_report(
+        Diagnosis(one, surfaces(axes=axes), model()), tmp_path / "report.html"
+    )
     assert page.read_text(encoding="utf-8").count("<img") == 5
 
 
 def test_the_command_report_takes_the_folder_too(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     write_diagnosis(diagnosis(), tmp_path / "found")
-    assert call("report", tmp_path / "found", "-o", tmp_path / "again.html", "--quiet-progress") == 0
+    assert (
+        call("report", tmp_path / "found", "-o", tmp_path / "again.html", "--quiet-progress") == 0
+    )
     assert "Gyro diagnosis" in (tmp_path / "again.html").read_text(encoding="utf-8")
     capfd.readouterr()
     assert call("report", tmp_path / "found", "-o", tmp_path / "again.html") == 2
@@ -315,7 +363,8 @@ def test_the_command_report_takes_the_folder_too(tmp_path: Path, capfd: pytest.C
     assert call("report", tmp_path / "found", "-o", tmp_path / "other.html", "--log", "x.nc") == 2
 
 
-# ---------------------------------------------------------------------------------------------------------------- sentences
+# ----------------------------------------------------------------------------------------------------------------
+# sentences
 
 
 def test_every_effect_has_a_plain_name_and_a_next_measurement():
@@ -326,7 +375,9 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
     assert next_measurement("no_such_effect", []) == ""
 
 
-@pytest.mark.parametrize("view", ["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"])
+@pytest.mark.parametrize(
+    "view", ["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"]
+)
 @pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
 def test_every_view_has_a_sentence(view: str, axes: list[str]):
     box = {
@@ -366,7 +417,12 @@ def test_a_diagnosis_prints_its_verdict_and_sentences():
     text = str(diagnosis())
     assert text.startswith("explained: There are 2 places")
     assert "- vibration_noise: Vibration raises the noise" in text
-    assert make_effect({"name": "vibration_noise", "white": 0.00045, "axes": ["x"]}).say({"white": 2.25e-5}) in text
+    assert (
+        make_effect({"name": "vibration_noise", "white": 0.00045, "axes": ["x"]}).say(
+            {"white": 2.25e-5}
+        )
+        in text
+    )
 
 
 @plain_pages
@@ -374,9 +430,15 @@ def test_a_page_of_many_mismatches_gives_their_chance_in_a_column(tmp_path: Path
     """24 places: the words on chance are said once for all of them, and each has its number."""
     one = diagnosis()
     box = one.content["mismatches"][0] | {"p_value": 1e-12, "explained_by": []}
-    box["statement"] = "Axis x is noisier than simulated (noise alone does that in fewer than 1 of a million such records)."
+    box["statement"] = (
+        "Axis x is noisier than simulated (noise alone does that in fewer than 1 of a million such records)."
+    )
     boxes = [box | {"id": number} for number in range(1, 25)]
-    many = replace(one, content=one.content | {"mismatches": boxes, "unexplained": list(range(1, 25)), "effects": []})
+    many = replace(
+        one,
+        content=one.content
+        | {"mismatches": boxes, "unexplained": list(range(1, 25)), "effects": []},
+    )
     text = write_diagnosis_report(many, tmp_path / "page.html").read_text(encoding="utf-8")
     assert text.count("<td>fewer than 1 of a million</td>") == 24
     assert "noise alone does that" not in text
@@ -387,4 +449,7 @@ def test_effects_without_a_size_have_a_whole_sentence():
     motion = make_effect({"name": "real_motion", "x": 0.02, "axes": ["z"]})
     assert motion.say() == "The tool really rotates on axis z: tilt 0.02 mrad/g along x."
     text = unsized_statement("real_motion", ["x", "z"])
-    assert text == "The record shows real rotation of the tool, not a sensor error, on axes x and z. It does not give a size."
+    assert (
+        text
+        == "The record shows real rotation of the tool, not a sensor error, on axes x and z. It does not give a size."
+    )

@@ -98,7 +98,11 @@ def test_held_out_means_have_the_density_of_dense_algebra():
         for factor, sign in ((2.0, 1.0), (1.0, -1.0)):
             covariance = factor * VARIANCE * (np.eye(12) + 1.0 / rest.size)
             away = y - rest.mean()
-            dense += -0.5 * sign * (away @ np.linalg.solve(covariance, away) + np.linalg.slogdet(covariance)[1])
+            dense += (
+                -0.5
+                * sign
+                * (away @ np.linalg.solve(covariance, away) + np.linalg.slogdet(covariance)[1])
+            )
     assert seen == pytest.approx(dense, rel=1e-6)
 
 
@@ -121,7 +125,9 @@ def test_cross_spectra_have_the_density_of_the_wishart_law():
             w = np.array([[powers[0], c], [c.conjugate(), powers[1]]])
             n = found["shape"].values[0, block, band]
             for s, sign in ((model, 1.0), (LEVEL * np.eye(2), -1.0)):
-                expected -= sign * n * (np.linalg.slogdet(s)[1] + np.trace(np.linalg.solve(s, w)).real)
+                expected -= (
+                    sign * n * (np.linalg.slogdet(s)[1] + np.trace(np.linalg.solve(s, w)).real)
+                )
     assert seen == pytest.approx(expected, rel=1e-9)
     assert seen > 0.0
 
@@ -136,7 +142,9 @@ def test_models_never_see_what_they_are_judged_on():
 
     held_out(found, base, train)
     folds, forecast = seen[:4], seen[4]
-    assert np.sum([~known for known in folds], axis=0).tolist() == [1] * 180  # each block is held out once
+    assert (
+        np.sum([~known for known in folds], axis=0).tolist() == [1] * 180
+    )  # each block is held out once
     assert forecast[:126].all()
     assert not forecast[126:].any()
 
@@ -169,7 +177,11 @@ def test_a_slow_drift_in_a_random_walk_is_worth_more_on_long_stretches(period, b
 
     def on(length):
         fold = np.arange(180) // length % 4
-        return sum(log_likelihood(found, after, fold != k, fold == k) - log_likelihood(found, base, fold != k, fold == k) for k in range(4))
+        return sum(
+            log_likelihood(found, after, fold != k, fold == k)
+            - log_likelihood(found, base, fold != k, fold == k)
+            for k in range(4)
+        )
 
     gain = held_out(found, base, after)["log_likelihood_gain"]
     assert gain == pytest.approx(on(best))
@@ -198,7 +210,10 @@ def test_the_allan_variance_is_compared_with_the_model_that_is_shown():
     base, found = _record()
     _add_effects(found, epsilon=0.5)
     whole = _with_effects(base, epsilon=0.5)
-    seen, blind = held_out(found, base, base, more_gain=3.5, shown=whole), held_out(found, base, base, more_gain=3.5)
+    seen, blind = (
+        held_out(found, base, base, more_gain=3.5, shown=whole),
+        held_out(found, base, base, more_gain=3.5),
+    )
     assert seen["log_likelihood_gain"] == blind["log_likelihood_gain"] == pytest.approx(3.5)
     assert abs(seen["misfit_after"] - 1.0) < 0.3 * abs(blind["misfit_after"] - 1.0)
 
@@ -231,7 +246,9 @@ def test_surfaces_stand_side_by_side():
     assert surfaces["case"].values.tolist() == list(CASES)
     assert surfaces["avar"].dims == ("case", "axis", "window", "tau")
     quiet = surfaces.sel(case="before").isel(axis=2)
-    np.testing.assert_allclose(quiet["avar"].isel(window=0), LAWS["N"].avar(quiet["tau"].values, 0.003), rtol=0.02)
+    np.testing.assert_allclose(
+        quiet["avar"].isel(window=0), LAWS["N"].avar(quiet["tau"].values, 0.003), rtol=0.02
+    )
     recorded, after, before = (surfaces.sel(case=case) for case in CASES[:1] + CASES[:0:-1])
     inside = (recorded["avar"] > after["avar_low"]) & (recorded["avar"] < after["avar_high"])
     assert 0.92 < float(inside.where(recorded["avar"].notnull()).mean()) < 0.98
@@ -240,14 +257,23 @@ def test_surfaces_stand_side_by_side():
     assert float(before["avar"].isel(axis=0).where(during & low).mean() * 1.5) == pytest.approx(
         float(recorded["avar"].isel(axis=0).where(during & low).mean()), rel=0.03
     )
-    step = after["mean"].isel(axis=1).where(during).mean() - after["mean"].isel(axis=1).where(surfaces["end"] <= 1200.0).mean()
+    step = (
+        after["mean"].isel(axis=1).where(during).mean()
+        - after["mean"].isel(axis=1).where(surfaces["end"] <= 1200.0).mean()
+    )
     assert float(step) == pytest.approx(0.4, abs=1e-6)
     away = (recorded["mean"] - after["mean"]) / after["mean_stderr"]
     assert float((away**2).mean()) < 2.0
     # at the edge of the step the Allan variance of the known mean is in the expected one
-    edge = (surfaces["begin"] < 60 * BLOCK_S) & (surfaces["end"] > 60 * BLOCK_S) & (surfaces["end"] < 90 * BLOCK_S)
+    edge = (
+        (surfaces["begin"] < 60 * BLOCK_S)
+        & (surfaces["end"] > 60 * BLOCK_S)
+        & (surfaces["end"] < 90 * BLOCK_S)
+    )
     long = surfaces["tau"] >= BLOCK_S
-    assert float(after["avar"].isel(axis=1).where(edge & long).mean()) > 2.0 * float(before["avar"].isel(axis=1).where(edge & long).mean())
+    assert float(after["avar"].isel(axis=1).where(edge & long).mean()) > 2.0 * float(
+        before["avar"].isel(axis=1).where(edge & long).mean()
+    )
 
 
 def test_surfaces_of_a_long_record_stay_small():

@@ -25,10 +25,19 @@ GLITCHES = {"degree_Celsius": (-90.0, 180.0), "W": (1e-9, 10.0), "V": (0.0, 100.
 def recording(kind: Any, seed: int) -> xr.Dataset:
     """Half a minute at 10 Hz with all channels of an effect, a glitch in each."""
     rng = np.random.default_rng(seed)
-    log = simulate({"log": {"axes": list("xyz")}, "noise": {"N": 0.003}}, duration=SIZE / RATE, rate=RATE, seed=seed).compute()
+    log = simulate(
+        {"log": {"axes": list("xyz")}, "noise": {"N": 0.003}},
+        duration=SIZE / RATE,
+        rate=RATE,
+        seed=seed,
+    ).compute()
     for name, unit in kind.channels.items():
         usual = {"degree_Celsius": 50.0, "W": 1e-4, "V": 24.0}.get(unit, 0.0)
-        values = usual * (1.0 + 0.01 * rng.standard_normal(SIZE)) if usual else np.abs(rng.standard_normal(SIZE))
+        values = (
+            usual * (1.0 + 0.01 * rng.standard_normal(SIZE))
+            if usual
+            else np.abs(rng.standard_normal(SIZE))
+        )
         values[rng.integers(SIZE, size=2)] = GLITCHES.get(unit, (0.0, 1e3))
         log[name] = ("time", values, {"units": unit})
     return log
@@ -40,19 +49,27 @@ def simulated(name: str, scale: float, seed: int) -> xr.Dataset | None:
     known = {item.name: item for item in kind.parameters()}
     sizes: dict[str, Any] = {}
     for size in dict.fromkeys([*kind.required(), *kind.size_parameters]):
-        typical = float(np.ravel(known[size].typical if known[size].typical is not None else 1.0)[0])
+        typical = float(
+            np.ravel(known[size].typical if known[size].typical is not None else 1.0)[0]
+        )
         value = typical * (scale if size in kind.size_parameters else 1.0)
         sizes[size] = [value, -value] if known[size].many else value
     effect = _instance(kind, sizes, ("x", "y"), ())
     if effect is None:
         return None
-    text = model_text({"noise": {axis: {"N": 0.003} for axis in "xyz"}, "effect": [effect_table(effect)]})
+    text = model_text(
+        {"noise": {axis: {"N": 0.003} for axis in "xyz"}, "effect": [effect_table(effect)]}
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return simulate(read_model(tomllib.loads(text)), like=recording(kind, seed), seed=1).compute()
+        return simulate(
+            read_model(tomllib.loads(text)), like=recording(kind, seed), seed=1
+        ).compute()
 
 
-@pytest.mark.parametrize("name", sorted({*effects()} - {"logger_filter"}))  # which needs one form of filter, not a size
+@pytest.mark.parametrize(
+    "name", sorted({*effects()} - {"logger_filter"})
+)  # which needs one form of filter, not a size
 def test_sizes_far_from_the_usual_can_be_simulated(name: str):
     """Sizes of a fit are anything: they are brought within what the effect allows, and then must run."""
     made = [simulated(name, scale, seed=1) for scale in (-30.0, 300.0)]
@@ -60,7 +77,9 @@ def test_sizes_far_from_the_usual_can_be_simulated(name: str):
     assert all(np.isfinite(log["rate"].values).all() for log in made if log is not None)
 
 
-@pytest.mark.parametrize("name", sorted(name for name, kind in effects().items() if kind.stage == "noise"))
+@pytest.mark.parametrize(
+    "name", sorted(name for name, kind in effects().items() if kind.stage == "noise")
+)
 @settings(max_examples=10, deadline=None)
 @given(scale=st.floats(-1e5, 1e5), seed=st.integers(0, 2**16))
 def test_any_change_of_the_noise_level_can_be_simulated(name: str, scale: float, seed: int):
@@ -77,4 +96,9 @@ def test_a_falling_law_stops_at_a_tenth_of_the_noise():
         changed = simulate(model, like=log, seed=1).compute()
     plain = simulate(model | {"effect": []}, like=log, seed=1).compute()
     ratio = changed["rate"].values / plain["rate"].values
-    np.testing.assert_allclose(ratio, np.sqrt(np.maximum(1.0 - 0.05 * (log["temperature"].values - 25.0), 0.01))[None].repeat(3, 0))
+    np.testing.assert_allclose(
+        ratio,
+        np.sqrt(np.maximum(1.0 - 0.05 * (log["temperature"].values - 25.0), 0.01))[None].repeat(
+            3, 0
+        ),
+    )

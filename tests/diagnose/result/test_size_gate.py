@@ -41,10 +41,15 @@ def estimate(value: float, error: float) -> Estimate:
     return Estimate(value, error, value - 1.96 * error, value + 1.96 * error, "deg/h")
 
 
-def claim_of(effect: str, axes: str, gains: tuple[float, ...] | None = None, *, view: str = "mean") -> Identification:
+def claim_of(
+    effect: str, axes: str, gains: tuple[float, ...] | None = None, *, view: str = "mean"
+) -> Identification:
     one: Any = Candidate(effect, view, (), ())
     variant: Any = SimpleNamespace(values={}, columns=())
-    parts = tuple(Component(one, variant, (axis,), gain) for axis, gain in zip(axes, gains or (20.0,) * len(axes), strict=True))
+    parts = tuple(
+        Component(one, variant, (axis,), gain)
+        for axis, gain in zip(axes, gains or (20.0,) * len(axes), strict=True)
+    )
     return Identification(effect, (), tuple(axes), parts, 20.0 * len(axes), 8.0)
 
 
@@ -65,14 +70,19 @@ def naming_with(*claims: Identification) -> Identifications:
         ({}, ("x", "y")),
     ],
 )
-def test_an_axis_is_supported_where_a_size_is_away_from_zero(parameters: dict[str, Estimate], axes: tuple[str, ...]):
+def test_an_axis_is_supported_where_a_size_is_away_from_zero(
+    parameters: dict[str, Estimate], axes: tuple[str, ...]
+):
     claim = claim_of("temperature_bias", "xy")
     assert supported_axes(Fitted(claim, ("x", "y"), parameters, None)) == axes
 
 
 def test_a_line_of_amplitude_zero_is_no_effect():
     claim = claim_of("spectral_line", "x", view="line")
-    nothing = {"amplitude": Estimate(0.0, 0.0, 0.0, 0.0, "deg/h"), "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz")}
+    nothing = {
+        "amplitude": Estimate(0.0, 0.0, 0.0, 0.0, "deg/h"),
+        "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz"),
+    }
     naming = keep_supported(naming_with(claim), [[Fitted(claim, ("x",), nothing, None)]])
     assert not naming.claims
     assert [(one.axes, one.candidates) for one in naming.unknown] == [(("x",), ("spectral_line",))]
@@ -81,12 +91,18 @@ def test_a_line_of_amplitude_zero_is_no_effect():
 def test_an_effect_keeps_the_axes_on_which_its_size_is_known():
     claim, other = claim_of("temperature_bias", "xy"), claim_of("shupe", "z")
     numbers = [
-        [Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None) for axis, error in (("x", 0.1), ("y", 1.0))],
+        [
+            Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None)
+            for axis, error in (("x", 0.1), ("y", 1.0))
+        ],
         [Fitted(other, ("z",), {"sensitivity": estimate(0.4, 0.1)}, None)],
     ]
     before = naming_with(claim, other)
     naming = keep_supported(before, numbers)
-    assert [(one.effect, one.axes) for one in naming.claims] == [("temperature_bias", ("x",)), ("shupe", ("z",))]
+    assert [(one.effect, one.axes) for one in naming.claims] == [
+        ("temperature_bias", ("x",)),
+        ("shupe", ("z",)),
+    ]
     assert naming.claims[0].parts == claim.parts[:1]
     assert [(one.axes, one.generic) for one in naming.unknown] == [(("y",), "~bias(t)")]
     assert keep_supported(before, [numbers[0][:1], numbers[1]]).claims[0].axes == ("x",)
@@ -95,7 +111,12 @@ def test_an_effect_keeps_the_axes_on_which_its_size_is_known():
 
 def test_what_chance_does_too_is_not_left_as_unknown():
     claim = claim_of("temperature_bias", "xy", (30.0, 3.0))
-    numbers = [[Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None) for axis, error in (("x", 0.1), ("y", 1.0))]]
+    numbers = [
+        [
+            Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None)
+            for axis, error in (("x", 0.1), ("y", 1.0))
+        ]
+    ]
     naming = keep_supported(naming_with(claim), numbers)
     assert [one.axes for one in naming.claims] == [("x",)]
     assert not naming.unknown
@@ -115,7 +136,8 @@ def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
     assert "a bias made by vibration" in box["statement"]
 
 
-# --------------------------------------------------------------------------------------------------------------- verdict
+# ---------------------------------------------------------------------------------------------------------------
+# verdict
 
 
 @pytest.mark.parametrize(
@@ -146,9 +168,20 @@ NUMBER = st.none() | st.floats(-1e9, 1e9)
 SHARE = st.none() | st.floats(0.0, 1.0)
 
 
-@given(gain=NUMBER, forecast=NUMBER, before=SHARE, after=SHARE, left=st.lists(st.integers(1, 3), max_size=2))
+@given(
+    gain=NUMBER,
+    forecast=NUMBER,
+    before=SHARE,
+    after=SHARE,
+    left=st.lists(st.integers(1, 3), max_size=2),
+)
 def test_explained_means_that_the_evidence_is_for_it(gain, forecast, before, after, left):
-    held = GOOD | {"log_likelihood_gain": gain, "forecast_gain": forecast, "coverage95_before": before, "coverage95_after": after}
+    held = GOOD | {
+        "log_likelihood_gain": gain,
+        "forecast_gain": forecast,
+        "coverage95_before": before,
+        "coverage95_after": after,
+    }
     verdict = decide_verdict([{}], ["shupe"], left, held)
     assert (verdict == "explained") == (not left and not failed_checks(held))
     if verdict == "explained":
@@ -161,7 +194,11 @@ def test_explained_means_that_the_evidence_is_for_it(gain, forecast, before, aft
 
 
 @given(
-    st.lists(st.tuples(st.floats(0.0, 1e12), st.floats(1e-9, 1e12), st.floats(1e-300, 1.0)), min_size=1, max_size=6),
+    st.lists(
+        st.tuples(st.floats(0.0, 1e12), st.floats(1e-9, 1e12), st.floats(1e-300, 1.0)),
+        min_size=1,
+        max_size=6,
+    ),
 )
 def test_a_limit_over_several_laws_lies_between_theirs(laws):
     size, sd, share = np.array(laws).T
@@ -182,7 +219,11 @@ def test_a_limit_over_several_laws_lies_between_theirs(laws):
 def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: bool):
     """An event that is over says nothing of later, and the size of one near the end is not known before."""
     shaken = {"profile": "vibration", "points": points}
-    reduced = reduced_of({"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, axes=("x",), environment=[shaken])
+    reduced = reduced_of(
+        {"name": "vibration_noise", "white": 0.002, "axes": ["x"]},
+        axes=("x",),
+        environment=[shaken],
+    )
     baseline = calibrate_noise(reduced)
     naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
     held = conclude.worth(reduced, baseline, naming, fit_identifications(naming, baseline))
@@ -193,16 +234,29 @@ def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: b
 
 
 @pytest.mark.slow
-def test_a_turn_on_the_bench_is_not_explained_by_what_fails_its_forecast(recordings: Callable[[str], Path]):
+def test_a_turn_on_the_bench_is_not_explained_by_what_fails_its_forecast(
+    recordings: Callable[[str], Path],
+):
     """A real record of 27 s whose rate turns to 123 deg/s at its end; the limits of what was not found once stopped the diagnosis."""
     path = recordings("fog-hybrid-warmup/run2_turn.txt")
-    known = {"map": {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z"}, "unit": {"gyro": "deg/s", "time": "s"}}
+    known = {
+        "map": {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z"},
+        "unit": {"gyro": "deg/s", "time": "s"},
+    }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = gyrostab.diagnose(gyrostab.regularise(gyrostab.read_log([path], **known)), nulls=100)
+        found = gyrostab.diagnose(
+            gyrostab.regularise(gyrostab.read_log([path], **known)), nulls=100
+        )
     assert found.verdict == "partly explained"
     for effect in found.effects:
-        sizes = {name: one for name, one in effect["parameters"].items() if name.split(".")[0] in effects()[effect["name"]].size_parameters}
-        assert not sizes or any(one["low"] > 0.0 or one["high"] < 0.0 for one in sizes.values()), effect
+        sizes = {
+            name: one
+            for name, one in effect["parameters"].items()
+            if name.split(".")[0] in effects()[effect["name"]].size_parameters
+        }
+        assert not sizes or any(one["low"] > 0.0 or one["high"] < 0.0 for one in sizes.values()), (
+            effect
+        )
     failed = failed_checks(found.content["held_out"])
     assert all(text in str(found) for text in failed)

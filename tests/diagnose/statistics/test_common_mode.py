@@ -41,7 +41,10 @@ def null(base):
 def _waveform() -> np.ndarray:
     """Slow rise and fall, whose steps are smaller than those of a walk of WALK."""
     t = 2.0 * np.pi * np.arange(BLOCKS) / BLOCKS
-    shape = sum(size * np.sin(turns * t + turns) for turns, size in ((2.3, 1.0), (4.7, 0.6), (8.1, 0.4), (13.3, 0.25)))
+    shape = sum(
+        size * np.sin(turns * t + turns)
+        for turns, size in ((2.3, 1.0), (4.7, 0.6), (8.1, 0.4), (13.3, 0.25))
+    )
     return 0.6 * shape * WALK * np.sqrt(BLOCK_S / 3600.0 / np.square(np.diff(shape)).mean())
 
 
@@ -52,7 +55,9 @@ def _means(noise, count: int, seed: int) -> xr.Dataset:
     values += np.cumsum(rng.normal(0.0, walk * np.sqrt(BLOCK_S / 3600.0), values.shape), axis=-1)
     edges = np.arange(BLOCKS + 1) * BLOCK_S
     coords = {"axis": list("xyz"), "begin": ("block", edges[:-1]), "end": ("block", edges[1:])}
-    return xr.Dataset({"mean": (("record", "axis", "block"), values)}, coords=coords, attrs={"block_s": BLOCK_S})
+    return xr.Dataset(
+        {"mean": (("record", "axis", "block"), values)}, coords=coords, attrs={"block_s": BLOCK_S}
+    )
 
 
 def _quiet(count: int, seed: int) -> xr.Dataset:
@@ -60,7 +65,10 @@ def _quiet(count: int, seed: int) -> xr.Dataset:
 
 
 def _with(found, shares):
-    return found.assign(mean=found["mean"] + xr.DataArray(np.asarray(shares)[:, None] * _waveform(), dims=("axis", "block")))
+    return found.assign(
+        mean=found["mean"]
+        + xr.DataArray(np.asarray(shares)[:, None] * _waveform(), dims=("axis", "block"))
+    )
 
 
 @pytest.mark.parametrize(("told", "true"), [(0.0, 0.0), (0.1, 0.1), (1.0, 0.02), (0.02, 1.0)])
@@ -69,7 +77,9 @@ def test_axes_that_wander_by_themselves_have_normal_scores(told, true, missing):
     found = _means(baseline(walk=true), 60, 3)
     found["mean"][:, 1, 30 : 30 + missing] = np.nan
     z = common.score(found, baseline(walk=told))["z"].values
-    few = z[:, :-1, -1, :3]  # of each pair over the whole record, for spans that leave many averages
+    few = z[
+        :, :-1, -1, :3
+    ]  # of each pair over the whole record, for spans that leave many averages
     assert abs(few.mean()) < 4.0 / np.sqrt(180.0)
     assert 0.7 < few.std() < 1.2  # less where increments are taken for related that are not
 
@@ -83,13 +93,18 @@ def test_a_waveform_on_all_axes_is_found_where_no_axis_shows_it(base, null, shar
     assert (alone.max(axis=(1, 2, 3)) > null.critical("mean", 0.005)).mean() <= 0.1
 
 
-@given(st.lists(st.floats(0.01, 100.0), min_size=3, max_size=3), st.lists(st.sampled_from([-1.0, 1.0]), min_size=3, max_size=3))
+@given(
+    st.lists(st.floats(0.01, 100.0), min_size=3, max_size=3),
+    st.lists(st.sampled_from([-1.0, 1.0]), min_size=3, max_size=3),
+)
 @settings(max_examples=15, deadline=None)
 def test_sizes_say_nothing_and_signs_only_signs(sizes, signs):
     noise, found = baseline(walk=WALK), _quiet(1, 9).isel(record=0)
     scaled = found.assign(mean=found["mean"] * xr.DataArray(np.multiply(sizes, signs), dims="axis"))
     before, after = (common.score(one, noise)["estimate"].values for one in (found, scaled))
-    turned = np.array([signs[0] * signs[1], signs[0] * signs[2], signs[1] * signs[2], 1.0])[:, None, None]
+    turned = np.array([signs[0] * signs[1], signs[0] * signs[2], signs[1] * signs[2], 1.0])[
+        :, None, None
+    ]
     np.testing.assert_allclose(after, before * turned, atol=1e-9)
 
 
@@ -98,11 +113,15 @@ def test_the_score_of_all_axes_is_that_of_their_determinant():
     found = _means(noise, 500, 12)
     scores = common.score(found, noise)
     assert stats.kstest(stats.norm.sf(scores["z"].values[:, -1, -1, 0]), "uniform").pvalue > 1e-3
-    matrix = np.corrcoef(found["mean"].values[0])  # of white noise, but for the constant of the record
+    matrix = np.corrcoef(
+        found["mean"].values[0]
+    )  # of white noise, but for the constant of the record
     pairs = np.array([matrix[0, 1], matrix[0, 2], matrix[1, 2]])
     np.testing.assert_allclose(scores["estimate"].values[0, :3, -1, 0], pairs, atol=0.02)
     chi2 = -(BLOCKS - 11.0 / 6.0) * np.linalg.slogdet(matrix)[1]
-    assert stats.norm.sf(scores["z"].values[0, -1, -1, 0]) == pytest.approx(stats.chi2.sf(chi2, 3), abs=0.06)
+    assert stats.norm.sf(scores["z"].values[0, -1, -1, 0]) == pytest.approx(
+        stats.chi2.sf(chi2, 3), abs=0.06
+    )
 
 
 def test_white_noise_that_is_known_to_be_shared_is_taken_off():
@@ -111,9 +130,13 @@ def test_white_noise_that_is_known_to_be_shared_is_taken_off():
     rng, share = np.random.default_rng(2), 0.4
     sigma = np.sqrt(noise["mean_variance"].values[0])
     one = rng.normal(size=(40, 1, BLOCKS)) * sigma * np.sqrt(share)
-    found["mean"] = found["mean"] * np.sqrt(1.0 - share) + xr.DataArray(one, dims=("record", "axis", "block")).isel(axis=0)
+    found["mean"] = found["mean"] * np.sqrt(1.0 - share) + xr.DataArray(
+        one, dims=("record", "axis", "block")
+    ).isel(axis=0)
     known = noise.assign(cross=(("pair", "block", "band"), share * noise["spectrum"].values + 0j))
-    before, after = (common.score(found, each)["estimate"].values[:, :3, -1, 0] for each in (noise, known))
+    before, after = (
+        common.score(found, each)["estimate"].values[:, :3, -1, 0] for each in (noise, known)
+    )
     assert before.mean() == pytest.approx(share, abs=0.03)
     assert abs(after.mean()) < 0.04
 
@@ -122,7 +145,10 @@ def test_what_the_baseline_knows_of_the_means_is_taken_off(base):
     shares = np.array([1.0, 0.8, -0.9])
     found = _with(_quiet(20, 5), shares)
     known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _waveform()))
-    before, after = (np.abs(common.score(found, each)["z"].values[:, :3, -1, :3]).mean() for each in (base, known))
+    before, after = (
+        np.abs(common.score(found, each)["z"].values[:, :3, -1, :3]).mean()
+        for each in (base, known)
+    )
     assert after < 1.2 < 2.5 < before
 
 
@@ -131,12 +157,16 @@ def test_one_axis_or_a_short_record_has_nothing_to_compare():
     assert common.score(records(alone, 2, np.random.default_rng(1)), alone) is None
     found = _means(baseline(), 2, 1)
     assert common.score(found.isel(block=slice(0, 4)), baseline().isel(block=slice(0, 4))) is None
-    assert common.score(found, baseline())["tau_min_s"].values.tolist() == [BLOCK_S * span for span in (1, 2, 4, 8, 16, 32)]
+    assert common.score(found, baseline())["tau_min_s"].values.tolist() == [
+        BLOCK_S * span for span in (1, 2, 4, 8, 16, 32)
+    ]
 
 
 def _claim(view: str, axes: str):
     variant = Variant({}, ("0",), np.broadcast_to(_waveform(), (1, 1, BLOCKS)))
-    parts = tuple(Component(Candidate("cause", view, (), (variant,)), variant, (axis,), 10.0) for axis in axes)
+    parts = tuple(
+        Component(Candidate("cause", view, (), (variant,)), variant, (axis,), 10.0) for axis in axes
+    )
     return SimpleNamespace(effect="cause", axes=tuple(axes), parts=parts)
 
 
@@ -147,7 +177,11 @@ def test_it_becomes_one_box_which_the_effect_explains_that_takes_it_away(base, n
     assert boxes["view"].values.tolist() == ["cross_axis"]
     assert boxes["what"].values.tolist() == ["slow"]
     assert set(str(boxes["axes"].values[0]).split()) == {"x", "y", "z"}
-    fields = {str(name): boxes[name].values[0].item() for name in boxes.data_vars if boxes[name].dtype.kind != "M"}
+    fields = {
+        str(name): boxes[name].values[0].item()
+        for name in boxes.data_vars
+        if boxes[name].dtype.kind != "M"
+    }
     said = mismatch_statement(fields | {"axes": ["x", "y", "z"]}, BLOCKS * BLOCK_S)
     assert said.startswith("Axes x, y and z wander together (correlation 0.")
     assert "random walks of independent gyros" in said
@@ -163,7 +197,15 @@ def test_it_becomes_one_box_which_the_effect_explains_that_takes_it_away(base, n
 
 
 def test_it_stays_apart_from_what_axes_share_inside_blocks():
-    slow = {"view": "cross_axis", "axes": "x y z", "what": "slow", "begin": 0.0, "end": 3600.0, "tau_min_s": 20.0, "tau_max_s": 1800.0}
+    slow = {
+        "view": "cross_axis",
+        "axes": "x y z",
+        "what": "slow",
+        "begin": 0.0,
+        "end": 3600.0,
+        "tau_min_s": 20.0,
+        "tau_max_s": 1800.0,
+    }
     slow |= {"frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
     fast = slow | {"what": "all in phase", "tau_min_s": 0.01, "tau_max_s": 20.0}
     assert [box["what"] for box in merge_regions([slow, fast])] == ["slow", "all in phase"]

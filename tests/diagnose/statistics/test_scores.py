@@ -18,9 +18,19 @@ from gyrostab.diagnose.statistics import phase_locked as locked
 from gyrostab.diagnose.statistics import power as davar
 from gyrostab.diagnose.statistics import sample_counts as distribution
 from gyrostab.diagnose.statistics import spectral_line as spectrum
-from gyrostab.diagnose.statistics.scores import cube_root_score, exponential_score, over_windows, window_set
+from gyrostab.diagnose.statistics.scores import (
+    cube_root_score,
+    exponential_score,
+    over_windows,
+    window_set,
+)
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.regression.boxcars import boxcar_information, filter_gains, precision_times, remaining_information
+from gyrostab.kernels.regression.boxcars import (
+    boxcar_information,
+    filter_gains,
+    precision_times,
+    remaining_information,
+)
 from gyrostab.noise import LAWS
 from tests.support.reduced_records import BLOCK_S, RATE, baseline, chunks, records
 
@@ -52,7 +62,11 @@ def _dense(variance, present, walk, ou, decay):
 def test_boxcar_kernels_are_the_dense_algebra():
     rng = np.random.default_rng(5)
     n, p = 60, 3
-    variance, walk, ou = rng.uniform(0.5, 2.0, n), rng.uniform(0.0, 0.3, n), rng.uniform(0.1, 1.0, p)
+    variance, walk, ou = (
+        rng.uniform(0.5, 2.0, n),
+        rng.uniform(0.0, 0.3, n),
+        rng.uniform(0.1, 1.0, p),
+    )
     decay = np.exp(-rng.uniform(0.5, 1.5, (n, 1)) / np.array([1.0, 5.0, 30.0]))
     present = rng.random(n) > 0.3
     innovation, gain, remaining = np.empty(n), np.empty((n, p + 1)), np.empty((n + 1, p + 1, p + 1))
@@ -92,7 +106,9 @@ def test_transfer_reproduces_the_laws_of_the_allan_variance():
     white = weights @ np.full(middle.size, LEVEL)
     np.testing.assert_allclose(white, LAWS["N"].avar(tau, 0.003), rtol=2e-4)
     walk = weights @ (0.02**2 / 3600.0 / (2 * np.pi * middle) ** 2)
-    np.testing.assert_allclose(walk[-1], LAWS["K"].avar(tau[-1], 0.02), rtol=0.02)  # a sampled walk, so long tau only
+    np.testing.assert_allclose(
+        walk[-1], LAWS["K"].avar(tau[-1], 0.02), rtol=0.02
+    )  # a sampled walk, so long tau only
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.3])
@@ -162,10 +178,14 @@ def test_a_line_is_seen_from_the_closed_form_on(base, null):
     def line(found, amplitude):
         signal, rng = amplitude**2 / 4.0 * 0.926 * BLOCK_S, np.random.default_rng(2)
         sine = np.sqrt(signal) * np.exp(2j * np.pi * rng.random((60, 8, 23)))
-        noise = np.sqrt(LEVEL / 2.0) * (rng.normal(size=sine.shape) + 1j * rng.normal(size=sine.shape))
+        noise = np.sqrt(LEVEL / 2.0) * (
+            rng.normal(size=sine.shape) + 1j * rng.normal(size=sine.shape)
+        )
         found["line_power"][:, 1, :, 267] = (np.abs(sine + noise) ** 2).mean(axis=-1)
 
-    limit = 2.0 * np.sqrt(null.critical("spectrum", 0.01) * LEVEL / (0.926 * BLOCK_S * np.sqrt(180)))
+    limit = 2.0 * np.sqrt(
+        null.critical("spectrum", 0.01) * LEVEL / (0.926 * BLOCK_S * np.sqrt(180))
+    )
     below, above = _limits(line, limit, spectrum, "spectrum", base, null)
     assert below < 0.5 < above
 
@@ -175,7 +195,9 @@ def test_davar_is_blind_to_a_step_between_its_windows_and_the_mean_is_not(base, 
     found["mean"][:, 0, 60:120] += 0.06
     assert _detected(mean.score(found, base), null, "mean") > 0.9
     scores = davar.score(found, base)
-    scores["z"] = scores["z"].where(scores["stop"] - scores["first"] <= 15)  # the record as a whole sees it at its longest tau
+    scores["z"] = scores["z"].where(
+        scores["stop"] - scores["first"] <= 15
+    )  # the record as a whole sees it at its longest tau
     assert _detected(scores, null, "davar") < 0.1
 
 
@@ -198,7 +220,9 @@ def test_mean_estimates_the_step(base):
     found["mean"][2, 60:105] += 0.5
     scores = mean.score(found, base)
     best = int(np.nanargmax(scores["z"].values[2, :, 0]))
-    assert (int(scores["first"][best]), int(scores["stop"][best])) == (60, 105) or abs(int(scores["first"][best]) - 60) <= 4
+    assert (int(scores["first"][best]), int(scores["stop"][best])) == (60, 105) or abs(
+        int(scores["first"][best]) - 60
+    ) <= 4
     inside = (np.arange(180) >= 60) & (np.arange(180) < 105)
     assert mean.region_mean(found, base, 2, inside) == pytest.approx(0.5, abs=0.03)
 
@@ -226,7 +250,9 @@ def test_what_is_locked_to_rotation_and_ramp_is_seen(base):
     assert locked.score(found, base) is None
     blocks, samples = 180, BLOCK_S * RATE
     spread = np.sqrt(2.0 * LEVEL * RATE / samples)
-    order = spread * (rng.normal(size=(40, 3, blocks, 3)) + 1j * rng.normal(size=(40, 3, blocks, 3)))
+    order = spread * (
+        rng.normal(size=(40, 3, blocks, 3)) + 1j * rng.normal(size=(40, 3, blocks, 3))
+    )
     profile = np.sqrt(LEVEL * RATE / 50.0) * rng.normal(size=(40, 3, blocks, 40))
     found["order"] = (("record", "axis", "block", "harmonic"), order)
     found["profile"] = (("record", "axis", "block", "phase"), profile)
@@ -238,10 +264,14 @@ def test_what_is_locked_to_rotation_and_ramp_is_seen(base):
     assert np.allclose(z.std(axis=(0, 1, 2)), 1.0, atol=0.1)
     assert np.all(z.mean(axis=(0, 1, 2)) < 0.15)
     found["order"][:, 0, :, 1] += 0.05 * np.exp(0.4j)
-    found["profile"] = found["profile"] + xr.DataArray(0.1 * np.sin(2 * np.pi * np.arange(40) / 40), dims="phase")
+    found["profile"] = found["profile"] + xr.DataArray(
+        0.1 * np.sin(2 * np.pi * np.arange(40) / 40), dims="phase"
+    )
     scores = locked.score(found, base)
     assert np.median(scores["estimate"].values[:, 0, -1, 1]) == pytest.approx(0.05, rel=0.1)
-    assert np.median(scores["estimate"].values[:, 1, -1, 3]) == pytest.approx(0.1 / np.sqrt(2.0), rel=0.1)
+    assert np.median(scores["estimate"].values[:, 1, -1, 3]) == pytest.approx(
+        0.1 / np.sqrt(2.0), rel=0.1
+    )
     assert (scores["z"].values[:, 0, -1, 1] > 5.0).mean() > 0.95
 
 
@@ -252,7 +282,11 @@ def test_transients_and_jumps_after_restarts_are_seen(base):
     found["restart_end"] = ("restart", np.array([1010.0, 2410.0]))
     z = restart.score(found, base)["z"].values
     assert np.nanstd(z) == pytest.approx(1.0, abs=0.06)
-    since = np.where(np.arange(180) >= 121, np.arange(180) - 121.0, np.where(np.arange(180) >= 51, np.arange(180) - 51.0, np.inf))
+    since = np.where(
+        np.arange(180) >= 121,
+        np.arange(180) - 121.0,
+        np.where(np.arange(180) >= 51, np.arange(180) - 51.0, np.inf),
+    )
     raised = found.copy()
     raised["mean"] = found["mean"] + xr.DataArray(0.2 * np.exp(-since / 6.0), dims="block")
     scores = restart.score(raised, base)
@@ -286,7 +320,9 @@ def test_counts_and_tails(base):
 def test_cube_root_score_is_the_normal_quantile_of_a_gamma(shape):
     for p in (0.01, 0.3, 0.7, 0.99):
         ratio = stats.gamma.ppf(p, shape) / shape
-        assert float(cube_root_score(np.array(ratio), np.array(shape))) == pytest.approx(stats.norm.ppf(p), abs=0.08)
+        assert float(cube_root_score(np.array(ratio), np.array(shape))) == pytest.approx(
+            stats.norm.ppf(p), abs=0.08
+        )
 
 
 @given(st.floats(1e-6, 600.0))
@@ -299,7 +335,11 @@ def test_exponential_score_is_exact(value):
 def test_a_correlation_score_is_that_of_student():
     r, n = np.array([0.3, 0.6]), 20.0
     t = r * np.sqrt((n - 1) / (1 - r**2))
-    np.testing.assert_allclose(cross_axis.correlation_score(r, np.full(2, n)), stats.norm.isf(stats.t.sf(t, n - 1)), rtol=2e-3)
+    np.testing.assert_allclose(
+        cross_axis.correlation_score(r, np.full(2, n)),
+        stats.norm.isf(stats.t.sf(t, n - 1)),
+        rtol=2e-3,
+    )
 
 
 def test_one_axis_has_no_pairs():
@@ -314,7 +354,9 @@ def test_noise_that_is_loud_for_a_while_is_neither_shared_nor_a_line(loud):
     for seed in range(8):
         noise = np.random.default_rng(seed).standard_normal((2, 12_000))
         noise[:, slice(*loud)] *= 8.0
-        found = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="100samples")
+        found = reduce_log(
+            make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="100samples"
+        )
         base = calibrate_noise(found, quiet=np.arange(120) < 60)
         for name, values in largest.items():
             values.append(float(np.nanmax(np.abs(STATISTICS[name](found, base)["z"].values))))

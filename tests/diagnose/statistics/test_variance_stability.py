@@ -55,7 +55,9 @@ def test_moments_of_the_scatter_are_those_of_drawn_levels(count, seed):
     drawn = rng.gamma(shape, size=(40_000, count)) / shape * rng.uniform(0.1, 10.0)
     mean = (drawn * shape).sum(axis=1, keepdims=True) / shape.sum()
     scatter = (shape * (drawn - mean) ** 2).sum(axis=1) / mean[:, 0] ** 2
-    wanted, variance = restless.scatter_moments(np.array(float(count)), shape.sum(), (1.0 / shape).sum())
+    wanted, variance = restless.scatter_moments(
+        np.array(float(count)), shape.sum(), (1.0 / shape).sum()
+    )
     assert scatter.mean() == pytest.approx(wanted, abs=5.0 * np.sqrt(variance / scatter.size))
     error = np.sqrt(((scatter - scatter.mean()) ** 2).var() / scatter.size)
     assert scatter.var() == pytest.approx(variance, abs=5.0 * error)
@@ -71,7 +73,9 @@ def test_scores_of_steady_noise_are_normal(base):
 
 def test_swelling_noise_is_seen_from_the_closed_form_on(base, null):
     shape = float(_some(base, 1, 1)["shape"].values[0, 0, 3:].sum())
-    swell = np.sqrt(2.0) * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 3.7)  # too fast for averages of more than one block
+    swell = np.sqrt(2.0) * np.sin(
+        2.0 * np.pi * np.arange(BLOCKS) / 3.7
+    )  # too fast for averages of more than one block
     critical = null.critical("restless", 0.01)
     limit = np.sqrt(critical * np.sqrt(2.0 * (BLOCKS - 1)) / (BLOCKS * shape))
     shares = []
@@ -85,7 +89,9 @@ def test_swelling_noise_is_seen_from_the_closed_form_on(base, null):
 def test_what_swells_on_all_axes_is_seen_sooner_together(base, null):
     found = _some(base, 30, 5)
     found["power"] *= np.exp(0.09 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 12.0))[:, None]
-    together, alone = (np.median(_largest(restless, found, base, null, row=row)) for row in (3, slice(0, 3)))
+    together, alone = (
+        np.median(_largest(restless, found, base, null, row=row)) for row in (3, slice(0, 3))
+    )
     assert together > null.critical("restless", 0.01) > alone
 
 
@@ -113,7 +119,9 @@ def test_noise_that_axes_share_is_not_restless(base, null):
     found["cross"][:] = found["power"][:, 0].values[:, None]
     critical = null.critical("restless", 0.01)
     assert (_largest(restless, found, base, null, row=3) > critical).mean() <= 0.1
-    assert (_largest(restless, found.drop_vars("cross"), base, null, row=3) > critical).mean() > 0.9  # were it not known
+    assert (
+        _largest(restless, found.drop_vars("cross"), base, null, row=3) > critical
+    ).mean() > 0.9  # were it not known
 
 
 def test_a_burst_that_has_its_box_is_not_told_again(base, null):
@@ -147,19 +155,29 @@ def _moving_line(found, row, first, last, energy, bend=0.0):
         for block in range(BLOCKS // 8):
             t = (part + (block + 0.5) / (BLOCKS // 8)) / 8.0
             line = round(first + (last - first) * (t + bend * t * (1.0 - t)))
-            beat = 2.0 * np.sqrt(energy) * rng.normal(0.0, np.sqrt(0.5), found.sizes["record"])  # of the line with the noise
-            found["line_power"].values[:, row, part, line] += level * (energy + beat) / (BLOCKS // 8)
+            beat = (
+                2.0 * np.sqrt(energy) * rng.normal(0.0, np.sqrt(0.5), found.sizes["record"])
+            )  # of the line with the noise
+            found["line_power"].values[:, row, part, line] += (
+                level * (energy + beat) / (BLOCKS // 8)
+            )
 
 
-@pytest.mark.parametrize(("first", "last", "bend"), [(20, 60, 0.0), (75, 30, 0.0), (10, 50, 0.6), (25, 90, -0.6)])
+@pytest.mark.parametrize(
+    ("first", "last", "bend"), [(20, 60, 0.0), (75, 30, 0.0), (10, 50, 0.6), (25, 90, -0.6)]
+)
 def test_a_moving_line_is_seen_where_none_of_its_lines_stands_out(base, null, first, last, bend):
     found = _some(base, 12, 12)
-    energy = 9.0 * np.sqrt(abs(last - first) / (8.0 * BLOCKS))  # nine standard deviations by the closed form
+    energy = 9.0 * np.sqrt(
+        abs(last - first) / (8.0 * BLOCKS)
+    )  # nine standard deviations by the closed form
     _moving_line(found, 1, first, last, energy, bend)
     critical = null.critical("gliding", 0.01)
     assert (_largest(gliding, found, base, null) > critical).mean() > 0.5
     scores = gliding.score(found, base)
-    best = scores["what"].values[np.bincount(standardise(scores, null.views["gliding"])[:, 1, 0].argmax(axis=1)).argmax()]
+    best = scores["what"].values[
+        np.bincount(standardise(scores, null.views["gliding"])[:, 1, 0].argmax(axis=1)).argmax()
+    ]
     begins, ends = (float(part) for part in str(best).split()[1:])
     assert begins == pytest.approx(first * 0.05, abs=0.65)
     assert ends == pytest.approx(last * 0.05, abs=0.65)
@@ -176,13 +194,22 @@ def test_a_line_that_stands_and_a_hump_for_a_while_do_not_move(base, null):
 
 
 def test_steady_noise_has_no_line_that_moves(base, null):
-    assert (_largest(gliding, _some(base, 100, 14), base, null) > null.critical("gliding", 0.01)).mean() <= 0.03
-    assert (_largest(restless, _some(base, 100, 15), base, null) > null.critical("restless", 0.01)).mean() <= 0.03
+    assert (
+        _largest(gliding, _some(base, 100, 14), base, null) > null.critical("gliding", 0.01)
+    ).mean() <= 0.03
+    assert (
+        _largest(restless, _some(base, 100, 15), base, null) > null.critical("restless", 0.01)
+    ).mean() <= 0.03
 
 
 def test_short_records_are_left_alone(base):
     few = {"rate": 10.0, "blocks": 5}
-    assert restless.score(records(baseline(**few), 2, np.random.default_rng(1), **few), baseline(**few)) is None
+    assert (
+        restless.score(
+            records(baseline(**few), 2, np.random.default_rng(1), **few), baseline(**few)
+        )
+        is None
+    )
     found = _some(base, 2, 1)
     assert gliding.score(found.drop_vars("line_power"), base) is None
     found["line_weight"][:, 4:] = 0.0
@@ -192,7 +219,9 @@ def test_short_records_are_left_alone(base):
 @pytest.mark.parametrize("blocks", [213, 218, 255])
 def test_windows_behind_the_last_average_have_no_score(blocks):
     small = {"rate": 10.0, "blocks": blocks}
-    found = restless.score(records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small))
+    found = restless.score(
+        records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small)
+    )
     behind = (found["first"] > blocks // 32 * 32).values
     assert behind.any()
     long = np.char.startswith(found["what"].values.astype(str), "restless 640 s")
@@ -219,31 +248,61 @@ def test_one_axis_has_no_row_of_all():
 
 
 def test_a_level_and_its_scatter_are_two_mismatches():
-    box = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 100.0, "tau_min_s": 0.01, "tau_max_s": 0.1}
+    box = {
+        "view": "davar",
+        "axes": "x",
+        "what": "avar",
+        "begin": 0.0,
+        "end": 100.0,
+        "tau_min_s": 0.01,
+        "tau_max_s": 0.1,
+    }
     box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
     assert len(merge_regions([box, box | {"what": "restless 20 s"}])) == 2
-    assert len(merge_regions([box | {"what": "restless 40 s"}, box | {"what": "restless 20 s", "axes": "x y"}])) == 1
+    assert (
+        len(
+            merge_regions(
+                [box | {"what": "restless 40 s"}, box | {"what": "restless 20 s", "axes": "x y"}]
+            )
+        )
+        == 1
+    )
 
 
 def test_sentences_say_how_fast_and_where_to():
-    box = {"view": "davar", "what": "restless 40 s", "axes": ["x", "y"], "begin": 0.0, "end": 2000.0, "tau_min_s": 0.1, "tau_max_s": 2.9}
+    box = {
+        "view": "davar",
+        "what": "restless 40 s",
+        "axes": ["x", "y"],
+        "begin": 0.0,
+        "end": 2000.0,
+        "tau_min_s": 0.1,
+        "tau_max_s": 2.9,
+    }
     box |= {"ratio": 4.38, "estimate": 0.08, "sign": 1, "p_value": 1e-4, "frequency": np.nan}
     told = mismatch_statement(box, 2000.0)
     assert "axes x and y goes up and down over the whole record" in told
     assert "one stretch of 40 s to another" in told
     assert "8 % (rms)" in told
     glide = box | {"view": "spectrum", "what": "glide 1.58 3.42", "axes": ["y"]}
-    assert "a line that moves over the whole record, from about 1.58 Hz to about 3.42 Hz" in mismatch_statement(glide, 2000.0)
+    assert (
+        "a line that moves over the whole record, from about 1.58 Hz to about 3.42 Hz"
+        in mismatch_statement(glide, 2000.0)
+    )
 
 
 def test_drawn_lines_leak_as_those_of_tapered_noise_do():
     rng, size = np.random.default_rng(2), 200
-    lines = np.abs(np.fft.rfft(rng.normal(size=(40_000, size)) * taper(size), axis=-1)[:, 1:100]) ** 2
+    lines = (
+        np.abs(np.fft.rfft(rng.normal(size=(40_000, size)) * taper(size), axis=-1)[:, 1:100]) ** 2
+    )
     drawn = _leaked(rng.gamma(12.0, size=(40_000, 99)) / 12.0, size)
     for wide in (4, 15, 40):  # lines that a way adds up
         spread = [one[:, 20 : 20 + wide].mean(axis=1).std() / one.mean() for one in (lines, drawn)]
         alone = [one[:, 20:60].std() / one.mean() for one in (lines, drawn)]
-        seen, wanted = (sums / single * np.sqrt(wide) for sums, single in zip(spread, alone, strict=True))
+        seen, wanted = (
+            sums / single * np.sqrt(wide) for sums, single in zip(spread, alone, strict=True)
+        )
         assert wanted == pytest.approx(seen, abs=0.015)
     assert seen > 1.02
     assert drawn.min() > 0.0
@@ -254,7 +313,9 @@ def test_drawn_lines_leak_as_those_of_tapered_noise_do():
 def test_a_stretch_that_ends_within_a_block_leaves_nothing_restless():
     noise = np.random.default_rng(5).standard_normal((2, 60_000))
     noise[:, 20_000:40_400] *= 6.0
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples")
+    reduced = reduce_log(
+        make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples"
+    )
     base = calibrate_noise(reduced, quiet=np.arange(60) < 20)
     told = restless.levelled(reduced, base, [(("x", "y"), 2_000.0, 4_100.0)])
     assert float(np.nanmax(restless.score(told, base)["z"].values)) < 4.8

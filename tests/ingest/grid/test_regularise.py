@@ -150,11 +150,16 @@ def test_gap_of_200_hours_costs_next_to_nothing():
     assert len(log.rate.data.dask) < 2000
     assert np.isnan(log.rate[0, gap // 2 : gap // 2 + 1000].values).all()
     assert log.rate[0, -1].compute().item() == 10_000.0
-    assert "200.0 h without samples from 2026-03-11T11:00:12.500 (after row 4999)" in log.attrs["notes"][-1]
+    assert (
+        "200.0 h without samples from 2026-03-11T11:00:12.500 (after row 4999)"
+        in log.attrs["notes"][-1]
+    )
 
 
 def test_increments_become_rates():
-    log = regularise(raw_log(stamps_of([0, 1, 2, 4], 100.0), [1e-6, 2e-6, 3e-6, 4e-6], kind="increment"))
+    log = regularise(
+        raw_log(stamps_of([0, 1, 2, 4], 100.0), [1e-6, 2e-6, 3e-6, 4e-6], kind="increment")
+    )
     np.testing.assert_allclose(log.rate.values[0], [0.36, 0.72, 1.08, np.nan, 1.44])
     assert log.rate.attrs["units"] == "degree hour-1"
     assert log.attrs["kind"] == "rate"
@@ -177,7 +182,10 @@ def test_unreadable_cells_infinite_values_and_lost_stamps():
     truth = np.where(np.isinf(values), np.nan, values)
     np.testing.assert_array_equal(log.rate.values, truth)
     table = gap_table(log).set_index("start")
-    seen = [(round((when.value - START) / 1e7), row.samples, row.cause) for when, row in table.iterrows()]
+    seen = [
+        (round((when.value - START) / 1e7), row.samples, row.cause)
+        for when, row in table.iterrows()
+    ]
     assert seen == [(50, 3, "unreadable"), (80, 1, "unreadable"), (120, 1, "outside_range")]
     assert log.attrs["notes"][0] == "read"
     assert any("infinite" in note for note in log.attrs["notes"])
@@ -190,7 +198,9 @@ def test_channels_on_time_and_slow_channels_on_their_own():
     slow[::50] = np.arange(12.0)
     raw = raw_log(stamps, temperature=slow, vibration=np.arange(2.0 * n))
     other = np.array(["2026-03-11T11:00:01", "2026-03-11T11:00:02"], "datetime64[ns]")
-    raw = raw.assign_coords(time_pressure=other).assign(pressure=("time_pressure", [1.0, 2.0], {"units": "Pa"}))
+    raw = raw.assign_coords(time_pressure=other).assign(
+        pressure=("time_pressure", [1.0, 2.0], {"units": "Pa"})
+    )
     log = regularise(raw)
     assert log.vibration.dims == ("time",)
     np.testing.assert_array_equal(log.vibration.values, np.r_[0:n, np.nan, n : 2 * n])
@@ -204,7 +214,11 @@ def test_channels_on_time_and_slow_channels_on_their_own():
 def test_rows_that_hold_a_slow_channel_only_are_no_samples():
     samples = np.arange(1000)
     stamps = stamps_of(np.sort(np.r_[samples, samples[5::10] + 0.4]), 100.0)
-    other = np.flatnonzero(np.isin(np.arange(len(stamps)), np.searchsorted(stamps, stamps_of(samples[5::10] + 0.4, 100.0))))
+    other = np.flatnonzero(
+        np.isin(
+            np.arange(len(stamps)), np.searchsorted(stamps, stamps_of(samples[5::10] + 0.4, 100.0))
+        )
+    )
     values = np.full(len(stamps), np.nan)
     gyro = np.setdiff1d(np.arange(len(stamps)), other)
     values[gyro] = samples
@@ -230,7 +244,10 @@ def test_names_of_several_files():
     raw = raw_log(stamps_of(np.r_[0:500, 1000:1500], 100.0))
     raw.attrs |= {"source_files": ["a.csv", "b.csv"], "row_start": [0, 400]}
     notes = regularise(raw).attrs["notes"]
-    assert any(note.startswith("b.csv: 5.0 s without samples from 2026-03-11T11:00:05.000 (after row 99)") for note in notes)
+    assert any(
+        note.startswith("b.csv: 5.0 s without samples from 2026-03-11T11:00:05.000 (after row 99)")
+        for note in notes
+    )
 
 
 def test_hopeless_logs_are_errors():
@@ -244,7 +261,13 @@ def test_hopeless_logs_are_errors():
         regularise(raw_log(stamps_of(np.zeros(100), 100.0)))
     with pytest.raises(TimeError):
         regularise(raw_log(np.full(100, np.iinfo(np.int64).min)))
-    for wrong in ({"rate": -1.0}, {"tolerance": 0.7}, {"max_gap": "soon"}, {"max_gap": 0}, {"chunk": 0}):
+    for wrong in (
+        {"rate": -1.0},
+        {"tolerance": 0.7},
+        {"max_gap": "soon"},
+        {"max_gap": 0},
+        {"chunk": 0},
+    ):
         with pytest.raises(OptionError):
             regularise(raw_log(stamps_of(np.arange(10), 100.0)), **wrong)
 
@@ -261,14 +284,20 @@ def test_a_regular_log_passes_through():
 
 
 def test_arrays_keep_every_bit():
-    values = np.random.default_rng(0).normal(size=(3, 1000)) * 10.0 ** np.arange(-200, 100, 100)[:, None]
+    values = (
+        np.random.default_rng(0).normal(size=(3, 1000)) * 10.0 ** np.arange(-200, 100, 100)[:, None]
+    )
     log = regularise(raw_log(stamps_of(np.arange(1000) * 2, 50.0), values))
     assert log.rate.values.tobytes() == values.tobytes()
 
 
 def test_on_grid_of_nothing_but_one_run_is_the_array_itself():
     placement = place_by_stamp(
-        lambda: iter([(np.arange(50), stamps_of(np.arange(50), 10.0))]), 10.0, tolerance=0.25, max_gap=1e9, where="x"
+        lambda: iter([(np.arange(50), stamps_of(np.arange(50), 10.0))]),
+        10.0,
+        tolerance=0.25,
+        max_gap=1e9,
+        where="x",
     )
     np.testing.assert_array_equal(on_grid(np.arange(50.0), placement, chunk=7), np.arange(50.0))
 
@@ -280,4 +309,10 @@ def test_a_channel_of_another_day_is_told():
         other = raw.assign_coords(time_temperature=("time_temperature", stamps)).assign(
             temperature=("time_temperature", np.full(5, 20.0), {"units": "degree_Celsius"})
         )
-        assert any("channel temperature: none of its 5 values" in note for note in regularise(other).attrs["notes"]) is told
+        assert (
+            any(
+                "channel temperature: none of its 5 values" in note
+                for note in regularise(other).attrs["notes"]
+            )
+            is told
+        )

@@ -12,14 +12,24 @@ from hypothesis import strategies as st
 from gyrostab.errors import TimeError
 from gyrostab.ingest.grid.regularise import gap_table, regularise
 from tests.support.raw_rows import START, raw_log, stamps_of
-from tests.support.stamp_scatter import JITTER, LOSSES, PACKET, lose_samples, round_stamps, scatter_stamps
+from tests.support.stamp_scatter import (
+    JITTER,
+    LOSSES,
+    PACKET,
+    lose_samples,
+    round_stamps,
+    scatter_stamps,
+)
 
 
 def place(jitter, scatter, losses, unit, *, rate=100.0, rows=20_000, seed=0, **options):
     """The regular log of scattered stamps, the true samples of its rows, and the samples that they were given."""
     random = np.random.default_rng(seed)
     samples = lose_samples(losses, rows, random)
-    log = regularise(raw_log(round_stamps(scatter_stamps(samples, jitter, scatter, random), rate, unit)), **options)
+    log = regularise(
+        raw_log(round_stamps(scatter_stamps(samples, jitter, scatter, random), rate, unit)),
+        **options,
+    )
     values = log.rate.values[0]
     given = np.flatnonzero(np.isfinite(values))
     assert (np.diff(values[given]) > 0).all()
@@ -73,12 +83,18 @@ def test_jitter_at_random_in_every_way():
 
     @settings(max_examples=15, deadline=None)
     @given(
-        st.sampled_from(combinations), st.floats(0, 0.6), st.sampled_from(["ns", "us", "ms"]), st.floats(40, 400), st.integers(0, 2**32 - 1)
+        st.sampled_from(combinations),
+        st.floats(0, 0.6),
+        st.sampled_from(["ns", "us", "ms"]),
+        st.floats(40, 400),
+        st.integers(0, 2**32 - 1),
     )
     @example(how=("latest", "none"), scatter=0.375, unit="ns", rate=40.0, seed=1)
     def check(how, scatter, unit, rate, seed):
         jitter, losses = how
-        log, _, given, samples = place(jitter, scatter, losses, unit, rate=round(rate, 2), rows=6000, seed=seed)
+        log, _, given, samples = place(
+            jitter, scatter, losses, unit, rate=round(rate, 2), rows=6000, seed=seed
+        )
         assert len(given) >= 0.999 * len(samples)
         assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-3)
 
@@ -105,7 +121,10 @@ def test_a_few_rows_that_share_a_stamp_are_the_same_sample_given_twice(share):
     rows = np.sort(np.append(np.arange(6000), np.flatnonzero(random.random(6000) < share)))
     log = regularise(raw_log(stamps[rows], random.standard_normal(6000)[rows]))
     assert np.isfinite(log.rate.values).all()
-    assert log.sizes["time"] - 6000 in (0, 1)  # no row follows that tells whether one of the last rows is given twice
+    assert log.sizes["time"] - 6000 in (
+        0,
+        1,
+    )  # no row follows that tells whether one of the last rows is given twice
     assert log.attrs["sampling_rate_hz"] == pytest.approx(40.0, rel=1e-6)
 
 
@@ -123,19 +142,27 @@ def test_a_given_rate_wins_over_a_pattern_of_losses_and_is_noted():
     stamps = stamps_of(np.flatnonzero(np.resize([1, 1, 1, 0, 0], 6000)), 100.0)
     log = regularise(raw_log(stamps), rate=60.0)
     assert np.isfinite(log.rate.values).sum() == len(stamps)
-    assert any("the stamps alone say 100 Hz" in note and "60 Hz" in note for note in log.attrs["notes"])
+    assert any(
+        "the stamps alone say 100 Hz" in note and "60 Hz" in note for note in log.attrs["notes"]
+    )
 
 
 @pytest.mark.parametrize("wrong", [50.0, 90.0, 110.0, 200.0])
 def test_a_rate_that_no_jitter_explains_is_refused_with_both_figures(wrong):
-    stamps = START + np.rint((np.arange(5000) + np.random.default_rng(3).normal(0, 0.4, 5000)) * 1e7).astype(np.int64)
-    with pytest.raises(TimeError, match=rf"{wrong:g} Hz.*100(\.00\d)? Hz.*lost samples nor jitter.*--rate"):
+    stamps = START + np.rint(
+        (np.arange(5000) + np.random.default_rng(3).normal(0, 0.4, 5000)) * 1e7
+    ).astype(np.int64)
+    with pytest.raises(
+        TimeError, match=rf"{wrong:g} Hz.*100(\.00\d)? Hz.*lost samples nor jitter.*--rate"
+    ):
         regularise(raw_log(stamps), rate=wrong)
 
 
 def test_jitter_is_noted():
     log, *_ = place("normal", 0.4, "none", "us")
-    assert any("scatter by 4." in note and "rows keep their order" in note for note in log.attrs["notes"])
+    assert any(
+        "scatter by 4." in note and "rows keep their order" in note for note in log.attrs["notes"]
+    )
 
 
 def test_a_clock_set_back_amid_jitter_is_a_restart():

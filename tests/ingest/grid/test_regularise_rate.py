@@ -25,13 +25,18 @@ def test_no_drift_over_200_hours(rate):
         for begin in range(0, last + 1, block * 8):
             rows = np.arange(begin, min(begin + block // 8, last + 1))
             yield rows, START + np.rint(rows * (step / 1000)).astype(np.int64) * 1000
-        yield np.array([last]), START + np.rint(np.array([last]) * (step / 1000)).astype(np.int64) * 1000
+        yield (
+            np.array([last]),
+            START + np.rint(np.array([last]) * (step / 1000)).astype(np.int64) * 1000,
+        )
 
     estimate = estimate_rate(stamps, where="long.csv")
     assert estimate.rate == rate
     placement = place_by_stamp(stamps, rate, tolerance=0.25, max_gap=1e9, where="long.csv")
     assert placement.size == last + 1
-    assert np.all(placement.runs[:, 0] == placement.runs[:, 1])  # rows are numbered by their true sample
+    assert np.all(
+        placement.runs[:, 0] == placement.runs[:, 1]
+    )  # rows are numbered by their true sample
     exact = START + round(last * Fraction(10**9) / Fraction(repr(rate)))
     end = time_coordinate(placement.start, rate, placement.size)["time"][-1].values.astype(np.int64)
     assert abs(int(end) - exact) <= 1
@@ -44,7 +49,11 @@ def test_bursts_are_placed_by_count_and_a_loss_shows_as_a_lasting_delay():
     samples[12_000:] += lost
     sent = samples / 100.0
     packet = np.ceil(sent / 0.07)  # one every 70 ms, unpacked row by row
-    arrival = packet * 0.07 + 0.002 * (np.arange(n) - np.searchsorted(packet, packet)) + random.uniform(0, 0.0005, n)
+    arrival = (
+        packet * 0.07
+        + 0.002 * (np.arange(n) - np.searchsorted(packet, packet))
+        + random.uniform(0, 0.0005, n)
+    )
     log = regularise(raw_log(START + np.rint(arrival * 1e9).astype(np.int64)))
     assert log.attrs["sampling_rate_hz"] == pytest.approx(100.0, rel=1e-6)
     assert any("bursts" in note for note in log.attrs["notes"])
@@ -69,7 +78,10 @@ def test_declared_rate_without_time():
     raw.attrs |= {"declared_rate_hz": 2.0, "start": "2026-03-11T11:00:00"}
     log = regularise(raw)
     assert log.time.values[-1] == np.datetime64("2026-03-11T11:00:02.5")
-    np.testing.assert_array_equal(log.time_temperature.values, np.array(["2026-03-11T11:00:00", "2026-03-11T11:00:02"], "datetime64[ns]"))
+    np.testing.assert_array_equal(
+        log.time_temperature.values,
+        np.array(["2026-03-11T11:00:00", "2026-03-11T11:00:02"], "datetime64[ns]"),
+    )
     np.testing.assert_array_equal(log.temperature.values, [20.0, 21.0])
     with pytest.raises(TimeError, match="--rate"):
         regularise(raw.assign_attrs(declared_rate_hz=None))
@@ -97,7 +109,9 @@ def test_three_rows_are_enough():
 
 
 def test_arrival_at_random_times_loses_no_row():
-    stamps = START + np.rint(np.sort(np.random.default_rng(0).uniform(0, 100, 10_000)) * 1e9).astype(np.int64)
+    stamps = START + np.rint(
+        np.sort(np.random.default_rng(0).uniform(0, 100, 10_000)) * 1e9
+    ).astype(np.int64)
     log = regularise(raw_log(stamps))
     assert log.attrs["sampling_rate_hz"] == pytest.approx(100.0, rel=0.02)
     assert np.isfinite(log.rate.values).sum() == 10_000
@@ -115,12 +129,16 @@ def test_stamps_coarser_than_the_jitter_of_a_sample(rate, n):
     assert abs(log.sizes["time"] - 1 - samples[-1]) <= 1
 
 
-@pytest.mark.parametrize("pattern", [[1, 1, 1, 0, 0], [1, 0, 1, 1, 0], [1, 1, 0], [1, 1, 0, 0, 0, 0, 0]])
+@pytest.mark.parametrize(
+    "pattern", [[1, 1, 1, 0, 0], [1, 0, 1, 1, 0], [1, 1, 0], [1, 1, 0, 0, 0, 0, 0]]
+)
 @pytest.mark.parametrize("rate", [100.0, 300.0, 248.7])
 @pytest.mark.parametrize("jitter", [0.0, 0.03])
 def test_rows_missing_in_a_fixed_pattern_leave_the_declared_grid(pattern, rate, jitter):
     samples = np.flatnonzero(np.resize(pattern, 6000))
-    stamps = stamps_of(samples + np.random.default_rng(3).uniform(-jitter, jitter, len(samples)), rate)
+    stamps = stamps_of(
+        samples + np.random.default_rng(3).uniform(-jitter, jitter, len(samples)), rate
+    )
     log = regularise(raw_log(stamps), rate=rate)
     assert log.attrs["sampling_rate_hz"] == rate
     assert np.array_equal(log.rate.values[0], expected(samples), equal_nan=True)
@@ -129,10 +147,16 @@ def test_rows_missing_in_a_fixed_pattern_leave_the_declared_grid(pattern, rate, 
 @pytest.mark.parametrize("pattern", [[1, 1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0, 1, 1, 0, 0]])
 @pytest.mark.parametrize("rate", [10.0, 248.7])
 @pytest.mark.parametrize("jitter", [0.0, 0.03])
-def test_a_log_whose_steps_recur_has_the_rate_of_the_unit_step_and_names_the_other(pattern, rate, jitter):
+def test_a_log_whose_steps_recur_has_the_rate_of_the_unit_step_and_names_the_other(
+    pattern, rate, jitter
+):
     samples = np.flatnonzero(np.resize(pattern, 6000))
-    samples = samples[(np.arange(samples.size) < 40) | (np.random.default_rng(5).random(samples.size) > 0.002)]  # a few lost beside
-    stamps = stamps_of(samples + np.random.default_rng(3).uniform(-jitter, jitter, len(samples)), rate)
+    samples = samples[
+        (np.arange(samples.size) < 40) | (np.random.default_rng(5).random(samples.size) > 0.002)
+    ]  # a few lost beside
+    stamps = stamps_of(
+        samples + np.random.default_rng(3).uniform(-jitter, jitter, len(samples)), rate
+    )
     log = regularise(raw_log(stamps))
     assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-6)
     assert np.array_equal(log.rate.values[0], expected(samples), equal_nan=True)
@@ -148,11 +172,19 @@ def test_a_log_whose_steps_recur_has_the_rate_of_the_unit_step_and_names_the_oth
 @pytest.mark.parametrize(
     "stamps",
     [
-        stamps_of(2 * np.arange(6000) + np.random.default_rng(6).integers(0, 2, 6000), 10.0),  # each on time, or late by 0.1 s
-        START + np.floor(np.arange(6000) * 1e3 / 700.0).astype(np.int64) * 1_000_000,  # 700 Hz, written to the millisecond
+        stamps_of(
+            2 * np.arange(6000) + np.random.default_rng(6).integers(0, 2, 6000), 10.0
+        ),  # each on time, or late by 0.1 s
+        START
+        + np.floor(np.arange(6000) * 1e3 / 700.0).astype(np.int64)
+        * 1_000_000,  # 700 Hz, written to the millisecond
         START + np.floor(np.arange(6000) * 1e3 / 60.0).astype(np.int64) * 1_000_000,
-        stamps_of(np.flatnonzero(np.random.default_rng(7).random(6000) > 0.4), 100.0),  # two of five lost, at random
-        stamps_of(np.flatnonzero(np.resize([1, 1, 0], 6000)) / 1.5, 100.0),  # even for a clock that ticks twice in three samples
+        stamps_of(
+            np.flatnonzero(np.random.default_rng(7).random(6000) > 0.4), 100.0
+        ),  # two of five lost, at random
+        stamps_of(
+            np.flatnonzero(np.resize([1, 1, 0], 6000)) / 1.5, 100.0
+        ),  # even for a clock that ticks twice in three samples
     ],
 )
 def test_even_samples_have_no_steps_that_recur(stamps):
@@ -168,7 +200,9 @@ def test_a_multiple_of_the_rate_is_not_taken_for_it():
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
 @pytest.mark.parametrize("group", [4, 5])
 @pytest.mark.parametrize("period_ms", [1, 4, 10])
-def test_even_stamps_and_then_shared_ones(rows: int, share: float, group: int, period_ms: int) -> None:
+def test_even_stamps_and_then_shared_ones(
+    rows: int, share: float, group: int, period_ms: int
+) -> None:
     """A logger that falls behind: even stamps at first, then groups of rows that share one. The rate is the same all along."""
     even = round(rows * (1 - share))
     shared = even - 1 + group * (1 + np.arange(rows - even) // group)

@@ -39,7 +39,10 @@ def test_rocket_gap(recordings):
     assert log.attrs["sampling_rate_hz"] == pytest.approx(90.909, abs=0.01)
     (gap,) = gap_table(log).itertuples()
     assert gap.seconds == pytest.approx(1068.2, abs=0.1)
-    assert any(note.startswith("launch_1.csv: 1068.2 s without samples") and "row 500" in note for note in log.attrs["notes"])
+    assert any(
+        note.startswith("launch_1.csv: 1068.2 s without samples") and "row 500" in note
+        for note in log.attrs["notes"]
+    )
     np.testing.assert_array_equal(present(log), table[axes].to_numpy().T)
 
 
@@ -55,7 +58,9 @@ def test_px4_dropouts(recordings):
     np.testing.assert_array_equal(present(log), gyro.to_numpy().T)
 
 
-@pytest.mark.parametrize(("name", "rows"), [("run1_static.txt", [5818]), ("run2_turn.txt", [1341, 1960, 2550])])
+@pytest.mark.parametrize(
+    ("name", "rows"), [("run1_static.txt", [5818]), ("run2_turn.txt", [1341, 1960, 2550])]
+)
 def test_fog_restarts(recordings, name, rows):
     table = pd.read_csv(recordings(f"fog-hybrid-warmup/{name}"), comment="#")
     log = regularise(recorded(table.time, table[["wx", "wy", "wz"]], name))

@@ -48,8 +48,16 @@ def test_rows_given_twice_are_duplicates(rows, block):
     assert twice.rows.sum() == len(rows) - 6000
     assert set(table.cause) == {"missing", "duplicate"}
     first = samples[rows[np.flatnonzero(np.diff(rows) < 0)[0] + 1]]
-    assert first in np.rint((twice.start - once.time.values[0]) / np.timedelta64(1, "ns") * 300e-9).astype(int).tolist()
-    assert any(f"dropped as their sample is taken: {len(rows) - 6000} rows" in note for note in log.attrs["notes"])
+    assert (
+        first
+        in np.rint((twice.start - once.time.values[0]) / np.timedelta64(1, "ns") * 300e-9)
+        .astype(int)
+        .tolist()
+    )
+    assert any(
+        f"dropped as their sample is taken: {len(rows) - 6000} rows" in note
+        for note in log.attrs["notes"]
+    )
 
 
 def test_a_damaged_copy_is_a_copy():
@@ -62,7 +70,9 @@ def test_a_damaged_copy_is_a_copy():
 
 
 @pytest.mark.parametrize(
-    "values", [np.random.default_rng(2).standard_normal(9000), np.zeros(9000)], ids=["other values", "values that never change"]
+    "values",
+    [np.random.default_rng(2).standard_normal(9000), np.zeros(9000)],
+    ids=["other values", "values that never change"],
 )
 def test_a_clock_that_starts_again_is_no_repetition(values):
     log = regularise(raw_log(stamps_of(np.r_[0:6000, 0:3000], 300.0), values))

@@ -14,15 +14,28 @@ from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, UnitError
 from gyrostab.ingest import ReadOptions, read_log, scan_file
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, floats_to_ns, integers_to_ns, looks_iso, parse_time_unit
+from gyrostab.ingest.columns.stamps import (
+    NAT,
+    cells_to_ns,
+    floats_to_ns,
+    integers_to_ns,
+    looks_iso,
+    parse_time_unit,
+)
 from gyrostab.ingest.formats import text as text_reader
 from gyrostab.ingest.text.layout import find_layout
 from tests.support.text_logs import PLAIN, ns, write
 
-# --- round trips -------------------------------------------------------------------------------------------------
+# --- round trips
+# -------------------------------------------------------------------------------------------------
 
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False).map(lambda value: float(f"{value:.9g}"))
-VOIDS = {",": ["", "nan", "****", "err"], ";": ["", "NaN", "--"], "\t": ["", "oops"], " ": ["nan", "****"]}
+VOIDS = {
+    ",": ["", "nan", "****", "err"],
+    ";": ["", "NaN", "--"],
+    "\t": ["", "oops"],
+    " ": ["nan", "****"],
+}
 
 
 @st.composite
@@ -34,7 +47,15 @@ def logs(draw: st.DrawFn) -> dict[str, object]:
     cells = {axis: draw(st.lists(NUMBERS, min_size=rows, max_size=rows)) for axis in axes}
     order = draw(st.permutations(["time", *axes]))
     holes = draw(st.sets(st.tuples(st.integers(0, rows - 1), st.sampled_from(axes)), max_size=3))
-    junk = draw(st.lists(st.tuples(st.integers(0, rows), st.sampled_from(["# remark", "", "broken", "1 2 3 4 5 6 7 8 9"])), max_size=2))
+    junk = draw(
+        st.lists(
+            st.tuples(
+                st.integers(0, rows),
+                st.sampled_from(["# remark", "", "broken", "1 2 3 4 5 6 7 8 9"]),
+            ),
+            max_size=2,
+        )
+    )
     return {
         "separator": separator,
         "rows": rows,
@@ -61,19 +82,29 @@ def render(log: dict[str, object]) -> tuple[str, list[int | None]]:
                 lines.append(junk)
                 expected += [None] if junk.strip() and not junk.startswith("#") else []
         if row < log["rows"]:
-            values = {axis: holes.get((row, axis), repr(log["cells"][axis][row])) for axis in log["axes"]}
-            lines.append(separator.join({"time": str(log["stamps"][row]), **values}[name] for name in log["order"]))
+            values = {
+                axis: holes.get((row, axis), repr(log["cells"][axis][row])) for axis in log["axes"]
+            }
+            lines.append(
+                separator.join(
+                    {"time": str(log["stamps"][row]), **values}[name] for name in log["order"]
+                )
+            )
             expected.append(row)
     return log["end"].join(lines) + log["end"], expected
 
 
 @given(logs())
-@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_what_is_written_is_read(tmp_path: Path, log: dict[str, object]) -> None:
     text, expected = render(log)
     data = gzip.compress(text.encode()) if log["gz"] else text.encode()
     path = write(tmp_path, data, "log.csv.gz" if log["gz"] else "log.csv")
-    lost = [row is None or all((row, axis) in log["holes"] for axis in log["axes"]) for row in expected]
+    lost = [
+        row is None or all((row, axis) in log["holes"] for axis in log["axes"]) for row in expected
+    ]
     if sum(lost) > 0.5 * len(expected):
         with pytest.raises(FormatError, match="rows are unreadable"):
             read_log(path)
@@ -81,7 +112,11 @@ def test_what_is_written_is_read(tmp_path: Path, log: dict[str, object]) -> None
     raw = read_log(path)
     assert raw.sizes["row"] == len(expected)
     assert raw.attrs["unreadable_rows"] == sum(lost)
-    inside = [log["stamps"][row] * 1000 for row, bad in zip(expected, lost, strict=True) if row is not None and not bad]
+    inside = [
+        log["stamps"][row] * 1000
+        for row, bad in zip(expected, lost, strict=True)
+        if row is not None and not bad
+    ]
     for index, row in enumerate(expected):
         stamp = int(raw.time.values[index].astype(np.int64))
         if row is None:
@@ -99,7 +134,9 @@ def test_what_is_written_is_read(tmp_path: Path, log: dict[str, object]) -> None
 
 
 @given(st.data())
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_blocks_of_any_size_give_the_same(tmp_path: Path, data: st.DataObject) -> None:
     rows = [f"{n},{n * 0.25}" for n in range(300)]
     for at in data.draw(st.sets(st.integers(0, 299), max_size=6)):
@@ -116,7 +153,8 @@ def test_blocks_of_any_size_give_the_same(tmp_path: Path, data: st.DataObject) -
         assert pieces.attrs[name] == whole.attrs[name]
 
 
-# --- stamps ------------------------------------------------------------------------------------------------------
+# --- stamps
+# ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -136,8 +174,14 @@ def test_blocks_of_any_size_give_the_same(tmp_path: Path, data: st.DataObject) -
     ],
 )
 def test_stamps_keep_every_digit(tmp_path: Path, unit: str, texts: list[str]) -> None:
-    raw = read_log(write(tmp_path, f"time [{unit}],gyro_x [deg/h]\n" + "".join(f"{text},1\n" for text in texts)))
-    per_unit = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "0.1 ms": 10**5, "min": 60 * 10**9}[unit]
+    raw = read_log(
+        write(
+            tmp_path, f"time [{unit}],gyro_x [deg/h]\n" + "".join(f"{text},1\n" for text in texts)
+        )
+    )
+    per_unit = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "0.1 ms": 10**5, "min": 60 * 10**9}[
+        unit
+    ]
     assert ns(raw) == [round(Fraction(Decimal(text)) * per_unit) for text in texts]
 
 
@@ -159,7 +203,9 @@ def test_iso_stamps(tmp_path: Path, text: str, expected: str) -> None:
 
 
 def test_stamps_of_mixed_zones(tmp_path: Path) -> None:
-    rows = "2026-01-01T00:00:00Z,1\n2026-01-01T01:00:01+01:00,2\n2026-01-01T00:00:02,3\nyesterday,4\n"
+    rows = (
+        "2026-01-01T00:00:00Z,1\n2026-01-01T01:00:01+01:00,2\n2026-01-01T00:00:02,3\nyesterday,4\n"
+    )
     raw = read_log(write(tmp_path, "time,gyro_x [deg/h]\n" + rows))
     start = int(np.datetime64("2026-01-01", "ns").astype(np.int64))
     assert ns(raw) == [start, start + 10**9, start + 2 * 10**9, NAT]
@@ -167,13 +213,23 @@ def test_stamps_of_mixed_zones(tmp_path: Path) -> None:
 
 def test_the_epoch_moves_numeric_time_and_is_said_once(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [deg/h]\n0,1\n0.5,2\n")
-    assert sum("1970-01-01" in note for note in read_log([path, write(tmp_path, path.read_text(), "b.csv")]).attrs["notes"]) == 1
+    assert (
+        sum(
+            "1970-01-01" in note
+            for note in read_log([path, write(tmp_path, path.read_text(), "b.csv")]).attrs["notes"]
+        )
+        == 1
+    )
     raw = read_log(path, epoch="2026-01-01T00:00:00Z")
     assert raw.time.values[1] == np.datetime64("2026-01-01T00:00:00.5")
     assert raw.attrs["notes"] == []
 
 
-@given(st.integers(-(2**62), 2**62), st.sampled_from(["s", "ms", "us", "ns"]), st.integers(-(10**18), 10**18))
+@given(
+    st.integers(-(2**62), 2**62),
+    st.sampled_from(["s", "ms", "us", "ns"]),
+    st.integers(-(10**18), 10**18),
+)
 def test_integers_convert_exactly_or_not_at_all(value: int, unit: str, epoch: int) -> None:
     parsed = parse_time_unit(unit)
     exact = value * int(parsed.ns) + epoch
@@ -190,21 +246,45 @@ def test_binary_floats_convert_to_the_nearest_nanosecond(value: float, unit: str
 
 def test_the_careful_way_refuses_what_is_no_number() -> None:
     cells = ["1", " 2.5 ", "1_0", "0x10", "nan", "inf", "", "1e400", "1e-400"]
-    assert cells_to_ns(cells, parse_time_unit("s"), 0).tolist() == [10**9, 25 * 10**8, NAT, NAT, NAT, NAT, NAT, NAT, 0]
+    assert cells_to_ns(cells, parse_time_unit("s"), 0).tolist() == [
+        10**9,
+        25 * 10**8,
+        NAT,
+        NAT,
+        NAT,
+        NAT,
+        NAT,
+        NAT,
+        0,
+    ]
     assert not looks_iso("20261120")
     with pytest.raises(UnitError, match="time unit 'fortnight'"):
         parse_time_unit("fortnight")
 
 
-# --- junk --------------------------------------------------------------------------------------------------------
+# --- junk
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_junk_is_counted_and_named_by_line(tmp_path: Path) -> None:
     lines = ["# head", "time [s],gyro_x [deg/h],gyro_y [deg/h],temperature [degC]"]
-    lines += ["0,1,1,20", "1,2,****,", "2,3", "# pause", "", "3,oops,4,warm", "4,5,5,", "5,nan,inf,", "6,1,1,1,1", "7,8,8,21"]
+    lines += [
+        "0,1,1,20",
+        "1,2,****,",
+        "2,3",
+        "# pause",
+        "",
+        "3,oops,4,warm",
+        "4,5,5,",
+        "5,nan,inf,",
+        "6,1,1,1,1",
+        "7,8,8,21",
+    ]
     raw = read_log(write(tmp_path, "\n".join(lines)))
     nan = np.nan
-    np.testing.assert_array_equal(raw.rate, [[1, 2, nan, nan, 5, nan, nan, 8], [1, nan, nan, 4, 5, nan, nan, 8]])
+    np.testing.assert_array_equal(
+        raw.rate, [[1, 2, nan, nan, 5, nan, nan, 8], [1, nan, nan, 4, 5, nan, nan, 8]]
+    )
     np.testing.assert_array_equal(raw.temperature, [20, nan, nan, nan, nan, nan, nan, 21])
     assert ns(raw) == [0, 10**9, NAT, 3 * 10**9, 4 * 10**9, 5 * 10**9, NAT, 7 * 10**9]
     assert raw.attrs["unreadable_rows"] == 3
@@ -219,7 +299,11 @@ def test_a_scratch_number_in_a_junk_row_is_no_stamp(tmp_path: Path) -> None:
 
 
 def test_a_stray_quote_swallows_no_rows(tmp_path: Path) -> None:
-    rows = "".join(f"{n},{n},ok\n" for n in range(20)).replace("7,7,ok", '7,7,"5 inch').replace("9,9,ok", '9,9,5" hole')
+    rows = (
+        "".join(f"{n},{n},ok\n" for n in range(20))
+        .replace("7,7,ok", '7,7,"5 inch')
+        .replace("9,9,ok", '9,9,5" hole')
+    )
     raw = read_log(write(tmp_path, "time [s],gyro_x [deg/h],remark\n" + rows))
     assert ns(raw) == [n * 10**9 for n in range(20)]
     assert raw.attrs["unreadable_rows"] <= 1
@@ -228,7 +312,11 @@ def test_a_stray_quote_swallows_no_rows(tmp_path: Path) -> None:
 @pytest.mark.parametrize("junk", [bytes(4096), bytes(range(256)) * 20, bytes(100) + b'"'])
 def test_junk_in_the_midst_of_a_log_spoils_single_rows(tmp_path: Path, junk: bytes) -> None:
     rows = [f"{n},{n}\n".encode() for n in range(2000)]
-    raw = read_log(write(tmp_path, PLAIN.encode() + b"".join(rows[:1000]) + junk + b"\n" + b"".join(rows[1000:])))
+    raw = read_log(
+        write(
+            tmp_path, PLAIN.encode() + b"".join(rows[:1000]) + junk + b"\n" + b"".join(rows[1000:])
+        )
+    )
     good = np.isfinite(raw.rate[0].values)
     assert set(raw.rate[0].values[good]) == set(range(2000))
     assert 1 <= raw.attrs["unreadable_rows"] <= 1 + 2 * junk.count(b"\n")
@@ -237,9 +325,13 @@ def test_junk_in_the_midst_of_a_log_spoils_single_rows(tmp_path: Path, junk: byt
 @pytest.mark.parametrize("keep", [0.02, 0.5, 0.99])
 def test_a_truncated_gzip_is_refused_with_advice(tmp_path: Path, keep: float) -> None:
     rng = np.random.default_rng(0)
-    whole = gzip.compress((PLAIN + "".join(f"{n},{v:.6f}\n" for n, v in enumerate(rng.normal(size=50_000)))).encode())
+    whole = gzip.compress(
+        (PLAIN + "".join(f"{n},{v:.6f}\n" for n, v in enumerate(rng.normal(size=50_000)))).encode()
+    )
     path = write(tmp_path, whole[: int(keep * len(whole))], "log.csv.gz")
-    with pytest.raises(FormatError, match=r"log.csv.gz: the gzip stream is damaged or cut off; .* bytes.*gzip -dc"):
+    with pytest.raises(
+        FormatError, match=r"log.csv.gz: the gzip stream is damaged or cut off; .* bytes.*gzip -dc"
+    ):
         read_log(path)
 
 
@@ -258,9 +350,13 @@ def test_the_head_of_a_big_file_may_end_inside_a_line() -> None:
 
 
 def test_the_layout_is_that_of_the_first_lines_and_a_strange_byte_far_below_is_told() -> None:
-    head = b"\xef\xbb\xbf# a tool\ntime [s],gyro_x [deg/h]\n" + b"".join(b"%d,1.5\n\n" % n for n in range(3000))
+    head = b"\xef\xbb\xbf# a tool\ntime [s],gyro_x [deg/h]\n" + b"".join(
+        b"%d,1.5\n\n" % n for n in range(3000)
+    )
     short = find_layout(Path("x.csv"), head[: head.index(b"\n400,")], complete=False)
     assert (short.headers, short.line) == (("time [s]", "gyro_x [deg/h]"), 3)
     assert find_layout(Path("x.csv"), head, complete=True) == short
-    strange = find_layout(Path("x.csv"), head[3:].replace(b"\n2500,1.5", b"\n2500,\xb0"), complete=True)
+    strange = find_layout(
+        Path("x.csv"), head[3:].replace(b"\n2500,1.5", b"\n2500,\xb0"), complete=True
+    )
     assert strange.notes == ("line 5003 is not UTF-8 (b'\\xb0'); the text was read as Latin-1",)

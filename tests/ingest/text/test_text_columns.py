@@ -13,7 +13,8 @@ from gyrostab.ingest import read_log
 from gyrostab.units import INNER
 from tests.support.text_logs import PLAIN, ns, write
 
-# --- layouts -----------------------------------------------------------------------------------------------------
+# --- layouts
+# -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -53,7 +54,9 @@ def test_numbers_without_a_header_are_mapped_by_column(tmp_path: Path) -> None:
 
 
 def test_a_latin_1_header_is_read_with_a_note(tmp_path: Path) -> None:
-    path = write(tmp_path, "time [s],gyro_x [°/h],temperature [°C]\n0,1,20\n1,2,21\n".encode("latin-1"))
+    path = write(
+        tmp_path, "time [s],gyro_x [°/h],temperature [°C]\n0,1,20\n1,2,21\n".encode("latin-1")
+    )
     raw = read_log(path)
     assert raw.temperature.values.tolist() == [20, 21]
     assert any("line 1 is not UTF-8" in note for note in raw.attrs["notes"])
@@ -79,7 +82,9 @@ def test_every_gyro_unit_of_the_contract(tmp_path: Path) -> None:
 def test_channels_convert_by_name(tmp_path: Path) -> None:
     headers = "gyro_x [deg/h],"
     headers += "temperature [degF],vibration [m/s^2],rotation_rate [rpm],supply_voltage [mV],pressure [bar],mag_x [gauss],ramp,mud [%]"
-    raw = read_log(write(tmp_path, headers + "\n1,212,9.80665,10,5000,2,0.5,7,3\n1,,,,,,,,\n"), rate=1)
+    raw = read_log(
+        write(tmp_path, headers + "\n1,212,9.80665,10,5000,2,0.5,7,3\n1,,,,,,,,\n"), rate=1
+    )
     expected = {
         "temperature": (100, "degree_Celsius"),
         "vibration": (1, "g"),
@@ -94,7 +99,9 @@ def test_channels_convert_by_name(tmp_path: Path) -> None:
         assert float(raw[name][0]) == pytest.approx(value, rel=1e-12)
         assert np.isnan(raw[name][1])
         assert raw[name].attrs["units"] == units
-    assert raw.attrs["unreadable_cells"] == 0  # an empty cell of a channel is a slow sensor, no fault
+    assert (
+        raw.attrs["unreadable_cells"] == 0
+    )  # an empty cell of a channel is a slow sensor, no fault
 
 
 def test_angles_are_never_guessed(tmp_path: Path) -> None:
@@ -109,10 +116,13 @@ def test_angles_are_never_guessed(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="--kind angle, but column 'gyro_x"):
         read_log(write(tmp_path, PLAIN + "0,1\n1,2\n"), kind="angle")
     with pytest.raises(UnitError, match="partly rates, partly angles"):
-        read_log(write(tmp_path, "time [s],gyro_x [deg/h],angle_y [deg]\n0,1,1\n1,2,1\n"), kind="rate")
+        read_log(
+            write(tmp_path, "time [s],gyro_x [deg/h],angle_y [deg]\n0,1,1\n1,2,1\n"), kind="rate"
+        )
 
 
-# --- mapping and units -------------------------------------------------------------------------------------------
+# --- mapping and units
+# -------------------------------------------------------------------------------------------
 
 
 def test_a_mapped_unit_overrules_the_header_and_an_option_does_not(tmp_path: Path) -> None:
@@ -125,7 +135,9 @@ def test_a_mapped_unit_overrules_the_header_and_an_option_does_not(tmp_path: Pat
 
 def test_units_for_one_axis_for_all_and_with_a_factor(tmp_path: Path) -> None:
     path = write(tmp_path, "gyro_x,gyro_y,wz\n10,10,10\n10,10,10\n")
-    raw = read_log(path, rate=1, map={"WZ": "gyro_z"}, unit={"gyro": "0.1 arcsec/s", "gyro_y": "deg/s"})
+    raw = read_log(
+        path, rate=1, map={"WZ": "gyro_z"}, unit={"gyro": "0.1 arcsec/s", "gyro_y": "deg/s"}
+    )
     np.testing.assert_allclose(raw.rate[:, 0], [1, 36000, 1])
 
 
@@ -133,15 +145,32 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
     raw = read_log(write(tmp_path, "gyro_x [deg/h],depth [m],state\n1,2,a\n1,2,b\n"), rate=1)
     assert list(raw.data_vars) == ["rate", "depth"]
     assert any("state" in note for note in raw.attrs["notes"])
-    assert "depth" not in read_log(write(tmp_path, "gyro_x [deg/h],depth [m]\n1,2\n1,2\n"), rate=1, map={"depth": "-"})
+    assert "depth" not in read_log(
+        write(tmp_path, "gyro_x [deg/h],depth [m]\n1,2\n1,2\n"), rate=1, map={"depth": "-"}
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "options", "error", "message"),
     [
-        ("time [s],gyro_x\n0,1\n1,2\n", {}, MissingUnitError, r"'gyro_x' carries no unit.*--unit gyro=deg/s"),
-        ("time [s],gyro_x [furlong]\n0,1\n1,2\n", {}, UnitError, r"'furlong' is not known.*--unit gyro=deg/s"),
-        ("time [s],gyro_x [degC]\n0,1\n1,2\n", {}, UnitError, r"a unit of temperature, not of rate"),
+        (
+            "time [s],gyro_x\n0,1\n1,2\n",
+            {},
+            MissingUnitError,
+            r"'gyro_x' carries no unit.*--unit gyro=deg/s",
+        ),
+        (
+            "time [s],gyro_x [furlong]\n0,1\n1,2\n",
+            {},
+            UnitError,
+            r"'furlong' is not known.*--unit gyro=deg/s",
+        ),
+        (
+            "time [s],gyro_x [degC]\n0,1\n1,2\n",
+            {},
+            UnitError,
+            r"a unit of temperature, not of rate",
+        ),
         (
             "time [s],gyro_x [deg/h],T\n0,1,2\n1,2,3\n",
             {"map": {"T": "temperature"}},
@@ -154,24 +183,69 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
             UnitError,
             r"no known unit of temperature",
         ),
-        ("time,gyro_x [deg/h]\n0,1\n1,2\n", {}, MissingUnitError, r"time column 'time' holds numbers.*--unit time=s"),
-        ("time,gyro_x [deg/h]\n0,1\n1,2\n", {"unit": {"time": "parsec"}}, UnitError, r"'parsec' is not known"),
-        ("time [s],gyro_x [deg/h],gyro_x [deg/h]\n0,1,1\n1,2,1\n", {}, FormatError, r"2 columns are called 'gyro_x'"),
-        ("time [s],gyro_x [deg/h],Gyro_X [deg/s]\n0,1,1\n1,2,1\n", {}, FormatError, r"2 columns are called 'gyro_x'"),
+        (
+            "time,gyro_x [deg/h]\n0,1\n1,2\n",
+            {},
+            MissingUnitError,
+            r"time column 'time' holds numbers.*--unit time=s",
+        ),
+        (
+            "time,gyro_x [deg/h]\n0,1\n1,2\n",
+            {"unit": {"time": "parsec"}},
+            UnitError,
+            r"'parsec' is not known",
+        ),
+        (
+            "time [s],gyro_x [deg/h],gyro_x [deg/h]\n0,1,1\n1,2,1\n",
+            {},
+            FormatError,
+            r"2 columns are called 'gyro_x'",
+        ),
+        (
+            "time [s],gyro_x [deg/h],Gyro_X [deg/s]\n0,1,1\n1,2,1\n",
+            {},
+            FormatError,
+            r"2 columns are called 'gyro_x'",
+        ),
         ("gyro_x [deg/h]\n1\n2\n", {}, OptionError, r"no time column.*--rate HZ"),
-        ("t_s,gx_dps,gy_dps\n0,1,1\n1,2,1\n", {}, FormatError, r"Columns: t_s, gx_dps, gy_dps.*gx_dps=gyro_x\" --unit gyro=deg/s"),
+        (
+            "t_s,gx_dps,gy_dps\n0,1,1\n1,2,1\n",
+            {},
+            FormatError,
+            r"Columns: t_s, gx_dps, gy_dps.*gx_dps=gyro_x\" --unit gyro=deg/s",
+        ),
         (
             "time [s],gyro_x [deg/h]\n0,1\n1,2\n",
             {"map": {"wx": "gyro_y"}},
             OptionError,
             r"--map wx: no such column in log.csv; the columns are time \[s\], gyro_x \[deg/h\]",
         ),
-        ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"unit": {"gryo": "deg/s"}}, OptionError, r"--unit gryo: no such column"),
+        (
+            "time [s],gyro_x [deg/h]\n0,1\n1,2\n",
+            {"unit": {"gryo": "deg/s"}},
+            OptionError,
+            r"--unit gryo: no such column",
+        ),
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"rate": -1.0}, OptionError, r"above 0"),
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"kind": "speed"}, OptionError, r"'rate'.*'angle'"),
-        ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"epoch": "long ago"}, OptionError, r"--epoch 'long ago'"),
-        ("time [s],gyro_x\n0,1\n1,2\n", {"unit": {"gyro": "0 deg/s"}}, UnitError, r"'gyro_x': .*the factor 0 is not usable"),
-        ("time [s],temperature [degC]\n0,1\n1,2\n", {}, FormatError, r'no gyro column.*--map "NAME=gyro_x"'),
+        (
+            "time [s],gyro_x [deg/h]\n0,1\n1,2\n",
+            {"epoch": "long ago"},
+            OptionError,
+            r"--epoch 'long ago'",
+        ),
+        (
+            "time [s],gyro_x\n0,1\n1,2\n",
+            {"unit": {"gyro": "0 deg/s"}},
+            UnitError,
+            r"'gyro_x': .*the factor 0 is not usable",
+        ),
+        (
+            "time [s],temperature [degC]\n0,1\n1,2\n",
+            {},
+            FormatError,
+            r'no gyro column.*--map "NAME=gyro_x"',
+        ),
         (b"", {}, FormatError, r"log.csv: the file is empty"),
         (b"\n\n  \n", {}, FormatError, r"empty"),
         ("# only\n# comments\n", {}, FormatError, r"only 2 blank or comment lines"),
@@ -180,11 +254,18 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
         (PLAIN + "0,1\n", {}, FormatError, r"one row of data only"),
         (b"PK\x03\x04" + bytes(range(256)) * 8, {}, FormatError, r"not text but binary"),
         ("time,gyro_x\n".encode("utf-16"), {}, FormatError, r"UTF-16.*UTF-8"),
-        (PLAIN + "0,1\n" + "x,y\n" * 3, {}, FormatError, r"75% of 4 rows are unreadable, the first is line 3"),
+        (
+            PLAIN + "0,1\n" + "x,y\n" * 3,
+            {},
+            FormatError,
+            r"75% of 4 rows are unreadable, the first is line 3",
+        ),
         ("Dear all,\nplease find the log below.\nRegards\nA.\n", {}, GyrostabError, r"log.csv"),
     ],
 )
-def test_bad_input_is_explained(tmp_path: Path, text: str | bytes, options: dict, error: type[Exception], message: str) -> None:
+def test_bad_input_is_explained(
+    tmp_path: Path, text: str | bytes, options: dict, error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message):
         read_log(write(tmp_path, text), **options)
 
@@ -203,7 +284,8 @@ def test_a_temperature_called_t_is_no_time(tmp_path: Path) -> None:
     assert ns(read_log(write(tmp_path, "t [s],gyro_x [deg/h]\n0,1\n1,2\n"))) == [0, 10**9]
 
 
-# --- what the page on formats says ---------------------------------------------------------------------------------
+# --- what the page on formats says
+# ---------------------------------------------------------------------------------
 
 
 def _page() -> str:
@@ -216,19 +298,42 @@ def _named_on_the_page() -> list[tuple[str, str]]:
     pairs = []
     for row in re.findall(r"^\| (`.*)\|$", _page(), re.M):
         cells = [cell.strip() for cell in row.split("|")]
-        names, groups = re.findall(r"`(\w+)`", cells[0]), [group.split(", ") for group in cells[2].split(";")]
+        names, groups = (
+            re.findall(r"`(\w+)`", cells[0]),
+            [group.split(", ") for group in cells[2].split(";")],
+        )
         if cells[2] != "any, or none" and names != ["rotation_rate"]:
-            several = zip(names, groups, strict=True) if len(groups) > 1 else [(name, groups[0]) for name in names]
+            several = (
+                zip(names, groups, strict=True)
+                if len(groups) > 1
+                else [(name, groups[0]) for name in names]
+            )
             pairs += [(name, unit.strip()) for name, units in several for unit in units]
-    assert {("angle_x", "arcsec"), ("gyro_z", "rpm"), ("pressure", "psi"), ("time", "us"), ("mag_y", "nT")} < set(pairs)
+    assert {
+        ("angle_x", "arcsec"),
+        ("gyro_z", "rpm"),
+        ("pressure", "psi"),
+        ("time", "us"),
+        ("mag_y", "nT"),
+    } < set(pairs)
     return pairs
 
 
 def test_every_unit_on_the_page_is_understood(tmp_path: Path) -> None:
     for name, unit in _named_on_the_page():
         others = [] if name == "time" else ["time [s]"]
-        header = ",".join([*others, f"{name} [{unit}]", *([] if name.startswith(("gyro", "angle")) else ["gyro_w [deg/h]"])])
-        path = write(tmp_path, f"{header}\n" + "".join(f"{row},{row}" + ",1" * (header.count(",") - 1) + "\n" for row in range(2)))
+        header = ",".join(
+            [
+                *others,
+                f"{name} [{unit}]",
+                *([] if name.startswith(("gyro", "angle")) else ["gyro_w [deg/h]"]),
+            ]
+        )
+        path = write(
+            tmp_path,
+            f"{header}\n"
+            + "".join(f"{row},{row}" + ",1" * (header.count(",") - 1) + "\n" for row in range(2)),
+        )
         raw = read_log(path, kind="angle" if name.startswith("angle") else None)
         assert name in ("time", *raw.data_vars) or name.split("_")[1] in raw["axis"], (name, unit)
         if name in raw.data_vars:
@@ -236,7 +341,12 @@ def test_every_unit_on_the_page_is_understood(tmp_path: Path) -> None:
 
 
 def test_the_log_on_the_page_is_read(tmp_path: Path) -> None:
-    raw = read_log(write(tmp_path, "\n".join(line[4:] for line in _page().splitlines() if line.startswith("    ")) + "\n"))
+    raw = read_log(
+        write(
+            tmp_path,
+            "\n".join(line[4:] for line in _page().splitlines() if line.startswith("    ")) + "\n",
+        )
+    )
     assert raw["axis"].values.tolist() == ["x", "y", "z"]
     assert raw["temperature"].values[0] == 61.2
     assert np.diff(ns(raw)).tolist() == [10_000_000]

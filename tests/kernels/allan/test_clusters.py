@@ -45,7 +45,9 @@ PATTERNS = {
 
 
 def surface(x: np.ndarray, ks: list[int], *, window: int = N, step: int | None = None, **options):
-    log = make_log(x, rate=1.0, unit="deg/h", axis=[f"a{i}" for i in range(np.atleast_2d(x).shape[0])])
+    log = make_log(
+        x, rate=1.0, unit="deg/h", axis=[f"a{i}" for i in range(np.atleast_2d(x).shape[0])]
+    )
     ks = [k for k in ks if 2 * k <= window]
     made = davar(
         log,
@@ -63,7 +65,9 @@ def surface(x: np.ndarray, ks: list[int], *, window: int = N, step: int | None =
 @settings(max_examples=40, deadline=None)
 def test_cells_equal_the_sum_over_their_terms(seed, data):
     rng = np.random.default_rng(seed)
-    x = rng.standard_normal(data.draw(st.integers(20, 700))) + data.draw(st.sampled_from([0.0, 1e4]))
+    x = rng.standard_normal(data.draw(st.integers(20, 700))) + data.draw(
+        st.sampled_from([0.0, 1e4])
+    )
     x[rng.random(x.size) < data.draw(st.sampled_from([0.0, 0.02, 0.2, 0.5]))] = np.nan
     start = int(rng.integers(0, x.size))
     x[start : start + data.draw(st.sampled_from([1, 30, 200]))] = np.nan
@@ -75,16 +79,29 @@ def test_cells_equal_the_sum_over_their_terms(seed, data):
         first = j * made.attrs["step_samples"]
         for i, k in enumerate(ks):
             stride = int(cluster_strides(window, np.array([k]), np.array([0]))[0])
-            cell, want = made.isel(time=j, tau=i), cluster_cell(x[first : first + window], k, stride=stride, first=first)
+            cell, want = (
+                made.isel(time=j, tau=i),
+                cluster_cell(x[first : first + window], k, stride=stride, first=first),
+            )
             if int(cell["estimator"]) != WEIGHTED:
-                assert np.isfinite(x[first : first + window]).all() or not want["count"] or window < 8
+                assert (
+                    np.isfinite(x[first : first + window]).all() or not want["count"] or window < 8
+                )
                 continue
             assert int(cell["count"]) == want["count"]
             if not want["count"]:
                 assert np.isnan(cell.avar)
                 continue
-            for name in ("avar", "white_response", "quantization_response", "ramp_response", "coverage"):
-                assert float(cell[name]) == pytest.approx(want[name], rel=1e-6 if name == "avar" else 1e-10, abs=1e-12), name
+            for name in (
+                "avar",
+                "white_response",
+                "quantization_response",
+                "ramp_response",
+                "coverage",
+            ):
+                assert float(cell[name]) == pytest.approx(
+                    want[name], rel=1e-6 if name == "avar" else 1e-10, abs=1e-12
+                ), name
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
@@ -94,15 +111,27 @@ def test_few_pairs_of_clusters_find_their_samples_as_many_do(share):
     x = rng.standard_normal(window + 900)
     x[rng.random(x.size) < share] = np.nan
     x[2000:2777] = np.nan
-    few, many = (surface(x, [*ks, 800, 1500, 2000], window=window, step=300).isel(axis=0) for ks in ([], [1, 2, 3]))
-    for name in ("avar", "count", "coverage", "white_response", "quantization_response", "ramp_response"):
+    few, many = (
+        surface(x, [*ks, 800, 1500, 2000], window=window, step=300).isel(axis=0)
+        for ks in ([], [1, 2, 3])
+    )
+    for name in (
+        "avar",
+        "count",
+        "coverage",
+        "white_response",
+        "quantization_response",
+        "ramp_response",
+    ):
         assert np.array_equal(few[name], many[name].sel(tau=few.tau), equal_nan=True), name
     for k in (800, 1500, 2000):
         stride = int(cluster_strides(window, np.array([k]), np.array([0]))[0])
         assert stride > 3  # so that all pairs together are fewer than the samples
         want = cluster_cell(x[300 : 300 + window], k, stride=stride, first=300)
         for name in ("avar", "white_response", "ramp_response", "coverage"):
-            assert float(few[name].isel(time=1).sel(tau=k)) == pytest.approx(want[name], rel=1e-9), name
+            assert float(few[name].isel(time=1).sel(tau=k)) == pytest.approx(
+                want[name], rel=1e-9
+            ), name
 
 
 def test_a_short_window_uses_every_pair_and_a_long_one_as_many_as_have_something_to_add():
@@ -131,7 +160,9 @@ def test_degrees_of_freedom_are_those_of_the_mask(pattern):
     assert compared >= 5
 
 
-@pytest.mark.parametrize("pattern", ["every 7th", "random, 40 %", "blocks of 60", "one block", "the end"])
+@pytest.mark.parametrize(
+    "pattern", ["every 7th", "random, 40 %", "blocks of 60", "one block", "the end"]
+)
 def test_the_scatter_of_many_records_is_that_of_the_degrees_of_freedom(pattern):
     """Of a cell with nu degrees of freedom the variance is ``2 mean^2 / nu``."""
     records, ks = 1500, [1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 180, 250, 330, 400, 440]
@@ -149,7 +180,11 @@ def test_a_cell_that_nearly_vanishes_by_chance_does_not_claim_to_be_certain():
     """Windows of 10 s at 100 Hz that lose their end: long averaging times use every position that is left, and know how few these are."""
     x = np.random.default_rng(6).standard_normal((300, 1000))
     x[:, 890:] = np.nan
-    made = surface(x.ravel(), list(range(1, 500, 6)), window=1000).isel(axis=0).sel(tau=slice(420.0, 490.0))
+    made = (
+        surface(x.ravel(), list(range(1, 500, 6)), window=1000)
+        .isel(axis=0)
+        .sel(tau=slice(420.0, 490.0))
+    )
     assert (made["count"] == 1001 - 2 * made.tau).all()
     assert ((made.avar * made.tau / made.white_response) < 1e-5).mean() < 0.01
     alone = [cluster_cell(x[0], int(k))["edf"] for k in made.tau]

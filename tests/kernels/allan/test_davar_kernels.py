@@ -20,11 +20,21 @@ class TestKernels:
         rng = np.random.default_rng(seed)
         if in_a_row:
             count = IN_A_ROW if count > 2 else 4
-        sizes, first, place = rng.integers(0, longest, count), int(rng.integers(0, 9)), int(rng.integers(0, 3))
-        lags = rng.integers(1, 40) + np.arange(-2, count) if in_a_row else np.sort(rng.choice(40, count + 2, replace=False)) + 1
+        sizes, first, place = (
+            rng.integers(0, longest, count),
+            int(rng.integers(0, 9)),
+            int(rng.integers(0, 3)),
+        )
+        lags = (
+            rng.integers(1, 40) + np.arange(-2, count)
+            if in_a_row
+            else np.sort(rng.choice(40, count + 2, replace=False)) + 1
+        )
         splits = rng.integers(0, sizes + 1)
         used = lags[2:]
-        theta = np.full(first + longest + 2 * used.max() + 2 * LANES, np.nan)  # what no term needs may be anything
+        theta = np.full(
+            first + longest + 2 * used.max() + 2 * LANES, np.nan
+        )  # what no term needs may be anything
         end = first + (sizes + 2 * used).max()
         theta[first:end] = rng.standard_normal(end - first)
         heads, tails = np.full((2, count + 4), 7.0)
@@ -33,12 +43,18 @@ class TestKernels:
             m = first + np.arange(size)
             squares = (theta[m + 2 * k] - 2 * theta[m + k] + theta[m]) ** 2
             found = [heads[place + i] - 7.0, tails[place + i] - 7.0]
-            np.testing.assert_allclose(found, [squares[:split].sum(), squares[split:].sum()], rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(
+                found, [squares[:split].sum(), squares[split:].sum()], rtol=1e-12, atol=1e-13
+            )
         others = np.r_[:place, place + count : count + 4]
         assert np.all(heads[others] == 7.0)
         assert np.all(tails[others] == 7.0)
 
-    @given(st.integers(0, 2**32 - 1), st.integers(1, 9000), st.sampled_from([0.0, 0.001, 0.3, 0.99, 1.0]))
+    @given(
+        st.integers(0, 2**32 - 1),
+        st.integers(1, 9000),
+        st.sampled_from([0.0, 0.001, 0.3, 0.99, 1.0]),
+    )
     @settings(max_examples=40, deadline=None)
     def test_integral_and_its_levels(self, seed, n, missing):
         rng = np.random.default_rng(seed)
@@ -73,6 +89,18 @@ class TestKernels:
             (whole, False, True, 9),
         ]:
             ks = np.arange(1, n_tau + 1) * 8 if octave else np.arange(1, n_tau + 1)
-            unit = Unit(1000, 300, ks, thin(ks) if octave else np.zeros_like(ks), angle, 0.01, False, 0.3, 0.1)
-            for fresh, used in zip(surface_unit(x, unit), surface_unit(x, unit, space), strict=True):
+            unit = Unit(
+                1000,
+                300,
+                ks,
+                thin(ks) if octave else np.zeros_like(ks),
+                angle,
+                0.01,
+                False,
+                0.3,
+                0.1,
+            )
+            for fresh, used in zip(
+                surface_unit(x, unit), surface_unit(x, unit, space), strict=True
+            ):
                 np.testing.assert_array_equal(fresh, used)

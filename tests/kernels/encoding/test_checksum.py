@@ -17,7 +17,11 @@ def by_numcodecs(data: np.ndarray) -> int:
 
 
 @settings(max_examples=100, deadline=None)
-@given(hnp.arrays(np.uint8, st.integers(1, 1100), elements=st.integers(0, 255) | st.sampled_from([0, 255])))
+@given(
+    hnp.arrays(
+        np.uint8, st.integers(1, 1100), elements=st.integers(0, 255) | st.sampled_from([0, 255])
+    )
+)
 @example(np.zeros(100, np.uint8))
 @example(np.full(720, 255, np.uint8))
 @example(np.array([255, 254, 0, 1], np.uint8))  # the words add up to 65535

@@ -9,24 +9,57 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.ingest.columns.stamps import NAT
-from gyrostab.kernels.encoding.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, clean_column, read_rows
+from gyrostab.kernels.encoding.rows import (
+    BLANKS,
+    ISO,
+    NUMBER,
+    NUMERIC_TIME,
+    SKIPPED,
+    clean_column,
+    read_rows,
+)
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-def rows_of(text: str, roles: list[int], *, separator: str = ",", point: str = ".", digits: int = 9):
+def rows_of(
+    text: str, roles: list[int], *, separator: str = ",", point: str = ".", digits: int = 9
+):
     code = BLANKS if separator == " " else ord(separator)
     held = np.frombuffer(text.encode("latin-1"), dtype=np.uint8)
-    return read_rows(held, 0, np.array(roles), separator=code, point=ord(point), digits=digits, rows=text.count("\n"))
+    return read_rows(
+        held,
+        0,
+        np.array(roles),
+        separator=code,
+        point=ord(point),
+        digits=digits,
+        rows=text.count("\n"),
+    )
 
 
 numbers = st.one_of(
     st.floats(-1e18, 1e18).map(repr),
     st.floats(-1e-3, 1e-3).map(repr),
-    st.tuples(st.integers(-(10**9), 10**9), st.integers(0, 12)).map(lambda t: f"{t[0] / 7:.{t[1]}f}"),
+    st.tuples(st.integers(-(10**9), 10**9), st.integers(0, 12)).map(
+        lambda t: f"{t[0] / 7:.{t[1]}f}"
+    ),
     st.integers(-(2**63), 2**63).map(str),
     st.tuples(st.integers(0, 10**18), st.integers(-45, 20)).map(lambda t: f"{t[0]}e{t[1]:+d}"),
-    st.sampled_from(["0", "-0.0", "+5", ".5", "5.", "9007199254740993", "9007199254740993.0", "1e23", "8.41e21", "1.8446744073709551e19"]),
+    st.sampled_from(
+        [
+            "0",
+            "-0.0",
+            "+5",
+            ".5",
+            "5.",
+            "9007199254740993",
+            "9007199254740993.0",
+            "1e23",
+            "8.41e21",
+            "1.8446744073709551e19",
+        ]
+    ),
 )
 
 
@@ -41,7 +74,16 @@ def test_a_number_is_the_nearest_double_or_is_not_read_at_all(cells):
 
 
 @pytest.mark.parametrize(
-    "cell", ["0.1", "-12.345678", "1767225600.0025", "3.141592653589793", "-2.2250738585072014e-8", "1e-5", "123456789012345678"]
+    "cell",
+    [
+        "0.1",
+        "-12.345678",
+        "1767225600.0025",
+        "3.141592653589793",
+        "-2.2250738585072014e-8",
+        "1e-5",
+        "123456789012345678",
+    ],
 )
 def test_common_numbers_are_read(cell):
     values, _, stop = rows_of(f"{cell}\n", [NUMBER])
@@ -50,7 +92,25 @@ def test_common_numbers_are_read(cell):
 
 
 @pytest.mark.parametrize(
-    "cell", ["****", "1_000", "0x10", "inf", "1e", "1e5000", "-", ".", "1.2.3", '"1"', "12 34", "1#", "e5", "na", "--1", "1" * 25]
+    "cell",
+    [
+        "****",
+        "1_000",
+        "0x10",
+        "inf",
+        "1e",
+        "1e5000",
+        "-",
+        ".",
+        "1.2.3",
+        '"1"',
+        "12 34",
+        "1#",
+        "e5",
+        "na",
+        "--1",
+        "1" * 25,
+    ],
 )
 def test_what_is_no_plain_number_is_left_to_others(cell):
     values, _, stop = rows_of(f"1.5\n{cell}\n2.5\n", [NUMBER])
@@ -63,7 +123,10 @@ def test_a_row_of_another_width_is_left_to_others(row):
     assert rows_of(f"{row}\n", [NUMBER, NUMBER])[2] == 0
 
 
-@pytest.mark.parametrize(("cell", "value"), [("", np.nan), ("  ", np.nan), ("nan", np.nan), ("-NaN", np.nan), (" 7.5 ", 7.5), ("\t7", 7.0)])
+@pytest.mark.parametrize(
+    ("cell", "value"),
+    [("", np.nan), ("  ", np.nan), ("nan", np.nan), ("-NaN", np.nan), (" 7.5 ", 7.5), ("\t7", 7.0)],
+)
 def test_void_cells_and_blanks_around_cells(cell, value):
     values, stamps, stop = rows_of(f"1,{cell}\r\n", [NUMERIC_TIME, NUMBER], digits=0)
     assert stop > 0
@@ -72,21 +135,27 @@ def test_void_cells_and_blanks_around_cells(cell, value):
 
 
 def test_lines_without_data_are_passed():
-    values, stamps, stop = rows_of("\n# said\n \r\n  % too\n1,2\n\n\n3,\n", [NUMERIC_TIME, NUMBER], digits=0)
+    values, stamps, stop = rows_of(
+        "\n# said\n \r\n  % too\n1,2\n\n\n3,\n", [NUMERIC_TIME, NUMBER], digits=0
+    )
     assert stop == 28
     assert stamps.tolist() == [1, 3]
     assert np.array_equal(values, [[2.0, np.nan]], equal_nan=True)
 
 
 def test_blanks_separate_in_any_number():
-    values, stamps, stop = rows_of("  1.5   2\t-3 \n4 5 6\n7 8\n", [NUMBER, SKIPPED, NUMERIC_TIME], separator=" ", digits=0)
+    values, stamps, stop = rows_of(
+        "  1.5   2\t-3 \n4 5 6\n7 8\n", [NUMBER, SKIPPED, NUMERIC_TIME], separator=" ", digits=0
+    )
     assert values.tolist() == [[1.5, 4.0]]
     assert stamps.tolist() == [-3, 6]
     assert stop == 20
 
 
 def test_decimal_comma_and_columns_that_are_not_wanted():
-    values, _, stop = rows_of("word;1,25;2,5\n", [SKIPPED, NUMBER, NUMBER], separator=";", point=",")
+    values, _, stop = rows_of(
+        "word;1,25;2,5\n", [SKIPPED, NUMBER, NUMBER], separator=";", point=","
+    )
     assert values.tolist() == [[1.25], [2.5]]
     assert stop == 14
     assert rows_of('"a;b";1;2\n', [SKIPPED, NUMBER, NUMBER], separator=";")[2] == 0
@@ -95,7 +164,11 @@ def test_decimal_comma_and_columns_that_are_not_wanted():
 @settings(deadline=None)
 @given(st.integers(-(10**18), 10**18), st.integers(0, 9), st.integers(0, 9))
 def test_numbers_of_time_are_exact_and_halves_go_to_even(count, decimals, digits):
-    text = f"{'-' if count < 0 else ''}{abs(count) // 10**decimals}.{abs(count) % 10**decimals:0{decimals}d}" if decimals else str(count)
+    text = (
+        f"{'-' if count < 0 else ''}{abs(count) // 10**decimals}.{abs(count) % 10**decimals:0{decimals}d}"
+        if decimals
+        else str(count)
+    )
     _, stamps, stop = rows_of(f"{text}\n", [NUMERIC_TIME], digits=digits)
     wanted = round(Fraction(count, 10**decimals) * 10**digits)
     if stop:
@@ -122,7 +195,14 @@ def test_dates_are_those_of_the_calendar(moment, digits, between, zone):
 
 
 @pytest.mark.parametrize(
-    "text", ["2025-02-29T00:00:00", "2026-04-31T00:00:00", "2026-13-01T00:00:00", "2026-01-01T24:00:00", "2026-01-01T00:00:60"]
+    "text",
+    [
+        "2025-02-29T00:00:00",
+        "2026-04-31T00:00:00",
+        "2026-13-01T00:00:00",
+        "2026-01-01T24:00:00",
+        "2026-01-01T00:00:60",
+    ],
 )
 def test_days_that_do_not_exist_are_left_to_others(text):
     assert rows_of(f"{text}\n", [ISO])[2] == 0
@@ -131,12 +211,20 @@ def test_days_that_do_not_exist_are_left_to_others(text):
 
 
 @settings(deadline=None)
-@given(st.lists(st.floats(-1e6, 1e6) | st.sampled_from([np.nan, np.inf, -np.inf]) | st.integers(-100, 100).map(float)))
+@given(
+    st.lists(
+        st.floats(-1e6, 1e6)
+        | st.sampled_from([np.nan, np.inf, -np.inf])
+        | st.integers(-100, 100).map(float)
+    )
+)
 def test_a_column_is_cleaned_as_numpy_would(values):
     column = np.array(values, dtype=np.float64)
     missing, low, high, whole = clean_column(held := column.copy(), 3.7, 0.1)
     finite = column[np.isfinite(column)]
     assert missing == len(column) - len(finite)
-    assert np.array_equal(held, np.where(np.isfinite(column), column * 3.7 + 0.1, np.nan), equal_nan=True)
+    assert np.array_equal(
+        held, np.where(np.isfinite(column), column * 3.7 + 0.1, np.nan), equal_nan=True
+    )
     assert (low, high) == (finite.min(initial=np.inf), finite.max(initial=-np.inf))
     assert whole == (finite == np.rint(finite)).all()

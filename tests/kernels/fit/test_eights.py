@@ -34,7 +34,9 @@ def test_operations_are_those_of_numpy_place_by_place():
     a, b = rng.normal(size=8), rng.uniform(0.1, 1.0, 8)
     a[2] = np.nan
     got, address = every_operation(a, b)
-    np.testing.assert_array_equal(got[:6], [a + b, 2.0 - a, a * b, 1.0 / b, np.sqrt(b), np.where(a > b, 1.0, a)])
+    np.testing.assert_array_equal(
+        got[:6], [a + b, 2.0 - a, a * b, 1.0 / b, np.sqrt(b), np.where(a > b, 1.0, a)]
+    )
     assert address % 64 == 0
 
 
@@ -66,8 +68,15 @@ def test_elimination_is_that_of_numpy_where_the_matrix_is_positive_definite(n):
         factor = np.linalg.cholesky(matrices[place])
         first, second = (one.reshape(n, n + 6, 8)[:, :, place] for one in (whitened, solved))
         np.testing.assert_allclose(np.triu(first[:, :n]), factor.T, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(first[:, n:], np.linalg.solve(factor, columns[place]), rtol=1e-7, atol=1e-8)
-        np.testing.assert_allclose(second[:, n : n + 5], np.linalg.solve(matrices[place], columns[place, :, :5]), rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(
+            first[:, n:], np.linalg.solve(factor, columns[place]), rtol=1e-7, atol=1e-8
+        )
+        np.testing.assert_allclose(
+            second[:, n : n + 5],
+            np.linalg.solve(matrices[place], columns[place, :, :5]),
+            rtol=1e-6,
+            atol=1e-7,
+        )
 
 
 @njit(**COMPILED)
@@ -91,8 +100,13 @@ def test_eight_nonnegative_solutions_are_those_of_scipy_whatever_is_tried_first(
         design = rng.standard_normal((8, 12, 5)) * 10.0 ** rng.integers(-6, 6, (8, 1, 5))
         data = rng.standard_normal((8, 12))
         if rng.random() < 0.5:  # a minimiser with all terms
-            data = data / 10 + (design / abs(design).max(axis=1, keepdims=True)) @ rng.uniform(0.5, 1.0, 5)
-        normal, right = np.einsum("pni,pnj->pij", design, design), np.einsum("pni,pn->pi", design, data)
+            data = data / 10 + (design / abs(design).max(axis=1, keepdims=True)) @ rng.uniform(
+                0.5, 1.0, 5
+            )
+        normal, right = (
+            np.einsum("pni,pnj->pij", design, design),
+            np.einsum("pni,pn->pi", design, data),
+        )
         guess = rng.integers(0, 2, (8, 5)) * np.isin(np.arange(5), members)
         squares, terms = nonnegative_eight(normal, right, allowed, guess.astype(float))
         for place in range(8):

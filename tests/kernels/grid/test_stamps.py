@@ -15,13 +15,17 @@ PERIOD = 10_000_000.0
 
 def place(samples, *, max_gap=1e9, hold=0.75, pieces=None):
     """Runs and events of rows with stamps at `samples` (may be fractions; None: no stamp)."""
-    stamps = np.array([NO_STAMP if s is None else round(s * PERIOD) for s in samples], dtype=np.int64)
+    stamps = np.array(
+        [NO_STAMP if s is None else round(s * PERIOD) for s in samples], dtype=np.int64
+    )
     rows = np.arange(len(stamps))
     state, ring = kernel.new_state()
     runs, events = [], []
     for a, b in pairwise([0, *(pieces or []), len(rows)]):
         end = min(len(rows), b + kernel.LOOK)
-        run, event = kernel.place(rows[a:end], stamps[a:end], b - a, PERIOD, hold, max_gap, state, ring)
+        run, event = kernel.place(
+            rows[a:end], stamps[a:end], b - a, PERIOD, hold, max_gap, state, ring
+        )
         runs.append(run)
         events.append(event)
     runs.append(state[kernel.OPEN_RUN][None])
@@ -118,7 +122,9 @@ def test_last_stamp_after_200_hours_at_300_hertz():
     samples = np.concatenate([np.arange(1000), np.arange(last - 1000, last + 1)])
     stamps = np.rint(samples * (1e9 / 300)).astype(np.int64)
     state, ring = kernel.new_state()
-    runs, _ = kernel.place(np.arange(len(samples)), stamps, len(samples), period, 0.75, 1e12, state, ring)
+    runs, _ = kernel.place(
+        np.arange(len(samples)), stamps, len(samples), period, 0.75, 1e12, state, ring
+    )
     assert runs.tolist() == [[0, 0, 1000]]
     assert state[kernel.OPEN_RUN].tolist() == [last - 1000, 1000, 1001]
 
@@ -127,7 +133,11 @@ def test_samples_between_stamps_are_counted_as_a_division_rounds_them():
     rng = np.random.default_rng(4)
     steps = rng.choice([0, 3, 4, 5, 6, 8, 10, 12, 14, 15, 16, 20, 25, 35, -5, -15, 400, -400], 3000)
     stamps = np.cumsum(steps)
-    for gain in (0.0, 0.1, 0.5):  # without gain the phase stays on whole numbers, and many a stamp lies just between two samples
+    for gain in (
+        0.0,
+        0.1,
+        0.5,
+    ):  # without gain the phase stays on whole numbers, and many a stamp lies just between two samples
         count, piece, phase = [0], [0], 0.0
         for step in np.diff(stamps).tolist():
             new = abs(step) > 300

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
 
-def enumerated(like: np.ndarray, low: float, high: float) -> tuple[float, np.ndarray, np.ndarray, float]:
+def enumerated(
+    like: np.ndarray, low: float, high: float
+) -> tuple[float, np.ndarray, np.ndarray, float]:
     """Log likelihood, shares, their squares and steps up, from every course of levels over the parts of the blocks."""
     blocks, parts = like.shape[0], like.shape[1] - 1
     rate = 1.0 / low + 1.0 / high
@@ -39,13 +41,17 @@ def test_is_the_sum_over_all_courses(parts: int) -> None:
     log, share, square, up = levels_smooth(like, *level_tables(low, high, parts), start)
     for record in range(2):
         expected = enumerated(like[record], low[record], high[record])
-        for found, known in zip((log[record], share[record], square[record], up[record]), expected, strict=True):
+        for found, known in zip(
+            (log[record], share[record], square[record], up[record]), expected, strict=True
+        ):
             np.testing.assert_allclose(found, known, rtol=1e-10)
 
 
 @given(low=st.floats(0.3, 300.0), high=st.floats(0.3, 300.0), parts=st.integers(1, 8))
 @settings(max_examples=40, deadline=None)
-def test_tables_are_chances_and_hop_as_often_as_the_times_say(low: float, high: float, parts: int) -> None:
+def test_tables_are_chances_and_hop_as_often_as_the_times_say(
+    low: float, high: float, parts: int
+) -> None:
     chance, rises = level_tables(np.array([low]), np.array([high]), parts)
     np.testing.assert_allclose(chance.sum(axis=(2, 3)), 1.0, rtol=1e-10)
     settled = np.array([low, high]) / (low + high)

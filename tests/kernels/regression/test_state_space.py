@@ -32,7 +32,9 @@ def relaxation_covariance(edges: np.ndarray, time: float) -> np.ndarray:
 
 def dense(columns, variance, step, present, K2, ou_variance, ou_time):
     edges = np.concatenate([[0.0], np.cumsum(step)])
-    V = np.diag(variance) + walk_covariance(np.concatenate([[0.0], np.cumsum(K2 * step)]))  # it walks by its own clock
+    V = np.diag(variance) + walk_covariance(
+        np.concatenate([[0.0], np.cumsum(K2 * step)])
+    )  # it walks by its own clock
     for v, time in zip(ou_variance, ou_time, strict=True):
         V = V + v * relaxation_covariance(edges, time)
     V, X, one = V[np.ix_(present, present)], columns[present], np.ones(present.sum())
@@ -43,7 +45,12 @@ def dense(columns, variance, step, present, K2, ou_variance, ou_time):
 
 
 @settings(deadline=None, max_examples=40)
-@given(seed=st.integers(0, 10**6), missing=st.floats(0.0, 0.8), K=st.sampled_from([0.0, 0.01, 1.0]), processes=st.integers(0, 5))
+@given(
+    seed=st.integers(0, 10**6),
+    missing=st.floats(0.0, 0.8),
+    K=st.sampled_from([0.0, 0.01, 1.0]),
+    processes=st.integers(0, 5),
+)
 def test_products_and_determinant_are_those_of_the_dense_covariance(seed, missing, K, processes):
     rng = np.random.default_rng(seed)
     n = 60
@@ -53,7 +60,15 @@ def test_products_and_determinant_are_those_of_the_dense_covariance(seed, missin
     columns = rng.standard_normal((n, 4)) + 5.0
     variance = rng.uniform(0.5, 2.0, n)
     K2 = K**2 * (rng.uniform(0.1, 3.0, n) if seed % 3 else np.ones(n))
-    case = (columns, variance, step, present, K2, rng.uniform(0.1, 3.0, processes), 10.0 ** rng.uniform(0.0, 5.0, processes))
+    case = (
+        columns,
+        variance,
+        step,
+        present,
+        K2,
+        rng.uniform(0.1, 3.0, processes),
+        10.0 ** rng.uniform(0.0, 5.0, processes),
+    )
     whitened, log_determinant = whiten(*case)
     products, expected = dense(*case)
     np.testing.assert_allclose(whitened.T @ whitened, products, rtol=1e-8, atol=1e-8)
@@ -64,7 +79,14 @@ def test_products_and_determinant_are_those_of_the_dense_covariance(seed, missin
 def test_a_constant_is_taken_out_and_nothing_else():
     rng = np.random.default_rng(3)
     n = 50
-    case = (np.ones(n), np.full(n, 20.0), rng.random(n) > 0.3, np.full(n, 1e-3), np.array([0.2]), np.array([100.0]))
+    case = (
+        np.ones(n),
+        np.full(n, 20.0),
+        rng.random(n) > 0.3,
+        np.full(n, 1e-3),
+        np.array([0.2]),
+        np.array([100.0]),
+    )
     columns = rng.standard_normal((n, 2))
     plain, _ = whiten(columns, *case)
     moved, _ = whiten(columns + np.array([1e6, 0.0]), *case)
@@ -75,7 +97,9 @@ def test_a_constant_is_taken_out_and_nothing_else():
 
 def test_white_noise_alone_leaves_deviations_from_the_mean():
     values = np.array([[1.0], [2.0], [4.0]])
-    whitened, log_determinant = whiten(values, np.full(3, 0.5), np.ones(3), np.ones(3, bool), np.zeros(3), np.empty(0), np.empty(0))
+    whitened, log_determinant = whiten(
+        values, np.full(3, 0.5), np.ones(3), np.ones(3, bool), np.zeros(3), np.empty(0), np.empty(0)
+    )
     assert (whitened**2).sum() == pytest.approx(((values - values.mean()) ** 2).sum() / 0.5)
     assert log_determinant == pytest.approx(3 * np.log(0.5) + np.log(3 / 0.5))
 
@@ -91,7 +115,14 @@ def test_slow_and_fast_processes_keep_their_digits():
     rng = np.random.default_rng(5)
     n = 40
     slow_and_fast = np.ones(3), np.array([999.0, 1e6, 1e-2])
-    case = (rng.standard_normal((n, 2)), np.full(n, 1e-3), np.full(n, 1.0), np.ones(n, bool), np.zeros(n), *slow_and_fast)
+    case = (
+        rng.standard_normal((n, 2)),
+        np.full(n, 1e-3),
+        np.full(n, 1.0),
+        np.ones(n, bool),
+        np.zeros(n),
+        *slow_and_fast,
+    )
     whitened, log_determinant = whiten(*case)
     products, expected = dense(*case)
     np.testing.assert_allclose(whitened.T @ whitened, products, rtol=1e-7)
@@ -104,7 +135,9 @@ def flicker_variogram(lag: np.ndarray) -> np.ndarray:
     def integral(x):
         return np.where(x > 0, -(x**2) / 2.0 * np.log(np.maximum(x, 1e-300)) + 0.75 * x**2, 0.0)
 
-    covariance = (integral(lag + 1.0) - 2.0 * integral(lag * 1.0) + integral(np.abs(lag - 1.0))) / np.pi
+    covariance = (
+        integral(lag + 1.0) - 2.0 * integral(lag * 1.0) + integral(np.abs(lag - 1.0))
+    ) / np.pi
     return 2.0 * (2.0 * integral(np.array(1.0)) / np.pi - covariance)
 
 
@@ -112,7 +145,9 @@ def test_processes_make_flicker_noise():
     step, n = 20.0, 180
     variance, time, white = flicker_states(step, step * n)
     edges = np.arange(n + 1) * step
-    covariance = sum(v * relaxation_covariance(edges, t)[0] for v, t in zip(variance, time, strict=True))
+    covariance = sum(
+        v * relaxation_covariance(edges, t)[0] for v, t in zip(variance, time, strict=True)
+    )
     lag = np.arange(1, n)
     found = 2.0 * (covariance[0] + white - covariance[1:])
     np.testing.assert_allclose(found, flicker_variogram(lag), rtol=0.05)

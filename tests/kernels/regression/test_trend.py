@@ -26,13 +26,18 @@ def test_means_and_slopes_are_those_of_extended_precision(offset):
     first = np.sort(rng.integers(0, 2990, 200))
     last = np.minimum(first + rng.integers(8, 900, 200), 3000)
     got = window_trend(values, seconds, first, last)
-    expected = np.array([plain(values[a:b], seconds[a:b]) for a, b in zip(first, last, strict=True)]).T
+    expected = np.array(
+        [plain(values[a:b], seconds[a:b]) for a, b in zip(first, last, strict=True)]
+    ).T
     np.testing.assert_allclose(got[0], expected[0], rtol=1e-14, atol=1e-14 * (1.0 + offset))
     np.testing.assert_allclose(got[1], expected[1], rtol=1e-10, atol=1e-14 * (1.0 + offset))
 
 
 def test_windows_that_have_no_mean_or_no_slope():
-    values, seconds = np.array([np.nan, np.inf, 3.0, np.nan, 5.0]), np.array([0.0, 1.0, 2.0, 3.0, 2.0])
+    values, seconds = (
+        np.array([np.nan, np.inf, 3.0, np.nan, 5.0]),
+        np.array([0.0, 1.0, 2.0, 3.0, 2.0]),
+    )
     first, last = np.array([0, 1, 2, 3, 4]), np.array([2, 3, 5, 3, 5])
     got = window_trend(values, seconds, first, last)
     np.testing.assert_array_equal(got, [[np.nan, 3.0, 4.0, np.nan, 5.0], [np.nan] * 5])

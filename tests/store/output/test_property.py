@@ -41,7 +41,13 @@ def read_tree(folder: Path) -> dict[str, object]:
     found: dict[str, object] = {}
     for path in sorted(folder.rglob("*")):
         place = path.relative_to(folder).as_posix()
-        found[place] = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
+        found[place] = (
+            os.readlink(path)
+            if path.is_symlink()
+            else path.read_bytes()
+            if path.is_file()
+            else None
+        )
     return found
 
 
@@ -62,7 +68,18 @@ def inputs(tmp_path_factory) -> Path:
 
 
 #: What may lie under the name of an output, and what may be put into it.
-KINDS = ("nothing", "file", "folder", "photos", "store", "store with notes", "link to file", "link to store", "link to nothing", "an input")
+KINDS = (
+    "nothing",
+    "file",
+    "folder",
+    "photos",
+    "store",
+    "store with notes",
+    "link to file",
+    "link to store",
+    "link to nothing",
+    "an input",
+)
 
 
 def put(folder: Path, name: str, kind: str, *, source: str = "") -> None:
@@ -79,7 +96,11 @@ def put(folder: Path, name: str, kind: str, *, source: str = "") -> None:
         if "notes" in kind:
             (path / "rate" / "notes.txt").write_text("mine")
     elif kind.startswith("link"):
-        path.symlink_to({"file": "precious.nc", "store": "elsewhere", "nothing": "nowhere"}[kind.rpartition(" ")[2]])
+        path.symlink_to(
+            {"file": "precious.nc", "store": "elsewhere", "nothing": "nowhere"}[
+                kind.rpartition(" ")[2]
+            ]
+        )
     elif kind == "an input":
         path.symlink_to(source.replace("*", "o"))
 
@@ -102,7 +123,10 @@ def calls_of_the_disk(act: Callable[[int], None], folder: Path) -> Iterator[None
     def wrap(function: Callable[..., object]) -> Callable[..., object]:
         def wrapped(*arguments: object, **options: object) -> object:
             nonlocal count
-            if any(str(argument).startswith(str(folder)) or "part" in str(argument) for argument in arguments[:2]):
+            if any(
+                str(argument).startswith(str(folder)) or "part" in str(argument)
+                for argument in arguments[:2]
+            ):
                 count += 1
                 act(count)
             return function(*arguments, **options)
@@ -116,7 +140,9 @@ def calls_of_the_disk(act: Callable[[int], None], folder: Path) -> Iterator[None
         yield
 
 
-def check_tree(folder: Path, before: dict[str, object], target: str, *, done: bool, killed: bool) -> None:
+def check_tree(
+    folder: Path, before: dict[str, object], target: str, *, done: bool, killed: bool
+) -> None:
     """Nothing has changed but the output; that is whole, the old one or the new one."""
 
     def is_output(name: str) -> bool:
@@ -128,7 +154,9 @@ def check_tree(folder: Path, before: dict[str, object], target: str, *, done: bo
 
     after = read_tree(folder)
     assert {name: value for name, value in before.items() if not is_output(name)} == {
-        name: value for name, value in after.items() if not is_output(name) and not (killed and is_hidden(name))
+        name: value
+        for name, value in after.items()
+        if not is_output(name) and not (killed and is_hidden(name))
     }
     old = {name: value for name, value in before.items() if is_output(name)}
     new = {name: value for name, value in after.items() if is_output(name)}
@@ -140,7 +168,13 @@ def check_tree(folder: Path, before: dict[str, object], target: str, *, done: bo
         assert new == old
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@settings(
+    max_examples=25,
+    deadline=None,
+    derandomize=True,
+    phases=[Phase.generate],
+    suppress_health_check=list(HealthCheck),
+)
 @given(data=st.data())
 def test_nothing_changes_but_the_output(inputs, data):
     command, suffixes = COMMANDS[data.draw(st.sampled_from(sorted(COMMANDS)))]
@@ -171,11 +205,14 @@ def test_nothing_changes_but_the_output(inputs, data):
                 pass
         assert code in (0, 2, 3)
         check_tree(folder, before, target, done=code == 0, killed=code == 3)
-        if kind in ("photos", "store with notes", "an input") or (not flags and "nothing" not in kind):
+        if kind in ("photos", "store with notes", "an input") or (
+            not flags and "nothing" not in kind
+        ):
             assert read_tree(folder) == before
 
 
-# -------------------------------------------------------------------------------------------------------------------- kills
+# --------------------------------------------------------------------------------------------------------------------
+# kills
 
 
 def kill_commands(inputs: Path, top: Path, seed: int, kills: int) -> dict[str, object]:
@@ -192,7 +229,9 @@ def kill_commands(inputs: Path, top: Path, seed: int, kills: int) -> dict[str, o
         child = os.fork()
         if child == 0:
             os.chdir(folder)
-            with calls_of_the_disk(lambda call, at=moment: os.kill(os.getpid(), 9) if call == at else None, folder):
+            with calls_of_the_disk(
+                lambda call, at=moment: os.kill(os.getpid(), 9) if call == at else None, folder
+            ):
                 os._exit(call(*command, "-o", name, "--overwrite", "--quiet-progress"))
         killed = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -9
         landed += killed
@@ -204,8 +243,18 @@ def kill_commands(inputs: Path, top: Path, seed: int, kills: int) -> dict[str, o
 
 
 def test_kills_leave_the_old_output_or_the_new_one(inputs, tmp_path):
-    command = [sys.executable, "-m", "tests.store.output.test_property", str(inputs), str(tmp_path), "1", "4"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=250, cwd=Path(__file__).parents[3])
+    command = [
+        sys.executable,
+        "-m",
+        "tests.store.output.test_property",
+        str(inputs),
+        str(tmp_path),
+        "1",
+        "4",
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=250, cwd=Path(__file__).parents[3]
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout.splitlines()[-1])
     assert result["wrong"] == []
@@ -213,4 +262,8 @@ def test_kills_leave_the_old_output_or_the_new_one(inputs, tmp_path):
 
 
 if __name__ == "__main__":
-    print(json.dumps(kill_commands(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))))
+    print(
+        json.dumps(
+            kill_commands(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
+        )
+    )

@@ -14,7 +14,13 @@ from gyrostab import davar, fit_noise, make_log, open_log, to_netcdf, to_zarr
 from gyrostab.errors import GyrostabError, OptionError, OutputError
 from gyrostab.jobs.job import folder_of
 from gyrostab.jobs.run import run
-from gyrostab.store.output import check_output, find_foreign_item, new_folder, new_output, protect_inputs
+from gyrostab.store.output import (
+    check_output,
+    find_foreign_item,
+    new_folder,
+    new_output,
+    protect_inputs,
+)
 from tests.support.command_line import WINDOW, call, write_log
 
 QUIET = "--quiet-progress"
@@ -25,7 +31,13 @@ def read_tree(folder: Path) -> dict[str, object]:
     found: dict[str, object] = {}
     for path in sorted(folder.rglob("*")):
         place = path.relative_to(folder).as_posix()
-        found[place] = os.readlink(path) if path.is_symlink() else path.read_bytes() if path.is_file() else None
+        found[place] = (
+            os.readlink(path)
+            if path.is_symlink()
+            else path.read_bytes()
+            if path.is_file()
+            else None
+        )
     return found
 
 
@@ -36,7 +48,10 @@ def made(tmp_path_factory) -> Path:
     write_log(folder / "log.csv", 40.0)
     assert call("ingest", folder / "log.csv", "-o", folder / "log.nc", QUIET) == 0
     to_zarr(open_log(folder / "log.nc"), folder / "log.zarr")
-    to_netcdf(fit_noise(davar(open_log(folder / "log.nc"), window="20s", step="5s")), folder / "product.nc")
+    to_netcdf(
+        fit_noise(davar(open_log(folder / "log.nc"), window="20s", step="5s")),
+        folder / "product.nc",
+    )
     (folder / "model.toml").write_text("[noise]\nN = 0.02\n")
     (folder / "names.toml").write_text('t_probe = "temperature [degC]"\n')
     (folder / "probe.csv").write_text("time [s],temperature [degC]\n0,20\n20,21\n40,22\n")
@@ -77,13 +92,29 @@ COMMANDS = {
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
 def test_a_folder_that_another_program_made_is_never_replaced(folder, command, overwrite, capfd):
-    refused(folder, *COMMANDS[command], "-o", "photos.zarr", *overwrite, says="holds 'tide.jpg', which gyrostab did not make", capfd=capfd)
+    refused(
+        folder,
+        *COMMANDS[command],
+        "-o",
+        "photos.zarr",
+        *overwrite,
+        says="holds 'tide.jpg', which gyrostab did not make",
+        capfd=capfd,
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_store_that_holds_something_else_is_not_replaced(folder, command, capfd):
     (folder / "log.zarr" / "rate" / "notes.txt").write_text("mine")
-    refused(folder, *COMMANDS[command], "-o", "log.zarr", "--overwrite", says="holds 'rate/notes.txt'", capfd=capfd)
+    refused(
+        folder,
+        *COMMANDS[command],
+        "-o",
+        "log.zarr",
+        "--overwrite",
+        says="holds 'rate/notes.txt'",
+        capfd=capfd,
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -115,7 +146,16 @@ def test_a_store_is_replaced_when_told_so(folder, command, capfd):
         ["correlate", "product.nc", "-o", "product.nc"],
         ["simulate", "model.toml", "--like", "log.nc", "-o", "log.nc"],
         ["report", "product.nc", "--log", "log.html", "-o", "log.html"],
-        ["export", "product.nc", "--format", "zarr", "-o", "log.zarr", "--config", "log.zarr/.zattrs"],
+        [
+            "export",
+            "product.nc",
+            "--format",
+            "zarr",
+            "-o",
+            "log.zarr",
+            "--config",
+            "log.zarr/.zattrs",
+        ],
     ],
     ids=" ".join,
 )
@@ -129,23 +169,69 @@ def test_an_output_that_is_an_input_is_refused(folder, arguments, capfd):
 @pytest.mark.parametrize("command", ["ingest", "run"])
 def test_links_do_not_hide_an_input(folder, command, how, capfd):
     how(folder / "other.nc", folder / "log.nc")
-    refused(folder, command, "log.nc", "-o", "other.nc", "--overwrite", says="is also an input", capfd=capfd)
-    refused(folder, command, "other.nc", "-o", "log.nc", "--overwrite", says="is also an input", capfd=capfd)
+    refused(
+        folder,
+        command,
+        "log.nc",
+        "-o",
+        "other.nc",
+        "--overwrite",
+        says="is also an input",
+        capfd=capfd,
+    )
+    refused(
+        folder,
+        command,
+        "other.nc",
+        "-o",
+        "log.nc",
+        "--overwrite",
+        says="is also an input",
+        capfd=capfd,
+    )
 
 
 def test_a_folder_around_an_input_is_refused(folder, capfd):
     (folder / "logs.zarr").mkdir()
     write_log(folder / "logs.zarr" / "in.csv", 20.0)
-    refused(folder, "ingest", "logs.zarr/in.csv", "-o", "logs.zarr", "--overwrite", says="a folder around the input", capfd=capfd)
+    refused(
+        folder,
+        "ingest",
+        "logs.zarr/in.csv",
+        "-o",
+        "logs.zarr",
+        "--overwrite",
+        says="a folder around the input",
+        capfd=capfd,
+    )
     (folder / "away.zarr").symlink_to("logs.zarr")
-    refused(folder, "ingest", "logs.zarr/in.csv", "-o", "away.zarr", "--overwrite", says="a folder around the input", capfd=capfd)
+    refused(
+        folder,
+        "ingest",
+        "logs.zarr/in.csv",
+        "-o",
+        "away.zarr",
+        "--overwrite",
+        says="a folder around the input",
+        capfd=capfd,
+    )
 
 
 def test_an_output_inside_a_store_that_is_read_is_refused(folder, capfd):
-    refused(folder, "run", "log.zarr", "-o", "log.zarr/product.nc", *WINDOW, says="lies inside the input", capfd=capfd)
+    refused(
+        folder,
+        "run",
+        "log.zarr",
+        "-o",
+        "log.zarr/product.nc",
+        *WINDOW,
+        says="lies inside the input",
+        capfd=capfd,
+    )
 
 
-# ------------------------------------------------------------------------------------------------------------------- links
+# -------------------------------------------------------------------------------------------------------------------
+# links
 
 
 def test_a_link_to_a_store_stays_a_link_and_its_target_is_replaced(folder):
@@ -172,7 +258,16 @@ def test_a_link_to_a_file_stays_a_link(folder):
 def test_links_in_a_loop_and_what_is_no_file(folder, capfd):
     (folder / "a.nc").symlink_to("b.nc")
     (folder / "b.nc").symlink_to("a.nc")
-    refused(folder, "ingest", "log.csv", "-o", "a.nc", "--overwrite", says="symbolic link in a loop", capfd=capfd)
+    refused(
+        folder,
+        "ingest",
+        "log.csv",
+        "-o",
+        "a.nc",
+        "--overwrite",
+        says="symbolic link in a loop",
+        capfd=capfd,
+    )
     os.mkfifo(folder / "pipe.nc")
     with pytest.raises(OutputError, match="no regular file"):
         check_output(folder / "pipe.nc", overwrite=True)
@@ -180,7 +275,8 @@ def test_links_in_a_loop_and_what_is_no_file(folder, capfd):
         check_output("/dev/null", overwrite=True)
 
 
-# ------------------------------------------------------------------------------------------------------- Python functions
+# -------------------------------------------------------------------------------------------------------
+# Python functions
 
 
 def test_the_functions_refuse_what_the_commands_refuse(folder):
@@ -191,7 +287,11 @@ def test_the_functions_refuse_what_the_commands_refuse(folder):
         with pytest.raises(OptionError, match="is also an input"):
             to_netcdf(dataset, folder / "log.nc", overwrite=True)
     with pytest.raises(OptionError, match="is also an input"):
-        to_zarr(davar(open_log(folder / "log.zarr"), window="20s", step="5s"), folder / "log.zarr", overwrite=True)
+        to_zarr(
+            davar(open_log(folder / "log.zarr"), window="20s", step="5s"),
+            folder / "log.zarr",
+            overwrite=True,
+        )
     with pytest.raises(OutputError, match=r"tide\.jpg"):
         to_zarr(log, folder / "photos.zarr", overwrite=True)
     with pytest.raises(OptionError, match="is also an input"):
@@ -201,13 +301,16 @@ def test_the_functions_refuse_what_the_commands_refuse(folder):
 
 
 def test_a_written_dataset_of_xarray_is_an_input_while_it_is_lazy(tmp_path):
-    made = xr.Dataset({"avar": (("axis", "time", "tau"), np.ones((1, 2, 3)))}, coords={"axis": ["x"]})
+    made = xr.Dataset(
+        {"avar": (("axis", "time", "tau"), np.ones((1, 2, 3)))}, coords={"axis": ["x"]}
+    )
     path = to_netcdf(made, tmp_path / "cube.nc")
     with xr.open_dataset(path) as lazy, pytest.raises(OptionError, match="is also an input"):
         to_netcdf(lazy, path, overwrite=True)
 
 
-# ------------------------------------------------------------------------------------------------------- folders of files
+# -------------------------------------------------------------------------------------------------------
+# folders of files
 
 
 def test_the_other_files_of_a_folder_of_figures_stay(folder):
@@ -226,7 +329,10 @@ def test_the_other_files_of_a_folder_of_figures_stay(folder):
 
 
 def test_figures_that_cannot_be_finished_leave_nothing(folder, monkeypatch):
-    monkeypatch.setattr("gyrostab.plot.figures.save_png", lambda figure, path, dpi: path.write_text("half") and 1 / 0)
+    monkeypatch.setattr(
+        "gyrostab.plot.figures.save_png",
+        lambda figure, path, dpi: path.write_text("half") and 1 / 0,
+    )
     before = read_tree(folder)
     for target in ("new/figures", "photos.zarr"):
         assert call("plot", folder / "product.nc", "-o", folder / target, QUIET) == 1
@@ -246,27 +352,66 @@ def test_a_folder_of_files_is_checked_before_the_first_is_moved(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["b.txt"]
 
 
-@pytest.mark.parametrize("names", [["notes.txt"], ["report.html"], ["diagnosis.json", "notes.txt"], ["diagnosis.json"]])
+@pytest.mark.parametrize(
+    "names", [["notes.txt"], ["report.html"], ["diagnosis.json", "notes.txt"], ["diagnosis.json"]]
+)
 def test_a_diagnosis_replaces_a_diagnosis_only(folder, names, capfd):
     (folder / "run7").mkdir()
     for name in names:
-        (folder / "run7" / name).write_text(json.dumps({"schema": "gyrostab.diagnosis/1" if len(names) == 2 else "other"}))
-    refused(folder, "diagnose", "log.nc", "-o", "run7", "--overwrite", says="which gyrostab did not make", capfd=capfd)
+        (folder / "run7" / name).write_text(
+            json.dumps({"schema": "gyrostab.diagnosis/1" if len(names) == 2 else "other"})
+        )
+    refused(
+        folder,
+        "diagnose",
+        "log.nc",
+        "-o",
+        "run7",
+        "--overwrite",
+        says="which gyrostab did not make",
+        capfd=capfd,
+    )
 
 
 def test_a_benchmark_replaces_a_benchmark_only(folder, capfd):
     for name in ("recordings", "truth"):
         (folder / "proof" / name).mkdir(parents=True)
     (folder / "proof" / "recordings" / "holiday.wav").write_text("waves")
-    refused(folder, "prove", "-o", "proof", "--overwrite", says="holds 'recordings/holiday.wav'", capfd=capfd)
+    refused(
+        folder,
+        "prove",
+        "-o",
+        "proof",
+        "--overwrite",
+        says="holds 'recordings/holiday.wav'",
+        capfd=capfd,
+    )
     (folder / "proof" / "benchmark.json").write_text('{"schema": "gyrostab.prove/1"}')
-    refused(folder, "prove", "-o", "proof", "--overwrite", says="holds 'recordings/holiday.wav'", capfd=capfd)
+    refused(
+        folder,
+        "prove",
+        "-o",
+        "proof",
+        "--overwrite",
+        says="holds 'recordings/holiday.wav'",
+        capfd=capfd,
+    )
 
 
-# ------------------------------------------------------------------------------------------------------ the folder of a run
+# ------------------------------------------------------------------------------------------------------
+# the folder of a run
 
 
-@pytest.mark.parametrize("content", [{"notes.txt": "mine"}, {"job.json": "{}"}, {"lock": "keep"}, {"windows-0000000000.block": ""}, None])
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"notes.txt": "mine"},
+        {"job.json": "{}"},
+        {"lock": "keep"},
+        {"windows-0000000000.block": ""},
+        None,
+    ],
+)
 @pytest.mark.parametrize("option", ["--overwrite", "--resume"])
 def test_a_folder_with_the_name_of_a_job_is_left_alone(folder, content, option, capfd):
     job = folder_of(folder / "out.nc")
@@ -276,10 +421,21 @@ def test_a_folder_with_the_name_of_a_job_is_left_alone(folder, content, option, 
         job.mkdir()
         for name, text in content.items():
             (job / name).write_text(text)
-    refused(folder, "run", "log.csv", "-o", "out.nc", *WINDOW, option, says="gyrostab did not make what is there", capfd=capfd)
+    refused(
+        folder,
+        "run",
+        "log.csv",
+        "-o",
+        "out.nc",
+        *WINDOW,
+        option,
+        says="gyrostab did not make what is there",
+        capfd=capfd,
+    )
 
 
-# ---------------------------------------------------------------------------------------- the decision and the writing itself
+# ---------------------------------------------------------------------------------------- the
+# decision and the writing itself
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -316,7 +472,9 @@ def test_what_another_process_has_made_meanwhile_is_not_replaced(tmp_path, suffi
 
     with pytest.raises(OutputError, match="exists already"):
         write_late()
-    assert {name: value for name, value in kept.items() if ".part" not in name} == read_tree(tmp_path)
+    assert {name: value for name, value in kept.items() if ".part" not in name} == read_tree(
+        tmp_path
+    )
 
 
 @pytest.mark.parametrize("renameat2", [True, False])
@@ -350,7 +508,9 @@ def test_an_input_that_changes_before_the_output_is_complete(folder, change, mon
     begin = export._begin_netcdf
 
     def spoil(*arguments):
-        (folder / "log.csv").write_text("other") if change == "has changed" else (folder / "log.csv").unlink()
+        (folder / "log.csv").write_text("other") if change == "has changed" else (
+            folder / "log.csv"
+        ).unlink()
         begin(*arguments)
 
     monkeypatch.setattr(export, "_begin_netcdf", spoil)

@@ -49,7 +49,14 @@ except OutputError as error:
 def test_a_full_disk_leaves_the_old_file_and_one_message(tmp_path, lazy):
     (tmp_path / "out.nc").write_text("old")
     code = FULL.format(tests=str(Path(__file__).parents[3]), lazy=lazy)
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
     assert done.stderr == ""
     assert done.stdout.startswith("out.nc: cannot be written: ")
     assert "disk full" in done.stdout
@@ -64,7 +71,10 @@ def test_unwritable_directory():
     try:
         if root:
             os.seteuid(65534)  # root may write anywhere; nobody may not
-        with pytest.raises(OutputError, match="no permission to write in"), new_output(folder / "out.nc"):
+        with (
+            pytest.raises(OutputError, match="no permission to write in"),
+            new_output(folder / "out.nc"),
+        ):
             pass
     finally:
         if root:
@@ -89,7 +99,9 @@ def test_an_interruption_leaves_nothing_behind(tmp_path, error):
         raise error
 
     surface = synthetic.surface(windows=4).chunk(time=2)
-    surface["avar"] = surface.avar.copy(data=surface.avar.data.map_blocks(fail, dtype=float, meta=np.empty((0, 0, 0))))
+    surface["avar"] = surface.avar.copy(
+        data=surface.avar.data.map_blocks(fail, dtype=float, meta=np.empty((0, 0, 0)))
+    )
     for write in (to_netcdf, to_zarr):
         with pytest.raises(error):
             write(surface, tmp_path / "out")
@@ -108,7 +120,10 @@ def test_a_late_piece_of_a_directory_is_removed_too(tmp_path, monkeypatch):
 
     looks: list[float] = []
     monkeypatch.setattr("gyrostab.store.output.write.time.sleep", write_on)
-    with pytest.raises(ZeroDivisionError), new_output(tmp_path / "out.zarr", find_foreign=find_foreign_item) as folder:
+    with (
+        pytest.raises(ZeroDivisionError),
+        new_output(tmp_path / "out.zarr", find_foreign=find_foreign_item) as folder,
+    ):
         raise ZeroDivisionError
     assert not late
     assert not list(tmp_path.iterdir())
