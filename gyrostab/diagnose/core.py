@@ -140,14 +140,14 @@ def _diagnose(
     if isinstance(given, xr.Dataset):
         given = as_log(given)
         _check_alike(log, given)
-    reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
-    alive = _axes_alive(reduced)
+    blocks = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
+    alive = _axes_alive(blocks)
     if len(alive) < log.sizes["axis"]:
         log = log.sel(axis=alive)
-        reduced = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
+        blocks = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
         given = given.sel(axis=alive) if isinstance(given, xr.Dataset) else given
     task = Task(log, given, quiet, restart_gap, seed, nulls, level, progress)
-    compared = _beside_hops(task, _at_rest(task, _compare(task, *_calibrated(task, reduced))))
+    compared = _beside_hops(task, _at_rest(task, _compare(task, *_calibrated(task, blocks))))
     progress("fitting", 0)
     return finish_diagnosis(task, compared, begun)
 
@@ -160,57 +160,59 @@ def _with_aligned_channels(log: xr.Dataset) -> xr.Dataset:
     return aligned.log.assign_attrs(unused_channels=aligned.unused)
 
 
-def _compare(task: Task, reduced: xr.Dataset, baseline: xr.Dataset) -> Compared:
+def _compare(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Compared:
     """Draw null records, name effects, locate what is beyond chance."""
-    seen = remove_known_lines(reduced, baseline)
+    seen = remove_known_lines(blocks, baseline)
     records = _records(seen, baseline, task.nulls, task.seed)
     task.progress("comparing", 0)
     null = null_scores(baseline, records())
     task.progress("naming", 0)
     half = task.level / 2.0  # the names have one half, the places the other
     known = _known_apart(baseline, task.given)
-    naming = name_effects(
+    identifications = name_effects(
         seen, baseline, records(), level=half, seed=task.seed, known=known, progress=task.progress
     )
-    before = expected_baseline(naming, baseline)
+    before = expected_baseline(identifications, baseline)
     apart = without_expected(
-        still_lines(task, seen, before) if naming.expected else seen, baseline, naming.expected
+        still_lines(task, seen, before) if identifications.expected else seen,
+        baseline,
+        identifications.expected,
     )
     found = unexpected(
         locate_mismatches(apart, before, null, level=half),
-        naming.expected,
+        identifications.expected,
         seen,
         before,
         null,
         level=half,
     )
-    return Compared(reduced, baseline, found, naming, null)
+    return Compared(blocks, baseline, found, identifications, null)
 
 
-def _calibrated(task: Task, reduced: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+def _calibrated(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """The record and its baseline; the record without the blocks in which a model that was given says that the rate moves."""
     task.progress("calibrating", 0)
-    baseline = _baseline(task, reduced)
-    if isinstance(task.given, Model) and (turning := expect_known_motion(reduced, baseline)).any():
+    baseline = _baseline(task, blocks)
+    if isinstance(task.given, Model) and (turning := expect_known_motion(blocks, baseline)).any():
         left = without_motion(
-            task.log, reduced, turning, restart_gap=task.restart_gap, progress=task.progress
+            task.log, blocks, turning, restart_gap=task.restart_gap, progress=task.progress
         )
-        reduced = left.drop_vars("moving")  # it is accounted for
-        baseline = _baseline(task, reduced)
-    return reduced, baseline
+        blocks = left.drop_vars("moving")  # it is accounted for
+        baseline = _baseline(task, blocks)
+    return blocks, baseline
 
 
 def _at_rest(task: Task, compared: Compared) -> Compared:
     """The comparison once more without the blocks of a motion that has no name; the same where there are none, or too few are left."""
     moving = (
-        unexplained_motion(compared.reduced, compared.naming.claims)
+        unexplained_motion(compared.blocks, compared.identifications.identified)
         if task.given is None
         else np.zeros(1, np.bool_)
     )
     if not moving.any():
         return compared
     at_rest = without_motion(
-        task.log, compared.reduced, moving, restart_gap=task.restart_gap, progress=task.progress
+        task.log, compared.blocks, moving, restart_gap=task.restart_gap, progress=task.progress
     )
     try:
         return _compare(task, *_calibrated(task, at_rest))
@@ -224,8 +226,8 @@ def _at_rest(task: Task, compared: Compared) -> Compared:
 
 def _beside_hops(task: Task, compared: Compared) -> Compared:
     """The comparison once more with the noise calibrated beside hops within blocks; the same where there are none."""
-    baseline = remove_fast_switching(compared.naming, compared.baseline)
-    return compared if baseline is compared.baseline else _compare(task, compared.reduced, baseline)
+    baseline = remove_fast_switching(compared.identifications, compared.baseline)
+    return compared if baseline is compared.baseline else _compare(task, compared.blocks, baseline)
 
 
 def _check_options(nulls: int, level: float, seed: int) -> None:
@@ -241,10 +243,10 @@ def _check_options(nulls: int, level: float, seed: int) -> None:
         raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
 
 
-def _axes_alive(reduced: xr.Dataset) -> list[str]:
+def _axes_alive(blocks: xr.Dataset) -> list[str]:
     """Axes whose samples are not all the same; warns of the others, which have no noise that could be compared."""
-    loudest = reduced["power"].max(["block", "band"]).values
-    axes = [str(axis) for axis in reduced["axis"].values]
+    loudest = blocks["power"].max(["block", "band"]).values
+    axes = [str(axis) for axis in blocks["axis"].values]
     alive = [axis for axis, power in zip(axes, loudest, strict=True) if not power <= _DEAD]
     dead = [axis for axis in axes if axis not in alive]
     if not alive:
@@ -277,30 +279,30 @@ def _check_alike(log: xr.Dataset, simulated: xr.Dataset) -> None:
             )
 
 
-def _baseline(task: Task, reduced: xr.Dataset) -> xr.Dataset:
+def _baseline(task: Task, blocks: xr.Dataset) -> xr.Dataset:
     if task.given is None:
-        return calibrate_noise(reduced, quiet=task.quiet)
+        return calibrate_noise(blocks, quiet=task.quiet)
     if isinstance(task.given, xr.Dataset):
-        same = f"{reduced.attrs['block_samples']}samples"
+        same = f"{blocks.attrs['block_samples']}samples"
         simulated = reduce_log(
             task.given, block=same, restart_gap=task.restart_gap, progress=task.progress
         )
-        return baseline_from_simulation(reduced, simulated, quiet=task.quiet)
-    return baseline_from_model(reduced, task.given, quiet=task.quiet)
+        return baseline_from_simulation(blocks, simulated, quiet=task.quiet)
+    return baseline_from_model(blocks, task.given, quiet=task.quiet)
 
 
 def _records(
-    reduced: xr.Dataset, baseline: xr.Dataset, count: int, seed: int
+    blocks: xr.Dataset, baseline: xr.Dataset, count: int, seed: int
 ) -> Callable[[], Iterable[xr.Dataset]]:
     """The same null records as often as they are asked for: kept where they are small, drawn again where not."""
-    together = int(np.clip(_AT_ONCE / (reduced["power"].size * 8), 25, count))
+    together = int(np.clip(_AT_ONCE / (blocks["power"].size * 8), 25, count))
 
     def draw() -> Iterable[xr.Dataset]:
         return null_records(
-            reduced, baseline, count=count, rng=np.random.default_rng(seed), chunk=together
+            blocks, baseline, count=count, rng=np.random.default_rng(seed), chunk=together
         )
 
-    if count * reduced["power"].size * 3 * 8 > _KEPT:
+    if count * blocks["power"].size * 3 * 8 > _KEPT:
         return draw
     kept: list[xr.Dataset] = []
 
@@ -334,25 +336,25 @@ def parse_quiescent_span(text: str) -> tuple[float | str, float | str]:
     >>> quiet_span("0s/30min"), quiet_span("2026-03-14T08:00/2026-03-14T08:30Z")
     ((0.0, 1800.0), ('2026-03-14T08:00', '2026-03-14T08:30'))
     """
-    parts = [part.strip() for part in text.split("/")]
-    if len(parts) != 2 or not all(parts):
+    components = [component.strip() for component in text.split("/")]
+    if len(components) != 2 or not all(components):
         raise OptionError(
             f"quiet {text!r}: write START/END, for instance 2026-03-14T08:00/2026-03-14T08:30 or 0s/30min after the start"
         )
-    ends = [_end(part, text) for part in parts]
+    ends = [_end(component, text) for component in components]
     return ends[0], ends[1]
 
 
-def _end(part: str, text: str) -> float | str:
+def _end(component: str, text: str) -> float | str:
     try:
         return (
-            str(np.datetime64(part.removesuffix("Z")))
-            if "-" in part
+            str(np.datetime64(component.removesuffix("Z")))
+            if "-" in component
             else 0.0
-            if part in ("0", "0s")
-            else duration_seconds(part, "quiet")
+            if component in ("0", "0s")
+            else duration_seconds(component, "quiet")
         )
     except ValueError as error:
         raise OptionError(
-            f"quiet {text!r}: {part!r} is neither a time (2026-03-14T08:00) nor a length of time since the start (30min)"
+            f"quiet {text!r}: {component!r} is neither a time (2026-03-14T08:00) nor a length of time since the start (30min)"
         ) from error

@@ -47,34 +47,34 @@ class Compared(NamedTuple):
 
     Attributes
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
     baseline : xarray.Dataset
     found : xarray.Dataset
         Places of mismatches.
-    naming : Naming
+    identifications : Naming
     null : NullScores
     """
 
-    reduced: xr.Dataset
+    blocks: xr.Dataset
     baseline: xr.Dataset
     found: xr.Dataset
-    naming: Identifications
+    identifications: Identifications
     null: NullScores
 
 
-def still_lines(task: Task, reduced: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
+def still_lines(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
     """The record with the line spectra of the blocks in which nothing that is known moves; the log is read once more where something does.
 
     A step within a block has the spectrum of a step, and a part of the record has only one for all
     its blocks.
     """
-    there = np.isfinite(reduced["power"].transpose("axis", "block", "band").values).any(axis=-1)
-    moving = expect_known_motion(reduced, known)
+    there = np.isfinite(blocks["power"].transpose("axis", "block", "band").values).any(axis=-1)
+    moving = expect_known_motion(blocks, known)
     if not (moving & there).any():
-        return reduced
+        return blocks
     calm = without_motion(
-        task.log, reduced, moving | ~there, restart_gap=task.restart_gap, progress=task.progress
+        task.log, blocks, moving | ~there, restart_gap=task.restart_gap, progress=task.progress
     )
     return remove_known_lines(
-        reduced.assign({name: calm[name] for name in ("line_power", "line_weight")}), known
+        blocks.assign({name: calm[name] for name in ("line_power", "line_weight")}), known
     )

@@ -100,9 +100,9 @@ def test_what_was_put_in_is_named_on_one_axis_beside_a_constant_channel_and_one_
     (effect,) = content["effects"]
     assert "vibration_noise" in [effect["name"], *effect["alternatives"]]
     assert effect["driver"] == "vibration"
-    box = next(box for box in content["mismatches"] if box["view"] == "davar")
-    assert effect["name"] in box["explained_by"]
-    begin, end = (np.datetime64(box[name].removesuffix("Z")) for name in ("start", "end"))
+    region = next(region for region in content["mismatches"] if region["view"] == "davar")
+    assert effect["name"] in region["explained_by"]
+    begin, end = (np.datetime64(region[name].removesuffix("Z")) for name in ("start", "end"))
     assert abs(begin - np.datetime64("2026-03-14T08:06:40")) < np.timedelta64(45, "s")
     assert abs(end - np.datetime64("2026-03-14T08:10:40")) < np.timedelta64(45, "s")
     assert content["baseline"]["noise"]["x"]["N"]["value"] == pytest.approx(0.003, rel=0.05)
@@ -291,17 +291,17 @@ def test_a_line_explains_a_line_at_its_own_frequency_only():
         50.0,
         place=116,
     )
-    reduced = xr.Dataset(coords={"line_frequency": ("line", np.arange(1, 400) * 0.25)})
-    box = {
+    blocks = xr.Dataset(coords={"line_frequency": ("line", np.arange(1, 400) * 0.25)})
+    region = {
         "view": "spectrum",
         "what": "line",
         "frequency": 29.25,
         "tau_min_s": 0.017,
         "tau_max_s": 0.017,
     }
-    assert _can_show(line, box, reduced)
-    assert not _can_show(line, box | {"frequency": 12.5}, reduced)
-    assert not _can_show(line, box | {"what": "ramp phase", "frequency": np.nan}, reduced)
+    assert _can_show(line, region, blocks)
+    assert not _can_show(line, region | {"frequency": 12.5}, blocks)
+    assert not _can_show(line, region | {"what": "ramp phase", "frequency": np.nan}, blocks)
     assert _can_show(
         line,
         {
@@ -311,23 +311,23 @@ def test_a_line_explains_a_line_at_its_own_frequency_only():
             "tau_min_s": 0.01,
             "tau_max_s": 0.02,
         },
-        reduced,
+        blocks,
     )
     assert not _can_show(
         line,
         {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0},
-        reduced,
+        blocks,
     )
     assert not _can_show(
         line,
         {"view": "mean", "what": "mean", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0},
-        reduced,
+        blocks,
     )
 
 
 def test_the_chance_of_a_gain_goes_on_beyond_the_null_records():
     best = np.sort(np.random.default_rng(1).exponential(size=400))
-    chances = [chance_of_gain(best, gain) for gain in np.linspace(0.0, 20.0, 60)]
+    chances = [chance_of_gain(best, evidence_nats) for evidence_nats in np.linspace(0.0, 20.0, 60)]
     assert np.all(np.diff(chances) <= 1e-12)
     assert chance_of_gain(best, 7.0) == pytest.approx(np.exp(-7.0), rel=0.9)
     assert chance_of_gain(best, 0.5) == pytest.approx(np.exp(-0.5), abs=0.06)

@@ -48,9 +48,11 @@ def test_resets_of_the_ramp_come_before_their_lines(log_of: Callable[..., Any]) 
     model = next(one for one in found.model["effect"] if one["name"] == "feedback_reset")
     assert model["phase"] == "channel"
     assert model["full"] < 0  # the ramp falls while the rate is positive
-    lines = [box for box in found.content["mismatches"] if "line at 4 Hz" in box["statement"]]
+    lines = [
+        region for region in found.content["mismatches"] if "line at 4 Hz" in region["statement"]
+    ]
     assert lines
-    assert all("feedback_reset" in box["explained_by"] for box in lines)
+    assert all("feedback_reset" in region["explained_by"] for region in lines)
     assert "spectral_line" not in lines[0]["explained_by"]
     held = found.content["held_out"]
     assert held["coverage95_before"] < 0.6
@@ -71,14 +73,14 @@ def test_without_the_ramp_no_resets_are_claimed(log_of: Callable[..., Any]) -> N
 
 
 def test_a_lattice_as_coarse_as_the_noise_tells_of_no_dead_zone(log_of: Callable[..., Any]) -> None:
-    reduced = reduce_log(log_of("rlg-static-30min"))
-    assert has_coarse_grid(reduced).all()
-    level = calibrate_noise(reduced)["coefficient"]
-    found, reasons = effect_candidates(reduced, level)
+    blocks = reduce_log(log_of("rlg-static-30min"))
+    assert has_coarse_grid(blocks).all()
+    level = calibrate_noise(blocks)["coefficient"]
+    found, reasons = effect_candidates(blocks, level)
     for name in ("dead_zone", "held_samples", "clipping"):
         assert "lattice" in reasons[name]
         assert name not in {one.effect for one in found}
-    assert "rate_quantization" in {one.effect for one in found if one.view == "marks"}
+    assert "rate_quantization" in {one.effect for one in found if one.statistic == "marks"}
 
 
 def test_the_sway_of_the_platform_is_real_motion(log_of: Callable[..., Any]) -> None:

@@ -69,11 +69,11 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
 
 
 def content() -> dict[str, Any]:
-    box = {
+    region = {
         "view": "davar", "what": "avar", "axes": ["x"], "begin": 1500.0, "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
         "sign": 1, "p_value": 0.0004, "estimate": 1.8, "frequency": np.nan,
     }  # fmt: skip
-    shift = box | {
+    shift = region | {
         "view": "mean",
         "what": "mean",
         "tau_min_s": 20.0,
@@ -86,7 +86,7 @@ def content() -> dict[str, Any]:
     mismatches = [
         {"id": number, **{key: one[key] for key in kept}, "start": when(one["begin"]), "end": when(one["end"]), "explained_by": [name],
          "statement": mismatch_statement(one, 3600.0)}
-        for number, (one, name) in enumerate([(shift, "vibration_rectification"), (box, "vibration_noise")], start=1)
+        for number, (one, name) in enumerate([(shift, "vibration_rectification"), (region, "vibration_noise")], start=1)
     ]  # fmt: skip
     effects = []
     for name, parameter, value, unit, others in (

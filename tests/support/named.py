@@ -93,10 +93,10 @@ def _made(effects: str, environment: str, seed: int) -> xr.Dataset:
 
 
 def nulls(
-    reduced: xr.Dataset, count: int = 80, seed: int = 3
+    blocks: xr.Dataset, count: int = 80, seed: int = 3
 ) -> tuple[xr.Dataset, list[xr.Dataset]]:
     """Baseline of a record, and records of noise alone."""
-    baseline = calibrate_noise(reduced)
+    baseline = calibrate_noise(blocks)
     return baseline, list(
-        null_records(reduced, baseline, count=count, rng=np.random.default_rng(seed), chunk=count)
+        null_records(blocks, baseline, count=count, rng=np.random.default_rng(seed), chunk=count)
     )

@@ -15,7 +15,7 @@ RATE, BLOCK_S, PARTS = 100.0, 20.0, 8
 
 
 def frame(
-    *, blocks: int = 180, missing: float = 0.0, rate: float = RATE, block_s: float = BLOCK_S
+    *, block_count: int = 180, missing: float = 0.0, rate: float = RATE, block_s: float = BLOCK_S
 ) -> dict[str, Any]:
     """Bands, shapes and edges that all records share."""
     half = int(block_s * rate / 2)
@@ -27,7 +27,7 @@ def frame(
         "high": (edges[1:] - 0.5) * step,
         "shape": 0.86 * np.diff(edges) * (1.0 - missing),
         "lines": np.arange(1, half + 1) * step,
-        "blocks": blocks,
+        "blocks": block_count,
         "rate": rate,
         "block_s": block_s,
         "samples": round(block_s * rate * (1.0 - missing)),
@@ -70,12 +70,12 @@ def baseline(
 def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: Any) -> xr.Dataset:
     """`count` records without any effect, by ``record``."""
     f = frame(**options)
-    axes, blocks = base.sizes["axis"], f["blocks"]
+    axes, block_count = base.sizes["axis"], f["blocks"]
     spectrum, shape = base["spectrum"].values, np.broadcast_to(f["shape"], base["spectrum"].shape)
     power = spectrum * rng.gamma(np.broadcast_to(shape, (count, *shape.shape))) / shape
     pairs = [(a, b) for a in range(axes) for b in range(a + 1, axes)]
     cross = [_cross(power[:, a], power[:, b], shape[a], rng) for a, b in pairs]
-    weight = np.full((axes, PARTS), blocks / PARTS)
+    weight = np.full((axes, PARTS), block_count / PARTS)
     density = np.stack([np.interp(f["lines"], base["frequency"], row) for row in spectrum[:, 0]])
     lines = (
         density[:, None]
@@ -86,18 +86,21 @@ def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: A
     names = [str(axis) for axis in base["axis"].values]
     data: dict[str, Any] = {
         "mean": (plane, _means(base, count, rng, f)),
-        "samples": (("axis", "block"), np.full((axes, blocks), f["samples"])),
+        "samples": (("axis", "block"), np.full((axes, block_count), f["samples"])),
         "power": (cube, power),
         "shape": (("axis", "block", "band"), shape),
         "line_power": (("record", "axis", "part", "line"), lines),
         "line_weight": (("axis", "part"), weight),
-        "kurtosis": (plane, rng.normal(0.0, np.sqrt(24.0 / f["samples"]), (count, axes, blocks))),
+        "kurtosis": (
+            plane,
+            rng.normal(0.0, np.sqrt(24.0 / f["samples"]), (count, axes, block_count)),
+        ),
     }
     if pairs:
         data["cross"] = (("record", "pair", "block", "band"), np.stack(cross, axis=1))
     for name in ("outliers", "repeats", "extremes", "zeros"):
-        data[name] = (plane, rng.poisson(1e-5, (count, axes, blocks)))
-    edges = np.arange(blocks + 1) * f["block_s"]
+        data[name] = (plane, rng.poisson(1e-5, (count, axes, block_count)))
+    edges = np.arange(block_count + 1) * f["block_s"]
     coords = {
         "axis": names,
         "begin": ("block", edges[:-1]),
@@ -125,13 +128,13 @@ def chunks(
         yield records(base, size, rng, **options)
 
 
-def smallest_p(reduced: xr.Dataset, base: xr.Dataset, null: NullScores) -> np.ndarray:
+def smallest_p(blocks: xr.Dataset, base: xr.Dataset, null: NullScores) -> np.ndarray:
     """The chance that a null record has a score as large as the largest of a record over all views; one for each record."""
     p = []
-    for name, view in null.views.items():
-        scores = STATISTICS[name](reduced, base)
+    for name, statistic in null.statistics.items():
+        scores = STATISTICS[name](blocks, base)
         if scores is not None:
-            z = np.abs(np.nan_to_num(standardise(scores, view))).max(axis=(-3, -2, -1))
+            z = np.abs(np.nan_to_num(standardise(scores, statistic))).max(axis=(-3, -2, -1))
             p.append(null.p_value(name, z))
     return np.asarray(np.min(p, axis=0))
 
@@ -146,15 +149,15 @@ def _cross(
 
 def _means(base: xr.Dataset, count: int, rng: np.random.Generator, f: dict[str, Any]) -> np.ndarray:
     """White noise, a random walk, and flicker noise as the sum of relaxing processes over six octaves of four."""
-    axes, blocks = base.sizes["axis"], f["blocks"]
-    mean = rng.normal(size=(count, axes, blocks)) * np.sqrt(base["mean_variance"].values)
+    axes, block_count = base.sizes["axis"], f["blocks"]
+    mean = rng.normal(size=(count, axes, block_count)) * np.sqrt(base["mean_variance"].values)
     walk, flicker = (float(base["coefficient"].sel(term=term)[0]) for term in ("K", "B"))
     mean += np.cumsum(rng.normal(0.0, walk * np.sqrt(f["block_s"] / 3600.0), mean.shape), axis=-1)
     if flicker:
         for time in 10.0 * 2.0 ** np.arange(14):
             keep = np.exp(-f["block_s"] / time)
             state = rng.normal(size=mean.shape[:-1])
-            for block in range(blocks):
+            for block in range(block_count):
                 mean[..., block] += flicker * np.sqrt(np.log(2.0) / np.pi) * state
                 state = keep * state + np.sqrt(1 - keep**2) * rng.normal(size=state.shape)
     return mean

@@ -93,16 +93,16 @@ def _grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Arr
         place.append(np.searchsorted(np.concatenate([[coarse[1] / np.sqrt(3.0)], between]), fine))
     mass = np.full((K.size, B.size), 1e-12)
     np.add.at(mass, tuple(place), posterior.weight)
-    many = [part.ravel() for part in np.meshgrid(K, B, indexing="ij")]
+    many = [component.ravel() for component in np.meshgrid(K, B, indexing="ij")]
     return many[0], many[1], np.log(mass.ravel() / mass.sum())
 
 
-def calibrate_noise(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
+def calibrate_noise(blocks: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     """Calibrate the noise of every axis on quiet blocks.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         What is known to be quiet: seconds since the start, or ISO times. Without it blocks with
@@ -138,27 +138,27 @@ def calibrate_noise(reduced: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     >>> bool(abs(error) < 4.0), baseline.attrs["source"]
     (True, 'calibrated')
     """
-    chosen, reason = find_quiescent_blocks(reduced, quiet)
+    chosen, reason = find_quiescent_blocks(blocks, quiet)
     attrs = {
         "source": "calibrated",
-        "calibrated_on": find_quiescent_spans(reduced, chosen),
+        "calibrated_on": find_quiescent_spans(blocks, chosen),
         "quiet_by": reason,
     }
-    return assemble_baseline(reduced, _posteriors(reduced, chosen), quiet=chosen, attrs=attrs)
+    return assemble_baseline(blocks, _posteriors(blocks, chosen), quiet=chosen, attrs=attrs)
 
 
-def _posteriors(reduced: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior]:
+def _posteriors(blocks: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior]:
     """Noise of every axis from the chosen blocks (axis, block)."""
-    columns = noise_powers(reduced)
-    common, rest = common_variance(reduced)
+    columns = noise_powers(blocks)
+    common, rest = common_variance(blocks)
     power, shape = (
-        reduced["power"].transpose("axis", "block", "band").values,
-        reduced["shape"].transpose("axis", "block", "band").values,
+        blocks["power"].transpose("axis", "block", "band").values,
+        blocks["shape"].transpose("axis", "block", "band").values,
     )
-    mean = reduced["mean"].transpose("axis", "block").values
-    step = float(reduced.attrs["block_s"])
+    mean = blocks["mean"].transpose("axis", "block").values
+    step = float(blocks.attrs["block_s"])
     found = []
-    for row, axis in enumerate(reduced["axis"].values):
+    for row, axis in enumerate(blocks["axis"].values):
         use = chosen[row]
         fit = summed(power[row][use], shape[row][use], columns[row][use])
         if fit.power.size < 4:
@@ -168,7 +168,7 @@ def _posteriors(reduced: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterio
             )
         fit = _with_common(fit, shape[row][use], rest[row][use], common[row][use])
         square = np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0])
-        variance = white_variance(reduced, np.tile(square, (len(mean), 1)))[row]
+        variance = white_variance(blocks, np.tile(square, (len(mean), 1)))[row]
         present = use & np.isfinite(mean[row])
         found.append(
             noise_posterior(
@@ -192,7 +192,7 @@ def _with_common(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
 
 
 def assemble_baseline(
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     found: list[Posterior],
     *,
     quiet: NDArray[np.bool_],
@@ -204,7 +204,7 @@ def assemble_baseline(
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
     found : list of Posterior
         One for each axis.
     quiet : ndarray of bool, shape (axis, block)
@@ -215,34 +215,34 @@ def assemble_baseline(
     spectrum : ndarray, shape (axis, block, band), optional
         Expected power with effects; that of the noise without it.
     """
-    columns = noise_powers(reduced)
+    columns = noise_powers(blocks)
     square = np.stack([one.square for one in found])
     noise = np.einsum("abfn,an->abf", columns, square)
     expected = noise if spectrum is None else spectrum
     power, shape = (
-        reduced["power"].transpose("axis", "block", "band").values,
-        reduced["shape"].transpose("axis", "block", "band").values,
+        blocks["power"].transpose("axis", "block", "band").values,
+        blocks["shape"].transpose("axis", "block", "band").values,
     )
     floor = np.array([1e-3 * one.min() / HOUR for one in expected])
     white = white_variance(
-        reduced,
+        blocks,
         np.stack(
             [square[:, 0], np.maximum(square[:, 1], floor), square[:, 2], square[:, 3]], axis=1
         ),
     )
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
     variance = white * np.stack(
-        [_noisier(*parts) for parts in zip(power, shape, expected, strict=True)]
+        [_noisier(*components) for components in zip(power, shape, expected, strict=True)]
     )
-    span = reduced.sizes["block"] * float(reduced.attrs["block_s"])
+    span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
     grids = [
         _grid(one, max(one.square[1], least) * HOUR, span)
         for one, least in zip(found, floor, strict=True)
     ]
     draws = np.stack([one.draws for one in found])
-    common, rest = common_variance(reduced)
+    common, rest = common_variance(blocks)
     value, error = _coefficients(found)
-    value[:, 4], error[:, 4] = 0.0, _ramp_error(reduced, white, value, quiet)
+    value[:, 4], error[:, 4] = 0.0, _ramp_error(blocks, white, value, quiet)
     plane, cube = ("axis", "block"), ("axis", "block", "band")
     told = ", ".join(f"{term} in {LAWS[term].label}" for term in TERMS)
     variables: dict[str, Any] = {
@@ -319,12 +319,12 @@ def assemble_baseline(
         ),
     }
     coordinates = {
-        name: reduced[name]
+        name: blocks[name]
         for name in ("axis", "time", "begin", "end", "frequency", "band_low", "band_high")
-        if name in reduced
+        if name in blocks
     }
     joined = [
-        str(axis) for axis, one in zip(reduced["axis"].values, found, strict=True) if not one.joined
+        str(axis) for axis, one in zip(blocks["axis"].values, found, strict=True) if not one.joined
     ]
     return xr.Dataset(
         variables,
@@ -342,14 +342,14 @@ def _coefficients(found: list[Posterior]) -> tuple[Array, Array]:
     return value, error
 
 
-def _ramp_error(reduced: xr.Dataset, white: Array, value: Array, quiet: NDArray[np.bool_]) -> Array:
+def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[np.bool_]) -> Array:
     """Error that a ramp would have in the quiet means [deg/h^2]."""
-    hours = (reduced["begin"].values + reduced["end"].values)[:, None] / (2.0 * HOUR)
-    present = quiet & np.isfinite(reduced["mean"].transpose("axis", "block").values)
+    hours = (blocks["begin"].values + blocks["end"].values)[:, None] / (2.0 * HOUR)
+    present = quiet & np.isfinite(blocks["mean"].transpose("axis", "block").values)
     error = np.zeros(len(white))
     for row in range(len(white)):
         K, B = value[row, 3:4], value[row, 2:3]
-        step = float(reduced.attrs["block_s"])
+        step = float(blocks.attrs["block_s"])
         seen = mean_products(
             hours[:, :0], hours, variance=white[row], step=step, K=K, B=B, present=present[row]
         ).gram[0, 0, 0]
@@ -357,12 +357,12 @@ def _ramp_error(reduced: xr.Dataset, white: Array, value: Array, quiet: NDArray[
     return error
 
 
-def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Dataset:
+def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Dataset:
     """Take the noise of a model, and its effects as far as means and band powers show them.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         The recording, from `reduce_log`.
     model : path, mapping or Model
         As `gyrostab.simulate` takes it.
@@ -387,7 +387,7 @@ def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -
         When the recording lacks the channel of an effect.
     """
     made = model if isinstance(model, Model) else read_model(model)
-    axes = [str(axis) for axis in reduced["axis"].values]
+    axes = [str(axis) for axis in blocks["axis"].values]
     found = []
     for axis in axes:
         coefficients = made.coefficients(axis)
@@ -399,18 +399,18 @@ def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -
         draws = np.tile(square, (DRAWS, 1))
         K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
         found.append(Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True))
-    chosen = np.ones((len(axes), reduced.sizes["block"]), np.bool_)
+    chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": made.source}
     if quiet is not None:
-        chosen, attrs["quiet_by"] = find_quiescent_blocks(reduced, quiet)
-        attrs["calibrated_on"] = find_quiescent_spans(reduced, chosen)
-        found = _levelled(reduced, made, found, chosen)
-    known = expect_known_effects(reduced, made, np.stack([one.square for one in found]))
+        chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet)
+        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
+        found = _levelled(blocks, made, found, chosen)
+    known = expect_known_effects(blocks, made, np.stack([one.square for one in found]))
     attrs["left_out"] = known.left_out
-    hours = (reduced["begin"].values + reduced["end"].values) / (2.0 * HOUR)
+    hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
     ramp = np.array([made.coefficients(axis)["R"] for axis in axes])
     out = assemble_baseline(
-        reduced,
+        blocks,
         found,
         quiet=chosen,
         attrs=attrs,
@@ -432,22 +432,23 @@ def baseline_from_model(reduced: xr.Dataset, model: Any, *, quiet: Any = None) -
             {"long_name": "expected power of lines", "units": _POWER},
         )
     if known.lines:
-        noise = np.stack([line_columns(reduced) @ one.square for one in found])
-        out["shape_alone"] *= evenness(noise + known.lines["peaks"], reduced)[:, None]
+        noise = np.stack([line_columns(blocks) @ one.square for one in found])
+        out["shape_alone"] *= evenness(noise + known.lines["peaks"], blocks)[:, None]
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if quiet is None else ["R"]}] = 0.0
     return out
 
 
 def _levelled(
-    reduced: xr.Dataset, model: Model, found: list[Posterior], quiet: NDArray[np.bool_]
+    blocks: xr.Dataset, model: Model, found: list[Posterior], quiet: NDArray[np.bool_]
 ) -> list[Posterior]:
     """Scale the noise of a model to the quiet blocks (axis, block) of the recording, beside its effects."""
     square = np.stack([one.square for one in found])
     whole, added = (
-        expect_known_effects(reduced, model, part).spectrum for part in (square, 0.0 * square)
+        expect_known_effects(blocks, model, component).spectrum
+        for component in (square, 0.0 * square)
     )
-    return _scaled(found, *quiescent_level(reduced, whole - added, added, quiet))
+    return _scaled(found, *quiescent_level(blocks, whole - added, added, quiet))
 
 
 def _scaled(found: list[Posterior], factor: Array, error: Array) -> list[Posterior]:
@@ -459,7 +460,7 @@ def _scaled(found: list[Posterior], factor: Array, error: Array) -> list[Posteri
 
 
 def baseline_from_simulation(
-    reduced: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None
+    blocks: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None
 ) -> xr.Dataset:
     """Take the noise of a simulated log with the error of calibrating it, and its level over time where that changes.
 
@@ -469,7 +470,7 @@ def baseline_from_simulation(
 
     Parameters
     ----------
-    reduced, simulated : xarray.Dataset
+    blocks, simulated : xarray.Dataset
         Recording and simulation, from `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         Quiet stretches of the recording: one factor for each axis fits the noise of the simulation
@@ -483,15 +484,15 @@ def baseline_from_simulation(
     for name, wanted, got in (
         (
             "sampling rate [Hz]",
-            reduced.attrs["sampling_rate_hz"],
+            blocks.attrs["sampling_rate_hz"],
             simulated.attrs["sampling_rate_hz"],
         ),
         (
             "blocks",
-            (reduced.sizes["block"], reduced.attrs["block_samples"]),
+            (blocks.sizes["block"], blocks.attrs["block_samples"]),
             (simulated.sizes["block"], simulated.attrs["block_samples"]),
         ),
-        ("axes", list(reduced["axis"].values), list(simulated["axis"].values)),
+        ("axes", list(blocks["axis"].values), list(simulated["axis"].values)),
     ):
         if wanted != got:
             raise SchemaError(
@@ -504,9 +505,7 @@ def baseline_from_simulation(
         * level[..., None]
     )
     shown = shown_by(simulated, plain, odd)
-    noise = np.einsum(
-        "abfn,an->abf", noise_powers(reduced), np.stack([one.square for one in found])
-    )
+    noise = np.einsum("abfn,an->abf", noise_powers(blocks), np.stack([one.square for one in found]))
     attrs = {
         "source": "simulation",
         "calibrated_on": find_quiescent_spans(simulated, chosen),
@@ -514,14 +513,14 @@ def baseline_from_simulation(
     }
     spectrum = noise * level[..., None] * shown.form[:, None]
     if quiet is not None:
-        chosen, attrs["quiet_by"] = find_quiescent_blocks(reduced, quiet)
-        attrs["calibrated_on"] = find_quiescent_spans(reduced, chosen)
-        factor, error = quiescent_level(reduced, spectrum, 0.0 * spectrum, chosen)
+        chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet)
+        attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
+        factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
         found, spectrum = _scaled(found, factor, error), spectrum * factor[:, None, None]
     return with_shown(
-        assemble_baseline(reduced, found, quiet=chosen, attrs=attrs, spectrum=spectrum),
+        assemble_baseline(blocks, found, quiet=chosen, attrs=attrs, spectrum=spectrum),
         shown,
-        reduced,
+        blocks,
     )
 
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 NOISE = ("Q", "N", "B", "K")
 
 
-def line_columns(reduced: xr.Dataset) -> Array:
+def line_columns(blocks: xr.Dataset) -> Array:
     """Expected power of every ordinate of a full block for unit squares of Q, N, B, K.
 
     Returns
@@ -35,14 +35,14 @@ def line_columns(reduced: xr.Dataset) -> Array:
     ndarray, shape (line, term)
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
-    size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
+    size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
     return np.asarray(
         expected_powers(taper(size), rate, ordinates(size)).T
         * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR])
     )
 
 
-def band_columns(reduced: xr.Dataset) -> Array:
+def band_columns(blocks: xr.Dataset) -> Array:
     """Expected band powers of a full block for unit squares of Q, N, B, K.
 
     Returns
@@ -50,17 +50,17 @@ def band_columns(reduced: xr.Dataset) -> Array:
     ndarray, shape (band, term)
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
-    each = line_columns(reduced)
-    edges = band_edges(int(reduced.attrs["block_samples"])) - 1
+    each = line_columns(blocks)
+    edges = band_edges(int(blocks.attrs["block_samples"])) - 1
     return np.stack([each[low:high].mean(axis=0) for low, high in pairwise(edges)])
 
 
-def noise_powers(reduced: xr.Dataset, response: Array | None = None) -> Array:
+def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
     """Expected band powers for unit squares of Q, N, B, K, as the gaps of each block let them be seen.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
     response : ndarray, shape (band,), optional
         Factor that a filter has put on the noise before samples were lost.
 
@@ -69,11 +69,11 @@ def noise_powers(reduced: xr.Dataset, response: Array | None = None) -> Array:
     ndarray, shape (axis, block, band, term)
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
-    whole = band_columns(reduced).T * (1.0 if response is None else response)
-    return np.stack([effective(one[None, None], reduced) for one in whole], axis=-1)
+    whole = band_columns(blocks).T * (1.0 if response is None else response)
+    return np.stack([effective(one[None, None], blocks) for one in whole], axis=-1)
 
 
-def common_variance(reduced: xr.Dataset) -> tuple[Array, Array]:
+def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
     """Relative variance that all band powers of a block have in common through random gaps, and the shape of what is left.
 
     Returns
@@ -82,11 +82,11 @@ def common_variance(reduced: xr.Dataset) -> tuple[Array, Array]:
     shape : ndarray, shape (axis, block, band)
         Of the gamma distribution of each power when the common factor is known.
     """
-    shape = reduced["shape"].transpose("axis", "block", "band").values
-    near = reduced["neighbours"].transpose("axis", "block").values
-    samples = np.maximum(reduced["samples"].transpose("axis", "block").values, 1)
+    shape = blocks["shape"].transpose("axis", "block", "band").values
+    near = blocks["neighbours"].transpose("axis", "block").values
+    samples = np.maximum(blocks["samples"].transpose("axis", "block").values, 1)
     scattered = np.clip(1.0 - np.where(np.isfinite(near), near, 1.0), 0.0, 1.0)
-    weights = taper(int(reduced.attrs["block_samples"]))
+    weights = taper(int(blocks.attrs["block_samples"]))
     scattered = np.maximum(
         scattered - (1.0 - float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())), 0.0
     )
@@ -97,12 +97,12 @@ def common_variance(reduced: xr.Dataset) -> tuple[Array, Array]:
     return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
 
 
-def white_variance(reduced: xr.Dataset, square: Array) -> Array:
+def white_variance(blocks: xr.Dataset, square: Array) -> Array:
     """Variance of block means by Q and N, shape (axis, block) [degree2 hour-2], for squares of shape (axis, 4)."""
-    samples = reduced["samples"].transpose("axis", "block").values.astype(np.float64)
-    near = reduced["neighbours"].transpose("axis", "block").values
-    rate, count = float(reduced.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
-    apart = 1.0 - np.where(np.isfinite(near), near, samples / float(reduced.attrs["block_samples"]))
+    samples = blocks["samples"].transpose("axis", "block").values.astype(np.float64)
+    near = blocks["neighbours"].transpose("axis", "block").values
+    rate, count = float(blocks.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
+    apart = 1.0 - np.where(np.isfinite(near), near, samples / float(blocks.attrs["block_samples"]))
     runs = np.maximum(apart, 0.0) * count + 1.0  # each leaves a rounding of the angle at either end
     return np.asarray(
         HOUR * rate * square[:, 1:2] / count

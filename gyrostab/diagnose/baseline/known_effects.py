@@ -80,12 +80,12 @@ class KnownEffects(NamedTuple):
     left_out: list[str]
 
 
-def expect_known_effects(reduced: xr.Dataset, model: Model, square: Array) -> KnownEffects:
+def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> KnownEffects:
     """What the effects of a model make of the record.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
     model : Model
     square : ndarray, shape (axis, 4)
         Squared noise coefficients.
@@ -95,14 +95,14 @@ def expect_known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Kn
     SchemaError
         When the recording lacks the channel of an effect.
     """
-    acting = [_acting(effect, reduced) for effect in map(_simulated(model), model.effects)]
+    acting = [_acting(effect, blocks) for effect in map(_simulated(model), model.effects)]
     shown = [
         one for one in acting if not _leaves_odd_samples(one)
     ]  # the blocks with odd samples are found, and left out
-    powers = [power for one in shown for power in _powers(one, reduced)]
-    response = _response(shown, reduced)
+    powers = [power for one in shown for power in _powers(one, blocks)]
+    response = _response(shown, blocks)
     noise = np.einsum(
-        "fn,abn->abf", band_columns(reduced), np.maximum(_levels(shown, square, reduced), 0.0)
+        "fn,abn->abf", band_columns(blocks), np.maximum(_levels(shown, square, blocks), 0.0)
     )
     added = np.zeros(noise.shape)
     for power in powers:
@@ -113,18 +113,18 @@ def expect_known_effects(reduced: xr.Dataset, model: Model, square: Array) -> Kn
         if one.acting.seen.line is not None and one.factor.any()
     ]
     sizes = {
-        "bands": reduced.sizes["band"],
-        "blocks": reduced.sizes["block"],
-        "axes": reduced.sizes["axis"],
+        "bands": blocks.sizes["band"],
+        "block_count": blocks.sizes["block"],
+        "axes": blocks.sizes["axis"],
     }
     return KnownEffects(
-        mean=_means(shown, reduced),
-        spectrum=effective((noise + added) * response, reduced),
-        cross=_cross(powers, response, reduced),
-        lines=_known_lines(reduced, narrow, response[:, 0])
-        if narrow and "line_power" in reduced
+        mean=_means(shown, blocks),
+        spectrum=effective((noise + added) * response, blocks),
+        cross=_cross(powers, response, blocks),
+        lines=_known_lines(blocks, narrow, response[:, 0])
+        if narrow and "line_power" in blocks
         else {},
-        wandering=wandering([(_wander_squares(one, reduced), one.seen) for one in shown], **sizes),
+        wandering=wandering([(_wander_squares(one, blocks), one.seen) for one in shown], **sizes),
         left_out=[
             one.effect.name for one in acting if _leaves_odd_samples(one) or _shows_elsewhere(one)
         ],
@@ -172,11 +172,11 @@ class _Power(NamedTuple):
         return np.asarray(np.abs(self.factor[:, None, None]) ** 2 * self.density)
 
 
-def _acting(effect: Effect, reduced: xr.Dataset) -> _Acting:
-    axes = [str(axis) for axis in reduced["axis"].values]
+def _acting(effect: Effect, blocks: xr.Dataset) -> _Acting:
+    axes = [str(axis) for axis in blocks["axis"].values]
     rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
     own = tuple(axes[row] for row in rows)
-    return _Acting(effect, rows, own, _explained(effect, reduced, own))
+    return _Acting(effect, rows, own, _explained(effect, blocks, own))
 
 
 def _leaves_odd_samples(one: _Acting) -> bool:
@@ -194,18 +194,18 @@ def _shows_elsewhere(one: _Acting) -> bool:
     )
 
 
-def _means(acting: Sequence[_Acting], reduced: xr.Dataset) -> Array:
+def _means(acting: Sequence[_Acting], blocks: xr.Dataset) -> Array:
     """Rates that effects add, (axis, block) [degree hour-1]."""
-    mean = np.zeros((reduced.sizes["axis"], reduced.sizes["block"]))
+    mean = np.zeros((blocks.sizes["axis"], blocks.sizes["block"]))
     for one in acting:
         for name, values in one.seen.mean.items():
             mean[one.rows] += _sizes(one.effect, name, one.axes)[:, None] * values
     return mean
 
 
-def _levels(acting: Sequence[_Acting], square: Array, reduced: xr.Dataset) -> Array:
+def _levels(acting: Sequence[_Acting], square: Array, blocks: xr.Dataset) -> Array:
     """Squared noise coefficients with what effects add to them, (axis, block, noise)."""
-    level = np.repeat(square[:, None], reduced.sizes["block"], axis=1)
+    level = np.repeat(square[:, None], blocks.sizes["block"], axis=1)
     for one in acting:
         for (term, name), values in one.seen.level.items():
             own = square[one.rows, None, NOISE.index(term)]
@@ -215,60 +215,60 @@ def _levels(acting: Sequence[_Acting], square: Array, reduced: xr.Dataset) -> Ar
     return level
 
 
-def _powers(one: _Acting, reduced: xr.Dataset) -> list[_Power]:
+def _powers(one: _Acting, blocks: xr.Dataset) -> list[_Power]:
     """Power that an effect adds, one for each of its spectra."""
-    out, bands = [], reduced.sizes["band"]
+    out, bands = [], blocks.sizes["band"]
     for name, values in one.seen.spectrum.items():
-        factor = np.zeros(reduced.sizes["axis"], np.complex128)
+        factor = np.zeros(blocks.sizes["axis"], np.complex128)
         factor[one.rows] = _factors(one.effect, name, one.axes)
-        density = np.zeros((factor.size, reduced.sizes["block"], bands))
-        peak = _peak(one.effect, name, reduced, one.axes)
+        density = np.zeros((factor.size, blocks.sizes["block"], bands))
+        peak = _peak(one.effect, name, blocks, one.axes)
         density[one.rows] = (
             values.reshape(*values.shape[:-1], bands, -1).mean(axis=-1)
             if peak is None
-            else _over_bands(peak, reduced)
+            else _over_bands(peak, blocks)
         )
         out.append(_Power(one, factor, density))
     return out
 
 
-def _response(acting: Sequence[_Acting], reduced: xr.Dataset) -> Array:
+def _response(acting: Sequence[_Acting], blocks: xr.Dataset) -> Array:
     """Share of the power that filters let pass, (axis, 1, band)."""
-    response = np.ones((reduced.sizes["axis"], 1, reduced.sizes["band"]))
+    response = np.ones((blocks.sizes["axis"], 1, blocks.sizes["band"]))
     for one in acting:
         if one.seen.response is not None:
-            response[one.rows] *= response_of(one.effect, reduced)
+            response[one.rows] *= response_of(one.effect, blocks)
     return response
 
 
 def _cross(
-    powers: Sequence[_Power], response: Array, reduced: xr.Dataset
+    powers: Sequence[_Power], response: Array, blocks: xr.Dataset
 ) -> NDArray[np.complex128] | None:
     """Cross-spectrum of what the axes share, behind a filter (axis, 1, band), as `Known.cross` has it."""
-    if "cross" not in reduced:
+    if "cross" not in blocks:
         return None
-    axes = [str(axis) for axis in reduced["axis"].values]
-    pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(reduced)]
-    shared = np.zeros((len(pairs), reduced.sizes["block"], reduced.sizes["band"]), np.complex128)
+    axes = [str(axis) for axis in blocks["axis"].values]
+    pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(blocks)]
+    shared = np.zeros((len(pairs), blocks.sizes["block"], blocks.sizes["band"]), np.complex128)
     for power in (power for power in powers if power.acting.seen.coherent):
         for number, (one, other) in enumerate(pairs):
             both = power.factor[one] * np.conj(power.factor[other])
             shared[number] += both * np.sqrt(power.density[one] * power.density[other])
     for number, (one, other) in enumerate(pairs):
         shared[number] *= np.sqrt(response[one] * response[other])
-    return effective(shared, reduced, "pair") if shared.any() else None
+    return effective(shared, blocks, "pair") if shared.any() else None
 
 
-def _wander_squares(one: _Acting, reduced: xr.Dataset) -> dict[str, Array]:
+def _wander_squares(one: _Acting, blocks: xr.Dataset) -> dict[str, Array]:
     """Squared sizes of what an effect does to the means at random, (axis,) each."""
     squares = {}
     for name in one.seen.wander:
-        squares[name] = np.zeros(reduced.sizes["axis"])
+        squares[name] = np.zeros(blocks.sizes["axis"])
         squares[name][one.rows] = _sizes(one.effect, name, one.axes) ** 2
     return squares
 
 
-def expect_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
+def expect_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks in which what is known of an axis moves far above its noise, (axis, block); none on an axis where that is the usual thing.
 
     The mean of such a block is known, and what moves inside it is not: its spectrum would be
@@ -276,51 +276,51 @@ def expect_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
     """
     step = np.abs(np.diff(baseline["known_mean"].transpose("axis", "block").values, axis=1))
     moved = np.maximum(np.pad(step, ((0, 0), (0, 1))), np.pad(step, ((0, 0), (1, 0))))
     noise = baseline["spectrum"].transpose("axis", "block", "band").values[..., 0]
-    moving = moved**2 * float(reduced.attrs["block_s"]) > _MOVES * noise
+    moving = moved**2 * float(blocks.attrs["block_s"]) > _MOVES * noise
     return np.asarray(moving & (moving.mean(axis=1, keepdims=True) <= _USUAL))
 
 
-def remove_known_motion(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def remove_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """The record without what blocks say of their inside where what is known of an axis moves: powers, kurtosis, and what axes share there.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
     """
-    moving = expect_known_motion(reduced, baseline)
+    moving = expect_known_motion(blocks, baseline)
     if not moving.any():
-        return reduced
+        return blocks
     still = xr.DataArray(~moving, dims=("axis", "block"))
-    out = reduced.assign(
-        {name: reduced[name].where(still) for name in ("power", "kurtosis") if name in reduced}
+    out = blocks.assign(
+        {name: blocks[name].where(still) for name in ("power", "kurtosis") if name in blocks}
     )
-    return out.assign(cross=cross_without(reduced, moving)) if "cross" in reduced else out
+    return out.assign(cross=cross_without(blocks, moving)) if "cross" in blocks else out
 
 
 def _known_lines(
-    reduced: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array
+    blocks: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array
 ) -> dict[str, Array]:
     """Lines of effects (with their axes, and their power in the bands), behind a filter (axis, band), as `Known.lines` has them."""
-    axes = [str(axis) for axis in reduced["axis"].values]
-    frequency, bands = reduced["line_frequency"].values, reduced["frequency"].values
+    axes = [str(axis) for axis in blocks["axis"].values]
+    frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
     passed = np.stack([np.interp(np.log(frequency), np.log(bands), one) for one in response])
     steady, most, broad = (np.zeros(passed.shape) for _ in range(3))
-    near, own = in_place(reduced)[..., None], np.zeros((len(axes), bands.size))
-    leak = _leak(int(reduced.attrs["block_samples"]))
+    near, own = in_place(blocks)[..., None], np.zeros((len(axes), bands.size))
+    leak = _leak(int(blocks.attrs["block_samples"]))
     for effect, rows, density in narrow:
         chosen = tuple(axes[row] for row in rows)
-        seen = _explained(effect, reduced, chosen, frequency)
+        seen = _explained(effect, blocks, chosen, frequency)
         own += (near * density).mean(axis=1) * response
         for name, values in seen.spectrum.items():
             size = np.abs(_factors(effect, name, chosen)[:, None]) ** 2 * values.mean(axis=-2)
-            places = 0 if seen.line is None else seen.line.size // reduced.sizes["block"]
+            places = 0 if seen.line is None else seen.line.size // blocks.sizes["block"]
             alone = np.count_nonzero(values, axis=-1).max() <= places
-            peak = _peak(effect, name, reduced, chosen)
+            peak = _peak(effect, name, blocks, chosen)
             if peak is not None:
                 broad[rows] += (
                     np.abs(_factors(effect, name, chosen)[:, None]) ** 2 * peak * passed[rows]
@@ -333,7 +333,7 @@ def _known_lines(
                     - frequency[int(np.argmax(values.reshape(-1, frequency.size)[0]))]
                 )
                 own_leak = _leak(
-                    int(reduced.attrs["block_samples"]), apart * float(reduced.attrs["block_s"])
+                    int(blocks.attrs["block_samples"]), apart * float(blocks.attrs["block_s"])
                 )[0]
             for row, one in zip(rows, size * passed[rows], strict=True):
                 (steady if alone else broad)[row] += np.convolve(
@@ -343,20 +343,20 @@ def _known_lines(
     return {"lines": steady, "lines_most": most, "peaks": broad, "line_spectrum": own}
 
 
-def _peak(effect: Effect, name: str, reduced: xr.Dataset, axes: tuple[str, ...]) -> Array | None:
+def _peak(effect: Effect, name: str, blocks: xr.Dataset, axes: tuple[str, ...]) -> Array | None:
     """Density of a resonance per squared unit as the taper shows it, (line,): its peak may be narrower than the taper's own width.
 
     None of an effect that has none.
     """
-    if not math.isfinite(getattr(effect, "quality", math.inf)) or "line_frequency" not in reduced:
+    if not math.isfinite(getattr(effect, "quality", math.inf)) or "line_frequency" not in blocks:
         return None
     frequency, finer, size = (
-        reduced["line_frequency"].values,
+        blocks["line_frequency"].values,
         2 * _BETWEEN,
-        int(reduced.attrs["block_samples"]),
+        int(blocks.attrs["block_samples"]),
     )
     fine = frequency[0] / finer * np.arange(1, finer * frequency.size + 1)
-    seen = _explained(effect, reduced, axes, fine)
+    seen = _explained(effect, blocks, axes, fine)
     density = seen.spectrum[name].reshape(-1, fine.size)[0].copy()
     centre = fine.size if seen.line is None else int(np.argmin(np.abs(fine - seen.line.flat[0])))
     inside = (np.arange(_INSIDE_PEAK) + 0.5) / _INSIDE_PEAK - 0.5
@@ -365,7 +365,7 @@ def _peak(effect: Effect, name: str, reduced: xr.Dataset, axes: tuple[str, ...])
     ):  # where the peak may be narrower than the steps of the density
         there = fine[place] + (fine[1] - fine[0]) * inside
         density[place] = (
-            _explained(effect, reduced, axes, there)
+            _explained(effect, blocks, axes, there)
             .spectrum[name]
             .reshape(-1, inside.size)[0]
             .mean()
@@ -379,16 +379,16 @@ def _peak(effect: Effect, name: str, reduced: xr.Dataset, axes: tuple[str, ...])
     return np.asarray(shown[fine.size + finer :: finer])
 
 
-def _over_bands(density: Array, reduced: xr.Dataset) -> Array:
+def _over_bands(density: Array, blocks: xr.Dataset) -> Array:
     """Mean of every band of a density of all ordinates."""
-    edges = band_edges(int(reduced.attrs["block_samples"])) - 1
+    edges = band_edges(int(blocks.attrs["block_samples"])) - 1
     return np.asarray(np.add.reduceat(density, edges[:-1]) / np.diff(edges))
 
 
-def evenness(density: Array, reduced: xr.Dataset) -> Array:
+def evenness(density: Array, blocks: xr.Dataset) -> Array:
     """Share of the ordinates of a band (axis, band) that scatter by themselves where one of them is louder than others (axis, line)."""
     return np.stack(
-        [_over_bands(one, reduced) ** 2 / _over_bands(one**2, reduced) for one in density]
+        [_over_bands(one, blocks) ** 2 / _over_bands(one**2, blocks) for one in density]
     )
 
 
@@ -405,7 +405,7 @@ def _leak(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
     return inside[:, _BETWEEN], np.average(inside, axis=1, weights=ends), inside.max(axis=1)
 
 
-def remove_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def remove_known_lines(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """The record with its line spectrum freed of the steady lines that the baseline knows.
 
     A line is left as it is above what is known of it where it is stronger than the form of an
@@ -413,15 +413,15 @@ def remove_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
     """
     if "lines" not in baseline:
-        return reduced
+        return blocks
     power, weight = (
-        reduced["line_power"].transpose("axis", "part", "line"),
-        reduced["line_weight"].transpose("axis", "part"),
+        blocks["line_power"].transpose("axis", "part", "line"),
+        blocks["line_weight"].transpose("axis", "part"),
     )
-    noise = expected_lines(baseline, reduced["line_frequency"].values)[:, None]
+    noise = expected_lines(baseline, blocks["line_frequency"].values)[:, None]
     known, most = (baseline[name].values[:, None] for name in ("lines", "lines_most"))
     with np.errstate(divide="ignore", invalid="ignore"):
         scatter = np.sqrt((noise**2 + 2.0 * noise * most) / weight.values[..., None])
@@ -433,7 +433,7 @@ def remove_known_lines(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     )  # with what it leaks into
     freed = noise + np.where(stands | (most < _SLIGHT * noise), above, 0.0)
     freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
-    return reduced.assign(
+    return blocks.assign(
         line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))
     )
 
@@ -452,13 +452,13 @@ def find_drivers(effect: Effect) -> dict[str, str]:
 
 
 def _explained(
-    effect: Effect, reduced: xr.Dataset, axes: tuple[str, ...], frequency: Array | None = None
+    effect: Effect, blocks: xr.Dataset, axes: tuple[str, ...], frequency: Array | None = None
 ) -> Prediction:
     """What an effect predicts for the record on some of its axes; spectra at many frequencies in each band, since a peak may be narrow."""
     drivers = find_drivers(effect)
     present = [
         str(name).removeprefix("channel_")
-        for name in reduced.data_vars
+        for name in blocks.data_vars
         if str(name).startswith("channel_")
     ]
     for role, name in drivers.items():
@@ -466,9 +466,9 @@ def _explained(
             raise driver_error(effect, role, present)
     return effect.explain(
         replace(
-            windows_of(reduced, drivers),
+            windows_of(blocks, drivers),
             axes=axes,
-            frequency=inside_bands(reduced) if frequency is None else frequency,
+            frequency=inside_bands(blocks) if frequency is None else frequency,
         )
     )
 

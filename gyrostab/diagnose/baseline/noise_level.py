@@ -20,13 +20,13 @@ _LEAST = 0.1  # of the factor before, below which no round takes it: the power o
 
 
 def quiescent_level(
-    reduced: xr.Dataset, noise: Array, added: Array, quiet: NDArray[np.bool_]
+    blocks: xr.Dataset, noise: Array, added: Array, quiet: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Measure how loud the noise of the quiet blocks is against that of a simulation.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         Recording, from `reduce_log`.
     noise, added : ndarray, shape (axis, block, band)
         Expected power of the noise, and what effects of the simulation add to it.
@@ -46,11 +46,11 @@ def quiescent_level(
         When an axis has no spectrum in its quiet blocks.
     """
     power, shape = (
-        reduced[name].transpose("axis", "block", "band").values for name in ("power", "shape")
+        blocks[name].transpose("axis", "block", "band").values for name in ("power", "shape")
     )
-    common, alone = common_variance(reduced)
+    common, alone = common_variance(blocks)
     found = []
-    for row, axis in enumerate(reduced["axis"].values):
+    for row, axis in enumerate(blocks["axis"].values):
         good = np.isfinite(power[row]) & np.isfinite(shape[row]) & quiet[row][:, None]
         good &= noise[row] > 0.0
         if not good.any():

@@ -156,9 +156,9 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
             after = np.asarray(np.maximum(after, _LEAST * spectrum))
         if not (after > 0.0).all():
             break
-        part = _step(fit, spectrum, after) if alone else 1.0
-        square = square + part * (np.maximum(found, 0.0) - square)
-        after = spectrum + part * (after - spectrum)
+        component = _step(fit, spectrum, after) if alone else 1.0
+        square = square + component * (np.maximum(found, 0.0) - square)
+        after = spectrum + component * (after - spectrum)
         change = np.abs(after / spectrum - 1.0).max()
         spectrum = after
         if change < 1e-9:
@@ -169,12 +169,12 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
 def _step(fit: Fit, spectrum: Array, after: Array) -> float:
     """How far to go towards the next spectrum: all the way, or half as far until that is likelier; scoring goes too far where none fits."""
     least = _log_likelihood(fit, spectrum)
-    part = 1.0
-    while part > _SHORTEST and _log_likelihood(
-        fit, spectrum + part * (after - spectrum)
+    component = 1.0
+    while component > _SHORTEST and _log_likelihood(
+        fit, spectrum + component * (after - spectrum)
     ) < least - _EVEN * abs(least):
-        part *= 0.5
-    return part
+        component *= 0.5
+    return component
 
 
 def _log_likelihood(fit: Fit, spectrum: Array) -> float:
@@ -225,7 +225,7 @@ def _by_powers(fit: Fit, spectrum: Array, K: Array, B: Array) -> tuple[Array, Ar
     known = fit.power - fit.rest()
     normal = _normal(near, weight, precision)
     without = _normal(near[:, 1:], weight, precision)
-    parts = [
+    components = [
         _chunk(
             fit,
             np.outer(b**2, fit.columns[:, 2]) + np.outer(k**2, fit.columns[:, 3]),
@@ -241,8 +241,8 @@ def _by_powers(fit: Fit, spectrum: Array, K: Array, B: Array) -> tuple[Array, Ar
     ]
     inverse = np.linalg.inv(normal)[:2, :2] if beside.shape[1] else None
     return (
-        np.concatenate([one[0] for one in parts]),
-        np.concatenate([one[1] for one in parts]),
+        np.concatenate([one[0] for one in components]),
+        np.concatenate([one[1] for one in components]),
         normal if inverse is None else np.linalg.inv(inverse),
     )
 
@@ -324,7 +324,7 @@ def noise_posterior(
     square, information, spectrum = _fitted(fit)
     density = HOUR * max(float(square[1]), floor_square(fit))
     coarse_K, coarse_B = _fine_grid(density, mean.size * step, step)
-    K, B = (part.ravel() for part in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
+    K, B = (component.ravel() for component in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
     values = np.where(present, mean, 0.0)[:, None]
     columns = (
         np.empty((mean.size, 0))

@@ -36,12 +36,12 @@ _SHOWN = 0.01  # of the variance of a sample: the form of the spectrum is not kn
 _TERMS = 40
 
 
-def rounded_rates(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
+def rounded_rates(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
     """Axes whose values stand on a lattice because the rate was rounded, as far as the spectrum and the cell of zero can tell.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
     baseline : xarray.Dataset
         From `calibrate_noise`; where it is not calibrated on this record, the noise of this record
@@ -51,32 +51,32 @@ def rounded_rates(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_
     -------
     ndarray of bool, shape (axis,)
     """
-    step = reduced["lattice"].values
+    step = blocks["lattice"].values
     if not (step > 0.0).any():
         return np.zeros(step.shape, np.bool_)
-    return np.asarray(cut_off(reduced) | _by_spectrum(reduced, baseline, step))
+    return np.asarray(cut_off(blocks) | _by_spectrum(blocks, baseline, step))
 
 
 def _by_spectrum(
-    reduced: xr.Dataset, baseline: xr.Dataset, step: NDArray[np.float64]
+    blocks: xr.Dataset, baseline: xr.Dataset, step: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Axes of which the spectrum rules out the Q that their lattice would make if it were one of angles."""
     if baseline.attrs.get("source") != "calibrated":
         from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 
-        baseline = calibrate_noise(reduced)
-    rate = float(reduced.attrs["sampling_rate_hz"])
+        baseline = calibrate_noise(blocks)
+    rate = float(blocks.attrs["sampling_rate_hz"])
     white = baseline["square"].sel(noise="N").values * HOUR * rate
     quiet = baseline["quiet"].transpose("axis", "block").values
     share = np.array(
         [
             _own_share(*row)
-            for row in zip(reduced["mean"].values, quiet, step, np.sqrt(white), strict=True)
+            for row in zip(blocks["mean"].values, quiet, step, np.sqrt(white), strict=True)
         ]
     )
     of_angles = np.where(step > 0.0, share * step**2 / 12.0 / (rate * URAD_PER_S) ** 2, np.nan)
     ratio, error = (
-        _own_square(reduced, baseline) / of_angles,
+        _own_square(blocks, baseline) / of_angles,
         baseline["square_stderr"].sel(noise="Q").values / of_angles,
     )
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -91,13 +91,13 @@ def _by_spectrum(
     return np.asarray(known & (ratio < _NEAR) & (short > _OWN))
 
 
-def _own_square(reduced: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.float64]:
+def _own_square(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.float64]:
     """Square of Q that fits the powers of the quiet blocks best on every axis, less than 0 where these fall towards the end."""
     out = []
-    for number in range(reduced.sizes["axis"]):
+    for number in range(blocks.sizes["axis"]):
         quiet = baseline["quiet"].transpose("axis", "block").values[number]
         power, shape = (
-            reduced[name].transpose("axis", "block", "band").values[number][quiet]
+            blocks[name].transpose("axis", "block", "band").values[number][quiet]
             for name in ("power", "shape")
         )
         columns = (

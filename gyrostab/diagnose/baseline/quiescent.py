@@ -35,14 +35,14 @@ def _running(values: Array, count: int) -> Array:
     return np.asarray(total[np.minimum(place + half + 1, n)] - total[np.maximum(place - half, 0)])
 
 
-def _restlessness(reduced: xr.Dataset) -> dict[str, Array]:
+def _restlessness(blocks: xr.Dataset) -> dict[str, Array]:
     """Channel -> how far each block is from rest, 1 at the limit."""
     found: dict[str, Array] = {}
-    step = float(reduced["end"][0] - reduced["begin"][0])
-    for name in (str(name) for name in reduced.data_vars):
+    step = float(blocks["end"][0] - blocks["begin"][0])
+    for name in (str(name) for name in blocks.data_vars):
         if not name.startswith("channel_"):
             continue
-        values = reduced[name].values.astype(np.float64)
+        values = blocks[name].values.astype(np.float64)
         good = np.isfinite(values)
         if good.sum() < max(_LEAST, values.size // 4):
             continue
@@ -64,20 +64,20 @@ def _restlessness(reduced: xr.Dataset) -> dict[str, Array]:
             found[name] = slope / max(
                 0.3 * float(np.quantile(slope, 0.95)), 3.0 * scatter, np.finfo(float).tiny
             )
-    if "moving" in reduced:
+    if "moving" in blocks:
         found["motion"] = np.where(
-            reduced["moving"].values.any(axis=0), 2.0, 0.0
+            blocks["moving"].values.any(axis=0), 2.0, 0.0
         )  # more than 1: not at rest
-    if reduced.sizes.get("restart", 0):
-        since = reduced["begin"].values[:, None] - reduced["restart_end"].values
+    if blocks.sizes.get("restart", 0):
+        since = blocks["begin"].values[:, None] - blocks["restart_end"].values
         since = np.where(since < -step, np.inf, np.maximum(since, 1.0)).min(axis=1)
-        found["restarts"] = min(_AFTER_RESTART_S, _span(reduced) / 10.0) / since
+        found["restarts"] = min(_AFTER_RESTART_S, _span(blocks) / 10.0) / since
     return found
 
 
-def _span(reduced: xr.Dataset) -> float:
+def _span(blocks: xr.Dataset) -> float:
     """Length of the record [s]."""
-    return float(reduced["end"][-1] - reduced["begin"][0])
+    return float(blocks["end"][-1] - blocks["begin"][0])
 
 
 def loudness(residual: Array, weight: Array) -> tuple[Array, Array]:
@@ -128,11 +128,11 @@ def _typical(power: Array, shape: Array) -> Array | None:
     return np.asarray(mean * np.median(level))
 
 
-def _calm_level(reduced: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _calm_level(blocks: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Blocks of each axis, (axis, block), whose spectrum is not louder than that of the typical block of `start`."""
     power, shape = (
-        reduced["power"].transpose("axis", "block", "band").values,
-        reduced["shape"].transpose("axis", "block", "band").values,
+        blocks["power"].transpose("axis", "block", "band").values,
+        blocks["shape"].transpose("axis", "block", "band").values,
     )
     calm = np.broadcast_to(start, power.shape[:2]).copy()
     for row in range(len(power)):
@@ -148,12 +148,12 @@ def _calm_level(reduced: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[np.boo
     return calm
 
 
-def find_quiescent_blocks(reduced: xr.Dataset, quiet: Any = None) -> tuple[NDArray[np.bool_], str]:
+def find_quiescent_blocks(blocks: xr.Dataset, quiet: Any = None) -> tuple[NDArray[np.bool_], str]:
     """Find the blocks to calibrate on.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`.
     quiet : array_like of bool (block,), or sequence of (start, end), optional
         What the user knows to be quiet; spans are in seconds since the start, or ISO times.
@@ -169,11 +169,11 @@ def find_quiescent_blocks(reduced: xr.Dataset, quiet: Any = None) -> tuple[NDArr
     OptionError
         When the quiet time of the user holds fewer than 100 samples in whole blocks.
     """
-    n, axes = reduced.sizes["block"], reduced.sizes["axis"]
+    n, axes = blocks.sizes["block"], blocks.sizes["axis"]
     if quiet is not None:
-        given = _given(reduced, quiet)
+        given = _given(blocks, quiet)
         return np.broadcast_to(given, (axes, n)).copy(), "the time that was named as quiet"
-    restless = _restlessness(reduced)
+    restless = _restlessness(blocks)
     worst = np.max([*restless.values(), np.zeros(n)], axis=0)
     start = worst <= 1.0
     names = [name.removeprefix("channel_") for name in restless]
@@ -182,11 +182,11 @@ def find_quiescent_blocks(reduced: xr.Dataset, quiet: Any = None) -> tuple[NDArr
     if start.sum() < least:
         start = worst <= np.sort(worst)[min(least, n) - 1]
         reason = f"nothing is calm by {', '.join(names)}: the calmest blocks"
-    return _calm_level(reduced, start), reason
+    return _calm_level(blocks, start), reason
 
 
-def _given(reduced: xr.Dataset, quiet: Any) -> NDArray[np.bool_]:
-    n = reduced.sizes["block"]
+def _given(blocks: xr.Dataset, quiet: Any) -> NDArray[np.bool_]:
+    n = blocks.sizes["block"]
     array = np.asarray(quiet)
     if array.dtype == np.bool_:
         if array.shape != (n,):
@@ -195,25 +195,25 @@ def _given(reduced: xr.Dataset, quiet: Any) -> NDArray[np.bool_]:
             )
         chosen = array.copy()
     else:
-        begin, end = reduced["begin"].values, reduced["end"].values
+        begin, end = blocks["begin"].values, blocks["end"].values
         chosen = np.zeros(n, np.bool_)
         pairs = [quiet] if array.ndim == 1 else list(quiet)
         for pair in pairs:
-            low, high = (_seconds(reduced, edge) for edge in pair)
+            low, high = (_seconds(blocks, edge) for edge in pair)
             chosen |= (begin >= low - 1e-6) & (end <= high + 1e-6)
-    _check_size(reduced, int(chosen.sum()))
+    _check_size(blocks, int(chosen.sum()))
     return np.asarray(chosen)
 
 
-def _check_size(reduced: xr.Dataset, count: int) -> None:
+def _check_size(blocks: xr.Dataset, count: int) -> None:
     """Refuse too few quiet blocks to tell a noise level from, and warn where they say little of slow noise."""
-    step, size = float(reduced.attrs["block_s"]), int(reduced.attrs["block_samples"])
+    step, size = float(blocks.attrs["block_s"]), int(blocks.attrs["block_samples"])
     if count * size < _LEAST_SAMPLES:
         least = -(-_LEAST_SAMPLES // size)
         raise OptionError(
             f"quiet holds {count} whole blocks of {step:g} s, {count * size} samples; calibration needs {_LEAST_SAMPLES} samples, from "
             f"which N is known to {_white_error(_LEAST_SAMPLES):.0%}: name {(least + 1) * step:g} s or more within the "
-            f"{_span(reduced):g} s of the record, or give a shorter block"
+            f"{_span(blocks):g} s of the record, or give a shorter block"
         )
     if count < _LEAST:
         warnings.warn(
@@ -229,20 +229,20 @@ def _white_error(samples: int) -> float:
     return math.sqrt(0.5 / samples)
 
 
-def _seconds(reduced: xr.Dataset, edge: Any) -> float:
+def _seconds(blocks: xr.Dataset, edge: Any) -> float:
     if isinstance(edge, int | float | np.integer | np.floating):
         return float(edge)
-    start = np.datetime64(str(reduced.attrs["start"]).removesuffix("Z"), "ns")
+    start = np.datetime64(str(blocks.attrs["start"]).removesuffix("Z"), "ns")
     instant = np.datetime64(stamp_ns(str(edge), "quiet:"), "ns")
     return float((instant - start) / np.timedelta64(1, "ns")) / 1e9
 
 
-def find_quiescent_spans(reduced: xr.Dataset, quiet: NDArray[np.bool_]) -> list[list[str]]:
+def find_quiescent_spans(blocks: xr.Dataset, quiet: NDArray[np.bool_]) -> list[list[str]]:
     """Spans of time in which any axis is quiet, [start, end] as ISO times."""
-    start = np.datetime64(str(reduced.attrs["start"]).removesuffix("Z"), "ms")
+    start = np.datetime64(str(blocks.attrs["start"]).removesuffix("Z"), "ms")
     some = np.concatenate([[False], quiet.any(axis=0), [False]])
     edges = np.flatnonzero(some[1:] != some[:-1]).reshape(-1, 2)
-    begin, end = reduced["begin"].values, reduced["end"].values
+    begin, end = blocks["begin"].values, blocks["end"].values
 
     def iso(seconds: float) -> str:
         return str(start + np.timedelta64(round(seconds * 1e3), "ms")) + "Z"

@@ -143,16 +143,16 @@ def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tu
         ),
         simulated["line_frequency"].values,
     )
-    gain = line_evidence(power[None], weight, slope)[0]
-    lines, peaks = np.zeros(gain.shape), np.zeros(gain.shape)
+    evidence_nats = line_evidence(power[None], weight, slope)[0]
+    lines, peaks = np.zeros(evidence_nats.shape), np.zeros(evidence_nats.shape)
     inside, near = _inside(simulated), odd.copy()
     near[:, 1:] |= odd[:, :-1]
     near[:, :-1] |= odd[:, 1:]
     for row, axis in enumerate(simulated["axis"].values):
-        known = np.zeros(gain.shape[1], np.bool_)
+        known = np.zeros(evidence_nats.shape[1], np.bool_)
         for _ in range(_MOST_LINES):
-            place = int(np.argmax(np.where(known, -np.inf, gain[row])))
-            if known[place] or not gain[row, place] > _LINE:
+            place = int(np.argmax(np.where(known, -np.inf, evidence_nats[row])))
+            if known[place] or not evidence_nats[row, place] > _LINE:
                 break
             known |= line_skirt(simulated, str(axis), place)
         good = (weight[row] > 0.0) & np.isfinite(power[row]).all(axis=1)
@@ -168,16 +168,16 @@ def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tu
     return lines, peaks
 
 
-def _inside(reduced: xr.Dataset) -> NDArray[np.bool_]:
+def _inside(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Whether a line lies in a band, (band, line)."""
-    frequency = reduced["line_frequency"].values
+    frequency = blocks["line_frequency"].values
     return np.asarray(
-        (frequency >= reduced["band_low"].values[:, None])
-        & (frequency < reduced["band_high"].values[:, None])
+        (frequency >= blocks["band_low"].values[:, None])
+        & (frequency < blocks["band_high"].values[:, None])
     )
 
 
-def with_shown(baseline: xr.Dataset, shown: Shown, reduced: xr.Dataset) -> xr.Dataset:
+def with_shown(baseline: xr.Dataset, shown: Shown, blocks: xr.Dataset) -> xr.Dataset:
     """The baseline, whose spectrum has the form already, with what null records and views ask of the rest.
 
     Added are ``form_shape(axis, band)``; where axes share something ``cross(pair, block, band)``
@@ -192,12 +192,12 @@ def with_shown(baseline: xr.Dataset, shown: Shown, reduced: xr.Dataset) -> xr.Da
         )
     )
     if shown.coherency.any():
-        axes = [str(axis) for axis in reduced["axis"].values]
+        axes = [str(axis) for axis in blocks["axis"].values]
         spectrum = baseline["spectrum"].transpose("axis", "block", "band").values
         both = np.stack(
             [
                 np.sqrt(spectrum[axes.index(one)] * spectrum[axes.index(other)])
-                for one, other in pair_rows(reduced)
+                for one, other in pair_rows(blocks)
             ]
         )
         out["cross"] = (
@@ -213,14 +213,14 @@ def with_shown(baseline: xr.Dataset, shown: Shown, reduced: xr.Dataset) -> xr.Da
     if shown.lines.any() or shown.peaks.any():
         own = (
             (shown.lines + shown.peaks)
-            @ _inside(reduced).T
-            * reduced["line_frequency"].values[0]
-            / band_widths(reduced)
+            @ _inside(blocks).T
+            * blocks["line_frequency"].values[0]
+            / band_widths(blocks)
         )
         attrs = {"long_name": "power of lines", "units": _POWER}
         out["line_spectrum"] = (
             ("axis", "band"),
-            own * in_place(reduced).mean(axis=1)[:, None],
+            own * in_place(blocks).mean(axis=1)[:, None],
             attrs,
         )
         for name, values in (

@@ -47,7 +47,11 @@ def _steady(time: float, variance: Array) -> bool:
 
 
 def wandering(
-    effects: Sequence[tuple[Mapping[str, Array], Prediction]], *, bands: int, blocks: int, axes: int
+    effects: Sequence[tuple[Mapping[str, Array], Prediction]],
+    *,
+    bands: int,
+    block_count: int,
+    axes: int,
 ) -> Wandering:
     """Random means of several effects.
 
@@ -59,7 +63,7 @@ def wandering(
     bands, blocks, axes : int
     """
     square, time = [], []
-    walk, power = np.zeros((axes, blocks)), np.zeros((axes, blocks))
+    walk, power = np.zeros((axes, block_count)), np.zeros((axes, block_count))
     for sizes, seen in effects:
         for name, (memory, variance) in seen.wander.items():
             if seen.levels or not _steady(memory, variance):
@@ -71,7 +75,7 @@ def wandering(
                 time.append(memory)
             if name in seen.spectrum:
                 lowest = np.asarray(seen.spectrum[name]).reshape(
-                    -1, blocks, bands, seen.spectrum[name].shape[-1] // bands
+                    -1, block_count, bands, seen.spectrum[name].shape[-1] // bands
                 )[0, :, 0]
                 power += sizes[name][:, None] * lowest.mean(axis=-1)
     return Wandering(np.array(square).reshape(-1, axes).T, np.array(time), walk, power)

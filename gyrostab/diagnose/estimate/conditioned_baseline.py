@@ -24,7 +24,7 @@ __all__ = ["predicted"]
 
 
 def predicted(
-    naming: Identifications,
+    identifications: Identifications,
     baseline: xr.Dataset,
     known: NDArray[np.bool_] | None = None,
     *,
@@ -34,7 +34,7 @@ def predicted(
 
     Parameters
     ----------
-    naming : Naming
+    identifications : Naming
         The effects, with those that were expected; their nuisance parameters are kept.
     baseline : xarray.Dataset
         That the naming started from.
@@ -50,11 +50,11 @@ def predicted(
         With ``spectrum`` and ``known_mean`` of the effects; for effects that axes share also
         ``cross`` (pair, block, band).
     """
-    reduced = naming.state.reduced
+    blocks = identifications.state.blocks
     keep = (
-        np.ones(reduced.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+        np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
     )
-    seen = reduced.copy()
+    seen = blocks.copy()
     for name in ("mean", "power", "cross"):
         if name in seen:
             seen[name] = seen[name].where(xr.DataArray(keep, dims="block"))
@@ -62,14 +62,16 @@ def predicted(
     mine: dict[
         tuple[str, str], list[bool]
     ] = {}  # of each given column: it is of an effect that is left out
-    claims = (*naming.expected, *naming.claims)
-    for claim in claims:
-        state = condition_on(state, list(claim.parts))
+    identified = (*identifications.expected, *identifications.identified)
+    for identification in identified:
+        state = condition_on(state, list(identification.components))
         for place, columns in state.given.items():
             known_of = mine.setdefault(place, [])
-            known_of += [any(claim is one for one in left_out)] * (len(columns) - len(known_of))
+            known_of += [any(identification is one for one in left_out)] * (
+                len(columns) - len(known_of)
+            )
     weight = _less(state, baseline, mine)
-    state = replace(state, reduced=seen, masked=naming.state.masked)
+    state = replace(state, blocks=seen, masked=identifications.state.masked)
     mean = baseline["known_mean"].transpose("axis", "block").values.copy()
     for row, axis in enumerate(state.axes):
         columns = state.given.get(("mean", axis), [])
@@ -85,12 +87,21 @@ def predicted(
         spectrum=baseline["spectrum"].transpose("axis", "block", "band").copy(data=weight),
         known_mean=baseline["known_mean"].transpose("axis", "block").copy(data=mean),
     )
-    there = [claim for claim in claims if not any(claim is one for one in left_out)]
-    shared = [part for claim in there for part in claim.parts if part.candidate.view == "cross"]
+    there = [
+        identification
+        for identification in identified
+        if not any(identification is one for one in left_out)
+    ]
+    shared = [
+        component
+        for identification in there
+        for component in identification.components
+        if component.candidate.statistic == "cross"
+    ]
     if not shared:
         return after
     expected = known_cross(baseline)
-    cross = _shared(shared, state, naming)
+    cross = _shared(shared, state, identifications)
     return after.assign(
         cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
     )
@@ -112,17 +123,17 @@ def _less(
 
 
 def _shared(
-    parts: Sequence[Component], state: State, naming: Identifications
+    components: Sequence[Component], state: State, identifications: Identifications
 ) -> NDArray[np.complex128]:
     shape = state.weight.shape[1:]
-    pairs = pair_rows(state.reduced)
+    pairs = pair_rows(state.blocks)
     total = np.zeros((len(pairs), *shape), np.complex128)
-    for part in parts:
-        row = pairs.index(part.row)
+    for component in components:
+        row = pairs.index(component.row)
         alone = replace(
             state, given={key: value for key, value in state.given.items() if key[0] != "cross"}
         )
-        mean, _ = component_mixture(part, alone).moments()
-        for size, design in zip(mean, part.variant.design, strict=True):
-            total[row] += size * cross_column(design, row, state.reduced)
+        mean, _ = component_mixture(component, alone).moments()
+        for size, design in zip(mean, component.variant.design, strict=True):
+            total[row] += size * cross_column(design, row, state.blocks)
     return total

@@ -19,46 +19,51 @@ __all__ = ["expected_baseline", "fit_expected", "without_expected"]
 
 
 def expected_baseline(
-    naming: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None
+    identifications: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None
 ) -> xr.Dataset:
     """The baseline with the effects that were expected, and no others, fitted to the blocks that are `known`.
 
     Parameters
     ----------
-    naming : Naming
+    identifications : Naming
     baseline : xarray.Dataset
         That the naming started from.
     known : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
     """
     return (
-        predicted(replace(naming, claims=(), unknown=()), baseline, known)
-        if naming.expected
+        predicted(replace(identifications, identified=(), unknown=()), baseline, known)
+        if identifications.expected
         else baseline
     )
 
 
-def fit_expected(naming: Identifications, baseline: xr.Dataset) -> list[Fitted]:
+def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """The numbers that the recording gives to the effects that were expected, with all that was named in the model."""
     return fit_identifications(
-        replace(naming, claims=naming.expected, expected=naming.claims), baseline
+        replace(
+            identifications,
+            identified=identifications.expected,
+            expected=identifications.identified,
+        ),
+        baseline,
     )
 
 
 def without_expected(
-    reduced: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]
+    blocks: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]
 ) -> xr.Dataset:
     """The record without the blocks in which effects that were expected leave odd samples, or move the rate too fast for its spectrum.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
     expected : sequence of Claim
     """
     if not expected:
-        return reduced
-    state = begin_state(reduced, baseline)
-    for claim in expected:
-        state = condition_on(state, list(claim.parts))
+        return blocks
+    state = begin_state(blocks, baseline)
+    for identification in expected:
+        state = condition_on(state, list(identification.components))
     moved = xr.DataArray(state.masked, dims=("axis", "block"))
-    return state.reduced.assign(power=state.reduced["power"].where(~moved))
+    return state.blocks.assign(power=state.blocks["power"].where(~moved))

@@ -65,7 +65,7 @@ def _scaled(variant: Variant, sizes: Mixture) -> Point:
     return Point(variant, sizes, unlikely=0.5 * float(np.linalg.slogdet(mean)[1]))
 
 
-def refined(part: Component, state: State, points: Sequence[Point]) -> list[Point]:
+def refined(component: Component, state: State, points: Sequence[Point]) -> list[Point]:
     """Points with others between them, wherever the likelihood or the size of an effect on means changes much from one to the next.
 
     The grid goes on where the likelihood still rises at its end. A step is halved about the best
@@ -74,13 +74,13 @@ def refined(part: Component, state: State, points: Sequence[Point]) -> list[Poin
 
     Parameters
     ----------
-    part : Part
+    component : Part
     state : State
         With all else that is named.
     points : sequence of Point
         Of the grid.
     """
-    name = _scale(part, points)
+    name = _scale(component, points)
     if name is None:
         return list(points)
     found = [
@@ -90,13 +90,13 @@ def refined(part: Component, state: State, points: Sequence[Point]) -> list[Poin
     for line in sorted({one.line for one in found}):
         members = sorted((one for one in found if one.line == line), key=lambda one: one.place)
         for down in (True, False) if len(members) > 1 else ():
-            found += _beyond(part, state, name, members, found, down)
+            found += _beyond(component, state, name, members, found, down)
     for _ in range(_ROUNDS):
         steps = _wide(found)[: max(_MOST - len(found) + len(points), 0)]
         new = [
             made
             for one, other in steps
-            if (made := _middle(part, state, name, one, other)) is not None
+            if (made := _middle(component, state, name, one, other)) is not None
         ]
         if not new:
             break
@@ -113,20 +113,24 @@ class _Placed:
     place: float
 
 
-def _scale(part: Component, points: Sequence[Point]) -> str | None:
+def _scale(component: Component, points: Sequence[Point]) -> str | None:
     """The first parameter of the grid that is a scale and has several values."""
-    if part.candidate.view != "mean":
+    if component.candidate.statistic != "mean":
         return None
     for name in points[0].variant.values:
         values = {point.variant.values.get(name) for point in points}
-        if len(values) > 2 and _unit(part, name) in _SCALES and name != _INSTANT:
+        if len(values) > 2 and _unit(component, name) in _SCALES and name != _INSTANT:
             return name
     return None
 
 
-def _unit(part: Component, name: str) -> str:
+def _unit(component: Component, name: str) -> str:
     return next(
-        (item.unit for item in effects()[part.candidate.effect].parameters() if item.name == name),
+        (
+            item.unit
+            for item in effects()[component.candidate.effect].parameters()
+            if item.name == name
+        ),
         "",
     )
 
@@ -176,16 +180,16 @@ def _differ(one: Point, other: Point) -> bool:
 
 
 def _middle(
-    part: Component, state: State, name: str, one: _Placed, other: _Placed
+    component: Component, state: State, name: str, one: _Placed, other: _Placed
 ) -> _Placed | None:
     """The point in the middle of a step: of the logarithm, but from none on."""
     low, high = sorted((_value(one.point, name), _value(other.point, name)))
     value = math.sqrt(low * high) if low > high / _NONE else 0.5 * (low + high)
-    return _made(part, state, name, one, value, 0.5 * (one.place + other.place))
+    return _made(component, state, name, one, value, 0.5 * (one.place + other.place))
 
 
 def _beyond(
-    part: Component,
+    component: Component,
     state: State,
     name: str,
     line: Sequence[_Placed],
@@ -199,7 +203,7 @@ def _beyond(
     before, last = (line[1], line[0]) if down else (line[-2], line[-1])
     ratio = _value(last.point, name) / max(_value(before.point, name), 1e-300)
     top, out = max(one.point.evidence for one in found) - _LIKELY, list[_Placed]()
-    longest = float(state.reduced["end"].values[-1]) / _SECONDS.get(_unit(part, name), math.nan)
+    longest = float(state.blocks["end"].values[-1]) / _SECONDS.get(_unit(component, name), math.nan)
     while (
         len(out) < _ROUNDS
         and 1.0 / _NONE < ratio < _NONE
@@ -209,7 +213,7 @@ def _beyond(
         after = (
             None
             if value > longest
-            else _made(part, state, name, last, value, last.place + (-1.0 if down else 1.0))
+            else _made(component, state, name, last, value, last.place + (-1.0 if down else 1.0))
         )
         if after is None:
             break
@@ -219,17 +223,19 @@ def _beyond(
 
 
 def _made(
-    part: Component, state: State, name: str, like: _Placed, value: float, place: float
+    component: Component, state: State, name: str, like: _Placed, value: float, place: float
 ) -> _Placed | None:
     """A point of another value on the same line; None where the effect cannot have it."""
     wanted = replace(like.point.variant, values={**like.point.variant.values, name: value})
     try:
-        variant = variants_of(part.candidate, wanted, state.reduced, state.baseline["coefficient"])
+        variant = variants_of(
+            component.candidate, wanted, state.blocks, state.baseline["coefficient"]
+        )
     except OptionError:
         return None
     if variant is None or variant.values.get(name) != value:
         return None
-    return _Placed(_scaled(variant, component_mixture(part, state, variant)), like.line, place)
+    return _Placed(_scaled(variant, component_mixture(component, state, variant)), like.line, place)
 
 
 def _shared(found: Sequence[_Placed]) -> list[Point]:

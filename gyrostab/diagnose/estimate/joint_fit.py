@@ -65,7 +65,7 @@ class Fitted:
 
     Attributes
     ----------
-    claim : Claim
+    identification : Claim
     axes : tuple of str
     parameters : mapping of str to Estimate
         Of an effect with a number for each axis: name and axis, with a dot between, where there are
@@ -76,7 +76,7 @@ class Fitted:
         What the numbers do not say.
     """
 
-    claim: Identification
+    identification: Identification
     axes: tuple[str, ...]
     parameters: Mapping[str, Estimate]
     effect: Effect | None
@@ -90,12 +90,12 @@ class Fitted:
         return f"{said} {self.note}" if self.note else said
 
 
-def fit_identifications(naming: Identifications, baseline: xr.Dataset) -> list[Fitted]:
+def fit_identifications(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """Fit all named effects, each with the others in the model.
 
     Parameters
     ----------
-    naming : Naming
+    identifications : Naming
         From `gyrostab.diagnose.identify.forward_search.name_effects`.
     baseline : xarray.Dataset
         That the naming started from.
@@ -106,141 +106,178 @@ def fit_identifications(naming: Identifications, baseline: xr.Dataset) -> list[F
         An entry for each axis of an effect with one number for all of its axes; one entry for all
         axes where each has its own number.
     """
-    start = begin_state(naming.state.reduced, baseline)
+    start = begin_state(identifications.state.blocks, baseline)
     found: list[Fitted] = []
-    for claim in naming.claims:
+    for identification in identifications.identified:
         state = start
         everything: list[Identification | Unidentified] = [
-            *naming.expected,
-            *naming.claims,
-            *naming.unknown,
+            *identifications.expected,
+            *identifications.identified,
+            *identifications.unknown,
         ]
         for one in everything:
-            if one is not claim:
-                state = condition_on(state, list(one.parts))
-        state = replace(state, weight=naming.state.weight, masked=naming.state.masked)
-        found += _fit_claim(claim, state, naming)
+            if one is not identification:
+                state = condition_on(state, list(one.components))
+        state = replace(
+            state, weight=identifications.state.weight, masked=identifications.state.masked
+        )
+        found += _fit_claim(identification, state, identifications)
     return found
 
 
-def _fit_claim(claim: Identification, state: State, naming: Identifications) -> list[Fitted]:
-    views = {part.candidate.view for part in claim.parts}
-    kind = effects()[claim.effect]
+def _fit_claim(
+    identification: Identification, state: State, identifications: Identifications
+) -> list[Fitted]:
+    statistics = {component.candidate.statistic for component in identification.components}
+    kind = effects()[identification.effect]
     many = any(item.many for item in kind.parameters() if item.name in kind.size_parameters)
     filtered = any(
-        is_filter(part.candidate.view, part.variant) for part in claim.parts
+        is_filter(component.candidate.statistic, component.variant)
+        for component in identification.components
     )  # one logger: its axes are filtered alike
     together = (
-        many or filtered or "cross" in views or any(not part.candidate.each for part in claim.parts)
+        many
+        or filtered
+        or "cross" in statistics
+        or any(not component.candidate.each for component in identification.components)
     )
     if together:
         return [
-            _fitted(claim, _axes(claim, parts), parts, state, naming)
-            for parts in _by_harmonic(claim, state)
+            _fitted(
+                identification,
+                _axes(identification, components),
+                components,
+                state,
+                identifications,
+            )
+            for components in _by_harmonic(identification, state)
         ]
     return [
-        _fitted(claim, (axis,), [part for part in claim.parts if axis in part.row], state, naming)
-        for axis in claim.axes
+        _fitted(
+            identification,
+            (axis,),
+            [component for component in identification.components if axis in component.row],
+            state,
+            identifications,
+        )
+        for axis in identification.axes
     ]
 
 
-def _axes(claim: Identification, parts: Sequence[Component]) -> tuple[str, ...]:
+def _axes(identification: Identification, components: Sequence[Component]) -> tuple[str, ...]:
     """Axes of the claim on which the parts are."""
-    return tuple(axis for axis in claim.axes if any(axis in part.row for part in parts))
+    return tuple(
+        axis
+        for axis in identification.axes
+        if any(axis in component.row for component in components)
+    )
 
 
-def _by_harmonic(claim: Identification, state: State) -> list[list[Component]]:
+def _by_harmonic(identification: Identification, state: State) -> list[list[Component]]:
     """Parts of a claim; those of several harmonics of the rotation, each of which has a size and a phase of its own, one by one.
 
     A harmonic beside the strongest is left out where its amplitude is within two standard errors on
     every axis.
     """
     turning = [
-        part for part in claim.parts if part.candidate.view == "order" and part.candidate.each
+        component
+        for component in identification.components
+        if component.candidate.statistic == "order" and component.candidate.each
     ]
-    sets = harmonic_sets(state.reduced.sizes["harmonic"]) if turning else []
-    there = sorted({k for part in turning for k in sets[part.place]})
-    alone = [[replace(part, place=k) for part in turning if k in sets[part.place]] for k in there]
+    sets = harmonic_sets(state.blocks.sizes["harmonic"]) if turning else []
+    there = sorted({k for component in turning for k in sets[component.place]})
+    alone = [
+        [replace(component, place=k) for component in turning if k in sets[component.place]]
+        for k in there
+    ]
     if len(alone) < 2:
-        return [list(claim.parts)]
+        return [list(identification.components)]
     clear = [
-        max(size / error for size, error, _ in (_amplitude(part, state) for part in parts))
-        for parts in alone
+        max(
+            size / error
+            for size, error, _ in (_amplitude(component, state) for component in components)
+        )
+        for components in alone
     ]
     kept = [
-        parts
-        for parts, times in zip(alone, clear, strict=True)
+        components
+        for components, times in zip(alone, clear, strict=True)
         if times > 2.0 or times == max(clear)
     ]
-    rest = [part for part in claim.parts if part not in turning]
+    rest = [component for component in identification.components if component not in turning]
     return [[*kept[0], *rest], *kept[1:]]
 
 
 def _fitted(
-    claim: Identification,
+    identification: Identification,
     axes: tuple[str, ...],
-    parts: list[Component],
+    components: list[Component],
     state: State,
-    naming: Identifications,
+    identifications: Identifications,
 ) -> Fitted:
-    kind = effects()[claim.effect]
+    kind = effects()[identification.effect]
     units = {item.name: item.unit for item in kind.parameters()}
     values: dict[str, Any] = {}
     estimates: dict[str, Estimate] = {}
     by_view: dict[str, list[Component]] = {}
-    for part in parts:
-        by_view.setdefault(part.candidate.view, []).append(part)
-    view = max(by_view, key=lambda name: sum(part.gain for part in by_view[name]))
-    plain = [prefer_plainer(part, state) for part in by_view[view]]
-    by_view[view] = [part for part, _ in plain]
-    filtered = is_filter(view, by_view[view][0].variant)
+    for component in components:
+        by_view.setdefault(component.candidate.statistic, []).append(component)
+    statistic = max(
+        by_view, key=lambda name: sum(component.evidence_nats for component in by_view[name])
+    )
+    plain = [prefer_plainer(component, state) for component in by_view[statistic]]
+    by_view[statistic] = [component for component, _ in plain]
+    filtered = is_filter(statistic, by_view[statistic][0].variant)
     sizes: Mapping[str, tuple[float, ...]]
     if filtered:
-        sizes, values = filter_sizes(by_view[view], state)
+        sizes, values = filter_sizes(by_view[statistic], state)
     else:
-        own = _SIZES.get(view, _linear)(by_view[view], axes, state, naming)
-        sizes = {**_elsewhere(by_view, view, axes, state, naming), **own}
+        own = _SIZES.get(statistic, _linear)(by_view[statistic], axes, state, identifications)
+        sizes = {**_elsewhere(by_view, statistic, axes, state, identifications), **own}
     for name, (mean, sd, *ends) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
         if math.isfinite(mean) and not math.isnan(
             sd
         ):  # a low-pass of infinite bandwidth is none; an exponent may be told, not measured
             form = (
-                0.0 if unit == _ANGLE or (view, name) == _PLACE else FORM_ERROR * mean
+                0.0 if unit == _ANGLE or (statistic, name) == _PLACE else FORM_ERROR * mean
             )  # angles have that of the size already
             estimates[name] = _estimate(
                 mean, sd, unit, ends=ends, positive=_positive(kind, name), form=form
             )
         _put(values, name, mean, axes)
     values |= {
-        name: value for name, value in by_view[view][0].variant.values.items() if name not in values
+        name: value
+        for name, value in by_view[statistic][0].variant.values.items()
+        if name not in values
     }
-    values |= _words(claim, by_view[view][0], state)
+    values |= _words(identification, by_view[statistic][0], state)
     return Fitted(
-        claim,
+        identification,
         axes,
         estimates,
-        _instance(kind, values, axes, claim.driver),
+        _instance(kind, values, axes, identification.driver),
         next((note for _, note in plain if note), ""),
     )
 
 
 def _elsewhere(
     by_view: Mapping[str, list[Component]],
-    view: str,
+    statistic: str,
     axes: tuple[str, ...],
     state: State,
-    naming: Identifications,
+    identifications: Identifications,
 ) -> dict[str, tuple[float, ...]]:
     """Sizes on axes that the strongest view says nothing of, from the strongest of the others that does."""
-    seen = {axis for part in by_view[view] for axis in part.row}
+    seen = {axis for component in by_view[statistic] for axis in component.row}
     found: dict[str, tuple[float, ...]] = {}
     for other in sorted(
-        set(by_view) - {view}, key=lambda name: -sum(part.gain for part in by_view[name])
+        set(by_view) - {statistic},
+        key=lambda name: -sum(component.evidence_nats for component in by_view[name]),
     ):
-        lacking = {axis for part in by_view[other] for axis in part.row} - seen
+        lacking = {axis for component in by_view[other] for axis in component.row} - seen
         if lacking:
-            sizes = _SIZES.get(other, _linear)(by_view[other], axes, state, naming)
+            sizes = _SIZES.get(other, _linear)(by_view[other], axes, state, identifications)
             found |= {
                 name: size for name, size in sizes.items() if name.partition(".")[2] in lacking
             }
@@ -264,27 +301,27 @@ def _put(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...])
     known[axes.index(axis)] = value
 
 
-def _words(claim: Identification, part: Component, state: State) -> dict[str, Any]:
+def _words(identification: Identification, component: Component, state: State) -> dict[str, Any]:
     """What the model needs beside the numbers."""
-    if claim.effect == "rotation_line":
+    if identification.effect == "rotation_line":
         return {"harmonics": 1.0}
-    if claim.effect == "feedback_reset" and "ramp_turns" in state.reduced:
-        low, high = (float(state.reduced["ramp_turns"].attrs[name]) for name in ("low", "high"))
+    if identification.effect == "feedback_reset" and "ramp_turns" in state.blocks:
+        low, high = (float(state.blocks["ramp_turns"].attrs[name]) for name in ("low", "high"))
         return {
             "phase": "channel",
-            "full": float(part.variant.values.get("full", 1.0)) * (high - low),
+            "full": float(component.variant.values.get("full", 1.0)) * (high - low),
         }
-    if claim.effect == "held_samples":
-        return {"fill": "zero" if part.variant.columns[0] == "filled" else "repeat"}
+    if identification.effect == "held_samples":
+        return {"fill": "zero" if component.variant.columns[0] == "filled" else "repeat"}
     if (
-        claim.effect == "rate_quantization"
-        and cut_off(state.reduced)[state.axes.index(part.row[0])]
+        identification.effect == "rate_quantization"
+        and cut_off(state.blocks)[state.axes.index(component.row[0])]
     ):
         return {"mode": "zero"}
-    if claim.effect == "spikes":
+    if identification.effect == "spikes":
         return {"kind": "outlier"}
-    if claim.effect == "earth_rate" and mirrored(part):
-        off, around = np.degrees(EarthRate.example().directions(claim.axes))
+    if identification.effect == "earth_rate" and mirrored(component):
+        off, around = np.degrees(EarthRate.example().directions(identification.axes))
         return {"off": list(off), "around": list(-around)}
     return {}
 
@@ -331,19 +368,22 @@ def _estimate(
 
 
 def _linear(
-    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+    components: list[Component],
+    axes: tuple[str, ...],
+    state: State,
+    identifications: Identifications,
 ) -> dict[str, tuple[float, ...]]:
     """Parameters of means, powers, profiles and transfers; by axis where there are several."""
     out: dict[str, tuple[float, ...]] = {}
-    for part in parts:
-        if part.variant.columns[:1] == ("any",):
+    for component in components:
+        if component.variant.columns[:1] == ("any",):
             continue
-        mean, covariance, nuisance = sizes_over(part, state, naming)
-        for number, name in enumerate(part.variant.columns):
+        mean, covariance, nuisance = sizes_over(component, state, identifications)
+        for number, name in enumerate(component.variant.columns):
             value, sd = float(mean[number]), float(math.sqrt(covariance[number, number]))
-            if part.variant.squared:
+            if component.variant.squared:
                 value, sd = _root(value, sd)
-            out[name if len(axes) == 1 else f"{name}.{part.row[0]}"] = (value, sd)
+            out[name if len(axes) == 1 else f"{name}.{component.row[0]}"] = (value, sd)
         out |= nuisance
     return out
 
@@ -355,32 +395,40 @@ def _root(square: float, sd: float) -> tuple[float, float]:
 
 
 def _common(
-    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+    components: list[Component],
+    axes: tuple[str, ...],
+    state: State,
+    identifications: Identifications,
 ) -> dict[str, tuple[float, ...]]:
-    return estimate_shared_factors(parts, axes, state)
+    return estimate_shared_factors(components, axes, state)
 
 
 def _turning(
-    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+    components: list[Component],
+    axes: tuple[str, ...],
+    state: State,
+    identifications: Identifications,
 ) -> dict[str, tuple[float, ...]]:
     """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down.
 
     Angles have the error of the form that the amplitude has: a share of an angle would be none.
     """
     out: dict[str, tuple[float, ...]] = {}
-    for part in parts:
-        size, sd, angle = _amplitude(part, state)
+    for component in components:
+        size, sd, angle = _amplitude(component, state)
         error = math.hypot(sd / max(size, 1e-300), FORM_ERROR)
-        if not part.candidate.each:
-            across = size * float(np.abs(part.variant.design).max())
+        if not component.candidate.each:
+            across = size * float(np.abs(component.variant.design).max())
             return {
                 "latitude": _latitude(across, error * across),
                 "toolface": (angle, math.degrees(error)),
             }
-        label = "" if len(axes) == 1 else f".{part.row[0]}"
+        label = "" if len(axes) == 1 else f".{component.row[0]}"
         out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
         out["order"] = (
-            float(state.reduced["harmonic"].values[part.place % state.reduced.sizes["harmonic"]]),
+            float(
+                state.blocks["harmonic"].values[component.place % state.blocks.sizes["harmonic"]]
+            ),
             0.0,
         )
     return out
@@ -395,43 +443,54 @@ def _latitude(across: float, error: float) -> tuple[float, float, float, float]:
     return middle, max((high - low) / (2.0 * _TWO_SIDED), 1e-12), low, high
 
 
-def _amplitude(part: Component, state: State) -> tuple[float, float, float]:
+def _amplitude(component: Component, state: State) -> tuple[float, float, float]:
     """Amplitude of the first harmonic of a part, its standard error, and the phase [deg]."""
-    mean, covariance = component_mixture(part, state).moments()
+    mean, covariance = component_mixture(component, state).moments()
     sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
     return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
 
 
 def _line(
-    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+    components: list[Component],
+    axes: tuple[str, ...],
+    state: State,
+    identifications: Identifications,
 ) -> dict[str, tuple[float, float]]:
-    name = {"real_motion": "sway"}.get(parts[0].candidate.effect, parts[0].variant.columns[0])
+    name = {"real_motion": "sway"}.get(
+        components[0].candidate.effect, components[0].variant.columns[0]
+    )
     out: dict[str, tuple[float, float]] = {}
-    for part in sorted(
-        parts, key=lambda part: part.gain
+    for component in sorted(
+        components, key=lambda component: component.evidence_nats
     ):  # of several lines of an axis the strongest
-        amplitude, frequency = line_size(state.reduced, part.row[0], part.place)
-        label = "" if len(axes) == 1 or name == "sway" else f".{part.row[0]}"
+        amplitude, frequency = line_size(state.blocks, component.row[0], component.place)
+        label = "" if len(axes) == 1 or name == "sway" else f".{component.row[0]}"
         out[f"{name}{label}"], out["frequency"] = amplitude, frequency
     return out
 
 
 def _odd(
-    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+    components: list[Component],
+    axes: tuple[str, ...],
+    state: State,
+    identifications: Identifications,
 ) -> dict[str, tuple[float, float]]:
     return sample_count_sizes(
-        parts[0].candidate.effect,
-        parts[0].variant.columns[0],
-        parts[0].row[0],
-        state.reduced,
-        naming.tallies,
+        components[0].candidate.effect,
+        components[0].variant.columns[0],
+        components[0].row[0],
+        state.blocks,
+        identifications.count_evidence,
     )
 
 
 def _levels(
-    parts: list[Component], axes: tuple[str, ...], state: State, naming: Identifications
+    components: list[Component],
+    axes: tuple[str, ...],
+    state: State,
+    identifications: Identifications,
 ) -> dict[str, tuple[float, float]]:
-    return estimate_telegraph(parts, axes, state)
+    return estimate_telegraph(components, axes, state)
 
 
 _SIZES: Mapping[str, Callable[..., Mapping[str, tuple[float, ...]]]] = {

@@ -25,7 +25,7 @@ _TAILS = (0.025, 0.975)
 
 
 def sizes_over(
-    part: Component, state: State, naming: Identifications
+    component: Component, state: State, identifications: Identifications
 ) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
     """Sizes of a part, averaged over the noise and over what else is free.
 
@@ -35,10 +35,10 @@ def sizes_over(
 
     Parameters
     ----------
-    part : Part
+    component : Part
     state : State
         With all else that is named.
-    naming : Naming
+    identifications : Naming
         Its candidates have the grid.
 
     Returns
@@ -51,10 +51,11 @@ def sizes_over(
         not symmetric; NaN for one that is told, but not measured.
     """
     grid = [
-        Point(variant, component_mixture(part, state, variant)) for variant in _family(part, naming)
+        Point(variant, component_mixture(component, state, variant))
+        for variant in _family(component, identifications)
     ]
-    usual = _usual(part, [point.variant for point in grid], [point.evidence for point in grid])
-    points = refined(part, state, [grid[place] for place in usual])
+    usual = _usual(component, [point.variant for point in grid], [point.evidence for point in grid])
+    points = refined(component, state, [grid[place] for place in usual])
     family = [point.variant for point in points]
     evidence = np.array([point.evidence for point in points])
     mean, covariance = _merged(points).moments()
@@ -62,7 +63,7 @@ def sizes_over(
     told = [
         place
         for place in at_once
-        if evidence[place] > evidence.max() - AMBIGUOUS - FORM * max(part.gain, 0.0)
+        if evidence[place] > evidence.max() - AMBIGUOUS - FORM * max(component.evidence_nats, 0.0)
     ]
     if told:
         middle, _ = _merged([points[place] for place in told]).moments()
@@ -100,20 +101,20 @@ def _merged(points: Sequence[Point]) -> Mixture:
     )
 
 
-def _family(part: Component, naming: Identifications) -> list[Variant]:
+def _family(component: Component, identifications: Identifications) -> list[Variant]:
     """Variants of the part with the same columns: the grid."""
     candidate = next(
         (
             one
-            for one in naming.candidates
-            if one.key == part.candidate.key and one.view == part.candidate.view
+            for one in identifications.candidates
+            if one.key == component.candidate.key and one.statistic == component.candidate.statistic
         ),
-        part.candidate,
+        component.candidate,
     )
     return [
         one
         for one in candidate.variants
-        if one.columns == part.variant.columns and one.squared == part.variant.squared
+        if one.columns == component.variant.columns and one.squared == component.variant.squared
     ]
 
 
@@ -132,9 +133,9 @@ def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
     ]
 
 
-def _usual(part: Component, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
+def _usual(component: Component, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
     """Places of the plain variants, unless others are clearly better."""
-    plain, top = plain_places(part.candidate.effect, family), max(evidence)
+    plain, top = plain_places(component.candidate.effect, family), max(evidence)
     return (
         plain
         if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS

@@ -18,7 +18,7 @@ _IN_ALL = "lattice"  # odd about every sample, so that the noise that was calibr
 
 
 def add_outlier_power(
-    baseline: xr.Dataset, reduced: xr.Dataset, fitted: Sequence[Fitted]
+    baseline: xr.Dataset, blocks: xr.Dataset, fitted: Sequence[Fitted]
 ) -> xr.Dataset:
     """The baseline with the mean power of spikes, held samples and other odd samples, as their fitted numbers and their physics say.
 
@@ -26,21 +26,21 @@ def add_outlier_power(
     ----------
     baseline : xarray.Dataset
         With the other effects, fitted to the blocks without odd samples.
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
     fitted : sequence of Fitted
         Effects of all kinds; those that leave no odd samples are passed over.
     """
-    axes = [str(axis) for axis in reduced["axis"].values]
-    frequency, rate = reduced["frequency"].values, float(reduced.attrs["sampling_rate_hz"])
+    axes = [str(axis) for axis in blocks["axis"].values]
+    frequency, rate = blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"])
     spectrum = baseline["spectrum"].transpose("axis", "block", "band")
     added = np.zeros(spectrum.shape)
     for one in fitted:
         if one.effect is None or not any(
-            part.candidate.view == "marks" for part in one.claim.parts
+            component.candidate.statistic == "marks" for component in one.identification.components
         ):
             continue
         rows = [axes.index(axis) for axis in one.axes]
-        seen = one.effect.explain(replace(windows_of(reduced, {}), axes=tuple(one.axes)))
+        seen = one.effect.explain(replace(windows_of(blocks, {}), axes=tuple(one.axes)))
         if _IN_ALL in seen.marks:
             continue
         for name, density in seen.spectrum.items():

@@ -76,7 +76,7 @@ class _Seen:
 
 
 def recalibrate(
-    naming: Identifications,
+    identifications: Identifications,
     baseline: xr.Dataset,
     fitted: Sequence[Fitted],
     known: NDArray[np.bool_] | None = None,
@@ -89,7 +89,7 @@ def recalibrate(
 
     Parameters
     ----------
-    naming : Naming
+    identifications : Naming
     baseline : xarray.Dataset
         That the naming started from; returned as it is unless it was calibrated on the recording.
     fitted : sequence of Fitted
@@ -103,36 +103,34 @@ def recalibrate(
         As `gyrostab.diagnose.baseline.calibrate.calibrate_noise` has it; ``attrs["recalibrated"]``
         names the axes.
     """
-    if baseline.attrs.get("source") != "calibrated" or not naming.claims:
+    if baseline.attrs.get("source") != "calibrated" or not identifications.identified:
         return baseline
-    reduced = naming.state.reduced
-    use = (
-        np.ones(reduced.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
-    )
-    state = begin_state(reduced, baseline)
-    for claim in naming.claims:
-        state = condition_on(state, list(claim.parts))
+    blocks = identifications.state.blocks
+    use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+    state = begin_state(blocks, baseline)
+    for identification in identifications.identified:
+        state = condition_on(state, list(identification.components))
     found: list[Posterior] = []
     power = baseline["spectrum"].transpose("axis", "block", "band").values.copy()
-    columns = noise_powers(reduced)
+    columns = noise_powers(blocks)
     changed, quiet = [], baseline["quiet"].transpose("axis", "block").values.copy()
     for row, axis in enumerate(state.axes):
-        seen = _seen(naming, baseline, fitted, axis)
+        seen = _seen(identifications, baseline, fitted, axis)
         posterior = None
         if seen is not None:
-            strange = any(axis in one.axes for one in naming.unknown)
+            strange = any(axis in one.axes for one in identifications.unknown)
             chosen = use & ~state.masked[row] & (quiet[row] if strange else True)
             posterior = _posterior(state, row, seen, chosen)
             if posterior is not None:
                 changed.append(axis)
                 quiet[row] = chosen
-                columns[row] = noise_powers(reduced, seen.response)[row]
+                columns[row] = noise_powers(blocks, seen.response)[row]
                 power[row] = columns[row] @ posterior.square + seen.known
         found.append(_kept(baseline, row) if posterior is None else posterior)
     if not changed:
         return baseline
     out = assemble_baseline(
-        reduced,
+        blocks,
         found,
         quiet=quiet,
         attrs={**baseline.attrs, "recalibrated": changed},
@@ -153,22 +151,24 @@ _OF_AXIS = (
 )  # fmt: skip
 
 
-def remove_fast_switching(naming: Identifications, baseline: xr.Dataset) -> xr.Dataset:
+def remove_fast_switching(identifications: Identifications, baseline: xr.Dataset) -> xr.Dataset:
     """The noise beside biases that hop within blocks alone: with these for noise it is another one, to which nothing can be compared.
 
     Parameters
     ----------
-    naming : Naming
+    identifications : Naming
     baseline : xarray.Dataset
         That the naming started from; returned as it is unless it was calibrated on the recording,
         and such a bias is named.
     """
     hops = tuple(
-        one for one in naming.claims if any(part.variant.inside.size for part in one.parts)
+        one
+        for one in identifications.identified
+        if any(component.variant.inside.size for component in one.components)
     )
     if not hops:
         return baseline
-    alone = replace(naming, claims=hops, unknown=())
+    alone = replace(identifications, identified=hops, unknown=())
     noise = recalibrate(alone, baseline, fit_identifications(alone, baseline))
     return noise if noise is baseline else noise.assign_attrs(recalibrated=[])
 
@@ -193,30 +193,33 @@ def _kept(baseline: xr.Dataset, row: int) -> Posterior:
 
 
 def _seen(
-    naming: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: str
+    identifications: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: str
 ) -> _Seen | None:
     """What all named effects do on an axis; None where they do nothing."""
-    reduced = naming.state.reduced
-    shape = (reduced.sizes["block"], reduced.sizes["band"])
+    blocks = identifications.state.blocks
+    shape = (blocks.sizes["block"], blocks.sizes["band"])
     out = _Seen(np.zeros(shape), np.ones(shape[1]))
     touched = False
-    for claim in naming.claims:
-        parts = [part for part in claim.parts if axis in part.row]
-        touched |= bool(parts)
-        for part in parts:
-            _add(out, part, naming, baseline, axis)
-        numbers = next((one for one in fitted if one.claim is claim and axis in one.axes), None)
+    for identification in identifications.identified:
+        components = [component for component in identification.components if axis in component.row]
+        touched |= bool(components)
+        for component in components:
+            _add(out, component, identifications, baseline, axis)
+        numbers = next(
+            (one for one in fitted if one.identification is identification and axis in one.axes),
+            None,
+        )
         effect = None if numbers is None else numbers.effect
         in_power = any(
-            part.candidate.view == "power" for part in parts
+            component.candidate.statistic == "power" for component in components
         )  # which has it with a free size
         if (
             numbers is not None
             and effect is not None
             and not in_power
-            and any(_only_said(part, reduced) for part in parts)
+            and any(_only_said(component, blocks) for component in components)
         ):
-            out.known += _said(effect, reduced, axis)
+            out.known += _said(effect, blocks, axis)
             out.doubt = max(
                 [
                     out.doubt,
@@ -228,57 +231,62 @@ def _seen(
                 ]
             )
         if effect is not None and any(
-            is_filter(part.candidate.view, part.variant) for part in parts
+            is_filter(component.candidate.statistic, component.variant) for component in components
         ):
-            out.response = out.response * response_of(effect, reduced)
+            out.response = out.response * response_of(effect, blocks)
     return out if touched else None
 
 
-def _only_said(part: Component, reduced: xr.Dataset) -> bool:
+def _only_said(component: Component, blocks: xr.Dataset) -> bool:
     """Whether the power of a part is in no column, but only in what the effect says of itself; with odd samples it may be left out."""
-    return part.candidate.view == "cross" or (
-        part.candidate.view == "marks" and not find_anomalous_blocks(part, reduced).any()
+    return component.candidate.statistic == "cross" or (
+        component.candidate.statistic == "marks"
+        and not find_anomalous_blocks(component, blocks).any()
     )
 
 
 def _add(
-    out: _Seen, part: Component, naming: Identifications, baseline: xr.Dataset, axis: str
+    out: _Seen,
+    component: Component,
+    identifications: Identifications,
+    baseline: xr.Dataset,
+    axis: str,
 ) -> None:
-    view = part.candidate.view
-    state = begin_state(naming.state.reduced, baseline)
-    if is_filter(view, part.variant):
+    statistic = component.candidate.statistic
+    state = begin_state(identifications.state.blocks, baseline)
+    if is_filter(statistic, component.variant):
         return
-    if view == "transfer":
-        out.known += _followed(part, replace(state, weight=naming.state.weight))
-    elif view == "phase_locked":
-        out.known += _comb(part, replace(state, weight=naming.state.weight))
-    elif view in ("mean", "levels", "power", "order", "line"):
-        given = condition_on_component(state, part).given
+    if statistic == "transfer":
+        out.known += _followed(component, replace(state, weight=identifications.state.weight))
+    elif statistic == "phase_locked":
+        out.known += _comb(component, replace(state, weight=identifications.state.weight))
+    elif statistic in ("mean", "levels", "power", "order", "line"):
+        given = condition_on_component(state, component).given
         out.free += [
             np.broadcast_to(one, out.known.shape) for one in given.get(("power", axis), [])
         ]
         out.means += given.get(("mean", axis), [])
 
 
-def _followed(part: Component, state: State) -> Array:
+def _followed(component: Component, state: State) -> Array:
     """Power that follows a channel or another axis, (block, band)."""
-    mean, _ = component_mixture(part, state).moments()
-    transfer = np.tensordot(mean, part.variant.design, axes=1)
+    mean, _ = component_mixture(component, state).moments()
+    transfer = np.tensordot(mean, component.variant.design, axes=1)
     return np.asarray(
         np.abs(transfer) ** 2
-        * np.nan_to_num(reference_channel_power(part.candidate.witness[0], state.reduced))
+        * np.nan_to_num(reference_channel_power(component.candidate.witness[0], state.blocks))
     )
 
 
-def _comb(part: Component, state: State) -> Array:
+def _comb(component: Component, state: State) -> Array:
     """Power of what is locked to the ramp: the lines of its mean over a turn, folded as samples see them, (block, band)."""
-    reduced = state.reduced
-    mean, _ = component_mixture(part, state).moments()
-    profile = np.tensordot(mean, part.variant.design, axes=1)
+    blocks = state.blocks
+    mean, _ = component_mixture(component, state).moments()
+    profile = np.tensordot(mean, component.variant.design, axes=1)
     square = np.abs(np.fft.rfft(profile)[1:] / profile.size) ** 2
-    turns, rate = np.abs(reduced["ramp_turns"].values), float(reduced.attrs["sampling_rate_hz"])
+    turns, rate = np.abs(blocks["ramp_turns"].values), float(blocks.attrs["sampling_rate_hz"])
     turns = np.where(np.isfinite(turns), turns, 0.0)
-    low, high = reduced["band_low"].values, reduced["band_high"].values
+    low, high = blocks["band_low"].values, blocks["band_high"].values
     out = np.zeros((turns.size, low.size))
     for number, size in enumerate(square, start=1):
         place = fold(number * turns, rate)[:, None]
@@ -288,10 +296,10 @@ def _comb(part: Component, state: State) -> Array:
     return out
 
 
-def _said(effect: Effect, reduced: xr.Dataset, axis: str) -> Array:
+def _said(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
     """Power that an effect says it has on an axis, (block, band)."""
-    windows = replace(windows_of(reduced, find_drivers(effect)), axes=(axis,))
-    out = np.zeros((reduced.sizes["block"], reduced.sizes["band"]))
+    windows = replace(windows_of(blocks, find_drivers(effect)), axes=(axis,))
+    out = np.zeros((blocks.sizes["block"], blocks.sizes["band"]))
     many = {item.name: item.many for item in effect.parameters()}
     for name, density in effect.explain(windows).spectrum.items():
         size = getattr(effect, name)
@@ -299,20 +307,20 @@ def _said(effect: Effect, reduced: xr.Dataset, axis: str) -> Array:
             size = size[effect.axes.index(axis)] if len(size) > 1 else size[0]
         rows = np.asarray(density)
         out = out + float(size) ** 2 * (rows[0] if rows.ndim == 3 else rows)
-    return np.asarray(effective(out[None], reduced.sel(axis=[axis]))[0])
+    return np.asarray(effective(out[None], blocks.sel(axis=[axis]))[0])
 
 
 def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -> Posterior | None:
     """Noise of an axis beside effects; None where too little is left to tell it by."""
-    reduced = state.reduced
+    blocks = state.blocks
     power, shape = (
-        reduced[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
+        blocks[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
     )
     chosen = chosen & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
     if chosen.sum() < _LEAST:
         return None
-    columns = noise_powers(reduced, seen.response)[row]
-    common, alone = (one[row] for one in common_variance(reduced))
+    columns = noise_powers(blocks, seen.response)[row]
+    common, alone = (one[row] for one in common_variance(blocks))
     fit = _fit(power, _weights(shape, alone, common), columns, state.weight[row], seen, chosen)
     square, information = fit_squares(fit)
     plain = float(
@@ -324,17 +332,17 @@ def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -
     if not information[1, 1] > _BLURRED * plain or not square[1] > 0.0:
         return None
     square = np.maximum(square, [0.0, floor_square(fit), 0.0, 0.0])
-    count = reduced.sizes["axis"]
-    variance = white_variance(reduced, np.tile(square, (count, 1)))[row]
+    count = blocks.sizes["axis"]
+    variance = white_variance(blocks, np.tile(square, (count, 1)))[row]
     variance = variance * np.maximum(state.weight[row, :, 0] / (columns[:, 0] @ square), 0.1)
-    mean = reduced["mean"].transpose("axis", "block").values[row]
+    mean = blocks["mean"].transpose("axis", "block").values[row]
     effects_there = np.stack(seen.means, axis=1) if seen.means else None
     return noise_posterior(
         fit,
         mean,
         variance,
         chosen & np.isfinite(mean),
-        step=float(reduced.attrs["block_s"]),
+        step=float(blocks.attrs["block_s"]),
         draws=DRAWS,
         rng=np.random.default_rng(row),
         effects=effects_there,
@@ -362,24 +370,28 @@ def _fit(
         np.argsort(level, kind="stable")[: int(chosen.sum())], min(_GROUPS, int(chosen.sum()))
     )
     size = [max(float(np.abs(one).max()), 1e-300) for one in seen.free]
-    parts = [
+    components = [
         power,
         columns,
         seen.known,
         expected,
         *[one / top for one, top in zip(seen.free, size, strict=True)],
     ]
-    means: list[list[Array]] = [[] for _ in parts]
+    means: list[list[Array]] = [[] for _ in components]
     weights = []
-    for blocks in groups:
-        use = np.where(np.isfinite(power[blocks]) & np.isfinite(shape[blocks]), shape[blocks], 0.0)
+    for block_count in groups:
+        use = np.where(
+            np.isfinite(power[block_count]) & np.isfinite(shape[block_count]),
+            shape[block_count],
+            0.0,
+        )
         total = use.sum(axis=0)
         safe = np.where(total > 0.0, total, 1.0)
         weights.append(total)
-        for place, one in enumerate(parts):
+        for place, one in enumerate(components):
             wide = use[..., None] if one.ndim == 3 else use
             by = safe[:, None] if one.ndim == 3 else safe
-            means[place].append((wide * np.nan_to_num(one[blocks])).sum(axis=0) / by)
+            means[place].append((wide * np.nan_to_num(one[block_count])).sum(axis=0) / by)
     weight = np.concatenate(weights)
     some = weight > 0.0
     flat = [np.concatenate(one)[some] for one in means]
@@ -402,38 +414,45 @@ def _fit(
     )
 
 
-def with_noise(naming: Identifications, baseline: xr.Dataset) -> Identifications:
+def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
     """The naming with designs for another noise: a share of N^2 is a share of the new one.
 
     Parameters
     ----------
-    naming : Naming
+    identifications : Naming
     baseline : xarray.Dataset
         With the new noise.
     """
-    reduced = naming.state.reduced
+    blocks = identifications.state.blocks
     swapped = {}
-    for part in (part for claim in naming.claims for part in claim.parts):
-        one = part.candidate
-        if one.view == "power" and id(one) not in swapped:
+    for component in (
+        component
+        for identification in identifications.identified
+        for component in identification.components
+    ):
+        one = component.candidate
+        if one.statistic == "power" and id(one) not in swapped:
             made = [
-                variants_of(one, variant, reduced, baseline["coefficient"]) or variant
+                variants_of(one, variant, blocks, baseline["coefficient"]) or variant
                 for variant in one.variants
             ]
             swapped[id(one)] = (one, replace(one, variants=tuple(made)))
 
-    def part_of(part: Component) -> Component:
-        if id(part.candidate) not in swapped:
-            return part
-        old, new = swapped[id(part.candidate)]
-        place = next(number for number, one in enumerate(old.variants) if one is part.variant)
-        return replace(part, candidate=new, variant=new.variants[place])
+    def part_of(component: Component) -> Component:
+        if id(component.candidate) not in swapped:
+            return component
+        old, new = swapped[id(component.candidate)]
+        place = next(number for number, one in enumerate(old.variants) if one is component.variant)
+        return replace(component, candidate=new, variant=new.variants[place])
 
-    claims = tuple(
-        replace(claim, parts=tuple(part_of(part) for part in claim.parts))
-        for claim in naming.claims
+    identified = tuple(
+        replace(
+            identification,
+            components=tuple(part_of(component) for component in identification.components),
+        )
+        for identification in identifications.identified
     )
     candidates = tuple(
-        swapped[id(one)][1] if id(one) in swapped else one for one in naming.candidates
+        swapped[id(one)][1] if id(one) in swapped else one for one in identifications.candidates
     )
-    return replace(naming, claims=claims, candidates=candidates)
+    return replace(identifications, identified=identified, candidates=candidates)

@@ -27,7 +27,7 @@ _ENDS = (0.025, 0.975)
 
 
 def estimate_shared_factors(
-    parts: Sequence[Component], axes: tuple[str, ...], state: State
+    components: Sequence[Component], axes: tuple[str, ...], state: State
 ) -> dict[str, tuple[float, ...]]:
     """Factor of every axis, with its standard error and the ends of its 95 % interval, and the low-pass of what is shared.
 
@@ -37,7 +37,7 @@ def estimate_shared_factors(
 
     Parameters
     ----------
-    parts : sequence of Part
+    components : sequence of Part
         In the view "cross".
     axes : tuple of str
         Of the effect.
@@ -49,10 +49,10 @@ def estimate_shared_factors(
     dict of str to (float, float, float, float)
         Value, standard error, low and high; ``bandwidth`` [Hz] is infinite for white noise.
     """
-    name = parts[0].variant.columns[0]
-    rows = [row for row in pair_rows(state.reduced) if set(row) <= set(axes)]
+    name = components[0].variant.columns[0]
+    rows = [row for row in pair_rows(state.blocks) if set(row) <= set(axes)]
     rng = np.random.default_rng(0)
-    seen = _seen(parts[0], rows, axes, state)
+    seen = _seen(components[0], rows, axes, state)
     chosen = rng.choice(seen.share.size, size=_DRAWS, p=seen.share)
     product = seen.product[chosen] + seen.error[chosen] * rng.standard_normal((_DRAWS, len(rows)))
     limit = seen.limit[chosen]
@@ -69,7 +69,7 @@ def estimate_shared_factors(
         name if len(axes) == 1 else f"{name}.{axis}": _told(factor[:, k], alike)
         for k, axis in enumerate(axes)
     }
-    if "bandwidth" in parts[0].variant.values:
+    if "bandwidth" in components[0].variant.values:
         width = seen.width[chosen][alike]
         sizes["bandwidth"] = (
             (math.inf, 0.0) if plain else _told(width, np.ones(width.size, np.bool_))
@@ -106,17 +106,19 @@ class _Seen(NamedTuple):
 
 
 def _seen(
-    part: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State
+    component: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State
 ) -> _Seen:
     """White noise is as likely beforehand as all low-passes together; what lies between two bandwidths of the grid is smooth."""
     from scipy.interpolate import CubicSpline
 
-    rate = float(state.reduced.attrs["sampling_rate_hz"])
+    rate = float(state.blocks.attrs["sampling_rate_hz"])
     grid = np.geomspace(rate / _NARROWEST, rate / _WIDEST, _STEPS)
     widths = (
-        np.append(grid, math.inf) if "bandwidth" in part.variant.values else np.array([math.inf])
+        np.append(grid, math.inf)
+        if "bandwidth" in component.variant.values
+        else np.array([math.inf])
     )
-    table = np.array([_of_width(part, float(width), rows, axes, state) for width in widths])
+    table = np.array([_of_width(component, float(width), rows, axes, state) for width in widths])
     prior = np.zeros(1)
     if widths.size > 1:
         fine = np.geomspace(grid[0], grid[-1], _FINE * (_STEPS - 1) + 1)
@@ -135,21 +137,23 @@ def _seen(
 
 
 def _of_width(
-    part: Component,
+    component: Component,
     width: float,
     rows: Sequence[tuple[str, ...]],
     axes: tuple[str, ...],
     state: State,
 ) -> Array:
     """Logarithm of the likelihood of a low-pass, products of the factors of each pair, their errors, and limits of the axes."""
-    variant = part.variant
+    variant = component.variant
     if "bandwidth" in variant.values:
         other = replace(variant, values={**variant.values, "bandwidth": width})
         variant = (
-            variants_of(part.candidate, other, state.reduced, state.baseline["coefficient"])
+            variants_of(component.candidate, other, state.blocks, state.baseline["coefficient"])
             or variant
         )
-    moments = [component_mixture(replace(part, row=row), state, variant).moments() for row in rows]
+    moments = [
+        component_mixture(replace(component, row=row), state, variant).moments() for row in rows
+    ]
     product, square = (
         np.array([float(one.flat[0]) for one in several]) for several in zip(*moments, strict=True)
     )
@@ -161,12 +165,11 @@ def _of_width(
 
 def _level(axis: str, variant: Variant, state: State) -> float:
     """The largest factor that the power of an axis leaves room for."""
-    reduced = state.reduced
-    row = next(number for number, pair in enumerate(pair_rows(reduced)) if axis in pair)
-    design = cross_column(variant.design[0], row, reduced).real
+    blocks = state.blocks
+    row = next(number for number, pair in enumerate(pair_rows(blocks)) if axis in pair)
+    design = cross_column(variant.design[0], row, blocks).real
     power, shape = (
-        reduced[name].sel(axis=axis).transpose("block", "band").values
-        for name in ("power", "shape")
+        blocks[name].sel(axis=axis).transpose("block", "band").values for name in ("power", "shape")
     )
     weight = (
         np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)

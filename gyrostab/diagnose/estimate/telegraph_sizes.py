@@ -15,13 +15,13 @@ __all__ = ["estimate_telegraph"]
 
 
 def estimate_telegraph(
-    parts: Sequence[Component], axes: tuple[str, ...], state: State
+    components: Sequence[Component], axes: tuple[str, ...], state: State
 ) -> dict[str, tuple[float, float]]:
     """Step of every axis [degree hour-1] and mean times on both levels [s], each with its error.
 
     Parameters
     ----------
-    parts : sequence of Part
+    components : sequence of Part
         In the view "levels", one for each axis.
     axes : tuple of str
         Of the effect.
@@ -34,15 +34,15 @@ def estimate_telegraph(
         The lower level is that of the axis that shows most; where another axis hops the other way
         its step is negative.
     """
-    ranked = sorted(parts, key=lambda part: -part.gain)
+    ranked = sorted(components, key=lambda component: -component.evidence_nats)
     name, first = ranked[0].variant.columns[0], ranked[0].variant
     course = first.design[0, 0]
     out: dict[str, tuple[float, float]] = {}
-    for part in ranked:
-        mean, covariance = component_mixture(part, state).moments()
-        own = part.variant.design[0, 0]
-        sign = 1.0 if part is ranked[0] or float(np.cov(own, course)[0, 1]) >= 0.0 else -1.0
-        label = name if len(axes) == 1 else f"{name}.{part.row[0]}"
+    for component in ranked:
+        mean, covariance = component_mixture(component, state).moments()
+        own = component.variant.design[0, 0]
+        sign = 1.0 if component is ranked[0] or float(np.cov(own, course)[0, 1]) >= 0.0 else -1.0
+        label = name if len(axes) == 1 else f"{name}.{component.row[0]}"
         out[label] = (sign * float(mean[0]), float(math.sqrt(covariance[0, 0])))
     stays = max(float(first.values["hops"]) / 2.0, 1.0)  # on either level
     return out | {

@@ -35,7 +35,7 @@ class UpperLimit:
     reason: str
 
 
-def find_upper_limits(naming: Identifications) -> dict[str, UpperLimit]:
+def find_upper_limits(identifications: Identifications) -> dict[str, UpperLimit]:
     """How large every effect that was not named may be.
 
     Returns
@@ -44,7 +44,10 @@ def find_upper_limits(naming: Identifications) -> dict[str, UpperLimit]:
         95 % limit of the effect's first size, the largest over axes; of effects in means and
         powers.
     """
-    named = {claim.effect for claim in (*naming.expected, *naming.claims)}
+    named = {
+        identification.effect
+        for identification in (*identifications.expected, *identifications.identified)
+    }
     out = {}
     for name, kind in effects().items():
         if name in named:
@@ -52,13 +55,13 @@ def find_upper_limits(naming: Identifications) -> dict[str, UpperLimit]:
         unit = next(
             (item.unit for item in kind.parameters() if item.name in kind.size_parameters), "1"
         )
-        if name in naming.reasons:
-            out[name] = UpperLimit(math.nan, unit, naming.reasons[name])
+        if name in identifications.reasons:
+            out[name] = UpperLimit(math.nan, unit, identifications.reasons[name])
             continue
         found = [
-            _limit(one, naming.state)
-            for one in naming.candidates
-            if one.effect == name and one.view in ("mean", "power", "cross")
+            _limit(one, identifications.state)
+            for one in identifications.candidates
+            if one.effect == name and one.statistic in ("mean", "power", "cross")
         ]
         known = [(value, column) for value, column in found if math.isfinite(value)]
         if not known:
@@ -83,7 +86,9 @@ def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
         [one for one in candidate.variants if one.columns == candidate.variants[0].columns],
     )
     rows = (
-        pair_rows(state.reduced) if candidate.view == "cross" else [(axis,) for axis in state.axes]
+        pair_rows(state.blocks)
+        if candidate.statistic == "cross"
+        else [(axis,) for axis in state.axes]
     )
     found = [_of_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows]
     known = [bound for bound in found if math.isfinite(bound)]
@@ -95,22 +100,22 @@ def _told_over(candidate: Candidate, family: Sequence[Variant]) -> Sequence[Vari
     """Of means some plain variants, evenly over the grid; of others the one in its middle: the sizes of the rest have other meanings."""
     plain = (
         [family[place] for place in plain_places(candidate.effect, family)]
-        if candidate.view == "mean"
+        if candidate.statistic == "mean"
         else []
     )
     every = -(-len(plain) // _MOST)
     return plain[every // 2 :: every] if plain else [family[len(family) // 2]]
 
 
-def _of_row(part: Component, family: Sequence[Variant], state: State) -> float:
+def _of_row(component: Component, family: Sequence[Variant], state: State) -> float:
     """The number that the size, or its square, is below at 95 %, on an axis or a pair; NaN where the record cannot tell."""
     moves = [
         one
         for one in family
-        if part.candidate.view != "mean"
-        or np.ptp(mean_columns(one, state.axes.index(part.row[0]))[0]) > 0.0
+        if component.candidate.statistic != "mean"
+        or np.ptp(mean_columns(one, state.axes.index(component.row[0]))[0]) > 0.0
     ]
-    sizes = [component_mixture(part, state, one) for one in moves]
+    sizes = [component_mixture(component, state, one) for one in moves]
     moments = [
         (float(mean[0]), math.sqrt(max(float(square[0, 0]), 0.0)))
         for mean, square in (one.moments() for one in sizes)
@@ -130,7 +135,7 @@ def _of_row(part: Component, family: Sequence[Variant], state: State) -> float:
         return math.nan
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
     one_sided = (
-        part.variant.squared and part.candidate.view == "power"
+        component.variant.squared and component.candidate.statistic == "power"
     )  # a product of two axes has either sign
     size = np.maximum(mean, 0.0) if one_sided else np.abs(mean)
     return mixture_limit(size, sd, share)

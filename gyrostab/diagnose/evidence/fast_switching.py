@@ -67,7 +67,7 @@ class SwitchingEvidence:
 
     Attributes
     ----------
-    gain : float
+    evidence_nats : float
         Lower bound of the log Bayes factor against noise [nats]; -inf where there are fewer than
         `MEAN_SWITCHES` hops, or where normal noise of any spectrum does as well but for `NORMAL`
         nats.
@@ -82,7 +82,7 @@ class SwitchingEvidence:
         levels that they have.
     """
 
-    gain: float
+    evidence_nats: float
     share: Array
     times: Array
     hops: float
@@ -126,19 +126,21 @@ def switching_evidence(
     for count in (0, 8):
         beside = np.concatenate([waves(n, count), own], axis=1)
         found = telegraph_courses(
-            flat, variance, present, beside, starts=_STARTS, least=_QUIETEST, parts=_PARTS
+            flat, variance, present, beside, starts=_STARTS, least=_QUIETEST, components=_PARTS
         )
-        gain, beyond = _worth(found, flat, variance, present, own, step, baseline.sel(axis=axis))
-        gain -= np.log(2.0)
+        evidence_nats, beyond = _worth(
+            found, flat, variance, present, own, step, baseline.sel(axis=axis)
+        )
+        evidence_nats -= np.log(2.0)
         share = np.repeat(found.share[0].reshape(shape), together, axis=1)
-        seen = found.hops[0] >= MEAN_SWITCHES and gain > 0.0
+        seen = found.hops[0] >= MEAN_SWITCHES and evidence_nats > 0.0
         alike = seen and _like_two_levels(found, variance, present)
         good, refuted = (
             alike and beyond > NORMAL,
-            seen and gain > _SURE and (not alike or beyond < -_SURE),
+            seen and evidence_nats > _SURE and (not alike or beyond < -_SURE),
         )
         one = SwitchingEvidence(
-            gain if good else -np.inf,
+            evidence_nats if good else -np.inf,
             share,
             found.times[0] * step,
             float(found.hops[0]),
@@ -146,7 +148,7 @@ def switching_evidence(
         )
         best = (
             one
-            if best is None or one.gain > best.gain
+            if best is None or one.evidence_nats > best.evidence_nats
             else replace(best, refuted=best.refuted and one.refuted)
         )
     return best
@@ -159,7 +161,7 @@ def _like_two_levels(found: TelegraphCourses, variance: Array, present: NDArray[
     neighbouring pieces are not alike then.
     """
     log, share = usual_courses(
-        found, variance, present, parts=_PARTS, count=_DRAWN, rng=np.random.default_rng(0)
+        found, variance, present, components=_PARTS, count=_DRAWN, rng=np.random.default_rng(0)
     )
     alike = _alike(share)
     return bool(
@@ -342,15 +344,15 @@ def switching_powers(share: Array, low: float, high: float, size: int, rate: flo
     return np.where(frequency < _TOLD * rate * share.shape[1] / size, out, beyond)
 
 
-def _wave(share: Array, blocks: slice, size: int) -> Array:
+def _wave(share: Array, block_count: slice, size: int) -> Array:
     """The course of some blocks, sample by sample: within a piece the bias hops so that it meets the levels at both ends."""
     pieces = share.shape[1]
     flat = np.clip(share.ravel(), 0.0, 1.0)
     ends = np.concatenate([flat[:1], (flat[1:] + flat[:-1]) / 2.0, flat[-1:]]) > 0.5
-    before, after = (one.reshape(share.shape)[blocks] for one in (ends[:-1], ends[1:]))
-    part = flat.reshape(share.shape)[blocks]
+    before, after = (one.reshape(share.shape)[block_count] for one in (ends[:-1], ends[1:]))
+    component = flat.reshape(share.shape)[block_count]
     outer = before & after
-    long = np.where(outer, 1.0 - part, part)
+    long = np.where(outer, 1.0 - component, component)
     begin = np.where(before == after, 0.5 - long / 2.0, np.where(before, 0.0, 1.0 - long))
     place = np.arange(size + 1) / size * pieces
     which = np.minimum(place[:-1].astype(np.int64), pieces - 1)

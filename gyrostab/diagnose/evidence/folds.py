@@ -19,12 +19,12 @@ FOLDS = 4
 LENGTHS = ((100.0, 1.0 / 36.0), (350.0, 1.0 / 10.0), (900.0, 1.0 / 4.0))
 
 
-def fold_blocks(reduced: xr.Dataset) -> xr.DataArray:
+def fold_blocks(blocks: xr.Dataset) -> xr.DataArray:
     """Fold of every block at every length.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`; its dimension `block`, coordinates or variables `begin` and `end` [s] are
         used.
 
@@ -42,12 +42,12 @@ def fold_blocks(reduced: xr.Dataset) -> xr.DataArray:
     Examples
     --------
     >>> edges = np.arange(181) * 20.0
-    >>> reduced = xr.Dataset({"begin": ("block", edges[:-1]), "end": ("block", edges[1:])})
-    >>> folds = fold_blocks(reduced)
+    >>> blocks = xr.Dataset({"begin": ("block", edges[:-1]), "end": ("block", edges[1:])})
+    >>> folds = fold_blocks(blocks)
     >>> folds.length.values, folds[0, :22].values
     (array([100., 360., 900.]), array([0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 0, 0]))
     """
-    begin, end = reduced["begin"].values, reduced["end"].values
+    begin, end = blocks["begin"].values, blocks["end"].values
     n = begin.size
     if n < FOLDS:
         raise SchemaError(
@@ -55,13 +55,13 @@ def fold_blocks(reduced: xr.Dataset) -> xr.DataArray:
         )
     step = float(end[0] - begin[0])
     span = n * step
-    blocks = [max(1, round(min(seconds, share * span) / step)) for seconds, share in LENGTHS]
-    fold = np.stack([np.arange(n) // count % FOLDS for count in blocks])
+    block_count = [max(1, round(min(seconds, share * span) / step)) for seconds, share in LENGTHS]
+    fold = np.stack([np.arange(n) // count % FOLDS for count in block_count])
     attributes = {"units": "s", "long_name": "length of a stretch that is held out"}
     return xr.DataArray(
         fold,
         dims=("length", "block"),
-        coords={"length": ("length", step * np.array(blocks, dtype=np.float64), attributes)},
+        coords={"length": ("length", step * np.array(block_count, dtype=np.float64), attributes)},
         name="fold",
         attrs={"units": "1", "long_name": "fold in which the block is held out"},
     )
@@ -75,6 +75,6 @@ def fold_subsets(fold: xr.DataArray) -> NDArray[np.bool_]:
     ndarray of bool, shape (1 + lengths * FOLDS, block)
     """
     values = fold.transpose("length", "block").values
-    parts = [values != number for number in range(FOLDS)]
-    held = np.stack(parts, axis=1).reshape(-1, values.shape[1])
+    components = [values != number for number in range(FOLDS)]
+    held = np.stack(components, axis=1).reshape(-1, values.shape[1])
     return np.concatenate([np.ones((1, values.shape[1]), np.bool_), held])

@@ -61,7 +61,7 @@ def _columns(
     designs: Sequence[Array], shape: tuple[int, ...]
 ) -> tuple[Array, list[NDArray[np.int64]]]:
     """All designs beside each other as (cell, column), and the numbers of the columns of each."""
-    parts, numbers, first = [], [], 0
+    components, numbers, first = [], [], 0
     for design in designs:
         array = np.asarray(design, dtype=np.float64)
         if array.shape[: len(shape)] != shape or array.ndim > len(shape) + 1:
@@ -69,10 +69,10 @@ def _columns(
                 f"a design has the shape {array.shape}; it must be {shape}, or that with the number of its columns behind"
             )
         flat = array.reshape(int(np.prod(shape)), -1)
-        parts.append(np.where(np.isfinite(flat), flat, 0.0))
+        components.append(np.where(np.isfinite(flat), flat, 0.0))
         numbers.append(np.arange(first, first + flat.shape[1]))
         first += flat.shape[1]
-    return np.concatenate([*parts, np.empty((int(np.prod(shape)), 0))], axis=1), numbers
+    return np.concatenate([*components, np.empty((int(np.prod(shape)), 0))], axis=1), numbers
 
 
 def _records(values: xr.DataArray, *dims: str) -> Array:
@@ -268,18 +268,18 @@ def linear_model_factors(cells: LinearModel, folds: xr.DataArray) -> Array:
     classes, member = np.unique(
         folds.transpose("block", "length").values, axis=0, return_inverse=True
     )
-    parts = []
+    components = []
     for number in range(len(classes)):
         chosen = member.ravel() == number
         size = int(chosen.sum()) * width
-        parts.append(
+        components.append(
             power_products(
                 values[chosen].reshape(size, records),
                 weight[chosen].ravel(),
                 columns[chosen].reshape(size, -1),
             )
         )
-    total = _summed(parts)
+    total = _summed(components)
     own = columns.shape[2] - count
     before = np.asarray(np.diagonal(total.gram[0]))
     precision = _nearly_free(cells.precision, before[own:])
@@ -291,8 +291,8 @@ def linear_model_factors(cells: LinearModel, folds: xr.DataArray) -> Array:
         for number in range(FOLDS):
             held = _summed(
                 [
-                    part
-                    for part, label in zip(parts, classes[:, length], strict=True)
+                    component
+                    for component, label in zip(components, classes[:, length], strict=True)
                     if label == number
                 ],
                 total,
@@ -301,7 +301,10 @@ def linear_model_factors(cells: LinearModel, folds: xr.DataArray) -> Array:
                 Products(*[a - b for a, b in zip(_fields(total), _fields(held), strict=True)])
             )
     out = np.stack(
-        [evidence(take_out(part, count, precision), numbers, limits, np.zeros(1)) for part in found]
+        [
+            evidence(take_out(component, count, precision), numbers, limits, np.zeros(1))
+            for component in found
+        ]
     )
     out[:, 1:] -= out[:, :1]
     return out
@@ -311,11 +314,11 @@ def _fields(products: Products) -> tuple[Array, ...]:
     return products.square, products.cross, products.gram, products.log_determinant
 
 
-def _summed(parts: Sequence[Products], like: Products | None = None) -> Products:
-    if not parts and like is not None:
+def _summed(components: Sequence[Products], like: Products | None = None) -> Products:
+    if not components and like is not None:
         return Products(*[np.zeros_like(one) for one in _fields(like)])
     return Products(
-        *[np.sum(several, axis=0) for several in zip(*map(_fields, parts), strict=True)]
+        *[np.sum(several, axis=0) for several in zip(*map(_fields, components), strict=True)]
     )
 
 

@@ -211,8 +211,8 @@ def share_out(values: Array, weight: Array, common: Array, unit: Array | None = 
     taken = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(
         total > 0.0, total, 1.0
     )
-    part = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
-    return np.asarray(values - one[..., None] * part[:, None])
+    component = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
+    return np.asarray(values - one[..., None] * component[:, None])
 
 
 def evidence(

@@ -15,10 +15,10 @@ __all__ = [
     "GRID_COUNTS",
     "Expected",
     "beyond_ends",
-    "count_evidence",
     "expected_counts",
     "has_coarse_grid",
     "kurtosis_evidence",
+    "sample_count_evidence",
     "still_scatter",
 ]
 
@@ -35,12 +35,12 @@ _ENDS = 2  # samples that are the smallest and the largest of any record
 _SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
 
 
-def has_coarse_grid(reduced: xr.Dataset) -> NDArray[np.bool_]:
+def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Axes whose lattice is so coarse that equal samples, zeros and tails are its own, and tell of nothing else.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         Recording or null records.
 
     Returns
@@ -53,15 +53,15 @@ def has_coarse_grid(reduced: xr.Dataset) -> NDArray[np.bool_]:
     >>> coarse_lattice(xr.Dataset(one, coords={"band_low": ("band", [0.0]), "band_high": ("band", [100.0])}))
     array([ True, False])
     """
-    if "lattice" not in reduced:
-        return np.zeros(reduced.sizes["axis"], np.bool_)
-    return np.asarray(reduced["lattice"].values > _COARSE * still_scatter(reduced))
+    if "lattice" not in blocks:
+        return np.zeros(blocks.sizes["axis"], np.bool_)
+    return np.asarray(blocks["lattice"].values > _COARSE * still_scatter(blocks))
 
 
-def still_scatter(reduced: xr.Dataset) -> NDArray[np.float64]:
+def still_scatter(blocks: xr.Dataset) -> NDArray[np.float64]:
     """Scatter of the samples of every axis in its quiet blocks [degree hour-1]; inf without any."""
-    width = reduced["band_high"].values - reduced["band_low"].values
-    power = reduced["power"].transpose("axis", ..., "band").values
+    width = blocks["band_high"].values - blocks["band_low"].values
+    power = blocks["power"].transpose("axis", ..., "band").values
     square = 2.0 * (power @ width).reshape(len(power), -1)
     return np.sqrt(
         [
@@ -109,7 +109,7 @@ class Expected:
                 values = nulls[name].transpose("record", "axis", "block").values.astype(np.float64)
                 self.sums[name].append(beyond_ends(values) if name == "extremes" else values)
 
-    def blocks(self, name: str) -> Array:
+    def block_count(self, name: str) -> Array:
         """(record, axis, block)."""
         return np.concatenate(self.sums[name])
 
@@ -120,11 +120,11 @@ def expected_counts(values: Array) -> tuple[Array, Array]:
     Blocks of few samples, and those far from a value that is counted, have few. One record in which
     all blocks have the same is added, so that none is expected to have nothing at all.
     """
-    records, _, blocks = values.shape
+    records, _, block_count = values.shape
     total = values.sum(axis=2)
     mean = np.maximum(total.mean(axis=0), 1.0 / records)
     spread = np.maximum(total.var(axis=0) / mean, 1.0)
-    even = np.broadcast_to(mean[:, None] / blocks, values.shape[1:])
+    even = np.broadcast_to(mean[:, None] / block_count, values.shape[1:])
     own = np.where(total.any(axis=0)[:, None], values.mean(axis=0), even)
     return (records * own + even) / (records + 1.0), spread
 
@@ -147,11 +147,13 @@ def _log_ratio(count: Array, mean: Array) -> Array:
 
 def _held_out(evidence: Array, lengths: int) -> Array:
     """Largest over the lengths of the sum over folds, from (subset, ...)."""
-    parts = evidence[1:].reshape(lengths, FOLDS, *evidence.shape[1:])
-    return np.asarray((evidence[0] - parts).sum(axis=1).max(axis=0))
+    components = evidence[1:].reshape(lengths, FOLDS, *evidence.shape[1:])
+    return np.asarray((evidence[0] - components).sum(axis=1).max(axis=0))
 
 
-def count_evidence(values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]) -> Array:
+def sample_count_evidence(
+    values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]
+) -> Array:
     """Held-out gain of a raised count.
 
     Parameters
@@ -176,7 +178,7 @@ def count_evidence(values: Array, mean: Array, spread: Array, subsets: NDArray[n
 def kurtosis_evidence(
     values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]
 ) -> Array:
-    """Held-out gain of a higher kurtosis; `mean` and `spread` are those of a block, (axis,); the rest as in `count_evidence`."""
+    """Held-out gain of a higher kurtosis; `mean` and `spread` are those of a block, (axis,); the rest as in `sample_count_evidence`."""
     z = np.clip(
         np.where(np.isfinite(values), (values - mean[:, None]) / spread[:, None], 0.0), -8.0, 8.0
     )
@@ -184,6 +186,8 @@ def kurtosis_evidence(
     for subset in subsets:
         total = z[:, :, subset].sum(axis=2) / np.sqrt(subset.sum())
         size = 100.0  # prior variance, of the total of the whole record
-        part = size * subset.mean()
-        found.append(0.5 * total**2 * part / (1.0 + part) * (total > 0) - 0.5 * np.log1p(part))
+        component = size * subset.mean()
+        found.append(
+            0.5 * total**2 * component / (1.0 + component) * (total > 0) - 0.5 * np.log1p(component)
+        )
     return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)

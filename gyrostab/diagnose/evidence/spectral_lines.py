@@ -61,7 +61,7 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
     slope = np.ones(power.shape[-1]) if expected is None else expected[:, None]
     clean = np.where(usable[..., None], power / slope, 1.0)
     level = level_about(clean)
-    gain = np.zeros((*power.shape[:2], power.shape[-1]))
+    evidence_nats = np.zeros((*power.shape[:2], power.shape[-1]))
     above, precision = clean - level, share / level**2
     for number in range(FOLDS):
         held = np.arange(power.shape[2]) % FOLDS == number
@@ -70,9 +70,11 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
             :, :, None
         ]
         ratio, excess = clean[:, :, held] / level[:, :, held], square / level[:, :, held]
-        gain += (share[:, held] * (ratio * excess / (1.0 + excess) - np.log1p(excess))).sum(axis=2)
-    gain[..., :_SLOWEST] = -np.inf
-    return np.asarray(gain - np.log(power.shape[3]))
+        evidence_nats += (
+            share[:, held] * (ratio * excess / (1.0 + excess) - np.log1p(excess))
+        ).sum(axis=2)
+    evidence_nats[..., :_SLOWEST] = -np.inf
+    return np.asarray(evidence_nats - np.log(power.shape[3]))
 
 
 def level_about(power: Array) -> Array:
@@ -115,14 +117,14 @@ def local_level(total: Array) -> Array:
     return np.asarray(medians[..., low] + (place - low) * (medians[..., high] - medians[..., low]))
 
 
-def line_skirt(reduced: xr.Dataset, axis: str, place: int) -> NDArray[np.bool_]:
+def line_skirt(blocks: xr.Dataset, axis: str, place: int) -> NDArray[np.bool_]:
     """Lines that belong to the one at `place`: those it leaks into, and on both sides as far as the power has not come down to the level.
 
     A line whose phase wanders is wider than the leakage; what stands on its slopes is no other
     line.
     """
-    weight = reduced["line_weight"].sel(axis=axis).values
-    power = reduced["line_power"].sel(axis=axis).transpose("part", "line").values
+    weight = blocks["line_weight"].sel(axis=axis).values
+    power = blocks["line_power"].sel(axis=axis).transpose("part", "line").values
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / max(float(weight[good].sum()), 1e-300)
     limit = local_level(total[None])[0] * (

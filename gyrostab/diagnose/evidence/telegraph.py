@@ -89,7 +89,7 @@ def telegraph_courses(
     *,
     starts: Sequence[tuple[float, float]] = STARTS,
     least: float = 1.0,
-    parts: int = PARTS,
+    components: int = PARTS,
 ) -> TelegraphCourses:
     """Courses of biases of two levels in white noise, by expectation and maximisation from several starts.
 
@@ -107,7 +107,7 @@ def telegraph_courses(
         Quantiles of the means that may be the levels.
     least : float
         Of the white variance, that the scatter may be.
-    parts : int
+    components : int
         Of a block, at least.
 
     Examples
@@ -139,9 +139,9 @@ def telegraph_courses(
     best = _Fit(size, times, scale)
     best, _ = _improved(best, y, weight, beside, _ROUNDS, least)
     told = _told(best, y, weight, beside)
-    if parts > PARTS:
+    if components > PARTS:
         finer, _ = _improved(
-            _Fit(best.size, best.times, np.ones(len(y)), parts),
+            _Fit(best.size, best.times, np.ones(len(y)), components),
             y,
             weight,
             beside,
@@ -159,7 +159,7 @@ class _Fit:
     size: Array
     times: Array
     scale: Array
-    parts: int = PARTS
+    components: int = PARTS
 
 
 def _picked(several: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
@@ -173,10 +173,10 @@ def _smoothed(
     """Log likelihood, share and its square, steps up, and the sum of squares over the white variance."""
     left = y - fit.size[:, :-1] @ beside.T
     step = fit.size[:, -1]
-    levels = step[:, None, None] * np.arange(fit.parts + 1) / fit.parts
+    levels = step[:, None, None] * np.arange(fit.components + 1) / fit.components
     log = -0.5 * (weight / fit.scale[:, None])[..., None] * (left[..., None] - levels) ** 2
     most = log.max(axis=2)
-    chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], fit.parts)
+    chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], fit.components)
     start = fit.times / fit.times.sum(axis=1, keepdims=True)
     found, share, square, up = levels_smooth(np.exp(log - most[..., None]), chance, rises, start)
     seen = weight > 0.0
@@ -215,9 +215,9 @@ def _improved(
         slow = rounds == _MANY_ROUNDS and np.abs(np.log(times / fit.times)).max() > _STILL
         fit = _Fit(
             size,
-            np.clip(times, _SHORTEST * PARTS / fit.parts, n),
+            np.clip(times, _SHORTEST * PARTS / fit.components, n),
             np.maximum(total / count, least),
-            fit.parts,
+            fit.components,
         )
         log, share, square, up, total = _smoothed(fit, y, weight, beside)
         if moved < still and not slow:
@@ -254,7 +254,7 @@ def usual_courses(
     variance: Array,
     present: NDArray[np.bool_],
     *,
-    parts: int,
+    components: int,
     count: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
@@ -266,7 +266,7 @@ def usual_courses(
         Of one record.
     variance, present
         As for `telegraph_courses`.
-    parts : int
+    components : int
         Of a block.
     count : int
         Records that are drawn.
@@ -276,7 +276,9 @@ def usual_courses(
     noise = np.sqrt(variance * found.scale[0]) * rng.standard_normal(share.shape)
     y = np.where(present, found.step[0] * share + noise, 0.0)
     size = np.tile([0.0, found.step[0]], (count, 1))
-    fit = _Fit(size, np.tile(found.times[0], (count, 1)), np.full(count, found.scale[0]), parts)
+    fit = _Fit(
+        size, np.tile(found.times[0], (count, 1)), np.full(count, found.scale[0]), components
+    )
     return _smoothed(
         fit, y, np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0), np.ones((n, 1))
     )[:2]
@@ -295,10 +297,10 @@ def _drawn_course(n: int, low: float, high: float, rng: np.random.Generator) -> 
     return np.diff(np.interp(np.arange(n + 1.0), at, up))
 
 
-def _unknown(hops: Array, blocks: int) -> Array:
+def _unknown(hops: Array, block_count: int) -> Array:
     """What it costs that both mean times are not known [nats]: the logarithm of each is, to the root of one over its hops."""
     return np.asarray(
-        2.0 * np.log(max(np.log(2.0 * blocks), 1.0))
+        2.0 * np.log(max(np.log(2.0 * block_count), 1.0))
         + np.maximum(np.log(np.maximum(hops, 1.0) / (4.0 * np.pi)), 0.0)
     )
 
@@ -321,7 +323,7 @@ def telegraph_evidence(
 
     Returns
     -------
-    gain : ndarray, shape (record,)
+    evidence_nats : ndarray, shape (record,)
         Lower bound of the log Bayes factor [nats]; -inf where there are fewer than `MEAN_SWITCHES`
         hops.
     courses : Courses
@@ -356,14 +358,14 @@ def telegraph_evidence(
         )
         worth = _worth(found, safe, own, frame, grid, log_weight) - np.log(len(_DRIFTS))
         tried.append((np.where(found.hops >= MEAN_SWITCHES, worth, -np.inf), found))
-    chosen = np.argmax([gain for gain, _ in tried], axis=0)
+    chosen = np.argmax([evidence_nats for evidence_nats, _ in tried], axis=0)
     best = TelegraphCourses(
         *(
             _picked([getattr(one, item.name) for _, one in tried], chosen)
             for item in fields(TelegraphCourses)
         )
     )
-    return _picked([gain for gain, _ in tried], chosen), best
+    return _picked([evidence_nats for evidence_nats, _ in tried], chosen), best
 
 
 def waves(n: int, count: int) -> Array:

@@ -24,17 +24,19 @@ _STEPS = (1.0, 3.0, 10.0, 30.0)  # of the flicker and random walk that just show
 _LOUDEST = 8.0  # standard deviations that the level of one block may be away
 
 
-def flexible(state: State, claims: Sequence[Identification], axis: str) -> State:
+def flexible(state: State, identified: Sequence[Identification], axis: str) -> State:
     """The state with the next points of the nuisance grids beside those named: a time constant lies between two of them."""
     row = state.axes.index(axis)
-    for part in (
-        part
-        for one in claims
-        for part in one.parts
-        if part.candidate.view == "mean" and part.row == (axis,)
+    for component in (
+        component
+        for one in identified
+        for component in one.components
+        if component.candidate.statistic == "mean" and component.row == (axis,)
     ):
-        family = [one for one in part.candidate.variants if one.columns == part.variant.columns]
-        place = next(number for number, one in enumerate(family) if one is part.variant)
+        family = [
+            one for one in component.candidate.variants if one.columns == component.variant.columns
+        ]
+        place = next(number for number, one in enumerate(family) if one is component.variant)
         for other in family[max(place - 1, 0) : place] + family[place + 1 : place + 2]:
             state = state.with_columns("mean", axis, mean_columns(other, row))
     return state
@@ -48,9 +50,9 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
     """
     given = state.given.get(("mean", axis))
     beside = np.stack(given, axis=-1) if given else None
-    columns = [np.linspace(-1.0, 1.0, state.reduced.sizes["block"])] if not given else []
+    columns = [np.linspace(-1.0, 1.0, state.blocks.sizes["block"])] if not given else []
     evidence, strength = [], []
-    span = state.reduced.sizes["block"] * float(state.reduced.attrs["block_s"])
+    span = state.blocks.sizes["block"] * float(state.blocks.attrs["block_s"])
     slow = (
         state.baseline["grid_K"].sel(axis=axis).values ** 2 * span / HOUR
         + state.baseline["grid_B"].sel(axis=axis).values ** 2
@@ -58,7 +60,7 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
     for tier in ("free", "calibrated"):
         evidence.append(
             mean_factors(
-                state.reduced, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds
+                state.blocks, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds
             )[0, 0, 0]
         )
         strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))
@@ -77,12 +79,14 @@ def variance_fluctuation(state: State, axis: str) -> float:
     present = np.isfinite(level) & np.isfinite(variance) & ~state.masked[row]
     if present.sum() < 8:
         return 0.0
-    step = float(state.reduced.attrs["block_s"])
+    step = float(state.blocks.attrs["block_s"])
     usual = float(np.median(variance[present]))
     least = scales(usual * step, present.sum() * step)
     K, B = (
-        part.ravel()
-        for part in np.meshgrid(*([0.0, *(one * np.array(_STEPS))] for one in least), indexing="ij")
+        component.ravel()
+        for component in np.meshgrid(
+            *([0.0, *(one * np.array(_STEPS))] for one in least), indexing="ij"
+        )
     )
     safe = np.where(present, variance, usual)
     error = np.sqrt(safe)
@@ -101,7 +105,7 @@ def _levels(state: State, row: int, axis: str) -> tuple[Array, Array, Array]:
     """Of every block: level over the expected less one, its variance, and what a change of size of all that is named does to it."""
     shape = state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values
     ratio = (
-        state.reduced["power"].transpose("axis", "block", "band").values[row] / state.weight[row]
+        state.blocks["power"].transpose("axis", "block", "band").values[row] / state.weight[row]
         - 1.0
     )
     use = np.where(np.isfinite(shape) & np.isfinite(ratio), shape, 0.0)

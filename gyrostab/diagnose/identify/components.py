@@ -31,15 +31,15 @@ PLAIN_LINE = "spectral_line"
 
 def find_components(found: Found) -> list[Component]:
     """Rows of a candidate that bring something."""
-    gain = found.gain[0]
-    rows = [number for number in range(gain.size) if gain[number] > LEAST]
-    rows = rows or [int(gain.argmax())]
+    evidence_nats = found.evidence_nats[0]
+    rows = [number for number in range(evidence_nats.size) if evidence_nats[number] > LEAST]
+    rows = rows or [int(evidence_nats.argmax())]
     return [
         Component(
             found.candidate,
             found.best[number],
             found.rows[number],
-            float(gain[number]),
+            float(evidence_nats[number]),
             int(found.place[0, number]) if found.place.size else -1,
         )
         for number in rows
@@ -51,21 +51,27 @@ def by_key(found: Sequence[Found]) -> dict[str, list[Component]]:
     out: dict[str, list[Component]] = {}
     for one in found:
         out.setdefault(one.candidate.key, []).extend(find_components(one))
-    for key, parts in out.items():
-        good = _once([part for part in parts if part.gain > LEAST])
-        out[key] = sorted(good or parts, key=lambda part: -part.gain)
+    for key, components in out.items():
+        good = _once([component for component in components if component.evidence_nats > LEAST])
+        out[key] = sorted(good or components, key=lambda component: -component.evidence_nats)
     return out
 
 
-def _once(parts: Sequence[Component]) -> list[Component]:
+def _once(components: Sequence[Component]) -> list[Component]:
     """Parts without the spectrum of an effect on axes whose course within blocks is known: that holds the same powers."""
     told = {
-        part.row for part in parts if part.candidate.view == "levels" and part.variant.inside.size
+        component.row
+        for component in components
+        if component.candidate.statistic == "levels" and component.variant.inside.size
     }
-    return [part for part in parts if part.candidate.view != "power" or part.row not in told]
+    return [
+        component
+        for component in components
+        if component.candidate.statistic != "power" or component.row not in told
+    ]
 
 
-def without_lines(parts: dict[str, list[Component]]) -> dict[str, list[Component]]:
+def without_lines(components: dict[str, list[Component]]) -> dict[str, list[Component]]:
     """The same, where a line counts for the plainest name only.
 
     Any line has the form that a ripple of the supply or a sway would have, and nothing in the line
@@ -73,46 +79,58 @@ def without_lines(parts: dict[str, list[Component]]) -> dict[str, list[Component
     such an effect does counts as before.
     """
     out = {}
-    for key, several in parts.items():
+    for key, several in components.items():
         plain = several[0].candidate.effect == PLAIN_LINE
-        kept = several if plain else [part for part in several if part.candidate.view != "line"]
+        kept = (
+            several
+            if plain
+            else [component for component in several if component.candidate.statistic != "line"]
+        )
         if kept:
             out[key] = kept
     return out
 
 
-def lines_only(parts: Sequence[Component]) -> bool:
+def lines_only(components: Sequence[Component]) -> bool:
     """Whether all that these parts say is that lines are there."""
-    return bool(parts) and all(part.candidate.view == "line" for part in parts)
-
-
-def sum_evidence(parts: Sequence[Component]) -> float:
-    """Gain of an effect from its parts [nats]."""
-    return float(together(np.array([part.gain for part in parts]))) if parts else 0.0
-
-
-def evidence_of(parts: Sequence[Component], like: Component) -> float:
-    """Gain of the part in the same view and row, and beside the same witness."""
-    wanted = like.candidate.view, like.row, like.candidate.witness
-    return next(
-        (
-            one.gain
-            for one in parts
-            if (one.candidate.view, one.row, one.candidate.witness) == wanted
-        ),
-        like.gain,
+    return bool(components) and all(
+        component.candidate.statistic == "line" for component in components
     )
 
 
-def tried_again(parts: Sequence[Component]) -> list[Candidate]:
+def sum_evidence(components: Sequence[Component]) -> float:
+    """Gain of an effect from its parts [nats]."""
+    return (
+        float(together(np.array([component.evidence_nats for component in components])))
+        if components
+        else 0.0
+    )
+
+
+def evidence_of(components: Sequence[Component], like: Component) -> float:
+    """Gain of the part in the same view and row, and beside the same witness."""
+    wanted = like.candidate.statistic, like.row, like.candidate.witness
+    return next(
+        (
+            one.evidence_nats
+            for one in components
+            if (one.candidate.statistic, one.row, one.candidate.witness) == wanted
+        ),
+        like.evidence_nats,
+    )
+
+
+def tried_again(components: Sequence[Component]) -> list[Candidate]:
     """Candidates that parts come from, each once."""
     seen: dict[tuple[str, str, tuple[str, ...]], Candidate] = {}
-    for part in parts:
-        seen[part.candidate.key, part.candidate.view, part.candidate.witness] = part.candidate
+    for component in components:
+        seen[
+            component.candidate.key, component.candidate.statistic, component.candidate.witness
+        ] = component.candidate
     return list(seen.values())
 
 
-def axes_of(parts: Sequence[Component], order: Sequence[str]) -> tuple[str, ...]:
+def axes_of(components: Sequence[Component], order: Sequence[str]) -> tuple[str, ...]:
     """Axes of parts, in order."""
-    named = {axis for part in parts for axis in part.row}
+    named = {axis for component in components for axis in component.row}
     return tuple(sorted(named, key=lambda axis: (order.index(axis) if axis in order else 0, axis)))

@@ -42,25 +42,29 @@ def identify_expected_effects(
     gains : callable
         Gains of candidates in a state.
     """
-    claims: list[Identification] = []
+    identified: list[Identification] = []
     state, left = start, list(known)
     rounds = _ROUNDS * len(left)
     while left and rounds > 0:
         rounds -= 1
         found = [(_parts(effect, candidates, state, gains), effect) for effect in left]
-        left = [effect for parts, effect in found if sum_evidence(parts) > LEAST]
-        parts, effect = max(found, key=lambda one: (_odd(one[0]), sum_evidence(one[0])))
-        if sum_evidence(parts) <= LEAST:
+        left = [effect for components, effect in found if sum_evidence(components) > LEAST]
+        components, effect = max(found, key=lambda one: (_odd(one[0]), sum_evidence(one[0])))
+        if sum_evidence(components) <= LEAST:
             break
-        claims.append(_claim(parts, state))
-        state = condition_on(state, parts)
-        if _odd(parts):  # their counts cannot be taken out
+        identified.append(_claim(components, state))
+        state = condition_on(state, components)
+        if _odd(components):  # their counts cannot be taken out
             left = [one for one in left if one is not effect]
-    return claims, state
+    return identified, state
 
 
-def _odd(parts: Sequence[Component]) -> bool:
-    return bool(parts) and parts[0].candidate.view == "marks" and sum_evidence(parts) > LEAST
+def _odd(components: Sequence[Component]) -> bool:
+    return (
+        bool(components)
+        and components[0].candidate.statistic == "marks"
+        and sum_evidence(components) > LEAST
+    )
 
 
 def _follows(candidate: Candidate, effect: Effect) -> bool:
@@ -80,19 +84,23 @@ def _parts(
     """What an effect brings on its axes, in the views and with the channels in which it brings most."""
     by = by_key(gains([one for one in candidates if _follows(one, effect)], state))
     own = [
-        [part for part in parts if not effect.axes or set(part.row) <= set(effect.axes)]
-        for parts in by.values()
+        [
+            component
+            for component in components
+            if not effect.axes or set(component.row) <= set(effect.axes)
+        ]
+        for components in by.values()
     ]
     return max(own, key=sum_evidence, default=[])
 
 
-def _claim(parts: Sequence[Component], state: State) -> Identification:
-    first = parts[0].candidate
+def _claim(components: Sequence[Component], state: State) -> Identification:
+    first = components[0].candidate
     return Identification(
         first.effect,
         first.driver,
-        axes_of(parts, state.axes),
-        tuple(parts),
-        sum_evidence(parts),
+        axes_of(components, state.axes),
+        tuple(components),
+        sum_evidence(components),
         LEAST,
     )

@@ -100,7 +100,7 @@ _OF_ZEROS = {"stuck", "filled"}  # a sample that is zero is so for one reason
 
 
 def name_effects(
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     baseline: xr.Dataset,
     nulls: Iterable[xr.Dataset],
     *,
@@ -113,7 +113,7 @@ def name_effects(
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`.
     baseline : xarray.Dataset
         From `gyrostab.diagnose.baseline.calibrate`.
@@ -138,14 +138,14 @@ def name_effects(
     OptionError
         When there are too few null records.
     """
-    folds = fold_blocks(reduced)
-    tried, reasons = effect_candidates(reduced, baseline["coefficient"])
-    candidates = [*tried, *nuisance_alternatives(reduced)]
-    state = begin_state(reduced, baseline)
-    best, tallies = _null_best(
+    folds = fold_blocks(blocks)
+    tried, reasons = effect_candidates(blocks, baseline["coefficient"])
+    candidates = [*tried, *nuisance_alternatives(blocks)]
+    state = begin_state(blocks, baseline)
+    best, count_evidence = _null_best(
         candidates, nulls, state, folds, np.random.default_rng(seed), progress
     )
-    if not tallies.rounded.any() and (reduced["lattice"] > 0.0).any():
+    if not count_evidence.rounded.any() and (blocks["lattice"] > 0.0).any():
         reasons |= {
             "rate_quantization": "not identifiable: the lattice of values is that of angles, or too fine to show"
         }
@@ -153,12 +153,14 @@ def name_effects(
         known,
         tried,
         state,
-        lambda some, now: compute_evidence(some, now.reduced, now, folds, tallies=tallies),
+        lambda some, now: compute_evidence(
+            some, now.blocks, now, folds, count_evidence=count_evidence
+        ),
     )
-    search = _Search(candidates, folds, tallies, tail_level(best, level), tuple(expected))
-    claims, unknown, state = search.run(state)
+    search = _Search(candidates, folds, count_evidence, tail_level(best, level), tuple(expected))
+    identified, unknown, state = search.run(state)
     return Identifications(
-        tuple(claims),
+        tuple(identified),
         tuple(unknown),
         search.threshold,
         best,
@@ -166,7 +168,7 @@ def name_effects(
         tuple(candidates),
         state,
         folds,
-        tallies,
+        count_evidence,
         tuple(expected),
     )
 
@@ -181,8 +183,8 @@ def _null_best(
 ) -> tuple[Array, CountEvidence]:
     """Largest gain of any effect in each null record; and what the records say of counts."""
     expected = Expected()
-    linear = [one for one in candidates if one.view != "marks"]
-    marks = [one for one in candidates if one.view == "marks"]
+    linear = [one for one in candidates if one.statistic != "marks"]
+    marks = [one for one in candidates if one.statistic == "marks"]
     sums: list[dict[str, Array]] = []
     kept: list[xr.Dataset] = []
     records = 0
@@ -196,16 +198,18 @@ def _null_best(
         raise OptionError(
             f"{records} null records are too few to tell how often noise alone does as much; give nulls=400"
         )
-    tallies = CountEvidence.gathered(expected, rounded_rates(state.reduced, state.baseline))
+    count_evidence = CountEvidence.gathered(expected, rounded_rates(state.blocks, state.baseline))
     best = []
     for total, chunk in zip(sums, kept, strict=True):
-        counted = totals(compute_evidence(marks, chunk, state, folds, tallies=tallies))
+        counted = totals(
+            compute_evidence(marks, chunk, state, folds, count_evidence=count_evidence)
+        )
         keys = {*total, *counted}
         nothing = np.zeros(chunk.sizes["record"])
         best.append(
             np.max([total.get(key, nothing) + counted.get(key, nothing) for key in keys], axis=0)
         )
-    return np.sort(np.concatenate(best)), tallies
+    return np.sort(np.concatenate(best)), count_evidence
 
 
 def tail_level(best: Array, level: float) -> float:
@@ -233,7 +237,7 @@ class _Search:
 
     candidates: Sequence[Candidate]
     folds: xr.DataArray
-    tallies: CountEvidence
+    count_evidence: CountEvidence
     threshold: float
     expected: tuple[Identification, ...] = ()
 
@@ -244,7 +248,7 @@ class _Search:
         barred = {
             key
             for one in self.expected
-            for key in (one.parts[0].candidate.key, *self._counted(one))
+            for key in (one.components[0].candidate.key, *self._counted(one))
         }
         rounds, lines = _ROUNDS, _LINES
         found: list[Found] = []
@@ -256,42 +260,48 @@ class _Search:
                 break
             one, rejected = pick
             barred |= rejected
-            line = one is not None and lines_only(one.parts)
+            line = one is not None and lines_only(one.components)
             rounds, lines = rounds - (not line), lines - line
             if one is not None:
                 chosen = add_identification(chosen, one)
                 barred |= self._counted(one)
-                state = condition_on(state, list(one.parts))
+                state = condition_on(state, list(one.components))
         chosen = hops_alone(chosen, lambda some: self._with(start, some), self._of, self.threshold)
         chosen = self._pruned(start, without_pulses(chosen))
-        chosen, claims = self._settled(start, chosen)
+        chosen, identified = self._settled(start, chosen)
         unknown = [one for one in chosen if isinstance(one, Unidentified)]
-        state = self._with(start, [*claims, *unknown])
-        kept, withdrawn = self._complete(start, state, claims, unknown)
+        state = self._with(start, [*identified, *unknown])
+        kept, withdrawn = self._complete(start, state, identified, unknown)
         unknown += withdrawn
-        same = len(kept) == len(claims) and not withdrawn
+        same = len(kept) == len(identified) and not withdrawn
         return (
-            sorted(kept, key=lambda one: -one.gain),
+            sorted(kept, key=lambda one: -one.evidence_nats),
             unknown,
             state if same else self._with(start, [*kept, *unknown]),
         )
 
     def _counted(self, one: Identification | Unidentified) -> set[str]:
         """Keys that stand for counts which are explained now: there is nothing to take out of a count."""
-        if any(part.candidate.effect in ("logger_filter", "~S(f)") for part in one.parts):
+        if any(
+            component.candidate.effect in ("logger_filter", "~S(f)") for component in one.components
+        ):
             return {"~outliers"}  # the kurtosis of a block is that of other noise
-        if not any(part.candidate.view == "marks" for part in one.parts):
+        if not any(component.candidate.statistic == "marks" for component in one.components):
             return set()
-        marks = {mark for part in one.parts for mark in part.variant.columns} | {"kurtosis"}
+        marks = {mark for component in one.components for mark in component.variant.columns} | {
+            "kurtosis"
+        }
         marks |= _OF_ZEROS if marks & _OF_ZEROS else set()
         return {
             other.key
             for other in self.candidates
-            if other.view == "marks" and marks & set(other.marks)
+            if other.statistic == "marks" and marks & set(other.marks)
         }
 
     def _of(self, candidates: Sequence[Candidate], state: State) -> list[Found]:
-        return compute_evidence(candidates, state.reduced, state, self.folds, tallies=self.tallies)
+        return compute_evidence(
+            candidates, state.blocks, state, self.folds, count_evidence=self.count_evidence
+        )
 
     def _ranked(self, state: State, barred: set[str], known: Sequence[Found] = ()) -> list[Found]:
         """Gains of all that is not barred, with weights that suit the best in the powers: what is loud is loud in every view.
@@ -304,46 +314,55 @@ class _Search:
             *(one for one in known if one.candidate.key not in barred),
             *self._of(sought, state),
         ]
-        weighed = [one.candidate for one in found if one.candidate.view in _WEIGHED]
+        weighed = [one.candidate for one in found if one.candidate.statistic in _WEIGHED]
         for _ in range(2):
-            powers = [one for one in found if one.candidate.view == "power"]
+            powers = [one for one in found if one.candidate.statistic == "power"]
             strong = max(
-                powers, key=lambda one: float(np.maximum(one.gain[0], 0.0).sum()), default=None
+                powers,
+                key=lambda one: float(np.maximum(one.evidence_nats[0], 0.0).sum()),
+                default=None,
             )
-            if strong is None or np.maximum(strong.gain[0], 0.0).sum() < 3.0 * self.threshold:
+            if (
+                strong is None
+                or np.maximum(strong.evidence_nats[0], 0.0).sum() < 3.0 * self.threshold
+            ):
                 break
             trial = condition_on(state, find_components(strong))
             again = compute_evidence(
-                weighed, state.reduced, replace(state, weight=trial.weight), self.folds
+                weighed, state.blocks, replace(state, weight=trial.weight), self.folds
             )
-            found = [one for one in found if one.candidate.view not in _WEIGHED] + again
+            found = [one for one in found if one.candidate.statistic not in _WEIGHED] + again
         return found
 
     def _pick(
         self, found: list[Found], state: State, chosen: Sequence[Identification | Unidentified]
     ) -> tuple[Identification | Unidentified | None, set[str]] | None:
         """The next effect, or generic; None when nothing passes. Second: keys that are out of the race from now on."""
-        parts = without_lines(by_key(found))
+        components = without_lines(by_key(found))
         need = {
             key: self.threshold + form_error(several, [*self.expected, *chosen], share=FORM)
-            for key, several in parts.items()
+            for key, several in components.items()
         }
         for key in [
-            key for key in parts if not key.startswith("~") and sum_evidence(parts[key]) > need[key]
+            key
+            for key in components
+            if not key.startswith("~") and sum_evidence(components[key]) > need[key]
         ]:
-            parts[key] = is_physical(parts[key], state, error=need[key] - self.threshold)
-        ranked = sorted(parts, key=lambda key: -sum_evidence(parts[key]))
-        passing = [key for key in ranked if sum_evidence(parts[key]) > need[key]]
+            components[key] = is_physical(components[key], state, error=need[key] - self.threshold)
+        ranked = sorted(components, key=lambda key: -sum_evidence(components[key]))
+        passing = [key for key in ranked if sum_evidence(components[key]) > need[key]]
         odd = [
             key
             for key in passing
-            if parts[key][0].candidate.view == "marks" and not key.startswith("~")
+            if components[key][0].candidate.statistic == "marks" and not key.startswith("~")
         ]
-        shared = [key for key in passing if sum_evidence(_witnessed(parts[key], state)) > need[key]]
+        shared = [
+            key for key in passing if sum_evidence(_witnessed(components[key], state)) > need[key]
+        ]
         # odd samples first: they raise powers and means too, and not the other way round; then
         # motion that another sensor sees as well
         hops = identify_switching(
-            passing, parts, state
+            passing, components, state
         )  # what hops within blocks has a spectrum, tails and a level of the noise that changes
         odd = (
             [] if hops and passing.index(hops[0]) < min(map(passing.index, odd), default=0) else odd
@@ -353,27 +372,32 @@ class _Search:
             or shared
             or hops
             or without_slopes(
-                self._without_locked_lines(passing, parts, state), parts, state, self.folds
+                self._without_locked_lines(passing, components, state),
+                components,
+                state,
+                self.folds,
             )
         )
-        passing = followed_first(passing, parts, state)
+        passing = followed_first(passing, components, state)
         if not passing:
             return None
-        top = sum_evidence(parts[passing[0]])
+        top = sum_evidence(components[passing[0]])
         rivals = [
             key
             for key in passing
-            if not key.startswith("~") and sum_evidence(parts[key]) >= top - AMBIGUOUS - FORM * top
+            if not key.startswith("~")
+            and sum_evidence(components[key]) >= top - AMBIGUOUS - FORM * top
         ]
-        effects = {parts[key][0].candidate.effect for key in rivals}
+        effects = {components[key][0].candidate.effect for key in rivals}
         later = {
-            key: self._lonely(parts[key]) or find_plainer_effect(parts[key], state) in effects
+            key: self._lonely(components[key])
+            or find_plainer_effect(components[key], state) in effects
             for key in rivals
         }
-        rivals.sort(key=lambda key: -sum_evidence(parts[key]) + AMBIGUOUS * later[key])
+        rivals.sort(key=lambda key: -sum_evidence(components[key]) + AMBIGUOUS * later[key])
         rejected: set[str] = set()
         for key in rivals:
-            passed, p_value = passes_time_shift_test(parts[key], state, self.folds)
+            passed, p_value = passes_time_shift_test(components[key], state, self.folds)
             if not passed:
                 rejected.add(key)
                 continue
@@ -382,53 +406,58 @@ class _Search:
                 for one in rivals
                 if one != key
                 and one not in rejected
-                and sum_evidence(parts[one]) >= sum_evidence(parts[key]) - AMBIGUOUS
+                and sum_evidence(components[one]) >= sum_evidence(components[key]) - AMBIGUOUS
             ]
             return self._claim(
-                parts[key], need[key], [parts[one][0].candidate.effect for one in close], p_value
+                components[key],
+                need[key],
+                [components[one][0].candidate.effect for one in close],
+                p_value,
             ), rejected
         if rejected:
             return None, rejected
         generic = passing[0]
-        near = [parts[one][0].candidate.effect for one in passing if not one.startswith("~")][:3]
-        return find_unidentified(generic, parts[generic], need[generic], near), set()
+        near = [components[one][0].candidate.effect for one in passing if not one.startswith("~")][
+            :3
+        ]
+        return find_unidentified(generic, components[generic], need[generic], near), set()
 
     def _without_locked_lines(
-        self, passing: list[str], parts: dict[str, list[Component]], state: State
+        self, passing: list[str], components: dict[str, list[Component]], state: State
     ) -> list[str]:
         """Keys without a line that is locked to a channel: what is locked makes lines, at frequencies of its own."""
-        locked = [key for key in passing if parts[key][0].candidate.view in _LOCKED]
-        lines = [key for key in passing if parts[key][0].candidate.view == "line"]
+        locked = [key for key in passing if components[key][0].candidate.statistic in _LOCKED]
+        lines = [key for key in passing if components[key][0].candidate.statistic == "line"]
         taken = [
             mask
             for key in locked
             if lines
-            for mask in condition_on(state, parts[key]).given.get(("line", "all"), [])
+            for mask in condition_on(state, components[key]).given.get(("line", "all"), [])
         ]
         return [
             key
             for key in passing
-            if key not in lines or not any(mask[parts[key][0].place] for mask in taken)
+            if key not in lines or not any(mask[components[key][0].place] for mask in taken)
         ]
 
-    def _lonely(self, parts: Sequence[Component]) -> bool:
+    def _lonely(self, components: Sequence[Component]) -> bool:
         """An effect that should be one process on all axes, and shows on a single one."""
-        key = parts[0].candidate.key
-        coherent = any(one.key == key and one.view == "cross" for one in self.candidates)
-        return coherent and len({axis for part in parts for axis in part.row}) == 1
+        key = components[0].candidate.key
+        coherent = any(one.key == key and one.statistic == "cross" for one in self.candidates)
+        return coherent and len({axis for component in components for axis in component.row}) == 1
 
     def _claim(
-        self, parts: list[Component], threshold: float, names: Sequence[str], p_value: float
+        self, components: list[Component], threshold: float, names: Sequence[str], p_value: float
     ) -> Identification:
-        first = parts[0].candidate
-        axes = axes_of(parts, list(map(str, self.folds.attrs.get("axes", ()))))
+        first = components[0].candidate
+        axes = axes_of(components, list(map(str, self.folds.attrs.get("axes", ()))))
         others = tuple(dict.fromkeys(name for name in names if name != first.effect))
         return Identification(
             first.effect,
             first.driver,
             axes,
-            tuple(parts),
-            sum_evidence(parts),
+            tuple(components),
+            sum_evidence(components),
             threshold,
             others,
             p_value,
@@ -443,11 +472,11 @@ class _Search:
         state, waiting = start, False
         for one in (one for one in chosen if one is not without):
             if lines_only(
-                one.parts
+                one.components
             ):  # what they add to the powers is fitted once for all of a comb
-                state, waiting = condition_on_components(state, one.parts), True
+                state, waiting = condition_on_components(state, one.components), True
                 continue
-            state = condition_on(reweighted(state) if waiting else state, list(one.parts))
+            state = condition_on(reweighted(state) if waiting else state, list(one.components))
             waiting = False
         return reweighted(state) if waiting else state
 
@@ -456,24 +485,28 @@ class _Search:
     ) -> list[Identification | Unidentified]:
         """Without what no longer passes when the others are in, the weakest first; and claims only on axes that still show them."""
         for one in sorted(
-            chosen, key=lambda one: (isinstance(one, Identification), one.gain)
+            chosen, key=lambda one: (isinstance(one, Identification), one.evidence_nats)
         ):  # what has no name the first
             if len(chosen) < 2:
                 break
             state = self._with(start, chosen, one)
             again = by_key(
                 compute_evidence(
-                    tried_again(one.parts), state.reduced, state, self.folds, tallies=self.tallies
+                    tried_again(one.components),
+                    state.blocks,
+                    state,
+                    self.folds,
+                    count_evidence=self.count_evidence,
                 )
             )
             leading = (
                 one is chosen[0]
                 and isinstance(one, Identification)
-                and one.parts[0].candidate.view != "marks"
+                and one.components[0].candidate.statistic != "marks"
             )  # odd samples come first
             if (
                 not leading
-                and max((sum_evidence(parts) for parts in again.values()), default=0.0)
+                and max((sum_evidence(components) for components in again.values()), default=0.0)
                 < self.threshold
             ):
                 chosen = [other for other in chosen if other is not one]
@@ -486,77 +519,111 @@ class _Search:
     ) -> tuple[list[Identification | Unidentified], list[Identification]]:
         """What is chosen, and its claims with their last gains; without those that beside the others no longer reach their threshold."""
         while True:
-            claims = {
+            identified = {
                 place: self._finished(start, one, chosen)
                 for place, one in enumerate(chosen)
                 if isinstance(one, Identification)
             }
-            spare = {place: one.gain - self._needed(one, claims) for place, one in claims.items()}
+            spare = {
+                place: one.evidence_nats - self._needed(one, identified)
+                for place, one in identified.items()
+            }
             weak = min(spare, key=lambda place: spare[place], default=None)
             if weak is None or spare[weak] >= 0.0:
-                return chosen, list(claims.values())
+                return chosen, list(identified.values())
             chosen = [*chosen[:weak], *chosen[weak + 1 :]]
 
-    def _needed(self, claim: Identification, claims: dict[int, Identification]) -> float:
+    def _needed(
+        self, identification: Identification, identified: dict[int, Identification]
+    ) -> float:
         """What a claim must gain beside the others, whichever was named first."""
-        others = [*self.expected, *(one for one in claims.values() if one is not claim)]
-        return max(claim.threshold, self.threshold + form_error(claim.parts, others, share=FORM))
+        others = [
+            *self.expected,
+            *(one for one in identified.values() if one is not identification),
+        ]
+        return max(
+            identification.threshold,
+            self.threshold + form_error(identification.components, others, share=FORM),
+        )
 
     def _finished(
-        self, start: State, claim: Identification, chosen: Sequence[Identification | Unidentified]
+        self,
+        start: State,
+        identification: Identification,
+        chosen: Sequence[Identification | Unidentified],
     ) -> Identification:
         """The claim with its gain and its rivals when all the others are in the model."""
-        state = self._with(start, chosen, claim)
-        weight = condition_on(state, list(claim.parts)).weight
-        views = {part.candidate.view for part in claim.parts}
-        near = [one for one in self.candidates if one.view in views]
-        parts = by_key(
+        state = self._with(start, chosen, identification)
+        weight = condition_on(state, list(identification.components)).weight
+        statistics = {component.candidate.statistic for component in identification.components}
+        near = [one for one in self.candidates if one.statistic in statistics]
+        components = by_key(
             compute_evidence(
-                near, state.reduced, replace(state, weight=weight), self.folds, tallies=self.tallies
+                near,
+                state.blocks,
+                replace(state, weight=weight),
+                self.folds,
+                count_evidence=self.count_evidence,
             )
         )
-        axes = set(claim.axes)
+        axes = set(identification.axes)
         mine = {
-            key: [one for one in several if set(one.row) & axes] for key, several in parts.items()
+            key: [one for one in several if set(one.row) & axes]
+            for key, several in components.items()
         }
-        key = claim.parts[0].candidate.key
-        again = found_again(claim.parts, mine.get(key, []), replace(state, weight=weight), self._of)
-        gain = sum(max(sum_evidence(one), 0.0) for one in again) or claim.gain
+        key = identification.components[0].candidate.key
+        again = found_again(
+            identification.components, mine.get(key, []), replace(state, weight=weight), self._of
+        )
+        evidence_nats = (
+            sum(max(sum_evidence(one), 0.0) for one in again) or identification.evidence_nats
+        )
         rivals = [
             several[0].candidate.effect
             for other, several in mine.items()
             if several
             and other != key
             and not other.startswith("~")
-            and sum_evidence(several) >= gain - AMBIGUOUS
-            and sum_evidence(is_physical(several, state)) >= gain - AMBIGUOUS
+            and sum_evidence(several) >= evidence_nats - AMBIGUOUS
+            and sum_evidence(is_physical(several, state)) >= evidence_nats - AMBIGUOUS
         ]
         lines = {
-            part.place
+            component.place
             for other in chosen
-            for part in other.parts
-            if part.candidate.effect == PLAIN_LINE
+            for component in other.components
+            if component.candidate.effect == PLAIN_LINE
         }
-        rivals += find_equivalent_effects(claim.effect, claim.parts, state, lines=len(lines))
+        rivals += find_equivalent_effects(
+            identification.effect, identification.components, state, lines=len(lines)
+        )
         others = tuple(
-            dict.fromkeys(name for name in [*claim.alternatives, *rivals] if name != claim.effect)
+            dict.fromkeys(
+                name
+                for name in [*identification.alternatives, *rivals]
+                if name != identification.effect
+            )
         )
         fresh = [
-            renewed(found, part)
-            for layer, found in zip(layers(claim.parts), again, strict=True)
-            for part in layer
+            renewed(found, component)
+            for layer, found in zip(layers(identification.components), again, strict=True)
+            for component in layer
         ]
-        return replace(claim, gain=gain, alternatives=others, parts=tuple(fresh))
+        return replace(
+            identification,
+            evidence_nats=evidence_nats,
+            alternatives=others,
+            components=tuple(fresh),
+        )
 
     def _complete(
         self,
         start: State,
         state: State,
-        claims: list[Identification],
+        identified: list[Identification],
         unknown: Sequence[Unidentified],
     ) -> tuple[list[Identification], list[Unidentified]]:
         """Names are withdrawn where, with them in the model, means are still redder than calibrated, or powers still restless."""
-        kept, withdrawn = list(claims), []
+        kept, withdrawn = list(identified), []
         for axis in state.axes:
             named = _on(kept, "mean", axis)
             part_of = _of_a_drift(named, unknown, axis)
@@ -566,9 +633,9 @@ class _Search:
             ):
                 continue
             if any(
-                part.candidate.effect in _SHAPES and axis in part.row
+                component.candidate.effect in _SHAPES and axis in component.row
                 for one in kept
-                for part in one.parts
+                for component in one.components
             ):
                 continue  # the white variance of the means is not what the calibration took it for
             red = excess_low_frequency_noise(flexible(state, named, axis), axis, self.folds)
@@ -596,8 +663,14 @@ class _Search:
     ) -> list[Unidentified]:
         """What a free course of the noise explains on an axis, in place of names that do not."""
         free = [one for one in self.candidates if one.effect == "~N(t)"]
-        parts = by_key(compute_evidence(free, state.reduced, state, self.folds)).get("~N(t)", [])
-        mine = [part for part in parts if part.row == (axis,) and part.gain > self.threshold]
+        components = by_key(compute_evidence(free, state.blocks, state, self.folds)).get(
+            "~N(t)", []
+        )
+        mine = [
+            component
+            for component in components
+            if component.row == (axis,) and component.evidence_nats > self.threshold
+        ]
         return (
             [find_unidentified("~N(t)", mine, self.threshold, [one.effect for one in weak])]
             if mine
@@ -605,11 +678,14 @@ class _Search:
         )
 
 
-def _on(claims: Sequence[Identification], view: str, axis: str) -> list[Identification]:
+def _on(identified: Sequence[Identification], statistic: str, axis: str) -> list[Identification]:
     return [
         one
-        for one in claims
-        if any(part.candidate.view == view and part.row == (axis,) for part in one.parts)
+        for one in identified
+        if any(
+            component.candidate.statistic == statistic and component.row == (axis,)
+            for component in one.components
+        )
     ]
 
 
@@ -617,20 +693,25 @@ def _of_a_drift(
     named: Sequence[Identification], unknown: Sequence[Unidentified], axis: str
 ) -> list[Identification]:
     """Claims that a drift of no name on the same axis makes doubtful: no channel tells of them, and it brings more than they do."""
-    drift = sum(one.gain for one in unknown if one.generic == "~bias(t)" and axis in one.axes)
-    return [one for one in named if not any(one.driver) and one.gain < drift]
+    drift = sum(
+        one.evidence_nats for one in unknown if one.generic == "~bias(t)" and axis in one.axes
+    )
+    return [one for one in named if not any(one.driver) and one.evidence_nats < drift]
 
 
 def _weak(named: Sequence[Identification], left: float) -> tuple[list[Identification], float]:
     """Claims that do not do enough beside what they leave [nats], and what all of them gain."""
-    strength = sum(one.gain for one in named)
-    return [one for one in named if left > max(_LEFT + FORM * strength, 0.1 * one.gain)], strength
+    strength = sum(one.evidence_nats for one in named)
+    return [
+        one for one in named if left > max(_LEFT + FORM * strength, 0.1 * one.evidence_nats)
+    ], strength
 
 
-def _witnessed(parts: Sequence[Component], state: State) -> list[Component]:
+def _witnessed(components: Sequence[Component], state: State) -> list[Component]:
     """Parts that a channel sees as well, which is no axis of the gyro itself."""
     return [
-        part
-        for part in parts
-        if part.candidate.view == "transfer" and part.candidate.witness[0] not in state.axes
+        component
+        for component in components
+        if component.candidate.statistic == "transfer"
+        and component.candidate.witness[0] not in state.axes
     ]

@@ -59,135 +59,149 @@ def without_pulses(
     wrong samples would make no lines.
     """
     lines: Counter[str] = Counter()
-    for part in (part for one in chosen for part in one.parts):
-        weight = {"line": 1, "phase_locked": _COMB}.get(part.candidate.view, 0)
-        lines.update(dict.fromkeys(part.row, weight))
+    for component in (component for one in chosen for component in one.components):
+        weight = {"line": 1, "phase_locked": _COMB}.get(component.candidate.statistic, 0)
+        lines.update(dict.fromkeys(component.row, weight))
     out: list[Identification | Unidentified] = []
     for one in chosen:
         if isinstance(one, Identification) and one.effect == "spikes":
-            kept = tuple(part for part in one.parts if lines[part.row[0]] < _COMB)
+            kept = tuple(
+                component for component in one.components if lines[component.row[0]] < _COMB
+            )
             out += (
-                [replace(one, parts=kept, axes=tuple(part.row[0] for part in kept))] if kept else []
+                [replace(one, components=kept, axes=tuple(component.row[0] for component in kept))]
+                if kept
+                else []
             )
         else:
             out.append(one)
     return out
 
 
-def is_physical(parts: Sequence[Component], state: State, *, error: float = 0.0) -> list[Component]:
+def is_physical(
+    components: Sequence[Component], state: State, *, error: float = 0.0
+) -> list[Component]:
     """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not.
 
     `error` is what errors of the form of all else that is named may leave to the effect [nats].
     """
     whole = (
-        on_all_axes(parts, state)
-        and is_sudden(parts, state, error=error)
-        and is_lasting(parts, state)
-        and levels(parts, state)
+        on_all_axes(components, state)
+        and is_sudden(components, state, error=error)
+        and is_lasting(components, state)
+        and levels(components, state)
     )
-    return [part for part in parts if _possible(part, state)] if whole else []
+    return [component for component in components if _possible(component, state)] if whole else []
 
 
-def find_plainer_effect(parts: Sequence[Component], state: State) -> str | None:
+def find_plainer_effect(components: Sequence[Component], state: State) -> str | None:
     """Effect that says the same more plainly; None where there is none.
 
     A real turning is seen by the cosine of the angle to the axis, which is rarely small; errors of
     the scale factor are.
     """
-    effect = parts[0].candidate.effect
+    effect = components[0].candidate.effect
     if effect == "real_motion" and all(
-        _spin(part) and _share(part, state) < _LEAN for part in parts
+        _spin(component) and _share(component, state) < _LEAN for component in components
     ):
         return "scale_factor"
     return EQUIVALENTS.get(effect)
 
 
-def _spin(part: Component) -> bool:
+def _spin(component: Component) -> bool:
     """Whether a part says that an axis sees the turning of the tool."""
     return (
-        part.candidate.effect == "real_motion"
-        and part.candidate.view == "mean"
-        and part.variant.columns == ("spin",)
+        component.candidate.effect == "real_motion"
+        and component.candidate.statistic == "mean"
+        and component.variant.columns == ("spin",)
     )
 
 
-def _share(part: Component, state: State) -> float:
+def _share(component: Component, state: State) -> float:
     from gyrostab.diagnose.predict.sizes import component_size
 
-    return abs(component_size(part, state)[0])
+    return abs(component_size(component, state)[0])
 
 
-def _possible(part: Component, state: State) -> bool:
+def _possible(component: Component, state: State) -> bool:
     from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 
-    effect, view = part.candidate.effect, part.candidate.view
+    effect, statistic = component.candidate.effect, component.candidate.statistic
     if (
         effect == "misalignment"
-        and view == "transfer"
-        and not _moves(part.candidate.witness[0], state)
+        and statistic == "transfer"
+        and not _moves(component.candidate.witness[0], state)
     ):
         return False
-    if _spin(part) and _share(part, state) < _SQUARE:
+    if _spin(component) and _share(component, state) < _SQUARE:
         return False
     if (
         effect == "fringe_hop"
-        and abs(component_size(part, state)[0]) * np.abs(part.variant.design).max()
+        and abs(component_size(component, state)[0]) * np.abs(component.variant.design).max()
         < _SMALLEST_FRINGE
     ):
         return False
-    if effect in LARGEST and part.variant.columns[0] != "any":
-        return bool(np.abs(component_mixture(part, state).moments()[0]).max() <= LARGEST[effect])
-    if view == "mean" and not _in_range(part, state):
+    if effect in LARGEST and component.variant.columns[0] != "any":
+        return bool(
+            np.abs(component_mixture(component, state).moments()[0]).max() <= LARGEST[effect]
+        )
+    if statistic == "mean" and not _in_range(component, state):
         return False
-    if view == "power" and not _from_least(part, state):
+    if statistic == "power" and not _from_least(component, state):
         return False
-    if view == "levels" and _more_levels(part, state):
+    if statistic == "levels" and _more_levels(component, state):
         return False
-    if not is_always_present(part, state):
+    if not is_always_present(component, state):
         return False
-    return not (part.variant.squared and view == "power" and component_size(part, state)[0] <= 0.0)
+    return not (
+        component.variant.squared
+        and statistic == "power"
+        and component_size(component, state)[0] <= 0.0
+    )
 
 
-def _in_range(part: Component, state: State) -> bool:
+def _in_range(component: Component, state: State) -> bool:
     """Whether the sizes of block means can lie where the registry allows the parameters: an instrument that has others is broken."""
     from gyrostab.diagnose.predict.sizes import component_mixture
 
     largest = {
         item.name: max(abs(item.low), abs(item.high))
-        for item in effects()[part.candidate.effect].parameters()
+        for item in effects()[component.candidate.effect].parameters()
     }
-    sizes, covariance = component_mixture(part, state).moments()
+    sizes, covariance = component_mixture(component, state).moments()
     least = np.abs(sizes) - _SURE * np.sqrt(np.diagonal(covariance))
     return all(
         size <= largest.get(name, np.inf)
-        for name, size in zip(part.variant.columns, least, strict=True)
+        for name, size in zip(component.variant.columns, least, strict=True)
     )
 
 
-def _from_least(part: Component, state: State) -> bool:
+def _from_least(component: Component, state: State) -> bool:
     """Whether the size of a level of the noise lies above the least that the registry allows: what ages does not get better."""
     from gyrostab.diagnose.predict.sizes import component_size
 
-    if part.variant.squared or len(part.variant.columns) != 1:
+    if component.variant.squared or len(component.variant.columns) != 1:
         return True
-    least = {item.name: item.low for item in effects()[part.candidate.effect].parameters()}.get(
-        part.variant.columns[0]
-    )
+    least = {
+        item.name: item.low for item in effects()[component.candidate.effect].parameters()
+    }.get(component.variant.columns[0])
     if least is None or not np.isfinite(least):
         return True
-    size, error = component_size(part, state)
+    size, error = component_size(component, state)
     return size >= least - _SURE * error
 
 
-def _more_levels(part: Component, state: State) -> bool:
+def _more_levels(component: Component, state: State) -> bool:
     """Whether, beside the two levels, the bias hops once more: then it has three or more."""
-    axis = part.row[0]
-    if part.variant.inside.size:
-        within = fast_switching_evidence(state.reduced, add_fast_switching(state, part), axis)
-        return within is not None and within.gain > _MORE + _FORM * part.gain
-    given = np.stack([*state.given.get(("mean", axis), []), part.variant.design[0, 0]], axis=-1)
-    gain, _ = telegraph_evidence(state.reduced, state.baseline, axis=axis, given=given)
-    return bool(gain[0] > _MORE + _FORM * part.gain)
+    axis = component.row[0]
+    if component.variant.inside.size:
+        within = fast_switching_evidence(state.blocks, add_fast_switching(state, component), axis)
+        return within is not None and within.evidence_nats > _MORE + _FORM * component.evidence_nats
+    given = np.stack(
+        [*state.given.get(("mean", axis), []), component.variant.design[0, 0]], axis=-1
+    )
+    evidence_nats, _ = telegraph_evidence(state.blocks, state.baseline, axis=axis, given=given)
+    return bool(evidence_nats[0] > _MORE + _FORM * component.evidence_nats)
 
 
 def _moves(axis: str, state: State) -> bool:
@@ -195,31 +209,33 @@ def _moves(axis: str, state: State) -> bool:
     row = state.axes.index(axis)
     expected = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
     return bool(
-        np.nanmax(np.nanmean(measured(state.reduced, "power").values[row] / expected, axis=0))
+        np.nanmax(np.nanmean(measured(state.blocks, "power").values[row] / expected, axis=0))
         > _MOVING
     )
 
 
 def find_equivalent_effects(
-    effect: str, parts: Sequence[Component], state: State, *, lines: int = 0
+    effect: str, components: Sequence[Component], state: State, *, lines: int = 0
 ) -> list[str]:
     """Effects that are part of the answer by their nature; `lines` are named in all."""
     out = list(OBSERVATIONALLY_EQUIVALENT.get(effect, ()))
-    reduced = state.reduced
-    if effect == "spectral_line" and "profile" not in reduced and lines >= _COMB:
+    blocks = state.blocks
+    if effect == "spectral_line" and "profile" not in blocks and lines >= _COMB:
         out.append("feedback_reset")
     if (
         effect == "dead_zone" and len(state.axes) == 1
     ):  # no other axis says whether the sample was lost
         out.append("held_samples")
     if effect == "dead_zone" and any(
-        may_be_cut_off(reduced)[state.axes.index(part.row[0])] for part in parts
+        may_be_cut_off(blocks)[state.axes.index(component.row[0])] for component in components
     ):
         out.append("rate_quantization")  # cut off towards zero, its cell of zero is twice as wide
-    if effect == "telegraph" and not any(part.candidate.view == "levels" for part in parts):
+    if effect == "telegraph" and not any(
+        component.candidate.statistic == "levels" for component in components
+    ):
         out.append("gauss_markov")  # two levels show in the means only
     if effect == "vibration_rectification":
-        vibration = reduced[f"channel_{parts[0].candidate.driver[0]}"].values
+        vibration = blocks[f"channel_{components[0].candidate.driver[0]}"].values
         good = np.isfinite(vibration)
         if np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1] > _LEVELS:
             out.append("g_sensitivity")

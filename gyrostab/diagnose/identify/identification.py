@@ -43,9 +43,9 @@ class Identification:
     driver : tuple of str
         Channels of the log that it follows, in the order of the effect's channels.
     axes : tuple of str
-    parts : tuple of Part
+    components : tuple of Part
         Where it shows.
-    gain : float
+    evidence_nats : float
         On held-out time, with all others in the model [nats].
     threshold : float
         That it had to pass [nats].
@@ -58,8 +58,8 @@ class Identification:
     effect: str
     driver: tuple[str, ...]
     axes: tuple[str, ...]
-    parts: tuple[Component, ...]
-    gain: float
+    components: tuple[Component, ...]
+    evidence_nats: float
     threshold: float
     alternatives: tuple[str, ...] = ()
     surrogate_p: float = math.nan
@@ -74,20 +74,20 @@ class Unidentified:
     generic : str
         One of `GENERICS`.
     axes : tuple of str
-    gain : float
+    evidence_nats : float
         [nats]
     threshold : float
     candidates : tuple of str
         Effects that come nearest, or whose channel is missing.
-    parts : tuple of Part
+    components : tuple of Part
     """
 
     generic: str
     axes: tuple[str, ...]
-    gain: float
+    evidence_nats: float
     threshold: float
     candidates: tuple[str, ...] = ()
-    parts: tuple[Component, ...] = ()
+    components: tuple[Component, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Identifications:
 
     Attributes
     ----------
-    claims : tuple of Claim
+    identified : tuple of Claim
         Effects named, the strongest first.
     unknown : tuple of Unknown
     threshold : float
@@ -111,13 +111,13 @@ class Identifications:
     state : State
         With all that was named.
     folds : xarray.DataArray
-    tallies : Tallies
+    count_evidence : Tallies
     expected : tuple of Claim
         Effects that the simulation has as well, with the size and course that the recording gives
         them; they are in `state` too.
     """
 
-    claims: tuple[Identification, ...]
+    identified: tuple[Identification, ...]
     unknown: tuple[Unidentified, ...]
     threshold: float
     null_best: Array
@@ -125,13 +125,13 @@ class Identifications:
     candidates: tuple[Candidate, ...]
     state: State
     folds: xr.DataArray
-    tallies: CountEvidence = field(default_factory=lambda: CountEvidence({}))
+    count_evidence: CountEvidence = field(default_factory=lambda: CountEvidence({}))
     expected: tuple[Identification, ...] = ()
 
     @property
     def verdict(self) -> str:
         """What to call it: "no mismatch", "explained", "partly explained" or "unknown"."""
-        if not self.claims:
+        if not self.identified:
             return "unknown" if self.unknown else "no mismatch"
         return "partly explained" if self.unknown else "explained"
 
@@ -151,56 +151,65 @@ def add_identification(
             both = replace(
                 other,
                 axes=axes,
-                parts=(*other.parts, *one.parts),
-                gain=other.gain + one.gain,
+                components=(*other.components, *one.components),
+                evidence_nats=other.evidence_nats + one.evidence_nats,
                 alternatives=alike,
             )
             return [*chosen[:place], both, *chosen[place + 1 :]]
     return [*chosen, one]
 
 
-def with_axes_of(claim: Identification, again: Mapping[str, Sequence[Component]]) -> Identification:
+def with_axes_of(
+    identification: Identification, again: Mapping[str, Sequence[Component]]
+) -> Identification:
     """A claim without the axes on which it no longer brings anything, by its parts that were found with the others in the model."""
     seen = {
         axis
-        for part in again.get(claim.parts[0].candidate.key, [])
-        if part.gain > LEAST
-        for axis in part.row
+        for component in again.get(identification.components[0].candidate.key, [])
+        if component.evidence_nats > LEAST
+        for axis in component.row
     }
-    kept = tuple(part for part in claim.parts if set(part.row) <= seen)
+    kept = tuple(component for component in identification.components if set(component.row) <= seen)
     return (
-        replace(claim, parts=kept, axes=tuple(axis for axis in claim.axes if axis in seen))
+        replace(
+            identification,
+            components=kept,
+            axes=tuple(axis for axis in identification.axes if axis in seen),
+        )
         if kept
-        else claim
+        else identification
     )
 
 
 def _same(one: Identification, other: Identification) -> bool:
     lines = {
-        part.place
-        for claim in (one, other)
-        for part in claim.parts
-        if part.candidate.view == "line"
+        component.place
+        for identification in (one, other)
+        for component in identification.components
+        if component.candidate.statistic == "line"
     }
     return (one.effect, one.driver) == (other.effect, other.driver) and len(lines) < 2
 
 
 def find_unidentified(
-    key: str, parts: Sequence[Component], threshold: float, near: Sequence[str]
+    key: str, components: Sequence[Component], threshold: float, near: Sequence[str]
 ) -> Unidentified:
     """What a generic found; `near` are the effects that come nearest."""
     return Unidentified(
         key,
-        axes_of(parts, ()),
-        sum_evidence(parts),
+        axes_of(components, ()),
+        sum_evidence(components),
         threshold,
         tuple(dict.fromkeys(near)),
-        tuple(parts),
+        tuple(components),
     )
 
 
 def form_error(
-    parts: Sequence[Component], chosen: Sequence[Identification | Unidentified], *, share: float
+    components: Sequence[Component],
+    chosen: Sequence[Identification | Unidentified],
+    *,
+    share: float,
 ) -> float:
     """What errors of the form of what is named already may leave in the views and axes of these parts [nats].
 
@@ -209,34 +218,42 @@ def form_error(
     simple law, in place of mounts and decimators: what that leaves over frequency, a filter takes
     for its own.
     """
-    views = [
-        (_kind(part), set(part.row), part.candidate.effect)
-        for part in parts
-        if part.candidate.view != "line"
+    statistics = [
+        (_kind(component), set(component.row), component.candidate.effect)
+        for component in components
+        if component.candidate.statistic != "line"
     ]
     error = 0.0
     for one in chosen:
-        for part in one.parts:
+        for component in one.components:
             beside = [
                 effect
-                for view, axes, effect in views
-                if view in _leaves(part) and axes & set(part.row)
+                for statistic, axes, effect in statistics
+                if statistic in _leaves(component) and axes & set(component.row)
             ]
             of_spectrum = (
-                part.candidate.view == "power"
+                component.candidate.statistic == "power"
                 and isinstance(one, Identification)
                 and bool(one.driver)
                 and _FILTER in beside
             )
-            error += max(_SPECTRUM if of_spectrum else 0.0, share) * part.gain if beside else 0.0
+            error += (
+                max(_SPECTRUM if of_spectrum else 0.0, share) * component.evidence_nats
+                if beside
+                else 0.0
+            )
     return error
 
 
-def _leaves(part: Component) -> tuple[str, ...]:
+def _leaves(component: Component) -> tuple[str, ...]:
     """Views in which an error of the form of a part shows: a harmonic that is not quite where it should be is power, and shared."""
-    return ("order", "power", "cross") if part.candidate.view == "order" else (_kind(part),)
+    return (
+        ("order", "power", "cross")
+        if component.candidate.statistic == "order"
+        else (_kind(component),)
+    )
 
 
-def _kind(part: Component) -> str:
+def _kind(component: Component) -> str:
     """View of a part, for what it leaves to others: two levels are seen in the means."""
-    return "mean" if part.candidate.view == "levels" else part.candidate.view
+    return "mean" if component.candidate.statistic == "levels" else component.candidate.statistic

@@ -27,19 +27,19 @@ _LOUDER = (10.0, 100.0, 1e3, 1e4, 1e5)  # times the usual variance of the means
 _SURE = 3.0  # standard errors of the level after an event, from which on it is another than before
 
 
-def jumps_at_will(part: Component, state: State) -> bool:
+def jumps_at_will(component: Component, state: State) -> bool:
     """Whether a part is a jump at an instant of its own choice, and not one at which power came back."""
     if (
-        part.candidate.effect != _JUMP
-        or part.candidate.view != "mean"
-        or _INSTANT not in part.variant.values
+        component.candidate.effect != _JUMP
+        or component.candidate.statistic != "mean"
+        or _INSTANT not in component.variant.values
     ):
         return False
-    ends = state.reduced["restart_end"].values if "restart_end" in state.reduced else np.empty(0)
-    return not np.isclose(ends, float(part.variant.values[_INSTANT])).any()
+    ends = state.blocks["restart_end"].values if "restart_end" in state.blocks else np.empty(0)
+    return not np.isclose(ends, float(component.variant.values[_INSTANT])).any()
 
 
-def is_sudden(parts: Sequence[Component], state: State, *, error: float = 0.0) -> bool:
+def is_sudden(components: Sequence[Component], state: State, *, error: float = 0.0) -> bool:
     """Whether jumps step, rather than go over from one level to the other within some blocks.
 
     Where a straight way of four or eight blocks about the same instant says more on all axes
@@ -47,22 +47,26 @@ def is_sudden(parts: Sequence[Component], state: State, *, error: float = 0.0) -
 
     Parameters
     ----------
-    parts : sequence of Part
+    components : sequence of Part
         Of an effect.
     state : State
         With all else that is named.
     error : float
         What errors of the form of that may leave [nats].
     """
-    jumps = [part for part in parts if jumps_at_will(part, state)]
+    jumps = [component for component in components if jumps_at_will(component, state)]
     if not jumps:
         return True
-    step = sum(_evidence(part, state, 0) for part in jumps)
-    over = max(sum(_evidence(part, state, length) for part in jumps) for length in _BLOCKS)
-    return over - step <= _BETTER + error + _FORM * sum(max(part.gain, 0.0) for part in jumps)
+    step = sum(_evidence(component, state, 0) for component in jumps)
+    over = max(
+        sum(_evidence(component, state, length) for component in jumps) for length in _BLOCKS
+    )
+    return over - step <= _BETTER + error + _FORM * sum(
+        max(component.evidence_nats, 0.0) for component in jumps
+    )
 
 
-def is_lasting(parts: Sequence[Component], state: State) -> bool:
+def is_lasting(components: Sequence[Component], state: State) -> bool:
     """Whether the means stay on another level after jumps, rather than come back.
 
     What lasts for two blocks to a tenth of the record before or after the instant, and says more
@@ -71,31 +75,34 @@ def is_lasting(parts: Sequence[Component], state: State) -> bool:
 
     Parameters
     ----------
-    parts : sequence of Part
+    components : sequence of Part
         Of an effect.
     state : State
         With all else that is named.
     """
-    jumps = [part for part in parts if jumps_at_will(part, state)]
+    jumps = [component for component in components if jumps_at_will(component, state)]
     if not jumps:
         return True
-    step = sum(_evidence(part, state, 0) for part in jumps)
+    step = sum(_evidence(component, state, 0) for component in jumps)
     spans = _spans(jumps[0], state)
     if not spans:
         return True
     events = [
-        sum(float(np.logaddexp.reduce(_events(part, state, span)[0].log_weight)) for part in jumps)
+        sum(
+            float(np.logaddexp.reduce(_events(component, state, span)[0].log_weight))
+            for component in jumps
+        )
         for span in spans
     ]
     best = int(np.argmax(events))
     if events[best] - step <= _BETTER + np.log(len(spans)) + _FORM * sum(
-        max(part.gain, 0.0) for part in jumps
+        max(component.evidence_nats, 0.0) for component in jumps
     ):
         return True
-    return any(_other_level(part, state, spans[best]) for part in jumps)
+    return any(_other_level(component, state, spans[best]) for component in jumps)
 
 
-def levels(parts: Sequence[Component], state: State) -> bool:
+def levels(components: Sequence[Component], state: State) -> bool:
     """Whether jumps lead to levels, and are not the wildest of means that scatter more for a while.
 
     Waves slower than a block make means scatter, and of such means any two that follow each other
@@ -104,20 +111,20 @@ def levels(parts: Sequence[Component], state: State) -> bool:
 
     Parameters
     ----------
-    parts : sequence of Part
+    components : sequence of Part
         Of an effect.
     state : State
         With all else that is named.
     """
-    jumps = [part for part in parts if jumps_at_will(part, state)]
-    return not jumps or sum(_beside_scatter(part, state) for part in jumps) > -_BETTER
+    jumps = [component for component in components if jumps_at_will(component, state)]
+    return not jumps or sum(_beside_scatter(component, state) for component in jumps) > -_BETTER
 
 
-def _beside_scatter(part: Component, state: State) -> float:
+def _beside_scatter(component: Component, state: State) -> float:
     """Logarithm of the Bayes factor of a jump of about the size that it has, where the means may scatter more for a while [nats]."""
-    variances = _scatter(part, state)
-    jump = [component_mixture(part, state, variance=one) for one in variances]
-    none = [mean_mixture(state, part.row[0], [], variance=one) for one in variances]
+    variances = _scatter(component, state)
+    jump = [component_mixture(component, state, variance=one) for one in variances]
+    none = [mean_mixture(state, component.row[0], [], variance=one) for one in variances]
     with_it, without = (
         np.array([np.logaddexp.reduce(one.log_weight) for one in several])
         for several in (jump, none)
@@ -125,22 +132,22 @@ def _beside_scatter(part: Component, state: State) -> float:
     likely = jump[int(with_it.argmax())]
     size, covariance = likely.moments()
     wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0]))) * float(
-        np.ptp(part.variant.design)
+        np.ptp(component.variant.design)
     )
-    instants = np.log(len(part.candidate.variants))
+    instants = np.log(len(component.candidate.variants))
     return float(
         np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without) - np.log(wide) - 0.5 - instants
     )
 
 
-def _scatter(part: Component, state: State) -> list[Array]:
+def _scatter(component: Component, state: State) -> list[Array]:
     """White variances of the means: the usual one, and louder ones for stretches before, after and about the instant of a jump."""
-    axis, blocks = part.row[0], state.reduced.sizes["block"]
-    block = np.arange(blocks)
-    at = round(float(part.variant.values[_INSTANT]) / float(state.reduced.attrs["block_s"]))
-    lengths = [2**power for power in range(1, max(blocks, 2).bit_length())]
+    axis, block_count = component.row[0], state.blocks.sizes["block"]
+    block = np.arange(block_count)
+    at = round(float(component.variant.values[_INSTANT]) / float(state.blocks.attrs["block_s"]))
+    lengths = [2**power for power in range(1, max(block_count, 2).bit_length())]
     spans = {
-        (max(at - one, 0), min(at + two, blocks))
+        (max(at - one, 0), min(at + two, block_count))
         for length in lengths
         for one, two in ((length, length), (0, length), (length, 0))
     }
@@ -152,45 +159,47 @@ def _scatter(part: Component, state: State) -> list[Array]:
     ]
 
 
-def _spans(part: Component, state: State) -> list[tuple[int, int]]:
+def _spans(component: Component, state: State) -> list[tuple[int, int]]:
     """First block and the one behind the last of events that begin or end at the instant of a jump, and at no end of the record."""
-    block, blocks = float(state.reduced.attrs["block_s"]), state.reduced.sizes["block"]
-    at = round(float(part.variant.values[_INSTANT]) / block)
-    lengths = np.unique(np.geomspace(2.0, max(_SHORT * blocks, 8.0), _LENGTHS).astype(int)).tolist()
+    block, block_count = float(state.blocks.attrs["block_s"]), state.blocks.sizes["block"]
+    at = round(float(component.variant.values[_INSTANT]) / block)
+    lengths = np.unique(
+        np.geomspace(2.0, max(_SHORT * block_count, 8.0), _LENGTHS).astype(int)
+    ).tolist()
     both = [span for length in lengths for span in ((at, at + length), (at - length, at))]
     return [
         (first, stop)
         for first, stop in both
-        if first >= _LEAST_BESIDE and stop <= blocks - _LEAST_BESIDE
+        if first >= _LEAST_BESIDE and stop <= block_count - _LEAST_BESIDE
     ]
 
 
-def _events(part: Component, state: State, span: tuple[int, int]) -> tuple[Mixture, Mixture]:
+def _events(component: Component, state: State, span: tuple[int, int]) -> tuple[Mixture, Mixture]:
     """Sizes of an event of so many blocks; and those of it and of the level behind it."""
-    block = np.arange(state.reduced.sizes["block"])
-    shape = part.variant.design.shape
+    block = np.arange(state.blocks.sizes["block"])
+    shape = component.variant.design.shape
     during = np.broadcast_to(((block >= span[0]) & (block < span[1])).astype(np.float64), shape)
     behind = np.broadcast_to((block >= span[1]).astype(np.float64), shape)
     alone, both = (
-        replace(part.variant, design=one) for one in (during, np.concatenate([during, behind]))
+        replace(component.variant, design=one) for one in (during, np.concatenate([during, behind]))
     )
-    return component_mixture(part, state, alone), component_mixture(part, state, both)
+    return component_mixture(component, state, alone), component_mixture(component, state, both)
 
 
-def _other_level(part: Component, state: State, span: tuple[int, int]) -> bool:
+def _other_level(component: Component, state: State, span: tuple[int, int]) -> bool:
     """Whether the level behind an event is surely another than the one before it."""
-    size, covariance = _events(part, state, span)[1].moments()
+    size, covariance = _events(component, state, span)[1].moments()
     return bool(abs(size[-1]) > _SURE * np.sqrt(covariance[-1, -1]))
 
 
-def _evidence(part: Component, state: State, length: int) -> float:
+def _evidence(component: Component, state: State, length: int) -> float:
     """Logarithm of the evidence of a level that goes over within so many blocks, whatever its size; 0 for the jump itself."""
-    variant = part.variant
+    variant = component.variant
     if length:
-        block = float(state.reduced.attrs["block_s"])
-        middle = (np.arange(state.reduced.sizes["block"]) + 0.5) * block - float(
+        block = float(state.blocks.attrs["block_s"])
+        middle = (np.arange(state.blocks.sizes["block"]) + 0.5) * block - float(
             variant.values[_INSTANT]
         )
         way = np.clip(middle / (length * block) + 0.5, 0.0, 1.0)
         variant = replace(variant, design=np.broadcast_to(way, variant.design.shape))
-    return float(np.logaddexp.reduce(component_mixture(part, state, variant).log_weight))
+    return float(np.logaddexp.reduce(component_mixture(component, state, variant).log_weight))

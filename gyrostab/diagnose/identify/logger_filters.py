@@ -38,7 +38,7 @@ _APART, _FORM = (
 
 
 def without_slopes(
-    passing: list[str], parts: Mapping[str, list[Component]], state: State, folds: xr.DataArray
+    passing: list[str], components: Mapping[str, list[Component]], state: State, folds: xr.DataArray
 ) -> list[str]:
     """Keys without lines that are gone, or nearly so, when the spectrum is straightened by a filter that passes as well.
 
@@ -46,48 +46,58 @@ def without_slopes(
     average, look like one. Lines that stay come before the filter: what they leave in their bands,
     many of them, has a broad form too.
     """
-    lines = [key for key in passing if parts[key][0].candidate.view == "line"]
+    lines = [key for key in passing if components[key][0].candidate.statistic == "line"]
     filters = [
         key
         for key in passing
-        if any(is_filter(part.candidate.view, part.variant) for part in parts[key])
+        if any(
+            is_filter(component.candidate.statistic, component.variant)
+            for component in components[key]
+        )
     ]
     if not lines or not filters:
         return passing
-    trial = condition_on(state, list(parts[filters[0]]))
-    again = compute_evidence(_candidates(parts, lines), trial.reduced, trial, folds)
-    left = {one.candidate.key: float(np.maximum(one.gain[0], 0.0).sum()) for one in again}
-    before = {key: sum(max(part.gain, 0.0) for part in parts[key]) for key in lines}
+    trial = condition_on(state, list(components[filters[0]]))
+    again = compute_evidence(_candidates(components, lines), trial.blocks, trial, folds)
+    left = {one.candidate.key: float(np.maximum(one.evidence_nats[0], 0.0).sum()) for one in again}
+    before = {
+        key: sum(max(component.evidence_nats, 0.0) for component in components[key])
+        for key in lines
+    }
     real = {key for key in lines if left.get(key, 0.0) > _KEPT * before[key]}
     return [
         key for key in passing if (key in real if key in lines else key not in filters or not real)
     ]
 
 
-def on_all_axes(parts: Sequence[Component], state: State) -> bool:
+def on_all_axes(components: Sequence[Component], state: State) -> bool:
     """Whether one filter suits all axes: they pass the same logger, so that it takes the same share of the noise of each.
 
     The share of the strongest part is fitted on every axis, also on those that do not show it, and
     once for all of them.
     """
-    shown = [part for part in parts if is_filter(part.candidate.view, part.variant)]
+    shown = [
+        component
+        for component in components
+        if is_filter(component.candidate.statistic, component.variant)
+    ]
     if not shown:
         return True
-    first = max(shown, key=lambda part: part.gain)
+    first = max(shown, key=lambda component: component.evidence_nats)
     share, error = np.array(
         [component_size(replace(first, row=(axis,)), state) for axis in state.axes]
     ).T
     weight = error**-2.0
     apart = 0.5 * float((weight * (share - (weight * share).sum() / weight.sum()) ** 2).sum())
-    return apart <= _APART + _FORM * sum(max(part.gain, 0.0) for part in shown)
+    return apart <= _APART + _FORM * sum(max(component.evidence_nats, 0.0) for component in shown)
 
 
-def _candidates(parts: Mapping[str, list[Component]], keys: Iterable[str]) -> list[Candidate]:
-    return [parts[key][0].candidate for key in keys]
+def _candidates(components: Mapping[str, list[Component]], keys: Iterable[str]) -> list[Candidate]:
+    return [components[key][0].candidate for key in keys]
 
 
 def filter_sizes(
-    parts: Sequence[Component], state: State
+    components: Sequence[Component], state: State
 ) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
     """Cutoff or length of a filter, and the words beside it, by the likelihood of the powers of all its axes with free noise.
 
@@ -99,17 +109,16 @@ def filter_sizes(
     others : dict of str to float
         Order, and what the samples are.
     """
-    kind = effects()[parts[0].candidate.effect]
-    fits = [_fit(part.row[0], state) for part in parts]
+    kind = effects()[components[0].candidate.effect]
+    fits = [_fit(component.row[0], state) for component in components]
 
     def likelihood(values: Mapping[str, Any]) -> float:
         filtered = (
-            band_columns(state.reduced)
-            * response_of(kind.example(**values), state.reduced)[:, None]
+            band_columns(state.blocks) * response_of(kind.example(**values), state.blocks)[:, None]
         )
         return sum(_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
 
-    family = [one.values for one in parts[0].candidate.variants if is_filter("power", one)]
+    family = [one.values for one in components[0].candidate.variants if is_filter("power", one)]
     log = [likelihood(one) for one in family]
     best = family[int(np.argmax(log))]
     name = "cutoff" if best["cutoff"] else "length"
@@ -174,16 +183,16 @@ def _of_all(sharp: tuple[float, float], tried: Sequence[tuple[float, float]]) ->
 
 def _fit(axis: str, state: State) -> tuple[Fit, Array]:
     """Powers of an axis averaged over the record, with the noise and what else is named free; and how gaps mix the bands of the noise."""
-    reduced = state.reduced
+    blocks = state.blocks
     row = state.axes.index(axis)
     power, shape = (
-        reduced[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
+        blocks[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
     )
     use = np.where(
         np.isfinite(power) & np.isfinite(shape) & ~state.masked[row][:, None], shape, 0.0
     )
     total = np.maximum(use.sum(axis=0), 1e-300)
-    common, alone = (one[row] for one in common_variance(reduced))
+    common, alone = (one[row] for one in common_variance(blocks))
     each = np.nansum(alone, axis=1)
     share = min(1.0, float((each / (1.0 + common * each)).sum() / max(np.nansum(shape), 1e-300)))
 
@@ -192,8 +201,8 @@ def _fit(axis: str, state: State) -> tuple[Fit, Array]:
             (use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total
         )
 
-    whole = mean(in_place(reduced)[row, :, None])
-    width = (reduced["band_high"] - reduced["band_low"]).values
+    whole = mean(in_place(blocks)[row, :, None])
+    width = (blocks["band_high"] - blocks["band_low"]).values
     seen = np.diag(whole) + np.outer(1.0 - whole, width / width.sum())
     beside = [mean(one) for one in state.given.get(("power", axis), [])]
     free = (
@@ -203,7 +212,7 @@ def _fit(axis: str, state: State) -> tuple[Fit, Array]:
     )
     return Fit(
         mean(power),
-        seen @ band_columns(reduced),
+        seen @ band_columns(blocks),
         total * share,
         beside=free,
         start=mean(state.weight[row]),

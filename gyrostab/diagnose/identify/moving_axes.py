@@ -48,12 +48,12 @@ _LEFT = 0.1
 _KEPT = ("mean", "power", "cross")
 
 
-def moving_blocks(reduced: xr.Dataset) -> NDArray[np.bool_]:
+def moving_blocks(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks in which an axis moves, of those axes that somewhere move far above their scatter at rest.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`.
 
     Returns
@@ -68,7 +68,7 @@ def moving_blocks(reduced: xr.Dataset) -> NDArray[np.bool_]:
     >>> moving_blocks(reduce_log(make_log(rate, rate=100.0, unit="deg/h"), block="5s")).sum(axis=1)
     array([ 0, 24])
     """
-    means = reduced["mean"].transpose("axis", "block").values
+    means = blocks["mean"].transpose("axis", "block").values
     return np.stack([_moving(row) for row in means])
 
 
@@ -114,7 +114,9 @@ def _core(mean: Array) -> tuple[float, float]:
     return float(np.median(ordered[first : first + size])), float(width[first]) / _CORE_WIDTH
 
 
-def unexplained_motion(reduced: xr.Dataset, claims: Iterable[Identification]) -> NDArray[np.bool_]:
+def unexplained_motion(
+    blocks: xr.Dataset, identified: Iterable[Identification]
+) -> NDArray[np.bool_]:
     """Moving blocks, (axis, block), of the axes on which no named effect accounts for the means.
 
     What stands for a mean must leave next to nothing of the motion. It is not enough that it brings
@@ -123,23 +125,30 @@ def unexplained_motion(reduced: xr.Dataset, claims: Iterable[Identification]) ->
 
     Parameters
     ----------
-    reduced : xarray.Dataset
-    claims : iterable of Claim
+    blocks : xarray.Dataset
+    identified : iterable of Claim
     """
-    parts = [part for claim in claims for part in claim.parts]
-    told = {axis for part in parts if part.candidate.view in _MEANS for axis in part.row}
-    moving = moving_blocks(reduced)
-    for row, axis in enumerate(map(str, reduced["axis"].values)):
+    components = [
+        component for identification in identified for component in identification.components
+    ]
+    told = {
+        axis
+        for component in components
+        if component.candidate.statistic in _MEANS
+        for axis in component.row
+    }
+    moving = moving_blocks(blocks)
+    for row, axis in enumerate(map(str, blocks["axis"].values)):
         columns = [
             column
-            for part in parts
-            if part.candidate.view in _FITTED and part.row == (axis,)
-            for column in mean_columns(part.variant, row)
+            for component in components
+            if component.candidate.statistic in _FITTED and component.row == (axis,)
+            for column in mean_columns(component.variant, row)
         ]
         if axis in told or (
             columns
             and _accounted(
-                reduced["mean"].sel(axis=axis).values, moving[row], np.stack(columns, axis=1)
+                blocks["mean"].sel(axis=axis).values, moving[row], np.stack(columns, axis=1)
             )
         ):
             moving[row] = False
@@ -162,7 +171,7 @@ def _accounted(mean: Array, moving: NDArray[np.bool_], columns: Array) -> bool:
 
 def without_motion(
     log: xr.Dataset,
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     moving: NDArray[np.bool_],
     *,
     restart_gap: Any = 5.0,
@@ -173,17 +182,17 @@ def without_motion(
     Parameters
     ----------
     log : xarray.Dataset
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         The log, from `reduce_log`.
     moving : ndarray of bool, shape (axis, block)
     restart_gap, progress
         As for `reduce_log`.
     """
-    same = f"{reduced.attrs['block_samples']}samples"
+    same = f"{blocks.attrs['block_samples']}samples"
     out = reduce_log(log, block=same, restart_gap=restart_gap, left_out=moving, progress=progress)
-    out = out.assign({f"measured_{one}": reduced[one] for one in _KEPT if one in reduced})
+    out = out.assign({f"measured_{one}": blocks[one] for one in _KEPT if one in blocks})
     out = out.drop_dims([dim for dim in ("gap", "restart") if dim in out.dims]).assign(
-        {one: reduced[one] for one in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
+        {one: blocks[one] for one in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
     )
     out["moving"] = (
         ("axis", "block"),

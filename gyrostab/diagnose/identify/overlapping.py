@@ -16,21 +16,21 @@ from gyrostab.diagnose.predict.search import Found
 __all__ = ["found_again", "layers"]
 
 
-def layers(parts: Sequence[Component]) -> list[list[Component]]:
+def layers(components: Sequence[Component]) -> list[list[Component]]:
     """Parts by how often their view, row and witness have come before."""
     out: list[list[Component]] = []
     seen: Counter[tuple[object, ...]] = Counter()
-    for part in parts:
-        place = part.candidate.view, part.row, part.candidate.witness
+    for component in components:
+        place = component.candidate.statistic, component.row, component.candidate.witness
         if seen[place] == len(out):
             out.append([])
-        out[seen[place]].append(part)
+        out[seen[place]].append(component)
         seen[place] += 1
     return out
 
 
 def found_again(
-    parts: Sequence[Component],
+    components: Sequence[Component],
     first: Sequence[Component],
     state: State,
     gains: Callable[[Sequence[Candidate], State], list[Found]],
@@ -42,7 +42,7 @@ def found_again(
 
     Parameters
     ----------
-    parts : sequence of Part
+    components : sequence of Part
         Of the claim.
     first : sequence of Part
         What was found of it with nothing of the claim in the model.
@@ -52,10 +52,10 @@ def found_again(
         Gains of candidates in a state.
     """
     out = [list(first)]
-    weight, key = state.weight, parts[0].candidate.key
-    axes = {axis for part in parts for axis in part.row}
-    for before, layer in pairwise(layers(parts)):
+    weight, key = state.weight, components[0].candidate.key
+    axes = {axis for component in components for axis in component.row}
+    for before, layer in pairwise(layers(components)):
         state = replace(condition_on(state, before), weight=weight)
         again = by_key(gains(tried_again(layer), state)).get(key, [])
-        out.append([part for part in again if set(part.row) & axes])
+        out.append([component for component in again if set(component.row) & axes])
     return out

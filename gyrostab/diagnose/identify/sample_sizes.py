@@ -23,17 +23,17 @@ _LAW = 0.1
 Pair = tuple[float, float]
 
 
-def line_size(reduced: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
+def line_size(blocks: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
     """Amplitude [degree hour-1] and frequency [Hz] of a line, each with its error, from the power about it that is above the level."""
     from gyrostab.diagnose.evidence.spectral_lines import line_skirt, local_level
 
-    lines = reduced["line_frequency"].values
-    weight = reduced["line_weight"].sel(axis=axis).values
-    power = reduced["line_power"].sel(axis=axis).transpose("part", "line").values
+    lines = blocks["line_frequency"].values
+    weight = blocks["line_weight"].sel(axis=axis).values
+    power = blocks["line_power"].sel(axis=axis).transpose("part", "line").values
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
     level = local_level(total[None, None])[0, 0]
-    near = line_skirt(reduced, axis, place)
+    near = line_skirt(blocks, axis, place)
     step = float(np.diff(lines[:2])[0])
     above = total[near] - level[near]
     square = 4.0 * max(float(above.sum()) * step, 0.0)
@@ -45,28 +45,28 @@ def line_size(reduced: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
 
 
 def sample_count_sizes(
-    effect: str, mark: str, axis: str, reduced: xr.Dataset, tallies: CountEvidence
+    effect: str, mark: str, axis: str, blocks: xr.Dataset, count_evidence: CountEvidence
 ) -> dict[str, Pair]:
     """Parameters of an effect on the distribution."""
     from scipy.stats import norm
 
-    samples = max(float(reduced["samples"].sel(axis=axis).sum()), 1.0)
-    rate = float(reduced.attrs["sampling_rate_hz"])
+    samples = max(float(blocks["samples"].sel(axis=axis).sum()), 1.0)
+    rate = float(blocks.attrs["sampling_rate_hz"])
     hours = samples / rate / 3600.0
     if mark == "lattice":
-        return {"step": (float(reduced["lattice"].sel(axis=axis)), 0.0)}
-    row = [str(one) for one in reduced["axis"].values].index(axis)
-    usual = float(tallies.of[mark][0][row].sum()) if mark in tallies.of else 0.0
-    count = max(float(reduced[mark].sel(axis=axis).sum()) - usual, 1.0)
-    spread = _spread(reduced, axis)
+        return {"step": (float(blocks["lattice"].sel(axis=axis)), 0.0)}
+    row = [str(one) for one in blocks["axis"].values].index(axis)
+    usual = float(count_evidence.of[mark][0][row].sum()) if mark in count_evidence.of else 0.0
+    count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
+    spread = _spread(blocks, axis)
     error = math.sqrt(count + usual)
     if effect == "spikes":
         count = max(
-            float(reduced["peaks"].sel(axis=axis).where(reduced[mark].sel(axis=axis) > 0).sum()),
+            float(blocks["peaks"].sel(axis=axis).where(blocks[mark].sel(axis=axis) > 0).sum()),
             1.0,
         )
         error = math.sqrt(count)
-        told = _outliers(reduced, axis)
+        told = _outliers(blocks, axis)
         if told is None:  # no block was steady enough to have a kurtosis
             return {"per_hour": (count / hours, error / hours)}
         seen, size, many = told
@@ -79,10 +79,10 @@ def sample_count_sizes(
         }
     if effect == "held_samples":
         usual = (
-            usual if float(reduced["lattice"].sel(axis=axis)) > 0.0 else 0.0
+            usual if float(blocks["lattice"].sel(axis=axis)) > 0.0 else 0.0
         )  # without a lattice chance makes none
-        count = max(float(reduced[mark].sel(axis=axis).sum()) - usual, 1.0)
-        runs = _held_runs(reduced, axis, mark, usual)
+        count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
+        runs = _held_runs(blocks, axis, mark, usual)
         length = max(count / runs, 1.0) / rate  # of a geometric law: scattered by itself
         return {
             "per_hour": (runs / hours, math.sqrt(runs) / hours),
@@ -101,10 +101,10 @@ def sample_count_sizes(
     return {}
 
 
-def _held_runs(reduced: xr.Dataset, axis: str, mark: str, usual: float) -> float:
+def _held_runs(blocks: xr.Dataset, axis: str, mark: str, usual: float) -> float:
     """How often samples were held: runs of them, less those that a lattice makes by chance."""
     own = {
-        name: float(reduced[name].sel(axis=axis).sum())
+        name: float(blocks[name].sel(axis=axis).sum())
         for name in ("adjacent", "repeats", "repeat_runs", "zeros", "zero_runs", "filled")
     }
     if mark == "filled":
@@ -112,7 +112,7 @@ def _held_runs(reduced: xr.Dataset, axis: str, mark: str, usual: float) -> float
     return max(own["repeat_runs"] - usual * (1.0 - usual / max(own["adjacent"], 1.0)), 1.0)
 
 
-def _outliers(reduced: xr.Dataset, axis: str) -> tuple[float, float, float] | None:
+def _outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, float] | None:
     """Share of outliers that is seen, their rms size [degree hour-1], and outliers told by; None where nothing tells.
 
     Of a block of n samples of the deviation s with m outliers of the square u s^2 each, a = m u /
@@ -123,7 +123,7 @@ def _outliers(reduced: xr.Dataset, axis: str) -> tuple[float, float, float] | No
     from scipy.stats import norm
 
     count, excess, samples = (
-        reduced[name].sel(axis=axis).values.astype(np.float64)
+        blocks[name].sel(axis=axis).values.astype(np.float64)
         for name in ("peaks", "kurtosis", "samples")
     )
     good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
@@ -138,7 +138,7 @@ def _outliers(reduced: xr.Dataset, axis: str) -> tuple[float, float, float] | No
     tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * most)
     half, far = tails - 3.0, most - tails
     share = (half + np.sqrt(half**2 + far * half)) / far
-    variance = reduced["variance"].sel(axis=axis).values
+    variance = blocks["variance"].sel(axis=axis).values
     calm = (count == 0.0) & (
         variance > 0.0
     )  # most blocks may have spikes: the median of all would not be the noise
@@ -156,6 +156,6 @@ def _outliers(reduced: xr.Dataset, axis: str) -> tuple[float, float, float] | No
     return float(2.0 * norm.sf(limit / size)), size * math.sqrt(usual), float(many.sum())
 
 
-def _spread(reduced: xr.Dataset, axis: str) -> float:
+def _spread(blocks: xr.Dataset, axis: str) -> float:
     """Standard deviation of the samples about the means of their blocks [degree hour-1]."""
-    return math.sqrt(float(reduced["variance"].sel(axis=axis).median()))
+    return math.sqrt(float(blocks["variance"].sel(axis=axis).median()))

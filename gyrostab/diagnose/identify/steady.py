@@ -21,7 +21,7 @@ _APART, _FORM = (
 )  # nats by which they may differ by chance; and of the gain, what other effects may leave
 
 
-def is_always_present(part: Component, state: State) -> bool:
+def is_always_present(component: Component, state: State) -> bool:
     """Whether a part that has no course in time has the same size in all eighths of the record; true for what may come and go.
 
     What is loud while the tool turns, or for any other while, has a broad spectrum too, and is no
@@ -29,21 +29,21 @@ def is_always_present(part: Component, state: State) -> bool:
 
     Parameters
     ----------
-    part : Part
+    component : Part
     state : State
         With all else that is named.
     """
     if (
-        part.candidate.effect not in _STEADY
-        or part.candidate.view != "power"
-        or state.reduced.sizes["block"] < _PARTS * _LEAST
+        component.candidate.effect not in _STEADY
+        or component.candidate.statistic != "power"
+        or state.blocks.sizes["block"] < _PARTS * _LEAST
     ):
         return True
-    state = replace(state, weight=condition_on(state, [part]).weight)
+    state = replace(state, weight=condition_on(state, [component]).weight)
     size, error = np.array(
         [
-            _size(part, state, inside)
-            for inside in np.array_split(np.arange(state.reduced.sizes["block"]), _PARTS)
+            _size(component, state, inside)
+            for inside in np.array_split(np.arange(state.blocks.sizes["block"]), _PARTS)
         ]
     ).T
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0
@@ -51,18 +51,18 @@ def is_always_present(part: Component, state: State) -> bool:
     apart = 0.5 * float(
         (weight * (size - (weight * size).sum() / max(weight.sum(), 1e-300)) ** 2).sum()
     )
-    return apart <= _APART + _FORM * max(part.gain, 0.0)
+    return apart <= _APART + _FORM * max(component.evidence_nats, 0.0)
 
 
-def _size(part: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:
+def _size(component: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:
     """Size of the first column by some blocks alone, and its error."""
     outside = np.ones(state.masked.shape[1], np.bool_)
     outside[inside] = False
-    row = state.axes.index(part.row[0])
-    power = state.reduced["power"].isel(axis=row).values
+    row = state.axes.index(component.row[0])
+    power = state.blocks["power"].isel(axis=row).values
     if not (np.isfinite(power).any(axis=1) & ~state.masked[row] & ~outside).any():
         return 0.0, np.inf
     mean, covariance = component_mixture(
-        part, replace(state, masked=state.masked | outside)
+        component, replace(state, masked=state.masked | outside)
     ).moments()
     return float(mean[0]), float(np.sqrt(covariance[0, 0]))

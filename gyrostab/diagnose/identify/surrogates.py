@@ -25,13 +25,13 @@ _OF_AXES = ("misalignment",)  # effects that follow the means of other axes
 
 
 def passes_time_shift_test(
-    parts: Sequence[Component], state: State, folds: xr.DataArray, *, share: float = 0.01
+    components: Sequence[Component], state: State, folds: xr.DataArray, *, share: float = 0.01
 ) -> tuple[bool, float]:
     """Whether an effect explains more than almost all slid copies of its channel do.
 
     Parameters
     ----------
-    parts : sequence of Part
+    components : sequence of Part
         Where the effect shows.
     state : State
         What is in the model without it.
@@ -47,31 +47,31 @@ def passes_time_shift_test(
     p_value : float
         Share of the copies that did as well; NaN where there are too few copies that differ.
     """
-    own = [part for part in parts if _follows(part, state)]
+    own = [component for component in components if _follows(component, state)]
     if not own:
         return True, np.nan
-    blocks = state.reduced.sizes["block"]
-    shifts = np.unique(np.linspace(blocks * 0.05, blocks * 0.95, TIME_SHIFTS).astype(int))
+    block_count = state.blocks.sizes["block"]
+    shifts = np.unique(np.linspace(block_count * 0.05, block_count * 0.95, TIME_SHIFTS).astype(int))
     real, slid = 0.0, np.zeros(shifts.size)
     valid = np.ones(shifts.size, np.bool_)
-    for part in own:
-        copies = [_slid(part, state, int(shift)) for shift in shifts]
-        row = state.axes.index(part.row[0])
+    for component in own:
+        copies = [_slid(component, state, int(shift)) for shift in shifts]
+        row = state.axes.index(component.row[0])
         for number, copy in enumerate(copies):
-            if copy is None or _alike(copy, part.variant, row) > _ALIKE:
+            if copy is None or _alike(copy, component.variant, row) > _ALIKE:
                 valid[number] = False
-        chosen = [copy if copy is not None else part.variant for copy in copies]
+        chosen = [copy if copy is not None else component.variant for copy in copies]
         several = [
-            replace(part.candidate, effect=f"slid {number}", variants=(one,))
+            replace(component.candidate, effect=f"slid {number}", variants=(one,))
             for number, one in enumerate(chosen)
         ]
         found = compute_evidence(
-            [replace(part.candidate, variants=(part.variant,)), *several],
-            state.reduced,
+            [replace(component.candidate, variants=(component.variant,)), *several],
+            state.blocks,
             state,
             folds,
         )
-        values = np.array([one.gain[0, row] for one in found])
+        values = np.array([one.evidence_nats[0, row] for one in found])
         real += float(values[0])
         slid += values[1:]
     if valid.sum() < _FEWEST:
@@ -80,31 +80,31 @@ def passes_time_shift_test(
     return p_value <= share, p_value
 
 
-def _follows(part: Component, state: State) -> bool:
+def _follows(component: Component, state: State) -> bool:
     """Whether a part follows a channel in means or powers, or the means of other axes."""
-    if part.candidate.view not in ("mean", "power"):
+    if component.candidate.statistic not in ("mean", "power"):
         return False
-    return any(part.candidate.driver) or (
-        part.candidate.view == "mean" and part.candidate.effect in _OF_AXES
+    return any(component.candidate.driver) or (
+        component.candidate.statistic == "mean" and component.candidate.effect in _OF_AXES
     )
 
 
-def _slid(part: Component, state: State, shift: int) -> Variant | None:
+def _slid(component: Component, state: State, shift: int) -> Variant | None:
     """The variant with its channels slid around the record."""
-    candidate: Candidate = part.candidate
-    reduced = state.reduced.copy()
+    candidate: Candidate = component.candidate
+    blocks = state.blocks.copy()
     for name in filter(None, candidate.driver):
-        for key in {f"channel_{name}", f"fine_{name}"} & set(map(str, reduced.data_vars)):
-            reduced[key] = reduced[key].copy(data=np.roll(reduced[key].values, shift, axis=0))
+        for key in {f"channel_{name}", f"fine_{name}"} & set(map(str, blocks.data_vars)):
+            blocks[key] = blocks[key].copy(data=np.roll(blocks[key].values, shift, axis=0))
     for key in (
-        {"mean", "measured_mean"} & set(map(str, reduced.data_vars))
+        {"mean", "measured_mean"} & set(map(str, blocks.data_vars))
         if candidate.effect in _OF_AXES
         else ()
     ):
-        reduced[key] = reduced[key].copy(
-            data=np.roll(reduced[key].values, shift, axis=list(reduced[key].dims).index("block"))
+        blocks[key] = blocks[key].copy(
+            data=np.roll(blocks[key].values, shift, axis=list(blocks[key].dims).index("block"))
         )
-    made = variants_of(candidate, part.variant, reduced, state.baseline["coefficient"])
+    made = variants_of(candidate, component.variant, blocks, state.baseline["coefficient"])
     return made
 
 

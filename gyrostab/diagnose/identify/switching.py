@@ -24,7 +24,7 @@ _LED = 0.5
 
 
 def followed_first(
-    passing: list[str], parts: Mapping[str, Sequence[Component]], state: State
+    passing: list[str], components: Mapping[str, Sequence[Component]], state: State
 ) -> list[str]:
     """Keys without those of two levels, as long as a mean that follows a channel passes too and may be why they hop.
 
@@ -33,28 +33,37 @@ def followed_first(
     or where half of the course of the hops is its own.
     """
     led = [
-        part
+        component
         for key in passing
-        for part in parts[key]
-        if part.candidate.view == "mean" and any(part.candidate.driver)
+        for component in components[key]
+        if component.candidate.statistic == "mean" and any(component.candidate.driver)
     ]
-    return [key for key in passing if not any(_may_be_led(part, led, state) for part in parts[key])]
+    return [
+        key
+        for key in passing
+        if not any(_may_be_led(component, led, state) for component in components[key])
+    ]
 
 
-def _may_be_led(part: Component, led: Sequence[Component], state: State) -> bool:
-    beside = [one for one in led if part.candidate.view == _VIEW and one.row == part.row]
-    return any(one.gain >= part.gain or _share_of(part, one, state) > _LED for one in beside)
+def _may_be_led(component: Component, led: Sequence[Component], state: State) -> bool:
+    beside = [
+        one for one in led if component.candidate.statistic == _VIEW and one.row == component.row
+    ]
+    return any(
+        one.evidence_nats >= component.evidence_nats or _share_of(component, one, state) > _LED
+        for one in beside
+    )
 
 
-def _share_of(part: Component, other: Component, state: State) -> float:
+def _share_of(component: Component, other: Component, state: State) -> float:
     """Share of the variance of the first column of a part that the columns of another one on the same axis explain."""
-    row = state.axes.index(part.row[0])
+    row = state.axes.index(component.row[0])
     course, beside = (
-        mean_columns(part.variant, row)[0],
+        mean_columns(component.variant, row)[0],
         np.stack(mean_columns(other.variant, row), axis=1),
     )
     good = (
-        np.isfinite(state.reduced["mean"].values[row])
+        np.isfinite(state.blocks["mean"].values[row])
         & np.isfinite(beside).all(axis=1)
         & np.isfinite(course)
     )
@@ -66,7 +75,7 @@ def _share_of(part: Component, other: Component, state: State) -> float:
 
 
 def identify_switching(
-    passing: list[str], parts: Mapping[str, Sequence[Component]], state: State
+    passing: list[str], components: Mapping[str, Sequence[Component]], state: State
 ) -> list[str]:
     """Keys of biases that hop within blocks, unless a mean that follows a channel may be why; once on an axis.
 
@@ -75,10 +84,10 @@ def identify_switching(
     """
     return [
         key
-        for key in followed_first(passing, parts, state)
+        for key in followed_first(passing, components, state)
         if any(
-            part.variant.inside.size and not state.given.get(("inner", part.row[0]))
-            for part in parts[key]
+            component.variant.inside.size and not state.given.get(("inner", component.row[0]))
+            for component in components[key]
         )
     ]
 
@@ -106,55 +115,70 @@ def hops_alone(
         What jumps must bring beside the hops [nats].
     """
     out = list(chosen)
-    for part in [part for one in chosen for part in one.parts if part.candidate.view == _VIEW]:
-        jumps = _jumps_beside(part, out, state_with([]))
+    for component in [
+        component
+        for one in chosen
+        for component in one.components
+        if component.candidate.statistic == _VIEW
+    ]:
+        jumps = _jumps_beside(component, out, state_with([]))
         for some in [jumps, *([one] for one in jumps if len(jumps) > 1)]:
             if not some or not _holds(out, some):
                 continue
             beside, alone = (
-                state_with(_without(out, left_out)) for left_out in ([part], [part, *some])
+                state_with(_without(out, left_out))
+                for left_out in ([component], [component, *some])
             )
-            own = _of_blocks(part, beside)
+            own = _of_blocks(component, beside)
             if (
                 np.isfinite(own)
-                and own + sum(jump.gain for jump in some) < _of_blocks(part, alone) + threshold
+                and own + sum(jump.evidence_nats for jump in some)
+                < _of_blocks(component, alone) + threshold
             ):
-                instead = _sought(part, gains([part.candidate], alone))
-                out = [_with_part(one, part, instead) for one in _without(out, some)]
-                part = instead
+                instead = _sought(component, gains([component.candidate], alone))
+                out = [_with_part(one, component, instead) for one in _without(out, some)]
+                component = instead
     return out
 
 
-def _of_blocks(part: Component, state: State) -> float:
+def _of_blocks(component: Component, state: State) -> float:
     """What two levels gain in the means of blocks [nats], which can be compared: those of pieces know more, and are not always there."""
-    given = state.given.get(("mean", part.row[0]))
-    gain, _ = telegraph_evidence(
-        state.reduced,
+    given = state.given.get(("mean", component.row[0]))
+    evidence_nats, _ = telegraph_evidence(
+        state.blocks,
         state.baseline,
-        axis=part.row[0],
+        axis=component.row[0],
         given=np.stack(given, axis=-1) if given else None,
     )
-    return float(gain[0])
+    return float(evidence_nats[0])
 
 
-def _holds(chosen: Sequence[Identification | Unidentified], parts: Sequence[Component]) -> bool:
-    return all(any(part is own for one in chosen for own in one.parts) for part in parts)
+def _holds(
+    chosen: Sequence[Identification | Unidentified], components: Sequence[Component]
+) -> bool:
+    return all(
+        any(component is own for one in chosen for own in one.components)
+        for component in components
+    )
 
 
 def _with_part(
-    claim: Identification | Unidentified, part: Component, instead: Component
+    identification: Identification | Unidentified, component: Component, instead: Component
 ) -> Identification | Unidentified:
-    return replace(claim, parts=tuple(instead if own is part else own for own in claim.parts))
+    return replace(
+        identification,
+        components=tuple(instead if own is component else own for own in identification.components),
+    )
 
 
 def _jumps_beside(
-    part: Component, chosen: Sequence[Identification | Unidentified], state: State
+    component: Component, chosen: Sequence[Identification | Unidentified], state: State
 ) -> list[Component]:
     return [
         one
-        for claim in chosen
-        for one in claim.parts
-        if one.row == part.row and jumps_at_will(one, state)
+        for identification in chosen
+        for one in identification.components
+        if one.row == component.row and jumps_at_will(one, state)
     ]
 
 
@@ -164,44 +188,63 @@ def _without(
     """What is chosen without some of its parts; claims of which nothing is left are none."""
     out = []
     for one in chosen:
-        kept = tuple(part for part in one.parts if not any(part is other for other in left_out))
-        if len(kept) < len(one.parts):
-            gain = one.gain - sum(part.gain for part in one.parts) + sum(part.gain for part in kept)
-            one = replace(one, parts=kept, axes=axes_of(kept, list(one.axes)), gain=gain)
+        kept = tuple(
+            component
+            for component in one.components
+            if not any(component is other for other in left_out)
+        )
+        if len(kept) < len(one.components):
+            evidence_nats = (
+                one.evidence_nats
+                - sum(component.evidence_nats for component in one.components)
+                + sum(component.evidence_nats for component in kept)
+            )
+            one = replace(
+                one,
+                components=kept,
+                axes=axes_of(kept, list(one.axes)),
+                evidence_nats=evidence_nats,
+            )
             if not kept:
                 continue
         out.append(one)
     return out
 
 
-def _sought(part: Component, found: Sequence[Found]) -> Component:
+def _sought(component: Component, found: Sequence[Found]) -> Component:
     """The part as it was found anew."""
     (one,) = found
-    row = one.rows.index(part.row)
-    return replace(part, variant=one.best[row], gain=float(one.gain[0, row]))
+    row = one.rows.index(component.row)
+    return replace(component, variant=one.best[row], evidence_nats=float(one.evidence_nats[0, row]))
 
 
-def renewed(parts: Sequence[Component], part: Component) -> Component:
-    """A part with its gain among `parts`, which were found with all others in the model; and with the course that was found then."""
-    fresh = replace(part, gain=evidence_of(parts, part))
-    if part.candidate.view != _VIEW:
+def renewed(components: Sequence[Component], component: Component) -> Component:
+    """A part with its gain among `components`, which were found with all others in the model; and with the course that was found then."""
+    fresh = replace(component, evidence_nats=evidence_of(components, component))
+    if component.candidate.statistic != _VIEW:
         return fresh
     return next(
         (
             replace(fresh, variant=one.variant)
-            for one in parts
-            if (one.candidate.view, one.row) == (_VIEW, part.row)
+            for one in components
+            if (one.candidate.statistic, one.row) == (_VIEW, component.row)
         ),
         fresh,
     )
 
 
-def remove_telegraph_bias(naming: Identifications) -> tuple[Identifications, float]:
+def remove_telegraph_bias(identifications: Identifications) -> tuple[Identifications, float]:
     """The naming without biases of two levels, whose course no other time tells; and what these gain [nats]."""
     those = [
-        claim
-        for claim in naming.claims
-        if any(part.candidate.view == _VIEW for part in claim.parts)
+        identification
+        for identification in identifications.identified
+        if any(component.candidate.statistic == _VIEW for component in identification.components)
     ]
-    kept = tuple(claim for claim in naming.claims if claim not in those)
-    return replace(naming, claims=kept), sum(claim.gain for claim in those)
+    kept = tuple(
+        identification
+        for identification in identifications.identified
+        if identification not in those
+    )
+    return replace(identifications, identified=kept), sum(
+        identification.evidence_nats for identification in those
+    )

@@ -45,7 +45,7 @@ FIELDS = {
 
 
 def locate_mismatches(
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     baseline: xr.Dataset,
     nulls: Iterable[xr.Dataset] | NullScores,
     *,
@@ -60,7 +60,7 @@ def locate_mismatches(
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         Of `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
     baseline : xarray.Dataset
         What the simulation expects.
@@ -73,7 +73,7 @@ def locate_mismatches(
     Returns
     -------
     xarray.Dataset
-        By ``mismatch``, the surest first: ``view``, ``axes`` (parted by blanks), ``what``,
+        By ``mismatch``, the surest first: ``statistic``, ``axes`` (parted by blanks), ``what``,
         ``begin``, ``end`` [s since the start], ``start_time``, ``end_time``, ``tau_min_s``,
         ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``,
         ``ratio`` (observed over expected; in the mean and restart views the number of standard
@@ -86,8 +86,8 @@ def locate_mismatches(
 
     Examples
     --------
-    >>> found = locate(reduced, baseline, null_records(reduced, baseline, count=400, rng=rng))   # doctest: +SKIP
-    >>> found.view.values, found.axes.values, found.begin.values, found.end.values               # doctest: +SKIP
+    >>> found = locate(blocks, baseline, null_records(blocks, baseline, count=400, rng=rng))   # doctest: +SKIP
+    >>> found.statistic.values, found.axes.values, found.begin.values, found.end.values               # doctest: +SKIP
     (array(['davar']), array(['x']), array([1500.]), array([1800.]))
     """
     if not 0.0 < level < 0.5:
@@ -95,65 +95,74 @@ def locate_mismatches(
             f"level {level!r}: give the share of false alarms, above 0 and below 0.5, for instance 0.01"
         )
     null = nulls if isinstance(nulls, NullScores) else null_scores(baseline, nulls)
-    boxes: list[dict[str, Any]] = []
+    regions: list[dict[str, Any]] = []
     for name, score in STATISTICS.items():
-        if name not in null.views:
+        if name not in null.statistics:
             continue
         find = _mean_boxes if name == "mean" else _boxes
-        seen = levelled(reduced, baseline, louder(boxes)) if name == "restless" else reduced
-        boxes += find(name, score, seen, baseline, null, level)
-    return _table(merge_regions(boxes)[:_TOLD], reduced, null, level)
+        seen = (
+            levelled(blocks, baseline, louder(regions)) if name == "variance_stability" else blocks
+        )
+        regions += find(name, score, seen, baseline, null, level)
+    return _table(merge_regions(regions)[:_TOLD], blocks, null, level)
 
 
-def louder(boxes: Iterable[Mapping[str, Any]]) -> list[tuple[list[str], float, float]]:
+def louder(regions: Iterable[Mapping[str, Any]]) -> list[tuple[list[str], float, float]]:
     """Axes, begin and end [s] of the boxes that say how loud the noise is: to say that it changes would tell the same again."""
-    told = (box for box in boxes if box["view"] == "davar" and box["what"] in ("avar", "level"))
-    return [(str(box["axes"]).split(), float(box["begin"]), float(box["end"])) for box in told]
+    told = (
+        region
+        for region in regions
+        if region["view"] == "davar" and region["what"] in ("avar", "level")
+    )
+    return [
+        (str(region["axes"]).split(), float(region["begin"]), float(region["end"]))
+        for region in told
+    ]
 
 
 def _boxes(
-    name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
+    name: str, score: Any, blocks: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
 ) -> list[dict[str, Any]]:
-    scores = score(reduced, baseline)
-    z, critical = standardise(scores, null.views[name]), null.critical(name, level)
+    scores = score(blocks, baseline)
+    z, critical = standardise(scores, null.statistics[name]), null.critical(name, level)
     found = []
     for row in range(z.shape[0]):
         left = z[row].copy()
         for _ in range(_MOST):
-            box = _next_box(scores, row, left, z[row], critical)
-            if box is None:
+            region = _next_box(scores, row, left, z[row], critical)
+            if region is None:
                 break
-            box["p_value"] = float(null.p_value(name, box["z"]))
-            found.append(box)
+            region["p_value"] = float(null.p_value(name, region["z"]))
+            found.append(region)
     return found
 
 
 def _mean_boxes(
-    name: str, score: Any, reduced: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
+    name: str, score: Any, blocks: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
 ) -> list[dict[str, Any]]:
     """As `_boxes`; a step in one place pulls the mean of the record, so that each one found is taken off before the next is looked for."""
     critical, found = null.critical(name, level), []
     known = baseline["known_mean"].transpose("axis", "block").copy(deep=True)
-    open_rows = set(range(reduced.sizes["axis"]))
+    open_rows = set(range(blocks.sizes["axis"]))
     for _ in range(_MOST):
         now = baseline.assign(known_mean=known)
-        scores = score(reduced, now)
-        z = standardise(scores, null.views[name])
+        scores = score(blocks, now)
+        z = standardise(scores, null.statistics[name])
         for row in sorted(open_rows):
-            box = _next_box(scores, row, z[row].copy(), z[row], critical)
-            if box is None:
+            region = _next_box(scores, row, z[row].copy(), z[row], critical)
+            if region is None:
                 open_rows.discard(row)
                 continue
-            box["p_value"] = float(null.p_value(name, box["z"]))
-            inside = (reduced["begin"].values >= box["begin"] - 1e-9) & (
-                reduced["end"].values <= box["end"] + 1e-9
+            region["p_value"] = float(null.p_value(name, region["z"]))
+            inside = (blocks["begin"].values >= region["begin"] - 1e-9) & (
+                blocks["end"].values <= region["end"] + 1e-9
             )
-            box |= {
-                "estimate": region_mean(reduced, now, row, inside),
-                "tau_max_s": max(box["end"] - box["begin"], box["tau_min_s"]),
+            region |= {
+                "estimate": region_mean(blocks, now, row, inside),
+                "tau_max_s": max(region["end"] - region["begin"], region["tau_min_s"]),
             }
-            known.values[row] += np.where(inside, box["estimate"], 0.0)
-            found.append(box)
+            known.values[row] += np.where(inside, region["estimate"], 0.0)
+            found.append(region)
         if not open_rows:
             break
     return merge_wandering_regions(found)
@@ -173,7 +182,7 @@ def _next_box(
     begin, end, fine = _span(scores, free * sign, int(window))
     together, ratio = _stacked(scores, row, z * sign, fine, int(window))
     columns, reach = _columns(scores, together, ratio, int(column))
-    box = {
+    region = {
         "view": scores.attrs["view"],
         "axes": str(scores["axes"].values[row]),
         "what": str(scores["what"].values[column]),
@@ -198,7 +207,7 @@ def _next_box(
     overlap = (scores["begin"].values < end - 1e-9) & (scores["end"].values > begin + 1e-9)
     overlap[window] = True
     left[np.ix_(overlap, reach)] = np.nan
-    return box
+    return region
 
 
 def _span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float, NDArray[np.int64]]:
@@ -280,34 +289,34 @@ def _columns(
         upper += 1
     grown = np.arange(lower, upper + 1)
     excess = np.abs(ratio - 1.0) if scores.attrs["view"] == "davar" else np.abs(together)
-    box = grown[excess[grown] >= 0.25 * excess[column]]
+    region = grown[excess[grown] >= 0.25 * excess[column]]
     beside = _BESIDE_LINE if what[column] == "line" else 0
     if what[column] == "line":
         return np.array([column]), np.arange(
             max(lower - beside, 0), min(upper + beside + 1, what.size)
         )
     overlap = (low <= high[grown].max() * 1.01) & (high >= low[grown].min() * 0.99)
-    return box, np.flatnonzero(overlap)
+    return region, np.flatnonzero(overlap)
 
 
 def _table(
-    boxes: list[dict[str, Any]], reduced: xr.Dataset, null: NullScores, level: float
+    regions: list[dict[str, Any]], blocks: xr.Dataset, null: NullScores, level: float
 ) -> xr.Dataset:
     variables: dict[str, Any] = {}
     for field, units in FIELDS.items():
         kind = str if field in ("view", "axes", "what") else int if field == "sign" else float
-        values = np.array([box[field] for box in boxes], dtype=kind)
+        values = np.array([region[field] for region in regions], dtype=kind)
         variables[field] = ("mismatch", values, {"units": units} if units else {})
     start = (
-        np.datetime64(int(reduced.attrs["start_ns"]), "ns")
-        if "start_ns" in reduced.attrs
+        np.datetime64(int(blocks.attrs["start_ns"]), "ns")
+        if "start_ns" in blocks.attrs
         else np.datetime64("1970-01-01", "ns")
     )
     for field, edge in (("start_time", "begin"), ("end_time", "end")):
-        seconds = np.array([box[edge] for box in boxes], dtype=float)
+        seconds = np.array([region[edge] for region in regions], dtype=float)
         variables[field] = ("mismatch", start + np.rint(seconds * 1e9).astype("timedelta64[ns]"))
     attributes = {"level": level, "null_records": null.records}
-    attributes |= {f"critical_{name}": null.critical(name, level) for name in null.views}
+    attributes |= {f"critical_{name}": null.critical(name, level) for name in null.statistics}
     return xr.Dataset(
-        variables, coords={"mismatch": np.arange(1, len(boxes) + 1)}, attrs=attributes
+        variables, coords={"mismatch": np.arange(1, len(regions) + 1)}, attrs=attributes
     )

@@ -17,7 +17,7 @@ _KINDS = ("slow", "restless", "glide")
 _STEPS = 3  # boxes of one mean, beyond which it is said to wander
 
 
-def merge_regions(boxes: Sequence[Region]) -> list[Region]:
+def merge_regions(regions: Sequence[Region]) -> list[Region]:
     """Join boxes, the surest first; the surest of those that are joined gives its numbers.
 
     Boxes of different axes are one when they share most of their time; those of the same axes also
@@ -25,26 +25,26 @@ def merge_regions(boxes: Sequence[Region]) -> list[Region]:
 
     Parameters
     ----------
-    boxes : sequence of dict
+    regions : sequence of dict
         With the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
 
     Examples
     --------
-    >>> box = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 60.0, "tau_min_s": 0.01, "tau_max_s": 0.1,
+    >>> region = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 60.0, "tau_min_s": 0.01, "tau_max_s": 0.1,
     ...        "frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
-    >>> [(one["axes"], one["end"]) for one in merged([box, box | {"axes": "y", "z": 8.0}, box | {"begin": 60.0, "end": 90.0, "z": 7.0}])]
+    >>> [(one["axes"], one["end"]) for one in merged([region, region | {"axes": "y", "z": 8.0}, region | {"begin": 60.0, "end": 90.0, "z": 7.0}])]
     [('x y', 90.0)]
     """
     kept: list[Region] = []
-    for box in sorted(boxes, key=lambda one: (one["p_value"], -abs(one["z"]))):
+    for region in sorted(regions, key=lambda one: (one["p_value"], -abs(one["z"]))):
         for other in kept:
-            if not _alike(box, other):
+            if not _alike(region, other):
                 continue
-            if _shared(box, other) > _LIKE or _touching(box, other):
-                _join(other, box)
+            if _shared(region, other) > _LIKE or _touching(region, other):
+                _join(other, region)
                 break
         else:
-            kept.append(dict(box))
+            kept.append(dict(region))
     return kept
 
 
@@ -67,9 +67,9 @@ def _alike(one: Region, other: Region) -> bool:
     )
 
 
-def _kind(box: Region) -> str:
+def _kind(region: Region) -> str:
     """What is never one mismatch: inside of blocks and from one to the next, a level and its scatter, lines that stand and that move."""
-    kind = str(box["what"]).split(" ")[0]
+    kind = str(region["what"]).split(" ")[0]
     return kind if kind in _KINDS else ""
 
 
@@ -92,33 +92,41 @@ def _touching(one: Region, other: Region) -> bool:
     )
 
 
-def _join(box: Region, other: Region) -> None:
-    if _shared(box, other) <= _LIKE:
-        box["begin"], box["end"] = min(box["begin"], other["begin"]), max(box["end"], other["end"])
-        if box["what"] != "line":
+def _join(region: Region, other: Region) -> None:
+    if _shared(region, other) <= _LIKE:
+        region["begin"], region["end"] = (
+            min(region["begin"], other["begin"]),
+            max(region["end"], other["end"]),
+        )
+        if region["what"] != "line":
             low, high = (
-                min(box["tau_min_s"], other["tau_min_s"]),
-                max(box["tau_max_s"], other["tau_max_s"]),
+                min(region["tau_min_s"], other["tau_min_s"]),
+                max(region["tau_max_s"], other["tau_max_s"]),
             )
-            box["tau_min_s"], box["tau_max_s"] = low, high
-    names = box["axes"].split()
-    box["axes"] = " ".join([*names, *(name for name in other["axes"].split() if name not in names)])
+            region["tau_min_s"], region["tau_max_s"] = low, high
+    names = region["axes"].split()
+    region["axes"] = " ".join(
+        [*names, *(name for name in other["axes"].split() if name not in names)]
+    )
 
 
-def merge_wandering_regions(boxes: Sequence[Region]) -> list[Region]:
+def merge_wandering_regions(regions: Sequence[Region]) -> list[Region]:
     """Boxes of the mean, those of an axis as one when there are many: its mean wanders, and the largest gives the numbers.
 
     Parameters
     ----------
-    boxes : sequence of dict
+    regions : sequence of dict
         Boxes of the mean view, one axis each.
     """
     found = []
-    for axes in dict.fromkeys(box["axes"] for box in boxes):
-        mine = [box for box in boxes if box["axes"] == axes]
+    for axes in dict.fromkeys(region["axes"] for region in regions):
+        mine = [region for region in regions if region["axes"] == axes]
         if len(mine) > _STEPS:
-            largest = max(mine, key=lambda box: abs(box["z"]))
-            begin, end = min(box["begin"] for box in mine), max(box["end"] for box in mine)
+            largest = max(mine, key=lambda region: abs(region["z"]))
+            begin, end = (
+                min(region["begin"] for region in mine),
+                max(region["end"] for region in mine),
+            )
             mine = [largest | {"sign": 0, "begin": begin, "end": end, "tau_max_s": end - begin}]
         found += mine
     return found

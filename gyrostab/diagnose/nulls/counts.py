@@ -18,13 +18,13 @@ COARSE = 1.5  # standard deviations: a lattice step from which on the values are
 
 
 def null_counts(
-    reduced: xr.Dataset, sd: Array, count: int, rng: np.random.Generator
+    blocks: xr.Dataset, sd: Array, count: int, rng: np.random.Generator
 ) -> dict[str, NDArray[np.int64]]:
     """Outliers, repeats, extremes and zeros as Gaussian noise on the lattice has them.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         The recording, whose blocks, gaps and lattices are taken.
     sd : ndarray, shape (axis, 2)
         Standard deviation of a sample, and of the difference of two neighbours [degree hour-1].
@@ -36,23 +36,23 @@ def null_counts(
     -------
     dict of str to ndarray of int, shape (record, axis, block)
     """
-    samples = reduced["samples"].transpose("axis", "block").values.astype(np.int64)
-    adjacent = reduced["adjacent"].transpose("axis", "block").values.astype(np.int64)
-    mean = _filled(reduced["mean"].transpose("axis", "block").values)
+    samples = blocks["samples"].transpose("axis", "block").values.astype(np.int64)
+    adjacent = blocks["adjacent"].transpose("axis", "block").values.astype(np.int64)
+    mean = _filled(blocks["mean"].transpose("axis", "block").values)
     repeat, zero = np.zeros(samples.shape), np.zeros(samples.shape)
-    cut = cut_off(reduced)
-    for axis, step in enumerate(reduced["lattice"].values):
+    cut = cut_off(blocks)
+    for axis, step in enumerate(blocks["lattice"].values):
         if step > 0.0:
             repeat[axis], zero[axis] = _lattice_chances(
                 mean[axis], float(step), sd[axis], cut=bool(cut[axis])
             )
-        if not reduced["zeros"].values[axis].any():
+        if not blocks["zeros"].values[axis].any():
             zero[axis] = 0.0
         own = zero[axis] ** 2 / (2.0 if cut[axis] else 1.0)  # of two cells in one
         repeat[axis] = np.maximum(repeat[axis] - own, 0.0)
     size = (count, *samples.shape)
     zeros = rng.binomial(samples, np.broadcast_to(zero, size))
-    filled = _filled_zeros(reduced, zeros, samples, rng)
+    filled = _filled_zeros(blocks, zeros, samples, rng)
     return {
         "outliers": rng.poisson(
             np.broadcast_to(
@@ -63,19 +63,19 @@ def null_counts(
         "zeros": zeros,
         "stuck": zeros - filled,
         "filled": filled,
-        "extremes": _extremes(reduced, sd, samples, count, rng),
+        "extremes": _extremes(blocks, sd, samples, count, rng),
     }
 
 
 def _filled_zeros(
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     zeros: NDArray[np.int64],
     samples: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
     """Of so many zeros (record, axis, block) those that look like samples filled with zeros, where chance alone brings zeros together."""
-    subset = reduced["axes_at_once"].transpose("subset", "axis").values.astype(bool)
-    number = reduced["at_once"].transpose("subset", "block").values.astype(np.int64)
+    subset = blocks["axes_at_once"].transpose("subset", "axis").values.astype(bool)
+    number = blocks["at_once"].transpose("subset", "block").values.astype(np.int64)
     share = zeros / np.maximum(samples, 1)
     if len(samples) == 1:
         together = rng.binomial(zeros, 1.0 - (1.0 - share) ** 2)  # a zero has another one beside it
@@ -127,11 +127,11 @@ def _before_cut(mean: Array, step: float, scatter: float) -> Array:
 
 
 def _extremes(
-    reduced: xr.Dataset, sd: Array, samples: NDArray[np.int64], count: int, rng: np.random.Generator
+    blocks: xr.Dataset, sd: Array, samples: NDArray[np.int64], count: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """The smallest and the largest value, each in the blocks where it falls: once, but for a lattice that is not fine."""
     out = np.zeros((count, *samples.shape), np.int64)
-    for axis, step in enumerate(reduced["lattice"].values):
+    for axis, step in enumerate(blocks["lattice"].values):
         total = int(samples[axis].sum())
         if not total:
             continue

@@ -41,7 +41,7 @@ _COMMON = 0.9  # of the scatter of a band that it may share with others
 class _Frame(NamedTuple):
     """What all null records share, as arrays (axis, block, ...)."""
 
-    reduced: xr.Dataset
+    blocks: xr.Dataset
     baseline: xr.Dataset
     shape: Array
     ties: list[
@@ -57,7 +57,7 @@ class _Frame(NamedTuple):
 
 
 def null_records(
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     baseline: xr.Dataset,
     *,
     count: int = 400,
@@ -68,7 +68,7 @@ def null_records(
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         The recording, whose blocks, gaps and channels are taken.
     baseline : xarray.Dataset
         From `calibrate`, `from_model` or `from_simulation`.
@@ -82,19 +82,19 @@ def null_records(
     Yields
     ------
     xarray.Dataset
-        As `reduced`, with a leading dimension ``record`` where it is random.
+        As `blocks`, with a leading dimension ``record`` where it is random.
 
     Examples
     --------
     >>> from gyrostab.diagnose.baseline.calibrate import calibrate
     >>> from gyrostab.diagnose.reduce.block_statistics import reduce_log
     >>> from gyrostab.simulate import simulate
-    >>> reduced = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0))
-    >>> nulls = list(null_records(reduced, calibrate(reduced), count=40, rng=np.random.default_rng(1)))
+    >>> blocks = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0))
+    >>> nulls = list(null_records(blocks, calibrate(blocks), count=40, rng=np.random.default_rng(1)))
     >>> [one.sizes["record"] for one in nulls], nulls[0]["power"].dims
     ([25, 15], ('record', 'axis', 'block', 'band'))
     """
-    frame = _frame(reduced, baseline, rng)
+    frame = _frame(blocks, baseline, rng)
     for first in range(0, count, chunk):
         yield _draw(frame, min(chunk, count - first), rng)
 
@@ -103,11 +103,11 @@ def _ordered(data: xr.Dataset, name: str, *dims: str) -> Array:
     return np.asarray(data[name].transpose(*dims).values)
 
 
-def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) -> _Frame:
+def _frame(blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) -> _Frame:
     columns = _ordered(baseline, "columns", "axis", "block", "band", "noise")
     noise = np.einsum("abfn,an->abf", columns, baseline["square"].values)
     effects = _ordered(baseline, "spectrum", "axis", "block", "band") / noise
-    lines = line_columns(reduced)
+    lines = line_columns(blocks)
     sd = []
     for square in baseline["square"].values:
         density = lines @ square
@@ -115,8 +115,8 @@ def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) 
             [
                 np.sqrt(level)
                 for level in (
-                    _variance(reduced, density),
-                    2.0 * _variance(reduced, density, difference=True),
+                    _variance(blocks, density),
+                    2.0 * _variance(blocks, density, difference=True),
                 )
             ]
         )
@@ -129,14 +129,14 @@ def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) 
         np.column_stack([lines * square, peak])
         for square, peak in zip(baseline["square"].values, peaks, strict=True)
     ]
-    tails = np.array([_tails(reduced, one, rng) for one in density])
-    shape = _ordered(reduced, "shape", "axis", "block", "band")
+    tails = np.array([_tails(blocks, one, rng) for one in density])
+    shape = _ordered(blocks, "shape", "axis", "block", "band")
     ties = _ties(
         _ordered(baseline, "shape_alone", "axis", "block", "band"),
-        int(reduced.attrs["block_samples"]),
+        int(blocks.attrs["block_samples"]),
     )
     return _Frame(
-        reduced,
+        blocks,
         baseline,
         shape,
         ties,
@@ -144,7 +144,7 @@ def _frame(reduced: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) 
         effects,
         np.array(sd),
         tails,
-        shared_by(reduced, baseline),
+        shared_by(blocks, baseline),
     )
 
 
@@ -177,9 +177,9 @@ def _between(values: Array, ties: list[Array]) -> Iterator[tuple[Array, Array, A
         yield values[..., : tie.shape[-1]], values[..., apart : apart + tie.shape[-1]], tie
 
 
-def _tails(reduced: xr.Dataset, density: Array, rng: np.random.Generator) -> tuple[float, float]:
+def _tails(blocks: xr.Dataset, density: Array, rng: np.random.Generator) -> tuple[float, float]:
     """Kurtosis of full blocks of noise (line, term): memory widens its scatter, a resonance swings, the rounding of an angle has edges."""
-    size, rate = int(reduced.attrs["block_samples"]), float(reduced.attrs["sampling_rate_hz"])
+    size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
     shaped = np.zeros(size // 2 + 1)
     shaped[1 : len(density) + 1] = density[:, 1:].sum(axis=1)
     many = int(np.clip(_POOL // size, 200, 2000))
@@ -193,18 +193,18 @@ def _tails(reduced: xr.Dataset, density: Array, rng: np.random.Generator) -> tup
     return float(kurtosis.mean() - mean), float(kurtosis.std() / np.sqrt(variance))
 
 
-def _variance(reduced: xr.Dataset, density: Array, *, difference: bool = False) -> float:
+def _variance(blocks: xr.Dataset, density: Array, *, difference: bool = False) -> float:
     """Variance of a sample, or half of that of the difference of neighbours, from the density of every ordinate."""
-    rate = float(reduced.attrs["sampling_rate_hz"])
+    rate = float(blocks.attrs["sampling_rate_hz"])
     factor = (
-        1.0 - np.cos(2.0 * np.pi * reduced["line_frequency"].values / rate) if difference else 1.0
+        1.0 - np.cos(2.0 * np.pi * blocks["line_frequency"].values / rate) if difference else 1.0
     )
     return float((density * factor).mean() * rate)
 
 
 def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
-    reduced, baseline = frame.reduced, frame.baseline
-    axes, draws = reduced.sizes["axis"], baseline.sizes["draw"]
+    blocks, baseline = frame.blocks, frame.baseline
+    axes, draws = blocks.sizes["axis"], baseline.sizes["draw"]
     chosen = rng.integers(0, draws, (count, axes))
     squares = np.stack(
         [baseline["posterior"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1
@@ -234,7 +234,7 @@ def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
         rng,
     )[..., None]
     power *= swell
-    power[..., np.isnan(_ordered(reduced, "power", "axis", "block", "band"))] = np.nan
+    power[..., np.isnan(_ordered(blocks, "power", "axis", "block", "band"))] = np.nan
     found: dict[str, Any] = {
         "mean": (("axis", "block"), _means(frame, squares, slow, rng)),
         "power": (("axis", "block", "band"), power),
@@ -249,17 +249,17 @@ def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
     }
     found |= {
         name: (("axis", "block"), values)
-        for name, values in null_counts(reduced, frame.sd, count, rng).items()
+        for name, values in null_counts(blocks, frame.sd, count, rng).items()
     }
-    if "witness_cross" in reduced:
+    if "witness_cross" in blocks:
         found["witness_cross"] = (("axis", "witness", "block", "band"), _witness(frame, power, rng))
-    if "order" in reduced:
+    if "order" in blocks:
         found["order"] = (("axis", "block", "harmonic"), _orders(frame, expected, rng))
-    if "profile" in reduced:
+    if "profile" in blocks:
         found["profile"] = (("axis", "block", "phase"), _profiles(frame, count, rng))
-    return reduced.assign(
+    return blocks.assign(
         {
-            name: (("record", *dims), values, reduced[name].attrs)
+            name: (("record", *dims), values, blocks[name].attrs)
             for name, (dims, values) in found.items()
         }
     )
@@ -288,10 +288,10 @@ def _tied(shape: Array, ties: list[Array], mean: Array, rng: np.random.Generator
 
 def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator) -> Array:
     """Block means: white noise, random walk, flicker and what else is known to wander, as means over the blocks."""
-    reduced, baseline = frame.reduced, frame.baseline
-    n, step = reduced.sizes["block"], float(reduced.attrs["block_s"])
+    blocks, baseline = frame.blocks, frame.baseline
+    n, step = blocks.sizes["block"], float(blocks.attrs["block_s"])
     each = np.stack(
-        [white_variance(reduced, np.tile(unit, (len(slow[0]), 1))) for unit in np.eye(4)[:2]],
+        [white_variance(blocks, np.tile(unit, (len(slow[0]), 1))) for unit in np.eye(4)[:2]],
         axis=-1,
     )
     usual = np.einsum("abn,an->ab", each, baseline["square"].values[:, :2])
@@ -324,25 +324,25 @@ def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator)
                 rng.standard_normal((n, 2)), memory / step, float(rng.standard_normal())
             )
             total[place] += np.sqrt(square) * wander
-    total[..., np.isnan(_ordered(reduced, "mean", "axis", "block"))] = np.nan
+    total[..., np.isnan(_ordered(blocks, "mean", "axis", "block"))] = np.nan
     return np.asarray(total)
 
 
 def _lines(frame: _Frame, squares: Array, rng: np.random.Generator) -> Array:
     """Mean periodograms of the parts of the record."""
-    reduced = frame.reduced
-    weight = _ordered(reduced, "line_weight", "axis", "part")
-    parts, n = weight.shape[1], reduced.sizes["block"]
-    columns = line_columns(reduced)
-    part_of = np.arange(n) * parts // n
-    near = _ordered(reduced, "neighbours", "axis", "block")
-    frequency, bands = np.log(reduced["line_frequency"].values), np.log(reduced["frequency"].values)
+    blocks = frame.blocks
+    weight = _ordered(blocks, "line_weight", "axis", "part")
+    components, n = weight.shape[1], blocks.sizes["block"]
+    columns = line_columns(blocks)
+    part_of = np.arange(n) * components // n
+    near = _ordered(blocks, "neighbours", "axis", "block")
+    frequency, bands = np.log(blocks["line_frequency"].values), np.log(blocks["frequency"].values)
     plain = squares @ columns.T
     flat = plain.mean(axis=-1, keepdims=True)
-    out = np.full((*plain.shape[:2], parts, plain.shape[2]), np.nan)
-    for axis, part in np.ndindex(*weight.shape):
-        chosen = (part_of == part) & np.isfinite(near[axis])
-        if not (chosen.any() and weight[axis, part] > 0.0):
+    out = np.full((*plain.shape[:2], components, plain.shape[2]), np.nan)
+    for axis, component in np.ndindex(*weight.shape):
+        chosen = (part_of == component) & np.isfinite(near[axis])
+        if not (chosen.any() and weight[axis, component] > 0.0):
             continue
         share = near[axis, chosen].mean()
         over = frame.effects[axis, chosen].mean(axis=0)
@@ -354,12 +354,12 @@ def _lines(frame: _Frame, squares: Array, rng: np.random.Generator) -> Array:
                 over - frame.baseline["line_spectrum"].values[axis] / noise, 0.01 * over
             )
         effects = np.interp(frequency, bands, over)
-        out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
+        out[:, axis, component] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
         if "peaks" in frame.baseline:
-            out[:, axis, part] += frame.baseline["peaks"].values[axis]
+            out[:, axis, component] += frame.baseline["peaks"].values[axis]
     return (
         _leaked(
-            _gamma(weight[..., None], np.ones(out.shape), rng), int(reduced.attrs["block_samples"])
+            _gamma(weight[..., None], np.ones(out.shape), rng), int(blocks.attrs["block_samples"])
         )
         * out
     )
@@ -388,15 +388,15 @@ def _coherency(
 
 
 def _cross(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[np.complex128]:
-    names = [str(axis) for axis in frame.reduced["axis"].values]
-    one = [names.index(str(name)) for name in frame.reduced["first"].values]
-    other = [names.index(str(name)) for name in frame.reduced["second"].values]
+    names = [str(axis) for axis in frame.blocks["axis"].values]
+    one = [names.index(str(name)) for name in frame.blocks["first"].values]
+    other = [names.index(str(name)) for name in frame.blocks["second"].values]
     size = np.sqrt(power[:, one] * power[:, other])
     shape = np.minimum(frame.shape[one], frame.shape[other])
-    if "cross_shape" in frame.reduced:
-        shape = _ordered(frame.reduced, "cross_shape", "pair", "block", "band")
+    if "cross_shape" in frame.blocks:
+        shape = _ordered(frame.blocks, "cross_shape", "pair", "block", "band")
     cross = size * _coherency(shape, size.shape, rng)
-    cross[..., np.isnan(_ordered(frame.reduced, "cross", "pair", "block", "band"))] = np.nan
+    cross[..., np.isnan(_ordered(frame.blocks, "cross", "pair", "block", "band"))] = np.nan
     return np.asarray(cross)
 
 
@@ -407,13 +407,13 @@ def _crossed(
     assert frame.shared is not None
     one, other = ([pair[side] for pair in frame.shared.pairs] for side in (0, 1))
     cross = between * np.sqrt(level[:, one] * level[:, other])
-    cross[..., np.isnan(_ordered(frame.reduced, "cross", "pair", "block", "band"))] = np.nan
+    cross[..., np.isnan(_ordered(frame.blocks, "cross", "pair", "block", "band"))] = np.nan
     return np.asarray(cross)
 
 
 def _witness(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[np.complex128]:
-    found = _ordered(frame.reduced, "witness_cross", "axis", "witness", "block", "band")
-    beside = _ordered(frame.reduced, "witness_power", "witness", "block", "band")
+    found = _ordered(frame.blocks, "witness_cross", "axis", "witness", "block", "band")
+    beside = _ordered(frame.blocks, "witness_power", "witness", "block", "band")
     size = np.sqrt(power[:, :, None] * beside)
     cross = size * _coherency(frame.shape[:, None], size.shape, rng)
     cross[..., np.isnan(found)] = np.nan
@@ -422,14 +422,14 @@ def _witness(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[n
 
 def _orders(frame: _Frame, expected: Array, rng: np.random.Generator) -> NDArray[np.complex128]:
     """Amplitudes at multiples of the rotation: Gaussian with the density at that frequency, or with that beside it where that is more."""
-    reduced = frame.reduced
-    found = _ordered(reduced, "order", "axis", "block", "harmonic")
-    rate = float(reduced.attrs["sampling_rate_hz"])
-    samples = np.maximum(_ordered(reduced, "samples", "axis", "block"), 1)
-    turning = np.abs(np.nan_to_num(reduced["channel_rotation_rate"].values)) / 360.0
-    bands = np.log(reduced["frequency"].values)
+    blocks = frame.blocks
+    found = _ordered(blocks, "order", "axis", "block", "harmonic")
+    rate = float(blocks.attrs["sampling_rate_hz"])
+    samples = np.maximum(_ordered(blocks, "samples", "axis", "block"), 1)
+    turning = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values)) / 360.0
+    bands = np.log(blocks["frequency"].values)
     density = np.empty((len(expected), *found.shape))
-    for place, harmonic in enumerate(reduced["harmonic"].values):
+    for place, harmonic in enumerate(blocks["harmonic"].values):
         folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
         at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
         low = np.minimum(at.astype(int), bands.size - 2)
@@ -439,17 +439,15 @@ def _orders(frame: _Frame, expected: Array, rng: np.random.Generator) -> NDArray
         ] * (at - low)
     noise = rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
     out = np.asarray(
-        np.sqrt(2.0 * noise_at_orders(reduced, density) * rate / samples[..., None]) * noise
+        np.sqrt(2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]) * noise
     )
     out[..., np.isnan(found)] = np.nan
     return out
 
 
 def _profiles(frame: _Frame, count: int, rng: np.random.Generator) -> Array:
-    found = _ordered(frame.reduced, "profile", "axis", "block", "phase")
-    samples = _ordered(frame.reduced, "profile_samples", "axis", "block", "phase").astype(
-        np.float64
-    )
+    found = _ordered(frame.blocks, "profile", "axis", "block", "phase")
+    samples = _ordered(frame.blocks, "profile_samples", "axis", "block", "phase").astype(np.float64)
     safe = np.maximum(samples, 1.0)
     noise = rng.standard_normal((count, *found.shape)) * frame.sd[:, :1, None] / np.sqrt(safe)
     noise -= (noise * samples).sum(axis=-1, keepdims=True) / np.maximum(samples.sum(axis=-1), 1.0)[
@@ -487,9 +485,9 @@ def _with_tails(score: Array, n: Array) -> Array:
 
 def _kurtosis(frame: _Frame, count: int, rng: np.random.Generator) -> Array:
     """Excess kurtosis as the noise has it, or that of other blocks where the values are few levels."""
-    reduced = frame.reduced
-    found = _ordered(reduced, "kurtosis", "axis", "block")
-    samples = np.maximum(_ordered(reduced, "samples", "axis", "block").astype(np.float64), 20.0)
+    blocks = frame.blocks
+    found = _ordered(blocks, "kurtosis", "axis", "block")
+    samples = np.maximum(_ordered(blocks, "samples", "axis", "block").astype(np.float64), 20.0)
     mean, variance, a = _kurtosis_moments(samples)
     root = (
         1.0
@@ -499,7 +497,7 @@ def _kurtosis(frame: _Frame, count: int, rng: np.random.Generator) -> Array:
     )
     score = ((1.0 - 2.0 / a) / np.maximum(root, 0.1) ** 3 - 1.0) / np.sqrt(2.0 / (a - 4.0))
     out = mean + frame.tails[:, :1] + np.sqrt(variance) * frame.tails[:, 1:] * score
-    for axis, step in enumerate(reduced["lattice"].values):
+    for axis, step in enumerate(blocks["lattice"].values):
         good = found[axis][np.isfinite(found[axis])]
         if step > COARSE * frame.sd[axis, 0] and good.size:
             out[:, axis] = rng.choice(good, out[:, axis].shape)

@@ -73,7 +73,7 @@ class NullScores:
 
     Attributes
     ----------
-    views : mapping of str to ViewNull
+    statistics : mapping of str to ViewNull
         By the names of `gyrostab.diagnose.statistics.STATISTICS`.
     family : Tail
         Of the largest ``-log p`` over the views, p that of each view's largest score.
@@ -81,18 +81,18 @@ class NullScores:
         Null records.
     """
 
-    views: Mapping[str, StatisticNull]
+    statistics: Mapping[str, StatisticNull]
     family: Tail
     records: int
 
-    def p_value(self, view: str, z: Array | float) -> Array:
+    def p_value(self, statistic: str, z: Array | float) -> Array:
         """Probability that a null record has so large a standardised score in any view, as this one has in this view."""
-        own = self.views[view].tail.surprise(np.square(z) / 2.0)
+        own = self.statistics[statistic].tail.surprise(np.square(z) / 2.0)
         return np.asarray(np.clip(np.exp(-self.family.surprise(own)), _LEAST_P, 1.0))
 
-    def critical(self, view: str, level: float) -> float:
+    def critical(self, statistic: str, level: float) -> float:
         """Standardised score of a view at which the p-value is `level`."""
-        t = self.views[view].tail.level(float(np.exp(-self.family.level(level))))
+        t = self.statistics[statistic].tail.level(float(np.exp(-self.family.level(level))))
         return float(np.sqrt(2.0 * max(t, 0.0)))
 
 
@@ -121,9 +121,9 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
         records += chunk.sizes["record"]
         size = max(1, _AT_ONCE * chunk.sizes["record"] // chunk["power"].size)
         for first in range(0, chunk.sizes["record"], size):
-            part = chunk.isel(record=slice(first, first + size))
+            component = chunk.isel(record=slice(first, first + size))
             for name, score in STATISTICS.items():
-                found = score(part, baseline)
+                found = score(component, baseline)
                 if found is not None:
                     if name not in gathered:
                         gathered[name] = _Gathered(found)
@@ -132,14 +132,14 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
         raise OptionError(
             f"{records} null records are too few to tell how often noise alone does as much; give nulls=400"
         )
-    views = {}
+    statistics = {}
     largest = {}
-    for name, view in gathered.items():
-        mean, spread, z = view.finish()
+    for name, statistic in gathered.items():
+        mean, spread, z = statistic.finish()
         half = z**2 / 2.0
-        views[name] = StatisticNull(mean, spread, _tail(half))
-        largest[name] = views[name].tail.surprise(half)
-    return NullScores(views, _tail(np.max(list(largest.values()), axis=0)), records)
+        statistics[name] = StatisticNull(mean, spread, _tail(half))
+        largest[name] = statistics[name].tail.surprise(half)
+    return NullScores(statistics, _tail(np.max(list(largest.values()), axis=0)), records)
 
 
 def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:
@@ -178,7 +178,7 @@ class _Gathered:
             [known.sum(axis=0), filled.sum(axis=0), np.square(filled).sum(axis=0)]
         )
         self.waiting.append(z)
-        if self.records + sum(len(part) for part in self.waiting) >= _FIRST:
+        if self.records + sum(len(component) for component in self.waiting) >= _FIRST:
             self._keep()
 
     def _keep(self) -> None:
@@ -194,7 +194,7 @@ class _Gathered:
 
     def _like(self) -> Array:
         """Variance of each cell, averaged over the windows of the same length."""
-        count, first, second = (part.reshape(self.shape) for part in self.sums)
+        count, first, second = (component.reshape(self.shape) for component in self.sums)
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = np.maximum(second / count - (first / count) ** 2, 0.0)
         like = np.empty(self.shape)
@@ -210,7 +210,7 @@ class _Gathered:
         self._keep()
         like = self._like()
         mean, spread = _moments(self.sums, like, self.floor)
-        record, cell, z = (np.concatenate(part) for part in zip(*self.far, strict=True))
+        record, cell, z = (np.concatenate(component) for component in zip(*self.far, strict=True))
         others = self.sums[:, cell] - np.stack([np.ones(z.size), z, z**2])
         own_mean, own_spread = _moments(others, like[cell], self.floor[cell])
         away = (z - own_mean) / own_spread

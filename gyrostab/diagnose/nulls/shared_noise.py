@@ -40,20 +40,20 @@ class Shared(NamedTuple):
     white: Array
 
 
-def shared_by(reduced: xr.Dataset, baseline: xr.Dataset) -> Shared | None:
+def shared_by(blocks: xr.Dataset, baseline: xr.Dataset) -> Shared | None:
     """What axes have in common by the baseline; None where that is nothing."""
     if "cross" not in baseline:
         return None
-    axes = [str(axis) for axis in reduced["axis"].values]
-    pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(reduced)]
+    axes = [str(axis) for axis in blocks["axis"].values]
+    pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(blocks)]
     spectrum, own = (
         baseline[name].transpose("axis", "block", "band").values
         for name in ("spectrum", "shape_alone")
     )
     cross = baseline["cross"].transpose("pair", "block", "band").values
     samples, together = (
-        reduced["samples"].transpose("axis", "block").values,
-        reduced["cross_samples"].transpose("pair", "block").values,
+        blocks["samples"].transpose("axis", "block").values,
+        blocks["cross_samples"].transpose("pair", "block").values,
     )
     matrix = np.zeros((*spectrum.shape[1:], len(axes), len(axes)), np.complex128)
     matrix[..., range(len(axes)), range(len(axes))] = 1.0
@@ -68,7 +68,7 @@ def shared_by(reduced: xr.Dataset, baseline: xr.Dataset) -> Shared | None:
         _root(matrix),
         pairs,
         own,
-        reduced["cross_shape"].transpose("pair", "block", "band").values,
+        blocks["cross_shape"].transpose("pair", "block", "band").values,
         _root(white),
     )
 

@@ -57,67 +57,67 @@ _TWINS = {"fringe_hop": "bias_jump"}  # the same design: the size decides
 _SAME = 1e-3  # designs that differ by less of their size are one
 
 
-def channel_units(reduced: xr.Dataset) -> dict[str, str]:
+def channel_units(blocks: xr.Dataset) -> dict[str, str]:
     """Channel of the log -> its unit."""
     begin = "channel_"
     return {
-        str(name)[len(begin) :]: str(reduced[name].attrs.get("units", ""))
-        for name in reduced.data_vars
+        str(name)[len(begin) :]: str(blocks[name].attrs.get("units", ""))
+        for name in blocks.data_vars
         if str(name).startswith(begin)
     }
 
 
-def windows_of(reduced: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
+def windows_of(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
     """The reduced record as effects see it.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`.
     drivers : mapping of str to str
         Channel of the effect -> channel of the log.
     """
-    axes = tuple(str(axis) for axis in reduced["axis"].values)
+    axes = tuple(str(axis) for axis in blocks["axis"].values)
     own = dict(
         zip(
             axes,
-            map(_bridged, measured(reduced, "mean").transpose("axis", "block").values),
+            map(_bridged, measured(blocks, "mean").transpose("axis", "block").values),
             strict=True,
         )
     )
 
     def spans(name: str) -> Array:
-        if f"{name}_begin" not in reduced:
+        if f"{name}_begin" not in blocks:
             return np.empty((0, 2))
         return np.stack(
-            [reduced[f"{name}_begin"].values, reduced[f"{name}_end"].values], axis=1
+            [blocks[f"{name}_begin"].values, blocks[f"{name}_end"].values], axis=1
         ).astype(np.float64)
 
     return Windows(
-        begin=reduced["begin"].values.astype(np.float64),
-        end=reduced["end"].values.astype(np.float64),
-        frequency=reduced["frequency"].values,
-        rate=float(reduced.attrs["sampling_rate_hz"]),
+        begin=blocks["begin"].values.astype(np.float64),
+        end=blocks["end"].values.astype(np.float64),
+        frequency=blocks["frequency"].values,
+        rate=float(blocks.attrs["sampling_rate_hz"]),
         axes=axes,
         drivers={
-            inner: _bridged(reduced[f"channel_{name}"].values) for inner, name in drivers.items()
+            inner: _bridged(blocks[f"channel_{name}"].values) for inner, name in drivers.items()
         },
         fine={
-            inner: reduced[f"fine_{name}"].values
+            inner: blocks[f"fine_{name}"].values
             for inner, name in drivers.items()
-            if f"fine_{name}" in reduced
+            if f"fine_{name}" in blocks
         },
         own=own,
         gaps=spans("gap"),
         restarts=spans("restart"),
-        phase=(np.arange(reduced.sizes["phase"]) + 0.5) / reduced.sizes["phase"]
-        if "profile" in reduced
+        phase=(np.arange(blocks.sizes["phase"]) + 0.5) / blocks.sizes["phase"]
+        if "profile" in blocks
         else np.empty(0),
-        turns=reduced["ramp_turns"].values if "ramp_turns" in reduced else np.empty(0),
+        turns=blocks["ramp_turns"].values if "ramp_turns" in blocks else np.empty(0),
         bands={
             inner: band
             for inner, name in drivers.items()
-            if (band := _band(reduced[f"channel_{name}"])) is not None
+            if (band := _band(blocks[f"channel_{name}"])) is not None
         },
     )
 
@@ -141,13 +141,13 @@ def _bridged(values: Array) -> Array:
 
 
 def effect_candidates(
-    reduced: xr.Dataset, coefficient: xr.DataArray
+    blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> tuple[list[Candidate], dict[str, str]]:
     """All effects of the registry as far as this record can tell about them.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`.
     coefficient : xarray.DataArray
         ``(axis, term)``: noise of the baseline, in the units of the laws.
@@ -163,15 +163,15 @@ def effect_candidates(
     >>> from gyrostab.diagnose.reduce.block_statistics import reduce_log
     >>> from gyrostab.ingest.make_log import make_log
     >>> noise = 1.8 * np.random.default_rng(1).standard_normal((1, 60_000))
-    >>> reduced = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
+    >>> blocks = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
     >>> level = xr.DataArray([[0.003, 0.0]], {"axis": ["axis_0"], "term": ["N", "B"]}, ("axis", "term"))
-    >>> found, reasons = effect_candidates(reduced, level)
+    >>> found, reasons = effect_candidates(blocks, level)
     >>> reasons["shupe"]
     'not identifiable: the recording has no channel temperature'
-    >>> sorted({one.effect for one in found if one.view == "marks"})
+    >>> sorted({one.effect for one in found if one.statistic == "marks"})
     ['clipping', 'dead_zone', 'held_samples', 'rate_quantization', 'spikes']
     """
-    units = channel_units(reduced)
+    units = channel_units(blocks)
     found: list[Candidate] = []
     reasons: dict[str, str] = {}
     for name, kind in effects().items():
@@ -179,11 +179,11 @@ def effect_candidates(
             continue
         made: list[Candidate] = []
         said = ""
-        if _by_lattice(kind, reduced):
+        if _by_lattice(kind, blocks):
             reasons[name] = "not identifiable: the lattice of values is too coarse"
             continue
-        for drivers in _drivers(kind, reduced, units):
-            more, why = _of_kind(kind, reduced, drivers, coefficient)
+        for drivers in _drivers(kind, blocks, units):
+            more, why = _of_kind(kind, blocks, drivers, coefficient)
             made += more
             said = said or why
         found += made
@@ -194,11 +194,11 @@ def effect_candidates(
     return found, reasons
 
 
-def _by_lattice(kind: type[Effect], reduced: xr.Dataset) -> bool:
+def _by_lattice(kind: type[Effect], blocks: xr.Dataset) -> bool:
     """The effect is told by statistics that, on every axis of this record, are those of the lattice of values."""
-    if kind.channels or not has_coarse_grid(reduced).all():
+    if kind.channels or not has_coarse_grid(blocks).all():
         return False
-    marks = kind.example().explain(windows_of(reduced, {})).marks
+    marks = kind.example().explain(windows_of(blocks, {})).marks
     return bool(marks) and set(marks) <= set(GRID_COUNTS)
 
 
@@ -207,11 +207,11 @@ def _by_lattice(kind: type[Effect], reduced: xr.Dataset) -> bool:
 
 
 def _drivers(
-    kind: type[Effect], reduced: xr.Dataset, units: Mapping[str, str]
+    kind: type[Effect], blocks: xr.Dataset, units: Mapping[str, str]
 ) -> Iterator[dict[str, str]]:
     """Channels of the effect -> channels of the log, in every way that makes sense."""
     options = [
-        _matches(channel, unit, tuple(kind.channels), reduced, units) or [""]
+        _matches(channel, unit, tuple(kind.channels), blocks, units) or [""]
         for channel, unit in kind.channels.items()
     ]
     seen = set()
@@ -229,7 +229,7 @@ def _matches(
     channel: str,
     unit: str,
     channels: tuple[str, ...],
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     units: Mapping[str, str],
 ) -> list[str]:
     """Channels of the log that can stand for one of the effect's: vectors by their name, others by the beginning of it."""
@@ -245,7 +245,7 @@ def _matches(
         name
         for name in names
         if units.get(name) == unit
-        and np.isfinite(reduced[f"channel_{name}"].values).mean() >= MIN_BLOCK_SHARE
+        and np.isfinite(blocks[f"channel_{name}"].values).mean() >= MIN_BLOCK_SHARE
     ]
 
 
@@ -254,22 +254,22 @@ def _matches(
 
 
 def _of_kind(
-    kind: type[Effect], reduced: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray
+    kind: type[Effect], blocks: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray
 ) -> tuple[list[Candidate], str]:
     """Candidates of one effect with its channels, by view; and why there are none."""
     if kind.channels and not drivers:
-        return _strangers(kind, reduced), missing_channel_reason(tuple(kind.channels), reduced)
-    windows = windows_of(reduced, drivers)
+        return _strangers(kind, blocks), missing_channel_reason(tuple(kind.channels), blocks)
+    windows = windows_of(blocks, drivers)
     predictions: list[tuple[dict[str, Any], Prediction]] = []
     why = ""
     for values in _grid(kind, windows):
         try:
             effect = kind.example(**values)
             predictions.append(
-                (values, _visible(kind.name, _exogenous(effect, windows), reduced, coefficient))
+                (values, _visible(kind.name, _exogenous(effect, windows), blocks, coefficient))
             )
         except KeyError as error:
-            why = missing_channel_reason((str(error.args[0]),), reduced)
+            why = missing_channel_reason((str(error.args[0]),), blocks)
         except OptionError as error:
             why = str(error)
     driver = tuple(drivers.get(channel, "") for channel in kind.channels) if drivers else ()
@@ -280,12 +280,12 @@ def _of_kind(
         why = f"{' and '.join(still)} {'does' if len(still) == 1 else 'do'} not change"
     many = {item.name for item in kind.parameters() if item.many}
     made = []
-    for view, build in BUILDERS.items():
+    for statistic, build in BUILDERS.items():
         variants = _distinct(
             [
                 one
                 for values, seen in predictions
-                for one in build(values, seen, reduced, coefficient)
+                for one in build(values, seen, blocks, coefficient)
             ]
         )
         variants = _weighed(variants, windows)
@@ -293,27 +293,27 @@ def _of_kind(
             continue
         marks = (
             tuple(dict.fromkeys(mark for _, seen in predictions for mark in seen.marks))
-            if view == "marks"
+            if statistic == "marks"
             else ()
         )
-        each = view != "order" or bool(many & set(variants[0].columns))
-        made.append(Candidate(kind.name, view, driver, variants, marks=marks, each=each))
+        each = statistic != "order" or bool(many & set(variants[0].columns))
+        made.append(Candidate(kind.name, statistic, driver, variants, marks=marks, each=each))
     made += [
-        replace(one, driver=driver) for one in _transfers(kind.name, predictions, windows, reduced)
+        replace(one, driver=driver) for one in _transfers(kind.name, predictions, windows, blocks)
     ]
     return made, why
 
 
 def variants_of(
-    candidate: Candidate, variant: Variant, reduced: xr.Dataset, coefficient: xr.DataArray
+    candidate: Candidate, variant: Variant, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Variant | None:
     """A variant of a candidate made anew, for other channels or other values of the same parameters; None where it is nothing."""
     kind = effects()[candidate.effect]
     drivers = {
         inner: name for inner, name in zip(kind.channels, candidate.driver, strict=False) if name
     }
-    seen = _exogenous(kind.example(**variant.values), windows_of(reduced, drivers))
-    made = BUILDERS[candidate.view](dict(variant.values), seen, reduced, coefficient)
+    seen = _exogenous(kind.example(**variant.values), windows_of(blocks, drivers))
+    made = BUILDERS[candidate.statistic](dict(variant.values), seen, blocks, coefficient)
     return next(
         (one for one in made if one.columns == variant.columns and one.squared == variant.squared),
         None,
@@ -401,7 +401,7 @@ def _exogenous(effect: Effect, windows: Windows) -> Prediction:
 
 
 def _visible(
-    name: str, seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    name: str, seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Prediction:
     """What an effect predicts, without the means that white noise alone hides on every axis at the largest size there is.
 
@@ -410,8 +410,8 @@ def _visible(
     """
     if name not in LARGEST or not seen.mean:
         return seen
-    good = np.isfinite(reduced["mean"].transpose("axis", "block").values)
-    white = coefficient.sel(term="N").values * np.sqrt(HOUR / float(reduced.attrs["block_s"]))
+    good = np.isfinite(blocks["mean"].transpose("axis", "block").values)
+    white = coefficient.sel(term="N").values * np.sqrt(HOUR / float(blocks.attrs["block_s"]))
     mean = {}
     for column, design in seen.mean.items():
         rows = np.where(good, np.broadcast_to(np.atleast_2d(design), good.shape), np.nan)
@@ -447,11 +447,11 @@ def _transfers(
     name: str,
     predictions: list[tuple[dict[str, Any], Prediction]],
     windows: Windows,
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
 ) -> list[Candidate]:
     """Rates that follow another channel, or another axis, at every frequency."""
-    there = {str(one) for one in reduced["witness"].values} if "witness" in reduced.dims else set()
-    axes = set(windows.axes) if "cross" in reduced else set()
+    there = {str(one) for one in blocks["witness"].values} if "witness" in blocks.dims else set()
+    axes = set(windows.axes) if "cross" in blocks else set()
     found: dict[str, list[Variant]] = {}
     for values, seen in predictions:
         for (parameter, channel), transfer in seen.transfer.items():
@@ -469,12 +469,12 @@ def _transfers(
     ]
 
 
-def _strangers(kind: type[Effect], reduced: xr.Dataset) -> list[Candidate]:
+def _strangers(kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
     """Real motion that only channels of no known effect see, a seismometer for instance."""
-    if kind.name != "real_motion" or "witness" not in reduced.dims:
+    if kind.name != "real_motion" or "witness" not in blocks.dims:
         return []
-    variants = _distinct(_any_transfer(reduced.sizes["band"]))
-    strange = sorted(str(one) for one in reduced["witness"].values if not _known(str(one)))
+    variants = _distinct(_any_transfer(blocks.sizes["band"]))
+    strange = sorted(str(one) for one in blocks["witness"].values if not _known(str(one)))
     return [
         Candidate(kind.name, "transfer", (), variants, witness=(channel,)) for channel in strange
     ]

@@ -18,31 +18,31 @@ MIN_BLOCK_SHARE = 0.5
 CALIBRATION_CHANNELS = ("vibration", "temperature", "rotation_rate")
 
 
-def missing_channel_reason(channels: Collection[str], reduced: xr.Dataset) -> str:
+def missing_channel_reason(channels: Collection[str], blocks: xr.Dataset) -> str:
     """Say why none of the channels that an effect follows can be used.
 
     Parameters
     ----------
     channels : collection of str
         Channels of the effect.
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`.
     """
-    unused: Mapping[str, str] = reduced.attrs.get("unused_channels", {})
+    unused: Mapping[str, str] = blocks.attrs.get("unused_channels", {})
     for name in channels:
         if name in unused:
             return f"the channel {name} is not used: {unused[name]}"
-        if problem := _problem(name, reduced):
+        if problem := _problem(name, blocks):
             return f"the channel {name} is not used: {problem}"
     return f"the recording has no channel {' or '.join(channels)}"
 
 
-def unused_channels(reduced: xr.Dataset, used: Iterable[str]) -> list[dict[str, str]]:
+def unused_channels(blocks: xr.Dataset, used: Iterable[str]) -> list[dict[str, str]]:
     """List the channels that took no part in a diagnosis.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`; its attribute ``unused_channels`` has those that were left out before.
     used : iterable of str
         Channels that some candidate follows or is compared with.
@@ -52,31 +52,31 @@ def unused_channels(reduced: xr.Dataset, used: Iterable[str]) -> list[dict[str, 
     list of dict
         ``name`` and ``reason`` of each.
     """
-    found = dict(reduced.attrs.get("unused_channels", {}))
+    found = dict(blocks.attrs.get("unused_channels", {}))
     known = set(used)
-    for variable in map(str, reduced.data_vars):
+    for variable in map(str, blocks.data_vars):
         name = variable.removeprefix("channel_")
         if name == variable or name in known:
             continue
-        problem = _problem(name, reduced)
+        problem = _problem(name, blocks)
         if problem or not name.startswith(CALIBRATION_CHANNELS):
-            found[name] = problem or _stranger(name, reduced)
+            found[name] = problem or _stranger(name, blocks)
     return [{"name": name, "reason": reason} for name, reason in found.items()]
 
 
-def _problem(name: str, reduced: xr.Dataset) -> str:
+def _problem(name: str, blocks: xr.Dataset) -> str:
     """Say what is wrong with the values or the unit of a channel; empty for nothing."""
     variable = f"channel_{name}"
-    if variable not in reduced:
+    if variable not in blocks:
         return ""
-    values = reduced[variable].values
+    values = blocks[variable].values
     share = float(np.isfinite(values).mean())
     if share < MIN_BLOCK_SHARE:
         return f"it has values in {share:.0%} of the blocks, and {MIN_BLOCK_SHARE:.0%} are needed"
-    unit, wanted = str(reduced[variable].attrs.get("units", "")), _wanted_units(name)
+    unit, wanted = str(blocks[variable].attrs.get("units", "")), _wanted_units(name)
     if wanted and unit not in wanted:
         return f"its unit is {unit!r}, and effects need {' or '.join(map(repr, wanted))}; give it with --unit {name}=UNIT"
-    if np.nanmax(values) == np.nanmin(values) and not _is_compared(name, reduced):
+    if np.nanmax(values) == np.nanmin(values) and not _is_compared(name, blocks):
         return "it does not change"
     return ""
 
@@ -92,15 +92,15 @@ def _wanted_units(name: str) -> list[str]:
     return list(found)
 
 
-def _is_compared(name: str, reduced: xr.Dataset) -> bool:
+def _is_compared(name: str, blocks: xr.Dataset) -> bool:
     """Return whether a channel lies on the time of the gyro, so that their spectra can be compared."""
-    return "witness" in reduced.dims and name in reduced["witness"].values
+    return "witness" in blocks.dims and name in blocks["witness"].values
 
 
-def _stranger(name: str, reduced: xr.Dataset) -> str:
-    if _is_compared(name, reduced) or _wanted_units(name):
+def _stranger(name: str, blocks: xr.Dataset) -> str:
+    if _is_compared(name, blocks) or _wanted_units(name):
         return "no effect that this record can show follows it"
     if name.startswith(TURNING):
         return "no effect follows a channel of this name; lines at the rotation are found with the channel rotation_rate"
-    rate = float(reduced.attrs["sampling_rate_hz"])
+    rate = float(blocks.attrs["sampling_rate_hz"])
     return f"no effect follows a channel of this name, and it is too slow to be compared with the gyro sample by sample ({rate:.4g} Hz)"

@@ -64,7 +64,7 @@ class Component:
     variant : Variant
     row : tuple of str
         Axes.
-    gain : float
+    evidence_nats : float
         On held-out time [nats].
     place : int
         Line, or set of harmonics; -1 where there is none.
@@ -73,30 +73,34 @@ class Component:
     candidate: Candidate
     variant: Variant
     row: tuple[str, ...]
-    gain: float
+    evidence_nats: float
     place: int = -1
 
 
-def mirrored(part: Component) -> bool:
+def mirrored(component: Component) -> bool:
     """Whether the axes see what turns in the other order: y stands at -90 degrees from x, or the channel runs back."""
-    return part.candidate.view == "order" and not part.candidate.each and part.place % 2 == 1
+    return (
+        component.candidate.statistic == "order"
+        and not component.candidate.each
+        and component.place % 2 == 1
+    )
 
 
-def condition_on(state: State, parts: list[Component]) -> State:
+def condition_on(state: State, components: list[Component]) -> State:
     """The state with an effect in it."""
-    return reweighted(condition_on_components(state, parts))
+    return reweighted(condition_on_components(state, components))
 
 
-def condition_on_components(state: State, parts: Iterable[Component]) -> State:
+def condition_on_components(state: State, components: Iterable[Component]) -> State:
     """The state with rows of effects in it, before its powers are fitted anew."""
-    for part in parts:
-        state = condition_on_component(state, part)
+    for component in components:
+        state = condition_on_component(state, component)
     return state
 
 
-def condition_on_component(state: State, part: Component) -> State:
+def condition_on_component(state: State, component: Component) -> State:
     """The state with one row of an effect in it."""
-    return _TAKERS[part.candidate.view](state, part)
+    return _TAKERS[component.candidate.statistic](state, component)
 
 
 def mean_columns(variant: Variant, row: int) -> list[Array]:
@@ -104,50 +108,50 @@ def mean_columns(variant: Variant, row: int) -> list[Array]:
     return [np.asarray(one[row] if one.shape[0] > 1 else one[0]) for one in variant.design]
 
 
-def _mean(state: State, part: Component) -> State:
-    axis = part.row[0]
+def _mean(state: State, component: Component) -> State:
+    axis = component.row[0]
     row = state.axes.index(axis)
-    columns = mean_columns(part.variant, row)
+    columns = mean_columns(component.variant, row)
     state = state.with_columns("mean", axis, columns)
     return replace(state, masked=state.masked | _edges(state, row, columns))
 
 
-def _hopping(state: State, part: Component) -> State:
+def _hopping(state: State, component: Component) -> State:
     """A bias of two levels; where it hops within blocks its course is the power there, and their kurtosis says nothing."""
-    inside = part.variant.inside
+    inside = component.variant.inside
     if not inside.size:
-        return _mean(state, part)
-    axis = part.row[0]
+        return _mean(state, component)
+    axis = component.row[0]
     row = state.axes.index(axis)
-    attrs = state.reduced.attrs
-    low, high = (float(part.variant.values[name]) for name in ("low", "high"))
+    attrs = state.blocks.attrs
+    low, high = (float(component.variant.values[name]) for name in ("low", "high"))
     power = switching_powers(
         inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"])
     )
-    state = add_fast_switching(state, part)
+    state = add_fast_switching(state, component)
     state = state.with_columns("power", axis, [power_column(power[None], row, state)])
     moves = xr.DataArray(np.ptp(inside, axis=1) > _HOPS, dims="block") & (
-        state.reduced["axis"] == axis
+        state.blocks["axis"] == axis
     )
     blank = {
-        name: state.reduced[name].where(~moves, other)
+        name: state.blocks[name].where(~moves, other)
         for name, other in (("kurtosis", np.nan), ("outliers", 0))
     }
-    return replace(state, reduced=state.reduced.assign(blank))
+    return replace(state, blocks=state.blocks.assign(blank))
 
 
-def add_fast_switching(state: State, part: Component) -> State:
+def add_fast_switching(state: State, component: Component) -> State:
     """The state with the course of a bias that hops within blocks, in the means of blocks and of their pieces."""
-    axis = part.row[0]
-    return state.with_columns("mean", axis, mean_columns(part.variant, 0)).with_columns(
-        "inner", axis, [part.variant.inside]
+    axis = component.row[0]
+    return state.with_columns("mean", axis, mean_columns(component.variant, 0)).with_columns(
+        "inner", axis, [component.variant.inside]
     )
 
 
 def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
     """Blocks in which the effect moves so much that it shows in the power of the axis."""
-    reduced = state.reduced
-    y = reduced["mean"].values[row] - state.baseline["known_mean"].values[row]
+    blocks = state.blocks
+    y = blocks["mean"].values[row] - state.baseline["known_mean"].values[row]
     good = np.isfinite(y)
     design = np.nan_to_num(np.stack([np.ones(y.size), *columns], axis=1))
     largest = np.abs(design).max(axis=0)
@@ -156,7 +160,7 @@ def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
     curve = design @ size
     step = np.abs(np.diff(curve))
     moved = np.maximum(np.append(step, 0.0), np.append(0.0, step))
-    seconds = float(reduced.attrs["block_s"])
+    seconds = float(blocks.attrs["block_s"])
     strong = moved**2 * seconds > 5.0 * state.weight[row, :, 0]
     mask = np.zeros_like(state.masked)
     if strong.mean() <= _FEW:
@@ -164,36 +168,38 @@ def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
     return mask
 
 
-def _power(state: State, part: Component) -> State:
-    axis = part.row[0]
+def _power(state: State, component: Component) -> State:
+    axis = component.row[0]
     row = state.axes.index(axis)
-    if is_filter("power", part.variant) and "line_power" in state.reduced:
-        expected = expected_lines(state.baseline, state.reduced["line_frequency"].values)[row]
-        reduced, stopped = straightened(
-            state.reduced, axis, part.candidate.effect, part.variant.values, expected
+    if is_filter("power", component.variant) and "line_power" in state.blocks:
+        expected = expected_lines(state.baseline, state.blocks["line_frequency"].values)[row]
+        blocks, stopped = straightened(
+            state.blocks, axis, component.candidate.effect, component.variant.values, expected
         )
-        state = replace(state, reduced=reduced).with_columns("line", "all", [stopped])
-    if is_filter("power", part.variant) and axis in state.baseline.attrs.get("recalibrated", ()):
+        state = replace(state, blocks=blocks).with_columns("line", "all", [stopped])
+    if is_filter("power", component.variant) and axis in state.baseline.attrs.get(
+        "recalibrated", ()
+    ):
         return state  # the noise of the baseline is filtered already
     return state.with_columns(
-        "power", axis, [power_column(one, row, state) for one in part.variant.design]
+        "power", axis, [power_column(one, row, state) for one in component.variant.design]
     )
 
 
-def _cross(state: State, part: Component) -> State:
-    row = pair_rows(state.reduced).index(part.row)
+def _cross(state: State, component: Component) -> State:
+    row = pair_rows(state.blocks).index(component.row)
     columns = []
-    for one in part.variant.design:
-        chosen = cross_column(one, row, state.reduced)
+    for one in component.variant.design:
+        chosen = cross_column(one, row, state.blocks)
         columns.append(np.concatenate([chosen.real, chosen.imag], axis=-1))
-    state = state.with_columns("cross", ",".join(part.row), columns)
-    if not part.variant.squared:
+    state = state.with_columns("cross", ",".join(component.row), columns)
+    if not component.variant.squared:
         return state
     calibrated = state.baseline.attrs.get("source", "calibrated") == "calibrated"
     added = [
-        one.real for one in part.variant.design if not (calibrated and _white(one))
+        one.real for one in component.variant.design if not (calibrated and _white(one))
     ]  # white noise was calibrated with it
-    for axis in part.row if added else ():
+    for axis in component.row if added else ():
         powers = [power_column(one, state.axes.index(axis), state) for one in added]
         known = state.given.get(("power", axis), [])
         state = state.with_columns(
@@ -213,7 +219,7 @@ def _white(density: NDArray[np.complex128]) -> bool:
 def _coherent(state: State, axes: tuple[str, ...], density: Array) -> State:
     """Any covariance of these axes with the rest of this density, (block, band)."""
     nothing = np.zeros_like(density)
-    for pair in pair_rows(state.reduced) if "cross" in state.reduced else []:
+    for pair in pair_rows(state.blocks) if "cross" in state.blocks else []:
         if set(pair) & set(axes):
             both = [
                 np.concatenate([density, nothing], axis=-1),
@@ -225,22 +231,26 @@ def _coherent(state: State, axes: tuple[str, ...], density: Array) -> State:
 
 def _bands_of(state: State, frequency: Array) -> NDArray[np.bool_]:
     """Bands in which frequencies, (block,) or scalar, lie, and the next ones where they are at an edge; (block, band)."""
-    low, high = state.reduced["band_low"].values, state.reduced["band_high"].values
-    reach = 1.0 / float(state.reduced.attrs["block_s"])
+    low, high = state.blocks["band_low"].values, state.blocks["band_high"].values
+    reach = 1.0 / float(state.blocks.attrs["block_s"])
     place = np.broadcast_to(frequency, (state.weight.shape[1],))[:, None]
     return (place >= low - reach) & (place < high + reach)
 
 
-def _order(state: State, part: Component) -> State:
-    count = state.reduced.sizes["harmonic"]
-    turn = np.abs(state.reduced["channel_rotation_rate"].values) / 360.0
-    if part.candidate.each:
-        chosen = harmonic_sets(count)[part.place]
-        patterns = [(axis, np.ones(count, np.complex128)) for axis in part.row]
+def _order(state: State, component: Component) -> State:
+    count = state.blocks.sizes["harmonic"]
+    turn = np.abs(state.blocks["channel_rotation_rate"].values) / 360.0
+    if component.candidate.each:
+        chosen = harmonic_sets(count)[component.place]
+        patterns = [(axis, np.ones(count, np.complex128)) for axis in component.row]
     else:
         chosen = (0,)
-        pattern = np.conj(part.variant.design[0]) if mirrored(part) else part.variant.design[0]
-        patterns = [(axis, pattern[state.axes.index(axis)]) for axis in part.row]
+        pattern = (
+            np.conj(component.variant.design[0])
+            if mirrored(component)
+            else component.variant.design[0]
+        )
+        patterns = [(axis, pattern[state.axes.index(axis)]) for axis in component.row]
     for axis, pattern in patterns:
         state = state.with_columns("order", axis, order_columns(pattern, chosen))
         for k in chosen:
@@ -250,7 +260,7 @@ def _order(state: State, part: Component) -> State:
                 column[:, band] = density[:, band]
                 state = state.with_columns("power", axis, [column])
                 state = _coherent(state, (axis,), column)
-    lines = state.reduced["line_frequency"].values
+    lines = state.blocks["line_frequency"].values
     taken = np.zeros(lines.size, np.bool_)
     for k in chosen:
         taken |= (lines >= np.nanmin(turn) * (k + 1) - 2 * lines[0]) & (
@@ -266,20 +276,20 @@ def _free_shape(state: State, axis: str) -> State:
     )
 
 
-def _profile(state: State, part: Component) -> State:
-    state = state.with_columns("phase_locked", part.row[0], list(part.variant.design))
-    if "ramp_turns" in state.reduced:
+def _profile(state: State, component: Component) -> State:
+    state = state.with_columns("phase_locked", component.row[0], list(component.variant.design))
+    if "ramp_turns" in state.blocks:
         state = state.with_columns("line", "all", [_comb(state)])
-    return _free_shape(state, part.row[0])
+    return _free_shape(state, component.row[0])
 
 
 def _comb(state: State) -> NDArray[np.bool_]:
     """Lines at the multiples of the turns of the ramp, folded as samples see them."""
     lines, rate = (
-        state.reduced["line_frequency"].values,
-        float(state.reduced.attrs["sampling_rate_hz"]),
+        state.blocks["line_frequency"].values,
+        float(state.blocks.attrs["sampling_rate_hz"]),
     )
-    turns = np.abs(state.reduced["ramp_turns"].values)
+    turns = np.abs(state.blocks["ramp_turns"].values)
     turns = turns[np.isfinite(turns)]
     if not turns.size:
         return np.zeros(lines.size, np.bool_)
@@ -292,14 +302,14 @@ def _comb(state: State) -> NDArray[np.bool_]:
     return np.asarray(near.any(axis=1))
 
 
-def _transfer(state: State, part: Component) -> State:
-    axis = part.row[0]
-    power = reference_channel_power(part.candidate.witness[0], state.reduced)
+def _transfer(state: State, component: Component) -> State:
+    axis = component.row[0]
+    power = reference_channel_power(component.candidate.witness[0], state.blocks)
     power = np.where(np.isfinite(power), power, 0.0)
     columns = np.concatenate(
         [
-            part.variant.design.real * np.sqrt(power)[:, None],
-            part.variant.design.imag * np.sqrt(power)[:, None],
+            component.variant.design.real * np.sqrt(power)[:, None],
+            component.variant.design.imag * np.sqrt(power)[:, None],
         ],
         axis=-1,
     )
@@ -313,9 +323,9 @@ def _transfer(state: State, part: Component) -> State:
     return state
 
 
-def _line(state: State, part: Component) -> State:
-    frequency = float(state.reduced["line_frequency"].values[part.place])
-    axis = part.row[0]
+def _line(state: State, component: Component) -> State:
+    frequency = float(state.blocks["line_frequency"].values[component.place])
+    axis = component.row[0]
     density = _bands_of(state, np.asarray(frequency)).astype(float)
     known = state.given.get(("power", axis), [])
     for band in np.flatnonzero(density.any(axis=0)):
@@ -325,57 +335,62 @@ def _line(state: State, part: Component) -> State:
             continue  # another line in the same band has made it free already
         state = state.with_columns("power", axis, [column])
         state = _coherent(state, (axis,), column)
-    return state.with_columns("line", "all", [line_skirt(state.reduced, axis, part.place)])
+    return state.with_columns("line", "all", [line_skirt(state.blocks, axis, component.place)])
 
 
-def _marks(state: State, part: Component) -> State:
+def _marks(state: State, component: Component) -> State:
     """Blocks with odd samples say nothing of the rest; where there are too many of them, the shape of the spectrum does not."""
-    if _everywhere(part):
+    if _everywhere(component):
         return state
-    axis, odd = part.row[0], find_anomalous_blocks(part, state.reduced)
+    axis, odd = component.row[0], find_anomalous_blocks(component, state.blocks)
     if not odd.any():
         return _free_shape(state, axis)
     keep = xr.DataArray(~odd, dims="block")
-    here = state.reduced["axis"] == axis
-    reduced = state.reduced.copy()
+    here = state.blocks["axis"] == axis
+    blocks = state.blocks.copy()
     for variable in ("mean", "power"):
-        reduced[variable] = reduced[variable].where(keep | ~here)
-    if "cross" in reduced:
+        blocks[variable] = blocks[variable].where(keep | ~here)
+    if "cross" in blocks:
         rows = np.array([one == axis for one in state.axes])
-        reduced["cross"] = cross_without(reduced, odd & rows[:, None])
-    return replace(state, reduced=reduced)
+        blocks["cross"] = cross_without(blocks, odd & rows[:, None])
+    return replace(state, blocks=blocks)
 
 
-def _everywhere(part: Component) -> bool:
+def _everywhere(component: Component) -> bool:
     """Odd samples that are in every block alike, so that none says less of the rest than others."""
-    return part.candidate.effect == "rate_quantization" or part.candidate.effect.startswith("~")
+    return (
+        component.candidate.effect == "rate_quantization"
+        or component.candidate.effect.startswith("~")
+    )
 
 
-def find_anomalous_blocks(part: Component, reduced: xr.Dataset) -> NDArray[np.bool_]:
+def find_anomalous_blocks(component: Component, blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks with odd samples, which are left out on the axis; none where they would be too many, or the effect is in all alike."""
-    samples = reduced["samples"].sel(axis=part.row[0]).values
+    samples = blocks["samples"].sel(axis=component.row[0]).values
     there = samples > _THERE * samples.max(initial=0)
-    if _everywhere(part) or not there.any():
+    if _everywhere(component) or not there.any():
         return np.zeros(there.size, np.bool_)
-    count = reduced[part.variant.columns[0]].sel(axis=part.row[0]).values
+    count = blocks[component.variant.columns[0]].sel(axis=component.row[0]).values
     usual = (
-        0.0 if part.variant.columns[0] == "outliers" else float(np.median(count[there]))
+        0.0 if component.variant.columns[0] == "outliers" else float(np.median(count[there]))
     )  # noise has as good as none
     odd = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
     return np.asarray(odd & (odd[there].mean() <= _ODD))
 
 
-def mask_anomalous_blocks(reduced: xr.Dataset, parts: Iterable[Component]) -> xr.Dataset:
+def mask_anomalous_blocks(blocks: xr.Dataset, components: Iterable[Component]) -> xr.Dataset:
     """The record without the blocks of odd samples that are named: their counts tell what they gain, their powers have no model."""
-    axes = [str(axis) for axis in reduced["axis"].values]
-    odd = np.zeros((len(axes), reduced.sizes["block"]), np.bool_)
-    for part in (part for part in parts if part.candidate.view == "marks"):
-        odd[axes.index(part.row[0])] |= find_anomalous_blocks(part, reduced)
+    axes = [str(axis) for axis in blocks["axis"].values]
+    odd = np.zeros((len(axes), blocks.sizes["block"]), np.bool_)
+    for component in (
+        component for component in components if component.candidate.statistic == "marks"
+    ):
+        odd[axes.index(component.row[0])] |= find_anomalous_blocks(component, blocks)
     if not odd.any():
-        return reduced
+        return blocks
     there = xr.DataArray(~odd, dims=("axis", "block"))
-    left = reduced.assign(mean=reduced["mean"].where(there), power=reduced["power"].where(there))
-    return left.assign(cross=cross_without(reduced, odd)) if "cross" in reduced else left
+    left = blocks.assign(mean=blocks["mean"].where(there), power=blocks["power"].where(there))
+    return left.assign(cross=cross_without(blocks, odd)) if "cross" in blocks else left
 
 
 _TAKERS = {
@@ -404,7 +419,7 @@ def reweighted(state: State, *, rounds: int = 4) -> State:
                 np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1),
                 rounds,
             )[0]
-    return replace(state, weight=weight, reduced=without_turns(state.reduced, weight))
+    return replace(state, weight=weight, blocks=without_turns(state.blocks, weight))
 
 
 def power_shares(state: State, axis: str, *, rounds: int = 4) -> Array:
@@ -417,7 +432,7 @@ def power_shares(state: State, axis: str, *, rounds: int = 4) -> Array:
     return np.stack([size * one for size, one in zip(sizes, named, strict=True)])
 
 
-def without_turns(reduced: xr.Dataset, expected: Array) -> xr.Dataset:
+def without_turns(blocks: xr.Dataset, expected: Array) -> xr.Dataset:
     """The record without the kurtosis and outliers that a changing level of the noise explains.
 
     Two levels in one block have tails that neither of them has; and noise of another level than
@@ -425,20 +440,20 @@ def without_turns(reduced: xr.Dataset, expected: Array) -> xr.Dataset:
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
     expected : ndarray, shape (axis, block, band)
         Expected power.
     """
-    level = np.log(expected @ (reduced["band_high"].values - reduced["band_low"].values))
+    level = np.log(expected @ (blocks["band_high"].values - blocks["band_low"].values))
     step = np.abs(np.diff(level, axis=1)) > _TURN
     turns = np.pad(step, ((0, 0), (1, 0))) | np.pad(step, ((0, 0), (0, 1)))
     unusual = turns | (np.abs(level - np.median(level, axis=1, keepdims=True)) > _TURN)
     left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
-    return reduced.assign(
+    return blocks.assign(
         {
-            name: reduced[name].where(xr.DataArray(~where, dims=("axis", "block")), other)
+            name: blocks[name].where(xr.DataArray(~where, dims=("axis", "block")), other)
             for name, (where, other) in left_out.items()
-            if name in reduced
+            if name in blocks
         }
     )
 
@@ -454,8 +469,8 @@ def _fit(state: State, row: int, axis: str, named: Array, rounds: int) -> tuple[
     columns = columns / size
     prior = np.zeros(columns.shape[1])
     prior[: level.shape[2]] = np.diagonal(precision) / size[: level.shape[2]] ** 2
-    power = state.reduced["power"].values[row].ravel()
-    shape = state.reduced["shape"].values[row].ravel()
+    power = state.blocks["power"].values[row].ravel()
+    shape = state.blocks["shape"].values[row].ravel()
     good = (
         np.isfinite(power) & np.isfinite(shape) & ~np.repeat(state.masked[row], expected.shape[1])
     )

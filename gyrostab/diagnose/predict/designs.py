@@ -64,7 +64,7 @@ class Candidate:
     ----------
     effect : str
         Name in the registry; a generic begins with "~".
-    view : str
+    statistic : str
         One of `VIEWS`.
     driver : tuple of str
         Channels of the log that it follows, in the order of the effect's channels; empty string for
@@ -80,7 +80,7 @@ class Candidate:
     """
 
     effect: str
-    view: str
+    statistic: str
     driver: tuple[str, ...]
     variants: tuple[Variant, ...]
     marks: tuple[str, ...] = ()
@@ -122,7 +122,7 @@ def _choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def _means(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     """Designs of the mean, each less its mean over time: the constant is free."""
     columns = {}
@@ -137,10 +137,10 @@ def _means(
 
 
 def _powers(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     """Added densities; a filter as what it adds or takes at its full size. What is constant and coherent is for the cross-spectra."""
-    frequency, rate = reduced["frequency"].values, float(reduced.attrs["sampling_rate_hz"])
+    frequency, rate = blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"])
     level: dict[str, Array] = {}
     for (symbol, name), share in seen.level.items():
         square = (
@@ -148,12 +148,12 @@ def _powers(
             if symbol in coefficient["term"].values
             else np.zeros(coefficient.sizes["axis"])
         )
-        part = (
+        component = (
             np.atleast_2d(share)[..., None]
             * square[:, None, None]
             * term_density(symbol, frequency, rate)
         )
-        level[name] = level.get(name, 0.0) + part
+        level[name] = level.get(name, 0.0) + component
     spectrum = {}
     if seen.line is None:
         spectrum = {
@@ -202,29 +202,29 @@ def _flat(density: Array) -> bool:
 
 
 def _crosses(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     """Cross-densities per product of the factors of both axes."""
-    if not seen.coherent or seen.line is not None or "cross" not in reduced:
+    if not seen.coherent or seen.line is not None or "cross" not in blocks:
         return
     for name, density in seen.spectrum.items():
         yield Variant(values, (name,), _rows(density)[None], squared=True)
 
 
 def _orders(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
-    if "order" not in reduced:
+    if "order" not in blocks:
         return
-    count = reduced.sizes["harmonic"]
+    count = blocks.sizes["harmonic"]
     for name, pattern in seen.order.items():
         yield Variant(values, (name,), pattern[None, :, :count])
 
 
 def _profiles(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
-    if "profile" not in reduced:
+    if "profile" not in blocks:
         return
     kept = {
         name: design
@@ -236,19 +236,19 @@ def _profiles(
 
 
 def _marks(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     if seen.marks:
         yield Variant(values, seen.marks, np.empty(0))
 
 
 def _lines(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     """A line that does not move, wherever it is; its frequency is found in the spectrum itself."""
     if (
         seen.line is None
-        or "line_power" not in reduced
+        or "line_power" not in blocks
         or not seen.coherent
         or np.ptp(seen.line) > 0
     ):
@@ -257,16 +257,16 @@ def _lines(
 
 
 def _wanders(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
-    block = float(reduced.attrs["block_s"])
+    block = float(blocks.attrs["block_s"])
     for name, (time, variance) in seen.wander.items():
         if time >= block / 2.0:
             yield Variant(values, (name,), np.asarray(variance)[None], squared=True, time=time)
 
 
 def _levels(
-    values: dict[str, Any], seen: Prediction, reduced: xr.Dataset, coefficient: xr.DataArray
+    values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     """Two levels: the means themselves tell the course and its times."""
     if seen.levels:

@@ -38,32 +38,32 @@ def _share(power: Array, full: Array) -> float:
     )
 
 
-def is_filter(view: str, variant: Variant) -> bool:
+def is_filter(statistic: str, variant: Variant) -> bool:
     """Whether a variant multiplies the spectrum rather than adds to it."""
-    return view == "power" and not variant.columns
+    return statistic == "power" and not variant.columns
 
 
-def response_of(effect: Effect, reduced: xr.Dataset) -> Array:
+def response_of(effect: Effect, blocks: xr.Dataset) -> Array:
     """Factor of the noise in the bands: the mean over the frequencies of each, for a filter is steep."""
     return np.asarray(
-        _response(effect, reduced, inside_bands(reduced)).reshape(-1, _INSIDE).mean(axis=1)
+        _response(effect, blocks, inside_bands(blocks)).reshape(-1, _INSIDE).mean(axis=1)
     )
 
 
-def inside_bands(reduced: xr.Dataset) -> Array:
+def inside_bands(blocks: xr.Dataset) -> Array:
     """Frequencies evenly inside of every band, as many in each, one band after the other [Hz]."""
-    low, high = reduced["band_low"].values, reduced["band_high"].values
+    low, high = blocks["band_low"].values, blocks["band_high"].values
     place = (np.arange(_INSIDE) + 0.5) / _INSIDE
     return np.asarray((low[:, None] + (high - low)[:, None] * place).ravel())
 
 
-def _response(effect: Effect, reduced: xr.Dataset, frequency: Array) -> Array:
-    found = effect.explain(replace(windows_of(reduced, {}), frequency=frequency)).response
+def _response(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Array:
+    found = effect.explain(replace(windows_of(blocks, {}), frequency=frequency)).response
     return np.ones(frequency.size) if found is None else np.asarray(found)
 
 
 def straightened(
-    reduced: xr.Dataset, axis: str, effect: str, values: Mapping[str, Any], expected: Array
+    blocks: xr.Dataset, axis: str, effect: str, values: Mapping[str, Any], expected: Array
 ) -> tuple[xr.Dataset, NDArray[np.bool_]]:
     """The record with the line spectrum of an axis as it was before a filter, once only; and the lines that the filter stops.
 
@@ -72,7 +72,7 @@ def straightened(
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
     axis : str
     effect : str
     values : mapping
@@ -80,11 +80,11 @@ def straightened(
     expected : ndarray, shape (line,)
         Density without it, but for a factor.
     """
-    frequency = reduced["line_frequency"].values
-    full = _response(effects()[effect].example(**values), reduced, frequency)
+    frequency = blocks["line_frequency"].values
+    full = _response(effects()[effect].example(**values), blocks, frequency)
     weight, power = (
-        reduced["line_weight"].sel(axis=axis).values,
-        reduced["line_power"].sel(axis=axis).transpose("part", "line").values,
+        blocks["line_weight"].sel(axis=axis).values,
+        blocks["line_power"].sel(axis=axis).transpose("part", "line").values,
     )
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     response = full
@@ -94,12 +94,12 @@ def straightened(
             full,
         ) * (full - 1.0)
     stopped = response < _STOPPED * response.max()
-    done = str(reduced.attrs.get("straightened", "")).split()
+    done = str(blocks.attrs.get("straightened", "")).split()
     if axis in done:
-        return reduced, stopped
-    here = reduced["axis"] == axis
+        return blocks, stopped
+    here = blocks["axis"] == axis
     factor = xr.DataArray(np.maximum(response, _STOPPED * response.max()), dims="line")
-    before = reduced["line_power"]
-    return reduced.assign(line_power=before.where(~here, before / factor)).assign_attrs(
+    before = blocks["line_power"]
+    return blocks.assign(line_power=before.where(~here, before / factor)).assign_attrs(
         straightened=" ".join([*done, axis])
     ), stopped

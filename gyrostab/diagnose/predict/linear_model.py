@@ -51,7 +51,7 @@ class State:
 
     Attributes
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         The recording: shapes, samples, channels.
     baseline : xarray.Dataset
         From `gyrostab.diagnose.baseline.calibrate`.
@@ -65,28 +65,28 @@ class State:
         axis, or both axes of a pair with a comma between.
     """
 
-    reduced: xr.Dataset
+    blocks: xr.Dataset
     baseline: xr.Dataset
     weight: Array
     masked: NDArray[np.bool_]
     given: dict[tuple[str, str], list[Array]] = field(default_factory=dict)
 
-    def with_columns(self, view: str, row: str, columns: Sequence[Array]) -> State:
+    def with_columns(self, statistic: str, row: str, columns: Sequence[Array]) -> State:
         """The same with more given columns."""
         given = dict(self.given)
-        given[view, row] = [*given.get((view, row), []), *columns]
+        given[statistic, row] = [*given.get((statistic, row), []), *columns]
         return replace(self, given=given)
 
     @property
     def axes(self) -> list[str]:
         """Names of the axes."""
-        return [str(one) for one in self.reduced["axis"].values]
+        return [str(one) for one in self.blocks["axis"].values]
 
 
-def begin_state(reduced: xr.Dataset, baseline: xr.Dataset) -> State:
+def begin_state(blocks: xr.Dataset, baseline: xr.Dataset) -> State:
     """Nothing is named yet."""
     weight = baseline["spectrum"].transpose("axis", "block", "band").values
-    return State(reduced, baseline, weight, np.zeros(weight.shape[:2], np.bool_))
+    return State(blocks, baseline, weight, np.zeros(weight.shape[:2], np.bool_))
 
 
 def drawn(cells: LinearModel, rng: np.random.Generator, count: int) -> LinearModel:
@@ -97,33 +97,31 @@ def drawn(cells: LinearModel, rng: np.random.Generator, count: int) -> LinearMod
     return cells._replace(values=spread[..., None] * rng.standard_normal((*spread.shape, count)))
 
 
-def in_place(reduced: xr.Dataset, row: str = "axis") -> Array:
+def in_place(blocks: xr.Dataset, row: str = "axis") -> Array:
     """Share of a density that the samples of each block show at its own frequencies, (axis or pair, block): 1 without gaps.
 
     Random gaps spread the rest over all frequencies. That the tapered ends of a block have fewer
     neighbours spreads nothing.
     """
     near = (
-        reduced["neighbours" if row == "axis" else "cross_neighbours"]
-        .transpose(row, "block")
-        .values
+        blocks["neighbours" if row == "axis" else "cross_neighbours"].transpose(row, "block").values
     )
-    weights = taper(int(reduced.attrs["block_samples"]))
+    weights = taper(int(blocks.attrs["block_samples"]))
     whole = float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())
     return np.minimum(np.where(np.isfinite(near), near, whole) / whole, 1.0)
 
 
-def effective(density: Array, reduced: xr.Dataset, row: str = "axis") -> Array:
+def effective(density: Array, blocks: xr.Dataset, row: str = "axis") -> Array:
     """A density, (axis or 1, block or 1, band), as gaps let it be seen: mixed with its mean over frequency, (axis, block, band).
 
     The row may be a pair of axes in place of an axis.
     """
-    return _mixed(density, in_place(reduced, row), band_widths(reduced))
+    return _mixed(density, in_place(blocks, row), band_widths(blocks))
 
 
-def band_widths(reduced: xr.Dataset) -> Array:
+def band_widths(blocks: xr.Dataset) -> Array:
     """Widths of the bands [Hz]."""
-    return np.asarray(reduced["band_high"].values - reduced["band_low"].values)
+    return np.asarray(blocks["band_high"].values - blocks["band_low"].values)
 
 
 def _mixed(density: Array, near: Array, width: Array) -> Array:
@@ -137,30 +135,28 @@ def _row_of(density: Array, row: int) -> Array:
     return np.asarray(density[row if density.shape[0] > 1 else 0])
 
 
-def pair_rows(reduced: xr.Dataset) -> list[tuple[str, ...]]:
+def pair_rows(blocks: xr.Dataset) -> list[tuple[str, ...]]:
     """Both axes of each pair."""
     return [
         (str(a), str(b))
-        for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)
+        for a, b in zip(blocks["first"].values, blocks["second"].values, strict=True)
     ]
 
 
-def cross_without(reduced: xr.Dataset, left_out: NDArray[np.bool_]) -> xr.DataArray:
+def cross_without(blocks: xr.Dataset, left_out: NDArray[np.bool_]) -> xr.DataArray:
     """Covariances of the pairs of axes without the blocks that are left out on either, (axis, block)."""
-    axes = [str(axis) for axis in reduced["axis"].values]
+    axes = [str(axis) for axis in blocks["axis"].values]
     pairs = np.array(
-        [[axes.index(axis) for axis in pair] for pair in pair_rows(reduced)], np.int64
+        [[axes.index(axis) for axis in pair] for pair in pair_rows(blocks)], np.int64
     ).reshape(-1, 2)
-    return reduced["cross"].where(
-        ~xr.DataArray(left_out[pairs].any(axis=1), dims=("pair", "block"))
-    )
+    return blocks["cross"].where(~xr.DataArray(left_out[pairs].any(axis=1), dims=("pair", "block")))
 
 
 def statistic_rows(candidate: Candidate, state: State) -> list[tuple[str, ...]]:
     """Axes that each row of a view speaks about."""
-    if candidate.view == "cross":
-        return pair_rows(state.reduced)
-    if candidate.view == "order" and not candidate.each:
+    if candidate.statistic == "cross":
+        return pair_rows(state.blocks)
+    if candidate.statistic == "order" and not candidate.each:
         pattern = np.abs(candidate.variants[0].design[0]).max(axis=-1)
         return [tuple(axis for axis, size in zip(state.axes, pattern, strict=True) if size > 0)]
     return [(axis,) for axis in state.axes]
@@ -173,7 +169,7 @@ def build_linear_model(
 
     Candidates of the view "transfer" must have the same witness.
     """
-    return _BUILDERS[candidates[0].view](candidates, row, data, state)
+    return _BUILDERS[candidates[0].statistic](candidates, row, data, state)
 
 
 # ----------------------------------------------------------------------------------------------------------------
@@ -192,14 +188,14 @@ def _parts(values: Array, axis: int = -1) -> Array:
 
 def _beside(
     state: State,
-    view: str,
+    statistic: str,
     row: tuple[str, ...],
     shape: tuple[int, ...],
     known: Sequence[Array] = (),
     precision: Any = (),
 ) -> Any:
     """Given columns (block, cell, column) and their precision: those known beforehand, and those of the effects named."""
-    named = state.given.get((view, ",".join(row)), [])
+    named = state.given.get((statistic, ",".join(row)), [])
     columns = [np.broadcast_to(one, shape) for one in [*known, *named]]
     given = np.stack(columns, axis=-1) if columns else np.empty((*shape, 0))
     return given, np.diag([*precision, *[-1.0] * len(named)])
@@ -216,7 +212,7 @@ def _spread(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
 
 def power_column(density: Array, row: int, state: State) -> Array:
     """An added density (axis or 1, block or 1, band) on one axis as gaps let it be seen, (block, band)."""
-    seen = _mixed(_row_of(density, row), in_place(state.reduced)[row], band_widths(state.reduced))
+    seen = _mixed(_row_of(density, row), in_place(state.blocks)[row], band_widths(state.blocks))
     return np.broadcast_to(seen, state.weight.shape[1:])
 
 
@@ -237,7 +233,7 @@ def _power(
     level, precision = noise_columns(state.baseline, axis=axis)
     known = [level[..., number] * expected for number in range(level.shape[2])]
     given, whole = _beside(state, "power", (axis,), weight.shape, known, np.diagonal(precision))
-    near, width = in_place(state.reduced)[row], band_widths(state.reduced)
+    near, width = in_place(state.blocks)[row], band_widths(state.blocks)
     designs = [
         _spread([_mixed(_row_of(one, row), near, width) for one in variant.design], weight.shape)
         for each in candidates
@@ -254,10 +250,10 @@ def _power(
 # crosses
 
 
-def cross_column(density: Array, row: int, reduced: xr.Dataset) -> Array:
+def cross_column(density: Array, row: int, blocks: xr.Dataset) -> Array:
     """A cross-density (1, block or 1, band) of a pair of axes as gaps let it be seen, complex (block, band)."""
-    shape = reduced["cross"].transpose("pair", "block", "band").shape
-    return np.asarray(np.broadcast_to(effective(density + 0j, reduced, "pair"), shape)[row])
+    shape = blocks["cross"].transpose("pair", "block", "band").shape
+    return np.asarray(np.broadcast_to(effective(density + 0j, blocks, "pair"), shape)[row])
 
 
 def known_cross(baseline: xr.Dataset) -> Array | None:
@@ -272,7 +268,7 @@ def known_cross(baseline: xr.Dataset) -> Array | None:
 def _cross(
     candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
 ) -> LinearModel:
-    pair = pair_rows(state.reduced)[row]
+    pair = pair_rows(state.blocks)[row]
     i, j = (state.axes.index(axis) for axis in pair)
     known = known_cross(state.baseline)
     shared = known[row] if known is not None else np.zeros(1)
@@ -280,7 +276,7 @@ def _cross(
         _records(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row]
         - shared[..., None]
     )
-    shape = state.reduced["cross_shape"].transpose("pair", "block", "band").values[row]
+    shape = state.blocks["cross_shape"].transpose("pair", "block", "band").values[row]
     alone, apart = (
         state.weight[i] * state.weight[j],
         (shared**2).real,
@@ -294,7 +290,7 @@ def _cross(
     )
     weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
     given, precision = _beside(state, "cross", pair, weight.shape)
-    near, width = in_place(state.reduced, "pair")[row], band_widths(state.reduced)
+    near, width = in_place(state.blocks, "pair")[row], band_widths(state.blocks)
     designs = [
         _spread(
             [_parts(_mixed(_row_of(one, row) + 0j, near, width)) for one in variant.design],
@@ -312,24 +308,22 @@ def _cross(
 
 def order_weight(state: State) -> Array:
     """(axis, block, harmonic): one over the variance of each part of a complex amplitude."""
-    reduced = state.reduced
-    rate, frequency = float(reduced.attrs["sampling_rate_hz"]), reduced["frequency"].values
+    blocks = state.blocks
+    rate, frequency = float(blocks.attrs["sampling_rate_hz"]), blocks["frequency"].values
     place = (
-        np.abs(reduced["channel_rotation_rate"].values)[:, None]
-        / 360.0
-        * reduced["harmonic"].values
+        np.abs(blocks["channel_rotation_rate"].values)[:, None] / 360.0 * blocks["harmonic"].values
     )
     good = (
-        np.isfinite(reduced["order"].values)
-        & (place * float(reduced.attrs["block_s"]) >= 2.0)
+        np.isfinite(blocks["order"].values)
+        & (place * float(blocks.attrs["block_s"]) >= 2.0)
         & (place < rate / 2.0)
     )
     nearest = np.abs(np.log(np.maximum(place, frequency[0])[..., None] / frequency)).argmin(axis=-1)
     level = np.take_along_axis(
         state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2
     )
-    level = noise_at_orders(reduced, level)
-    seconds = reduced["samples"].values[..., None] / rate
+    level = noise_at_orders(blocks, level)
+    seconds = blocks["samples"].values[..., None] / rate
     return np.where(good, seconds / (2.0 * level), 0.0)
 
 
@@ -375,7 +369,8 @@ def _order(
                 by_axis = [order_columns(one, (0,)) for one in pattern]
                 designs.append(
                     _spread(
-                        [np.concatenate(parts) for parts in zip(*by_axis, strict=True)], both.shape
+                        [np.concatenate(components) for components in zip(*by_axis, strict=True)],
+                        both.shape,
                     )
                 )
     named = [state.given.get(("order", axis), []) for axis in state.axes]
@@ -398,10 +393,10 @@ def _profile(
     candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
 ) -> LinearModel:
     values = _records(data["profile"].transpose(..., "axis", "block", "phase").values, 3)[row]
-    rate = float(state.reduced.attrs["sampling_rate_hz"])
-    width = (state.reduced["band_high"] - state.reduced["band_low"]).values
+    rate = float(state.blocks.attrs["sampling_rate_hz"])
+    width = (state.blocks["band_high"] - state.blocks["band_low"]).values
     variance = rate * (state.weight[row] * width).sum(axis=-1) / width.sum()
-    weight = state.reduced["profile_samples"].values[row] / variance[:, None]
+    weight = state.blocks["profile_samples"].values[row] / variance[:, None]
     given, precision = _beside(
         state, "phase_locked", (state.axes[row],), weight.shape, [np.ones(weight.shape[1])], [-1.0]
     )
@@ -418,50 +413,50 @@ def _profile(
 
 
 def reference_channel_of(
-    name: str, row: int, data: xr.Dataset, reduced: xr.Dataset, baseline: xr.Dataset
+    name: str, row: int, data: xr.Dataset, blocks: xr.Dataset, baseline: xr.Dataset
 ) -> tuple[Array, Array]:
     """Cross-power of an axis with a channel or another axis, (block, band, record), and the power of that, (block, band).
 
     What both axes are known to share is taken off.
     """
-    axes = [str(one) for one in reduced["axis"].values]
+    axes = [str(one) for one in blocks["axis"].values]
     if name in axes:
         cross = _records(measured(data, "cross").transpose(..., "pair", "block", "band").values, 3)
-        there = np.isfinite(reduced["power"].values[row])[..., None]
+        there = np.isfinite(blocks["power"].values[row])[..., None]
         known = known_cross(baseline)
         cross = cross if known is None else cross - known[..., None]
         found = np.full(cross.shape[1:], np.nan + 0j)
-        for number, pair in enumerate(pair_rows(reduced)):
+        for number, pair in enumerate(pair_rows(blocks)):
             if set(pair) == {name, axes[row]} and name != axes[row]:
                 found = np.where(
                     there, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan
                 )
-        return found, reference_channel_power(name, reduced)
-    place = [str(one) for one in reduced["witness"].values].index(name)
+        return found, reference_channel_power(name, blocks)
+    place = [str(one) for one in blocks["witness"].values].index(name)
     cross = _records(
         data["witness_cross"].transpose(..., "axis", "witness", "block", "band").values, 4
     )
-    return cross[row, place], reference_channel_power(name, reduced)
+    return cross[row, place], reference_channel_power(name, blocks)
 
 
-def reference_channel_power(name: str, reduced: xr.Dataset) -> Array:
+def reference_channel_power(name: str, blocks: xr.Dataset) -> Array:
     """Power of a channel on the log's time, or of an axis as it measured, (block, band)."""
-    if name in reduced["axis"].values:
+    if name in blocks["axis"].values:
         return np.asarray(
-            measured(reduced, "power").sel(axis=name).transpose("block", "band").values
+            measured(blocks, "power").sel(axis=name).transpose("block", "band").values
         )
-    return np.asarray(reduced["witness_power"].sel(witness=name).transpose("block", "band").values)
+    return np.asarray(blocks["witness_power"].sel(witness=name).transpose("block", "band").values)
 
 
 def _transfer(
     candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
 ) -> LinearModel:
     cross, power = reference_channel_of(
-        candidates[0].witness[0], row, data, state.reduced, state.baseline
+        candidates[0].witness[0], row, data, state.blocks, state.baseline
     )
     root = np.sqrt(np.where(power > 0.0, power, np.nan))
     share = _moving_share(candidates[0].witness[0], power, state)
-    weight = 2.0 * state.reduced["shape"].values[row] / state.weight[row]
+    weight = 2.0 * state.blocks["shape"].values[row] / state.weight[row]
     weight = np.where(
         np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0
     )

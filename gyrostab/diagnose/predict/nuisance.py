@@ -25,7 +25,7 @@ _KNOTS = 12
 _STRETCHES = 240  # stretches of time that are tried
 
 
-def stretches(blocks: int, most: int = _STRETCHES) -> NDArray[np.int64]:
+def stretches(block_count: int, most: int = _STRETCHES) -> NDArray[np.int64]:
     """First block and the one behind the last of stretches of time, (stretch, 2): single blocks, two, four and so on, up to half of them.
 
     Each begins half its length behind the one before. Where there are too many of a length, these
@@ -39,13 +39,13 @@ def stretches(blocks: int, most: int = _STRETCHES) -> NDArray[np.int64]:
     >>> stretches(1000)[:4].tolist(), len(stretches(1000)) <= 240
     ([[0, 1], [999, 1000], [0, 2], [998, 1000]], True)
     """
-    lengths = [2**power for power in range(max(1, blocks // 2).bit_length())]
-    first = [np.arange(0, blocks - length + 1, max(1, length // 2)) for length in lengths]
+    lengths = [2**power for power in range(max(1, block_count // 2).bit_length())]
+    first = [np.arange(0, block_count - length + 1, max(1, length // 2)) for length in lengths]
     while sum(one.size for one in first) > most:
         longest = next(
             number for number, one in enumerate(first) if one.size > 2
         )  # of the stretches that are many these are the shortest
-        first[longest] = np.array([0, blocks - lengths[longest]])
+        first[longest] = np.array([0, block_count - lengths[longest]])
     return np.concatenate(
         [np.stack([one, one + length], axis=1) for one, length in zip(first, lengths, strict=True)]
     )
@@ -64,16 +64,16 @@ def splines(begin: Array, end: Array, knots: int = _KNOTS) -> Array:
     return np.stack([np.interp(middle, places, row) for row in np.eye(knots)])
 
 
-def nuisance_alternatives(reduced: xr.Dataset) -> list[Candidate]:
+def nuisance_alternatives(blocks: xr.Dataset) -> list[Candidate]:
     """Generics of all views that the record has."""
-    hats = splines(reduced["begin"].values, reduced["end"].values)
-    white = term_density("N", reduced["frequency"].values, float(reduced.attrs["sampling_rate_hz"]))
-    bands = reduced.sizes["band"]
+    hats = splines(blocks["begin"].values, blocks["end"].values)
+    white = term_density("N", blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"]))
+    bands = blocks.sizes["band"]
     level = hats[:, None, :, None] * white
     shapes = np.eye(bands)[:, None, None, :]
     bursts = tuple(
-        _burst(first, stop, reduced, white)
-        for first, stop in stretches(reduced.sizes["block"]).tolist()
+        _burst(first, stop, blocks, white)
+        for first, stop in stretches(blocks.sizes["block"]).tolist()
     )
     found = [
         Candidate("~bias(t)", "mean", (), (Variant({}, _numbered(len(hats)), hats[:, None, :]),)),
@@ -88,16 +88,16 @@ def nuisance_alternatives(reduced: xr.Dataset) -> list[Candidate]:
             marks=("kurtosis",),
         ),
     ]
-    if "cross" in reduced and reduced.sizes["pair"]:
+    if "cross" in blocks and blocks.sizes["pair"]:
         found.append(Candidate("~cov", "cross", (), _covariances(bands)))
     return found
 
 
-def _burst(first: int, stop: int, reduced: xr.Dataset, white: Array) -> Variant:
+def _burst(first: int, stop: int, blocks: xr.Dataset, white: Array) -> Variant:
     """White noise that is louder in some blocks."""
-    block = np.arange(reduced.sizes["block"])
+    block = np.arange(blocks.sizes["block"])
     inside = ((block >= first) & (block < stop)).astype(np.float64)
-    values = {"begin": float(reduced["begin"][first]), "end": float(reduced["end"][stop - 1])}
+    values = {"begin": float(blocks["begin"][first]), "end": float(blocks["end"][stop - 1])}
     return Variant(values, ("0",), inside[None, None, :, None] * white)
 
 
@@ -115,8 +115,8 @@ def _covariances(bands: int) -> tuple[Variant, ...]:
     """Covariance in any one band, or in four groups of bands, with any phase."""
     alone = [np.eye(bands)[number] for number in range(bands)]
     groups = [
-        np.isin(np.arange(bands), part).astype(float)
-        for part in np.array_split(np.arange(bands), min(4, bands))
+        np.isin(np.arange(bands), component).astype(float)
+        for component in np.array_split(np.arange(bands), min(4, bands))
     ]
     variants = [_phased([one]) for one in alone]
     return (*variants, _phased(groups))

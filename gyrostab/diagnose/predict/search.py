@@ -16,10 +16,10 @@ from gyrostab.diagnose.evidence.sample_counts import (
     GRID_COUNTS,
     Expected,
     beyond_ends,
-    count_evidence,
     expected_counts,
     has_coarse_grid,
     kurtosis_evidence,
+    sample_count_evidence,
 )
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence
 from gyrostab.diagnose.evidence.telegraph import TelegraphCourses, telegraph_evidence
@@ -61,7 +61,7 @@ class Found:
     candidate : Candidate
     rows : list of tuple of str
         Axes that each row speaks about.
-    gain : ndarray, shape (record, row)
+    evidence_nats : ndarray, shape (record, row)
         On held-out time [nats].
     best : tuple of Variant
         For each row the variant that the first record likes best.
@@ -71,7 +71,7 @@ class Found:
 
     candidate: Candidate
     rows: list[tuple[str, ...]]
-    gain: Array
+    evidence_nats: Array
     best: tuple[Variant, ...]
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
 
@@ -90,10 +90,10 @@ class CountEvidence:
     def gathered(cls, expected: Expected, rounded: NDArray[np.bool_]) -> CountEvidence:
         """From all null records."""
         found = {}
-        for name, parts in expected.sums.items():
-            if not parts:
+        for name, components in expected.sums.items():
+            if not components:
                 continue
-            values = expected.blocks(name)
+            values = expected.block_count(name)
             if name == "kurtosis":
                 good = np.isfinite(values)
                 clean = np.where(good, values, np.nan)
@@ -109,7 +109,7 @@ def compute_evidence(
     state: State,
     folds: xr.DataArray,
     *,
-    tallies: CountEvidence | None = None,
+    count_evidence: CountEvidence | None = None,
     rng: np.random.Generator | None = None,
 ) -> list[Found]:
     """Gains of candidates on data.
@@ -123,7 +123,7 @@ def compute_evidence(
         What is in the model already.
     folds : xarray.DataArray
         From `fold_blocks`.
-    tallies : Tallies, optional
+    count_evidence : Tallies, optional
         Without them the distribution is left out.
     rng : numpy.random.Generator, optional
         For null records: what they do not hold is drawn.
@@ -132,18 +132,20 @@ def compute_evidence(
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for one in candidates:
         groups.setdefault(
-            (one.view, one.witness, one.each if one.view == "order" else True), []
+            (one.statistic, one.witness, one.each if one.statistic == "order" else True), []
         ).append(one)
-    for (view, *_), group in groups.items():
-        if view == "mean":
+    for (statistic, *_), group in groups.items():
+        if statistic == "mean":
             found += _means(group, data, state, folds)
-        elif view == "marks":
-            found += [] if tallies is None else _marks(group, data, state, folds, tallies)
-        elif view == "line":
+        elif statistic == "marks":
+            found += (
+                [] if count_evidence is None else _marks(group, data, state, folds, count_evidence)
+            )
+        elif statistic == "line":
             found += _lines(group, data, state)
-        elif view == "levels":
+        elif statistic == "levels":
             found += _levels(group, data, state)
-        elif view != "wander":
+        elif statistic != "wander":
             found += _cells(group, data, state, folds, rng)
     return found
 
@@ -155,8 +157,10 @@ def of_means(found: Sequence[Found], before: State, now: State) -> list[Found]:
     """
     if before.baseline is not now.baseline or _of_means_given(before) != _of_means_given(now):
         return []
-    left, right = (state.reduced.drop_vars(_TAILS, errors="ignore") for state in (before, now))
-    return [one for one in found if one.candidate.view in _OF_MEANS] if left.equals(right) else []
+    left, right = (state.blocks.drop_vars(_TAILS, errors="ignore") for state in (before, now))
+    return (
+        [one for one in found if one.candidate.statistic in _OF_MEANS] if left.equals(right) else []
+    )
 
 
 def _of_means_given(state: State) -> dict[tuple[str, str], list[int]]:
@@ -171,13 +175,13 @@ def totals(found: Sequence[Found]) -> dict[str, Array]:
     """Gain of every effect by the key of its candidates, (record,), as `together` has it."""
     rows: dict[str, list[Array]] = {}
     for one in found:
-        rows.setdefault(one.candidate.key, []).append(one.gain)
+        rows.setdefault(one.candidate.key, []).append(one.evidence_nats)
     return {key: together(np.concatenate(several, axis=1)) for key, several in rows.items()}
 
 
-def together(gain: Array) -> Array:
+def together(evidence_nats: Array) -> Array:
     """Gain of an effect from its rows (..., row): that of the best, and what others bring beyond the price of naming them."""
-    good = np.sort(np.nan_to_num(gain, neginf=-1e9), axis=-1)
+    good = np.sort(np.nan_to_num(evidence_nats, neginf=-1e9), axis=-1)
     return np.asarray(good[..., -1] + np.maximum(good[..., :-1] - _PRICE, 0.0).sum(axis=-1))
 
 
@@ -188,7 +192,7 @@ def _collect(
     variants = [[one for one in each.variants for _ in range(spread)] for each in group]
     owner = np.repeat(np.arange(len(group)), [len(several) for several in variants])
     weight = [one.weight for several in variants for one in several]
-    gain = np.stack(
+    evidence_nats = np.stack(
         [score(one, owner, weight=weight) for one in factors], axis=-1
     )  # (candidate, record, row)
     first = (
@@ -202,7 +206,7 @@ def _collect(
             Found(
                 each,
                 rows,
-                gain[number],
+                evidence_nats[number],
                 best,
                 own.argmax(axis=0)[None] if spread > 1 else np.empty((0, 0), np.int64),
             )
@@ -241,8 +245,10 @@ def _cells(
     factors = []
     spread = 1
     for row in range(len(rows)):
-        there = rng is None or (group[0].view in ("power", "cross") and group[0].view in data)
-        cells = build_linear_model(group, row, data if there else state.reduced, state)
+        there = rng is None or (
+            group[0].statistic in ("power", "cross") and group[0].statistic in data
+        )
+        cells = build_linear_model(group, row, data if there else state.blocks, state)
         if not there and rng is not None:
             cells = drawn(cells, rng, data.sizes["record"])
         factors.append(linear_model_factors(cells, folds)[:, 1:])
@@ -255,53 +261,59 @@ def _marks(
     data: xr.Dataset,
     state: State,
     folds: xr.DataArray,
-    tallies: CountEvidence,
+    count_evidence: CountEvidence,
 ) -> list[Found]:
     subsets = fold_subsets(folds)
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
-    coarse = has_coarse_grid(state.reduced)
+    coarse = has_coarse_grid(state.blocks)
     out = []
     for each in group:
-        gain, best = [], []
+        evidence_nats, best = [], []
         for variant in each.variants:
-            parts = [
+            components = [
                 np.where(
-                    coarse & (name in GRID_COUNTS), 0.0, _mark(name, data, state, subsets, tallies)
+                    coarse & (name in GRID_COUNTS),
+                    0.0,
+                    _mark(name, data, state, subsets, count_evidence),
                 )
                 for name in variant.columns
             ]
-            gain.append(np.max(parts, axis=0))
-        place = np.argmax([one[0] for one in gain], axis=0)
+            evidence_nats.append(np.max(components, axis=0))
+        place = np.argmax([one[0] for one in evidence_nats], axis=0)
         best = [each.variants[int(number)] for number in place]
-        out.append(Found(each, rows, np.max(gain, axis=0), tuple(best)))
+        out.append(Found(each, rows, np.max(evidence_nats, axis=0), tuple(best)))
     return out
 
 
 def _mark(
-    name: str, data: xr.Dataset, state: State, subsets: NDArray[np.bool_], tallies: CountEvidence
+    name: str,
+    data: xr.Dataset,
+    state: State,
+    subsets: NDArray[np.bool_],
+    count_evidence: CountEvidence,
 ) -> Array:
     """Gain of a raised statistic, (record, axis)."""
     records = data.sizes.get("record", 1)
     if name == "lattice":
         return np.broadcast_to(
-            _lattice(state, tallies) if "record" not in data.dims else 0.0,
+            _lattice(state, count_evidence) if "record" not in data.dims else 0.0,
             (records, len(state.axes)),
         )
-    if name not in data or name not in tallies.of:
+    if name not in data or name not in count_evidence.of:
         return np.zeros((records, len(state.axes)))
     values = data[name].transpose(..., "axis", "block").values.astype(np.float64)
     values = values if values.ndim == 3 else values[None]
     values = beyond_ends(values) if name == "extremes" else values
-    how = kurtosis_evidence if name == "kurtosis" else count_evidence
-    return how(values, *tallies.of[name], subsets)
+    how = kurtosis_evidence if name == "kurtosis" else sample_count_evidence
+    return how(values, *count_evidence.of[name], subsets)
 
 
-def _lattice(state: State, tallies: CountEvidence) -> Array:
+def _lattice(state: State, count_evidence: CountEvidence) -> Array:
     """Samples of a rounded rate, one nat each: noise without a lattice never stands on it."""
-    samples = state.reduced["samples"].transpose("axis", "block").values.sum(axis=1)
+    samples = state.blocks["samples"].transpose("axis", "block").values.sum(axis=1)
     return (
-        np.where(tallies.rounded, samples, 0.0).astype(np.float64)
-        if tallies.rounded.size
+        np.where(count_evidence.rounded, samples, 0.0).astype(np.float64)
+        if count_evidence.rounded.size
         else np.zeros(samples.size)
     )
 
@@ -309,15 +321,17 @@ def _lattice(state: State, tallies: CountEvidence) -> Array:
 def _lines(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[Found]:
     power = data["line_power"].transpose(..., "axis", "part", "line").values
     power = power if power.ndim == 4 else power[None]
-    expected = expected_lines(state.baseline, state.reduced["line_frequency"].values)
-    gain = line_evidence(
-        power, state.reduced["line_weight"].transpose("axis", "part").values, expected
+    expected = expected_lines(state.baseline, state.blocks["line_frequency"].values)
+    evidence_nats = line_evidence(
+        power, state.blocks["line_weight"].transpose("axis", "part").values, expected
     )
     taken = state.given.get(("line", "all"), [])
     for mask in taken:
-        gain = np.where(mask, -np.inf, gain)
-    place = np.maximum(gain, 0.0).sum(axis=1).argmax(axis=-1)  # (record,), one line for all axes
-    best = np.take_along_axis(gain, place[:, None, None], axis=2)[..., 0]
+        evidence_nats = np.where(mask, -np.inf, evidence_nats)
+    place = (
+        np.maximum(evidence_nats, 0.0).sum(axis=1).argmax(axis=-1)
+    )  # (record,), one line for all axes
+    best = np.take_along_axis(evidence_nats, place[:, None, None], axis=2)[..., 0]
     best = np.where(np.isfinite(best), best, -np.log(power.shape[-1]))
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     places = np.repeat(place[:, None], len(rows), axis=1)
@@ -339,37 +353,42 @@ def _levels(group: Sequence[Candidate], data: xr.Dataset, state: State) -> list[
         else data
     )
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
-    gain = np.full((records, len(rows)), -np.inf)
+    evidence_nats = np.full((records, len(rows)), -np.inf)
     courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
     for row, axis in enumerate(state.axes):
         given = state.given.get(("mean", axis))
         found, course = telegraph_evidence(
             some, state.baseline, axis=axis, given=np.stack(given, axis=-1) if given else None
         )
-        gain[: found.size, row] = found
+        evidence_nats[: found.size, row] = found
         within, refuted = _within(some, state, axis, course, float(found[0]))
         if refuted:
-            gain[0, row] = -np.inf
+            evidence_nats[0, row] = -np.inf
         if within is not None:
-            gain[0, row] = max(within.gain, gain[0, row])
+            evidence_nats[0, row] = max(within.evidence_nats, evidence_nats[0, row])
         courses.append((course, within))
     return [
-        Found(each, rows, gain, tuple(_course(each.variants[0], *one, state) for one in courses))
+        Found(
+            each,
+            rows,
+            evidence_nats,
+            tuple(_course(each.variants[0], *one, state) for one in courses),
+        )
         for each in group
     ]
 
 
 def _within(
-    data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, gain: float
+    data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, evidence_nats: float
 ) -> tuple[SwitchingEvidence | None, bool]:
     """Hops within blocks, where these tell more than the means of blocks do; and whether they say that there are not two levels."""
-    found, block = _hops(data, state, axis), float(state.reduced.attrs["block_s"])
+    found, block = _hops(data, state, axis), float(state.blocks.attrs["block_s"])
     if found is None:
         return None, False
     if not _resolved(found, block):
         return None, found.refuted and float(course.times[0].min()) < _LONG
     deviation = float(np.sqrt(np.nanmedian(state.baseline["mean_variance"].sel(axis=axis).values)))
-    coarse = np.isfinite(gain) and float(course.step[0]) < _STEP * deviation
+    coarse = np.isfinite(evidence_nats) and float(course.step[0]) < _STEP * deviation
     return (None if coarse and found.times.min() > _WITHIN * block else found), False
 
 
@@ -378,7 +397,7 @@ def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> Switch
     found = _hops(data, state, axis)
     return (
         found
-        if found is not None and _resolved(found, float(state.reduced.attrs["block_s"]))
+        if found is not None and _resolved(found, float(state.blocks.attrs["block_s"]))
         else None
     )
 
@@ -386,13 +405,14 @@ def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> Switch
 def _resolved(found: SwitchingEvidence, block: float) -> bool:
     """Whether pieces of blocks of so many seconds tell two levels; what is shorter than a piece is a spike."""
     return (
-        bool(np.isfinite(found.gain)) and float(found.times.min()) >= block / found.share.shape[1]
+        bool(np.isfinite(found.evidence_nats))
+        and float(found.times.min()) >= block / found.share.shape[1]
     )
 
 
 def _hops(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
     """What pieces of blocks say; None where more is named in the means of blocks than is known of their pieces."""
-    known, inner = (state.given.get((view, axis), []) for view in ("mean", "inner"))
+    known, inner = (state.given.get((statistic, axis), []) for statistic in ("mean", "inner"))
     if len(inner) < len(known):
         return None
     return switching_evidence(
@@ -413,7 +433,7 @@ def _course(
             design=within.share.mean(axis=1)[None, None],
             inside=within.share,
         )
-    block = float(state.reduced.attrs["block_s"])
+    block = float(state.blocks.attrs["block_s"])
     low, high = found.times[0] * block
     values = {"low": float(low), "high": float(high), "hops": float(found.hops[0])}
     return replace(variant, values=values, design=found.share[0][None, None])

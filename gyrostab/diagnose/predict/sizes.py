@@ -73,7 +73,7 @@ def mean_mixture(
     """
     baseline = state.baseline
     row = state.axes.index(axis)
-    y = (state.reduced["mean"] - baseline["known_mean"]).transpose("axis", "block").values[row]
+    y = (state.blocks["mean"] - baseline["known_mean"]).transpose("axis", "block").values[row]
     every = [*columns, *state.given.get(("mean", axis), [])]
     whole = np.stack(every, axis=1) if every else np.empty((y.size, 0))
     present = np.isfinite(y)
@@ -87,7 +87,7 @@ def mean_mixture(
         np.where(present, y, 0.0)[:, None],
         whole / size,
         variance=baseline["mean_variance"].sel(axis=axis).values if variance is None else variance,
-        step=float(state.reduced.attrs["block_s"]),
+        step=float(state.blocks.attrs["block_s"]),
         present=present,
         wander=known_wander(baseline, axis),
         **grid,
@@ -110,17 +110,23 @@ def mean_mixture(
 
 
 def component_mixture(
-    part: Component, state: State, variant: Variant | None = None, *, variance: Array | None = None
+    component: Component,
+    state: State,
+    variant: Variant | None = None,
+    *,
+    variance: Array | None = None,
 ) -> Mixture:
     """Sizes of a part's columns, in the unit of the parameters (or their squares), when `state` is in the model beside it."""
-    variant = variant or part.variant
-    if part.candidate.view in ("mean", "levels"):
-        row = state.axes.index(part.row[0])
-        return mean_mixture(state, part.row[0], mean_columns(variant, row), variance=variance)
-    candidate = replace(part.candidate, variants=(variant,))
-    row = statistic_rows(candidate, state).index(part.row)
-    cells = build_linear_model([candidate], row, state.reduced, state)
-    design = cells.designs[max(part.place, 0) if part.candidate.view == "order" else 0]
+    variant = variant or component.variant
+    if component.candidate.statistic in ("mean", "levels"):
+        row = state.axes.index(component.row[0])
+        return mean_mixture(state, component.row[0], mean_columns(variant, row), variance=variance)
+    candidate = replace(component.candidate, variants=(variant,))
+    row = statistic_rows(candidate, state).index(component.row)
+    cells = build_linear_model([candidate], row, state.blocks, state)
+    design = cells.designs[
+        max(component.place, 0) if component.candidate.statistic == "order" else 0
+    ]
     columns = np.concatenate([design, cells.given], axis=2).reshape(
         -1, design.shape[2] + cells.given.shape[2]
     )
@@ -147,9 +153,9 @@ def component_mixture(
     return Mixture(np.array([log_weight]), (mean[:own] / scale)[None], own_covariance[None])
 
 
-def component_size(part: Component, state: State) -> tuple[float, float]:
+def component_size(component: Component, state: State) -> tuple[float, float]:
     """Size of the first column and its standard error; zero and infinite for a view that has no size."""
-    if part.candidate.view in ("marks", "line", "wander"):
+    if component.candidate.statistic in ("marks", "line", "wander"):
         return 0.0, np.inf
-    mean, covariance = component_mixture(part, state).moments()
+    mean, covariance = component_mixture(component, state).moments()
     return float(mean[0]), float(np.sqrt(covariance[0, 0]))

@@ -46,8 +46,13 @@ class Accumulator:
     Rows are the axes, then the channels on the log's own time.
     """
 
-    def __init__(self, log: xr.Dataset, length: int, blocks: int, rate: float):
-        self.rate, self.length, self.blocks, self.start = rate, length, blocks, first_stamp(log)
+    def __init__(self, log: xr.Dataset, length: int, block_count: int, rate: float):
+        self.rate, self.length, self.block_count, self.start = (
+            rate,
+            length,
+            block_count,
+            first_stamp(log),
+        )
         self.axes = log.sizes["axis"]
         self.beside = numeric_channels(log)[0]
         rows = self.rows = self.axes + len(self.beside)
@@ -60,29 +65,29 @@ class Accumulator:
         )[0]
         self.whole_neighbours = _neighbours(whole, self.weights)[0]
         bands = self.edges.size - 1
-        self.moments = np.full((rows, blocks, 5), np.nan)
-        self.counts = np.zeros((rows, blocks, 9), np.int64)
-        self.together = np.zeros((self.axes, blocks), np.int64)
+        self.moments = np.full((rows, block_count, 5), np.nan)
+        self.counts = np.zeros((rows, block_count, 9), np.int64)
+        self.together = np.zeros((self.axes, block_count), np.int64)
         self.at_once: dict[tuple[bool, ...], NDArray[np.int64]] = {
-            (True,) * self.axes: np.zeros(blocks, np.int64)
+            (True,) * self.axes: np.zeros(block_count, np.int64)
         }
-        self.histogram = np.zeros((self.axes, blocks, HISTOGRAM), np.uint32)
+        self.histogram = np.zeros((self.axes, block_count, HISTOGRAM), np.uint32)
         self.peaks: list[list[Peaks]] = [[] for _ in range(self.axes)]
-        self.power = np.full((rows, blocks, bands), np.nan)
-        self.shape = np.full((self.axes, blocks, bands), np.nan)
-        self.neighbours = np.full((self.axes, blocks), np.nan)
-        self.adjacent = np.zeros((self.axes, blocks), np.int64)
+        self.power = np.full((rows, block_count, bands), np.nan)
+        self.shape = np.full((self.axes, block_count, bands), np.nan)
+        self.neighbours = np.full((self.axes, block_count), np.nan)
+        self.adjacent = np.zeros((self.axes, block_count), np.int64)
         self.pairs = [(a, b) for a, b in combinations(range(rows), 2) if a < self.axes]
-        self.cross = np.full((len(self.pairs), blocks, bands), np.nan + 0j)
+        self.cross = np.full((len(self.pairs), block_count, bands), np.nan + 0j)
         self.cross_shape = np.full(self.cross.shape, np.nan)
         self.cross_neighbours = np.full(self.cross.shape[:2], np.nan)
         self.cross_samples = np.zeros(self.cross.shape[:2], np.int64)
         self.line_sum = np.zeros((self.axes, PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, PARTS, 2))
-        self.pieces = np.zeros((2, self.axes, blocks, PIECES))  # sums and numbers of samples
+        self.pieces = np.zeros((2, self.axes, block_count, PIECES))  # sums and numbers of samples
         self.fine = {
-            name: np.full((blocks, FINE), np.nan)
+            name: np.full((block_count, FINE), np.nan)
             for name in self.beside
             if name.startswith(FOLLOWED)
         }
@@ -93,68 +98,80 @@ class Accumulator:
         self.turn_carry: float | None = None
         self.turns = 0.0
         self.order = (
-            np.full((self.axes, blocks, len(HARMONICS)), np.nan + 0j) if self.turning else None
+            np.full((self.axes, block_count, len(HARMONICS)), np.nan + 0j) if self.turning else None
         )
         self.order_level = np.full(self.order.shape, np.nan) if self.order is not None else None
         self.ramp = self.beside.index("ramp") + self.axes if "ramp" in self.beside else None
         self.ramp_range = _range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
         if self.ramp_range[0] >= self.ramp_range[1]:
             self.ramp = None
-        self.profile_sums = np.zeros((self.axes, blocks, PHASES)) if self.ramp is not None else None
-        self.profile_counts = np.zeros((self.axes, blocks, PHASES), np.int64)
-        self.ramp_turns = np.full(blocks, np.nan) if self.ramp is not None else None
+        self.profile_sums = (
+            np.zeros((self.axes, block_count, PHASES)) if self.ramp is not None else None
+        )
+        self.profile_counts = np.zeros((self.axes, block_count, PHASES), np.int64)
+        self.ramp_turns = np.full(block_count, np.nan) if self.ramp is not None else None
 
     def add(self, stretch: Stretch) -> None:
         """Take in some blocks."""
-        part = slice(stretch.first, stretch.first + stretch.values.shape[1])
+        component = slice(stretch.first, stretch.first + stretch.values.shape[1])
         present = ~np.isnan(stretch.values)
         centred = np.empty_like(stretch.values)
         for row in range(self.rows):
             kernel.block_samples(
-                stretch.values[row], centred[row], self.moments[row, part], self.counts[row, part]
+                stretch.values[row],
+                centred[row],
+                self.moments[row, component],
+                self.counts[row, component],
             )
             if row < self.axes:
-                found = find_peaks(stretch.values[row], self.histogram[row, part])
+                found = find_peaks(stretch.values[row], self.histogram[row, component])
                 self.peaks[row].append(found._replace(block=found.block + stretch.first))
-        self._spectra(part, centred, present)
-        self.together[:, part] = zeros_together(stretch.values[: self.axes])
+        self._spectra(component, centred, present)
+        self.together[:, component] = zeros_together(stretch.values[: self.axes])
         for kind, number in samples_at_once(present[: self.axes]).items():
-            self.at_once.setdefault(kind, np.zeros(self.blocks, np.int64))[part] = number
-        self.adjacent[:, part] = np.count_nonzero(
+            self.at_once.setdefault(kind, np.zeros(self.block_count, np.int64))[component] = number
+        self.adjacent[:, component] = np.count_nonzero(
             present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1
         )
-        self._find_gaps(part, present[: self.axes])
+        self._find_gaps(component, present[: self.axes])
         inner = np.arange(PIECES) * self.length // PIECES
         for row in range(self.axes):
-            self.pieces[0, row, part] = np.add.reduceat(
+            self.pieces[0, row, component] = np.add.reduceat(
                 np.where(present[row], stretch.values[row], 0.0), inner, axis=1
             )
-            self.pieces[1, row, part] = np.add.reduceat(
+            self.pieces[1, row, component] = np.add.reduceat(
                 present[row], inner, axis=1, dtype=np.float64
             )
         for name, fine in self.fine.items():
             row, edges = self.axes + self.beside.index(name), np.arange(FINE) * self.length // FINE
             total = np.add.reduceat(np.where(present[row], stretch.values[row], 0.0), edges, axis=1)
             with np.errstate(invalid="ignore", divide="ignore"):
-                fine[part] = total / np.add.reduceat(present[row].astype(np.float64), edges, axis=1)
-        every = max(1, self.blocks // _FOR_LATTICE)
-        chosen = [number for number in range(part.start, part.stop) if number % every == 0]
+                fine[component] = total / np.add.reduceat(
+                    present[row].astype(np.float64), edges, axis=1
+                )
+        every = max(1, self.block_count // _FOR_LATTICE)
+        chosen = [
+            number for number in range(component.start, component.stop) if number % every == 0
+        ]
         self.kept += [
-            stretch.values[: self.axes, number - part.start, : _KEPT // _FOR_LATTICE].copy()
+            stretch.values[: self.axes, number - component.start, : _KEPT // _FOR_LATTICE].copy()
             for number in chosen
         ]
         if self.order is not None:
-            self._orders(part, centred[: self.axes])
+            self._orders(component, centred[: self.axes])
         if self.profile_sums is not None:
             phase = stretch.values[self.ramp]
-            self._turn_ramp(part, phase)
+            self._turn_ramp(component, phase)
             for row in range(self.axes):
-                sums, counts = self.profile_sums[row, part], self.profile_counts[row, part]
+                sums, counts = (
+                    self.profile_sums[row, component],
+                    self.profile_counts[row, component],
+                )
                 kernel.phase_profile(
                     centred[row], present[row], phase, *self.ramp_range, sums, counts
                 )
 
-    def _turn_ramp(self, part: slice, phase: Array) -> None:
+    def _turn_ramp(self, component: slice, phase: Array) -> None:
         """How often the ramp turns in each block, from the moves between samples, none of them half a turn."""
         assert self.ramp_turns is not None
         low, high = self.ramp_range
@@ -162,27 +179,27 @@ class Accumulator:
         moved -= np.round(moved)
         there = np.isfinite(moved)
         total = np.where(there, moved, 0.0).sum(axis=1)
-        self.ramp_turns[part] = (
+        self.ramp_turns[component] = (
             np.where(there.any(axis=1), total / np.maximum(there.sum(axis=1), 1), np.nan)
             * self.rate
         )
 
-    def _spectra(self, part: slice, centred: Array, present: NDArray[np.bool_]) -> None:
+    def _spectra(self, component: slice, centred: Array, present: NDArray[np.bool_]) -> None:
         inside = slice(1, kernel.ordinates(self.length) + 1)
-        counts = self.counts[:, part, 0]
+        counts = self.counts[:, component, 0]
         spectra = np.fft.rfft(centred * self.weights, axis=-1)[..., inside]
         used = counts >= max(_POWER_SHARE * self.length, 2)
         places, tables = [], []
         for row in range(self.rows):
-            place, table = self._masks(row, part, present[row], counts[row], used[row])
+            place, table = self._masks(row, component, present[row], counts[row], used[row])
             places.append(place)
             tables.append(table)
             power = kernel.band_powers(
                 spectra[row], spectra[row], table, place, self.edges, self.rate
             ).real
-            self.power[row, part] = np.where(used[row][:, None], power, np.nan)
+            self.power[row, component] = np.where(used[row][:, None], power, np.nan)
             if row < self.axes:
-                self._lines(row, part, spectra[row], table, place, used[row])
+                self._lines(row, component, spectra[row], table, place, used[row])
         for number, (a, b) in enumerate(self.pairs):
             both = np.count_nonzero(present[a] & present[b], axis=-1)
             cross = kernel.band_powers(
@@ -190,23 +207,25 @@ class Accumulator:
             )
             differ = (both != counts[a]) | (both != counts[b])
             differ &= used[a] & used[b]
-            self.cross_shape[number, part] = self.shape[a, part]
-            self.cross_neighbours[number, part] = self.neighbours[a, part]
-            self.cross_samples[number, part] = both
+            self.cross_shape[number, component] = self.shape[a, component]
+            self.cross_neighbours[number, component] = self.neighbours[a, component]
+            self.cross_samples[number, component] = both
             if differ.any():
                 both_there = (present[a] & present[b])[differ]
-                cross[differ], self.cross_shape[number, part][differ] = self._jointly(
+                cross[differ], self.cross_shape[number, component][differ] = self._jointly(
                     centred[[a, b]][:, differ], both_there
                 )
-                self.cross_neighbours[number, part][differ] = _neighbours(both_there, self.weights)
+                self.cross_neighbours[number, component][differ] = _neighbours(
+                    both_there, self.weights
+                )
             cross[~(used[a] & used[b])] = np.nan
             cross[both < max(_POWER_SHARE * self.length, 2)] = np.nan
-            self.cross[number, part] = cross
+            self.cross[number, component] = cross
 
     def _masks(
         self,
         row: int,
-        part: slice,
+        component: slice,
         present: NDArray[np.bool_],
         counts: NDArray[np.int64],
         used: NDArray[np.bool_],
@@ -228,19 +247,19 @@ class Accumulator:
                 )
                 neighbours[gappy] = _neighbours(present[gappy], self.weights)
             shape[~used] = neighbours[~used] = np.nan
-            self.shape[row, part], self.neighbours[row, part] = shape, neighbours
+            self.shape[row, component], self.neighbours[row, component] = shape, neighbours
         return place, table
 
     def _lines(
         self,
         row: int,
-        part: slice,
+        component: slice,
         spectra: NDArray[np.complex128],
         table: Array,
         place: NDArray[np.int64],
         used: NDArray[np.bool_],
     ) -> None:
-        part_of = np.arange(part.start, part.stop) * PARTS // self.blocks
+        part_of = np.arange(component.start, component.stop) * PARTS // self.block_count
         for piece in np.unique(part_of):
             chosen = used & (part_of == piece)
             self.line_sum[row, piece] += (
@@ -277,10 +296,10 @@ class Accumulator:
             )
         return out, shape
 
-    def _find_gaps(self, part: slice, present: NDArray[np.bool_]) -> None:
+    def _find_gaps(self, component: slice, present: NDArray[np.bool_]) -> None:
         """List the long stretches in which no axis has a sample."""
         lost = np.concatenate([[self.open is not None], ~present.any(axis=0).ravel()])
-        first = part.start * self.length
+        first = component.start * self.length
         for place in np.flatnonzero(lost[1:] != lost[:-1]) if lost.any() else ():
             if lost[place + 1]:
                 self.open = first + int(place)
@@ -290,11 +309,11 @@ class Accumulator:
                     self.gaps.append((begin, first + int(place)))
                 self.open = None
 
-    def _orders(self, part: slice, centred: Array) -> None:
+    def _orders(self, component: slice, centred: Array) -> None:
         assert self.turning is not None
         assert self.order is not None
         assert self.order_level is not None
-        index = np.arange(part.start * self.length, part.stop * self.length)
+        index = np.arange(component.start * self.length, component.stop * self.length)
         rotation, self.turn_carry = channel_at(
             self.turning, grid_times(self.start, self.rate, index), self.turn_carry
         )
@@ -304,18 +323,18 @@ class Accumulator:
         turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
         often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
         turned = np.abs(often) >= 1.0
-        counts = self.counts[: self.axes, part, 0]
+        counts = self.counts[: self.axes, component, 0]
         enough = turned & (counts >= max(_POWER_SHARE * self.length, 2))
         wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
         present, left = centred != 0.0, centred  # missing samples count as zero
         with np.errstate(invalid="ignore", divide="ignore"):
             for number, wheel in enumerate(wheels):
                 value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
-                self.order[:, part, number] = np.where(enough, value, np.nan)
+                self.order[:, component, number] = np.where(enough, value, np.nan)
                 left = left - np.where(present, (value[..., None] * np.conj(wheel)).real, 0.0)
             for number, wheel in enumerate(wheels):
                 level = _power_beside(left * wheel, often, HARMONICS[number]) / (counts * self.rate)
-                self.order_level[:, part, number] = np.where(enough, level, np.nan)
+                self.order_level[:, component, number] = np.where(enough, level, np.nan)
 
 
 def _power_beside(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:

@@ -146,7 +146,12 @@ def align_channels(log: xr.Dataset) -> Aligned:
                     {name: ("time", problem.values, log[name].attrs)}
                 )
                 notes += [problem.note] if problem.note else []
-    mine = [part for name in unused for part in (name, f"time_{name}") if part in log.variables]
+    mine = [
+        component
+        for name in unused
+        for component in (name, f"time_{name}")
+        if component in log.variables
+    ]
     return Aligned(log.drop_vars(mine), unused, notes)
 
 
@@ -263,11 +268,11 @@ def _on_grid(log: xr.Dataset, name: str, clock: _Clock, lay: Any, size: int) -> 
     import dask.array as da
 
     laid = dask.delayed(lay, pure=False)
-    parts = [
+    components = [
         da.from_delayed(laid(data[a:b], a, low, high), (high - low,), dtype=np.float64)
         for (low, high), (a, b) in zip(pieces, spans, strict=True)
     ]
-    return da.concatenate(parts)
+    return da.concatenate(components)
 
 
 def _needed(clock: _Clock, lay: Any, low: int, high: int) -> tuple[int, int]:

@@ -165,8 +165,8 @@ def reduce_log(
     --------
     >>> from gyrostab.ingest.make_log import make_log
     >>> noise = 0.18 * 10 * np.random.default_rng(1).standard_normal((1, 360_000))
-    >>> reduced = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
-    >>> reduced.sizes["block"], reduced.attrs["block_s"], float((reduced.power.mean() ** 0.5).round(2))
+    >>> blocks = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
+    >>> blocks.sizes["block"], blocks.attrs["block_s"], float((blocks.power.mean() ** 0.5).round(2))
     (180, 20.0, 0.18)
     """
     check_log(log)
@@ -174,7 +174,7 @@ def reduce_log(
     length = block_samples(size, rate, block)
     work = Accumulator(log, length, size // length, rate)
     rows = row_count(log)
-    progress("reducing", rows * work.blocks * length)
+    progress("reducing", rows * work.block_count * length)
     for stretch in read_stretches(log, length):
         if left_out is not None:
             stretch.values[: work.axes][
@@ -183,18 +183,18 @@ def reduce_log(
         work.add(stretch)
         progress(
             "reducing",
-            rows * work.blocks * length,
+            rows * work.block_count * length,
             rows * (stretch.first + stretch.values.shape[1]) * length,
         )
     return _labelled(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
 
 
-def measured(reduced: xr.Dataset, name: str) -> xr.DataArray:
+def measured(blocks: xr.Dataset, name: str) -> xr.DataArray:
     """A variable of the reduced record as the axes measured it, with what of it is left out because they moved."""
-    return reduced[f"measured_{name}"] if f"measured_{name}" in reduced else reduced[name]
+    return blocks[f"measured_{name}"] if f"measured_{name}" in blocks else blocks[name]
 
 
-def noise_at_orders(reduced: xr.Dataset, expected: Array) -> Array:
+def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
     """Density of the noise about the orders of the rotation: the expected one, or what turns almost as often where that is surely more.
 
     Waves in the recording that have nothing to do with the tool, as those of the ground, are as
@@ -202,14 +202,14 @@ def noise_at_orders(reduced: xr.Dataset, expected: Array) -> Array:
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `reduce_log`.
     expected : ndarray, shape (..., axis, block, harmonic)
         [degree2 hour-2 Hz-1]
     """
-    if "order_level" not in reduced:
+    if "order_level" not in blocks:
         return expected
-    beside = reduced["order_level"].transpose("axis", "block", "harmonic").values
+    beside = blocks["order_level"].transpose("axis", "block", "harmonic").values
     return np.where(beside > _LOUDER * expected, beside, expected)
 
 
@@ -365,7 +365,7 @@ def _named(name: str, units: str) -> dict[str, Any]:
     return {"long_name": name, "units": units}
 
 
-def _evenness(power: Array, shape: Array, samples: NDArray[np.int64], parts: int) -> Array:
+def _evenness(power: Array, shape: Array, samples: NDArray[np.int64], components: int) -> Array:
     """Share of the blocks of each part that as many blocks of equal power would be, (axis, part): a few loud ones have all the weight."""
     good = np.isfinite(power) & np.isfinite(shape) & (shape > 0.0)
     ordinates = np.where(good, shape, 0.0)
@@ -377,14 +377,14 @@ def _evenness(power: Array, shape: Array, samples: NDArray[np.int64], parts: int
     level = (ordinates * np.divide(known, usual, out=np.zeros_like(known), where=usual > 0.0)).sum(
         axis=2
     ) / total
-    out = np.ones((len(power), parts))
-    for part in range(parts):
-        mine = np.arange(power.shape[1]) * parts // power.shape[1] == part
+    out = np.ones((len(power), components))
+    for component in range(components):
+        mine = np.arange(power.shape[1]) * components // power.shape[1] == component
         size, loud = samples[:, mine].astype(np.float64), level[:, mine]
         square = size.sum(axis=1) * (
             size * loud**2 * (1.0 - 1.0 / np.maximum(total[:, mine], 2.0))
         ).sum(axis=1)  # less its own scatter
-        out[:, part] = np.divide(
+        out[:, component] = np.divide(
             (size * loud).sum(axis=1) ** 2, square, out=np.ones(len(power)), where=square > 0.0
         )
     return np.minimum(out, 1.0)
@@ -504,7 +504,7 @@ def _locked(work: Accumulator) -> dict[str, Any]:
 def _channels(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     found: dict[str, Any] = {}
     inside, own = numeric_channels(log)
-    edges = grid_times(work.start, work.rate, np.arange(work.blocks + 1) * work.length)
+    edges = grid_times(work.start, work.rate, np.arange(work.block_count + 1) * work.length)
     for name in (*inside, *own):
         rms = name.startswith("vibration")
         if name in inside:
@@ -526,7 +526,7 @@ def _fine(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     """Channels in parts of the blocks, less their noise, where each part has a value of its own: effects follow them with a lag."""
     found: dict[str, Any] = {}
     edges = grid_times(
-        work.start, work.rate, np.arange(work.blocks * FINE + 1) * work.length // FINE
+        work.start, work.rate, np.arange(work.block_count * FINE + 1) * work.length // FINE
     )
     for name in numeric_channels(log)[1]:
         if not name.startswith(FOLLOWED):
@@ -578,7 +578,7 @@ def _spans(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, Any]
 
 
 def _coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
-    ends = np.arange(work.blocks + 1) * work.length
+    ends = np.arange(work.block_count + 1) * work.length
     stamps = grid_times(work.start, work.rate, ends)
     step = work.rate / work.length
     coordinates: dict[str, Any] = {

@@ -82,14 +82,16 @@ def read_stretches(log: xr.Dataset, size: int) -> Iterator[Stretch]:
     rest, number = np.empty((rows, 0)), 0
     for values in _rates(log):
         values = np.concatenate([rest, values], axis=1) if rest.shape[1] else values
-        blocks = values.shape[1] // size
-        for low in range(0, blocks, together):
-            high = min(low + together, blocks)
+        block_count = values.shape[1] // size
+        for low in range(0, block_count, together):
+            high = min(low + together, block_count)
             yield Stretch(
                 number + low, values[:, low * size : high * size].reshape(rows, high - low, size)
             )
-        number += blocks
-        rest = np.array(values[:, blocks * size :])  # a copy, so that the rest of the values can go
+        number += block_count
+        rest = np.array(
+            values[:, block_count * size :]
+        )  # a copy, so that the rest of the values can go
 
 
 def _rates(log: xr.Dataset) -> Iterator[Array]:
@@ -133,11 +135,11 @@ def _cuts(signal: Any, rows: int) -> Iterator[tuple[int, int]]:
 def _loaded(signal: Any, beside: Sequence[Any], low: int, high: int) -> Array:
     import dask
 
-    parts = dask.compute(signal[:, low:high], *(channel[low:high] for channel in beside))
+    components = dask.compute(signal[:, low:high], *(channel[low:high] for channel in beside))
     out = np.empty((signal.shape[0] + len(beside), high - low))
-    out[: signal.shape[0]] = parts[0]
-    for row, part in enumerate(parts[1:], start=signal.shape[0]):
-        out[row] = part
+    out[: signal.shape[0]] = components[0]
+    for row, component in enumerate(components[1:], start=signal.shape[0]):
+        out[row] = component
     return out
 
 
@@ -146,12 +148,12 @@ def channel_at(
 ) -> tuple[Array, float | None]:
     """Values of a channel at rising `instants` [ns since 1970], and what the call for the next ones must be given."""
     stretch = source.stretch(int(instants[0]) - 1, int(instants[-1]))
-    part = (
+    component = (
         None
         if stretch is None
         else (stretch, direct.stretch(source.values, stretch.low, stretch.high))
     )
-    return source.at(instants, part, carry)
+    return source.at(instants, component, carry)
 
 
 def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: bool) -> Array:

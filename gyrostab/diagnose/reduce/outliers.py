@@ -125,10 +125,10 @@ def count_outliers(
         ],
         axis=1,
     )
-    blocks = np.arange(histogram.shape[1])
+    block_count = np.arange(histogram.shape[1])
     near = (
-        sums[:, np.minimum(blocks + _NEAR + 1, blocks.size)]
-        - sums[:, np.maximum(blocks - _NEAR, 0)]
+        sums[:, np.minimum(block_count + _NEAR + 1, block_count.size)]
+        - sums[:, np.maximum(block_count - _NEAR, 0)]
     )
     own, wide = _deviation(np.diff(sums, axis=1)), _deviation(near)
     beside = np.pad(own, ((0, 0), (1, 1)))
@@ -136,9 +136,9 @@ def count_outliers(
     usual = np.maximum(np.maximum(own, wide), 0.1 * _deviation(sums[:, -1:]))
     scale = np.where(beside > _LOUDER * usual, beside, usual)
     number, outliers = np.zeros((2, *scale.shape), np.int64)
-    for axis, parts in enumerate(found):
+    for axis, components in enumerate(found):
         limit = _swollen_limit(histogram[axis], scale[axis])
-        for one in parts:
+        for one in components:
             away = one.size / np.maximum(scale[axis, one.block], one.level)
             np.add.at(number[axis], one.block, away > limit)
             np.add.at(
@@ -249,15 +249,17 @@ def samples_at_once(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArra
     >>> samples_at_once(np.array([[[True, True, True]], [[True, False, True]], [[True, True, False]]]))
     {(True, False, True): array([1]), (True, True, False): array([1]), (True, True, True): array([1])}
     """
-    axes, blocks = present.shape[:2]
+    axes, block_count = present.shape[:2]
     if axes < 2:
         return {}
     if (present == present[:1]).all():
         return {(True,) * axes: np.asarray(np.count_nonzero(present[0], axis=-1), np.int64)}
     code = (present * (1 << np.arange(axes, dtype=np.int64))[:, None, None]).sum(axis=0)
     kinds, place = np.unique(code, return_inverse=True)
-    each = np.arange(blocks)[:, None] * kinds.size + place.reshape(code.shape)
-    number = np.bincount(each.ravel(), minlength=blocks * kinds.size).reshape(blocks, kinds.size)
+    each = np.arange(block_count)[:, None] * kinds.size + place.reshape(code.shape)
+    number = np.bincount(each.ravel(), minlength=block_count * kinds.size).reshape(
+        block_count, kinds.size
+    )
     found = {
         tuple(bool(kind >> axis & 1) for axis in range(axes)): number[:, k]
         for k, kind in enumerate(kinds.tolist())

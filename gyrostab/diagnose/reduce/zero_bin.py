@@ -113,20 +113,20 @@ def _parabola(at: Array, count: NDArray[np.int64], reach: float) -> tuple[Array,
     return None
 
 
-def cut_off(reduced: xr.Dataset) -> NDArray[np.bool_]:
+def cut_off(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Axes whose rate is cut off towards zero on its lattice; the axes tell it together, since one logger writes all of them in one way.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         From `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
 
     Returns
     -------
     ndarray of bool, shape (axis,)
     """
-    on_lattice = np.asarray(reduced["lattice"].values > 0.0)
-    width, error, known = _widths(reduced)
+    on_lattice = np.asarray(blocks["lattice"].values > 0.0)
+    width, error, known = _widths(blocks)
     like = known & _like_cut(width, error)
     narrower = known & (width[:, 0] < _CUT[0] - _LIKE * np.hypot(error[:, 0], _FORM * _CUT[0]))
     if not like.any() or narrower.any():
@@ -137,15 +137,15 @@ def cut_off(reduced: xr.Dataset) -> NDArray[np.bool_]:
     return np.asarray(on_lattice & sure)
 
 
-def may_be_cut_off(reduced: xr.Dataset) -> NDArray[np.bool_]:
+def may_be_cut_off(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Axes on a lattice of which the cells do not tell that they are not cut off towards zero; the rest as for `cut_off`."""
-    width, error, known = _widths(reduced)
-    return np.asarray((reduced["lattice"].values > 0.0) & (~known | _like_cut(width, error)))
+    width, error, known = _widths(blocks)
+    return np.asarray((blocks["lattice"].values > 0.0) & (~known | _like_cut(width, error)))
 
 
-def _widths(reduced: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _widths(blocks: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
     width, error = (
-        reduced[name].transpose("axis", "cell").values
+        blocks[name].transpose("axis", "cell").values
         for name in ("cell_width", "cell_width_stderr")
     )
     return width, error, np.isfinite(width).all(axis=1) & np.isfinite(error).all(axis=1)

@@ -59,25 +59,28 @@ _MOVES = (
 _MOVED = 0.1  # of the largest step from block to block
 
 
-def active_spans(claim: Identification, reduced: xr.Dataset) -> NDArray[np.bool_]:
+def active_spans(identification: Identification, blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks in which an effect does something, from its designs and from the turning of the tool; all where neither depends on time."""
-    blocks = reduced.sizes["block"]
-    there = np.zeros(blocks, bool)
-    for part in claim.parts:
-        design = part.variant.design
-        if part.candidate.view == "order":
-            there |= _turning(reduced)
+    block_count = blocks.sizes["block"]
+    there = np.zeros(block_count, bool)
+    for component in identification.components:
+        design = component.variant.design
+        if component.candidate.statistic == "order":
+            there |= _turning(blocks)
             continue
-        if part.candidate.view not in ("mean", "power", "cross", "wander") or design.size == 0:
-            return np.ones(blocks, bool)
-        place = [number for number, size in enumerate(design.shape) if size == blocks]
+        if (
+            component.candidate.statistic not in ("mean", "power", "cross", "wander")
+            or design.size == 0
+        ):
+            return np.ones(block_count, bool)
+        place = [number for number, size in enumerate(design.shape) if size == block_count]
         if not place:
-            return np.ones(blocks, bool)
-        size = np.asarray(np.moveaxis(np.asarray(design), place[0], 0).reshape(blocks, -1))
-        size = np.abs(size - _rest(size) if part.candidate.view == "mean" else size)
+            return np.ones(block_count, bool)
+        size = np.asarray(np.moveaxis(np.asarray(design), place[0], 0).reshape(block_count, -1))
+        size = np.abs(size - _rest(size) if component.candidate.statistic == "mean" else size)
         largest = np.nanmax(size, axis=0, initial=0.0)
         there |= (size > _ACTS * np.where(largest > 0, largest, np.inf)).any(axis=1)
-    return there if there.any() else np.ones(blocks, bool)
+    return there if there.any() else np.ones(block_count, bool)
 
 
 def _rest(size: Array) -> Array:
@@ -86,9 +89,9 @@ def _rest(size: Array) -> Array:
     return np.where(still.mean(axis=0) >= _RESTS, 0.0, np.median(size, axis=0))
 
 
-def _turning(reduced: xr.Dataset) -> NDArray[np.bool_]:
+def _turning(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Blocks in which the tool turns: those that the harmonics of its turning are measured in."""
-    turn = np.abs(np.nan_to_num(reduced["channel_rotation_rate"].values))
+    turn = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values))
     return np.asarray(turn > _STILL * turn.max(initial=0.0))
 
 
@@ -119,8 +122,8 @@ def spans(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[floa
 
 def attribute_mismatches(
     found: xr.Dataset,
-    claims: Sequence[Identification],
-    reduced: xr.Dataset,
+    identified: Sequence[Identification],
+    blocks: xr.Dataset,
     after: xr.Dataset,
     null: NullScores,
     *,
@@ -141,8 +144,8 @@ def attribute_mismatches(
     ----------
     found : xarray.Dataset
         From `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
-    claims : sequence of Claim
-    reduced, after : xarray.Dataset
+    identified : sequence of Claim
+    blocks, after : xarray.Dataset
         The recording, and the baseline with the effects.
     null : NullScores
         What was found is measured by.
@@ -159,58 +162,79 @@ def attribute_mismatches(
     list of list of str
         Names, for each mismatch.
     """
-    boxes = [
+    regions = [
         {str(name): found[name].values[number] for name in found.data_vars}
         for number in range(found.sizes["mismatch"])
     ]
-    scores = statistic_scores(reduced, after, null, boxes, claims, still=still)
+    scores = statistic_scores(blocks, after, null, regions, identified, still=still)
     known: dict[tuple[int, ...], Scores] = {(): scores}
 
-    def left(box: Mapping[str, Any], out: Sequence[Identification]) -> tuple[float, float]:
+    def left(region: Mapping[str, Any], out: Sequence[Identification]) -> tuple[float, float]:
         chosen = tuple(
-            number for number, claim in enumerate(claims) if any(claim is one for one in out)
+            number
+            for number, identification in enumerate(identified)
+            if any(identification is one for one in out)
         )
         if chosen not in known and without is not None:
-            rest = [claim for number, claim in enumerate(claims) if number not in chosen]
-            known[chosen] = statistic_scores(reduced, without(out), null, boxes, rest, still=still)
-        return left_of(box, known[chosen], null, level)
-
-    when = [_reach(claim, reduced) for claim in claims]
-    moves = [_moves(claim, reduced, after) for claim in claims]
-    told = []
-    for box in boxes:
-        score, limit = left_of(box, scores, null, level)
-        shown = []
-        for claim, its_time, its_moves in zip(claims, when, moves, strict=True):
-            moved = _is_inside(box, reduced) and any(
-                _overlap(box, span) > 0.0 for span in its_moves
-            )
-            parts = [part for part in claim.parts if _can_show(part, box, reduced)]
-            parts = [
-                part
-                for part in parts
-                if moved or part.candidate.view not in _MOVES or box["view"] != "spectrum"
+            rest = [
+                identification
+                for number, identification in enumerate(identified)
+                if number not in chosen
             ]
-            if not parts or not set(str(box["axes"]).split()) & set(claim.axes):
+            known[chosen] = statistic_scores(blocks, without(out), null, regions, rest, still=still)
+        return left_of(region, known[chosen], null, level)
+
+    when = [_reach(identification, blocks) for identification in identified]
+    moves = [_moves(identification, blocks, after) for identification in identified]
+    told = []
+    for region in regions:
+        score, limit = left_of(region, scores, null, level)
+        shown = []
+        for identification, its_time, its_moves in zip(identified, when, moves, strict=True):
+            moved = _is_inside(region, blocks) and any(
+                _overlap(region, span) > 0.0 for span in its_moves
+            )
+            components = [
+                component
+                for component in identification.components
+                if _can_show(component, region, blocks)
+            ]
+            components = [
+                component
+                for component in components
+                if moved
+                or component.candidate.statistic not in _MOVES
+                or region["view"] != "spectrum"
+            ]
+            if not components or not set(str(region["axes"]).split()) & set(identification.axes):
                 continue
-            if score >= limit and {part.candidate.view for part in parts} <= _modelled(claim, box):
+            if score >= limit and {
+                component.candidate.statistic for component in components
+            } <= _modelled(identification, region):
                 continue
             if (
                 moved
-                or any(_meet(box, span) for span in its_time)
-                or (without is not None and _beside(box, parts, partial(left, box, (claim,))))
+                or any(_meet(region, span) for span in its_time)
+                or (
+                    without is not None
+                    and _beside(region, components, partial(left, region, (identification,)))
+                )
             ):
-                shown.append((claim, parts))
+                shown.append((identification, components))
         several = without is not None and score < limit
-        kept = needed(box, shown, partial(left, box)) if several else [claim for claim, _ in shown]
-        told.append(list(dict.fromkeys(claim.effect for claim in kept)))
+        kept = (
+            needed(region, shown, partial(left, region))
+            if several
+            else [identification for identification, _ in shown]
+        )
+        told.append(list(dict.fromkeys(identification.effect for identification in kept)))
     return told
 
 
 def unexpected(
     found: xr.Dataset,
     expected: Sequence[Identification],
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     before: xr.Dataset,
     null: NullScores,
     *,
@@ -224,7 +248,7 @@ def unexpected(
         Located where odd samples that are expected were left out; so these explain what is odd and
         no more.
     expected : sequence of Claim
-    reduced, before : xarray.Dataset
+    blocks, before : xarray.Dataset
         The recording, and the baseline with these effects.
     null : NullScores
     level : float
@@ -233,31 +257,36 @@ def unexpected(
         one
         for one in expected
         if any(
-            part.candidate.view == "marks" and find_anomalous_blocks(part, reduced).any()
-            for part in one.parts
+            component.candidate.statistic == "marks"
+            and find_anomalous_blocks(component, blocks).any()
+            for component in one.components
         )
     ]
     others = [one for one in expected if one not in odd]
     by_count, by_all = (
-        attribute_mismatches(found, claims, reduced, before, null, level=level)
-        for claims in (odd, others)
+        attribute_mismatches(found, identified, blocks, before, null, level=level)
+        for identified in (odd, others)
     )
     told = [
-        bool(named) or (bool(counted) and view == "distribution")
-        for view, counted, named in zip(found["view"].values, by_count, by_all, strict=True)
+        bool(named) or (bool(counted) and statistic == "distribution")
+        for statistic, counted, named in zip(found["view"].values, by_count, by_all, strict=True)
     ]
     return found.isel(mismatch=~np.array(told, np.bool_)) if expected else found
 
 
 def _beside(
-    box: Mapping[str, Any], parts: Sequence[Component], left: Callable[[], tuple[float, float]]
+    region: Mapping[str, Any],
+    components: Sequence[Component],
+    left: Callable[[], tuple[float, float]],
 ) -> bool:
     """Whether a mismatch of the mean is there for what an effect does at other times.
 
     The constant of a record is free: a mean that is higher in one part is one that is lower in the
     rest, and either may stand out.
     """
-    if str(box["view"]) != "mean" or not {part.candidate.view for part in parts} <= {
+    if str(region["view"]) != "mean" or not {
+        component.candidate.statistic for component in components
+    } <= {
         "mean",
         "levels",
     }:
@@ -266,84 +295,95 @@ def _beside(
     return score >= limit
 
 
-def _modelled(claim: Identification, box: Mapping[str, Any]) -> set[str]:
+def _modelled(identification: Identification, region: Mapping[str, Any]) -> set[str]:
     """Parts that must take the mismatch away; that several axes wander as one is in no model, and what wanders on them may do it."""
-    held = {*_MODELLED, "line", "marks"} if box["view"] == "cross_axis" else set(_MODELLED)
+    held = {*_MODELLED, "line", "marks"} if region["view"] == "cross_axis" else set(_MODELLED)
     wanders = (
-        str(box["what"]) == "slow" and len(set(str(box["axes"]).split()) & set(claim.axes)) > 1
+        str(region["what"]) == "slow"
+        and len(set(str(region["axes"]).split()) & set(identification.axes)) > 1
     )
     return held - ({"wander"} if wanders else set())
 
 
-def _can_show(part: Component, box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
+def _can_show(component: Component, region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
     """Whether a part of an effect can be seen where a mismatch is.
 
     A line explains a line at its own frequency only, and a mean of what axes share only what is
     slow.
     """
-    if str(box["view"]) not in _SHOWS.get(part.candidate.view, ()):
+    if str(region["view"]) not in _SHOWS.get(component.candidate.statistic, ()):
         return False
     if (
-        part.candidate.view in ("mean", "wander", "levels")
-        and box["view"] == "cross_axis"
-        and box["what"] != "slow"
+        component.candidate.statistic in ("mean", "wander", "levels")
+        and region["view"] == "cross_axis"
+        and region["what"] != "slow"
     ):
         return False
-    if part.candidate.view == "line" and box["view"] == "cross_axis":
-        return str(box["what"]) != "slow"
-    if part.candidate.view != "line" or part.place < 0 or box["view"] == "distribution":
+    if component.candidate.statistic == "line" and region["view"] == "cross_axis":
+        return str(region["what"]) != "slow"
+    if (
+        component.candidate.statistic != "line"
+        or component.place < 0
+        or region["view"] == "distribution"
+    ):
         return True
-    lines = reduced["line_frequency"].values
-    mine = float(lines[part.place])
-    if np.isfinite(box["frequency"]):
-        return bool(abs(box["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine)
+    lines = blocks["line_frequency"].values
+    mine = float(lines[component.place])
+    if np.isfinite(region["frequency"]):
+        return bool(
+            abs(region["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine
+        )
     tau = _BUMP / mine  # where the Allan variance of a sine is largest
-    return str(box["what"]).startswith(("avar", "level", "restless")) and bool(
-        box["tau_min_s"] / _WIDE <= tau <= box["tau_max_s"] * _WIDE
+    return str(region["what"]).startswith(("avar", "level", "restless")) and bool(
+        region["tau_min_s"] / _WIDE <= tau <= region["tau_max_s"] * _WIDE
     )
 
 
-def _reach(claim: Identification, reduced: xr.Dataset) -> list[tuple[float, float]]:
+def _reach(identification: Identification, blocks: xr.Dataset) -> list[tuple[float, float]]:
     """Stretches whose mismatches an effect can explain: a line of the turning stands out also where a part turns but little."""
-    begin, end = reduced["begin"].values, reduced["end"].values
-    if any(part.candidate.view == "order" for part in claim.parts):
+    begin, end = blocks["begin"].values, blocks["end"].values
+    if any(component.candidate.statistic == "order" for component in identification.components):
         return [(float(begin[0]), float(end[-1]))]
-    return spans(active_spans(claim, reduced), begin, end)
+    return spans(active_spans(identification, blocks), begin, end)
 
 
-def _meet(box: Mapping[str, Any], span: tuple[float, float]) -> bool:
-    return _overlap(box, span) >= _MEETS * min(float(box["end"] - box["begin"]), span[1] - span[0])
-
-
-def _overlap(box: Mapping[str, Any], span: tuple[float, float]) -> float:
-    return float(min(box["end"], span[1]) - max(box["begin"], span[0]))
-
-
-def _is_inside(box: Mapping[str, Any], reduced: xr.Dataset) -> bool:
-    """Whether a mismatch is of the inside of blocks, and not of their means."""
-    return str(box["view"]) in ("spectrum", "distribution") or float(box["tau_max_s"]) < float(
-        reduced.attrs["block_s"]
+def _meet(region: Mapping[str, Any], span: tuple[float, float]) -> bool:
+    return _overlap(region, span) >= _MEETS * min(
+        float(region["end"] - region["begin"]), span[1] - span[0]
     )
+
+
+def _overlap(region: Mapping[str, Any], span: tuple[float, float]) -> float:
+    return float(min(region["end"], span[1]) - max(region["begin"], span[0]))
+
+
+def _is_inside(region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
+    """Whether a mismatch is of the inside of blocks, and not of their means."""
+    return str(region["view"]) in ("spectrum", "distribution") or float(
+        region["tau_max_s"]
+    ) < float(blocks.attrs["block_s"])
 
 
 def _moves(
-    claim: Identification, reduced: xr.Dataset, after: xr.Dataset
+    identification: Identification, blocks: xr.Dataset, after: xr.Dataset
 ) -> list[tuple[float, float]]:
     """Blocks [s] in which an effect moves the rate of an axis too fast for what is said of their inside."""
     axes, moving = (
-        [str(axis) for axis in reduced["axis"].values],
-        expect_known_motion(reduced, after),
+        [str(axis) for axis in blocks["axis"].values],
+        expect_known_motion(blocks, after),
     )
-    there = np.zeros(reduced.sizes["block"], np.bool_)
-    for part in (
-        part for part in claim.parts if part.candidate.view in _MOVES and part.variant.design.size
+    there = np.zeros(blocks.sizes["block"], np.bool_)
+    for component in (
+        component
+        for component in identification.components
+        if component.candidate.statistic in _MOVES and component.variant.design.size
     ):
-        row = axes.index(part.row[0])
-        for column in mean_columns(part.variant, row):
+        row = axes.index(component.row[0])
+        for column in mean_columns(component.variant, row):
             step = np.abs(np.diff(np.nan_to_num(column)))
             far = step > _MOVED * step.max(initial=0.0)
             there |= moving[row] & (np.append(far, False) | np.append(False, far))
     return [
-        (float(reduced["begin"].values[block]), float(reduced["end"].values[block]))
+        (float(blocks["begin"].values[block]), float(blocks["end"].values[block]))
         for block in np.flatnonzero(there)
     ]

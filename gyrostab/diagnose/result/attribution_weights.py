@@ -41,62 +41,68 @@ _WEIGHED: dict[str, tuple[str, ...]] = {
     "cross_axis": ("mean", "levels", "cross", "line", "marks"),
     "distribution": ("power",),
 }
-_OF_LINES = ("spectrum", "gliding")  # views of the spectrum at full resolution
+_OF_LINES = ("spectral_line", "drifting_line")  # views of the spectrum at full resolution
 _LEFT = 0.3  # of a mismatch, that an error of the form may leave
 _FAIR = 0.5  # of an equal share
 
 
 def statistic_scores(
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     after: xr.Dataset,
     null: NullScores,
-    boxes: Sequence[Box],
-    claims: Iterable[Identification] = (),
+    regions: Sequence[Box],
+    identified: Iterable[Identification] = (),
     *,
     still: xr.Dataset | None = None,
 ) -> Scores:
     """Views of the recording against a baseline with effects in it.
 
-    What is said of blocks leaves out those of odd samples of `claims`, and what is said of their
+    What is said of blocks leaves out those of odd samples of `identified`, and what is said of their
     inside those in which an effect moves the rate; so do the lines of `still`, which are those of
-    `reduced` by default.
+    `blocks` by default.
     """
     out = []
-    reduced = remove_known_motion(reduced, after)
-    after = _with_shared_lines(reduced, after, claims := list(claims))
-    seen = mask_anomalous_blocks(reduced, [part for claim in claims for part in claim.parts])
-    turns_left_out = without_turns(
-        reduced, after["spectrum"].transpose("axis", "block", "band").values
+    blocks = remove_known_motion(blocks, after)
+    after = _with_shared_lines(blocks, after, identified := list(identified))
+    seen = mask_anomalous_blocks(
+        blocks,
+        [component for identification in identified for component in identification.components],
     )
-    special = {"distribution": turns_left_out, "restless": levelled(seen, after, louder(boxes))}
+    turns_left_out = without_turns(
+        blocks, after["spectrum"].transpose("axis", "block", "band").values
+    )
+    special = {
+        "sample_counts": turns_left_out,
+        "variance_stability": levelled(seen, after, louder(regions)),
+    }
     if still is not None:
         special |= dict.fromkeys(
             _OF_LINES, seen.assign({name: still[name] for name in ("line_power", "line_weight")})
         )
     for name, score in STATISTICS.items():
-        scores = score(special.get(name, seen), after) if name in null.views else None
+        scores = score(special.get(name, seen), after) if name in null.statistics else None
         if scores is not None:
-            out.append((name, scores, standardise(scores, null.views[name])))
+            out.append((name, scores, standardise(scores, null.statistics[name])))
     return out
 
 
 def _with_shared_lines(
-    reduced: xr.Dataset, after: xr.Dataset, claims: Sequence[Identification]
+    blocks: xr.Dataset, after: xr.Dataset, identified: Sequence[Identification]
 ) -> xr.Dataset:
     """The baseline with the covariance of a line that axes have in common: its mean over the record, in the bands where the line is.
 
     The lowest band stays as it is, for it tells what the means of the blocks share.
     """
     lines = [
-        (part.place, part.row[0])
-        for claim in claims
-        for part in claim.parts
-        if part.candidate.view == "line" and part.place >= 0
+        (component.place, component.row[0])
+        for identification in identified
+        for component in identification.components
+        if component.candidate.statistic == "line" and component.place >= 0
     ]
-    if "cross" not in reduced or len(lines) < 2:
+    if "cross" not in blocks or len(lines) < 2:
         return after
     seen, shape = (
-        reduced[name].transpose("pair", "block", "band").values for name in ("cross", "cross_shape")
+        blocks[name].transpose("pair", "block", "band").values for name in ("cross", "cross_shape")
     )
     known = (
         after["cross"].transpose("pair", "block", "band").values
@@ -111,49 +117,52 @@ def _with_shared_lines(
         out=np.zeros(total.shape, complex),
         where=total > 0.0,
     )
-    reach = 1.0 / float(reduced.attrs["block_s"])
+    reach = 1.0 / float(blocks.attrs["block_s"])
     cross = known.copy()
     for place in {place for place, _ in lines}:
-        frequency = float(reduced["line_frequency"].values[place])
+        frequency = float(blocks["line_frequency"].values[place])
         bands = np.flatnonzero(
-            (reduced["band_low"].values <= frequency + reach)
-            & (frequency - reach < reduced["band_high"].values)
+            (blocks["band_low"].values <= frequency + reach)
+            & (frequency - reach < blocks["band_high"].values)
         )
         axes = {axis for other, axis in lines if other == place}
-        for number, pair in enumerate(pair_rows(reduced)):
+        for number, pair in enumerate(pair_rows(blocks)):
             if set(pair) <= axes:
                 mine = bands[bands > 0]
                 cross[number][:, mine] = known[number][:, mine] + mean[number][mine]
     return after.assign(cross=(("pair", "block", "band"), cross))
 
 
-def left_of(box: Box, scores: Scores, null: NullScores, level: float) -> tuple[float, float]:
+def left_of(region: Box, scores: Scores, null: NullScores, level: float) -> tuple[float, float]:
     """Largest score where the mismatch was, and the score from which on that is one still."""
     left, limit = 0.0, np.inf
-    for name, view, z in scores:
-        if view.attrs["view"] != box["view"] or str(box["what"]) not in view["what"].values:
+    for name, statistic, z in scores:
+        if (
+            statistic.attrs["view"] != region["view"]
+            or str(region["what"]) not in statistic["what"].values
+        ):
             continue
         rows = [
             number
-            for number, axes in enumerate(view["axes"].values)
-            if set(str(axes).split()) & set(str(box["axes"]).split())
+            for number, axes in enumerate(statistic["axes"].values)
+            if set(str(axes).split()) & set(str(region["axes"]).split())
         ]
-        inside = (view["begin"].values >= box["begin"] - 1e-6) & (
-            view["end"].values <= box["end"] + 1e-6
+        inside = (statistic["begin"].values >= region["begin"] - 1e-6) & (
+            statistic["end"].values <= region["end"] + 1e-6
         )
-        columns = (view["what"].values == box["what"]) & (
-            view["tau_min_s"].values >= 0.99 * box["tau_min_s"]
+        columns = (statistic["what"].values == region["what"]) & (
+            statistic["tau_min_s"].values >= 0.99 * region["tau_min_s"]
         )
-        columns &= view["tau_min_s"].values <= 1.01 * box["tau_max_s"]
+        columns &= statistic["tau_min_s"].values <= 1.01 * region["tau_max_s"]
         cells = np.abs(z[np.ix_(rows, inside, columns)])
         if np.isfinite(cells).any():
             left = max(left, float(np.nanmax(cells)))
-            limit = min(limit, max(null.critical(name, level), _LEFT * abs(float(box["z"]))))
+            limit = min(limit, max(null.critical(name, level), _LEFT * abs(float(region["z"]))))
     return left, limit
 
 
 def needed(
-    box: Box,
+    region: Box,
     shown: Sequence[tuple[Identification, Sequence[Component]]],
     left: Callable[[Sequence[Identification]], tuple[float, float]],
 ) -> list[Identification]:
@@ -167,7 +176,7 @@ def needed(
 
     Parameters
     ----------
-    box : mapping
+    region : mapping
         The mismatch, with the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
     shown : sequence of (Claim, sequence of Part)
         Effects that act there and together leave nothing of it, each with its parts that can show
@@ -175,7 +184,11 @@ def needed(
     left : callable
         The score that is left there when some effects are left out, and the score of a mismatch.
     """
-    weighed = [one for one, parts in shown if all(_is_weighed(part, box) for part in parts)]
+    weighed = [
+        one
+        for one, components in shown
+        if all(_is_weighed(component, region) for component in components)
+    ]
     if not weighed or len(shown) < 2:
         return [one for one, _ in shown]
     whole = left(())[0]
@@ -193,8 +206,8 @@ def needed(
     return [one for one, _ in shown if id(one) not in dropped]
 
 
-def _is_weighed(part: Component, box: Box) -> bool:
+def _is_weighed(component: Component, region: Box) -> bool:
     """Whether a view holds what a part brings; a low-pass may be in the noise of the baseline by now."""
-    return part.candidate.view in _WEIGHED.get(str(box["view"]), ()) and not is_filter(
-        part.candidate.view, part.variant
+    return component.candidate.statistic in _WEIGHED.get(str(region["view"]), ()) and not is_filter(
+        component.candidate.statistic, component.variant
     )

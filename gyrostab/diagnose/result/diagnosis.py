@@ -76,10 +76,10 @@ class Diagnosis:
         """The verdict, and a sentence for each effect and each mismatch that none explains."""
         lines = [f"{self.verdict}: {summary(self.content)}"]
         for effect in self.effects:
-            gain = effect["held_out_gain"]
+            evidence_nats = effect["held_out_gain"]
             lines.append(f"- {effect['name']}: {effect['statement']}")
             lines.append(
-                f"  predicts time kept apart better by {gain['nats']:.3g} nats; chance reaches {gain['threshold']:.2g}"
+                f"  predicts time kept apart better by {evidence_nats['nats']:.3g} nats; chance reaches {evidence_nats['threshold']:.2g}"
             )
             if step := next_measurement(effect["name"], effect["alternatives"]):
                 lines.append(f"  {step}")
@@ -88,13 +88,13 @@ class Diagnosis:
             for one in self.content.get("unused_channels", [])
         ]
         left = set(self.content["unexplained"])
-        boxes = [box for box in self.mismatches if box["id"] in left]
+        regions = [region for region in self.mismatches if region["id"] in left]
         lines += [
-            f"- unexplained: {without_chance(box['statement']) if len(boxes) > 1 else box['statement']}"
-            for box in boxes
+            f"- unexplained: {without_chance(region['statement']) if len(regions) > 1 else region['statement']}"
+            for region in regions
         ]
-        if len(boxes) > 1:
-            likeliest = max(box["p_value"] for box in boxes)
+        if len(regions) > 1:
+            likeliest = max(region["p_value"] for region in regions)
             lines.append(
                 f"  Noise alone does as much as the least certain of these in {chance_share(likeliest)} such records."
             )
@@ -228,14 +228,14 @@ def check_diagnosis(content: Mapping[str, Any]) -> None:
     _times((content["recording"]["start"], content["recording"]["end"]), "recording")
     _check_baseline(content["baseline"])
     _require(content["held_out"], "held_out", "held_out")
-    numbers = [box.get("id") for box in content["mismatches"]]
+    numbers = [region.get("id") for region in content["mismatches"]]
     if len(set(numbers)) < len(numbers):
         raise SchemaError(
             f"diagnosis: the ids of the mismatches are {numbers}; each must be there once"
         )
     names = [effect.get("name") for effect in content["effects"]]
-    for place, box in enumerate(content["mismatches"]):
-        _check_mismatch(box, f"mismatches[{place}]", names)
+    for place, region in enumerate(content["mismatches"]):
+        _check_mismatch(region, f"mismatches[{place}]", names)
     for place, effect in enumerate(content["effects"]):
         _check_effect(effect, f"effects[{place}]")
     for name, entry in content["not_found"].items():
@@ -272,18 +272,18 @@ def _check_baseline(baseline: Mapping[str, Any]) -> None:
         _require(effect, "expected", f"baseline.expected[{number}]")
 
 
-def _check_mismatch(box: Mapping[str, Any], where: str, names: list[Any]) -> None:
-    _require(box, "mismatch", where)
-    if box["view"] not in MISMATCH_VIEWS:
+def _check_mismatch(region: Mapping[str, Any], where: str, names: list[Any]) -> None:
+    _require(region, "mismatch", where)
+    if region["view"] not in MISMATCH_VIEWS:
         raise SchemaError(
-            f"diagnosis: {where}.view is {box['view']!r}; there are {', '.join(MISMATCH_VIEWS)}"
+            f"diagnosis: {where}.view is {region['view']!r}; there are {', '.join(MISMATCH_VIEWS)}"
         )
-    _times((box["start"], box["end"]), where)
-    if not 0.0 <= box["p_value"] <= 1.0:
+    _times((region["start"], region["end"]), where)
+    if not 0.0 <= region["p_value"] <= 1.0:
         raise SchemaError(
-            f"diagnosis: {where}.p_value is {box['p_value']}, which is no probability"
+            f"diagnosis: {where}.p_value is {region['p_value']}, which is no probability"
         )
-    stray = [name for name in box["explained_by"] if name not in names]
+    stray = [name for name in region["explained_by"] if name not in names]
     if stray:
         raise SchemaError(
             f"diagnosis: {where}.explained_by names {stray[0]!r}, which is not among the effects"

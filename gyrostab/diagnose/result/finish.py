@@ -53,7 +53,7 @@ class Fit(NamedTuple):
 
     Attributes
     ----------
-    naming : Naming
+    identifications : Naming
         With designs for the noise below.
     noise : xarray.Dataset
         The baseline with the noise as it is beside the effects.
@@ -61,7 +61,7 @@ class Fit(NamedTuple):
         Effects that the simulation lacks, and those that it has as well.
     """
 
-    naming: Identifications
+    identifications: Identifications
     noise: xr.Dataset
     fitted: list[Fitted]
     expected: list[Fitted]
@@ -69,50 +69,50 @@ class Fit(NamedTuple):
 
 def finish_diagnosis(task: Task, compared: Compared, begun: float) -> Diagnosis:
     """Fit what was named, see what it is worth and what is left, and put it all into one result."""
-    reduced, baseline = compared.reduced, compared.baseline
-    naming, first, fit = fit_supported(compared.naming, baseline)
-    before = expected_baseline(fit.naming, baseline)
-    after = predicted(fit.naming, fit.noise) if naming.claims else before
+    blocks, baseline = compared.blocks, compared.baseline
+    identifications, first, fit = fit_supported(compared.identifications, baseline)
+    before = expected_baseline(fit.identifications, baseline)
+    after = predicted(fit.identifications, fit.noise) if identifications.identified else before
     mismatches = _mismatches(task, compared, fit, after)
-    unexplained = [box["id"] for box in mismatches if not box["explained_by"]]
-    held = worth(reduced, baseline, naming, first)
+    unexplained = [region["id"] for region in mismatches if not region["explained_by"]]
+    held = worth(blocks, baseline, identifications, first)
     content = {
         "schema": SCHEMA,
-        "recording": recording_table(reduced),
+        "recording": recording_table(blocks),
         "baseline": baseline_table(baseline, fit.expected),
-        "verdict": decide_verdict(mismatches, fit.naming.claims, unexplained, held),
+        "verdict": decide_verdict(mismatches, fit.identifications.identified, unexplained, held),
         "false_alarm_level": task.level,
         "mismatches": mismatches,
-        "effects": effect_tables(fit.fitted, reduced),
+        "effects": effect_tables(fit.fitted, blocks),
         "unexplained": unexplained,
-        "not_found": limit_tables(find_upper_limits(fit.naming)),
-        "unused_channels": unused_channels(reduced, _used_channels(fit.naming)),
+        "not_found": limit_tables(find_upper_limits(fit.identifications)),
+        "unused_channels": unused_channels(blocks, _used_channels(fit.identifications)),
         "held_out": {name: held[name] for name in HELD_OUT},
         "seconds": round(time.perf_counter() - begun, 3),
     }
     own = task.given if isinstance(task.given, Model) else None
     diagnosis = Diagnosis(
         plain(content),
-        _surfaces(reduced, fit, before, after),
+        _surfaces(blocks, fit, before, after),
         model_tables(fit.noise, fit.fitted, own),
     )
     check_diagnosis(diagnosis.content)
     return diagnosis
 
 
-def _used_channels(naming: Identifications) -> set[str]:
+def _used_channels(identifications: Identifications) -> set[str]:
     """Channels that some effect could follow, or was compared with."""
-    return {name for one in naming.candidates for name in (*one.driver, *one.witness)}
+    return {name for one in identifications.candidates for name in (*one.driver, *one.witness)}
 
 
 def fit_supported(
-    naming: Identifications, baseline: xr.Dataset
+    identifications: Identifications, baseline: xr.Dataset
 ) -> tuple[Identifications, list[Fitted], Fit]:
     """Fit the effects until each that is left has a size away from zero.
 
     Returns
     -------
-    naming : Naming
+    identifications : Naming
         Without the effects whose size may be zero.
     first : list of Fitted
         Their numbers beside the noise of `baseline`.
@@ -120,48 +120,75 @@ def fit_supported(
         Their numbers beside the noise that they leave.
     """
     while True:
-        first = fit_identifications(naming, baseline)
-        fit = fitted_beside_their_noise(naming, baseline, first)
-        numbers = [[one for one in fit.fitted if one.claim is claim] for claim in fit.naming.claims]
-        kept = keep_supported(naming, numbers)
-        if kept is naming:
-            return naming, first, fit
-        naming = kept
+        first = fit_identifications(identifications, baseline)
+        fit = fitted_beside_their_noise(identifications, baseline, first)
+        numbers = [
+            [one for one in fit.fitted if one.identification is identification]
+            for identification in fit.identifications.identified
+        ]
+        kept = keep_supported(identifications, numbers)
+        if kept is identifications:
+            return identifications, first, fit
+        identifications = kept
 
 
 def fitted_beside_their_noise(
-    naming: Identifications, baseline: xr.Dataset, first: list[Fitted]
+    identifications: Identifications, baseline: xr.Dataset, first: list[Fitted]
 ) -> Fit:
     """Calibrate the noise beside the effects as they were fitted `first`, and fit them once more to what is left."""
-    noise = recalibrate(naming, baseline, first)
+    noise = recalibrate(identifications, baseline, first)
     if noise is baseline:
-        return Fit(naming, baseline, first, fit_expected(naming, baseline))
-    naming = with_noise(naming, noise)
-    return Fit(naming, noise, fit_identifications(naming, noise), fit_expected(naming, baseline))
+        return Fit(identifications, baseline, first, fit_expected(identifications, baseline))
+    identifications = with_noise(identifications, noise)
+    return Fit(
+        identifications,
+        noise,
+        fit_identifications(identifications, noise),
+        fit_expected(identifications, baseline),
+    )
 
 
 def worth(
-    reduced: xr.Dataset, baseline: xr.Dataset, naming: Identifications, first: Sequence[Fitted]
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    identifications: Identifications,
+    first: Sequence[Fitted],
 ) -> dict[str, float]:
     """What the effects gain on time that they were not fitted to, each by the views that can tell; the noise is fitted with them."""
-    told, hopping = remove_telegraph_bias(naming)
+    told, hopping = remove_telegraph_bias(identifications)
     judged, waving = without_waves(told)
 
     def trained(chosen: Identifications, known: NDArray[np.bool_]) -> xr.Dataset:
         own = recalibrate(chosen, baseline, first, known)
         return predicted(with_noise(chosen, own), own, known)
 
-    parts = [part for claim in told.claims for part in claim.parts]
+    components = [
+        component for identification in told.identified for component in identification.components
+    ]
     odd = sum(
-        part.gain for part in parts if part.candidate.view == "marks"
+        component.evidence_nats
+        for component in components
+        if component.candidate.statistic == "marks"
     )  # no other number has them
     clean = mask_anomalous_blocks(
-        reduced, [*parts, *(part for claim in told.expected for part in claim.parts)]
+        blocks,
+        [
+            *components,
+            *(
+                component
+                for identification in told.expected
+                for component in identification.components
+            ),
+        ],
     )
     start = partial(expected_baseline, told, baseline) if told.expected else baseline
-    whole, rest = (partial(trained, one) if one.claims else start for one in (told, judged))
-    later = tuple(claim for claim in judged.claims if _can_be_forecast(claim, reduced))
-    forecast = partial(trained, replace(judged, claims=later)) if later else start
+    whole, rest = (partial(trained, one) if one.identified else start for one in (told, judged))
+    later = tuple(
+        identification
+        for identification in judged.identified
+        if _can_be_forecast(identification, blocks)
+    )
+    forecast = partial(trained, replace(judged, identified=later)) if later else start
     found = held_out(
         clean,
         start,
@@ -170,18 +197,18 @@ def worth(
         shown=whole if waving else None,
         forecast=forecast,
     )
-    return found if later or not told.claims else found | {"forecast_gain": np.nan}
+    return found if later or not told.identified else found | {"forecast_gain": np.nan}
 
 
-def _can_be_forecast(claim: Identification, reduced: xr.Dataset) -> bool:
+def _can_be_forecast(identification: Identification, blocks: xr.Dataset) -> bool:
     """Return whether an effect acts both in the time that a forecast is fitted to and in the time that it predicts.
 
     The size of an event in the last part is not known before, and one that is over says nothing of
     later. Counts of odd samples are in neither means nor powers, which the forecast predicts.
     """
-    if {part.candidate.view for part in claim.parts} <= {"marks"}:
+    if {component.candidate.statistic for component in identification.components} <= {"marks"}:
         return False
-    acts, known = active_spans(claim, reduced), forecast_from(reduced)
+    acts, known = active_spans(identification, blocks), forecast_from(blocks)
     return bool(acts[known].any() and acts[~known].any())
 
 
@@ -189,34 +216,34 @@ def _mismatches(
     task: Task, compared: Compared, fit: Fit, after: xr.Dataset
 ) -> list[dict[str, Any]]:
     """Places beyond chance and those of what was named, each with the effects that explain it."""
-    reduced, found, claims = compared.reduced, compared.found, fit.naming.claims
+    blocks, found, identified = compared.blocks, compared.found, fit.identifications.identified
 
     def without(left_out: Sequence[Identification]) -> xr.Dataset:
-        return predicted(fit.naming, fit.noise, left_out=left_out)
+        return predicted(fit.identifications, fit.noise, left_out=left_out)
 
     lines = (
-        still_lines(task, reduced, after)
-        if claims and (found["view"] == "spectrum").any()
+        still_lines(task, blocks, after)
+        if identified and (found["view"] == "spectrum").any()
         else None
     )
     explained = attribute_mismatches(
         found,
-        claims,
-        reduced,
+        identified,
+        blocks,
         after,
         compared.null,
         level=task.level / 2.0,
         without=without,
         still=lines,
     )
-    mismatches = mismatch_tables(found, reduced, explained)
-    mismatches += identification_tables(fit.naming, reduced, mismatches)
-    mismatches += unidentified_tables(fit.naming, reduced, mismatches)
-    return mismatches + motion_tables(claims, reduced, mismatches)
+    mismatches = mismatch_tables(found, blocks, explained)
+    mismatches += identification_tables(fit.identifications, blocks, mismatches)
+    mismatches += unidentified_tables(fit.identifications, blocks, mismatches)
+    return mismatches + motion_tables(identified, blocks, mismatches)
 
 
-def _surfaces(reduced: xr.Dataset, fit: Fit, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
+def _surfaces(blocks: xr.Dataset, fit: Fit, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
     """The recording beside the simulation without and with the effects, odd samples in both of them as they are in the recording."""
-    before = add_outlier_power(before, reduced, fit.expected)
-    after = add_outlier_power(after, reduced, [*fit.expected, *fit.fitted])
-    return surfaces_with_blocks(make_surfaces(reduced, before, after), reduced, before, after)
+    before = add_outlier_power(before, blocks, fit.expected)
+    after = add_outlier_power(after, blocks, [*fit.expected, *fit.fitted])
+    return surfaces_with_blocks(make_surfaces(blocks, before, after), blocks, before, after)

@@ -32,7 +32,7 @@ _INSIDE = 1.959964  # standard deviations that hold 95 %
 
 
 def held_out(
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     before: Trained,
     after: Trained,
     *,
@@ -50,7 +50,7 @@ def held_out(
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         The recording.
     before, after : xarray.Dataset or callable
         Baselines, the second with the effects in its ``spectrum``, ``known_mean`` and, for what the
@@ -70,7 +70,7 @@ def held_out(
     Returns
     -------
     dict
-        ``blocks``, the stretches; ``log_likelihood_gain`` of `after` over `before` and its
+        ``block_count``, the stretches; ``log_likelihood_gain`` of `after` over `before` and its
         ``stderr`` by the noise of the recording [nats]; ``misfit_before``, ``misfit_after``, the
         mean square of the scores of the Allan variance, 1 for a model that fits, and
         ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band;
@@ -84,11 +84,11 @@ def held_out(
 
     Examples
     --------
-    >>> found = held_out(reduced, baseline, lambda known: refit(reduced.isel(block=known)))           # doctest: +SKIP
+    >>> found = held_out(blocks, baseline, lambda known: refit(blocks.isel(block=known)))           # doctest: +SKIP
     >>> found["log_likelihood_gain"], found["stderr"]                                                 # doctest: +SKIP
     (41.2, 6.0)
     """
-    cut = stretches(reduced)
+    cut = stretches(blocks)
     fold = np.arange(cut.first.size) % FOLDS
     gains = _Gain(more_gain, 2.0 * abs(more_gain))
     squares: dict[str, list[Array]] = {
@@ -97,22 +97,24 @@ def held_out(
     moves = False
     for number in range(FOLDS):
         held = Windows(cut.first[fold == number], cut.stop[fold == number])
-        out = _inside(held, reduced.sizes["block"])
+        out = _inside(held, blocks.sizes["block"])
         models = {"before": _trained(before, ~out), "after": _trained(after, ~out)}
-        gains = gains.plus(_gain(reduced, models["before"], models["after"], out))
+        gains = gains.plus(_gain(blocks, models["before"], models["after"], out))
         moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
         if shown is not None:
             models["after"] = _trained(shown, ~out)
         for name, baseline in models.items():
-            squares[name].append(_allan_scores(reduced, baseline, held))
-            squares[f"mean_{name}"].append(_mean_scores(reduced, baseline, held))
-    gain, variance = max([gains, *(_longer(reduced, before, after, more_gain) if moves else [])])
+            squares[name].append(_allan_scores(blocks, baseline, held))
+            squares[f"mean_{name}"].append(_mean_scores(blocks, baseline, held))
+    evidence_nats, variance = max(
+        [gains, *(_longer(blocks, before, after, more_gain) if moves else [])]
+    )
     return {
         "blocks": cut.first.size,
-        "log_likelihood_gain": float(gain),
+        "log_likelihood_gain": float(evidence_nats),
         "stderr": float(np.sqrt(variance)),
         **_misfits(squares),
-        "forecast_gain": _forecast(reduced, before, after if forecast is None else forecast),
+        "forecast_gain": _forecast(blocks, before, after if forecast is None else forecast),
     }
 
 
@@ -127,30 +129,26 @@ class _Gain(NamedTuple):
 
 
 def _gain(
-    reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_]
+    blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_]
 ) -> _Gain:
     """What one trained model gains over another on the blocks held out."""
-    nats = log_likelihood(reduced, after, ~held, held) - log_likelihood(
-        reduced, before, ~held, held
-    )
-    return _Gain(nats, _variance(reduced, before, after, held, nats))
+    nats = log_likelihood(blocks, after, ~held, held) - log_likelihood(blocks, before, ~held, held)
+    return _Gain(nats, _variance(blocks, before, after, held, nats))
 
 
-def _longer(reduced: xr.Dataset, before: Trained, after: Trained, more_gain: float) -> list[_Gain]:
+def _longer(blocks: xr.Dataset, before: Trained, after: Trained, more_gain: float) -> list[_Gain]:
     """Gains on longer stretches."""
     found = []
-    for fold in fold_blocks(reduced).transpose("length", "block").values[1:]:
+    for fold in fold_blocks(blocks).transpose("length", "block").values[1:]:
         whole = _Gain(more_gain, 2.0 * abs(more_gain))
         for number in range(FOLDS):
             held = fold == number
-            whole = whole.plus(
-                _gain(reduced, _trained(before, ~held), _trained(after, ~held), held)
-            )
+            whole = whole.plus(_gain(blocks, _trained(before, ~held), _trained(after, ~held), held))
         found.append(whole)
     return found
 
 
-def stretches(reduced: xr.Dataset) -> Windows:
+def stretches(blocks: xr.Dataset) -> Windows:
     """The stretches that are held out: 100 s long, shorter in records of less than an hour.
 
     Raises
@@ -158,33 +156,36 @@ def stretches(reduced: xr.Dataset) -> Windows:
     OptionError
         When there are too few blocks.
     """
-    blocks, span = reduced.sizes["block"], reduced.sizes["block"] * float(reduced.attrs["block_s"])
-    if blocks < _LEAST:
+    block_count, span = (
+        blocks.sizes["block"],
+        blocks.sizes["block"] * float(blocks.attrs["block_s"]),
+    )
+    if block_count < _LEAST:
         raise OptionError(
-            f"the record has {blocks} blocks, too few to hold any out: it needs {_LEAST}; give a longer record or shorter blocks"
+            f"the record has {block_count} blocks, too few to hold any out: it needs {_LEAST}; give a longer record or shorter blocks"
         )
     edge = np.rint(
-        np.linspace(0, blocks, min(blocks, max(_FEWEST, round(span / _STRETCH_S))) + 1)
+        np.linspace(0, block_count, min(block_count, max(_FEWEST, round(span / _STRETCH_S))) + 1)
     ).astype(np.int64)
     return Windows(edge[:-1], edge[1:])
 
 
 def log_likelihood(
-    reduced: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: NDArray[np.bool_]
+    blocks: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: NDArray[np.bool_]
 ) -> float:
     """Log-likelihood of held-out blocks given the known blocks [nats], up to a constant of the data.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         The recording, and a model.
     known, held : ndarray of bool (block,)
         Blocks that are predicted from, and those that are predicted.
     """
-    total = float((_power_terms(reduced, baseline) + _cross_terms(reduced, baseline))[held].sum())
-    for axis in range(reduced.sizes["axis"]):
-        total += _mean_evidence(reduced, baseline, axis, known | held) - _mean_evidence(
-            reduced, baseline, axis, known
+    total = float((_power_terms(blocks, baseline) + _cross_terms(blocks, baseline))[held].sum())
+    for axis in range(blocks.sizes["axis"]):
+        total += _mean_evidence(blocks, baseline, axis, known | held) - _mean_evidence(
+            blocks, baseline, axis, known
         )
     return total
 
@@ -193,56 +194,56 @@ def _trained(model: Trained, known: NDArray[np.bool_]) -> xr.Dataset:
     return model if isinstance(model, xr.Dataset) else model(known)
 
 
-def _inside(windows: Windows, blocks: int) -> NDArray[np.bool_]:
-    inside = np.zeros(blocks, dtype=bool)
+def _inside(windows: Windows, block_count: int) -> NDArray[np.bool_]:
+    inside = np.zeros(block_count, dtype=bool)
     for first, stop in zip(windows.first, windows.stop, strict=True):
         inside[first:stop] = True
     return inside
 
 
 def _variance(
-    reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_], gain: float
+    blocks: xr.Dataset,
+    before: xr.Dataset,
+    after: xr.Dataset,
+    held: NDArray[np.bool_],
+    evidence_nats: float,
 ) -> float:
     """Variance of a gain: that of the powers from the scatter of their cells about `after`; a normal law has twice its gain."""
-    power, shape = (
-        values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape")
-    )
+    power, shape = (values_of(blocks, name, "axis", "block", "band") for name in ("power", "shape"))
     one, other = (
         values_of(baseline, "spectrum", "axis", "block", "band") for baseline in (after, before)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.square(shape * (1.0 / one - 1.0 / other) * (power - one))[:, held]
-    by_power = float((_power_terms(reduced, after) - _power_terms(reduced, before))[held].sum())
-    return float(terms[np.isfinite(terms)].sum()) + 2.0 * abs(gain - by_power)
+    by_power = float((_power_terms(blocks, after) - _power_terms(blocks, before))[held].sum())
+    return float(terms[np.isfinite(terms)].sum()) + 2.0 * abs(evidence_nats - by_power)
 
 
-def _power_terms(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
+def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     """Log-likelihood of the band powers of every block, by gamma laws."""
-    power, shape = (
-        values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape")
-    )
+    power, shape = (values_of(blocks, name, "axis", "block", "band") for name in ("power", "shape"))
     spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
     there = np.isfinite(power) & np.isfinite(shape) & (spectrum > 0)
     safe = np.where(there, spectrum, 1.0)
     return np.asarray(np.where(there, -shape * (np.log(safe) + power / safe), 0.0).sum(axis=(0, 2)))
 
 
-def _cross_terms(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
+def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     """What the cross-spectra of the model add in every block, by complex Wishart laws; nothing where it has none."""
-    blocks = reduced.sizes["block"]
-    if "cross" not in baseline or "cross" not in reduced:
-        return np.zeros(blocks)
-    axes = [str(axis) for axis in reduced["axis"].values]
-    left = [axes.index(str(axis)) for axis in reduced["first"].values]
-    right = [axes.index(str(axis)) for axis in reduced["second"].values]
+    block_count = blocks.sizes["block"]
+    if "cross" not in baseline or "cross" not in blocks:
+        return np.zeros(block_count)
+    axes = [str(axis) for axis in blocks["axis"].values]
+    left = [axes.index(str(axis)) for axis in blocks["first"].values]
+    right = [axes.index(str(axis)) for axis in blocks["second"].values]
     power, shape = (
-        np.moveaxis(values_of(reduced, name, "axis", "block", "band"), 0, -1)
+        np.moveaxis(values_of(blocks, name, "axis", "block", "band"), 0, -1)
         for name in ("power", "shape")
     )
     spectrum = np.moveaxis(values_of(baseline, "spectrum", "axis", "block", "band"), 0, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         both = np.sqrt(spectrum[..., left] * spectrum[..., right])
-        seen = np.moveaxis(values_of(reduced, "cross", "pair", "block", "band"), 0, -1) / both
+        seen = np.moveaxis(values_of(blocks, "cross", "pair", "block", "band"), 0, -1) / both
         model = np.moveaxis(values_of(baseline, "cross", "pair", "block", "band"), 0, -1) / both
         flat = power / spectrum
     there = (
@@ -264,11 +265,11 @@ def _cross_terms(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
 
 
 def _mean_evidence(
-    reduced: xr.Dataset, baseline: xr.Dataset, axis: int, used: NDArray[np.bool_]
+    blocks: xr.Dataset, baseline: xr.Dataset, axis: int, used: NDArray[np.bool_]
 ) -> float:
     """Log-likelihood of the block means that are used, with a free constant, averaged over the calibrated random walk and flicker."""
     residual = (
-        values_of(reduced, "mean", "axis", "block")[axis]
+        values_of(blocks, "mean", "axis", "block")[axis]
         - values_of(baseline, "known_mean", "axis", "block")[axis]
     )
     variance = values_of(baseline, "mean_variance", "axis", "block")[axis]
@@ -287,7 +288,7 @@ def _mean_evidence(
         np.where(present, residual, 0.0)[:, None],
         np.empty((residual.size, 0)),
         variance=np.where(present, variance, 1.0),
-        step=float(reduced.attrs["block_s"]),
+        step=float(blocks.attrs["block_s"]),
         K=np.asarray(walk, dtype=float),
         B=np.asarray(flicker, dtype=float),
         present=present,
@@ -297,7 +298,7 @@ def _mean_evidence(
     return float(np.logaddexp.reduce(log))
 
 
-def _allan_scores(reduced: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Array:
+def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Array:
     """Squared scores of the Allan variance in windows that lie inside the held-out stretches, side by side."""
     first, stop = [held.first], [held.stop]
     for length in {1, min(_SHORT, int((held.stop - held.first).min()))}:
@@ -309,7 +310,7 @@ def _allan_scores(reduced: xr.Dataset, baseline: xr.Dataset, held: Windows) -> A
         first.append(start)
         stop.append(start + length)
     windows = Windows(np.concatenate(first), np.concatenate(stop))
-    surface = allan_surface(reduced, baseline, windows)
+    surface = allan_surface(blocks, baseline, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])[
             ..., surface["columns"]["what"] == "avar"
@@ -317,15 +318,15 @@ def _allan_scores(reduced: xr.Dataset, baseline: xr.Dataset, held: Windows) -> A
     return np.asarray(z[np.isfinite(z)] ** 2)
 
 
-def _mean_scores(reduced: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Array:
-    amount, information = window_means(reduced, baseline, held)
+def _mean_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Array:
+    amount, information = window_means(blocks, baseline, held)
     square = amount**2 / information
     return np.asarray(square[np.isfinite(square)])
 
 
 def _misfits(squares: dict[str, list[Array]]) -> dict[str, float]:
     found: dict[str, float] = {}
-    joined = {name: np.concatenate(parts) for name, parts in squares.items()}
+    joined = {name: np.concatenate(components) for name, components in squares.items()}
     for name in ("before", "after"):
         cells = joined[name]
         found[f"misfit_{name}"] = float(cells.mean()) if cells.size else np.nan
@@ -335,14 +336,14 @@ def _misfits(squares: dict[str, list[Array]]) -> dict[str, float]:
     return found
 
 
-def forecast_from(reduced: xr.Dataset) -> NDArray[np.bool_]:
+def forecast_from(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Select the blocks that a forecast of the others begins from."""
-    return np.asarray(np.arange(reduced.sizes["block"]) < round(_KNOWN * reduced.sizes["block"]))
+    return np.asarray(np.arange(blocks.sizes["block"]) < round(_KNOWN * blocks.sizes["block"]))
 
 
-def _forecast(reduced: xr.Dataset, before: Trained, after: Trained) -> float:
-    known = forecast_from(reduced)
+def _forecast(blocks: xr.Dataset, before: Trained, after: Trained) -> float:
+    known = forecast_from(blocks)
     late, early = (
-        log_likelihood(reduced, _trained(model, known), known, ~known) for model in (after, before)
+        log_likelihood(blocks, _trained(model, known), known, ~known) for model in (after, before)
     )
     return late - early

@@ -38,7 +38,7 @@ def supported_axes(fitted: Fitted) -> tuple[str, ...]:
     tuple of str
         All axes when no size is measured, as for motion that has another form in every band.
     """
-    sizes = effects()[fitted.claim.effect].size_parameters
+    sizes = effects()[fitted.identification.effect].size_parameters
     measured = {name: one for name, one in fitted.parameters.items() if name.split(".")[0] in sizes}
     found = []
     for axis in fitted.axes:
@@ -48,7 +48,9 @@ def supported_axes(fitted: Fitted) -> tuple[str, ...]:
     return tuple(found)
 
 
-def keep_supported(naming: Identifications, fitted: Sequence[Sequence[Fitted]]) -> Identifications:
+def keep_supported(
+    identifications: Identifications, fitted: Sequence[Sequence[Fitted]]
+) -> Identifications:
     """Keep the effects whose size is away from zero, on the axes where it is.
 
     What an effect gained on the other axes stays in the naming as something unknown where that
@@ -56,42 +58,59 @@ def keep_supported(naming: Identifications, fitted: Sequence[Sequence[Fitted]]) 
 
     Parameters
     ----------
-    naming : Naming
+    identifications : Naming
     fitted : sequence of sequence of Fitted
-        Numbers of each claim of `naming`, in the same order.
+        Numbers of each claim of `identifications`, in the same order.
 
     Returns
     -------
     Naming
-        `naming` itself when every effect keeps all of its axes.
+        `identifications` itself when every effect keeps all of its axes.
     """
-    claims: list[Identification] = []
+    identified: list[Identification] = []
     unknown: list[Unidentified] = []
     changed = False
-    for claim, numbers in zip(naming.claims, fitted, strict=True):
+    for identification, numbers in zip(identifications.identified, fitted, strict=True):
         good = {axis for one in numbers for axis in supported_axes(one)}
-        kept = tuple(part for part in claim.parts if set(part.row) <= good)
-        if set(claim.axes) <= good or not numbers:
-            claims.append(claim)
+        kept = tuple(
+            component for component in identification.components if set(component.row) <= good
+        )
+        if set(identification.axes) <= good or not numbers:
+            identified.append(identification)
             continue
-        lost = tuple(part for part in claim.parts if part not in kept)
-        if sum_evidence(kept) > claim.threshold:
-            axes = tuple(axis for axis in claim.axes if axis in good)
-            gain = min(claim.gain, sum_evidence(kept))
-            claims.append(replace(claim, parts=kept, axes=axes, gain=gain))
+        lost = tuple(component for component in identification.components if component not in kept)
+        if sum_evidence(kept) > identification.threshold:
+            axes = tuple(axis for axis in identification.axes if axis in good)
+            evidence_nats = min(identification.evidence_nats, sum_evidence(kept))
+            identified.append(
+                replace(identification, components=kept, axes=axes, evidence_nats=evidence_nats)
+            )
         else:
-            lost = claim.parts
-        if sum_evidence(lost) > claim.threshold:
-            unknown.append(_unsupported(claim, lost))
+            lost = identification.components
+        if sum_evidence(lost) > identification.threshold:
+            unknown.append(_unsupported(identification, lost))
         changed = True
     if not changed:
-        return naming
-    return replace(naming, claims=tuple(claims), unknown=(*naming.unknown, *unknown))
+        return identifications
+    return replace(
+        identifications, identified=tuple(identified), unknown=(*identifications.unknown, *unknown)
+    )
 
 
-def _unsupported(claim: Identification, parts: tuple[Component, ...]) -> Unidentified:
+def _unsupported(identification: Identification, components: tuple[Component, ...]) -> Unidentified:
     """Turn the parts of an effect whose size may be zero into something unknown."""
-    strongest = max(parts, key=lambda part: part.gain).candidate.view
-    axes = tuple(axis for axis in claim.axes if any(axis in part.row for part in parts))
+    strongest = max(components, key=lambda component: component.evidence_nats).candidate.statistic
+    axes = tuple(
+        axis
+        for axis in identification.axes
+        if any(axis in component.row for component in components)
+    )
     generic = _REST.get(strongest, "~S(f)")
-    return Unidentified(generic, axes, sum_evidence(parts), claim.threshold, (claim.effect,), parts)
+    return Unidentified(
+        generic,
+        axes,
+        sum_evidence(components),
+        identification.threshold,
+        (identification.effect,),
+        components,
+    )

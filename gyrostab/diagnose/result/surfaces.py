@@ -20,12 +20,12 @@ _WINDOW = 15  # blocks
 _MOST = 240  # windows
 
 
-def make_surfaces(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
+def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
     """Lay out Allan variances and window means of the recording and of what the simulation expects without and with the effects.
 
     Parameters
     ----------
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         The recording.
     before, after : xarray.Dataset
         Baselines without and with the effects.
@@ -39,9 +39,9 @@ def make_surfaces(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset) ->
         recording of that simulation may be from it; coordinates ``begin``, ``end`` [s since the
         start], ``time``, ``tau`` [s].
     """
-    windows = _windows(reduced.sizes["block"])
+    windows = _windows(blocks.sizes["block"])
     plain = before.assign(known_mean=before["known_mean"] * 0.0)
-    recorded = allan_surface(reduced, plain, windows)
+    recorded = allan_surface(blocks, plain, windows)
     keep = (recorded["columns"]["what"] == "avar") & np.isfinite(recorded["shape"]).any(axis=(0, 1))
     avar, low, high = (
         [recorded["observed"][..., keep]],
@@ -49,52 +49,52 @@ def make_surfaces(reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset) ->
         [],
     )
     high.append(low[0])
-    mean, error = [_averaged(reduced, values_of(reduced, "mean", "axis", "block"), windows)], []
+    mean, error = [_averaged(blocks, values_of(blocks, "mean", "axis", "block"), windows)], []
     error.append(np.full(mean[0].shape, np.nan))
     for baseline in (before, after):
-        noise = allan_surface(reduced, baseline, windows)
+        noise = allan_surface(blocks, baseline, windows)
         shape = noise["shape"][..., keep]
-        known = _known(reduced, baseline, windows)[..., keep]
+        known = _known(blocks, baseline, windows)[..., keep]
         with np.errstate(invalid="ignore"):
             avar.append(noise["expected"][..., keep] + known)
             low.append(noise["expected"][..., keep] * gammaincinv(shape, 0.025) / shape + known)
             high.append(noise["expected"][..., keep] * gammaincinv(shape, 0.975) / shape + known)
-            information = window_means(reduced, baseline, windows)[1]
+            information = window_means(blocks, baseline, windows)[1]
             error.append(1.0 / np.sqrt(information))
-        mean.append(_predicted(reduced, baseline, windows))
+        mean.append(_predicted(blocks, baseline, windows))
     return _labelled(
-        reduced, windows, recorded["columns"]["tau_min_s"][keep], [avar, low, high], [mean, error]
+        blocks, windows, recorded["columns"]["tau_min_s"][keep], [avar, low, high], [mean, error]
     )
 
 
-def _windows(blocks: int) -> Windows:
-    length = min(_WINDOW, max(1, blocks // 2))
-    step = max(1, blocks // _MOST)
-    first = np.arange(0, blocks - length + 1, step)
+def _windows(block_count: int) -> Windows:
+    length = min(_WINDOW, max(1, block_count // 2))
+    step = max(1, block_count // _MOST)
+    first = np.arange(0, block_count - length + 1, step)
     return Windows(first, first + length)
 
 
-def _known(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
+def _known(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Allan variance of the known mean, which the noise is without."""
     means = np.where(
-        np.isfinite(values_of(reduced, "mean", "axis", "block")),
+        np.isfinite(values_of(blocks, "mean", "axis", "block")),
         values_of(baseline, "known_mean", "axis", "block"),
         np.nan,
     )
-    alone = reduced.assign(mean=(("axis", "block"), means))
+    alone = blocks.assign(mean=(("axis", "block"), means))
     found = allan_surface(alone, baseline.assign(known_mean=baseline["known_mean"] * 0.0), windows)
     return np.asarray(
         np.where(
-            found["columns"]["tau_min_s"] >= float(reduced.attrs["block_s"]), found["observed"], 0.0
+            found["columns"]["tau_min_s"] >= float(blocks.attrs["block_s"]), found["observed"], 0.0
         )
     )
 
 
-def _averaged(reduced: xr.Dataset, values: Array, windows: Windows) -> Array:
+def _averaged(blocks: xr.Dataset, values: Array, windows: Windows) -> Array:
     """Mean over windows, weighted with the samples present where the recording has a mean."""
     weight = np.where(
-        np.isfinite(values_of(reduced, "mean", "axis", "block")),
-        values_of(reduced, "samples", "axis", "block"),
+        np.isfinite(values_of(blocks, "mean", "axis", "block")),
+        values_of(blocks, "samples", "axis", "block"),
         0.0,
     )
     sums = over_windows((np.where(weight > 0, values, 0.0) * weight)[..., None], windows)[..., 0]
@@ -103,11 +103,11 @@ def _averaged(reduced: xr.Dataset, values: Array, windows: Windows) -> Array:
         return np.asarray(np.where(total > 0, sums / total, np.nan))
 
 
-def _predicted(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
+def _predicted(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Mean of the effects, and the constant that the recording has beside them."""
     known, mean = (
         values_of(baseline, "known_mean", "axis", "block"),
-        values_of(reduced, "mean", "axis", "block"),
+        values_of(blocks, "mean", "axis", "block"),
     )
     weight = np.where(
         np.isfinite(mean), 1.0 / values_of(baseline, "mean_variance", "axis", "block"), 0.0
@@ -117,15 +117,15 @@ def _predicted(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> A
         level = (weight * np.nan_to_num(mean - known)).sum(axis=-1, keepdims=True) / weight.sum(
             axis=-1, keepdims=True
         )
-    return _averaged(reduced, known + level, windows)
+    return _averaged(blocks, known + level, windows)
 
 
 def _labelled(
-    reduced: xr.Dataset, windows: Windows, tau: Array, squares: list[Any], means: list[Any]
+    blocks: xr.Dataset, windows: Windows, tau: Array, squares: list[Any], means: list[Any]
 ) -> xr.Dataset:
     cube, plane = ("case", "axis", "window", "tau"), ("case", "axis", "window")
-    begin, end = reduced["begin"].values[windows.first], reduced["end"].values[windows.stop - 1]
-    start = np.datetime64(int(reduced.attrs["start_ns"]), "ns")
+    begin, end = blocks["begin"].values[windows.first], blocks["end"].values[windows.stop - 1]
+    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
     middle = start + np.rint((begin + end) / 2.0 * 1e9).astype("timedelta64[ns]")
     units = {"avar": "degree2 hour-2", "mean": "degree hour-1", "time": "s"}
     names = (
@@ -149,7 +149,7 @@ def _labelled(
         data[name] = (plane, np.stack(values), {"units": units["mean"], "long_name": told})
     coordinates: dict[str, Any] = {
         "case": ("case", list(CASES)),
-        "axis": ("axis", [str(axis) for axis in reduced["axis"].values]),
+        "axis": ("axis", [str(axis) for axis in blocks["axis"].values]),
         "time": ("window", middle, {"long_name": "middle of the window"}),
         "begin": (
             "window",
@@ -160,8 +160,8 @@ def _labelled(
         "tau": ("tau", tau, {"units": "s", "long_name": "averaging time"}),
     }
     attributes = {
-        name: reduced.attrs[name]
+        name: blocks.attrs[name]
         for name in ("start", "start_ns", "sampling_rate_hz", "block_s")
-        if name in reduced.attrs
+        if name in blocks.attrs
     }
     return xr.Dataset(data, coords=coordinates, attrs=attributes)

@@ -67,27 +67,27 @@ _BUMP = 0.371  # averaging time times frequency where the Allan variance of a si
 _MOST_LINES = 4000
 
 
-def iso(reduced: xr.Dataset, seconds: float) -> str:
+def iso(blocks: xr.Dataset, seconds: float) -> str:
     """Time [s since the start of the record] as ISO 8601."""
-    start = np.datetime64(int(reduced.attrs["start_ns"]), "ns")
+    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
     return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
 
 
-def recording_table(reduced: xr.Dataset) -> dict[str, Any]:
+def recording_table(blocks: xr.Dataset) -> dict[str, Any]:
     """What the recording is."""
     channels = [
         str(name).removeprefix("channel_")
-        for name in reduced.data_vars
+        for name in blocks.data_vars
         if str(name).startswith("channel_")
     ]
     return {
-        "files": [str(name) for name in reduced.attrs["source_files"]],
-        "axes": [str(axis) for axis in reduced["axis"].values],
-        "start": reduced.attrs["start"],
-        "end": reduced.attrs["end"],
-        "sampling_rate_hz": float(reduced.attrs["sampling_rate_hz"]),
+        "files": [str(name) for name in blocks.attrs["source_files"]],
+        "axes": [str(axis) for axis in blocks["axis"].values],
+        "start": blocks.attrs["start"],
+        "end": blocks.attrs["end"],
+        "sampling_rate_hz": float(blocks.attrs["sampling_rate_hz"]),
         "channels": channels,
-        "missing_share": float(reduced.attrs["missing_share"]),
+        "missing_share": float(blocks.attrs["missing_share"]),
     }
 
 
@@ -109,9 +109,9 @@ def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str
     spans = baseline.attrs.get("calibrated_on", [])
     known = [
         {
-            "name": one.claim.effect,
+            "name": one.identification.effect,
             "axes": list(one.axes),
-            "statement": one.say() or unsized_statement(one.claim.effect, one.axes),
+            "statement": one.say() or unsized_statement(one.identification.effect, one.axes),
         }
         for one in expected
     ]
@@ -124,125 +124,136 @@ def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str
 
 
 def mismatch_tables(
-    found: xr.Dataset, reduced: xr.Dataset, explained: Sequence[Sequence[str]]
+    found: xr.Dataset, blocks: xr.Dataset, explained: Sequence[Sequence[str]]
 ) -> list[dict[str, Any]]:
     """The mismatches, each with its sentence."""
-    whole = float(reduced["end"].values[-1])
+    whole = float(blocks["end"].values[-1])
     out = []
     for number, names in enumerate(explained):
-        box = {
+        region = {
             str(name): found[name].values[number].item()
             for name in found.data_vars
             if found[name].dtype.kind != "M"
         }
-        box["axes"] = str(box["axes"]).split()
+        region["axes"] = str(region["axes"]).split()
         out.append(
             {
                 "id": number + 1,
-                "view": box["view"],
-                "axes": box["axes"],
-                "start": iso(reduced, box["begin"]),
-                "end": iso(reduced, box["end"]),
-                "tau_min_s": box["tau_min_s"],
-                "tau_max_s": box["tau_max_s"],
-                "ratio": box["ratio"],
-                "p_value": box["p_value"],
+                "view": region["view"],
+                "axes": region["axes"],
+                "start": iso(blocks, region["begin"]),
+                "end": iso(blocks, region["end"]),
+                "tau_min_s": region["tau_min_s"],
+                "tau_max_s": region["tau_max_s"],
+                "ratio": region["ratio"],
+                "p_value": region["p_value"],
                 "explained_by": list(names),
-                "statement": mismatch_statement(box, whole),
+                "statement": mismatch_statement(region, whole),
             }
         )
     return out
 
 
-def chance_of_gain(best: Array, gain: float) -> float:
-    """Share of null records whose largest gain is `gain` or more; by an exponential tail beyond their upper quarter."""
+def chance_of_gain(best: Array, evidence_nats: float) -> float:
+    """Share of null records whose largest gain is `evidence_nats` or more; by an exponential tail beyond their upper quarter."""
     start = float(np.quantile(best, 1.0 - _TAIL))
-    if gain <= start:
-        return float((best >= gain).mean())
+    if evidence_nats <= start:
+        return float((best >= evidence_nats).mean())
     scale = max(float((best[best > start] - start).mean()), 0.1)
-    return max(_TAIL * math.exp(-(gain - start) / scale), _LEAST_P)
+    return max(_TAIL * math.exp(-(evidence_nats - start) / scale), _LEAST_P)
 
 
 def identification_tables(
-    naming: Identifications, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]
+    identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """Mismatches that only naming saw: where a named effect acts that explains none of those known, by its strongest part."""
     out: list[dict[str, Any]] = []
-    begin, end = reduced["begin"].values, reduced["end"].values
-    for claim in naming.claims:
+    begin, end = blocks["begin"].values, blocks["end"].values
+    for identification in identifications.identified:
         if any(
-            claim.effect in box["explained_by"] and set(box["axes"]) & set(claim.axes)
-            for box in known
+            identification.effect in region["explained_by"]
+            and set(region["axes"]) & set(identification.axes)
+            for region in known
         ):
             continue
-        strongest = max(claim.parts, key=lambda part: part.gain)
-        view = _PART_VIEW.get(strongest.candidate.view, "davar")
-        low, high = _taus(strongest, view, reduced)
-        p_value = chance_of_gain(naming.null_best, claim.gain)
-        for first, last in spans(active_spans(claim, reduced), begin, end):
+        strongest = max(identification.components, key=lambda component: component.evidence_nats)
+        statistic = _PART_VIEW.get(strongest.candidate.statistic, "davar")
+        low, high = _taus(strongest, statistic, blocks)
+        p_value = chance_of_gain(identifications.null_best, identification.evidence_nats)
+        for first, last in spans(active_spans(identification, blocks), begin, end):
             when = span_text(first, last, float(end[-1]))
             out.append(
                 {
                     "id": len(known) + len(out) + 1,
-                    "view": view,
-                    "axes": list(claim.axes),
-                    "start": iso(reduced, first),
-                    "end": iso(reduced, last),
+                    "view": statistic,
+                    "axes": list(identification.axes),
+                    "start": iso(blocks, first),
+                    "end": iso(blocks, last),
                     "tau_min_s": low,
                     "tau_max_s": high,
                     "ratio": None,
                     "p_value": p_value,
-                    "explained_by": [claim.effect],
-                    "statement": named_statement(view, claim.effect, claim.axes, when, p_value),
+                    "explained_by": [identification.effect],
+                    "statement": named_statement(
+                        statistic, identification.effect, identification.axes, when, p_value
+                    ),
                 }
             )
     return out
 
 
-def _taus(part: Component, view: str, reduced: xr.Dataset) -> tuple[float, float]:
+def _taus(component: Component, statistic: str, blocks: xr.Dataset) -> tuple[float, float]:
     """Averaging times [s] at which a part of an effect shows: those of its line, of block means, or those within a block."""
-    block, whole = float(reduced.attrs["block_s"]), float(reduced["end"].values[-1])
-    if part.candidate.view == "line" and part.place >= 0:
-        tau = _BUMP / float(reduced["line_frequency"].values[part.place])
+    block, whole = float(blocks.attrs["block_s"]), float(blocks["end"].values[-1])
+    if component.candidate.statistic == "line" and component.place >= 0:
+        tau = _BUMP / float(blocks["line_frequency"].values[component.place])
         return tau, tau
-    if view == "mean":
+    if statistic == "mean":
         return block, whole / 2.0
-    return 1.0 / float(reduced.attrs["sampling_rate_hz"]), block
+    return 1.0 / float(blocks.attrs["sampling_rate_hz"]), block
 
 
 def unidentified_tables(
-    naming: Identifications, reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]
+    identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """Mismatches that only naming saw: what no effect explains, where no box that is left says so already."""
     out: list[dict[str, Any]] = []
-    for one in naming.unknown:
-        view = _GENERIC_VIEW.get(one.generic, "davar")
+    for one in identifications.unknown:
+        statistic = _GENERIC_VIEW.get(one.generic, "davar")
         told = any(
-            box["view"] == view and set(box["axes"]) & set(one.axes) and not box["explained_by"]
-            for box in known
+            region["view"] == statistic
+            and set(region["axes"]) & set(one.axes)
+            and not region["explained_by"]
+            for region in known
         )
         if not told:
-            out.append(_unknown_table(one, naming, reduced, len(known) + len(out) + 1, view))
+            out.append(
+                _unknown_table(one, identifications, blocks, len(known) + len(out) + 1, statistic)
+            )
     return out
 
 
 def _unknown_table(
-    one: Unidentified, naming: Identifications, reduced: xr.Dataset, number: int, view: str
+    one: Unidentified,
+    identifications: Identifications,
+    blocks: xr.Dataset,
+    number: int,
+    statistic: str,
 ) -> dict[str, Any]:
-    p_value = chance_of_gain(naming.null_best, one.gain)
+    p_value = chance_of_gain(identifications.null_best, one.evidence_nats)
     near = ", ".join(plain_name(name) for name in one.candidates)
     beside = f"; what comes nearest: {near}" if near else ""
-    means, what = view == "mean", NUISANCE_ALTERNATIVES.get(one.generic, "something differs")
-    rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
-    begin, end, when = _when(one, reduced)
+    means, what = statistic == "mean", NUISANCE_ALTERNATIVES.get(one.generic, "something differs")
+    rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
+    begin, end, when = _when(one, blocks)
     return {
         "id": number,
-        "view": view,
+        "view": statistic,
         "axes": list(one.axes),
-        "start": iso(reduced, begin),
-        "end": iso(reduced, end),
+        "start": iso(blocks, begin),
+        "end": iso(blocks, end),
         "tau_min_s": block if means else 1.0 / rate,
-        "tau_max_s": float(reduced["end"].values[-1]) / 2.0 if means else block,
+        "tau_max_s": float(blocks["end"].values[-1]) / 2.0 if means else block,
         "ratio": None,
         "p_value": p_value,
         "explained_by": [],
@@ -250,36 +261,36 @@ def _unknown_table(
     }
 
 
-def _when(one: Unidentified, reduced: xr.Dataset) -> tuple[float, float, str]:
+def _when(one: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
     """Begin and end of what has no name [s], with words for an event; else the whole record."""
-    whole = float(reduced["end"].values[-1])
+    whole = float(blocks["end"].values[-1])
     found = [
-        (part.variant.values["begin"], part.variant.values["end"])
-        for part in one.parts
-        if "begin" in part.variant.values
+        (component.variant.values["begin"], component.variant.values["end"])
+        for component in one.components
+        if "begin" in component.variant.values
     ]
     if not found:
-        return float(reduced["begin"].values[0]), whole, ""
+        return float(blocks["begin"].values[0]), whole, ""
     begin, end = min(first for first, _ in found), max(last for _, last in found)
     return begin, end, f", {span_text(begin, end, whole)}"
 
 
 def motion_tables(
-    claims: Sequence[Identification], reduced: xr.Dataset, known: Sequence[Mapping[str, Any]]
+    identified: Sequence[Identification], blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """One mismatch for every axis whose moving stretches were left out of the comparison, from the first of them to the last."""
-    if "moving" not in reduced:
+    if "moving" not in blocks:
         return []
     begin, end, block = (
-        reduced["begin"].values,
-        reduced["end"].values,
-        float(reduced.attrs["block_s"]),
+        blocks["begin"].values,
+        blocks["end"].values,
+        float(blocks.attrs["block_s"]),
     )
     out: list[dict[str, Any]] = []
     for axis, moving, mean in zip(
-        map(str, reduced["axis"].values),
-        reduced["moving"].values,
-        measured(reduced, "mean").values,
+        map(str, blocks["axis"].values),
+        blocks["moving"].values,
+        measured(blocks, "mean").values,
         strict=True,
     ):
         if not moving.any():
@@ -291,35 +302,43 @@ def motion_tables(
                 "id": len(known) + len(out) + 1,
                 "view": "mean",
                 "axes": [axis],
-                "start": iso(reduced, first),
-                "end": iso(reduced, last),
-                "tau_min_s": 1.0 / float(reduced.attrs["sampling_rate_hz"]),
+                "start": iso(blocks, first),
+                "end": iso(blocks, last),
+                "tau_min_s": 1.0 / float(blocks.attrs["sampling_rate_hz"]),
                 "tau_max_s": max((last - first) / 2.0, block),
                 "ratio": None,
                 "p_value": _LEAST_P,
                 "explained_by": [],
                 "statement": motion_statement(
-                    axis, span_text(first, last, float(end[-1])), largest, _followers(axis, claims)
+                    axis,
+                    span_text(first, last, float(end[-1])),
+                    largest,
+                    _followers(axis, identified),
                 ),
             }
         )
     return out
 
 
-def _followers(axis: str, claims: Sequence[Identification]) -> list[str]:
+def _followers(axis: str, identified: Sequence[Identification]) -> list[str]:
     """Axes on which the rate of an axis is seen through a lean of theirs."""
-    parts = [part for claim in claims if claim.effect == "misalignment" for part in claim.parts]
+    components = [
+        component
+        for identification in identified
+        if identification.effect == "misalignment"
+        for component in identification.components
+    ]
     return sorted(
         {
             name
-            for part in parts
-            if axis in (*part.variant.columns, *part.candidate.witness)
-            for name in part.row
+            for component in components
+            if axis in (*component.variant.columns, *component.candidate.witness)
+            for name in component.row
         }
     )
 
 
-def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[str, Any]]:
+def effect_tables(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[dict[str, Any]]:
     """The named effects, the strongest first.
 
     An effect with different numbers on several axes is one claim in as many tables, each with the
@@ -327,28 +346,28 @@ def effect_tables(fitted: Sequence[Fitted], reduced: xr.Dataset) -> list[dict[st
     the one that the logarithm of a likelihood ratio has where the model is right: the root of twice
     the gain.
     """
-    begin, end = reduced["begin"].values, reduced["end"].values
+    begin, end = blocks["begin"].values, blocks["end"].values
     out = []
     for one in fitted:
-        claim = one.claim
-        when = spans(active_spans(claim, reduced), begin, end)
+        identification = one.identification
+        when = spans(active_spans(identification, blocks), begin, end)
         whole = float(end[-1])
         out.append(
             {
-                "name": claim.effect,
+                "name": identification.effect,
                 "axes": list(one.axes),
-                "driver": ",".join(filter(None, claim.driver)) or None,
-                "intervals": [[iso(reduced, low), iso(reduced, high)] for low, high in when],
+                "driver": ",".join(filter(None, identification.driver)) or None,
+                "intervals": [[iso(blocks, low), iso(blocks, high)] for low, high in when],
                 "parameters": {name: asdict(estimate) for name, estimate in one.parameters.items()},
                 "held_out_gain": {
-                    "nats": claim.gain,
-                    "stderr": math.sqrt(2.0 * max(claim.gain, 0.0)),
-                    "threshold": claim.threshold,
+                    "nats": identification.evidence_nats,
+                    "stderr": math.sqrt(2.0 * max(identification.evidence_nats, 0.0)),
+                    "threshold": identification.threshold,
                 },
-                "alternatives": list(claim.alternatives),
+                "alternatives": list(identification.alternatives),
                 "statement": effect_statement(
-                    one.say() or unsized_statement(claim.effect, one.axes),
-                    alternatives=claim.alternatives,
+                    one.say() or unsized_statement(identification.effect, one.axes),
+                    alternatives=identification.alternatives,
                     intervals=[]
                     if when == [(float(begin[0]), whole)]
                     else [span_text(*span, whole) for span in when],
@@ -392,33 +411,33 @@ def _instrument(effect: Effect) -> int:
 
 
 def surfaces_with_blocks(
-    surfaces: xr.Dataset, reduced: xr.Dataset, before: xr.Dataset, after: xr.Dataset
+    surfaces: xr.Dataset, blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset
 ) -> xr.Dataset:
     """The surfaces with what else the report draws: block means, channels, and spectra of the whole record."""
     power = "degree2 hour-2 s"
     channels = {
-        str(name): reduced[name] for name in reduced.data_vars if str(name).startswith("channel_")
+        str(name): blocks[name] for name in blocks.data_vars if str(name).startswith("channel_")
     }
     with np.errstate(invalid="ignore"):
-        cases = [reduced["power"], before["spectrum"], after["spectrum"]]
-        there = np.isfinite(reduced["power"].transpose("axis", "block", "band").values)
+        cases = [blocks["power"], before["spectrum"], after["spectrum"]]
+        there = np.isfinite(blocks["power"].transpose("axis", "block", "band").values)
         density = np.stack(
             [_mean_where(one.transpose("axis", "block", "band").values, there) for one in cases]
         )
-        lines = reduced["line_power"].weighted(reduced["line_weight"].fillna(0.0)).mean("part")
+        lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
     step = max(1, lines.sizes["line"] // _MOST_LINES)
     lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines
     frequency = (
-        reduced["line_frequency"].coarsen(line=step, boundary="trim").mean()
+        blocks["line_frequency"].coarsen(line=step, boundary="trim").mean()
         if step > 1
-        else reduced["line_frequency"]
+        else blocks["line_frequency"]
     )
     added = xr.Dataset(
         {
             "block_mean": (
                 ("axis", "block"),
-                reduced["mean"].transpose("axis", "block").values,
-                dict(reduced["mean"].attrs),
+                blocks["mean"].transpose("axis", "block").values,
+                dict(blocks["mean"].attrs),
             ),
             "density": (
                 ("case", "axis", "band"),
@@ -439,10 +458,10 @@ def surfaces_with_blocks(
             },
         },
         coords={
-            "block_begin": ("block", reduced["begin"].values, dict(reduced["begin"].attrs)),
-            "block_end": ("block", reduced["end"].values, dict(reduced["end"].attrs)),
-            "frequency": ("band", reduced["frequency"].values, dict(reduced["frequency"].attrs)),
-            "line_frequency": ("line", frequency.values, dict(reduced["line_frequency"].attrs)),
+            "block_begin": ("block", blocks["begin"].values, dict(blocks["begin"].attrs)),
+            "block_end": ("block", blocks["end"].values, dict(blocks["end"].attrs)),
+            "frequency": ("band", blocks["frequency"].values, dict(blocks["frequency"].attrs)),
+            "line_frequency": ("line", frequency.values, dict(blocks["line_frequency"].attrs)),
         },
     )
     return surfaces.merge(added, compat="no_conflicts", join="exact")

@@ -210,12 +210,12 @@ def length_text(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds >= 0.1 else f"{seconds * 1e3:.3g} ms"
 
 
-def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
+def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
     """One sentence on a place where recording and simulation differ.
 
     Parameters
     ----------
-    box : mapping
+    region : mapping
         Fields of `gyrostab.diagnose.locate.mismatches.FIELDS`, with ``axes`` as a list.
     whole : float
         Length of the record [s].
@@ -227,59 +227,59 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
     'Axis x is noisier than simulated from 25:00 to 30:00 after the start, at averaging times of 10 ms to 3 s: its Allan variance is
      1.8 times the expected one (noise alone does that in 1 of 2 500 such records).'
     """
-    axes, when = axes_text(box["axes"]), span_text(box["begin"], box["end"], whole)
-    low, high = length_text(box["tau_min_s"]), length_text(box["tau_max_s"])
+    axes, when = axes_text(region["axes"]), span_text(region["begin"], region["end"], whole)
+    low, high = length_text(region["tau_min_s"]), length_text(region["tau_max_s"])
     taus = (
         f"averaging times of {low} to {high}"
-        if box["tau_max_s"] > 1.01 * box["tau_min_s"]
+        if region["tau_max_s"] > 1.01 * region["tau_min_s"]
         else f"an averaging time of {low}"
     )
-    verb = "is" if len(box["axes"]) == 1 else "are"
-    more = box.get("sign", 1) >= 0
-    sure = chance(box["p_value"])
+    verb = "is" if len(region["axes"]) == 1 else "are"
+    more = region.get("sign", 1) >= 0
+    sure = chance(region["p_value"])
     begin = axes[0].upper() + axes[1:]
-    one, estimate = len(box["axes"]) == 1, box.get("estimate", np.nan)
-    if box["view"] == "davar" and str(box.get("what", "")).startswith("restless"):
-        pace = length_text(float(str(box["what"]).split()[1]))
+    one, estimate = len(region["axes"]) == 1, region.get("estimate", np.nan)
+    if region["view"] == "davar" and str(region.get("what", "")).startswith("restless"):
+        pace = length_text(float(str(region["what"]).split()[1]))
         size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
         return (
             f"The noise of {axes} goes up and down {when}, at {taus}: from one stretch of {pace} to another its power changes{size}, which "
-            f"is {box['ratio']:.3g} times the scatter of steady noise ({sure})."
+            f"is {region['ratio']:.3g} times the scatter of steady noise ({sure})."
         )
-    if box["view"] == "davar":
+    if region["view"] == "davar":
         what = "noisier" if more else "quieter"
         return (
             f"{begin} {verb} {what} than simulated {when}, at {taus}: {'its' if one else 'their'} Allan variance is "
-            f"{box['ratio']:.3g} times the expected one ({sure})."
+            f"{region['ratio']:.3g} times the expected one ({sure})."
         )
-    if box["view"] == "mean" and box.get("sign", 1) == 0:
+    if region["view"] == "mean" and region.get("sign", 1) == 0:
         return f"The mean rate of {axes} wanders {when} by more than drift and noise allow, {abs(estimate):.3g} deg/h at most ({sure})."
-    if box["view"] == "mean":
+    if region["view"] == "mean":
         size = f" by {abs(estimate):.3g} deg/h" if np.isfinite(estimate) else ""
         return f"The mean rate of {axes} is {'higher' if more else 'lower'}{size} {when} than drift and noise allow ({sure})."
-    if box["view"] == "cross_axis" and box.get("what") == "slow":
+    if region["view"] == "cross_axis" and region.get("what") == "slow":
         size = f" (correlation {estimate:.2g})"
         return f"{begin} wander together{size} {when}, at {taus}, which the random walks of independent gyros do not ({sure})."
-    if box["view"] == "cross_axis":
+    if region["view"] == "cross_axis":
         size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
         return f"{begin} vary together{size} {when}, at {taus}, which independent gyros do not ({sure})."
-    what = str(box.get("what", ""))
-    if box["view"] == "spectrum" and what.startswith("order"):
+    what = str(region.get("what", ""))
+    if region["view"] == "spectrum" and what.startswith("order"):
         return (
             f"The rate of {axes} has a part of {estimate:.3g} deg/h that turns {what.removeprefix('order ')} times with every turn of the "
             f"tool {when} ({sure})."
         )
-    if box["view"] == "spectrum" and what == "ramp phase":
+    if region["view"] == "spectrum" and what == "ramp phase":
         return f"The rate of {axes} has a part of {estimate:.3g} deg/h rms that follows the phase of the feedback ramp {when} ({sure})."
-    if box["view"] == "spectrum" and what.startswith("glide"):
+    if region["view"] == "spectrum" and what.startswith("glide"):
         begins, ends = what.split()[1:]
         return f"The spectrum of {axes} has a line that moves {when}, from about {begins} Hz to about {ends} Hz ({sure})."
-    if box["view"] == "spectrum":
+    if region["view"] == "spectrum":
         return (
-            f"The spectrum of {axes} has a line at {box.get('frequency', np.nan):.5g} Hz {when}, {box['ratio']:.3g} times the level "
+            f"The spectrum of {axes} has a line at {region.get('frequency', np.nan):.5g} Hz {when}, {region['ratio']:.3g} times the level "
             f"of the noise ({sure})."
         )
-    if box["view"] == "restart":
+    if region["view"] == "restart":
         return (
             f"The rate of {axes} does not begin where it ended when the power comes back ({sure})."
         )
@@ -287,7 +287,9 @@ def mismatch_statement(box: Mapping[str, Any], whole: float) -> str:
     return f"{begin} {'has' if one else 'have'} {told} {when} ({sure})."
 
 
-def named_statement(view: str, effect: str, axes: Sequence[str], when: str, p_value: float) -> str:
+def named_statement(
+    statistic: str, effect: str, axes: Sequence[str], when: str, p_value: float
+) -> str:
     """One sentence on what shows only when an effect says where to look.
 
     Examples
@@ -297,7 +299,7 @@ def named_statement(view: str, effect: str, axes: Sequence[str], when: str, p_va
      rate of change of temperature (Shupe effect) would have it (noise alone does that in 1 of 250
      such records).'
     """
-    what = _SHOWN.get(view, "The noise")
+    what = _SHOWN.get(statistic, "The noise")
     return (
         f"{what} of {axes_text(axes)} differs {when}, in no single place, but taken together as {plain_name(effect)} would have it "
         f"({chance(p_value)})."
@@ -383,14 +385,14 @@ def effect_statement(
     'The bias jumps on axis x. It shows from 1:00 to 2:00 after the start. This record cannot tell it from a bias that
      switches between two levels.'
     """
-    parts = [said]
+    components = [said]
     if intervals:
-        parts.append(f"It shows {', and '.join(intervals)}.")
+        components.append(f"It shows {', and '.join(intervals)}.")
     if alternatives:
-        parts.append(
+        components.append(
             f"This record cannot tell it from {', or '.join(plain_name(one) for one in alternatives)}."
         )
-    return " ".join(parts)
+    return " ".join(components)
 
 
 def summary(content: Mapping[str, Any]) -> str:

@@ -1,8 +1,8 @@
-"""Where recording and simulation are compared: each view gives near-normal scores of its cells.
+"""Statistics in which a recording and a simulation are compared: near-normal scores of windows.
 
-A view is a file with a function ``score(reduced, baseline)`` that gives a Dataset of
-`cells.view_dataset`, or None when the recording has nothing that it looks at; the tuple here is all
-that must know of it.
+A statistic is a file with a function ``score(blocks, baseline)`` that gives a Dataset of
+`scores.statistic_dataset`, or None when the recording has nothing that it uses. The table here is
+the only other place that names it.
 """
 
 from __future__ import annotations
@@ -11,29 +11,31 @@ from collections.abc import Callable
 
 import xarray as xr
 
-from gyrostab.diagnose.statistics import common_mode as common
-from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
-from gyrostab.diagnose.statistics import drifting_line as gliding
-from gyrostab.diagnose.statistics import mean, restart
-from gyrostab.diagnose.statistics import phase_locked as locked
-from gyrostab.diagnose.statistics import power as davar
-from gyrostab.diagnose.statistics import sample_counts as distribution
-from gyrostab.diagnose.statistics import spectral_line as spectrum
-from gyrostab.diagnose.statistics import variance_stability as restless
+from gyrostab.diagnose.statistics import (
+    common_mode,
+    cross_spectrum,
+    drifting_line,
+    mean,
+    phase_locked,
+    power,
+    restart,
+    sample_counts,
+    spectral_line,
+    variance_stability,
+)
 
 __all__ = ["STATISTICS"]
 
-#: Every view by a name of its own; the name in the contract is the attribute ``view`` of what it
-#: gives.
+#: Statistics by name. The attribute ``view`` of what they give is the name in diagnosis.json.
 STATISTICS: dict[str, Callable[[xr.Dataset, xr.Dataset], xr.Dataset | None]] = {
-    "davar": davar.score,
+    "power": power.score,
     "mean": mean.score,
-    "cross_axis": cross_axis.score,
-    "common": common.score,
-    "spectrum": spectrum.score,
-    "locked": locked.score,
-    "distribution": distribution.score,
+    "cross_spectrum": cross_spectrum.score,
+    "common_mode": common_mode.score,
+    "spectral_line": spectral_line.score,
+    "phase_locked": phase_locked.score,
+    "sample_counts": sample_counts.score,
     "restart": restart.score,
-    "restless": restless.score,
-    "gliding": gliding.score,
+    "variance_stability": variance_stability.score,
+    "drifting_line": drifting_line.score,
 }

@@ -39,7 +39,7 @@ _PROBES, _SEED = (
 )  # series of white noise that tell what a known covariance makes of the increments
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     """Score the correlation of what is new in the block means of every pair of axes, against axes that wander independently.
 
     The block means of each axis are whitened by its noise: what is left of each is what the ones
@@ -50,7 +50,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects; white noise that the axes share
         by its ``cross`` is taken off.
 
@@ -61,19 +61,19 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         and ``estimate`` are the correlation. Three axes or more have a row of all together, by the
         determinant of their correlations; its ``estimate`` is the root of the mean square of them.
     """
-    axes = [str(axis) for axis in reduced["axis"].values]
-    blocks = reduced.sizes["block"]
-    spans = [span for span in SPANS if _OVERLAP * blocks / span >= _FEWEST]
+    axes = [str(axis) for axis in blocks["axis"].values]
+    block_count = blocks.sizes["block"]
+    spans = [span for span in SPANS if _OVERLAP * block_count / span >= _FEWEST]
     if len(axes) < 2 or not spans:
         return None
-    windows = window_set(blocks, LENGTHS)
-    residual = values_of(reduced, "mean", "axis", "block") - values_of(
+    windows = window_set(block_count, LENGTHS)
+    residual = values_of(blocks, "mean", "axis", "block") - values_of(
         baseline, "known_mean", "axis", "block"
     )
     there = np.isfinite(residual).reshape(-1, *residual.shape[-2:]).all(axis=0)
-    new = _increments(residual, there, reduced, baseline)
+    new = _increments(residual, there, blocks, baseline)
     pairs = list(combinations(range(len(axes)), 2))
-    shared = _shared(there, pairs, reduced, baseline) if "cross" in baseline else None
+    shared = _shared(there, pairs, blocks, baseline) if "cross" in baseline else None
     found = [_correlations(new, there, pairs, windows, span, shared) for span in spans]
     r, count = (
         np.stack([one for one, _ in found], axis=-1),
@@ -85,16 +85,16 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         z = np.concatenate([z, _together(r, count, pairs, len(axes))[..., None, :, :]], axis=-3)
         r = np.concatenate([r, np.sqrt((r**2).mean(axis=-3, keepdims=True))], axis=-3)
         rows = [*rows, " ".join(axes)]
-    block = float(reduced.attrs["block_s"])
+    block = float(blocks.attrs["block_s"])
     return statistic_dataset(
         "cross_axis",
-        reduced,
+        blocks,
         rows=rows,
         windows=windows,
         columns={
             "what": "slow",
             "tau_min_s": block * np.array(spans, dtype=float),
-            "tau_max_s": block * blocks / 2.0,
+            "tau_max_s": block * block_count / 2.0,
         },
         z=z,
         ratio=np.abs(r),
@@ -103,15 +103,15 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 
 
 def _increments(
-    residual: Array, there: NDArray[np.bool_], reduced: xr.Dataset, baseline: xr.Dataset
+    residual: Array, there: NDArray[np.bool_], blocks: xr.Dataset, baseline: xr.Dataset
 ) -> Array:
     """Whitened block means by (record), axis, block; zero where there is none."""
     terms = [str(term) for term in baseline["term"].values]
     white = baseline["mean_variance"].transpose("axis", "block").values
     begin, end, block = (
-        reduced["begin"].values,
-        reduced["end"].values,
-        float(reduced.attrs["block_s"]),
+        blocks["begin"].values,
+        blocks["end"].values,
+        float(blocks.attrs["block_s"]),
     )
     share, times, faster = flicker_states(block, float(end[-1] - begin[0]))
     new = np.empty_like(residual)
@@ -134,7 +134,7 @@ def _increments(
 def _shared(
     there: NDArray[np.bool_],
     pairs: list[tuple[int, int]],
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     baseline: xr.Dataset,
 ) -> tuple[Array, Array]:
     """Increments of one white noise on all axes by probe, axis, block, and the part of it that each pair is known to share."""
@@ -147,7 +147,7 @@ def _shared(
     one, other = ([pair[side] for pair in pairs] for side in (0, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         share = cross / np.sqrt(spectrum[one] * spectrum[other])
-    return _increments(series, there, reduced, baseline), np.nan_to_num(np.nanmean(share, axis=-1))
+    return _increments(series, there, blocks, baseline), np.nan_to_num(np.nanmean(share, axis=-1))
 
 
 def _correlations(

@@ -25,12 +25,12 @@ LENGTHS = (5, 15, 45)
 _FEWEST = 8.0  # complex ordinates; with fewer a coherency is no number to judge by
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     """Score the coherency of every pair of axes, in bands and over all bands, against independent axes.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects: the bands are weighed by its
         spectrum, and a ``cross`` (pair, block, band) that the axes share by it is taken off.
 
@@ -41,36 +41,37 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         and ``estimate`` too. Three axes or more have a row of all pairs together, over all bands in
         phase.
     """
-    if "cross" not in reduced or reduced.sizes.get("pair", 0) == 0:
+    if "cross" not in blocks or blocks.sizes.get("pair", 0) == 0:
         return None
-    axes = [str(axis) for axis in reduced["axis"].values]
-    left = [axes.index(str(axis)) for axis in reduced["first"].values]
-    right = [axes.index(str(axis)) for axis in reduced["second"].values]
-    windows = window_set(reduced.sizes["block"], LENGTHS)
-    coherency, count = _coherency(reduced, baseline, left, right, windows)
-    parts = [coherency.real, coherency.imag]
-    r = np.concatenate(parts, axis=-1)
+    axes = [str(axis) for axis in blocks["axis"].values]
+    left = [axes.index(str(axis)) for axis in blocks["first"].values]
+    right = [axes.index(str(axis)) for axis in blocks["second"].values]
+    windows = window_set(blocks.sizes["block"], LENGTHS)
+    coherency, count = _coherency(blocks, baseline, left, right, windows)
+    components = [coherency.real, coherency.imag]
+    r = np.concatenate(components, axis=-1)
     z = correlation_score(r, np.concatenate([2.0 * count] * 2, axis=-1))
     rows = [f"{axes[a]} {axes[b]}" for a, b in zip(left, right, strict=True)]
-    bands = reduced.sizes["band"]
+    bands = blocks.sizes["band"]
     if len(rows) > 1:
         z, r = (
             np.concatenate(
-                [part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)], axis=-3
+                [component, np.full((*component.shape[:-3], 1, *component.shape[-2:]), np.nan)],
+                axis=-3,
             )
-            for part in (z, r)
+            for component in (z, r)
         )
         broad = z[..., :-1, :, bands]
         together = (broad**2).mean(axis=-2)
         z[..., -1, :, bands] = cube_root_score(together, np.full(together.shape, len(rows) / 2.0))
         r[..., -1, :, bands] = np.sqrt((r[..., :-1, :, bands] ** 2).mean(axis=-2))
         rows = [*rows, " ".join(axes)]
-    low, high = reduced["band_low"].values, reduced["band_high"].values
-    low = np.maximum(low, 0.5 / float(reduced.attrs["block_s"]))
+    low, high = blocks["band_low"].values, blocks["band_high"].values
+    low = np.maximum(low, 0.5 / float(blocks.attrs["block_s"]))
     f_min, f_max = np.append(low, low[0]), np.append(high, high[-1])
     return statistic_dataset(
         "cross_axis",
-        reduced,
+        blocks,
         rows=rows,
         windows=windows,
         columns={
@@ -80,7 +81,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
             ),
             "tau_min_s": np.tile(0.5 / f_max, 2),
             "tau_max_s": np.tile(0.5 / f_min, 2),
-            "frequency": np.tile(np.append(reduced["frequency"].values, np.nan), 2),
+            "frequency": np.tile(np.append(blocks["frequency"].values, np.nan), 2),
         },
         z=z,
         ratio=np.abs(r),
@@ -89,19 +90,19 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 
 
 def _coherency(
-    reduced: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows
+    blocks: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows
 ) -> tuple[Complex, Array]:
     """Coherency of each pair by (record), pair, window, band and over all bands last, and the complex ordinates in each.
 
     Where both axes are loud in a few blocks only, these have all the weight: so many blocks of
     equal power would scatter as much.
     """
-    cross = values_of(reduced, "cross", "pair", "block", "band")
+    cross = values_of(blocks, "cross", "pair", "block", "band")
     if "cross" in baseline:
         cross = cross - values_of(baseline, "cross", "pair", "block", "band")
     power, shape = (
-        values_of(reduced, "power", "axis", "block", "band"),
-        values_of(reduced, "shape", "axis", "block", "band"),
+        values_of(blocks, "power", "axis", "block", "band"),
+        values_of(blocks, "shape", "axis", "block", "band"),
     )
     spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -39,7 +39,7 @@ _USUAL = 20.0  # ways that do as much, beyond which a score is as low as any
 _BUMP = 0.371  # averaging time times frequency where the Allan variance of a sine is largest
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     r"""Score the lines of the spectrum along ways: each part of the record at another frequency.
 
     A line of power :math:`E` over the density of the noise in every block, moving over L lines
@@ -52,7 +52,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects.
 
     Returns
@@ -67,21 +67,23 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     parts, and counts for little by itself: a line that stands still, or a part of the record that
     is louder, is no motion.
     """
-    if "line_power" not in reduced:
+    if "line_power" not in blocks:
         return None
     power, weight = (
-        values_of(reduced, "line_power", "axis", "part", "line"),
-        values_of(reduced, "line_weight", "axis", "part"),
+        values_of(blocks, "line_power", "axis", "part", "line"),
+        values_of(blocks, "line_weight", "axis", "part"),
     )
     there = np.isfinite(power).reshape(-1, *power.shape[-3:]).all(axis=(0, 3)) & (weight > 0)
-    parts = np.flatnonzero(there.all(axis=0))
+    components = np.flatnonzero(there.all(axis=0))
     lines = power.shape[-1]
-    if parts.size < _FEWEST or lines < 2 * _STRETCHES:
+    if components.size < _FEWEST or lines < 2 * _STRETCHES:
         return None
     cells = _cells(
-        power[..., parts, :], weight[:, parts, None], _expected(reduced, baseline)[:, parts]
+        power[..., components, :],
+        weight[:, components, None],
+        _expected(blocks, baseline)[:, components],
     )
-    axes = [str(axis) for axis in reduced["axis"].values]
+    axes = [str(axis) for axis in blocks["axis"].values]
     if len(axes) > 1:
         cells, axes = (
             np.concatenate(
@@ -92,7 +94,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     cells = cells / np.maximum(
         cells.std(axis=(-2, -1), keepdims=True), 1.0
     )  # axes with noise in common add up to more
-    edges = np.stack([parts, parts + 1]) - parts[0]
+    edges = np.stack([components, components + 1]) - components[0]
     largest, ways = _largest(cells, edges / edges.max())
     with np.errstate(divide="ignore", invalid="ignore"):
         more = np.exp(
@@ -101,26 +103,30 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         z = np.where(
             ways > 0, exponential_score(-np.log(-np.expm1(-np.minimum(more, _USUAL)))), np.nan
         )
-    blocks = -(-np.arange(power.shape[-2] + 1) * reduced.sizes["block"] // power.shape[-2])
+    block_count = -(-np.arange(power.shape[-2] + 1) * blocks.sizes["block"] // power.shape[-2])
     return statistic_dataset(
         "spectrum",
-        reduced,
+        blocks,
         rows=axes,
-        windows=Windows(blocks[parts[:1]], blocks[parts[-1:] + 1]),
-        columns=_columns(reduced["line_frequency"].values),
+        windows=Windows(block_count[components[:1]], block_count[components[-1:] + 1]),
+        columns=_columns(blocks["line_frequency"].values),
         z=z[..., None, :],
         ratio=np.where(ways > 0, largest, np.nan)[..., None, :],
         one_sided=True,
     )
 
 
-def _expected(reduced: xr.Dataset, baseline: xr.Dataset) -> Array:
+def _expected(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     """Spectrum of the baseline at the lines by axis, part, line."""
-    parts, blocks = reduced.sizes["part"], reduced.sizes["block"]
-    of = np.arange(blocks) * parts // blocks
-    lines = reduced["line_frequency"].values
+    components, block_count = blocks.sizes["part"], blocks.sizes["block"]
+    of = np.arange(block_count) * components // block_count
+    lines = blocks["line_frequency"].values
     return np.stack(
-        [expected_lines(baseline.isel(block=of == part), lines) for part in range(parts)], axis=1
+        [
+            expected_lines(baseline.isel(block=of == component), lines)
+            for component in range(components)
+        ],
+        axis=1,
     )
 
 
@@ -151,25 +157,29 @@ def _largest(cells: Array, edges: Array) -> tuple[Array, Array]:
 
     `cells` are (record), row, part, line, `edges` (2, part) the begin and end of each part, 0 to 1.
     """
-    lines, parts = cells.shape[-1], cells.shape[-2]
+    lines, components = cells.shape[-1], cells.shape[-2]
     total = np.concatenate([np.zeros((*cells.shape[:-1], 1)), np.cumsum(cells, axis=-1)], axis=-1)
     largest = np.full((*cells.shape[:-2], _STRETCHES**2), -np.inf)
     ways = np.zeros(_STRETCHES**2)
     for move, bend in _moves(lines):
         at = np.rint(move * (edges + bend * edges * (1.0 - edges))).astype(np.int64)
         low, high = at.min(axis=0), at.max(axis=0) + 1
-        begin, end, step = max(0, -move), lines - max(0, move), max(1, abs(move) // (2 * parts))
+        begin, end, step = (
+            max(0, -move),
+            lines - max(0, move),
+            max(1, abs(move) // (2 * components)),
+        )
         start = np.arange(begin, end, step)
         along = np.zeros((*cells.shape[:-2], start.size))
-        for part in range(parts):
+        for component in range(components):
             upper, lower = (
-                slice(begin + edge, end + edge, step) for edge in (high[part], low[part])
+                slice(begin + edge, end + edge, step) for edge in (high[component], low[component])
             )
-            inside = total[..., part, upper] - total[..., part, lower]
-            along += np.minimum(inside / np.sqrt(high[part] - low[part]), _PART)
+            inside = total[..., component, upper] - total[..., component, lower]
+            along += np.minimum(inside / np.sqrt(high[component] - low[component]), _PART)
         column = start * _STRETCHES // lines * _STRETCHES + (start + move) * _STRETCHES // lines
         first = np.flatnonzero(np.diff(column, prepend=-1))
-        best = np.maximum.reduceat(along / np.sqrt(parts), first, axis=-1)
+        best = np.maximum.reduceat(along / np.sqrt(components), first, axis=-1)
         largest[..., column[first]] = np.maximum(largest[..., column[first]], best)
         np.add.at(ways, column, 1.0)
     return largest, ways
@@ -180,8 +190,8 @@ def _columns(frequency: Array) -> dict[str, Any]:
     edges = np.linspace(frequency[0], frequency[-1], _STRETCHES + 1)
     middle = (edges[1:] + edges[:-1]) / 2.0
     one, other = (
-        part.ravel()
-        for part in np.meshgrid(np.arange(_STRETCHES), np.arange(_STRETCHES), indexing="ij")
+        component.ravel()
+        for component in np.meshgrid(np.arange(_STRETCHES), np.arange(_STRETCHES), indexing="ij")
     )
     return {
         "what": [f"glide {middle[a]:.3g} {middle[b]:.3g}" for a, b in zip(one, other, strict=True)],

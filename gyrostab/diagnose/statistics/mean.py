@@ -49,7 +49,7 @@ class MeanNoise(NamedTuple):
     remaining: Array
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Score the mean of windows of four lengths against the rest of the record, with the noise of the simulation.
 
     The score is that of a constant which is added inside the window alone, by generalised least
@@ -58,7 +58,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects.
 
     Returns
@@ -67,14 +67,14 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         See `gyrostab.diagnose.statistics.scores.statistic_dataset`; ``estimate`` is the constant
         [degree hour-1].
     """
-    windows = window_set(reduced.sizes["block"], LENGTHS, whole=False)
-    amount, information = window_means(reduced, baseline, windows)
+    windows = window_set(blocks.sizes["block"], LENGTHS, whole=False)
+    amount, information = window_means(blocks, baseline, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         z, estimate = (amount / np.sqrt(information))[..., None], (amount / information)[..., None]
-    block = float(reduced.attrs["block_s"])
+    block = float(blocks.attrs["block_s"])
     return statistic_dataset(
         "mean",
-        reduced,
+        blocks,
         windows=windows,
         columns={
             "what": "mean",
@@ -88,14 +88,12 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     )
 
 
-def window_means(
-    reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows
-) -> tuple[Array, Array]:
+def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:
     """Matched filter of every window and its information: their ratio is the constant that stands in the window alone.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         As for `score`.
     windows : Windows
         Not the whole record, which says nothing beside its own constant.
@@ -105,14 +103,14 @@ def window_means(
     amount, information : ndarray ((record,) axis, window), (axis, window)
         [degree-1 hour], [degree-2 hour2]; NaN where too little of the window is there.
     """
-    residual = values_of(reduced, "mean", "axis", "block") - values_of(
+    residual = values_of(blocks, "mean", "axis", "block") - values_of(
         baseline, "known_mean", "axis", "block"
     )
     amount = np.full((*residual.shape[:-1], windows.first.size), np.nan)
     information = np.full((residual.shape[-2], windows.first.size), np.nan)
     for axis in range(residual.shape[-2]):
         present = np.isfinite(residual[..., axis, :]).reshape(-1, residual.shape[-1]).any(axis=0)
-        noise = mean_noise(reduced, baseline, axis, present)
+        noise = mean_noise(blocks, baseline, axis, present)
         amount[..., axis, :], information[axis] = _matched(residual[..., axis, :], noise, windows)
     return amount, information
 
@@ -134,12 +132,12 @@ def _matched(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array
     return over_windows(weighted[..., None], windows)[..., 0], np.where(enough, information, np.nan)
 
 
-def mean_noise(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, present: Array) -> MeanNoise:
+def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Array) -> MeanNoise:
     """Covariance of the block means of an axis: white, random walk and flicker of the baseline, and what else it knows to wander.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         As for `score`.
     axis : int
         Number of the axis.
@@ -151,9 +149,9 @@ def mean_noise(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, present: Ar
         float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)]))
         for term in ("B", "K")
     )
-    begin, end = reduced["begin"].values, reduced["end"].values
+    begin, end = blocks["begin"].values, blocks["end"].values
     step = np.diff((begin + end) / 2.0, append=end[-1])
-    block, span = float(reduced.attrs["block_s"]), float(end[-1] - begin[0])
+    block, span = float(blocks.attrs["block_s"]), float(end[-1] - begin[0])
     share, times, white = flicker_states(block, span)
     known = known_wander(baseline, axis)
     slow, times = (
@@ -181,13 +179,13 @@ def precision(series: Array, noise: MeanNoise) -> Array:
     return out.reshape(series.shape)
 
 
-def region_mean(reduced: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:
+def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:
     """Constant that stands in some blocks of a recording alone, by generalised least squares beside one of the record [degree hour-1]."""
     residual = (
-        values_of(reduced, "mean", "axis", "block")[axis]
+        values_of(blocks, "mean", "axis", "block")[axis]
         - values_of(baseline, "known_mean", "axis", "block")[axis]
     )
-    noise = mean_noise(reduced, baseline, axis, np.isfinite(residual))
+    noise = mean_noise(blocks, baseline, axis, np.isfinite(residual))
     rows = precision(np.stack([np.ones(residual.size), inside.astype(float)]), noise)
     columns = np.stack([np.ones(residual.size), inside.astype(float)])
     solved = np.linalg.lstsq(rows @ columns.T, rows @ np.nan_to_num(residual), rcond=None)[0]

@@ -23,12 +23,12 @@ __all__ = ["LENGTHS", "score"]
 LENGTHS = (5, 15)
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     """Score the harmonics that are locked to rotation, and the mean by phase of the feedback ramp.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects.
 
     Returns
@@ -37,32 +37,34 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         None with neither channel. ``estimate`` is the amplitude, or the rms over the phase [degree
         hour-1].
     """
-    windows = window_set(reduced.sizes["block"], LENGTHS)
-    rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
+    windows = window_set(blocks.sizes["block"], LENGTHS)
+    rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
     found: list[tuple[Array, ...]] = []
     what: list[str] = []
     tau_min, tau_max = [], []
-    if "order" in reduced:
-        found.append(_orders(reduced, baseline, windows))
-        what += [f"order {h}" for h in range(1, reduced.sizes["harmonic"] + 1)]
-        turning = _turning(reduced)
+    if "order" in blocks:
+        found.append(_orders(blocks, baseline, windows))
+        what += [f"order {h}" for h in range(1, blocks.sizes["harmonic"] + 1)]
+        turning = _turning(blocks)
         seen = turning[turning > 0]
         low, high = (
             (float(seen.min()), float(seen.max())) if seen.size else (1.0 / block, rate / 2.0)
         )
-        tau_min += [0.371 / (h * high) for h in range(1, reduced.sizes["harmonic"] + 1)]
-        tau_max += [0.371 / (h * low) for h in range(1, reduced.sizes["harmonic"] + 1)]
-    if "profile" in reduced:
-        found.append(_profile(reduced, baseline, windows))
+        tau_min += [0.371 / (h * high) for h in range(1, blocks.sizes["harmonic"] + 1)]
+        tau_max += [0.371 / (h * low) for h in range(1, blocks.sizes["harmonic"] + 1)]
+    if "profile" in blocks:
+        found.append(_profile(blocks, baseline, windows))
         what.append("ramp phase")
         tau_min.append(1.0 / rate)
         tau_max.append(block)
     if not found:
         return None
-    z, ratio, estimate = (np.concatenate(part, axis=-1) for part in zip(*found, strict=True))
+    z, ratio, estimate = (
+        np.concatenate(component, axis=-1) for component in zip(*found, strict=True)
+    )
     return statistic_dataset(
         "spectrum",
-        reduced,
+        blocks,
         windows=windows,
         columns={"what": what, "tau_min_s": tau_min, "tau_max_s": tau_max},
         z=z,
@@ -73,20 +75,20 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     )
 
 
-def _turning(reduced: xr.Dataset) -> Array:
+def _turning(blocks: xr.Dataset) -> Array:
     """Turns per second in each block."""
-    if "channel_rotation_rate" not in reduced:
-        return np.zeros(reduced.sizes["block"])
-    return np.asarray(np.nan_to_num(np.abs(reduced["channel_rotation_rate"].values) / 360.0))
+    if "channel_rotation_rate" not in blocks:
+        return np.zeros(blocks.sizes["block"])
+    return np.asarray(np.nan_to_num(np.abs(blocks["channel_rotation_rate"].values) / 360.0))
 
 
-def _orders(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+def _orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
     """Score, ratio and amplitude of the coherent sum, by (record), axis, window, harmonic."""
-    order = values_of(reduced, "order", "axis", "block", "harmonic")
-    samples = values_of(reduced, "samples", "axis", "block")
-    rate = float(reduced.attrs["sampling_rate_hz"])
+    order = values_of(blocks, "order", "axis", "block", "harmonic")
+    samples = values_of(blocks, "samples", "axis", "block")
+    rate = float(blocks.attrs["sampling_rate_hz"])
     turning, spectrum = (
-        _turning(reduced),
+        _turning(blocks),
         baseline["spectrum"].transpose("axis", "block", "band").values,
     )
     bands = np.log(baseline["frequency"].values)
@@ -103,7 +105,7 @@ def _orders(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tupl
             density[axis, block] = np.exp(
                 np.interp(at[block], bands, np.log(spectrum[axis, block]))
             )
-        density = noise_at_orders(reduced, density)
+        density = noise_at_orders(blocks, density)
         variance = (
             4.0 * density * rate / samples[..., None]
         )  # of |order|^2 / 1: two components of 2 S rate / n each
@@ -111,7 +113,7 @@ def _orders(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tupl
             np.isfinite(order)
             & np.isfinite(variance)
             & (variance > 0)
-            & (turning > 0.5 / float(reduced.attrs["block_s"]))[:, None]
+            & (turning > 0.5 / float(blocks.attrs["block_s"]))[:, None]
         )
         weight = np.where(there, 1.0 / variance, 0.0)
         sums = over_windows(np.where(there, order, 0.0) * weight, windows)
@@ -121,11 +123,11 @@ def _orders(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tupl
     return exponential_score(ratio), ratio, amplitude
 
 
-def _profile(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+def _profile(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
     """Score, ratio and rms of the mean by phase, by (record), axis, window, one."""
-    profile = values_of(reduced, "profile", "axis", "block", "phase")
-    samples = values_of(reduced, "profile_samples", "axis", "block", "phase")
-    width = (reduced["band_high"] - reduced["band_low"]).values
+    profile = values_of(blocks, "profile", "axis", "block", "phase")
+    samples = values_of(blocks, "profile_samples", "axis", "block", "phase")
+    width = (blocks["band_high"] - blocks["band_low"]).values
     variance = (
         2.0
         * (baseline["spectrum"].transpose("axis", "block", "band").values * width).sum(axis=-1)[

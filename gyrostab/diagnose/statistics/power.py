@@ -62,7 +62,7 @@ def transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
     return out
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Score the Allan variance in windows of three lengths and of the whole record.
 
     Inside a block it is taken from the powers of the bands, at octaves of the sampling interval up
@@ -71,7 +71,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects.
 
     Returns
@@ -79,12 +79,12 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     xarray.Dataset
         See `gyrostab.diagnose.statistics.scores.statistic_dataset`.
     """
-    surface = allan_surface(reduced, baseline)
+    surface = allan_surface(blocks, baseline)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = surface["observed"] / surface["expected"]
     return statistic_dataset(
         "davar",
-        reduced,
+        blocks,
         windows=surface["windows"],
         columns=surface["columns"],
         z=cube_root_score(ratio, surface["shape"]),
@@ -93,13 +93,13 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 
 
 def allan_surface(
-    reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows | None = None
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows | None = None
 ) -> dict[str, Any]:
     """Observed and expected Allan variance [degree2 hour-2] by (record), axis, window, tau, and the shape of their gamma law.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         As for `score`; the known mean is taken off before.
     windows : Windows, optional
         Those of `score` by default.
@@ -109,27 +109,27 @@ def allan_surface(
     dict
         ``observed``, ``expected``, ``shape``; ``windows``; ``columns`` as for `statistic_dataset`.
     """
-    windows = window_set(reduced.sizes["block"], LENGTHS) if windows is None else windows
-    parts = [_inside(reduced, baseline, windows), _beyond(reduced, baseline, windows)]
+    windows = window_set(blocks.sizes["block"], LENGTHS) if windows is None else windows
+    components = [_inside(blocks, baseline, windows), _beyond(blocks, baseline, windows)]
     joined: dict[str, Any] = {"windows": windows}
     for name in ("observed", "expected", "shape"):
-        joined[name] = np.concatenate([part[name] for part in parts], axis=-1)
+        joined[name] = np.concatenate([component[name] for component in components], axis=-1)
     joined["columns"] = {
-        name: np.concatenate([part["columns"][name] for part in parts])
-        for name in parts[0]["columns"]
+        name: np.concatenate([component["columns"][name] for component in components])
+        for name in components[0]["columns"]
     }
     return joined
 
 
-def _inside(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
-    rate, block = float(reduced.attrs["sampling_rate_hz"]), float(reduced.attrs["block_s"])
+def _inside(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
+    rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
     power, shape = (
-        values_of(reduced, "power", "axis", "block", "band"),
-        values_of(reduced, "shape", "axis", "block", "band"),
+        values_of(blocks, "power", "axis", "block", "band"),
+        values_of(blocks, "shape", "axis", "block", "band"),
     )
     spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
     k = 2 ** np.arange(max(1, int(np.log2(block * rate / 4.0)) + 1))
-    weights = transfer(reduced["band_low"].values, reduced["band_high"].values, k / rate, rate).T
+    weights = transfer(blocks["band_low"].values, blocks["band_high"].values, k / rate, rate).T
     there = np.isfinite(power) & np.isfinite(spectrum) & (shape > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(there, 1.0 / shape, 0.0)
@@ -160,37 +160,38 @@ def _inside(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict
         }
 
 
-def _beyond(reduced: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
+def _beyond(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
     """Averaging times of whole blocks: second differences of the block means, all that overlap."""
-    block, blocks = float(reduced.attrs["block_s"]), reduced.sizes["block"]
-    means = values_of(reduced, "mean", "axis", "block") - values_of(
+    block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
+    means = values_of(blocks, "mean", "axis", "block") - values_of(
         baseline, "known_mean", "axis", "block"
     )
     white = values_of(baseline, "mean_variance", "axis", "block")
-    sizes = [k for k in (1, 2, 4, 8, 16, 32) if 4 * k <= blocks]
-    parts: dict[str, list[Array]] = {"observed": [], "expected": [], "shape": []}
+    sizes = [k for k in (1, 2, 4, 8, 16, 32) if 4 * k <= block_count]
+    components: dict[str, list[Array]] = {"observed": [], "expected": [], "shape": []}
     for k in sizes:
         d2 = _differences(means, k) ** 2 / 2.0
-        expected = _pair_variance(white, k) / 2.0 + _slow(reduced, baseline, k * block)[:, None]
+        expected = _pair_variance(white, k) / 2.0 + _slow(blocks, baseline, k * block)[:, None]
         there = np.isfinite(d2) & np.isfinite(expected)
         pairs = Windows(windows.first, np.maximum(windows.stop - 2 * k + 1, windows.first))
         count = over_windows(there[..., None].astype(float), pairs)[..., 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             fits = (count >= 0.5 * pairs.length) & (pairs.length > 0) & (windows.length >= 4 * k)
-            parts["observed"].append(
+            components["observed"].append(
                 over_windows(np.where(there, d2, 0.0)[..., None], pairs)[..., 0] / count
             )
-            parts["expected"].append(
+            components["expected"].append(
                 over_windows(np.where(there, expected, 0.0)[..., None], pairs)[..., 0] / count
             )
             table = _shape(np.arange(int(count.max(initial=0)) + 1), k)
-            parts["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
+            components["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
     if not sizes:
         nothing = np.empty((*means.shape[:-1], windows.first.size, 0))
-        joined: dict[str, Any] = dict.fromkeys(parts, nothing)
+        joined: dict[str, Any] = dict.fromkeys(components, nothing)
     else:
         joined = {
-            name: np.stack(np.broadcast_arrays(*values), axis=-1) for name, values in parts.items()
+            name: np.stack(np.broadcast_arrays(*values), axis=-1)
+            for name, values in components.items()
         }
     tau = np.array(sizes, dtype=float) * block
     joined["columns"] = {
@@ -234,10 +235,10 @@ def _padded(values: Array, size: int) -> Array:
     return np.concatenate([values, rest], axis=-1)
 
 
-def _slow(reduced: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
+def _slow(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
     """Allan variance of the slow terms by axis [degree2 hour-2]; a ramp is in the known mean."""
     coefficient = values_of(baseline.transpose(..., "axis", "term"), "coefficient", "axis", "term")
-    total = np.zeros(reduced.sizes["axis"])
+    total = np.zeros(blocks.sizes["axis"])
     for place, term in enumerate(baseline["term"].values):
         if str(term) in ("B", "K"):
             total = total + LAWS[str(term)].avar(tau) * np.nan_to_num(coefficient[..., place]) ** 2
@@ -246,8 +247,8 @@ def _slow(reduced: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
 
 def _shape(count: Any, k: int) -> Array:
     """Shape of the gamma law of the mean of `count` overlapping terms in white noise."""
-    box = np.concatenate([-np.ones(k), np.ones(k)])
-    r2 = (np.correlate(box, box, mode="full")[2 * k - 1 :] / (2 * k)) ** 2
+    region = np.concatenate([-np.ones(k), np.ones(k)])
+    r2 = (np.correlate(region, region, mode="full")[2 * k - 1 :] / (2 * k)) ** 2
     lag = np.arange(r2.size)
     n = np.maximum(count, 1.0)[..., None]
     pairs = np.where(lag == 0, n, 2.0 * np.maximum(n - lag, 0.0)) * r2

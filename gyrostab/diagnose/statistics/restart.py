@@ -14,14 +14,14 @@ _TIMES = (2, 6, 18)  # blocks in which a transient falls to 1/e
 _BESIDE = 15  # blocks before and after a restart that are compared
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     """Score transients that begin at every restart alike, and a jump of the mean at each.
 
     Both are free from a constant of the record, and have the noise of the simulation.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects.
 
     Returns
@@ -30,18 +30,18 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         None without restarts. ``estimate`` is the transient at the restart, or the jump [degree
         hour-1].
     """
-    at = restart_blocks(reduced)
+    at = restart_blocks(blocks)
     if at.size == 0:
         return None
-    block, blocks = float(reduced.attrs["block_s"]), reduced.sizes["block"]
-    designs, windows = _designs(at, blocks)
-    residual = values_of(reduced, "mean", "axis", "block") - values_of(
+    block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
+    designs, windows = _designs(at, block_count)
+    residual = values_of(blocks, "mean", "axis", "block") - values_of(
         baseline, "known_mean", "axis", "block"
     )
     z, estimate = (np.full((*residual.shape[:-1], len(designs)), np.nan) for _ in range(2))
-    for axis in range(reduced.sizes["axis"]):
-        present = np.isfinite(residual[..., axis, :]).reshape(-1, blocks).any(axis=0)
-        noise = mean_noise(reduced, baseline, axis, present)
+    for axis in range(blocks.sizes["axis"]):
+        present = np.isfinite(residual[..., axis, :]).reshape(-1, block_count).any(axis=0)
+        noise = mean_noise(blocks, baseline, axis, present)
         amount, information = _matched(residual[..., axis, :], designs, noise)
         with np.errstate(divide="ignore", invalid="ignore"):
             z[..., axis, :] = amount / np.sqrt(information)
@@ -58,7 +58,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     tau = np.array([*_TIMES, _BESIDE], dtype=float) * block
     return statistic_dataset(
         "restart",
-        reduced,
+        blocks,
         windows=windows,
         columns={"what": what, "tau_min_s": block, "tau_max_s": tau},
         z=spread,
@@ -68,23 +68,26 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     )
 
 
-def restart_blocks(reduced: xr.Dataset) -> np.ndarray:
+def restart_blocks(blocks: xr.Dataset) -> np.ndarray:
     """First whole block after each restart that has blocks on both sides."""
-    if "restart_end" not in reduced:
+    if "restart_end" not in blocks:
         return np.empty(0, np.int64)
-    found = np.searchsorted(reduced["begin"].values, reduced["restart_end"].values - 1e-9)
-    return np.unique(found[(found > 0) & (found < reduced.sizes["block"])])
+    found = np.searchsorted(blocks["begin"].values, blocks["restart_end"].values - 1e-9)
+    return np.unique(found[(found > 0) & (found < blocks.sizes["block"])])
 
 
-def _designs(at: np.ndarray, blocks: int) -> tuple[Array, Windows]:
-    since = np.full(blocks, np.inf)
+def _designs(at: np.ndarray, block_count: int) -> tuple[Array, Windows]:
+    since = np.full(block_count, np.inf)
     for start in at:
-        since[start:] = np.arange(blocks - start)
+        since[start:] = np.arange(block_count - start)
     rows = [np.exp(-since / k) for k in _TIMES]
-    first, stop = [int(at[0])] * len(_TIMES), [int(min(at[-1] + 2 * k, blocks)) for k in _TIMES]
+    first, stop = (
+        [int(at[0])] * len(_TIMES),
+        [int(min(at[-1] + 2 * k, block_count)) for k in _TIMES],
+    )
     for start in at:
-        row = np.zeros(blocks)
-        low, high = max(start - _BESIDE, 0), min(start + _BESIDE, blocks)
+        row = np.zeros(block_count)
+        low, high = max(start - _BESIDE, 0), min(start + _BESIDE, block_count)
         row[low:start], row[start:high] = -0.5, 0.5
         rows.append(row)
         first.append(int(start))

@@ -27,7 +27,7 @@ _MOST = (
 _FLOOR = (0.35, 0.35, 0.35, 0.35, 0.2)
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Score counts and kurtosis in windows of three lengths and of the whole record.
 
     The counts are made to scatter alike by Anscombe's root; what is to be expected of them the null
@@ -36,7 +36,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records; nothing of the baseline is used.
 
     Returns
@@ -45,15 +45,15 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         See `gyrostab.diagnose.statistics.scores.statistic_dataset`. ``ratio`` and ``estimate`` are
         the count, or the mean kurtosis.
     """
-    windows = window_set(reduced.sizes["block"], LENGTHS)
-    samples = values_of(reduced, "samples", "axis", "block").astype(float)
+    windows = window_set(blocks.sizes["block"], LENGTHS)
+    samples = values_of(blocks, "samples", "axis", "block").astype(float)
     each = {
-        name: np.nan_to_num(values_of(reduced, name, "axis", "block").astype(float))
+        name: np.nan_to_num(values_of(blocks, name, "axis", "block").astype(float))
         for name in COUNTS
     }
     each["extremes"] = beyond_ends(each["extremes"])
     counts = over_windows(np.stack([each[name] for name in COUNTS], axis=-1), windows)
-    heavy, used = kurtosis_score(values_of(reduced, "kurtosis", "axis", "block"), samples)
+    heavy, used = kurtosis_score(values_of(blocks, "kurtosis", "axis", "block"), samples)
     usual = np.median(
         heavy, axis=-1, keepdims=True
     )  # rounding has no tails, so that the noise itself may be away from 0
@@ -62,17 +62,17 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     with np.errstate(divide="ignore", invalid="ignore"):
         tails = np.where(n > 0, over_windows(heavy[..., None], windows) / np.sqrt(n), np.nan)
         excess = np.where(
-            used > 0, np.nan_to_num(values_of(reduced, "kurtosis", "axis", "block")), 0.0
+            used > 0, np.nan_to_num(values_of(blocks, "kurtosis", "axis", "block")), 0.0
         )
         mean = over_windows(excess[..., None], windows) / n
-    rate = float(reduced.attrs["sampling_rate_hz"])
+    rate = float(blocks.attrs["sampling_rate_hz"])
     number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
     z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
     of_lattice = np.array([name in GRID_COUNTS for name in (*COUNTS, "kurtosis")])
-    z = np.where(has_coarse_grid(reduced)[:, None, None] & of_lattice, np.nan, z)
+    z = np.where(has_coarse_grid(blocks)[:, None, None] & of_lattice, np.nan, z)
     return statistic_dataset(
         "distribution",
-        reduced,
+        blocks,
         windows=windows,
         columns={
             "what": [*COUNTS, "kurtosis"],

@@ -38,12 +38,12 @@ class Windows(NamedTuple):
         return self.stop - self.first
 
 
-def window_set(blocks: int, lengths: Sequence[int], *, whole: bool = True) -> Windows:
+def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) -> Windows:
     """Windows of several lengths over a record, a fifth of their length apart (two fifths in long records).
 
     Parameters
     ----------
-    blocks : int
+    block_count : int
         Blocks of the record.
     lengths : sequence of int
         Lengths [blocks]; those above half of the record are left out.
@@ -58,17 +58,17 @@ def window_set(blocks: int, lengths: Sequence[int], *, whole: bool = True) -> Wi
     """
     first, length = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for wanted in lengths:
-        if wanted > max(blocks // 2, 1):
+        if wanted > max(block_count // 2, 1):
             continue
-        step = max(1, round(wanted * (_STEP if blocks <= _LONG else _LONG_STEP)))
-        start = np.arange(0, blocks - wanted + 1, step)
-        if start[-1] != blocks - wanted:
-            start = np.append(start, blocks - wanted)
+        step = max(1, round(wanted * (_STEP if block_count <= _LONG else _LONG_STEP)))
+        start = np.arange(0, block_count - wanted + 1, step)
+        if start[-1] != block_count - wanted:
+            start = np.append(start, block_count - wanted)
         first.append(start)
         length.append(np.full(start.size, wanted))
     if whole:
         first.append(np.zeros(1, np.int64))
-        length.append(np.full(1, blocks))
+        length.append(np.full(1, block_count))
     begin = np.concatenate(first)
     return Windows(begin, begin + np.concatenate(length))
 
@@ -112,14 +112,14 @@ def exponential_score(value: Array) -> Array:
     return np.asarray(-ndtri_exp(-value))
 
 
-def values_of(reduced: xr.Dataset, name: str, *dims: str) -> Any:
+def values_of(blocks: xr.Dataset, name: str, *dims: str) -> Any:
     """Values of a variable, `dims` last; a leading dimension of records stays in front."""
-    return reduced[name].transpose(..., *dims).values
+    return blocks[name].transpose(..., *dims).values
 
 
 def statistic_dataset(
     name: str,
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     *,
     windows: Windows,
     columns: dict[str, Any],
@@ -136,7 +136,7 @@ def statistic_dataset(
     ----------
     name : str
         View, one of the contract's.
-    reduced : xarray.Dataset
+    blocks : xarray.Dataset
         Of `gyrostab.diagnose.reduce.block_statistics.reduce_log`; gives the edges of the windows.
     windows : Windows
         The windows.
@@ -161,7 +161,7 @@ def statistic_dataset(
         ``z``, ``ratio`` and ``estimate`` by (record), row, window, tau.
     """
     dims = ("record", "row", "window", "tau") if z.ndim == 4 else ("row", "window", "tau")
-    begin, end = reduced["begin"].values, reduced["end"].values
+    begin, end = blocks["begin"].values, blocks["end"].values
     size = z.shape[-1]
     label = {key: np.broadcast_to(np.asarray(value), size) for key, value in columns.items()}
     found = xr.Dataset(
@@ -179,7 +179,7 @@ def statistic_dataset(
         coords={
             "axes": (
                 "row",
-                np.asarray(reduced["axis"].values if rows is None else rows, dtype=str),
+                np.asarray(blocks["axis"].values if rows is None else rows, dtype=str),
             ),
             "begin": ("window", begin[windows.first], {"units": "s"}),
             "end": ("window", end[windows.stop - 1], {"units": "s"}),

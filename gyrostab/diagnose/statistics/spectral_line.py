@@ -21,12 +21,12 @@ _NEAR = 2  # lines on either side that a line leaks into
 _AROUND = 40  # lines on either side that tell the level
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     """Score every line of the full-resolution spectrum, in parts of the record and in the whole, against its surroundings.
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects: its spectrum gives the slope of
         the surroundings, their level is the recording's own.
 
@@ -36,14 +36,14 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         None without lines. ``estimate`` is the amplitude of a sine that would raise the line so far
         [degree hour-1].
     """
-    if "line_power" not in reduced:
+    if "line_power" not in blocks:
         return None
     power, weight = (
-        values_of(reduced, "line_power", "axis", "part", "line"),
-        values_of(reduced, "line_weight", "axis", "part"),
+        values_of(blocks, "line_power", "axis", "part", "line"),
+        values_of(blocks, "line_weight", "axis", "part"),
     )
-    frequency = reduced["line_frequency"].values
-    windows = _parts(reduced)
+    frequency = blocks["line_frequency"].values
+    windows = _parts(blocks)
     expected = expected_lines(baseline, frequency)[:, None, :]
     flat = power / expected
     there = np.isfinite(flat) & (weight > 0)[..., None]
@@ -53,7 +53,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         whole = flat.sum(axis=-2, keepdims=True)
         count = np.concatenate([each, each.sum(axis=-2, keepdims=True)], axis=-2)
         flat = np.concatenate([flat, whole], axis=-2) / count
-        count = count * _evenness(reduced, windows)
+        count = count * _evenness(blocks, windows)
         around = _surroundings(flat)
         ratio = flat / around
     # a sum over lines, which only a recording needs
@@ -62,38 +62,38 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     half = 0.371 / frequency  # where the Allan variance of a sine is largest
     return statistic_dataset(
         "spectrum",
-        reduced,
+        blocks,
         windows=windows,
         columns={"what": "line", "tau_min_s": half, "tau_max_s": half, "frequency": frequency},
         z=z,
         ratio=ratio,
-        estimate=2.0 * np.sqrt(np.maximum(excess, 0.0) / float(reduced.attrs["block_s"])),
+        estimate=2.0 * np.sqrt(np.maximum(excess, 0.0) / float(blocks.attrs["block_s"])),
         units="degree hour-1",
         one_sided=True,
     )
 
 
-def _parts(reduced: xr.Dataset) -> Windows:
+def _parts(blocks: xr.Dataset) -> Windows:
     """Blocks of the equal parts of the record, and of the whole last."""
-    parts, blocks = reduced.sizes["part"], reduced.sizes["block"]
+    components, block_count = blocks.sizes["part"], blocks.sizes["block"]
     edge = -(
-        -np.arange(parts + 1) * blocks // parts
+        -np.arange(components + 1) * block_count // components
     )  # as the blocks were shared out when the log was read
-    return Windows(np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), blocks))
-
-
-def _evenness(reduced: xr.Dataset, windows: Windows) -> Array:
-    """Blocks that a mean is as good as, over those in it, by window and line: one loud block among quiet ones scatters as one alone."""
-    power, shape = (
-        values_of(reduced, name, "axis", "block", "band") for name in ("power", "shape")
+    return Windows(
+        np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), block_count)
     )
+
+
+def _evenness(blocks: xr.Dataset, windows: Windows) -> Array:
+    """Blocks that a mean is as good as, over those in it, by window and line: one loud block among quiet ones scatters as one alone."""
+    power, shape = (values_of(blocks, name, "axis", "block", "band") for name in ("power", "shape"))
     there = np.isfinite(power) & (shape > 0)
     power, one = np.where(there, power, 0.0), there.astype(float)
     square = np.where(there, power**2 * shape / (1.0 + shape), 0.0)
-    count, first, second = (over_windows(part, windows) for part in (one, power, square))
+    count, first, second = (over_windows(component, windows) for component in (one, power, square))
     with np.errstate(divide="ignore", invalid="ignore"):
         even = np.where(second > 0, first**2 / (count * second), 1.0)
-    bands, lines = np.log(reduced["frequency"].values), np.log(reduced["line_frequency"].values)
+    bands, lines = np.log(blocks["frequency"].values), np.log(blocks["line_frequency"].values)
     place = np.clip(np.searchsorted(bands, lines), 1, bands.size - 1)
     share = np.clip((lines - bands[place - 1]) / (bands[place] - bands[place - 1]), 0.0, 1.0)
     even = np.minimum(even, 1.0)

@@ -33,7 +33,7 @@ _LOW = 3.5  # ordinates: below, a mean that moves inside of a block is seen rath
 _MOST = 4.0
 
 
-def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     r"""Score the scatter of the band powers in time about their own mean, whatever that is, against what steady noise has.
 
     The powers of a block over the expected ones, averaged over bands and over 1, 2, 4 ... blocks,
@@ -51,7 +51,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         Recording or null records, and what the simulation expects: the levels are relative to its
         spectrum.
 
@@ -68,22 +68,22 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     -----
     Of the lowest bands a moving mean takes hold; they are left out.
     """
-    blocks, block = reduced.sizes["block"], float(reduced.attrs["block_s"])
-    spans = [span for span in SPANS if blocks // span >= _FEWEST]
-    low, high = (reduced[name].values for name in ("band_low", "band_high"))
+    block_count, block = blocks.sizes["block"], float(blocks.attrs["block_s"])
+    spans = [span for span in SPANS if block_count // span >= _FEWEST]
+    low, high = (blocks[name].values for name in ("band_low", "band_high"))
     used = low * block >= _LOW
     if not spans or not used.any():
         return None
     members = _members(int(used.sum()))
-    level, weight, rows = _levels(reduced, baseline, used, members)
-    windows = window_set(blocks, LENGTHS)
+    level, weight, rows = _levels(blocks, baseline, used, members)
+    windows = window_set(block_count, LENGTHS)
     found = [_scatter(level, weight, windows, span, single=int(used.sum())) for span in spans]
     z, ratio, swing = (np.concatenate([one[place] for one in found], axis=-1) for place in range(3))
     f_low = np.append([low[used][one].min() for one in members], low[used][0])
     f_high = np.append([high[used][one].max() for one in members], high[used][-1])
     return statistic_dataset(
         "davar",
-        reduced,
+        blocks,
         rows=rows,
         windows=windows,
         columns={
@@ -99,7 +99,7 @@ def score(reduced: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
 
 
 def levelled(
-    reduced: xr.Dataset, baseline: xr.Dataset, spans: Sequence[tuple[Sequence[str], float, float]]
+    blocks: xr.Dataset, baseline: xr.Dataset, spans: Sequence[tuple[Sequence[str], float, float]]
 ) -> xr.Dataset:
     """The recording with the powers of some stretches brought to the expected mean: their levels are told already.
 
@@ -108,35 +108,35 @@ def levelled(
 
     Parameters
     ----------
-    reduced, baseline : xarray.Dataset
+    blocks, baseline : xarray.Dataset
         A recording, and what the simulation expects.
     spans : sequence of (axes, begin, end)
         Names of axes, and times [s since the start].
     """
     if not spans:
-        return reduced
+        return blocks
     power, spectrum = (
         one.transpose("axis", "block", "band").values
-        for one in (reduced["power"], baseline["spectrum"])
+        for one in (blocks["power"], baseline["spectrum"])
     )
-    shape, power = reduced["shape"].transpose("axis", "block", "band").values, power.copy()
+    shape, power = blocks["shape"].transpose("axis", "block", "band").values, power.copy()
     for axes, begin, end in spans:
         inside = np.flatnonzero(
-            (reduced["begin"].values >= begin - 1e-6) & (reduced["end"].values <= end + 1e-6)
+            (blocks["begin"].values >= begin - 1e-6) & (blocks["end"].values <= end + 1e-6)
         )
         pieces = np.split(inside, [1, 2, -2, -1] if inside.size > 4 else range(1, inside.size))
-        rows = np.flatnonzero(np.isin(reduced["axis"].values.astype(str), list(axes)))
-        for row, blocks in product(rows, pieces):
+        rows = np.flatnonzero(np.isin(blocks["axis"].values.astype(str), list(axes)))
+        for row, block_count in product(rows, pieces):
             ratio, weight = (
-                power[row, blocks] / spectrum[row, blocks],
-                np.nan_to_num(shape[row, blocks]),
+                power[row, block_count] / spectrum[row, block_count],
+                np.nan_to_num(shape[row, block_count]),
             )
             weight = np.where(np.isfinite(ratio), weight, 0.0)
             with np.errstate(invalid="ignore", divide="ignore"):
-                power[row, blocks] /= (np.nan_to_num(ratio) * weight).sum(axis=0) / weight.sum(
+                power[row, block_count] /= (np.nan_to_num(ratio) * weight).sum(axis=0) / weight.sum(
                     axis=0
                 )
-    return reduced.assign(power=(("axis", "block", "band"), power, reduced["power"].attrs))
+    return blocks.assign(power=(("axis", "block", "band"), power, blocks["power"].attrs))
 
 
 def scatter_moments(count: Array, total: Array, inverse: Array) -> tuple[Array, Array]:
@@ -170,23 +170,27 @@ def _members(bands: int) -> list[NDArray[np.int64]]:
     each = [np.array([band]) for band in range(bands)]
     return [
         *each,
-        *(part for part in np.array_split(np.arange(bands), _GROUPS) if part.size > 1),
+        *(
+            component
+            for component in np.array_split(np.arange(bands), _GROUPS)
+            if component.size > 1
+        ),
         np.arange(bands),
     ]
 
 
 def _levels(
-    reduced: xr.Dataset,
+    blocks: xr.Dataset,
     baseline: xr.Dataset,
     used: NDArray[np.bool_],
     members: list[NDArray[np.int64]],
 ) -> tuple[Array, Array, list[str]]:
     """Level over that of the record and its shape by (record), row, block, group of bands; and the axes of each row."""
     power, spectrum = (
-        values_of(reduced, "power", "axis", "block", "band"),
+        values_of(blocks, "power", "axis", "block", "band"),
         values_of(baseline, "spectrum", "axis", "block", "band"),
     )
-    shape = values_of(reduced, "shape", "axis", "block", "band")[..., used]
+    shape = values_of(blocks, "shape", "axis", "block", "band")[..., used]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = (power / spectrum)[..., used]
         there = np.isfinite(ratio) & (shape > 0)
@@ -198,14 +202,14 @@ def _levels(
         )
         level = total / weight
         level = level / _middle(level, weight)
-    axes = [str(axis) for axis in reduced["axis"].values]
+    axes = [str(axis) for axis in blocks["axis"].values]
     level = np.nan_to_num(level)
     if len(axes) == 1:
         return level, weight, axes
     together = weight.sum(axis=-3, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = np.nan_to_num((level * weight).sum(axis=-3, keepdims=True) / together)
-    together = together / _alike(reduced, used, members, weight)
+    together = together / _alike(blocks, used, members, weight)
     return (
         np.concatenate([level, mean], axis=-3),
         np.concatenate([weight, together], axis=-3),
@@ -227,23 +231,23 @@ def _tamed(ratio: Array, shape: Array) -> Array:
 
 
 def _alike(
-    reduced: xr.Dataset, used: NDArray[np.bool_], members: list[NDArray[np.int64]], weight: Array
+    blocks: xr.Dataset, used: NDArray[np.bool_], members: list[NDArray[np.int64]], weight: Array
 ) -> Array:
     """Factor on the variance of the mean over the axes by (record), 1, 1, group: powers of axes scatter alike where these are coherent."""
-    if "cross" not in reduced:
+    if "cross" not in blocks:
         return np.ones(1)
-    axes = [str(axis) for axis in reduced["axis"].values]
+    axes = [str(axis) for axis in blocks["axis"].values]
     one, other = (
-        [axes.index(str(axis)) for axis in reduced[name].values] for name in ("first", "second")
+        [axes.index(str(axis)) for axis in blocks[name].values] for name in ("first", "second")
     )
-    power = np.nan_to_num(values_of(reduced, "power", "axis", "block", "band")[..., used])
-    cross = np.nan_to_num(values_of(reduced, "cross", "pair", "block", "band")[..., used])
+    power = np.nan_to_num(values_of(blocks, "power", "axis", "block", "band")[..., used])
+    cross = np.nan_to_num(values_of(blocks, "cross", "pair", "block", "band")[..., used])
     with np.errstate(divide="ignore", invalid="ignore"):
         squared = np.abs(cross.sum(axis=-2)) ** 2 / (
             power[..., one, :, :].sum(axis=-2) * power[..., other, :, :].sum(axis=-2)
         )
     squared = np.minimum(np.nan_to_num(squared), 1.0)
-    mean = np.stack([squared[..., part].mean(axis=-1) for part in members], axis=-1)
+    mean = np.stack([squared[..., component].mean(axis=-1) for component in members], axis=-1)
     share = weight.sum(axis=-2)
     pairs = 2.0 * (np.sqrt(share[..., one, :] * share[..., other, :]) * mean).sum(axis=-2)
     return np.asarray(1.0 + np.nan_to_num(pairs / share.sum(axis=-2)))[..., None, None, :]
@@ -299,13 +303,13 @@ def _scatter(
         found = (square - first**2 / weights) / (first / weights) ** 2
     mean, variance = scatter_moments(number, weights, over_windows(inverse, inside))
     enough = (number >= _FEWEST) & (weights > 0)
-    parts = [
-        np.where(enough, np.nan_to_num(part), 0.0)[..., :single].sum(axis=-1, keepdims=True)
-        for part in (found, mean, variance, weights)
+    components = [
+        np.where(enough, np.nan_to_num(component), 0.0)[..., :single].sum(axis=-1, keepdims=True)
+        for component in (found, mean, variance, weights)
     ]
     found, mean, variance, weights = (
         np.concatenate(pair, axis=-1)
-        for pair in zip((found, mean, variance, weights), parts, strict=True)
+        for pair in zip((found, mean, variance, weights), components, strict=True)
     )
     enough = np.concatenate([enough, enough[..., :single].any(axis=-1, keepdims=True)], axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):

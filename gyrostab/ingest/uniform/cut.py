@@ -122,9 +122,9 @@ def cut_log(
     >>> cut_log(log, time_from="2s", time_to="8s", exclude="3s/5s").rate.values
     array([[ 2., nan, nan,  5.,  6.,  7.]])
     """
-    spans: list[Span] = (
-        [exclude] if isinstance(exclude, str) or _is_pair(exclude) else list(exclude)
-    )  # type: ignore[list-item]
+    if isinstance(exclude, str) or _is_pair(exclude):
+        exclude = (exclude,)  # type: ignore[assignment]
+    spans: list[Span] = list(exclude)
     if time_from is None and time_to is None and not spans:
         return log
     check_log(log)

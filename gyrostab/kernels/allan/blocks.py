@@ -52,7 +52,7 @@ def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64
 
 
 @njit(**INNER)
-def _limit(
+def _limit(  # type: ignore[no-untyped-def]
     i,
     count,
     first,
@@ -67,7 +67,7 @@ def _limit(
     whole,
     splits,
     sizes,
-):  # type: ignore[no-untyped-def]
+):
     """Terms of the head and of head and tail, from `first` on, of `count` averaging factors from number i on; the most of them."""
     shift = shifts[i]
     up = (1 << shift) - 1

@@ -127,9 +127,9 @@ def _part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: i
 
 
 @njit(**KERNEL)
-def single_blocks(
+def single_blocks(  # type: ignore[no-untyped-def]
     high, low, places, starts, stops, angle, step, ks, shifts, head_lengths, whole, n_windows
-):  # type: ignore[no-untyped-def]
+):
     """Heads and tails as `gyrostab.kernels.allan.blocks.grouped_blocks`; `low` is the remainder of `high`, or empty."""
     n_blocks = n_windows + whole[0]
     heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))

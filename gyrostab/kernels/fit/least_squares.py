@@ -141,9 +141,9 @@ def _mirror(normal):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def identify_noise(
+def identify_noise(  # type: ignore[no-untyped-def]
     avar, white, quantization, ramp, factor, columns, weight, to_samples, pairs, ramps
-):  # type: ignore[no-untyped-def]
+):
     """Degrees of freedom of each cell with the noise mixture identified by a quick fit of the window.
 
     Parameters
@@ -212,9 +212,9 @@ def identify_noise(
 
 
 @njit(**INNER)
-def _observe_eight(
+def _observe_eight(  # type: ignore[no-untyped-def]
     start, avar, white, quantization, ramp, factor, columns, to_samples, cells, valid
-):  # type: ignore[no-untyped-def]
+):
     """Describe the windows from number `start` on, beyond the last ones without cells; numbers of valid cells to `valid`."""
     system, seen, inverse, facts = cells
     for place in range(PLACES):
@@ -452,9 +452,9 @@ def _judge(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore
 
 
 @njit(**KERNEL)
-def fit_windows(
+def fit_windows(  # type: ignore[no-untyped-def]
     avar, white, quantization, ramp, gap_factor, columns, to_samples, pairs, ramps, weight, allowed
-):  # type: ignore[no-untyped-def]
+):
     """Fit every window.
 
     Parameters

@@ -71,7 +71,7 @@ def _cell_quantile(a, whole, own_dof, share, dof, most, start, step, curve):  # 
 
 
 @njit(**KERNEL)
-def cell_limits(
+def cell_limits(  # type: ignore[no-untyped-def]
     avar,
     white,
     quantization,
@@ -87,7 +87,7 @@ def cell_limits(
     start,
     step,
     curve,
-):  # type: ignore[no-untyped-def]
+):
     """Upper limit of each squared coefficient from one cell, which cannot be less than the term's own part of it.
 
     The cell is the one where the fitted model promises the lowest limit, so that its own scatter

@@ -63,7 +63,7 @@ def combine_products(pairs, ramps, n, tables):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def observe(
+def observe(  # type: ignore[no-untyped-def]
     avar,
     white,
     quantization,
@@ -76,7 +76,7 @@ def observe(
     seen,
     inverse,
     facts,
-):  # type: ignore[no-untyped-def]
+):
     """Describe the cells of a window in one place; returns how many are valid.
 
     Design matrix and data go to `system` (row ``6 cell + column``); what a unit of each squared
@@ -286,9 +286,9 @@ def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: 
 
 
 @njit(**INNER)
-def degrees_of_freedom(
+def degrees_of_freedom(  # type: ignore[no-untyped-def]
     squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal, out
-):  # type: ignore[no-untyped-def]
+):
     """Equivalent degrees of freedom of each finite cell of a window under a mixture of noises, ``2 mean^2 / variance``."""
     amounts = np.empty(5)
     for i in range(avar.size):

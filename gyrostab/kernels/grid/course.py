@@ -141,7 +141,7 @@ def _seed(table, level, phase, first, most):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def trace(
+def trace(  # type: ignore[no-untyped-def]
     count,
     stamps,
     count0,
@@ -156,7 +156,7 @@ def trace(
     seen,
     levels,
     phases,
-):  # type: ignore[no-untyped-def]
+):
     """Find the most likely course of the stamps of rows.
 
     Parameters

@@ -69,10 +69,10 @@ def log(
     ("term", "size"), [("Q", 1.0 / URAD_PER_S), ("N", 1.0 / 60.0), ("B", 1.0), ("K", 60.0)]
 )
 def test_expected_powers_are_those_of_simulated_noise(term, size):
-    length, rate, blocks = 500, 10.0, 800
+    length, rate, block_count = 500, 10.0, 800
     weights, edges = taper(length), band_edges(length)
-    noise = make_noise(rate=rate, size=length * blocks, seed=5, **{term: size}).reshape(
-        blocks, length
+    noise = make_noise(rate=rate, size=length * block_count, seed=5, **{term: size}).reshape(
+        block_count, length
     )
     spectra = np.fft.rfft((noise - noise.mean(axis=1, keepdims=True)) * weights)[
         :, 1 : ordinates(length) + 1
@@ -84,7 +84,7 @@ def test_expected_powers_are_those_of_simulated_noise(term, size):
     )
     for low, high in zip(edges[:-1] - 1, edges[1:] - 1, strict=True):
         assert ratio[low:high].mean() == pytest.approx(
-            1.0, abs=4.5 / np.sqrt(blocks * (high - low)) + 0.01
+            1.0, abs=4.5 / np.sqrt(block_count * (high - low)) + 0.01
         )
 
 
@@ -107,16 +107,16 @@ def test_coefficients_lie_within_their_errors(lost):
 
 def test_white_variance_is_that_of_block_means():
     noise = {"Q": 2.0, "N": 0.003}
-    reduced = reduce_log(log(noise, axes=tuple("abcdef"), duration="2h", lost=0.3))
-    expected = white_variance(reduced, np.tile([4.0, 9e-6, 0.0, 0.0], (6, 1)))
-    ratio = (reduced["mean"].values ** 2).sum() / expected.sum()
+    blocks = reduce_log(log(noise, axes=tuple("abcdef"), duration="2h", lost=0.3))
+    expected = white_variance(blocks, np.tile([4.0, 9e-6, 0.0, 0.0], (6, 1)))
+    ratio = (blocks["mean"].values ** 2).sum() / expected.sum()
     assert ratio == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / expected.size))
 
 
 def test_powers_of_a_block_scatter_together_as_told():
-    reduced = reduce_log(log({"N": 0.003}, axes=tuple("abcdefgh"), duration="2h", lost=0.4))
-    common, rest = common_variance(reduced)
-    residual = (reduced["power"] / noise_powers(reduced)[..., 1] / 9e-6 - 1.0).values
+    blocks = reduce_log(log({"N": 0.003}, axes=tuple("abcdefgh"), duration="2h", lost=0.4))
+    common, rest = common_variance(blocks)
+    residual = (blocks["power"] / noise_powers(blocks)[..., 1] / 9e-6 - 1.0).values
     total = (residual * rest).sum(axis=2) / rest.sum(axis=2)
     expected = common + 1.0 / rest.sum(axis=2)
     assert total.var() == pytest.approx(expected.mean(), rel=0.2)
@@ -132,9 +132,9 @@ def test_shaken_turning_and_warming_blocks_are_not_quiet():
         "unit": "degC",
         "points": [[0, 30], [2700, 30], [3600, 60]],
     }
-    reduced = reduce_log(log(environment=[SHAKEN, warm], duration="1h"))
-    quiet, reason = find_quiescent_blocks(reduced)
-    middle = ((reduced["begin"] + reduced["end"]) / 2.0).values
+    blocks = reduce_log(log(environment=[SHAKEN, warm], duration="1h"))
+    quiet, reason = find_quiescent_blocks(blocks)
+    middle = ((blocks["begin"] + blocks["end"]) / 2.0).values
     assert not quiet[0, (middle > 1210) & (middle < 1490)].any()
     assert not quiet[0, middle > 2900].any()
     assert quiet[0, middle < 1100].mean() > 0.9
@@ -166,21 +166,21 @@ def test_a_loud_stretch_without_a_channel_is_not_calibrated_on():
 
 
 def test_quiet_time_is_taken_as_named_and_checked():
-    reduced = reduce_log(log(rate=10.0))
-    begin, end = reduced["begin"].values, reduced["end"].values
+    blocks = reduce_log(log(rate=10.0))
+    begin, end = blocks["begin"].values, blocks["end"].values
     for quiet in ((0.0, 1200.0), ("1970-01-01T00:00:00Z", "1970-01-01T00:20:00Z"), end <= 1200.0):
-        chosen = calibrate_noise(reduced, quiet=quiet)["quiet"].values[0]
+        chosen = calibrate_noise(blocks, quiet=quiet)["quiet"].values[0]
         np.testing.assert_array_equal(chosen, (begin >= 0.0) & (end <= 1200.0))
-    assert calibrate_noise(reduced, quiet=(0.0, 1200.0)).attrs["calibrated_on"] == [
+    assert calibrate_noise(blocks, quiet=(0.0, 1200.0)).attrs["calibrated_on"] == [
         ["1970-01-01T00:00:00.000Z", "1970-01-01T00:20:00.000Z"]
     ]
     with pytest.raises(
         OptionError,
         match=r"quiet holds 0 whole blocks of 20 s, 0 samples; .* name 40 s or more within the 3600 s",
     ):
-        calibrate_noise(reduced, quiet=(0.0, 15.0))
+        calibrate_noise(blocks, quiet=(0.0, 15.0))
     with pytest.raises(OptionError, match="'soon' is not a date and time"):
-        calibrate_noise(reduced, quiet=("soon", "later"))
+        calibrate_noise(blocks, quiet=("soon", "later"))
 
 
 def test_the_grid_holds_calibrated_and_far_redder_noise():
@@ -212,10 +212,10 @@ def test_a_model_is_taken_with_its_effects():
         "log": {"axes": ["x", "y"]},
     }
     made = simulate({**model, "effect": effects[:2]}, duration="1h", rate=10.0, seed=4).compute()
-    reduced = reduce_log(made)
-    baseline = baseline_from_model(reduced, model)
-    ratio = reduced["power"] / baseline["spectrum"]
-    shaken = (reduced["begin"].values > 1200) & (reduced["end"].values < 1500)
+    blocks = reduce_log(made)
+    baseline = baseline_from_model(blocks, model)
+    ratio = blocks["power"] / baseline["spectrum"]
+    shaken = (blocks["begin"].values > 1200) & (blocks["end"].values < 1500)
     assert float(ratio.isel(block=shaken).mean()) == pytest.approx(1.0, abs=0.1)
     assert float(ratio.isel(block=~shaken).mean()) == pytest.approx(1.0, abs=0.1)
     assert (
@@ -225,25 +225,25 @@ def test_a_model_is_taken_with_its_effects():
         )
         > 2.0
     )
-    z = ((reduced["mean"] - baseline["known_mean"]) / np.sqrt(baseline["mean_variance"])).values
+    z = ((blocks["mean"] - baseline["known_mean"]) / np.sqrt(baseline["mean_variance"])).values
     assert np.abs(z - z.mean(axis=1, keepdims=True)).max() < 5.0
     assert baseline.attrs["left_out"] == ["telegraph"]
     assert float(baseline["coefficient"].sel(axis="x", term="R")) == 0.1
     assert float(baseline["stderr"].max()) == 0.0
-    nulls = next(iter(null_records(reduced, baseline, count=3, rng=np.random.default_rng(1))))
+    nulls = next(iter(null_records(blocks, baseline, count=3, rng=np.random.default_rng(1))))
     assert float((nulls["mean"] - baseline["known_mean"]).std()) < 2.0 * float(
         np.sqrt(baseline["mean_variance"].mean())
     )
     with pytest.raises(SchemaError, match="temperature"):
-        baseline_from_model(reduced.drop_vars("channel_temperature"), model)
+        baseline_from_model(blocks.drop_vars("channel_temperature"), model)
     with pytest.raises(OptionError, match="no noise"):
-        baseline_from_model(reduced, {"noise": {"z": {"N": 1.0}}})
+        baseline_from_model(blocks, {"noise": {"z": {"N": 1.0}}})
 
 
 def test_a_ramp_of_a_model_is_expected_once():
     noise = {"N": 0.003, "R": 2.0}
-    reduced = reduce_log(log(noise))
-    surface = allan_surface(reduced, baseline_from_model(reduced, {"noise": noise}))
+    blocks = reduce_log(log(noise))
+    surface = allan_surface(blocks, baseline_from_model(blocks, {"noise": noise}))
     score = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])
     assert np.nanmax(np.abs(score[0, -1])) < 4.0  # the record as one window
 
@@ -254,9 +254,9 @@ def test_a_filter_of_a_model_is_seen_through_random_gaps():
         "effect": [{"name": "logger_filter", "cutoff": 1.5, "order": 2, "instrument": 1}],
         "log": {"axes": ["x"]},
     }
-    reduced = reduce_log(log({"N": 0.003}, effects=model["effect"], lost=0.3))
-    ratio = (reduced["power"] / baseline_from_model(reduced, model)["spectrum"]).mean("block")
-    error = 1.0 / np.sqrt(reduced["shape"].sum("block"))
+    blocks = reduce_log(log({"N": 0.003}, effects=model["effect"], lost=0.3))
+    ratio = (blocks["power"] / baseline_from_model(blocks, model)["spectrum"]).mean("block")
+    error = 1.0 / np.sqrt(blocks["shape"].sum("block"))
     assert float(np.abs((ratio - 1.0) / error).max()) < 4.5
 
 
@@ -276,10 +276,10 @@ def test_a_simulation_is_calibrated_and_keeps_its_level():
 
 
 def test_an_axis_without_spectra_is_named():
-    reduced = reduce_log(log(axes=("x", "y")))
-    reduced["power"].loc[{"axis": "y"}] = np.nan
+    blocks = reduce_log(log(axes=("x", "y")))
+    blocks["power"].loc[{"axis": "y"}] = np.nan
     with pytest.raises(SchemaError, match="axis y"):
-        calibrate_noise(reduced)
+        calibrate_noise(blocks)
 
 
 def test_noise_is_fitted_where_the_likelihood_is_largest_also_where_no_sum_of_terms_fits():

@@ -33,11 +33,11 @@ def log_of(seed: int, size: float) -> xr.Dataset:
     return simulate(model(size), duration="30min", rate=10.0, seed=seed).compute()
 
 
-def gain(reduced: xr.Dataset, baseline: xr.Dataset) -> float:
-    expected = expected_lines(baseline, reduced["line_frequency"].values)
+def evidence_nats(blocks: xr.Dataset, baseline: xr.Dataset) -> float:
+    expected = expected_lines(baseline, blocks["line_frequency"].values)
     return float(
         line_evidence(
-            reduced["line_power"].values[None], reduced["line_weight"].values, expected
+            blocks["line_power"].values[None], blocks["line_weight"].values, expected
         ).max()
     )
 
@@ -47,35 +47,43 @@ def gain(reduced: xr.Dataset, baseline: xr.Dataset) -> float:
 def test_a_known_line_is_gone_wherever_it_lies_between_ordinates(amplitude, frequency):
     line = {"name": "spectral_line", "amplitude": amplitude, "frequency": frequency}
     made = {"noise": NOISE, "effect": [line], "log": {"axes": ["x"]}}
-    reduced = reduce_log(simulate(made, duration="30min", rate=10.0, seed=7).compute())
-    baseline = baseline_from_model(reduced, made)
-    freed = remove_known_lines(reduced, baseline)
-    assert gain(freed, baseline) < 6.0
+    blocks = reduce_log(simulate(made, duration="30min", rate=10.0, seed=7).compute())
+    baseline = baseline_from_model(blocks, made)
+    freed = remove_known_lines(blocks, baseline)
+    assert evidence_nats(freed, baseline) < 6.0
     assert float(np.nanmax(score(freed, baseline)["z"])) < 5.0
     if amplitude > 0.1:
         assert (
-            gain(reduced, baseline_from_model(reduced, model(0.0) | {"log": {"axes": ["x"]}}))
+            evidence_nats(
+                blocks, baseline_from_model(blocks, model(0.0) | {"log": {"axes": ["x"]}})
+            )
             > 50.0
         )
 
 
 def test_a_line_that_is_a_little_off_the_model_is_not_told_and_a_stronger_one_is():
     baseline = baseline_from_model(reduce_log(log_of(1, SIZE)), model(SIZE))
-    assert gain(remove_known_lines(reduce_log(log_of(1, 1.03 * SIZE)), baseline), baseline) < 6.0
-    assert gain(remove_known_lines(reduce_log(log_of(1, 1.5 * SIZE)), baseline), baseline) > 20.0
+    assert (
+        evidence_nats(remove_known_lines(reduce_log(log_of(1, 1.03 * SIZE)), baseline), baseline)
+        < 6.0
+    )
+    assert (
+        evidence_nats(remove_known_lines(reduce_log(log_of(1, 1.5 * SIZE)), baseline), baseline)
+        > 20.0
+    )
 
 
 def test_null_records_have_the_peaks_of_the_model():
     made = model(0.5, quality=30.0)
-    reduced = reduce_log(simulate(made, duration="1h", rate=10.0, seed=2).compute())
-    baseline = baseline_from_model(reduced, made)
-    nulls = next(iter(null_records(reduced, baseline, count=25, rng=np.random.default_rng(1))))
+    blocks = reduce_log(simulate(made, duration="1h", rate=10.0, seed=2).compute())
+    baseline = baseline_from_model(blocks, made)
+    nulls = next(iter(null_records(blocks, baseline, count=25, rng=np.random.default_rng(1))))
     drawn = nulls["line_power"].isel(axis=0).mean(["record", "part"])
-    seen = reduced["line_power"].isel(axis=0).mean("part")
-    near = np.abs(reduced["line_frequency"].values - PLACE) < 0.1
+    seen = blocks["line_power"].isel(axis=0).mean("part")
+    near = np.abs(blocks["line_frequency"].values - PLACE) < 0.1
     assert float(seen[near].sum()) == pytest.approx(float(drawn[near].sum()), rel=0.25)
     assert float(drawn[near].max()) > 5.0 * float(drawn[~near].median())
-    far = np.abs(reduced["line_frequency"].values - PLACE) > 0.3
+    far = np.abs(blocks["line_frequency"].values - PLACE) > 0.3
     assert float((seen[far] / drawn[far]).mean()) == pytest.approx(1.0, abs=0.05)
 
 

@@ -35,10 +35,10 @@ def made(**filtering: float) -> dict[str, object]:
 )
 def test_a_model_expects_its_own_filter(filtering):
     model = made(**filtering)
-    reduced = reduce_log(simulate(model, duration="1h", rate=10.0, seed=3).compute())
-    expected = baseline_from_model(reduced, model)["spectrum"]
-    ratio = (reduced["power"] / expected).mean(["axis", "block"]).values
-    error = 1.0 / np.sqrt(reduced["shape"].sum(["axis", "block"]).values)
+    blocks = reduce_log(simulate(model, duration="1h", rate=10.0, seed=3).compute())
+    expected = baseline_from_model(blocks, model)["spectrum"]
+    ratio = (blocks["power"] / expected).mean(["axis", "block"]).values
+    error = 1.0 / np.sqrt(blocks["shape"].sum(["axis", "block"]).values)
     assert np.abs((ratio - 1.0) / error).max() < 4.5
 
 

@@ -43,16 +43,16 @@ def on_lattice(
 @pytest.mark.parametrize("mean", [3.0, 0.05])
 def test_steps_are_told_apart(steps: float, mean: float) -> None:
     for kind, expected in (("rate", True), ("angle", False)):
-        reduced = on_lattice(kind, steps, mean=mean)
-        np.testing.assert_allclose(reduced["lattice"], steps * SCATTER, rtol=1e-6)
-        assert (rounded_rates(reduced, calibrate_noise(reduced)) == expected).all(), kind
+        blocks = on_lattice(kind, steps, mean=mean)
+        np.testing.assert_allclose(blocks["lattice"], steps * SCATTER, rtol=1e-6)
+        assert (rounded_rates(blocks, calibrate_noise(blocks)) == expected).all(), kind
 
 
 @pytest.mark.parametrize("kind", ["rate", "angle"])
 def test_fine_steps_are_nobodys(kind: str) -> None:
-    reduced = on_lattice(kind, 0.3)
-    assert (reduced["lattice"] > 0).all()
-    assert not rounded_rates(reduced, calibrate_noise(reduced)).any()
+    blocks = on_lattice(kind, 0.3)
+    assert (blocks["lattice"] > 0).all()
+    assert not rounded_rates(blocks, calibrate_noise(blocks)).any()
 
 
 def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
@@ -63,33 +63,33 @@ def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
         0.8 * rates[:, 1:] + 0.2 * rates[:, :-1]
     )  # takes more from the highest frequencies than the steps add
     counted = np.diff(np.floor(np.cumsum(smooth, axis=1) / step), axis=1, prepend=0.0) * step
-    reduced = reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
-    assert (reduced["lattice"] > 0).all()
-    assert not rounded_rates(reduced, calibrate_noise(reduced)).any()
+    blocks = reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
+    assert (blocks["lattice"] > 0).all()
+    assert not rounded_rates(blocks, calibrate_noise(blocks)).any()
 
 
 def test_axes_tell_together_what_one_tells_not() -> None:
-    reduced = on_lattice("rate", 0.7)
-    baseline = calibrate_noise(reduced)
+    blocks = on_lattice("rate", 0.7)
+    baseline = calibrate_noise(blocks)
     alone = [
-        rounded_rates(reduced.isel(axis=[number]), baseline.isel(axis=[number]))
+        rounded_rates(blocks.isel(axis=[number]), baseline.isel(axis=[number]))
         for number in range(2)
     ]
     assert not np.concatenate(alone).any()
-    assert rounded_rates(reduced, baseline).all()
+    assert rounded_rates(blocks, baseline).all()
 
 
 def test_without_a_lattice_nothing_was_rounded() -> None:
-    reduced = on_lattice("rate", 2.0)
-    plain = reduced.assign(lattice=reduced["lattice"] * 0.0)
-    assert not rounded_rates(plain, calibrate_noise(reduced)).any()
+    blocks = on_lattice("rate", 2.0)
+    plain = blocks.assign(lattice=blocks["lattice"] * 0.0)
+    assert not rounded_rates(plain, calibrate_noise(blocks)).any()
 
 
 def test_a_model_does_not_say_what_the_record_is() -> None:
     model = {"noise": {"N": 0.003, "Q": 0.1}, "log": {"axes": ["x", "y"]}}
     for kind, expected in (("rate", True), ("angle", False)):
-        reduced = on_lattice(kind, 2.0)
-        assert (rounded_rates(reduced, baseline_from_model(reduced, model)) == expected).all()
+        blocks = on_lattice(kind, 2.0)
+        assert (rounded_rates(blocks, baseline_from_model(blocks, model)) == expected).all()
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.13, 0.5])
@@ -105,10 +105,10 @@ def test_the_share_of_a_counter_is_that_of_its_errors(mean: float, scatter: floa
 
 @pytest.mark.parametrize(("kind", "names"), [("rate", ["rate_quantization"]), ("angle", [])])
 def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
-    reduced = on_lattice(kind, 2.0, size=9_000)
-    baseline, records = nulls(reduced, 40)
-    found = name_effects(reduced, baseline, records)
-    assert [claim.effect for claim in found.claims] == names
+    blocks = on_lattice(kind, 2.0, size=9_000)
+    baseline, records = nulls(blocks, 40)
+    found = name_effects(blocks, baseline, records)
+    assert [identification.effect for identification in found.identified] == names
     assert ("lattice" in found.reasons.get("rate_quantization", "")) == (kind == "angle")
 
 
@@ -131,21 +131,21 @@ def cut_record(
 @pytest.mark.parametrize("step", [0.05, 0.18, 0.5])
 def test_a_rate_that_is_cut_off_towards_zero_is_told_by_the_cell_of_zero(step: float) -> None:
     for how, cut in ((np.trunc, True), (np.rint, False), (np.floor, False)):
-        reduced = cut_record(how, step=step)
-        assert (cut_off(reduced) == cut).all()
-        assert (may_be_cut_off(reduced) == cut).all()
-        width, error = reduced["cell_width"].values, reduced["cell_width_stderr"].values
+        blocks = cut_record(how, step=step)
+        assert (cut_off(blocks) == cut).all()
+        assert (may_be_cut_off(blocks) == cut).all()
+        width, error = blocks["cell_width"].values, blocks["cell_width_stderr"].values
         assert (np.abs(width - [2.0 if cut else 1.0, 1.0]) < 4.0 * error + 0.15).all()
-        assert rounded_rates(reduced, calibrate_noise(reduced)).all() == cut or step > 0.4
+        assert rounded_rates(blocks, calibrate_noise(blocks)).all() == cut or step > 0.4
 
 
 @pytest.mark.parametrize("zone", [1.0, 2.0])
 def test_what_sticks_at_zero_is_missing_beside_it(zone: float) -> None:
-    reduced = cut_record(np.rint, zone=zone)
-    width = reduced["cell_width"].sel(axis="x", cell="next")
+    blocks = cut_record(np.rint, zone=zone)
+    width = blocks["cell_width"].sel(axis="x", cell="next")
     assert abs(float(width) - max(1.5 - zone, 0.0)) < 0.1
-    assert not cut_off(reduced).any()
-    assert not may_be_cut_off(reduced).any()
+    assert not cut_off(blocks).any()
+    assert not may_be_cut_off(blocks).any()
 
 
 @pytest.mark.parametrize(
@@ -155,11 +155,11 @@ def test_what_sticks_at_zero_is_missing_beside_it(zone: float) -> None:
 def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(
     how, zone: float, names: list[str]
 ) -> None:
-    reduced = cut_record(how, zone=zone, size=15_000)
-    baseline, records = nulls(reduced, 40)
-    found = name_effects(reduced, baseline, records)
-    assert [claim.effect for claim in found.claims] == names
-    assert all(claim.alternatives == () for claim in found.claims)
+    blocks = cut_record(how, zone=zone, size=15_000)
+    baseline, records = nulls(blocks, 40)
+    found = name_effects(blocks, baseline, records)
+    assert [identification.effect for identification in found.identified] == names
+    assert all(identification.alternatives == () for identification in found.identified)
     if names == ["rate_quantization"]:
         assert {one.effect.mode for one in fit_identifications(found, baseline) if one.effect} == {
             "zero"
@@ -168,14 +168,14 @@ def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(
 
 def test_where_the_cells_do_not_tell_both_names_stand() -> None:
     """Three standard deviations away a cell holds three of 15 000 samples: nothing tells whether that of zero is twice as wide."""
-    reduced = cut_record(np.rint, step=0.04, mean=(-3.0, 2.8), zone=0.0, size=15_000)
-    assert may_be_cut_off(reduced).all()
-    assert not cut_off(reduced).any()
+    blocks = cut_record(np.rint, step=0.04, mean=(-3.0, 2.8), zone=0.0, size=15_000)
+    assert may_be_cut_off(blocks).all()
+    assert not cut_off(blocks).any()
     variant = Variant({}, ("stuck",), np.empty(0))
-    part = Component(Candidate("dead_zone", "marks", (), (variant,)), variant, ("x",), 20.0)
-    state = begin_state(reduced, calibrate_noise(reduced))
-    assert "rate_quantization" in find_equivalent_effects("dead_zone", [part], state)
+    component = Component(Candidate("dead_zone", "marks", (), (variant,)), variant, ("x",), 20.0)
+    state = begin_state(blocks, calibrate_noise(blocks))
+    assert "rate_quantization" in find_equivalent_effects("dead_zone", [component], state)
     told = cut_record(np.rint, zone=1.0, size=15_000)
     assert "rate_quantization" not in find_equivalent_effects(
-        "dead_zone", [part], begin_state(told, calibrate_noise(told))
+        "dead_zone", [component], begin_state(told, calibrate_noise(told))
     )

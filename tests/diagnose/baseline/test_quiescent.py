@@ -23,14 +23,14 @@ def value_of(baseline, term, axis="x"):
     )
 
 
-@pytest.mark.parametrize("blocks", [1, 2, 4, 15])
-def test_a_short_quiet_stretch_calibrates_with_a_note_on_its_precision(blocks):
-    reduced = reduce_log(log({"N": 0.003}, duration="30min"))
-    step = reduced.attrs["block_s"]
+@pytest.mark.parametrize("block_count", [1, 2, 4, 15])
+def test_a_short_quiet_stretch_calibrates_with_a_note_on_its_precision(block_count):
+    blocks = reduce_log(log({"N": 0.003}, duration="30min"))
+    step = blocks.attrs["block_s"]
     with pytest.warns(
-        UserWarning, match=rf"holds {blocks} blocks? of {step:g} s: N is known to \d"
+        UserWarning, match=rf"holds {block_count} blocks? of {step:g} s: N is known to \d"
     ):
-        baseline = calibrate_noise(reduced, quiet=(0.0, blocks * step + 1.0))
+        baseline = calibrate_noise(blocks, quiet=(0.0, block_count * step + 1.0))
     value, error = value_of(baseline, "N")
     assert 0.0 < error < 0.25 * value
     assert abs(value - 0.003) < 4.0 * error
@@ -40,9 +40,9 @@ def test_a_short_quiet_stretch_calibrates_with_a_note_on_its_precision(blocks):
 def test_the_error_of_a_short_calibration_covers_the_truth():
     pulls = []
     for seed in range(8):
-        reduced = reduce_log(log({"N": 0.003}, seed=seed, duration="20min"))
+        blocks = reduce_log(log({"N": 0.003}, seed=seed, duration="20min"))
         with pytest.warns(UserWarning, match="N is known to"):
-            value, error = value_of(calibrate_noise(reduced, quiet=(0.0, 45.0)), "N")
+            value, error = value_of(calibrate_noise(blocks, quiet=(0.0, 45.0)), "N")
         pulls.append((value - 0.003) / error)
     assert np.abs(pulls).max() < 4.0
 
@@ -50,11 +50,11 @@ def test_the_error_of_a_short_calibration_covers_the_truth():
 def test_a_model_gives_the_proportions_and_quiet_time_the_level():
     """Noise of the model 20 % too low: one factor brings it to that of the recording, effects keep their size."""
     recording = log(effects=[SHAKE_NOISE], environment=[SHAKEN])
-    reduced = reduce_log(recording)
+    blocks = reduce_log(recording)
     model = {"noise": {name: 0.8 * size for name, size in NOISE.items()}, "effect": [SHAKE_NOISE]}
     raw, scaled = (
-        baseline_from_model(reduced, model),
-        baseline_from_model(reduced, model, quiet=(0.0, 1100.0)),
+        baseline_from_model(blocks, model),
+        baseline_from_model(blocks, model, quiet=(0.0, 1100.0)),
     )
     assert value_of(raw, "N") == (pytest.approx(0.0024), 0.0)
     for term, size in NOISE.items():
@@ -67,10 +67,10 @@ def test_a_model_gives_the_proportions_and_quiet_time_the_level():
     assert scaled.attrs["calibrated_on"] == [
         ["1970-01-01T00:00:00.000Z", "1970-01-01T00:18:20.000Z"]
     ]
-    middle = ((reduced["begin"] + reduced["end"]) / 2.0).values
+    middle = ((blocks["begin"] + blocks["end"]) / 2.0).values
     shaken = (middle > 1220) & (middle < 1480)
     for expected, where in ((1.0, ~shaken), (1.0, shaken)):
-        ratio = float((reduced["power"] / scaled["spectrum"])[0, where].mean())
+        ratio = float((blocks["power"] / scaled["spectrum"])[0, where].mean())
         assert ratio == pytest.approx(expected, abs=0.1)
     assert (
         scaled["spectrum"].values[0, shaken].mean()
@@ -81,26 +81,26 @@ def test_a_model_gives_the_proportions_and_quiet_time_the_level():
 def test_quiet_time_calibrates_beside_an_effect_that_acts_in_it():
     """Vibration all the time: its noise is the model's, and is not taken for a higher level."""
     shaken = {"profile": "vibration", "points": [[0, 6.0], [3600, 6.0]]}
-    reduced = reduce_log(log(effects=[SHAKE_NOISE], environment=[shaken]))
+    blocks = reduce_log(log(effects=[SHAKE_NOISE], environment=[shaken]))
     model = {"noise": {name: 0.8 * size for name, size in NOISE.items()}, "effect": [SHAKE_NOISE]}
-    value, error = value_of(baseline_from_model(reduced, model, quiet=(0.0, 1800.0)), "N")
+    value, error = value_of(baseline_from_model(blocks, model, quiet=(0.0, 1800.0)), "N")
     assert abs(value - 0.003) < 4.0 * error
     assert error < 0.15 * value
 
 
 def test_a_simulated_log_is_scaled_to_quiet_time():
-    reduced, simulated = (
+    blocks, simulated = (
         reduce_log(log(seed=1)),
         reduce_log(log({name: 0.8 * size for name, size in NOISE.items()}, seed=2)),
     )
     plain, scaled = (
-        baseline_from_simulation(reduced, simulated),
-        baseline_from_simulation(reduced, simulated, quiet=(0.0, 1800.0)),
+        baseline_from_simulation(blocks, simulated),
+        baseline_from_simulation(blocks, simulated, quiet=(0.0, 1800.0)),
     )
     assert abs(value_of(plain, "N")[0] - 0.0024) < 1e-4
     value, error = value_of(scaled, "N")
     assert abs(value - 0.003) < 4.0 * error
-    assert float((reduced["power"] / scaled["spectrum"]).mean()) == pytest.approx(1.0, abs=0.05)
+    assert float((blocks["power"] / scaled["spectrum"]).mean()) == pytest.approx(1.0, abs=0.05)
     assert scaled.attrs["calibrated_on"] == [
         ["1970-01-01T00:00:00.000Z", "1970-01-01T00:30:00.000Z"]
     ]

@@ -75,12 +75,12 @@ def test_null_records_share_what_the_model_says(lost):
         )
     assert found["raw"] == pytest.approx(found["drawn"], abs=0.07)
     assert found["drawn"] == pytest.approx(-0.41 * (1.0 - lost), abs=0.05)
-    for part in (
+    for component in (
         lambda one: one["cross"].real,
         lambda one: one["cross"].imag,
         lambda one: one["power"],
     ):
-        scatter = part(nulls).isel(band=bands).std(["record", "block"]) / part(raw).isel(
+        scatter = component(nulls).isel(band=bands).std(["record", "block"]) / component(raw).isel(
             band=bands
         ).std(["record", "block"])
         assert float(np.abs(scatter - 1.0).max()) < 0.15
@@ -102,16 +102,14 @@ def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
     }
     sway = {"name": "real_motion", "direction": [1.0, -0.5, 0.0], "sway": 0.5, "frequency": 0.4}
     model = {"noise": NOISE, "effect": [line, sway], "log": {"axes": ["x", "y", "z"]}}
-    reduced = reduce_log(simulate(model, duration="1h", rate=10.0, seed=3).compute())
-    baseline = baseline_from_model(reduced, model)
+    blocks = reduce_log(simulate(model, duration="1h", rate=10.0, seed=3).compute())
+    baseline = baseline_from_model(blocks, model)
     for frequency in (1.3, 0.4):
         band = int(
-            np.flatnonzero((reduced["band_low"] <= frequency) & (frequency < reduced["band_high"]))[
-                0
-            ]
+            np.flatnonzero((blocks["band_low"] <= frequency) & (frequency < blocks["band_high"]))[0]
         )
         seen, expected = (
-            one["cross"].isel(band=band).mean("block").values for one in (reduced, baseline)
+            one["cross"].isel(band=band).mean("block").values for one in (blocks, baseline)
         )
         scale = float(np.sqrt(baseline["spectrum"].isel(band=band).mean("block").max()) ** 2)
         assert np.abs(seen - expected).max() < 0.15 * scale

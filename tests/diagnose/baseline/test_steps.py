@@ -47,8 +47,10 @@ def test_a_jump_within_a_block_explains_the_power_that_it_has_there_and_at_the_l
     found = _diagnosed(jumped)
     assert found.verdict == "explained"
     assert [effect["name"] for effect in found.effects] == ["bias_jump"]
-    assert {"davar", "spectrum", "mean"} <= {box["view"] for box in found.content["mismatches"]}
-    assert {name for box in found.content["mismatches"] for name in box["explained_by"]} == {
+    assert {"davar", "spectrum", "mean"} <= {
+        region["view"] for region in found.content["mismatches"]
+    }
+    assert {name for region in found.content["mismatches"] for name in region["explained_by"]} == {
         "bias_jump"
     }
 
@@ -58,15 +60,15 @@ def test_what_is_loud_in_other_blocks_is_not_the_jump(jumped):
     rate = jumped["rate"].transpose("axis", "time").values.copy()
     rate[:, (seconds >= 1200) & (seconds < 1300)] *= 1.4
     found = _diagnosed(jumped.assign(rate=(("axis", "time"), rate, jumped["rate"].attrs)))
-    left = [box for box in found.content["mismatches"] if not box["explained_by"]]
+    left = [region for region in found.content["mismatches"] if not region["explained_by"]]
     assert found.verdict == "partly explained"
     start = np.datetime64(found.content["recording"]["start"].removesuffix("Z"))
     spans = [
         [
-            (np.datetime64(box[end].removesuffix("Z")) - start) / np.timedelta64(1, "s")
+            (np.datetime64(region[end].removesuffix("Z")) - start) / np.timedelta64(1, "s")
             for end in ("start", "end")
         ]
-        for box in left
+        for region in left
     ]
     assert any(begin < 1300 and end > 1200 for begin, end in spans)
 
@@ -81,43 +83,43 @@ def test_hops_between_two_levels_leave_no_line_against_their_own_model():
 def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
     """The core reads the log again for its lines; what is loud in blocks that are left out does not matter then."""
     task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
-    reduced = reduce_log(jumped)
-    baseline = calibrate_noise(reduced)
-    course = np.zeros((1, reduced.sizes["block"]))
+    blocks = reduce_log(jumped)
+    baseline = calibrate_noise(blocks)
+    course = np.zeros((1, blocks.sizes["block"]))
     course[:, :12:2] = 5.0  # the first part has the blocks 0 to 11
     known = baseline.assign(known_mean=(("axis", "block"), course))
-    found = still_lines(task, reduced, known)
+    found = still_lines(task, blocks, known)
     assert found["line_weight"].values[0, 0] == 0.0
-    np.testing.assert_allclose(found["line_power"][:, 2:], reduced["line_power"][:, 2:])
+    np.testing.assert_allclose(found["line_power"][:, 2:], blocks["line_power"][:, 2:])
     xr.testing.assert_identical(
         found.drop_vars(["line_power", "line_weight"]),
-        reduced.drop_vars(["line_power", "line_weight"]),
+        blocks.drop_vars(["line_power", "line_weight"]),
     )
-    assert still_lines(task, reduced, baseline) is reduced
+    assert still_lines(task, blocks, baseline) is blocks
 
 
 def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_else():
-    reduced = record([])
-    baseline, _ = nulls(reduced, 4)
-    step = np.zeros((3, reduced.sizes["block"]))
+    blocks = record([])
+    baseline, _ = nulls(blocks, 4)
+    step = np.zeros((3, blocks.sizes["block"]))
     step[1, 90:] = 1.0
     known = baseline.assign(known_mean=(("axis", "block"), step))
-    moving = expect_known_motion(reduced, known)
+    moving = expect_known_motion(blocks, known)
     assert np.argwhere(moving).tolist() == [[1, 89], [1, 90]]
-    out = remove_known_motion(reduced, known)
+    out = remove_known_motion(blocks, known)
     for name in ("power", "kurtosis"):
-        lost = out[name].isnull() & reduced[name].notnull()
+        lost = out[name].isnull() & blocks[name].notnull()
         lost = lost.any("band") if "band" in lost.dims else lost
         np.testing.assert_array_equal(lost.transpose("axis", "block"), moving)
     lost = (
-        (out["cross"].isnull() & reduced["cross"].notnull())
+        (out["cross"].isnull() & blocks["cross"].notnull())
         .any("band")
         .transpose("pair", "block")
         .values
     )
     touched = [
-        "y" in pair for pair in zip(reduced["first"].values, reduced["second"].values, strict=True)
+        "y" in pair for pair in zip(blocks["first"].values, blocks["second"].values, strict=True)
     ]
     np.testing.assert_array_equal(lost, np.outer(touched, moving[1]))
-    xr.testing.assert_identical(out["mean"], reduced["mean"])
-    assert remove_known_motion(reduced, baseline) is reduced
+    xr.testing.assert_identical(out["mean"], blocks["mean"])
+    assert remove_known_motion(blocks, baseline) is blocks

@@ -29,9 +29,9 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
     effect = make_effect(table)
     on = [axes.index(axis) for axis in effect.axes or axes]
     noise[on] = run(effect, size=noise.shape[1], axes=axes, signal=noise[on], seed=seed)
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list(axes)))
-    baseline, records = nulls(reduced, 40)
-    return name_effects(reduced, baseline, records)
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list(axes)))
+    baseline, records = nulls(blocks, 40)
+    return name_effects(blocks, baseline, records)
 
 
 @pytest.mark.parametrize(
@@ -50,13 +50,13 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
 )
 def test_it_is_told_where_they_stand(table, options):
     found = named(table, **options)
-    (claim,) = found.claims
-    assert claim.effect == table["name"]
-    assert claim.axes == tuple(table.get("axes", options.get("axes", "xyz")))
+    (identification,) = found.identified
+    assert identification.effect == table["name"]
+    assert identification.axes == tuple(table.get("axes", options.get("axes", "xyz")))
     alone = table["name"] == "dead_zone" and options
-    assert claim.alternatives == (("held_samples",) if alone else ())
+    assert identification.alternatives == (("held_samples",) if alone else ())
     if table["name"] == "held_samples":
-        (fitted,) = fit_identifications(found, calibrate_noise(found.state.reduced))[:1]
+        (fitted,) = fit_identifications(found, calibrate_noise(found.state.blocks))[:1]
         assert fitted.effect is not None
         assert fitted.effect.fill == table.get("fill", "repeat")
 
@@ -65,9 +65,12 @@ def test_a_pulse_that_comes_again_and_again_is_lines_and_no_spikes():
     noise = SCATTER * np.random.default_rng(6).standard_normal((2, 15_000))
     noise[0, ::37] += 8.0 * SCATTER
     noise[1, np.random.default_rng(7).choice(15_000, 40, replace=False)] += 12.0 * SCATTER
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]))
-    baseline, records = nulls(reduced, 40)
-    found = {claim.effect: claim.axes for claim in name_effects(reduced, baseline, records).claims}
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]))
+    baseline, records = nulls(blocks, 40)
+    found = {
+        identification.effect: identification.axes
+        for identification in name_effects(blocks, baseline, records).identified
+    }
     assert found["spectral_line"] == ("x",)
     assert found["spikes"] == ("y",)
 
@@ -88,26 +91,24 @@ def on_a_lattice(held: int, *, seed: int = 21, size: int = 15_000) -> xr.Dataset
 
 
 def test_zeros_of_a_lattice_are_expected_together_where_an_axis_is_lost():
-    reduced = on_a_lattice(0)
-    zeros, samples = (reduced[name].sum("block").values for name in ("zeros", "samples"))
+    blocks = on_a_lattice(0)
+    zeros, samples = (blocks[name].sum("block").values for name in ("zeros", "samples"))
     assert (zeros / samples > 0.04).all()
-    lost = reduced["begin"].values > 800.0
-    baseline, records = nulls(reduced, 40)
-    found = name_effects(reduced, baseline, records)
-    assert found.claims == ()
+    lost = blocks["begin"].values > 800.0
+    baseline, records = nulls(blocks, 40)
+    found = name_effects(blocks, baseline, records)
+    assert found.identified == ()
     drawn = records[0]["filled"].mean("record").values[:, lost].mean(axis=1)
-    np.testing.assert_allclose(
-        drawn[:2], reduced["filled"].values[:2, lost].mean(axis=1), atol=0.12
-    )
+    np.testing.assert_allclose(drawn[:2], blocks["filled"].values[:2, lost].mean(axis=1), atol=0.12)
 
 
 def test_samples_that_were_filled_with_zeros_are_seen_where_an_axis_is_lost():
-    reduced = on_a_lattice(20)
-    baseline, records = nulls(reduced, 40)
-    (claim,) = name_effects(reduced, baseline, records).claims
-    assert (claim.effect, claim.axes) == ("held_samples", ("x", "y", "z"))
-    assert all(part.variant.columns == ("filled",) for part in claim.parts)
-    assert float(reduced["filled"].sel(axis="x").sum()) == pytest.approx(120, abs=25)
+    blocks = on_a_lattice(20)
+    baseline, records = nulls(blocks, 40)
+    (identification,) = name_effects(blocks, baseline, records).identified
+    assert (identification.effect, identification.axes) == ("held_samples", ("x", "y", "z"))
+    assert all(component.variant.columns == ("filled",) for component in identification.components)
+    assert float(blocks["filled"].sel(axis="x").sum()) == pytest.approx(120, abs=25)
 
 
 def test_an_axis_that_is_lost_early_keeps_blocks_where_all_that_are_left_have_odd_samples():
@@ -117,15 +118,15 @@ def test_an_axis_that_is_lost_early_keeps_blocks_where_all_that_are_left_have_od
     noise[2, 3_240:] = np.nan
     for first in range(100, 3_240, 162):
         noise[:, first : first + 6] = 0.0
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
     assert (
-        (reduced["filled"].sel(axis="z") > 0).sum()
-        == np.isfinite(reduced["mean"].sel(axis="z")).sum()
+        (blocks["filled"].sel(axis="z") > 0).sum()
+        == np.isfinite(blocks["mean"].sel(axis="z")).sum()
         == 20
     )
-    baseline, records = nulls(reduced, 40)
-    (claim,) = name_effects(reduced, baseline, records).claims
-    assert (claim.effect, claim.axes) == ("held_samples", ("x", "y", "z"))
+    baseline, records = nulls(blocks, 40)
+    (identification,) = name_effects(blocks, baseline, records).identified
+    assert (identification.effect, identification.axes) == ("held_samples", ("x", "y", "z"))
 
 
 @pytest.mark.parametrize("fill", ["repeat", "zero"])
@@ -138,11 +139,11 @@ def test_how_often_and_how_long_samples_were_held_is_told(fill):
     ):
         length = 6 if number < 40 else 2
         noise[:, first : first + length] = noise[:, first - 1 : first] if fill == "repeat" else 0.0
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
-    baseline, records = nulls(reduced, 40)
-    found = fit_identifications(name_effects(reduced, baseline, records), baseline)
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(blocks, 40)
+    found = fit_identifications(name_effects(blocks, baseline, records), baseline)
     assert [one.axes for one in found] == [("x",), ("y",), ("z",)]
-    hours = float(reduced["samples"].sel(axis="x").sum()) / 36_000.0
+    hours = float(blocks["samples"].sel(axis="x").sum()) / 36_000.0
     for one in found:
         assert one.parameters["per_hour"].value == pytest.approx(60 / hours, rel=0.06)
         assert one.parameters["length"].value == pytest.approx(
@@ -158,10 +159,10 @@ def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
     places = 6_000 + 3 * np.arange(14)
     flips = rng.choice([-1.0, 1.0], 14) * 2.0 ** rng.integers(3, 7, 14)
     noise[1, places] += flips
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
-    baseline, records = nulls(reduced, 40)
-    (claim,) = (found := name_effects(reduced, baseline, records)).claims
-    assert (claim.effect, claim.axes) == ("spikes", ("y",))
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(blocks, 40)
+    (identification,) = (found := name_effects(blocks, baseline, records)).identified
+    assert (identification.effect, identification.axes) == ("spikes", ("y",))
     (fitted,) = fit_identifications(found, baseline)
     assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0
 
@@ -182,8 +183,8 @@ def test_noise_that_rises_within_a_block_is_no_outlier_beside_spikes_of_another_
     )
     baseline, records = nulls(reduce_log(log), 40)
     axes = {
-        claim.effect: claim.axes
-        for claim in name_effects(reduce_log(log), baseline, records).claims
+        identification.effect: identification.axes
+        for identification in name_effects(reduce_log(log), baseline, records).identified
     }
     assert axes.pop("spikes") == ("y",)
     assert list(axes.values()) == [("x", "y", "z")]  # of what vibration does
@@ -208,10 +209,10 @@ def test_spikes_of_six_deviations_are_named_and_counted():
     rng = np.random.default_rng(8)
     noise = SCATTER * rng.standard_normal((3, 15_000))
     noise[1, rng.choice(15_000, 20, replace=False)] += 6.0 * SCATTER * rng.choice([-1.0, 1.0], 20)
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
-    baseline, records = nulls(reduced, 40)
-    (claim,) = (found := name_effects(reduced, baseline, records)).claims
-    assert (claim.effect, claim.axes) == ("spikes", ("y",))
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(blocks, 40)
+    (identification,) = (found := name_effects(blocks, baseline, records)).identified
+    assert (identification.effect, identification.axes) == ("spikes", ("y",))
     (fitted,) = fit_identifications(found, baseline)
     number = fitted.parameters["per_hour"].value * 15_000 / 36_000
     assert 10 < number < 40
@@ -224,23 +225,23 @@ def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_power
     noise = SCATTER * (
         rng.standard_normal((1, 15_000)) + 70.0 * rng.standard_normal((1, 15_000)) * hit
     )
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
-    assert (reduced["peaks"] > 0).mean() > 0.6
-    baseline, records = nulls(reduced, 40)
-    (fitted,) = fit_identifications(found := name_effects(reduced, baseline, records), baseline)
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
+    assert (blocks["peaks"] > 0).mean() > 0.6
+    baseline, records = nulls(blocks, 40)
+    (fitted,) = fit_identifications(found := name_effects(blocks, baseline, records), baseline)
     size, number = fitted.parameters["size"], fitted.parameters["per_hour"]
     assert size.low < 70.0 * SCATTER < size.high
     assert number.low < 0.009 * 36_000 < number.high
     clean = predicted(found, recalibrate(found, baseline, [fitted]))
-    whole = add_outlier_power(clean, reduced, [fitted])["spectrum"].mean()
-    assert float(whole) == pytest.approx(float(reduced["power"].mean()), rel=0.4)
+    whole = add_outlier_power(clean, blocks, [fitted])["spectrum"].mean()
+    assert float(whole) == pytest.approx(float(blocks["power"].mean()), rel=0.4)
     assert float(clean["spectrum"].mean()) < 0.1 * float(whole)
     for lacking, known in (
         ([fitted], []),
         ([], [fitted]),
     ):  # effects of the recording alone, or of the simulation too
         surfaces = conclude._surfaces(
-            reduced, conclude.Fit(found, clean, lacking, known), clean, clean
+            blocks, conclude.Fit(found, clean, lacking, known), clean, clean
         )
         short = surfaces["avar"].isel(tau=0).mean(["axis", "window"])
         before, after = (
@@ -257,8 +258,9 @@ def test_bursts_of_noise_shorter_than_a_block_have_no_spikes():
     for first in rng.integers(0, 14_900, 10):
         loud[first : first + 40] = 8.0
     noise = SCATTER * loud * rng.standard_normal((3, 15_000))
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
-    baseline, records = nulls(reduced, 40)
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(blocks, 40)
     assert "spikes" not in [
-        claim.effect for claim in name_effects(reduced, baseline, records).claims
+        identification.effect
+        for identification in name_effects(blocks, baseline, records).identified
     ]

@@ -40,13 +40,13 @@ def fits(
     environment: tuple[dict[str, Any], ...], effect: str, column: str, shape: np.ndarray
 ) -> list[dict[str, Any]]:
     """Numbers of an effect in records of noise to which its mean, of one value a second, is added."""
-    reduced = record([], environment=environment)
-    baseline = calibrate_noise(reduced)
-    frame = claimed(reduced, baseline, effect, "mean", (column,))
+    blocks = record([], environment=environment)
+    baseline = calibrate_noise(blocks)
+    frame = claimed(blocks, baseline, effect, "mean", (column,))
     drawn = next(
         iter(
             null_records(
-                reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
+                blocks, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
             )
         )
     )
@@ -54,7 +54,7 @@ def fits(
     for number in range(RECORDS):
         mean = drawn["mean"].isel(record=number).transpose("axis", "block") + in_blocks(shape)
         state = condition_on(
-            begin_state(reduced.assign(mean=mean), baseline), list(frame.claims[0].parts)
+            begin_state(blocks.assign(mean=mean), baseline), list(frame.identified[0].components)
         )
         out.append(dict(fit_identifications(replace(frame, state=state), baseline)[0].parameters))
     return out
@@ -122,23 +122,25 @@ def test_what_is_there_but_slower_than_others_is_below_its_limit():
         {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT},
         WORLD["usual"][1],
     )
-    reduced = record([], environment=environment)
-    baseline = calibrate_noise(reduced)
-    frame = claimed(reduced, baseline, "shupe", "mean", ("sensitivity",))
+    blocks = record([], environment=environment)
+    baseline = calibrate_noise(blocks)
+    frame = claimed(blocks, baseline, "shupe", "mean", ("sensitivity",))
     frame = replace(
-        frame, claims=(), candidates=tuple(one for one in frame.candidates if one.effect == "shupe")
+        frame,
+        identified=(),
+        candidates=tuple(one for one in frame.candidates if one.effect == "shupe"),
     )
     drawn = next(
         iter(
             null_records(
-                reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
+                blocks, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
             )
         )
     )
     there = in_blocks(size * slow(60.0 * np.gradient(heat), time))
     found = []
     for number in range(RECORDS):
-        seen = reduced.assign(
+        seen = blocks.assign(
             mean=drawn["mean"].isel(record=number).transpose("axis", "block") + there
         )
         found.append(

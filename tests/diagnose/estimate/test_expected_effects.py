@@ -77,23 +77,23 @@ def test_another_effect_beside_those_that_are_expected_is_named():
 
 
 @pytest.fixture(scope="module")
-def reduced():
+def blocks():
     model = {"noise": NOISE, "log": {"axes": ["x"]}, "environment": [TURN, SHAKE]}
     return reduce_log(simulate(model, duration="25min", rate=10.0, seed=4).compute())
 
 
 @pytest.mark.parametrize(("memory", "rms"), [(300.0, 0.5), (30.0, 0.5)])
-def test_null_means_wander_as_the_model_does(reduced, memory, rms):
+def test_null_means_wander_as_the_model_does(blocks, memory, rms):
     """The covariance of block means is that of the double integral of the exponential memory."""
     effect = {"name": "gauss_markov", "rms": rms, "correlation_time": memory}
-    baseline = baseline_from_model(reduced, {"noise": {"N": 1e-5}, "effect": [effect]})
+    baseline = baseline_from_model(blocks, {"noise": {"N": 1e-5}, "effect": [effect]})
     drawn = np.concatenate(
         [
             one["mean"].values[:, 0]
-            for one in null_records(reduced, baseline, count=600, rng=np.random.default_rng(2))
+            for one in null_records(blocks, baseline, count=600, rng=np.random.default_rng(2))
         ]
     )
-    a = float(reduced.attrs["block_s"]) / memory
+    a = float(blocks.attrs["block_s"]) / memory
     own, next_one = 2.0 * (a + np.expm1(-a)) / a**2, (np.expm1(-a) / a) ** 2
     assert (drawn**2).mean() == pytest.approx(rms**2 * own, rel=0.05)
     assert (drawn[:, 1:] * drawn[:, :-1]).mean() == pytest.approx(
@@ -102,20 +102,20 @@ def test_null_means_wander_as_the_model_does(reduced, memory, rms):
     assert mean_share(a, np.array([1.0])) == pytest.approx(own)
 
 
-def test_null_means_walk_while_it_shakes(reduced):
+def test_null_means_walk_while_it_shakes(blocks):
     effect = {"name": "vibration_random_walk", "sensitivity": 0.3}
-    baseline = baseline_from_model(reduced, {"noise": {"N": 0.003}, "effect": [effect]})
+    baseline = baseline_from_model(blocks, {"noise": {"N": 0.003}, "effect": [effect]})
     nulls = np.concatenate(
         [
             one["mean"].values[:, 0]
-            for one in null_records(reduced, baseline, count=400, rng=np.random.default_rng(3))
+            for one in null_records(blocks, baseline, count=400, rng=np.random.default_rng(3))
         ]
     )
-    begin, end = reduced["begin"].values, reduced["end"].values
+    begin, end = blocks["begin"].values, blocks["end"].values
     still, shaken = end <= 500.0, (begin >= 520.0) & (end <= 900.0)
     span = (end[shaken][-1] - end[shaken][0]) / 3600.0
     moved = nulls[:, np.flatnonzero(shaken)[-1]] - nulls[:, np.flatnonzero(shaken)[0]]
-    block = float(reduced.attrs["block_s"]) / 3600.0
+    block = float(blocks.attrs["block_s"]) / 3600.0
     assert moved.var() == pytest.approx(
         (0.3 * 6.0) ** 2 * (span - block / 3.0), rel=0.15
     )  # K^2 t, less what the means smooth
@@ -124,12 +124,12 @@ def test_null_means_walk_while_it_shakes(reduced):
     assert walk[shaken] == pytest.approx((0.3 * 6.0) ** 2 / 3600.0, rel=0.02)
 
 
-def test_blocks_in_which_a_known_rate_moves_are_left_out(reduced):
+def test_blocks_in_which_a_known_rate_moves_are_left_out(blocks):
     baseline = baseline_from_model(
-        reduced, {"noise": NOISE, "effect": [{"name": "scale_factor", "linear": 1000.0}]}
+        blocks, {"noise": NOISE, "effect": [{"name": "scale_factor", "linear": 1000.0}]}
     )
-    moving = expect_known_motion(reduced, baseline)[0]
-    begin, end = reduced["begin"].values, reduced["end"].values
+    moving = expect_known_motion(blocks, baseline)[0]
+    begin, end = blocks["begin"].values, blocks["end"].values
     ramp = ((begin < 330.0) & (end > 300.0)) | ((begin < 830.0) & (end > 800.0))
     assert moving[ramp].all()
     assert not moving[(end < 270.0) | ((begin > 360.0) & (end < 770.0)) | (begin > 860.0)].any()
@@ -151,16 +151,16 @@ def test_a_narrow_resonance_is_expected_as_the_taper_shows_it(frequency, quality
     values *= np.sqrt(0.5) / values.std()
     means = values[: values.size // 4 * 4].reshape(-1, 4).mean(axis=1)
     log = gyrostab.make_log(means[None], rate=rate, unit="deg/h")
-    reduced = reduce_log(log, block="20s")
-    baseline = baseline_from_model(reduced, {"noise": {"N": 1e-4}, "effect": [effect]})
+    blocks = reduce_log(log, block="20s")
+    baseline = baseline_from_model(blocks, {"noise": {"N": 1e-4}, "effect": [effect]})
     seen, expected = (
-        reduced["power"].values[0].mean(axis=0),
+        blocks["power"].values[0].mean(axis=0),
         baseline["spectrum"].values[0].mean(axis=0),
     )
     near = expected > 0.02 * expected.max()
     assert near.sum() >= 2
     np.testing.assert_allclose(seen[near], expected[near], rtol=0.25)
-    scatter = reduced["power"].values[0, :, near].var(axis=1) / seen[near] ** 2
+    scatter = blocks["power"].values[0, :, near].var(axis=1) / seen[near] ** 2
     assert (scatter / (1.0 / baseline["shape_alone"].values[0, 0, near]) > 0.4).all()
     assert (
         scatter[np.argmax(seen[near])]

@@ -27,43 +27,52 @@ RECORDS = 60
 
 @pytest.fixture(scope="module")
 def quiet():
-    reduced = record([])
-    return reduced, calibrate_noise(reduced)
+    blocks = record([])
+    return blocks, calibrate_noise(blocks)
 
 
 def claimed(
-    reduced: xr.Dataset, baseline: xr.Dataset, effect: str, view: str, columns: tuple[str, ...]
+    blocks: xr.Dataset, baseline: xr.Dataset, effect: str, statistic: str, columns: tuple[str, ...]
 ) -> Identifications:
     """A naming of one effect on the first axis."""
-    candidates, reasons = effect_candidates(reduced, COEFFICIENT)
-    one = next(one for one in candidates if one.effect == effect and one.view == view)
+    candidates, reasons = effect_candidates(blocks, COEFFICIENT)
+    one = next(one for one in candidates if one.effect == effect and one.statistic == statistic)
     variant = next(variant for variant in one.variants if variant.columns == columns)
-    part = Component(one, variant, ("x",), 50.0)
-    claim = Identification(effect, one.driver, ("x",), (part,), 50.0, 8.0)
-    state = condition_on(begin_state(reduced, baseline), [part])
+    component = Component(one, variant, ("x",), 50.0)
+    identification = Identification(effect, one.driver, ("x",), (component,), 50.0, 8.0)
+    state = condition_on(begin_state(blocks, baseline), [component])
     return Identifications(
-        (claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)
+        (identification,),
+        (),
+        8.0,
+        np.zeros(1),
+        reasons,
+        tuple(candidates),
+        state,
+        fold_blocks(blocks),
     )
 
 
-def fits(quiet, change, effect, view, columns):
+def fits(quiet, change, effect, statistic, columns):
     """Fits of many records of noise to which `change` adds an effect."""
-    reduced, baseline = quiet
+    blocks, baseline = quiet
     drawn = next(
         iter(
             null_records(
-                reduced, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
+                blocks, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
             )
         )
     )
     out = []
-    frame = claimed(reduced, baseline, effect, view, columns)
+    frame = claimed(blocks, baseline, effect, statistic, columns)
     for number in range(RECORDS):
-        one = reduced.assign(
+        one = blocks.assign(
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
         )
-        state = condition_on(begin_state(change(one), baseline), list(frame.claims[0].parts))
+        state = condition_on(
+            begin_state(change(one), baseline), list(frame.identified[0].components)
+        )
         (fitted,) = fit_identifications(replace(frame, state=state), baseline)
         out.append(fitted.parameters[columns[0]])
     return out
@@ -103,8 +112,8 @@ def test_intervals_of_vibration_noise_hold_the_truth(quiet, share):
 
 @pytest.mark.parametrize(("levels", "both"), [((5.0, 5.0), False), ((3.0, 8.0), True)])
 def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
-    reduced, baseline = quiet
-    place = np.linspace(0.0, 1.0, reduced.sizes["block"])
+    blocks, baseline = quiet
+    place = np.linspace(0.0, 1.0, blocks.sizes["block"])
     g = np.where(
         (place > 0.2) & (place < 0.4),
         levels[0],
@@ -114,10 +123,10 @@ def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
     sensitivity, quartic = (0.05, -5e-4) if both else (0.005, 0.0)
     shape = xr.DataArray(sensitivity * g**2 + quartic * g**4, dims="block")
     drawn = next(
-        iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
+        iter(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
     )
-    one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
-    one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
+    one = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
+    one["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
     frame = claimed(one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic"))
     (fitted,) = fit_identifications(frame, baseline)
     assert set(fitted.parameters) == ({"sensitivity", "quartic"} if both else {"sensitivity"})
@@ -132,19 +141,19 @@ def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
 def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_from_it(
     quiet, levels, column
 ):
-    reduced, baseline = quiet
-    place = np.linspace(0.0, 1.0, reduced.sizes["block"])
+    blocks, baseline = quiet
+    place = np.linspace(0.0, 1.0, blocks.sizes["block"])
     g = np.where(
         (place > 0.2) & (place < 0.4),
         levels[0],
         np.where((place > 0.6) & (place < 0.8), levels[1], 0.0),
     )
     drawn = next(
-        iter(null_records(reduced, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
+        iter(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
     )
     shape = xr.DataArray(0.005 * g**2 if column == "sensitivity" else 1e-4 * g**4, dims="block")
-    one = reduced.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
-    one["channel_vibration"] = reduced["channel_vibration"].copy(data=g)
+    one = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
+    one["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
     (fitted,) = fit_identifications(
         claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline
     )
@@ -155,14 +164,14 @@ def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_fro
 
 @pytest.fixture(scope="module")
 def shaken():
-    reduced = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])
-    baseline, records = nulls(reduced)
-    return name_effects(reduced, baseline, records), baseline
+    blocks = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])
+    baseline, records = nulls(blocks)
+    return name_effects(blocks, baseline, records), baseline
 
 
 def test_the_model_has_the_effect(shaken):
-    naming, baseline = shaken
-    (fitted,) = fit_identifications(naming, baseline)
+    identifications, baseline = shaken
+    (fitted,) = fit_identifications(identifications, baseline)
     one = fitted.parameters["sensitivity"]
     assert one.low < 0.005 < one.high
     assert one.unit == "deg/h/g^2"
@@ -182,15 +191,15 @@ def test_the_model_has_the_effect(shaken):
 
 
 def test_the_prediction_fits_only_what_it_may_see(shaken):
-    naming, baseline = shaken
-    after = predicted(naming, baseline)
-    vibration = naming.state.reduced["channel_vibration"].values
+    identifications, baseline = shaken
+    after = predicted(identifications, baseline)
+    vibration = identifications.state.blocks["channel_vibration"].values
     gained = (after["known_mean"] - baseline["known_mean"]).sel(axis="y").values
     assert np.ptp(gained) == pytest.approx(0.005 * np.max(vibration**2), rel=0.35)
     assert np.allclose((after["known_mean"] - baseline["known_mean"]).sel(axis="x"), 0.0)
-    blind = predicted(naming, baseline, vibration < 1.0)
-    changed = replace(naming, state=replace(naming.state, reduced=naming.state.reduced.assign(
-        mean=naming.state.reduced["mean"] + xr.DataArray(np.where(vibration < 1.0, 0.0, 5.0), dims="block")
+    blind = predicted(identifications, baseline, vibration < 1.0)
+    changed = replace(identifications, state=replace(identifications.state, blocks=identifications.state.blocks.assign(
+        mean=identifications.state.blocks["mean"] + xr.DataArray(np.where(vibration < 1.0, 0.0, 5.0), dims="block")
     )))  # fmt: skip
     np.testing.assert_allclose(
         predicted(changed, baseline, vibration < 1.0)["known_mean"], blind["known_mean"]
@@ -198,8 +207,8 @@ def test_the_prediction_fits_only_what_it_may_see(shaken):
 
 
 def test_what_was_not_found_has_a_limit_or_a_reason(shaken):
-    naming, _ = shaken
-    found = find_upper_limits(naming)
+    identifications, _ = shaken
+    found = find_upper_limits(identifications)
     assert "vibration_rectification" not in found
     assert found["shupe"].reason == "below limit"
     assert 0.0 < found["shupe"].upper_limit < 5.0
@@ -211,35 +220,37 @@ def test_what_was_not_found_has_a_limit_or_a_reason(shaken):
 
 def test_size_of_a_line():
     table = {"name": "spectral_line", "amplitude": 0.4, "frequency": 2.345, "axes": ["x"]}
-    reduced = record([table])
-    power = reduced["line_power"].sel(axis="x").mean("part")
+    blocks = record([table])
+    power = blocks["line_power"].sel(axis="x").mean("part")
     place = int(power.values.argmax())
-    (amplitude, error), (frequency, _) = line_size(reduced, "x", place)
+    (amplitude, error), (frequency, _) = line_size(blocks, "x", place)
     assert amplitude == pytest.approx(0.4, abs=max(4 * error, 0.04))
     assert frequency == pytest.approx(2.345, abs=0.03)
 
 
 def test_where_a_line_is_is_known_to_a_step_of_its_spectrum():
     true = 4.013
-    reduced = record(
-        [{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}]
-    )
-    baseline = calibrate_noise(reduced)
-    naming = claimed(reduced, baseline, "spectral_line", "line", ("amplitude",))
-    place = int(reduced["line_power"].sel(axis="x").mean("part").values.argmax())
-    part = replace(naming.claims[0].parts[0], place=place)
+    blocks = record([{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}])
+    baseline = calibrate_noise(blocks)
+    identifications = claimed(blocks, baseline, "spectral_line", "line", ("amplitude",))
+    place = int(blocks["line_power"].sel(axis="x").mean("part").values.argmax())
+    component = replace(identifications.identified[0].components[0], place=place)
     (fitted,) = fit_identifications(
-        replace(naming, claims=(replace(naming.claims[0], parts=(part,)),)), baseline
+        replace(
+            identifications,
+            identified=(replace(identifications.identified[0], components=(component,)),),
+        ),
+        baseline,
     )
     found = fitted.parameters["frequency"]
-    step = float(np.diff(reduced["line_frequency"].values[:2])[0])
+    step = float(np.diff(blocks["line_frequency"].values[:2])[0])
     assert found.low < true < found.high
     assert found.high - found.low < 2.0 * step
 
 
 def test_simulation_of_named_effects_runs(shaken):
-    naming, baseline = shaken
-    (fitted,) = fit_identifications(naming, baseline)
+    identifications, baseline = shaken
+    (fitted,) = fit_identifications(identifications, baseline)
     values = {item.name: getattr(fitted.effect, item.name) for item in fitted.effect.parameters()}
     log = simulate(
         {"noise": {"N": 0.003}, "effect": [{"name": fitted.effect.name, "axes": ["y"], **values}],
@@ -265,22 +276,33 @@ def test_axes_that_the_strongest_view_lacks_have_their_sizes_from_the_next():
         "sensitivity": list(truth.values()),
         "axes": list(truth),
     }
-    reduced = record([effect], environment=world)
-    baseline = calibrate_noise(reduced)
-    candidates, reasons = effect_candidates(reduced, baseline["coefficient"])
+    blocks = record([effect], environment=world)
+    baseline = calibrate_noise(blocks)
+    candidates, reasons = effect_candidates(blocks, baseline["coefficient"])
     power, cross = (
-        next(one for one in candidates if (one.effect, one.view) == (effect["name"], view))
-        for view in ("power", "cross")
+        next(
+            one for one in candidates if (one.effect, one.statistic) == (effect["name"], statistic)
+        )
+        for statistic in ("power", "cross")
     )
-    parts = [
+    components = [
         Component(cross, cross.variants[0], ("x", "y"), 90.0),
         *(Component(power, power.variants[0], (axis,), 40.0) for axis in "yz"),
     ]
-    claim = Identification(effect["name"], power.driver, tuple(truth), tuple(parts), 130.0, 8.0)
-    state = condition_on(begin_state(reduced, baseline), parts)
+    identification = Identification(
+        effect["name"], power.driver, tuple(truth), tuple(components), 130.0, 8.0
+    )
+    state = condition_on(begin_state(blocks, baseline), components)
     (fitted,) = fit_identifications(
         Identifications(
-            (claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(reduced)
+            (identification,),
+            (),
+            8.0,
+            np.zeros(1),
+            reasons,
+            tuple(candidates),
+            state,
+            fold_blocks(blocks),
         ),
         baseline,
     )

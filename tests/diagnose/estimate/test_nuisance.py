@@ -18,46 +18,48 @@ from tests.support.named import record
 
 @pytest.fixture(scope="module")
 def quiet():
-    reduced = record([])
-    return reduced, calibrate_noise(reduced)
+    blocks = record([])
+    return blocks, calibrate_noise(blocks)
 
 
-def _variant(naming, part, values):
+def _variant(identifications, component, values):
     candidate = next(
         one
-        for one in naming.candidates
-        if one.key == part.candidate.key and one.view == part.candidate.view
+        for one in identifications.candidates
+        if one.key == component.candidate.key and one.statistic == component.candidate.statistic
     )
     return next(
         one
         for one in candidate.variants
-        if one.columns == part.variant.columns
+        if one.columns == component.variant.columns
         and all(
             one.values[name] == pytest.approx(value, rel=0.01) for name, value in values.items()
         )
     )
 
 
-def fitted(quiet, effect, view, column, *, true, size, named):
+def fitted(quiet, effect, statistic, column, *, true, size, named):
     """The fit of an effect with the values `true`, where naming likes `named` best."""
-    reduced, baseline = quiet
-    naming = claimed(reduced, baseline, effect, view, (column,))
-    part = naming.claims[0].parts[0]
-    design = _variant(naming, part, true).design
-    if view == "mean":
-        seen = reduced.assign(
-            mean=reduced["mean"]
+    blocks, baseline = quiet
+    identifications = claimed(blocks, baseline, effect, statistic, (column,))
+    component = identifications.identified[0].components[0]
+    design = _variant(identifications, component, true).design
+    if statistic == "mean":
+        seen = blocks.assign(
+            mean=blocks["mean"]
             + size * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
         )
     else:
-        seen = reduced.assign(
-            power=reduced["power"]
+        seen = blocks.assign(
+            power=blocks["power"]
             + size**2 * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
         )
-    part = replace(part, variant=_variant(naming, part, named))
-    claim = replace(naming.claims[0], parts=(part,))
-    state = condition_on(begin_state(seen, baseline), [part])
-    (found,) = fit_identifications(replace(naming, claims=(claim,), state=state), baseline)
+    component = replace(component, variant=_variant(identifications, component, named))
+    identification = replace(identifications.identified[0], components=(component,))
+    state = condition_on(begin_state(seen, baseline), [component])
+    (found,) = fit_identifications(
+        replace(identifications, identified=(identification,), state=state), baseline
+    )
     return found
 
 

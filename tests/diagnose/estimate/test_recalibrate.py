@@ -38,10 +38,10 @@ def reduced_of(*effects, axes=("x", "y"), environment=(), lost=0.0):
     return reduce_log(log.assign(rate=log["rate"].where(there).assign_attrs(log["rate"].attrs)))
 
 
-def naming_of(reduced, baseline, effect, view, columns, **values):
+def naming_of(blocks, baseline, effect, statistic, columns, **values):
     """A naming of one effect on the axis x, or on both where it is a property of the pair."""
-    known, reasons = effect_candidates(reduced, baseline["coefficient"])
-    one = next(one for one in known if one.effect == effect and one.view == view)
+    known, reasons = effect_candidates(blocks, baseline["coefficient"])
+    one = next(one for one in known if one.effect == effect and one.statistic == statistic)
     fits = [each for each in one.variants if each.columns == columns]
     variant = min(
         fits,
@@ -50,12 +50,12 @@ def naming_of(reduced, baseline, effect, view, columns, **values):
             for name, size in values.items()
         ),
     )
-    rows = [("x", "y")] if view == "cross" else [("x",)]
-    parts = tuple(Component(one, variant, row, 500.0) for row in rows)
-    claim = Identification(effect, one.driver, rows[0], parts, 500.0, 8.0)
-    state = condition_on(begin_state(reduced, baseline), list(parts))
+    rows = [("x", "y")] if statistic == "cross" else [("x",)]
+    components = tuple(Component(one, variant, row, 500.0) for row in rows)
+    identification = Identification(effect, one.driver, rows[0], components, 500.0, 8.0)
+    state = condition_on(begin_state(blocks, baseline), list(components))
     return Identifications(
-        (claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced)
+        (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(blocks)
     )
 
 
@@ -67,12 +67,18 @@ def noise_of(baseline, term, axis="x"):
 
 @pytest.fixture(scope="module")
 def shaken():
-    reduced = reduced_of(
+    blocks = reduced_of(
         {"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, environment=[SHAKE]
     )
-    baseline = calibrate_noise(reduced)
-    naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
-    return naming, baseline, recalibrate(naming, baseline, fit_identifications(naming, baseline))
+    baseline = calibrate_noise(blocks)
+    identifications = naming_of(
+        blocks, baseline, "vibration_noise", "power", ("white",), exponent=1.0
+    )
+    return (
+        identifications,
+        baseline,
+        recalibrate(identifications, baseline, fit_identifications(identifications, baseline)),
+    )
 
 
 def test_vibration_at_two_levels_and_never_none(shaken):
@@ -86,14 +92,14 @@ def test_vibration_at_two_levels_and_never_none(shaken):
 
 def test_a_diagnosis_tells_noise_and_effects_as_they_are_beside_each_other(shaken):
     """The first calibration has the vibration in its noise, and finds less of it than there is."""
-    naming, baseline, after = shaken
+    identifications, baseline, after = shaken
     fit = conclude.fitted_beside_their_noise(
-        naming, baseline, first := fit_identifications(naming, baseline)
+        identifications, baseline, first := fit_identifications(identifications, baseline)
     )
     assert noise_of(fit.noise, "N")[0] == noise_of(after, "N")[0] < 1.2 * 0.003
     (size,) = fit.fitted[0].parameters.values()
     assert size.low < 0.002 < size.high
-    held = conclude.worth(naming.state.reduced, baseline, naming, first)
+    held = conclude.worth(identifications.state.blocks, baseline, identifications, first)
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.15)
 
 
@@ -105,13 +111,13 @@ def test_a_size_in_shares_of_the_noise_is_one_of_the_noise_beside_it():
         "unit": "degC",
         "points": [[0, 35], [600, 35], [601, 50], [1200, 50], [1201, 65], [1800, 65]],
     }
-    reduced = reduced_of(
+    blocks = reduced_of(
         {"name": "temperature_noise", "linear": 0.05, "axes": ["x"]}, environment=[heat]
     )
-    baseline = calibrate_noise(reduced)
-    naming = naming_of(reduced, baseline, "temperature_noise", "power", ("linear",))
-    first = fit_identifications(naming, baseline)
-    fit = conclude.fitted_beside_their_noise(naming, baseline, first)
+    baseline = calibrate_noise(blocks)
+    identifications = naming_of(blocks, baseline, "temperature_noise", "power", ("linear",))
+    first = fit_identifications(identifications, baseline)
+    fit = conclude.fitted_beside_their_noise(identifications, baseline, first)
     assert first[0].parameters["linear"].high < 0.05
     growth = fit.fitted[0].parameters["linear"].value * noise_of(fit.noise, "N")[0] ** 2
     assert growth == pytest.approx(0.05 * 0.003**2, rel=0.1)
@@ -124,34 +130,41 @@ def test_an_axis_without_an_effect_keeps_its_noise(shaken):
 
 
 def test_effect_and_new_noise_make_the_record(shaken):
-    naming, _, after = shaken
-    model = predicted(with_noise(naming, after), after)
-    ratio = (naming.state.reduced["power"] / model["spectrum"]).sel(axis="x")
-    shape = naming.state.reduced["shape"].sel(axis="x")
-    for blocks in (slice(0, 42), slice(43, None)):
-        part = ratio.isel(block=blocks).weighted(shape.isel(block=blocks).fillna(0.0)).mean()
-        assert float(part) == pytest.approx(
-            1.0, abs=5.0 / np.sqrt(float(shape.isel(block=blocks).sum()))
+    identifications, _, after = shaken
+    model = predicted(with_noise(identifications, after), after)
+    ratio = (identifications.state.blocks["power"] / model["spectrum"]).sel(axis="x")
+    shape = identifications.state.blocks["shape"].sel(axis="x")
+    for block_count in (slice(0, 42), slice(43, None)):
+        component = (
+            ratio.isel(block=block_count).weighted(shape.isel(block=block_count).fillna(0.0)).mean()
+        )
+        assert float(component) == pytest.approx(
+            1.0, abs=5.0 / np.sqrt(float(shape.isel(block=block_count).sum()))
         )
 
 
 def test_noise_of_held_out_time_is_not_used(shaken):
-    naming, baseline, _ = shaken
-    known = np.arange(naming.state.reduced.sizes["block"]) % 2 == 0
-    blind = recalibrate(naming, baseline, [], known)
-    spoiled = naming.state.reduced.copy()
+    identifications, baseline, _ = shaken
+    known = np.arange(identifications.state.blocks.sizes["block"]) % 2 == 0
+    blind = recalibrate(identifications, baseline, [], known)
+    spoiled = identifications.state.blocks.copy()
     spoiled["power"] = spoiled["power"].where(xr.DataArray(known, dims="block"), 99.0)
     other = recalibrate(
-        replace(naming, state=replace(naming.state, reduced=spoiled)), baseline, [], known
+        replace(identifications, state=replace(identifications.state, blocks=spoiled)),
+        baseline,
+        [],
+        known,
     )
     assert noise_of(blind, "N")[0] == pytest.approx(noise_of(other, "N")[0], rel=0.03)
 
 
 def test_what_axes_share_is_no_noise_of_their_own():
-    reduced = reduced_of({"name": "shared_source", "N": 0.002})
-    baseline = calibrate_noise(reduced)
-    naming = naming_of(reduced, baseline, "shared_source", "cross", ("N",), bandwidth=np.inf)
-    after = recalibrate(naming, baseline, fit_identifications(naming, baseline))
+    blocks = reduced_of({"name": "shared_source", "N": 0.002})
+    baseline = calibrate_noise(blocks)
+    identifications = naming_of(
+        blocks, baseline, "shared_source", "cross", ("N",), bandwidth=np.inf
+    )
+    after = recalibrate(identifications, baseline, fit_identifications(identifications, baseline))
     for axis in "xy":
         assert noise_of(baseline, "N", axis)[0] > 1.15 * 0.003
         value, error = noise_of(after, "N", axis)
@@ -168,29 +181,32 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
         "points": [[0, 0.02], [600, 0.02], [601, 6.0], [1200, 6.0], [1201, 0.02], [1800, 0.02]],
         "band": [17.5, 20.0],
     }
-    reduced = reduced_of(
+    blocks = reduced_of(
         {"name": "aliased_vibration", "sensitivity": 0.3, "low": 17.5, "high": 20.0},
         environment=[shaken],
     )
-    baseline = calibrate_noise(reduced)
-    known, reasons = effect_candidates(reduced, baseline["coefficient"])
-    views = {one.view: one for one in known if one.effect == "aliased_vibration"}
+    baseline = calibrate_noise(blocks)
+    known, reasons = effect_candidates(blocks, baseline["coefficient"])
+    statistics = {one.statistic: one for one in known if one.effect == "aliased_vibration"}
     variants = {
-        view: next(each for each in one.variants if each.values["sampling"] == "point")
-        for view, one in views.items()
+        statistic: next(each for each in one.variants if each.values["sampling"] == "point")
+        for statistic, one in statistics.items()
     }
     places = [("power", ("x",)), ("power", ("y",)), ("cross", ("x", "y"))]
-    parts = tuple(Component(views[view], variants[view], row, 500.0) for view, row in places)
-    claim = Identification(
-        "aliased_vibration", views["power"].driver, ("x", "y"), parts, 500.0, 8.0
+    components = tuple(
+        Component(statistics[statistic], variants[statistic], row, 500.0)
+        for statistic, row in places
     )
-    state = condition_on(begin_state(reduced, baseline), list(parts))
-    naming = Identifications(
-        (claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(reduced)
+    identification = Identification(
+        "aliased_vibration", statistics["power"].driver, ("x", "y"), components, 500.0, 8.0
     )
-    first = fit_identifications(naming, baseline)
-    noise = recalibrate(naming, baseline, first)
-    for fitted in (first, fit_identifications(with_noise(naming, noise), noise)):
+    state = condition_on(begin_state(blocks, baseline), list(components))
+    identifications = Identifications(
+        (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(blocks)
+    )
+    first = fit_identifications(identifications, baseline)
+    noise = recalibrate(identifications, baseline, first)
+    for fitted in (first, fit_identifications(with_noise(identifications, noise), noise)):
         sizes = [
             one.value
             for name, one in fitted[0].parameters.items()
@@ -216,18 +232,20 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
 
 @pytest.mark.parametrize("size", [10.0, 40.0])
 def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them(size):
-    reduced = reduced_of(
+    blocks = reduced_of(
         {"name": "spikes", "kind": "outlier", "per_hour": 60.0, "size": size}, axes=["x"]
     )
-    baseline = calibrate_noise(reduced)
-    naming = naming_of(reduced, baseline, "spikes", "marks", ("outliers",))
-    naming = replace(naming, tallies=CountEvidence({"outliers": (np.zeros(1), np.ones(1))}))
-    (fitted,) = fit_identifications(naming, baseline)
+    baseline = calibrate_noise(blocks)
+    identifications = naming_of(blocks, baseline, "spikes", "marks", ("outliers",))
+    identifications = replace(
+        identifications, count_evidence=CountEvidence({"outliers": (np.zeros(1), np.ones(1))})
+    )
+    (fitted,) = fit_identifications(identifications, baseline)
     for name, true in (("per_hour", 60.0), ("size", size)):
         one = fitted.parameters[name]
         assert one.low <= true <= one.high
         assert one.stderr < 0.3 * one.value
-    value, error = noise_of(recalibrate(naming, baseline, [fitted]), "N")
+    value, error = noise_of(recalibrate(identifications, baseline, [fitted]), "N")
     assert abs(value - 0.003) < 3.0 * error
     assert error < 0.05 * value
 
@@ -244,15 +262,15 @@ def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them
     ],
 )
 def test_noise_before_a_filter(table, grid, lost):
-    reduced = reduced_of({"name": "logger_filter", **table}, axes=["x"], lost=lost)
-    baseline = calibrate_noise(reduced)
-    naming = naming_of(reduced, baseline, "logger_filter", "power", (), **grid)
-    (fitted,) = fit_identifications(naming, baseline)
+    blocks = reduced_of({"name": "logger_filter", **table}, axes=["x"], lost=lost)
+    baseline = calibrate_noise(blocks)
+    identifications = naming_of(blocks, baseline, "logger_filter", "power", (), **grid)
+    (fitted,) = fit_identifications(identifications, baseline)
     name = "cutoff" if "cutoff" in table else "length"
     one = fitted.parameters[name]
     assert one.low <= table[name] <= one.high
     assert one.value == pytest.approx(table[name], rel=0.04 if lost == 0.0 else 0.15)
-    after = recalibrate(naming, baseline, [fitted])
+    after = recalibrate(identifications, baseline, [fitted])
     assert noise_of(baseline, "N")[0] < 0.8 * 0.003
     value, error = noise_of(after, "N")
     assert abs(value - 0.003) < 3.0 * error
@@ -260,6 +278,6 @@ def test_noise_before_a_filter(table, grid, lost):
 
 
 def test_a_model_that_was_given_keeps_its_noise(shaken):
-    naming, baseline, _ = shaken
+    identifications, baseline, _ = shaken
     given = baseline.assign_attrs(source="model")
-    assert recalibrate(naming, given, []) is given
+    assert recalibrate(identifications, given, []) is given

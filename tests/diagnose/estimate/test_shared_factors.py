@@ -21,43 +21,43 @@ RECORDS = 8
 
 @pytest.fixture(scope="module")
 def quiet():
-    reduced = record([])
-    candidates, _ = effect_candidates(reduced, COEFFICIENT)
+    blocks = record([])
+    candidates, _ = effect_candidates(blocks, COEFFICIENT)
     return (
-        reduced,
-        calibrate_noise(reduced),
+        blocks,
+        calibrate_noise(blocks),
         next(one for one in candidates if one.effect == "shared_source"),
     )
 
 
 def sizes(quiet, factors, number, *, bandwidth=math.inf, axes=AXES):
     """Sizes from cross-spectra that are drawn about those of common noise with these factors, white or behind one pole."""
-    reduced, baseline, candidate = quiet
+    blocks, baseline, candidate = quiet
     rng = np.random.default_rng([11, number])
-    f = reduced["frequency"].values
+    f = blocks["frequency"].values
     density = 3600.0 / (1.0 + (f / bandwidth) ** 2)
     spectrum = baseline["spectrum"].transpose("axis", "block", "band").values
-    shape = reduced["cross_shape"].transpose("pair", "block", "band").values
+    shape = blocks["cross_shape"].transpose("pair", "block", "band").values
     cross = np.empty(shape.shape, np.complex128)
-    for row, pair in enumerate(pair_rows(reduced)):
+    for row, pair in enumerate(pair_rows(blocks)):
         i, j = (AXES.index(axis) for axis in pair)
         scatter = np.sqrt(spectrum[i] * spectrum[j] / (2.0 * shape[row]))
         noise = scatter * (
             rng.standard_normal(shape[row].shape) + 1j * rng.standard_normal(shape[row].shape)
         )
         cross[row] = (
-            factors[i] * factors[j] * cross_column(density[None, None], row, reduced) + noise
+            factors[i] * factors[j] * cross_column(density[None, None], row, blocks) + noise
         )
     state = begin_state(
-        reduced.assign(cross=xr.DataArray(cross, dims=("pair", "block", "band"))), baseline
+        blocks.assign(cross=xr.DataArray(cross, dims=("pair", "block", "band"))), baseline
     )
     variant = candidate.variants[-1]
-    parts = [
+    components = [
         Component(candidate, variant, row, 10.0)
-        for row in pair_rows(reduced)
+        for row in pair_rows(blocks)
         if set(row) <= set(axes)
     ]
-    return estimate_shared_factors(parts, axes, state)
+    return estimate_shared_factors(components, axes, state)
 
 
 @pytest.mark.parametrize("bandwidth", [math.inf, 1.2])

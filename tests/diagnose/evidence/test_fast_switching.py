@@ -73,7 +73,7 @@ def test_finds_hops_within_blocks_and_their_numbers(low: float, high: float, ste
     rng = np.random.default_rng(1)
     course = course_of(rng, low, high, BLOCKS * STEP, PIECES / STEP)
     found = found_in(step * course, rng)
-    assert found.gain > 20.0
+    assert found.evidence_nats > 20.0
     np.testing.assert_allclose(found.times, [low, high], rtol=0.4)
     assert np.sqrt(np.mean((found.share.ravel() - course) ** 2)) < 0.15
     slope = np.polyfit(found.share.ravel(), step * course, 1)[0]
@@ -98,7 +98,7 @@ def test_noise_of_the_same_second_order_does_not_hop() -> None:
                 [np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(BLOCKS * PIECES + 500)
             )[500:]
         )
-        assert found_in(bias, rng).gain < 3.0
+        assert found_in(bias, rng).evidence_nats < 3.0
 
 
 def test_waves_and_bumps_of_any_height_do_not_hop_between_two_levels() -> None:
@@ -106,7 +106,7 @@ def test_waves_and_bumps_of_any_height_do_not_hop_between_two_levels() -> None:
     time = (np.arange(BLOCKS * PIECES) + 0.5) * STEP / PIECES
     for period in (8.0, 20.0, 45.0):
         for size in (0.5, 10.0):
-            assert found_in(size * np.sin(2.0 * np.pi * time / period), rng).gain < 3.0
+            assert found_in(size * np.sin(2.0 * np.pi * time / period), rng).evidence_nats < 3.0
 
 
 def test_three_levels_are_not_two() -> None:
@@ -115,7 +115,7 @@ def test_three_levels_are_not_two() -> None:
         first, second = (
             course_of(rng, dwell, dwell, BLOCKS * STEP, PIECES / STEP) for _ in range(2)
         )
-        assert found_in(2.0 * (first + second), rng).gain == -np.inf
+        assert found_in(2.0 * (first + second), rng).evidence_nats == -np.inf
 
 
 @pytest.mark.parametrize("dwell", [2.0, 4.0, 10.0])
@@ -128,18 +128,18 @@ def test_a_bias_that_hops_among_three_levels_at_random_is_not_two(dwell: float) 
         stay = max(1, int(rng.exponential(dwell) * PIECES / STEP * fine))
         course[at : at + stay] = level
         at, level = at + stay, (level + int(rng.integers(1, 3))) % 3
-    assert found_in(4.0 * course.reshape(-1, fine).mean(axis=1), rng).gain == -np.inf
+    assert found_in(4.0 * course.reshape(-1, fine).mean(axis=1), rng).evidence_nats == -np.inf
 
 
 def test_powers_within_blocks_are_those_of_the_samples() -> None:
     rng = np.random.default_rng(5)
     course = course_of(rng, 15.0, 6.0, 1200.0, 10.0)
     log = make_log(course[None], rate=10.0, unit="deg/h")
-    reduced = reduce_log(log, block="20s")
-    size = int(reduced.attrs["block_samples"])
-    seen = reduced["power"].values[0]
-    told = switching_powers(reduced["piece_mean"].values[0], 15.0, 6.0, size, 10.0)
-    slow = reduced["frequency"].values < 0.3
+    blocks = reduce_log(log, block="20s")
+    size = int(blocks.attrs["block_samples"])
+    seen = blocks["power"].values[0]
+    told = switching_powers(blocks["piece_mean"].values[0], 15.0, 6.0, size, 10.0)
+    slow = blocks["frequency"].values < 0.3
     np.testing.assert_allclose(told[:, slow].mean(axis=0), seen[:, slow].mean(axis=0), rtol=0.05)
     np.testing.assert_allclose(
         told.mean(axis=0), seen.mean(axis=0), rtol=0.25

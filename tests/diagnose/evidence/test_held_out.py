@@ -51,7 +51,7 @@ def mean_case(
     data = xr.Dataset(
         {"mean": (("record", "axis", "block"), mean)}, coords={**frame(n), "axis": ["x"]}
     )
-    K, B = (part.ravel() for part in np.meshgrid([0.0, 0.02, 0.1], [0.0, 0.01]))
+    K, B = (component.ravel() for component in np.meshgrid([0.0, 0.02, 0.1], [0.0, 0.01]))
     grid = ("axis", "grid")
     weights = rng.uniform(-3.0, 0.0, (2, 1, K.size))
     baseline = xr.Dataset(
@@ -242,10 +242,10 @@ def test_gain_is_what_the_folds_lose_at_the_best_length():
     gains = score(factors, [0, 0, 1])
     for record in range(5):
         mixed = np.log(np.exp(factors[:, :2, record]).mean(axis=1))
-        parts = [
+        components = [
             sum(mixed[0] - mixed[1 + 4 * length + fold] for fold in range(4)) for length in range(3)
         ]
-        assert gains[0, record] == pytest.approx(max(parts))
+        assert gains[0, record] == pytest.approx(max(components))
     assert gains[1, 0] == pytest.approx(
         max((factors[0, 2, 0] - factors[1 + 4 * i : 5 + 4 * i, 2, 0]).sum() for i in range(3))
     )
@@ -307,8 +307,8 @@ def test_units_of_a_design_do_not_matter():
 
 
 def test_folds_are_interleaved_and_scale_with_the_record():
-    reduced = xr.Dataset(coords={name: value for name, value in frame(180).items()})
-    fold = fold_blocks(reduced)
+    blocks = xr.Dataset(coords={name: value for name, value in frame(180).items()})
+    fold = fold_blocks(blocks)
     assert fold["length"].values.tolist() == [100.0, 360.0, 900.0]
     assert [int((fold == number).sum()) for number in range(4)] == [
         45 + 54 + 45,
@@ -347,15 +347,13 @@ def test_many_records_take_seconds():
 def test_a_spectrum_that_falls_is_no_quantization_of_negative_power():
     """A mean of two neighbours takes ``4 a (1 - a) sin^2(pi f / fs)`` off, the form of Q: but the square of Q ends at zero."""
     raw = np.random.default_rng(12).standard_normal((1, 20_001))
-    reduced = reduce_log(make_log(0.9 * raw[:, 1:] + 0.1 * raw[:, :-1], rate=10.0, unit="deg/h"))
-    baseline = calibrate_noise(reduced)
+    blocks = reduce_log(make_log(0.9 * raw[:, 1:] + 0.1 * raw[:, :-1], rate=10.0, unit="deg/h"))
+    baseline = calibrate_noise(blocks)
     design = [
-        np.tile(
-            np.sin(np.pi * reduced["frequency"].values / 10.0) ** 2, (reduced.sizes["block"], 1)
-        )
+        np.tile(np.sin(np.pi * blocks["frequency"].values / 10.0) ** 2, (blocks.sizes["block"], 1))
     ]
-    found = power_factors(reduced, baseline, design, axis="x")[0, 1, 0]
-    beside_any = power_factors(reduced, baseline.drop_vars("posterior"), design, axis="x")[0, 1, 0]
+    found = power_factors(blocks, baseline, design, axis="x")[0, 1, 0]
+    beside_any = power_factors(blocks, baseline.drop_vars("posterior"), design, axis="x")[0, 1, 0]
     assert found > 20.0
     assert found > 1.3 * beside_any
     assert (
@@ -368,18 +366,18 @@ def test_a_spectrum_that_falls_is_no_quantization_of_negative_power():
 def test_a_weak_filter_gains_more_than_noise_reaches(share, least, most):
     """Six per cent of every sample come late: the spectrum falls by a quarter towards its end."""
     raw = np.random.default_rng(12).standard_normal((2, 15_001))
-    reduced = reduce_log(
+    blocks = reduce_log(
         make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h")
     )
-    baseline = calibrate_noise(reduced)
+    baseline = calibrate_noise(blocks)
     filters = [
         one
-        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect == "logger_filter"
     ]
-    (noise,) = null_records(reduced, baseline, count=200, rng=np.random.default_rng(3), chunk=200)
-    start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    (found,) = totals(compute_evidence(filters, reduced, start, folds)).values()
+    (noise,) = null_records(blocks, baseline, count=200, rng=np.random.default_rng(3), chunk=200)
+    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    (found,) = totals(compute_evidence(filters, blocks, start, folds)).values()
     (drawn,) = totals(
         compute_evidence(filters, noise, start, folds, rng=np.random.default_rng(1))
     ).values()

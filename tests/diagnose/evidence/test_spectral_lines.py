@@ -39,8 +39,8 @@ def spectra(density: np.ndarray, *, records: int = 20, seed: int = 1) -> np.ndar
 def test_slopes_and_humps_are_no_lines() -> None:
     place = np.arange(1.0, 601.0)
     for density in (place**-2.0, place**2.0, 1.0 + 50.0 * np.exp(-(((place - 90.0) / 15.0) ** 2))):
-        gain = line_evidence(spectra(density[None]), WEIGHT)
-        assert gain.max(axis=-1).max() < 8.0  # of 12 000 lines
+        evidence_nats = line_evidence(spectra(density[None]), WEIGHT)
+        assert evidence_nats.max(axis=-1).max() < 8.0  # of 12 000 lines
 
 
 def test_what_comes_and_goes_is_no_steady_line() -> None:
@@ -72,52 +72,53 @@ def sines(
 
 @pytest.mark.parametrize("wander", [0.0, 30.0])
 def test_the_skirt_holds_the_line_and_no_other(wander: float) -> None:
-    reduced = sines({1.0: 3.0, 3.1: 1.0}, wander=wander)
-    lines = reduced["line_frequency"].values
+    blocks = sines({1.0: 3.0, 3.1: 1.0}, wander=wander)
+    lines = blocks["line_frequency"].values
     place = int(np.abs(lines - 1.0).argmin())
-    skirt = line_skirt(reduced, "x", place)
+    skirt = line_skirt(blocks, "x", place)
     assert skirt[place]
     assert (np.abs(lines[skirt] - 1.0) < 1.5).all()
-    (amplitude, error), (frequency, _) = line_size(reduced, "x", place)
+    (amplitude, error), (frequency, _) = line_size(blocks, "x", place)
     assert amplitude == pytest.approx(3.0, abs=max(4.0 * error, 0.15))
     assert frequency == pytest.approx(1.0, abs=0.03)
 
 
 @pytest.fixture(scope="module")
 def lines() -> tuple[Identification, ...]:
-    reduced = sines({0.7: 0.25, 2.03: 0.15, 4.06: 0.2}, size=12_000)
-    baseline, records = nulls(reduced, 40)
-    return name_effects(reduced, baseline, records).claims
+    blocks = sines({0.7: 0.25, 2.03: 0.15, 4.06: 0.2}, size=12_000)
+    baseline, records = nulls(blocks, 40)
+    return name_effects(blocks, baseline, records).identified
 
 
 def test_each_line_is_a_claim_of_its_own(lines: tuple[Identification, ...]) -> None:
-    assert [claim.effect for claim in lines] == ["spectral_line"] * 3
-    assert all(claim.axes == ("x",) for claim in lines)
-    assert all(len({part.place for part in claim.parts}) == 1 for claim in lines)
-    assert len({claim.parts[0].place for claim in lines}) == 3
+    assert [identification.effect for identification in lines] == ["spectral_line"] * 3
+    assert all(identification.axes == ("x",) for identification in lines)
     assert all(
-        {"real_motion", "supply_bias", "feedback_reset"} <= set(claim.alternatives)
-        for claim in lines
+        len({component.place for component in identification.components}) == 1
+        for identification in lines
+    )
+    assert len({identification.components[0].place for identification in lines}) == 3
+    assert all(
+        {"real_motion", "supply_bias", "feedback_reset"} <= set(identification.alternatives)
+        for identification in lines
     )  # three may be a comb
 
 
 def test_a_line_changes_no_gain_of_the_means() -> None:
-    reduced = sines({0.7: 0.4}, size=9_000, axes=1)
-    state, folds = begin_state(reduced, calibrate_noise(reduced)), fold_blocks(reduced)
-    candidates, _ = effect_candidates(reduced, state.baseline["coefficient"])
-    found = compute_evidence(candidates, reduced, state, folds)
+    blocks = sines({0.7: 0.4}, size=9_000, axes=1)
+    state, folds = begin_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
+    candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
+    found = compute_evidence(candidates, blocks, state, folds)
     line, jump = (by_key(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
-    assert line.gain > 10.0
+    assert line.evidence_nats > 10.0
     named = condition_on(state, [line])
     kept = of_means(found, state, named)
-    assert {one.candidate.view for one in kept} == {"mean", "levels"}
-    again = compute_evidence([one.candidate for one in kept], named.reduced, named, folds)
+    assert {one.candidate.statistic for one in kept} == {"mean", "levels"}
+    again = compute_evidence([one.candidate for one in kept], named.blocks, named, folds)
     for one, other in zip(kept, again, strict=True):
-        np.testing.assert_array_equal(one.gain, other.gain)
+        np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
     assert not of_means(found, state, condition_on(state, [jump]))
-    lost = replace(
-        state, reduced=reduced.assign(mean=reduced["mean"].where(reduced["begin"] > 0.0))
-    )
+    lost = replace(state, blocks=blocks.assign(mean=blocks["mean"].where(blocks["begin"] > 0.0)))
     assert not of_means(found, state, lost)
 
 
@@ -125,41 +126,49 @@ def test_a_line_changes_no_gain_of_the_means() -> None:
 # bookkeeping
 
 
-def part(effect: str, view: str, gain: float, place: int = -1) -> Component:
+def component(effect: str, statistic: str, evidence_nats: float, place: int = -1) -> Component:
     variant = Variant({}, ("size",), np.empty(0))
-    return Component(Candidate(effect, view, (), (variant,)), variant, ("x",), gain, place)
+    return Component(
+        Candidate(effect, statistic, (), (variant,)), variant, ("x",), evidence_nats, place
+    )
 
 
-def claim(one: Component) -> Identification:
-    return Identification(one.candidate.effect, (), one.row, (one,), one.gain, 7.0)
+def identification(one: Component) -> Identification:
+    return Identification(one.candidate.effect, (), one.row, (one,), one.evidence_nats, 7.0)
 
 
 def test_a_line_counts_for_the_plainest_name_only() -> None:
     found = {
-        "spectral_line": [part("spectral_line", "line", 50.0)],
+        "spectral_line": [component("spectral_line", "line", 50.0)],
         "supply_bias(supply)": [
-            part("supply_bias", "line", 50.0),
-            part("supply_bias", "mean", 9.0),
+            component("supply_bias", "line", 50.0),
+            component("supply_bias", "mean", 9.0),
         ],
-        "real_motion": [part("real_motion", "line", 50.0)],
+        "real_motion": [component("real_motion", "line", 50.0)],
     }
     kept = without_lines(found)
     assert kept["spectral_line"] == found["spectral_line"]
-    assert [one.candidate.view for one in kept["supply_bias(supply)"]] == ["mean"]
+    assert [one.candidate.statistic for one in kept["supply_bias(supply)"]] == ["mean"]
     assert "real_motion" not in kept
 
 
 def test_claims_of_one_effect_become_one_but_for_lines_of_other_frequencies() -> None:
-    first = claim(part("spectral_line", "line", 50.0, 3))
-    assert len(add_identification([first], claim(part("spectral_line", "line", 20.0, 9)))) == 2
-    (both,) = add_identification(
-        [first], replace(claim(part("spectral_line", "line", 20.0, 3)), axes=("y",))
+    first = identification(component("spectral_line", "line", 50.0, 3))
+    assert (
+        len(
+            add_identification([first], identification(component("spectral_line", "line", 20.0, 9)))
+        )
+        == 2
     )
-    assert (both.axes, both.gain) == (("x", "y"), 70.0)
+    (both,) = add_identification(
+        [first], replace(identification(component("spectral_line", "line", 20.0, 3)), axes=("y",))
+    )
+    assert (both.axes, both.evidence_nats) == (("x", "y"), 70.0)
     assert (
         len(
             add_identification(
-                [claim(part("shupe", "mean", 9.0))], claim(part("shupe", "mean", 8.0))
+                [identification(component("shupe", "mean", 9.0))],
+                identification(component("shupe", "mean", 8.0)),
             )
         )
         == 1
@@ -167,22 +176,29 @@ def test_claims_of_one_effect_become_one_but_for_lines_of_other_frequencies() ->
 
 
 def test_a_steady_line_leaves_no_error_of_its_form() -> None:
-    chosen = [claim(part("spectral_line", "line", 900.0, 3)), claim(part("shupe", "mean", 400.0))]
-    assert form_error([part("spectral_line", "line", 20.0, 9)], chosen, share=0.01) == 0.0
-    assert form_error([part("warm_up", "mean", 20.0)], chosen, share=0.01) == pytest.approx(4.0)
+    chosen = [
+        identification(component("spectral_line", "line", 900.0, 3)),
+        identification(component("shupe", "mean", 400.0)),
+    ]
+    assert form_error([component("spectral_line", "line", 20.0, 9)], chosen, share=0.01) == 0.0
+    assert form_error([component("warm_up", "mean", 20.0)], chosen, share=0.01) == pytest.approx(
+        4.0
+    )
 
 
 def test_the_spectrum_of_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
-    driven = replace(claim(part("vibration_noise", "power", 200.0)), driver=("vibration",))
-    steady = claim(part("relative_intensity_noise", "power", 200.0))
+    driven = replace(
+        identification(component("vibration_noise", "power", 200.0)), driver=("vibration",)
+    )
+    steady = identification(component("relative_intensity_noise", "power", 200.0))
     for chosen, effect, error in (
         (driven, "logger_filter", 20.0),
         (driven, "temperature_noise", 2.0),
         (steady, "logger_filter", 2.0),
     ):
-        assert form_error([part(effect, "power", 17.0)], [chosen], share=0.01) == pytest.approx(
-            error
-        )
+        assert form_error(
+            [component(effect, "power", 17.0)], [chosen], share=0.01
+        ) == pytest.approx(error)
 
 
 @pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])

@@ -58,14 +58,16 @@ def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
     return data, baseline
 
 
-def hops(rng: np.random.Generator, low: float, high: float, blocks: int = BLOCKS) -> np.ndarray:
+def hops(
+    rng: np.random.Generator, low: float, high: float, block_count: int = BLOCKS
+) -> np.ndarray:
     """Share of each block on the upper level; times in seconds."""
-    fine, t, level = np.zeros(blocks * 20), 0.0, int(rng.integers(2))
+    fine, t, level = np.zeros(block_count * 20), 0.0, int(rng.integers(2))
     while t < fine.size:
         stay = rng.exponential((low, high)[level])
         fine[int(t) : int(t + stay) + 1] = level
         t, level = t + stay, 1 - level
-    return fine.reshape(blocks, 20).mean(axis=1)
+    return fine.reshape(block_count, 20).mean(axis=1)
 
 
 def white(rng: np.random.Generator, records: int) -> np.ndarray:
@@ -75,21 +77,26 @@ def white(rng: np.random.Generator, records: int) -> np.ndarray:
 def test_finds_hops_and_their_numbers() -> None:
     rng = np.random.default_rng(1)
     course = np.stack([hops(rng, 120.0, 240.0) for _ in range(20)])
-    gain, found = telegraph_evidence(*frame(0.6 * course + white(rng, 20)), axis="x")
-    assert np.median(gain) > 20.0
-    assert (gain > 5.0).mean() >= 0.9
+    evidence_nats, found = telegraph_evidence(*frame(0.6 * course + white(rng, 20)), axis="x")
+    assert np.median(evidence_nats) > 20.0
+    assert (evidence_nats > 5.0).mean() >= 0.9
     assert np.median(found.step) == pytest.approx(0.6, rel=0.05)
     np.testing.assert_allclose(np.median(found.times, axis=0) * STEP, [120.0, 240.0], rtol=0.3)
-    assert np.sqrt(np.mean((found.share[gain > 5.0] - course[gain > 5.0]) ** 2)) < 0.12
+    assert (
+        np.sqrt(np.mean((found.share[evidence_nats > 5.0] - course[evidence_nats > 5.0]) ** 2))
+        < 0.12
+    )
 
 
 def test_finds_hops_beside_a_walk_of_several_steps() -> None:
     rng = np.random.default_rng(2)
     walk = np.cumsum(0.07 * rng.standard_normal((20, BLOCKS)), axis=1)
     course = np.stack([hops(rng, 150.0, 150.0) for _ in range(20)])
-    gain, found = telegraph_evidence(*frame(1.5 * course + walk + white(rng, 20)), axis="x")
-    assert np.median(gain) > 10.0
-    assert np.median(found.step[gain > 10.0]) == pytest.approx(1.5, rel=0.1)
+    evidence_nats, found = telegraph_evidence(
+        *frame(1.5 * course + walk + white(rng, 20)), axis="x"
+    )
+    assert np.median(evidence_nats) > 10.0
+    assert np.median(found.step[evidence_nats > 10.0]) == pytest.approx(1.5, rel=0.1)
 
 
 def test_is_a_lower_bound_of_a_bayes_factor() -> None:
@@ -97,10 +104,10 @@ def test_is_a_lower_bound_of_a_bayes_factor() -> None:
     rng = np.random.default_rng(3)
     K = rng.choice(WALKS, 300) * np.sqrt(STEP / 3600.0)
     mean = white(rng, 300) + np.cumsum(K[:, None] * rng.standard_normal((300, BLOCKS)), axis=1)
-    gain, _ = telegraph_evidence(*frame(mean), axis="x")
-    assert np.isfinite(gain).mean() > 0.3
-    assert np.exp(gain).mean() < 1.0
-    assert gain.max() < 4.0
+    evidence_nats, _ = telegraph_evidence(*frame(mean), axis="x")
+    assert np.isfinite(evidence_nats).mean() > 0.3
+    assert np.exp(evidence_nats).mean() < 1.0
+    assert evidence_nats.max() < 4.0
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0])
@@ -111,18 +118,20 @@ def test_a_bias_on_a_spring_is_no_bias_of_two_levels(time: float, size: float) -
     fine = lfilter(
         [np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal((30, BLOCKS * 20 + 3000))
     )[:, -BLOCKS * 20 :]
-    gain, _ = telegraph_evidence(
+    evidence_nats, _ = telegraph_evidence(
         *frame(size * fine.reshape(30, BLOCKS, 20).mean(axis=2) + white(rng, 30)), axis="x"
     )
-    assert gain.max() < 3.0
+    assert evidence_nats.max() < 3.0
 
 
 def test_one_jump_and_back_are_no_two_levels() -> None:
     mean = np.zeros((1, BLOCKS)) + np.repeat([0.0, 2.0, 0.0], [30, 40, 30])
-    gain, found = telegraph_evidence(*frame(mean + white(np.random.default_rng(5), 1)), axis="x")
+    evidence_nats, found = telegraph_evidence(
+        *frame(mean + white(np.random.default_rng(5), 1)), axis="x"
+    )
     assert found.hops[0] == pytest.approx(2.0, abs=0.2)
     assert found.hops[0] < MEAN_SWITCHES
-    assert gain[0] == -np.inf
+    assert evidence_nats[0] == -np.inf
 
 
 def test_what_is_given_is_not_found_again_and_blocks_may_be_missing() -> None:
@@ -154,9 +163,13 @@ def test_the_other_sign_is_the_same_bias() -> None:
     np.testing.assert_allclose(one.step, other.step, rtol=0.01)
 
 
-def part(state: State, course: np.ndarray, axis: str = "x", gain: float = 50.0) -> Component:
+def component(
+    state: State, course: np.ndarray, axis: str = "x", evidence_nats: float = 50.0
+) -> Component:
     variant = Variant({"low": 100.0, "high": 200.0, "hops": 18.0}, ("step",), course[None, None])
-    return Component(Candidate("telegraph", "levels", (), (variant,)), variant, (axis,), gain)
+    return Component(
+        Candidate("telegraph", "levels", (), (variant,)), variant, (axis,), evidence_nats
+    )
 
 
 def state_of(mean: np.ndarray) -> State:
@@ -170,16 +183,16 @@ def test_a_bias_of_three_levels_is_not_possible() -> None:
     rng = np.random.default_rng(8)
     first, second = hops(rng, 150.0, 150.0), hops(rng, 200.0, 200.0)
     two = state_of(first + white(rng, 1)[0])
-    assert is_physical([part(two, first)], two)
+    assert is_physical([component(two, first)], two)
     more = state_of(first + 0.8 * second + white(rng, 1)[0])
-    assert not is_physical([part(more, first)], more)
+    assert not is_physical([component(more, first)], more)
 
 
 def test_sizes_are_those_of_the_course() -> None:
     rng = np.random.default_rng(9)
     course = hops(rng, 100.0, 200.0)
     state = state_of(0.5 * course + white(rng, 1)[0])
-    sizes = estimate_telegraph([part(state, course)], ("x",), state)
+    sizes = estimate_telegraph([component(state, course)], ("x",), state)
     value, error = sizes["step"]
     assert abs(value - 0.5) < 4.0 * error
     assert 0.015 < error < 0.06  # twice the noise of a mean over the root of the blocks
@@ -187,19 +200,22 @@ def test_sizes_are_those_of_the_course() -> None:
     assert sizes["high"] == (200.0, pytest.approx(200.0 / 3.0))
 
 
-def led(course: np.ndarray, gain: float, axis: str = "x") -> Component:
+def led(course: np.ndarray, evidence_nats: float, axis: str = "x") -> Component:
     """A mean that follows the temperature."""
     variant = Variant({}, ("sensitivity",), course[None, None])
     return Component(
-        Candidate("temperature_bias", "mean", ("temperature",), (variant,)), variant, (axis,), gain
+        Candidate("temperature_bias", "mean", ("temperature",), (variant,)),
+        variant,
+        (axis,),
+        evidence_nats,
     )
 
 
-def jump(place: int, gain: float) -> Component:
+def jump(place: int, evidence_nats: float) -> Component:
     variant = Variant(
         {"at": place * STEP}, ("step",), (np.arange(BLOCKS) >= place).astype(float)[None, None]
     )
-    return Component(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), gain)
+    return Component(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), evidence_nats)
 
 
 FOLLOWS, HOPS_FIRST = (
@@ -209,7 +225,7 @@ FOLLOWS, HOPS_FIRST = (
 
 
 @pytest.mark.parametrize(
-    ("kind", "gain", "axis", "expected"),
+    ("kind", "evidence_nats", "axis", "expected"),
     [
         ("the same", 20.0, "x", FOLLOWS),  # a channel that switches, one block early
         ("another", 20.0, "x", HOPS_FIRST),
@@ -218,19 +234,22 @@ FOLLOWS, HOPS_FIRST = (
     ],
 )
 def test_what_follows_a_channel_that_may_hop_comes_first(
-    kind: str, gain: float, axis: str, expected: list[str]
+    kind: str, evidence_nats: float, axis: str, expected: list[str]
 ) -> None:
     rng = np.random.default_rng(10)
     course = hops(rng, 120.0, 180.0)
     state = state_of(0.6 * course + white(rng, 1)[0])
     channel = np.roll(course, 1) if kind == "the same" else np.sin(np.arange(BLOCKS) / 9.0)
-    parts = {
-        "telegraph": [part(state, course)],
-        FOLLOWS[0]: [led(channel, gain, axis)],
+    components = {
+        "telegraph": [component(state, course)],
+        FOLLOWS[0]: [led(channel, evidence_nats, axis)],
         "bias_jump": [jump(50, 20.0)],
     }
-    assert followed_first(HOPS_FIRST, parts, state) == expected
-    assert followed_first(["telegraph", "bias_jump"], parts, state) == ["telegraph", "bias_jump"]
+    assert followed_first(HOPS_FIRST, components, state) == expected
+    assert followed_first(["telegraph", "bias_jump"], components, state) == [
+        "telegraph",
+        "bias_jump",
+    ]
 
 
 REAL, HOP = 41, -1  # blocks: a jump of another size than the hops; and the last hop
@@ -249,12 +268,12 @@ def test_jumps_that_are_hops_themselves_are_none(
     course = hops(rng, 150.0, 200.0)
     moves = np.flatnonzero(np.abs(np.diff(course)) > 0.5) + 1
     start = state_of(0.7 * course + size * (np.arange(BLOCKS) >= REAL) + white(rng, 1)[0])
-    candidate = part(start, course).candidate
+    candidate = component(start, course).candidate
 
     def gains(_: object, state: State) -> list[Found]:
         columns = state.given.get(("mean", "x"), [])
-        gain, found = telegraph_evidence(
-            state.reduced,
+        evidence_nats, found = telegraph_evidence(
+            state.blocks,
             state.baseline,
             axis="x",
             given=np.stack(columns, axis=-1) if columns else None,
@@ -263,27 +282,36 @@ def test_jumps_that_are_hops_themselves_are_none(
             Found(
                 candidate,
                 [("x",)],
-                gain[:, None],
+                evidence_nats[:, None],
                 (Variant({}, ("step",), found.share[0][None, None]),),
             )
         ]
 
     def state_with(some: Sequence[Identification]) -> State:
-        return condition_on_components(start, [one for claim in some for one in claim.parts])
+        return condition_on_components(
+            start, [one for identification in some for one in identification.components]
+        )
 
     jumps = [jump(place if place == REAL else int(moves[place]), 20.0) for place in places]
     first = Identification("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
     (beside,) = gains((), state_with([first]))
-    gain = float(beside.gain[0, 0])
+    evidence_nats = float(beside.evidence_nats[0, 0])
     hopping = Identification(
-        "telegraph", (), ("x",), (Component(candidate, beside.best[0], ("x",), gain),), gain, 8.0
+        "telegraph",
+        (),
+        ("x",),
+        (Component(candidate, beside.best[0], ("x",), evidence_nats),),
+        evidence_nats,
+        8.0,
     )
     left = hops_alone([first, hopping], state_with, gains, 8.0)
     assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
     assert [
-        one.variant.values["at"] for one in left[0].parts if one.candidate.effect == "bias_jump"
+        one.variant.values["at"]
+        for one in left[0].components
+        if one.candidate.effect == "bias_jump"
     ] == [place * STEP for place in kept]
-    assert np.abs(np.corrcoef(left[-1].parts[0].variant.design[0, 0], course)[0, 1]) > 0.98
+    assert np.abs(np.corrcoef(left[-1].components[0].variant.design[0, 0], course)[0, 1]) > 0.98
 
 
 def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Identifications:
@@ -300,21 +328,23 @@ def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) ->
         unit="deg/h",
         channels={"supply_voltage": (np.repeat(supply, 200), "V")},
     )
-    reduced = reduce_log(log, block="20s")
-    return name_effects(reduced, *nulls(reduced, 40))
+    blocks = reduce_log(log, block="20s")
+    return name_effects(blocks, *nulls(blocks, 40))
 
 
 def test_the_search_asks_hops_whether_jumps_named_before_are_theirs(one_thread) -> None:
     """The supply that scatters holds the hops back; so the last of them is a jump first, and the search ends without it."""
-    naming = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
-    assert [claim.effect for claim in naming.claims] == ["telegraph"]
-    assert naming.verdict == "explained"
+    identifications = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
+    assert [identification.effect for identification in identifications.identified] == ["telegraph"]
+    assert identifications.verdict == "explained"
 
 
 def test_the_search_names_the_channel_that_switches_before_the_hops(one_thread) -> None:
     """Two levels bring more than a supply that is known with a scatter, and still it is the cause."""
-    naming = switched([45, 14, 3, 12, 3, 10, 3, 5], 1, step=0.6, scatter=0.3)
-    assert [claim.effect for claim in naming.claims] == ["supply_bias"]
+    identifications = switched([45, 14, 3, 12, 3, 10, 3, 5], 1, step=0.6, scatter=0.3)
+    assert [identification.effect for identification in identifications.identified] == [
+        "supply_bias"
+    ]
 
 
 @pytest.fixture(scope="module")

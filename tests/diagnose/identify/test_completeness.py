@@ -34,9 +34,9 @@ def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Datas
     return reduce_log(make_log(rates, rate=10.0, unit="deg/h"), block="20s")
 
 
-def left(reduced: xr.Dataset, *columns: np.ndarray) -> float:
+def left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
     """Unrest beside columns (block,) of added white power."""
-    state: State = begin_state(reduced, calibrate_noise(reduced))
+    state: State = begin_state(blocks, calibrate_noise(blocks))
     spread = [
         np.broadcast_to(one[:, None], state.weight.shape[1:]).astype(float) for one in columns
     ]
@@ -55,10 +55,10 @@ def test_noise_that_stands_still_is_at_rest(gaps: bool) -> None:
 def test_bursts_are_unrest_and_none_once_they_are_known() -> None:
     burst = np.zeros(BLOCKS)
     burst[[10, 11, 12, 30, 31, 52, 53, 54, 55, 90, 91, 92]] = 0.6
-    reduced = record(np.sqrt(1.0 + burst))
-    assert left(reduced) > 8.0
-    assert left(reduced, burst) < 2.0
-    assert left(reduced, np.linspace(0.0, 1.0, BLOCKS)) > 8.0
+    blocks = record(np.sqrt(1.0 + burst))
+    assert left(blocks) > 8.0
+    assert left(blocks, burst) < 2.0
+    assert left(blocks, np.linspace(0.0, 1.0, BLOCKS)) > 8.0
 
 
 def test_a_single_loud_block_is_no_course_of_time() -> None:
@@ -70,8 +70,8 @@ def test_a_single_loud_block_is_no_course_of_time() -> None:
 def test_blocks_that_are_masked_do_not_count() -> None:
     burst = np.ones(BLOCKS)
     burst[20:40] = 1.5
-    reduced = record(burst)
-    state = begin_state(reduced, calibrate_noise(reduced))
+    blocks = record(burst)
+    state = begin_state(blocks, calibrate_noise(blocks))
     assert variance_fluctuation(state, "x") > 8.0
     assert variance_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
 
@@ -82,36 +82,43 @@ def test_a_smooth_name_for_bursts_is_taken_back() -> None:
     level[60:] = np.where(
         rng.random(60) < 0.4, 1.35, 1.0
     )  # later is louder on average, and not at all steadily
-    reduced = record(level)
-    baseline, records = nulls(reduced, 40)
-    found = name_effects(reduced, baseline, records)
-    assert not [claim for claim in found.claims if claim.effect == "ageing_noise"]
+    blocks = record(level)
+    baseline, records = nulls(blocks, 40)
+    found = name_effects(blocks, baseline, records)
+    assert not [
+        identification
+        for identification in found.identified
+        if identification.effect == "ageing_noise"
+    ]
     assert found.verdict == "unknown"
     steady = record(np.linspace(0.9, 1.15, BLOCKS))
     baseline, records = nulls(steady, 40)
-    assert [claim.effect for claim in name_effects(steady, baseline, records).claims] == [
-        "ageing_noise"
-    ]
+    assert [
+        identification.effect
+        for identification in name_effects(steady, baseline, records).identified
+    ] == ["ageing_noise"]
 
 
 def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
     rng = np.random.default_rng(6)
     loud = np.ones(BLOCKS)
     loud[40:60] = 20.0
-    reduced = reduce_log(
+    blocks = reduce_log(
         make_log(
             rng.standard_normal((2, BLOCKS * LENGTH)) * np.repeat(loud, LENGTH),
             rate=10.0,
             unit="deg/h",
         )
     )
-    state = begin_state(reduced, calibrate_noise(reduced))
-    search = _Search(nuisance_alternatives(reduced), fold_blocks(reduced), CountEvidence({}), 7.0)
+    state = begin_state(blocks, calibrate_noise(blocks))
+    search = _Search(nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0)
 
     def common(found: list[Found]) -> float:
-        return max(float(one.gain.max()) for one in found if one.candidate.effect == "~cov")
+        return max(
+            float(one.evidence_nats.max()) for one in found if one.candidate.effect == "~cov"
+        )
 
-    assert common(compute_evidence(search.candidates, reduced, state, search.folds)) > 100.0
+    assert common(compute_evidence(search.candidates, blocks, state, search.folds)) > 100.0
     assert common(search._ranked(state, set())) < 3.0
 
 
@@ -134,8 +141,8 @@ def test_no_jump_and_no_ageing_is_named_beside_a_drift_of_no_name_that_brings_mo
         0,
     ]  # deg/h, with no channel to tell of it
     noise += np.interp(seconds, np.linspace(0.0, 640.0, 13), turned)
-    reduced = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
-    found = name_effects(reduced, *nulls(reduced, 40))
-    assert not found.claims
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
+    found = name_effects(blocks, *nulls(blocks, 40))
+    assert not found.identified
     assert {one.generic for one in found.unknown} == {"~bias(t)"}
     assert {one.axes for one in found.unknown} == {("y",)}

@@ -45,36 +45,34 @@ def loud(factor: np.ndarray) -> np.ndarray:
 
 
 def started(rate: np.ndarray) -> State:
-    reduced = reduced_of(rate)
+    blocks = reduced_of(rate)
     return begin_state(
-        reduced,
+        blocks,
         baseline_from_model(
-            reduced, {**MODEL, "log": {"axes": [str(one) for one in reduced["axis"].values]}}
+            blocks, {**MODEL, "log": {"axes": [str(one) for one in blocks["axis"].values]}}
         ),
     )
 
 
-def candidate(state: State, effect: str, view: str) -> Candidate:
-    known, _ = effect_candidates(state.reduced, state.baseline["coefficient"])
-    return next(one for one in known if (one.effect, one.view) == (effect, view))
+def candidate(state: State, effect: str, statistic: str) -> Candidate:
+    known, _ = effect_candidates(state.blocks, state.baseline["coefficient"])
+    return next(one for one in known if (one.effect, one.statistic) == (effect, statistic))
 
 
 def parts_of(state: State, one: Candidate) -> list[Component]:
-    return by_key(compute_evidence([one], state.reduced, state, fold_blocks(state.reduced)))[
-        one.key
-    ]
+    return by_key(compute_evidence([one], state.blocks, state, fold_blocks(state.blocks)))[one.key]
 
 
 @pytest.mark.parametrize("inside", [slice(0, 3), slice(-4, None)])
 def test_noise_that_is_louder_for_one_stretch_does_not_age(inside: slice) -> None:
     factor = np.ones(BLOCKS)
     factor[inside] = 3.0
-    reduced = reduced_of(loud(factor))
-    found = name_effects(reduced, *nulls(reduced, 40))
-    assert not found.claims
+    blocks = reduced_of(loud(factor))
+    found = name_effects(blocks, *nulls(blocks, 40))
+    assert not found.identified
     first = found.unknown[0]
     assert first.generic == "~burst"
-    begin, end = (first.parts[0].variant.values[name] / 20.0 for name in ("begin", "end"))
+    begin, end = (first.components[0].variant.values[name] / 20.0 for name in ("begin", "end"))
     assert abs(begin - range(BLOCKS)[inside][0]) <= 1
     assert abs(end - range(BLOCKS)[inside][-1] - 1) <= 1
 
@@ -83,18 +81,23 @@ def test_noise_that_is_louder_for_one_stretch_does_not_age(inside: slice) -> Non
 def test_noise_gets_louder_with_age_and_not_the_other_way(
     first: float, last: float, named: list[str]
 ) -> None:
-    reduced = reduced_of(loud(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))
-    found = name_effects(reduced, *nulls(reduced, 40))
-    assert [claim.effect for claim in found.claims] == named
+    blocks = reduced_of(loud(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))
+    found = name_effects(blocks, *nulls(blocks, 40))
+    assert [identification.effect for identification in found.identified] == named
     assert found.verdict == ("explained" if named else "unknown")
 
 
 def test_stretches_of_all_lengths_are_tried_at_both_ends() -> None:
-    for blocks in (5, 92, 540, 4320):
-        tried = {tuple(one) for one in stretches(blocks).tolist()}
+    for block_count in (5, 92, 540, 4320):
+        tried = {tuple(one) for one in stretches(block_count).tolist()}
         assert len(tried) <= 240
-        assert {(0, 1), (blocks - 1, blocks), (0, 2), (blocks - 2, blocks)} <= tried
-        assert max(stop for _, stop in tried) == blocks
+        assert {
+            (0, 1),
+            (block_count - 1, block_count),
+            (0, 2),
+            (block_count - 2, block_count),
+        } <= tried
+        assert max(stop for _, stop in tried) == block_count
 
 
 @pytest.mark.parametrize(("size", "jump"), [(8.0, True), (0.0, False)])
@@ -150,12 +153,12 @@ def test_only_motion_leaks(moves: bool) -> None:
     state = started(rate)
     leaks = [
         one
-        for one in effect_candidates(state.reduced, state.baseline["coefficient"])[0]
+        for one in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
         if one.key == "misalignment(y)"
     ]
-    (found,) = compute_evidence(leaks, state.reduced, state, fold_blocks(state.reduced))
-    assert (float(found.gain[0, 0]) > 20.0) == moves
-    assert moves or float(found.gain.max()) < 3.0
+    (found,) = compute_evidence(leaks, state.blocks, state, fold_blocks(state.blocks))
+    assert (float(found.evidence_nats[0, 0]) > 20.0) == moves
+    assert moves or float(found.evidence_nats.max()) < 3.0
 
 
 @pytest.mark.parametrize("sway", [0.0, 3.0])
@@ -167,11 +170,11 @@ def test_what_is_at_rest_cannot_leak(sway: float) -> None:
     state = started(rate)
     one = next(
         each
-        for each in effect_candidates(state.reduced, state.baseline["coefficient"])[0]
+        for each in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
         if each.key == "misalignment(y)"
     )
-    part = Component(one, one.variants[0], ("x",), 20.0)
-    assert is_physical([part], state) == ([part] if sway else [])
+    component = Component(one, one.variants[0], ("x",), 20.0)
+    assert is_physical([component], state) == ([component] if sway else [])
 
 
 @pytest.mark.parametrize("leak", [0.0, 0.003])
@@ -184,7 +187,7 @@ def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) 
     one = candidate(state, "misalignment", "mean")
     variant = next(each for each in one.variants if each.columns == ("y",))
     beats, p_value = passes_time_shift_test(
-        [Component(one, variant, ("x",), 20.0)], state, fold_blocks(state.reduced)
+        [Component(one, variant, ("x",), 20.0)], state, fold_blocks(state.blocks)
     )
     assert np.isfinite(p_value)
     assert beats == bool(leak)
@@ -198,11 +201,11 @@ def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(
     phase = 2.0 * np.pi * SECOND / 200.0
     rate = WHITE * np.random.default_rng(9).standard_normal((1, SECOND.size)) + 0.3 * np.sin(phase)
     shaking = np.sqrt(2.0 + np.sin(phase - late))
-    reduced = reduce_log(
+    blocks = reduce_log(
         make_log(rate, rate=RATE, unit="deg/h", channels={"vibration": (shaking, "g")}), block="20s"
     )
-    found = name_effects(reduced, *nulls(reduced, 40))
-    assert [claim.effect for claim in found.claims] == named
+    found = name_effects(blocks, *nulls(blocks, 40))
+    assert [identification.effect for identification in found.identified] == named
 
 
 def swelling(size: float) -> State:
@@ -225,10 +228,10 @@ def turned(rate: np.ndarray, turns: np.ndarray) -> State:
     """Rates (axis, time) [deg/h] with the channel of a tool that has made so many turns."""
     log = make_log(rate, rate=RATE, unit="deg/h")
     turning = 360.0 * np.gradient(turns, SECOND)
-    reduced = reduce_log(
+    blocks = reduce_log(
         log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block="20s"
     )
-    return begin_state(reduced, baseline_from_model(reduced, {**MODEL, "log": {"axes": ["x"]}}))
+    return begin_state(blocks, baseline_from_model(blocks, {**MODEL, "log": {"axes": ["x"]}}))
 
 
 @pytest.mark.parametrize("size", [0.0, 6.0])
@@ -248,7 +251,7 @@ def test_what_turns_with_the_tool_leaves_the_noise_about_it_alone() -> None:
         size * np.sin(2.0 * np.pi * k * turns) for k, size in ((1, 3.0), (2, 5.0), (3, 2.0))
     )
     level = [
-        turned(values[None], turns).reduced["order_level"].values[0] for values in (rate, quiet)
+        turned(values[None], turns).blocks["order_level"].values[0] for values in (rate, quiet)
     ]
     usual = 3600.0 * 0.003**2
     assert np.nanmean(level[1]) == pytest.approx(usual, rel=0.08)
@@ -258,9 +261,9 @@ def test_what_turns_with_the_tool_leaves_the_noise_about_it_alone() -> None:
 def test_what_is_scored_at_orders_is_as_wild_as_in_null_records() -> None:
     state = swelling(0.0)
     (drawn,) = null_records(
-        state.reduced, state.baseline, count=40, rng=np.random.default_rng(1), chunk=40
+        state.blocks, state.baseline, count=40, rng=np.random.default_rng(1), chunk=40
     )
-    real, noise = (locked.score(one, state.baseline) for one in (state.reduced, drawn))
+    real, noise = (locked.score(one, state.baseline) for one in (state.blocks, drawn))
     assert real is not None
     assert noise is not None
     largest = noise["z"].max([dim for dim in noise["z"].dims if dim != "record"])

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.evidence.sample_counts import count_evidence, expected_counts
+from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_count_evidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify.forward_search import Identification, name_effects, tail_level
 from gyrostab.diagnose.identify.identifiability import is_physical
@@ -26,9 +26,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def named(effects, *, environment=WORLD["usual"], seed=1, drop=(), count=40):
-    reduced = record(effects, environment=environment, seed=seed, drop=drop)
-    baseline, records = nulls(reduced, count)
-    return name_effects(reduced, baseline, records)
+    blocks = record(effects, environment=environment, seed=seed, drop=drop)
+    baseline, records = nulls(blocks, count)
+    return name_effects(blocks, baseline, records)
 
 
 VIBRATION = [{"name": "vibration_noise", "white": 6e-4, "axes": ["x"]}]
@@ -42,50 +42,53 @@ def shaken():
 def test_noise_gets_no_name():
     found = named([], seed=2)
     assert found.verdict == "no mismatch"
-    assert found.claims == found.unknown == ()
+    assert found.identified == found.unknown == ()
     assert 3.0 < found.threshold < 15.0
     assert found.null_best.size == 40
 
 
 def test_vibration_noise_is_named_on_its_axis(shaken):
-    (claim,) = shaken.claims
-    assert claim.effect == "vibration_noise"
-    assert claim.axes == ("x",)
-    assert claim.driver == ("vibration",)
-    assert claim.gain > claim.threshold >= shaken.threshold
-    assert claim.surrogate_p <= 0.01
-    assert "temperature_noise" not in claim.alternatives
+    (identification,) = shaken.identified
+    assert identification.effect == "vibration_noise"
+    assert identification.axes == ("x",)
+    assert identification.driver == ("vibration",)
+    assert identification.evidence_nats > identification.threshold >= shaken.threshold
+    assert identification.surrogate_p <= 0.01
+    assert "temperature_noise" not in identification.alternatives
     assert shaken.verdict == "explained"
 
 
 def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
     """A part of negative size on an axis without the effect is dropped, not the effect with it."""
-    state, (claim,) = shaken.state, shaken.claims
-    (part,) = (one for one in claim.parts if one.candidate.view == "power")
-    elsewhere = [replace(part, row=(axis,)) for axis in "yz"]
+    state, (identification,) = shaken.state, shaken.identified
+    (component,) = (one for one in identification.components if one.candidate.statistic == "power")
+    elsewhere = [replace(component, row=(axis,)) for axis in "yz"]
     sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
     monkeypatch.setattr(
         sys.modules["gyrostab.diagnose.predict.sizes"],
-        "part_size",
-        lambda part, state: (sizes[part.row[0]], 0.01),
+        "component_size",
+        lambda component, state: (sizes[component.row[0]], 0.01),
     )
-    assert is_physical([part, *elsewhere], state) == [part, elsewhere[1]]
+    assert is_physical([component, *elsewhere], state) == [component, elsewhere[1]]
 
 
 def test_sizes_beyond_what_the_registry_allows_are_impossible(shaken):
     """A bias of 15 deg/h for each of some 40 degC is that of a broken instrument, or no effect of temperature."""
     bias = next(
-        one for one in shaken.candidates if one.effect == "temperature_bias" and one.view == "mean"
+        one
+        for one in shaken.candidates
+        if one.effect == "temperature_bias" and one.statistic == "mean"
     )
     variant = next(one for one in bias.variants if one.columns == ("sensitivity",))
-    part = Component(bias, variant, ("y",), 50.0)
-    for size, answer in ((5.0, [part]), (15.0, [])):
+    component = Component(bias, variant, ("y",), 50.0)
+    for size, answer in ((5.0, [component]), (15.0, [])):
         state = shaken.state
-        mean = state.reduced["mean"] + size * xr.DataArray(
-            variant.design[0, 0], dims="block"
-        ).where(state.reduced["axis"] == "y", 0.0)
+        mean = state.blocks["mean"] + size * xr.DataArray(variant.design[0, 0], dims="block").where(
+            state.blocks["axis"] == "y", 0.0
+        )
         assert (
-            is_physical([part], replace(state, reduced=state.reduced.assign(mean=mean))) == answer
+            is_physical([component], replace(state, blocks=state.blocks.assign(mean=mean)))
+            == answer
         )
 
 
@@ -117,15 +120,15 @@ def test_sizes_beyond_what_the_registry_allows_are_impossible(shaken):
 )
 def test_single_effects_are_named(table, environment, others):
     found = named([table], environment=WORLD[environment])
-    assert [claim.effect for claim in found.claims] == [table["name"]]
-    (claim,) = found.claims
-    assert claim.axes == tuple(table["axes"])
-    assert set(claim.alternatives) <= others
+    assert [identification.effect for identification in found.identified] == [table["name"]]
+    (identification,) = found.identified
+    assert identification.axes == tuple(table["axes"])
+    assert set(identification.alternatives) <= others
 
 
 def test_without_its_channel_an_effect_is_not_named():
     found = named(VIBRATION, drop=("vibration",))
-    assert not found.claims
+    assert not found.identified
     assert found.verdict == "unknown"
     assert {one.generic for one in found.unknown} <= {"~N(t)", "~S(f)", "~burst"}
     assert all(one.axes == ("x",) for one in found.unknown)
@@ -135,41 +138,43 @@ def test_two_effects_are_both_named():
     found = named(
         [*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}]
     )
-    assert {(claim.effect, claim.axes) for claim in found.claims} == {
+    assert {
+        (identification.effect, identification.axes) for identification in found.identified
+    } == {
         ("vibration_noise", ("x",)),
         ("vibration_rectification", ("y",)),
     }
 
 
 def test_slid_channels_do_worse(shaken):
-    (claim,) = shaken.claims
+    (identification,) = shaken.identified
     start = replace(shaken.state, given={})
-    beats, p_value = passes_time_shift_test(claim.parts, start, shaken.folds)
+    beats, p_value = passes_time_shift_test(identification.components, start, shaken.folds)
     assert beats
     assert p_value <= 0.01
-    elsewhere = [replace(part, row=("z",)) for part in claim.parts]
+    elsewhere = [replace(component, row=("z",)) for component in identification.components]
     assert not passes_time_shift_test(elsewhere, start, shaken.folds)[0]
 
 
 def test_what_is_named_is_taken_out_of_the_rest(shaken):
-    (claim,) = shaken.claims
+    (identification,) = shaken.identified
     loud = shaken.state.weight[0] / shaken.state.baseline["spectrum"].values[0]
-    vibration = shaken.state.reduced["channel_vibration"].values
+    vibration = shaken.state.blocks["channel_vibration"].values
     assert loud[vibration > 4].mean() > 1.2
     assert loud[vibration < 1].mean() == pytest.approx(1.0, abs=0.05)
-    again = condition_on(shaken.state, list(claim.parts))
+    again = condition_on(shaken.state, list(identification.components))
     np.testing.assert_allclose(again.weight, shaken.state.weight, rtol=1e-3)
 
 
 def test_too_few_null_records_are_refused():
-    reduced = record([])
-    baseline, records = nulls(reduced, 20)
+    blocks = record([])
+    baseline, records = nulls(blocks, 20)
     with pytest.raises(OptionError, match="20 null records are too few"):
-        name_effects(reduced, baseline, records)
+        name_effects(blocks, baseline, records)
 
 
 def test_claims_are_plain(shaken):
-    assert all(isinstance(claim, Identification) for claim in shaken.claims)
+    assert all(isinstance(identification, Identification) for identification in shaken.identified)
 
 
 # ----------------------------------------------------------------------------------------------------------------
@@ -188,8 +193,8 @@ def test_level_of_an_exponential_tail():
         assert tail_level(sample, level) == pytest.approx(-np.log(level), rel=0.05)
 
 
-def subsets(blocks: int) -> np.ndarray:
-    return fold_subsets(fold_blocks(record([]).isel(block=slice(0, blocks))))
+def subsets(block_count: int) -> np.ndarray:
+    return fold_subsets(fold_blocks(record([]).isel(block=slice(0, block_count))))
 
 
 def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
@@ -198,8 +203,8 @@ def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
     mean, spread = expected_counts(usual)
     np.testing.assert_allclose(mean.mean(axis=1), 0.05, rtol=0.1)
     np.testing.assert_allclose(spread, 1.0, atol=0.2)
-    null = count_evidence(usual, mean, spread, subsets(120))
-    raised = count_evidence(rng.poisson(0.3, (50, 2, 120)), mean, spread, subsets(120))
+    null = sample_count_evidence(usual, mean, spread, subsets(120))
+    raised = sample_count_evidence(rng.poisson(0.3, (50, 2, 120)), mean, spread, subsets(120))
     assert np.quantile(null, 0.99) < 3.0
     assert raised.min() > 5.0
 
@@ -214,8 +219,8 @@ def test_blocks_that_are_lost_are_expected_to_count_nothing():
         [mean[0, there].mean(), mean[0, ~there].mean()], [1.0, 0.0], atol=0.02
     )
     assert (mean > 0.0).all()
-    few = count_evidence(rng.poisson(0.5 * there, (50, 1, 120)), mean, spread, subsets(120))
-    many = count_evidence(rng.poisson(3.0 * there, (50, 1, 120)), mean, spread, subsets(120))
+    few = sample_count_evidence(rng.poisson(0.5 * there, (50, 1, 120)), mean, spread, subsets(120))
+    many = sample_count_evidence(rng.poisson(3.0 * there, (50, 1, 120)), mean, spread, subsets(120))
     assert few.max() < 3.0
     assert many.min() > 40.0
 
@@ -229,13 +234,22 @@ def test_every_line_of_a_comb_is_named():
     loud = np.ones(quiet.sizes["line"])
     loud[comb] = 4.0
     shape = xr.DataArray(np.stack([loud, np.ones_like(loud)]), dims=("axis", "line"))
-    reduced = quiet.assign(
+    blocks = quiet.assign(
         line_power=(quiet["line_power"] * shape).transpose(*quiet["line_power"].dims)
     )
     baseline, chance = nulls(quiet, 40)
-    found = name_effects(reduced, baseline, chance)
-    assert {(claim.effect, claim.axes) for claim in found.claims} == {("spectral_line", ("x",))}
-    assert sorted(part.place for claim in found.claims for part in claim.parts) == comb.tolist()
+    found = name_effects(blocks, baseline, chance)
+    assert {
+        (identification.effect, identification.axes) for identification in found.identified
+    } == {("spectral_line", ("x",))}
+    assert (
+        sorted(
+            component.place
+            for identification in found.identified
+            for component in identification.components
+        )
+        == comb.tolist()
+    )
     assert comb.size == 14
 
 

@@ -92,7 +92,7 @@ def test_growing_coefficients_are_named_for_what_they_are(small) -> None:
 def test_everything_is_explained_and_every_name_has_a_place(small) -> None:
     _, found = small
     assert found.verdict == "explained", str(found)
-    explained = {name for box in found.mismatches for name in box["explained_by"]}
+    explained = {name for region in found.mismatches for name in region["explained_by"]}
     assert explained == {effect["name"] for effect in found.effects}
 
 
@@ -110,22 +110,33 @@ def test_the_page_has_what_the_script_writes(small) -> None:
 # a name without a box
 
 
-def naming(view: str, *, place: int = -1, gain: float = 40.0) -> Identifications:
+def identifications(
+    statistic: str, *, place: int = -1, evidence_nats: float = 40.0
+) -> Identifications:
     there = np.zeros((1, 1, 40))
     there[..., 10:20] = 1.0
-    variant = Variant({}, ("sensitivity",), there if view == "mean" else there[..., None])
-    part = Component(
-        Candidate("shupe", view, ("temperature",), (variant,)), variant, ("y",), gain, place
+    variant = Variant({}, ("sensitivity",), there if statistic == "mean" else there[..., None])
+    component = Component(
+        Candidate("shupe", statistic, ("temperature",), (variant,)),
+        variant,
+        ("y",),
+        evidence_nats,
+        place,
     )
-    claim = Identification(
-        "shupe", ("temperature",), ("y",), (part, replace(part, gain=1.0)), gain, 7.0
+    identification = Identification(
+        "shupe",
+        ("temperature",),
+        ("y",),
+        (component, replace(component, evidence_nats=1.0)),
+        evidence_nats,
+        7.0,
     )
     null = np.sort(np.random.default_rng(1).exponential(1.0, 400))
     nothing: Any = None
-    return Identifications((claim,), (), 7.0, null, {}, (), nothing, nothing)
+    return Identifications((identification,), (), 7.0, null, {}, (), nothing, nothing)
 
 
-def reduced() -> xr.Dataset:
+def blocks() -> xr.Dataset:
     begin = np.arange(40) * 20.0
     return xr.Dataset(
         {
@@ -138,7 +149,7 @@ def reduced() -> xr.Dataset:
 
 
 @pytest.mark.parametrize(
-    ("view", "told", "taus"),
+    ("statistic", "told", "taus"),
     [
         ("mean", "mean", (20.0, 400.0)),
         ("power", "davar", (0.1, 20.0)),
@@ -146,24 +157,28 @@ def reduced() -> xr.Dataset:
     ],
 )
 def test_an_effect_without_a_box_gets_one_where_it_acts(
-    view: str, told: str, taus: tuple[float, float]
+    statistic: str, told: str, taus: tuple[float, float]
 ) -> None:
-    (box,) = identification_tables(naming(view, place=9 if view == "line" else -1), reduced(), [])
-    assert (box["view"], box["axes"], box["explained_by"]) == (told, ["y"], ["shupe"])
-    assert (box["tau_min_s"], box["tau_max_s"]) == pytest.approx(taus)
-    whole = view == "line"  # a steady line is there all the time
-    assert (box["start"], box["end"]) == (("1970-01-01T00:00:00.000Z", "1970-01-01T00:13:20.000Z") if whole else (
+    (region,) = identification_tables(
+        identifications(statistic, place=9 if statistic == "line" else -1), blocks(), []
+    )
+    assert (region["view"], region["axes"], region["explained_by"]) == (told, ["y"], ["shupe"])
+    assert (region["tau_min_s"], region["tau_max_s"]) == pytest.approx(taus)
+    whole = statistic == "line"  # a steady line is there all the time
+    assert (region["start"], region["end"]) == (("1970-01-01T00:00:00.000Z", "1970-01-01T00:13:20.000Z") if whole else (
         "1970-01-01T00:03:20.000Z", "1970-01-01T00:06:40.000Z"))  # fmt: skip
-    assert 0.0 < box["p_value"] < 1e-9
-    assert "Shupe" in box["statement"]
+    assert 0.0 < region["p_value"] < 1e-9
+    assert "Shupe" in region["statement"]
 
 
 def test_an_effect_with_a_box_gets_no_other() -> None:
     known = [{"explained_by": ["shupe"], "axes": ["x", "y"]}]
-    assert identification_tables(naming("mean"), reduced(), known) == []
+    assert identification_tables(identifications("mean"), blocks(), known) == []
     assert [
-        box["id"]
-        for box in identification_tables(naming("mean"), reduced(), [known[0] | {"axes": ["x"]}])
+        region["id"]
+        for region in identification_tables(
+            identifications("mean"), blocks(), [known[0] | {"axes": ["x"]}]
+        )
     ] == [2]
 
 
@@ -180,10 +195,10 @@ def loud() -> xr.Dataset:
     return reduce_log(make_log(values, rate=50.0, unit="deg/h"))
 
 
-def flat(reduced: xr.Dataset, level: np.ndarray) -> xr.Dataset:
-    expected = np.broadcast_to(level[:, None] / 50.0, reduced["power"].shape)
+def flat(blocks: xr.Dataset, level: np.ndarray) -> xr.Dataset:
+    expected = np.broadcast_to(level[:, None] / 50.0, blocks["power"].shape)
     return xr.Dataset(
-        {"spectrum": (("axis", "block", "band"), expected), "frequency": reduced["frequency"]}
+        {"spectrum": (("axis", "block", "band"), expected), "frequency": blocks["frequency"]}
     )
 
 

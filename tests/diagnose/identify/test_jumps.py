@@ -31,20 +31,20 @@ def test_what_goes_over_within_some_blocks_is_no_jump(way: float, size: float, j
     noise = (
         0.003 * 60.0 * np.sqrt(10.0) * np.random.default_rng(4).standard_normal((2, second.size))
     )
-    reduced = reduce_log(make_log(noise + size * course * [[1.0], [-0.8]], rate=10.0, unit="deg/h"))
-    baseline = baseline_from_model(reduced, MODEL)
+    blocks = reduce_log(make_log(noise + size * course * [[1.0], [-0.8]], rate=10.0, unit="deg/h"))
+    baseline = baseline_from_model(blocks, MODEL)
     (jumps,) = (
         one
-        for one in effect_candidates(reduced, baseline["coefficient"])[0]
-        if (one.effect, one.view) == ("bias_jump", "mean")
+        for one in effect_candidates(blocks, baseline["coefficient"])[0]
+        if (one.effect, one.statistic) == ("bias_jump", "mean")
     )
-    state = begin_state(reduced, baseline)
-    parts = by_key(compute_evidence([jumps], reduced, state, fold_blocks(reduced)))[jumps.key]
-    assert sum_evidence(parts) > 10.0
-    assert abs(float(parts[0].variant.values["at"]) - MIDDLE) <= 30.0
-    assert all(jumps_at_will(part, state) for part in parts)
-    assert is_sudden(parts, state) == jump
-    assert bool(is_physical(parts, state)) == jump
+    state = begin_state(blocks, baseline)
+    components = by_key(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[jumps.key]
+    assert sum_evidence(components) > 10.0
+    assert abs(float(components[0].variant.values["at"]) - MIDDLE) <= 30.0
+    assert all(jumps_at_will(component, state) for component in components)
+    assert is_sudden(components, state) == jump
+    assert bool(is_physical(components, state)) == jump
 
 
 def test_where_power_came_back_a_jump_may_settle() -> None:
@@ -53,18 +53,18 @@ def test_where_power_came_back_a_jump_may_settle() -> None:
     course = np.clip((second - 960.0) / 100.0, 0.0, 1.0)
     rate = 0.6 * np.random.default_rng(4).standard_normal((2, second.size)) + 0.8 * course
     rate[:, (second >= 850.0) & (second < 960.0)] = np.nan
-    reduced = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
-    baseline = baseline_from_model(reduced, MODEL)
+    blocks = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
+    baseline = baseline_from_model(blocks, MODEL)
     (jumps,) = (
         one
-        for one in effect_candidates(reduced, baseline["coefficient"])[0]
-        if (one.effect, one.view) == ("bias_jump", "mean")
+        for one in effect_candidates(blocks, baseline["coefficient"])[0]
+        if (one.effect, one.statistic) == ("bias_jump", "mean")
     )
-    state = begin_state(reduced, baseline)
+    state = begin_state(blocks, baseline)
     at = np.array([one.values["at"] for one in jumps.variants])
-    parts = {
+    components = {
         instant: Component(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0)
         for instant in (960.0, 1010.0)
     }
-    assert [jumps_at_will(part, state) for part in parts.values()] == [False, True]
-    assert [is_sudden([part], state) for part in parts.values()] == [True, False]
+    assert [jumps_at_will(component, state) for component in components.values()] == [False, True]
+    assert [is_sudden([component], state) for component in components.values()] == [True, False]

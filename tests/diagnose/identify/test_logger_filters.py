@@ -34,20 +34,22 @@ def test_a_filter_that_other_axes_deny_is_none_of_the_logger(late, one_filter):
     """So much of every sample comes with the next: one law for a logger, and a noise of their own for axes of which one has none of it."""
     share = np.array(late)[:, None]
     raw = np.random.default_rng(5).standard_normal((share.size, 18_001))
-    reduced = reduce_log(
+    blocks = reduce_log(
         make_log((1.0 - share) * raw[:, 1:] + share * raw[:, :-1], rate=10.0, unit="deg/h")
     )
-    baseline = calibrate_noise(reduced)
+    baseline = calibrate_noise(blocks)
     filters = [
         one
-        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect == "logger_filter"
     ]
-    state = begin_state(reduced, baseline)
-    parts = by_key(compute_evidence(filters, reduced, state, fold_blocks(reduced)))["logger_filter"]
-    assert sum_evidence(parts) > 10.0
-    assert on_all_axes(parts, state) == one_filter
-    assert is_physical(parts, state) == (parts if one_filter else [])
+    state = begin_state(blocks, baseline)
+    components = by_key(compute_evidence(filters, blocks, state, fold_blocks(blocks)))[
+        "logger_filter"
+    ]
+    assert sum_evidence(components) > 10.0
+    assert on_all_axes(components, state) == one_filter
+    assert is_physical(components, state) == (components if one_filter else [])
 
 
 def test_a_cutoff_that_the_record_does_not_tell_has_an_interval_of_all_that_suit() -> None:
@@ -76,14 +78,16 @@ def test_a_cutoff_that_the_record_tells_keeps_its_narrow_interval() -> None:
 
 def _cutoff(log: xr.Dataset) -> tuple[float, float]:
     """95 % interval of the cutoff of a filter on all axes of a record."""
-    reduced = reduce_log(log)
-    baseline = calibrate_noise(reduced)
+    blocks = reduce_log(log)
+    baseline = calibrate_noise(blocks)
     candidate = next(
         one
-        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect == "logger_filter"
     )
     variant = next(one for one in candidate.variants if is_filter("power", one))
-    parts = [Component(candidate, variant, (str(axis),), 50.0) for axis in reduced["axis"].values]
-    mean, error, *ends = filter_sizes(parts, begin_state(reduced, baseline))[0]["cutoff"]
+    components = [
+        Component(candidate, variant, (str(axis),), 50.0) for axis in blocks["axis"].values
+    ]
+    mean, error, *ends = filter_sizes(components, begin_state(blocks, baseline))[0]["cutoff"]
     return (ends[0], ends[1]) if ends else (mean - 1.96 * error, mean + 1.96 * error)

@@ -93,16 +93,16 @@ def test_the_noise_is_that_of_the_rest(seen):
     assert (baseline["coefficient"].sel(term="K") < 1.0).all()
 
 
-def claim(
-    effect: str, view: str, *row: str, column: str = "z", course: np.ndarray | None = None
+def identification(
+    effect: str, statistic: str, *row: str, column: str = "z", course: np.ndarray | None = None
 ) -> SimpleNamespace:
     design = np.empty(0) if course is None else course[None, None]
     variant, candidate = (
         SimpleNamespace(columns=(column,), design=design),
-        SimpleNamespace(view=view, witness=()),
+        SimpleNamespace(statistic=statistic, witness=()),
     )
     return SimpleNamespace(
-        effect=effect, parts=(SimpleNamespace(candidate=candidate, row=row, variant=variant),)
+        effect=effect, components=(SimpleNamespace(candidate=candidate, row=row, variant=variant),)
     )
 
 
@@ -111,14 +111,14 @@ def test_an_effect_explains_the_motion_if_it_leaves_next_to_nothing_of_it(seen):
     moving = moving_blocks(whole)
     bump = np.nan_to_num(whole["mean"].values[2] - np.nanmedian(whole["mean"].values[2]))
     assert not unexplained_motion(
-        whole, [claim("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)]
+        whole, [identification("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)]
     ).any()
-    assert not unexplained_motion(whole, [claim("rotation_line", "order", "z")]).any()
+    assert not unexplained_motion(whole, [identification("rotation_line", "order", "z")]).any()
     step = np.where(np.arange(bump.size) < np.flatnonzero(moving[2]).mean(), 0.0, 1.0)
     for other in (
-        claim("bias_jump", "mean", "z", course=step),
-        claim("warm_up", "mean", "x", course=bump),
-        claim("light_power_noise", "power", "z"),
+        identification("bias_jump", "mean", "z", course=step),
+        identification("warm_up", "mean", "x", course=bump),
+        identification("light_power_noise", "power", "z"),
     ):
         np.testing.assert_array_equal(unexplained_motion(whole, [other]), moving)
 
@@ -127,8 +127,11 @@ def test_a_jump_that_stays_is_no_motion_once_it_is_named(still):
     step = np.where(np.arange(still.sizes["time"]) < 8000, 0.0, 300.0)
     whole = reduce_log(still.assign(rate=still["rate"] + xr.DataArray(step, dims="time")))
     assert moving_blocks(whole).any(axis=1).all()
-    blocks = whole["begin"].values * 10.0 >= 8000
-    named = [claim("bias_jump", "mean", axis, course=blocks.astype(float)) for axis in "xyz"]
+    block_count = whole["begin"].values * 10.0 >= 8000
+    named = [
+        identification("bias_jump", "mean", axis, course=block_count.astype(float))
+        for axis in "xyz"
+    ]
     assert not unexplained_motion(whole, named).any()
 
 
@@ -152,7 +155,7 @@ def test_one_mismatch_says_where_it_moves_and_who_sees_it(seen):
     assert (alone["id"], alone["axes"], alone["explained_by"]) == (2, ["z"], [])
     assert "scale-factor" in alone["statement"]
     assert "40" in alone["statement"] or "39" in alone["statement"]
-    (witnessed,) = motion_tables([claim("misalignment", "mean", "x")], rest, [])
+    (witnessed,) = motion_tables([identification("misalignment", "mean", "x")], rest, [])
     assert "axis x sees a share" in witnessed["statement"]
     assert "real rotation" in witnessed["statement"]
 

@@ -19,18 +19,24 @@ from gyrostab.simulate import simulate
 VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
 
 
-def part(gain, *, row="x", witness=""):
+def component(evidence_nats, *, row="x", witness=""):
     return Component(
         Candidate("misalignment", "transfer", (), (VARIANT,), witness=(witness,)),
         VARIANT,
         (row,),
-        gain,
+        evidence_nats,
     )
 
 
 def test_rows_that_come_again_are_a_layer_of_their_own():
-    parts = [part(9.0), part(8.0, row="y"), part(7.0), part(6.0, witness="seismometer"), part(5.0)]
-    assert [[one.gain for one in layer] for layer in layers(parts)] == [
+    components = [
+        component(9.0),
+        component(8.0, row="y"),
+        component(7.0),
+        component(6.0, witness="seismometer"),
+        component(5.0),
+    ]
+    assert [[one.evidence_nats for one in layer] for layer in layers(components)] == [
         [9.0, 8.0, 6.0],
         [7.0],
         [5.0],
@@ -38,8 +44,10 @@ def test_rows_that_come_again_are_a_layer_of_their_own():
 
 
 def test_a_part_has_no_gain_of_another_witness():
-    parts = [part(40.0, witness="z"), part(9.0, witness="seismometer")]
-    assert [evidence_of(parts, part(1.0, witness=name)) for name in ("z", "seismometer", "y")] == [
+    components = [component(40.0, witness="z"), component(9.0, witness="seismometer")]
+    assert [
+        evidence_of(components, component(1.0, witness=name)) for name in ("z", "seismometer", "y")
+    ] == [
         40.0,
         9.0,
         1.0,
@@ -47,13 +55,21 @@ def test_a_part_has_no_gain_of_another_witness():
 
 
 def test_a_claim_keeps_the_axes_that_show_it_beside_the_others():
-    parts = (part(9.0), part(8.0, row="y"))
-    claim = Identification("misalignment", (), ("x", "y"), parts, 15.5, 8.0)
-    key = parts[0].candidate.key
-    assert with_axes_of(claim, {key: [part(9.0), part(1.0, row="y")]}).axes == ("x",)
-    assert with_axes_of(claim, {key: [part(9.0), part(1.0, row="y")]}).parts == parts[:1]
-    assert with_axes_of(claim, {key: [part(3.0), part(4.0, row="y")]}) == claim
-    assert with_axes_of(claim, {}) == claim
+    components = (component(9.0), component(8.0, row="y"))
+    identification = Identification("misalignment", (), ("x", "y"), components, 15.5, 8.0)
+    key = components[0].candidate.key
+    assert with_axes_of(identification, {key: [component(9.0), component(1.0, row="y")]}).axes == (
+        "x",
+    )
+    assert (
+        with_axes_of(identification, {key: [component(9.0), component(1.0, row="y")]}).components
+        == components[:1]
+    )
+    assert (
+        with_axes_of(identification, {key: [component(3.0), component(4.0, row="y")]})
+        == identification
+    )
+    assert with_axes_of(identification, {}) == identification
 
 
 def test_two_opposite_jumps_gain_together_what_none_gains_alone():
@@ -62,11 +78,16 @@ def test_two_opposite_jumps_gain_together_what_none_gains_alone():
         for step, at in ((0.3, 600.0), (-0.3, 1300.0))
     ]
     model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003, "K": 0.005}, "effect": jumps}
-    reduced = reduce_log(simulate(model, duration="30min", rate=10.0, seed=4).compute())
-    baseline = calibrate_noise(reduced)
-    nulls = list(null_records(reduced, baseline, count=40, rng=np.random.default_rng(1), chunk=40))
-    (claim,) = name_effects(reduced, baseline, nulls).claims
-    assert claim.effect == "bias_jump"
-    assert sorted(one.variant.values["at"] for one in claim.parts) == [600.0, 1300.0]
-    assert claim.gain == pytest.approx(sum(one.gain for one in claim.parts))
-    assert claim.gain > max(one.gain for one in claim.parts) + 5.0
+    blocks = reduce_log(simulate(model, duration="30min", rate=10.0, seed=4).compute())
+    baseline = calibrate_noise(blocks)
+    nulls = list(null_records(blocks, baseline, count=40, rng=np.random.default_rng(1), chunk=40))
+    (identification,) = name_effects(blocks, baseline, nulls).identified
+    assert identification.effect == "bias_jump"
+    assert sorted(one.variant.values["at"] for one in identification.components) == [600.0, 1300.0]
+    assert identification.evidence_nats == pytest.approx(
+        sum(one.evidence_nats for one in identification.components)
+    )
+    assert (
+        identification.evidence_nats
+        > max(one.evidence_nats for one in identification.components) + 5.0
+    )

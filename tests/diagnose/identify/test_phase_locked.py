@@ -18,19 +18,27 @@ from gyrostab.simulate import simulate
 N = 0.003  # deg/sqrt(h)
 
 
-def part(view: str, gain: float) -> Component:
+def component(statistic: str, evidence_nats: float) -> Component:
     variant = Variant({}, np.ones((1, 1, 1)), ("any",))
-    return Component(Candidate("rotation_line", view, (), (variant,)), variant, ("x",), gain)
+    return Component(
+        Candidate("rotation_line", statistic, (), (variant,)), variant, ("x",), evidence_nats
+    )
 
 
-def claim(*parts: Component) -> Identification:
-    return Identification("rotation_line", (), ("x",), parts, sum(one.gain for one in parts), 6.0)
+def identification(*components: Component) -> Identification:
+    return Identification(
+        "rotation_line", (), ("x",), components, sum(one.evidence_nats for one in components), 6.0
+    )
 
 
 def test_only_waves_are_taken_out_with_what_they_gain() -> None:
-    mean, wave, comb = part("mean", 5.0), part("order", 20.0), part("phase_locked", 7.0)
-    naming = Identifications(
-        (claim(mean, wave), claim(comb), claim(mean)),
+    mean, wave, comb = (
+        component("mean", 5.0),
+        component("order", 20.0),
+        component("phase_locked", 7.0),
+    )
+    identifications = Identifications(
+        (identification(mean, wave), identification(comb), identification(mean)),
         (),
         6.0,
         np.zeros(1),
@@ -39,10 +47,10 @@ def test_only_waves_are_taken_out_with_what_they_gain() -> None:
         None,
         xr.DataArray(),
     )  # type: ignore[arg-type]
-    left, gain = without_waves(naming)
-    assert gain == 27.0
-    assert [one.parts for one in left.claims] == [(mean,), (mean,)]
-    assert left.claims[1] is naming.claims[2]
+    left, evidence_nats = without_waves(identifications)
+    assert evidence_nats == 27.0
+    assert [one.components for one in left.identified] == [(mean,), (mean,)]
+    assert left.identified[1] is identifications.identified[2]
 
 
 def model(size: float, seconds: float) -> dict[str, Any]:

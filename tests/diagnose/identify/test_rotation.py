@@ -44,20 +44,20 @@ def _reduced(share: float) -> xr.Dataset:
     return reduce_log(simulate(model, duration="20min", rate=10.0, seed=3).compute())
 
 
-def _parts(reduced: xr.Dataset):
-    baseline = calibrate_noise(reduced)
+def _parts(blocks: xr.Dataset):
+    baseline = calibrate_noise(blocks)
     known = [
         one
-        for one in effect_candidates(reduced, baseline["coefficient"])[0]
+        for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect in ("scale_factor", "real_motion")
     ]
-    state = begin_state(reduced, baseline)
-    parts = by_key(
+    state = begin_state(blocks, baseline)
+    components = by_key(
         compute_evidence(
-            [one for one in known if one.view == "mean"], reduced, state, fold_blocks(reduced)
+            [one for one in known if one.statistic == "mean"], blocks, state, fold_blocks(blocks)
         )
     )
-    return {several[0].candidate.effect: several for several in parts.values()}, state
+    return {several[0].candidate.effect: several for several in components.values()}, state
 
 
 @pytest.mark.parametrize(
@@ -65,21 +65,21 @@ def _parts(reduced: xr.Dataset):
     [(3e-6, "scale_factor", False), (1e-3, "scale_factor", True), (0.5, None, True)],
 )
 def test_the_share_of_the_turning_tells_what_it_is(share, plainer, allowed):
-    parts, state = _parts(_reduced(share))
-    motion, error = parts["real_motion"], parts["scale_factor"]
+    components, state = _parts(_reduced(share))
+    motion, error = components["real_motion"], components["scale_factor"]
     assert motion[0].row == ("z",)
-    assert motion[0].gain > 30.0
+    assert motion[0].evidence_nats > 30.0
     assert find_plainer_effect(motion, state) == plainer
     assert bool(is_physical(motion, state)) is allowed
     assert find_plainer_effect(error, state) is None
 
 
 def test_a_few_millionths_of_the_turning_are_an_error_of_the_scale_factor():
-    reduced = _reduced(1e-6)
-    baseline, records = nulls(reduced, 40)
-    found = name_effects(reduced, baseline, records)
-    (claim,) = found.claims
-    assert claim.effect == "scale_factor"
-    assert claim.axes == ("z",)
-    assert "real_motion" not in claim.alternatives
-    assert np.isfinite(claim.gain)
+    blocks = _reduced(1e-6)
+    baseline, records = nulls(blocks, 40)
+    found = name_effects(blocks, baseline, records)
+    (identification,) = found.identified
+    assert identification.effect == "scale_factor"
+    assert identification.axes == ("z",)
+    assert "real_motion" not in identification.alternatives
+    assert np.isfinite(identification.evidence_nats)

@@ -28,17 +28,17 @@ def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], S
     white = 0.003 * 60.0 * np.sqrt(10.0) * rng.standard_normal(SECOND.size)
     keep = np.exp(-0.2)
     bias = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(SECOND.size))
-    reduced = reduce_log(
+    blocks = reduce_log(
         make_log(white + size * bias * (share * 600.0 > SECOND % 600.0), rate=10.0, unit="deg/h")
     )
-    baseline = baseline_from_model(reduced, MODEL)
+    baseline = baseline_from_model(blocks, MODEL)
     biases = [
         one
-        for one in effect_candidates(reduced, baseline["coefficient"])[0]
-        if one.key == "gauss_markov" and one.view == "power"
+        for one in effect_candidates(blocks, baseline["coefficient"])[0]
+        if one.key == "gauss_markov" and one.statistic == "power"
     ]
-    state = begin_state(reduced, baseline)
-    return by_key(compute_evidence(biases, reduced, state, fold_blocks(reduced)))[
+    state = begin_state(blocks, baseline)
+    return by_key(compute_evidence(biases, blocks, state, fold_blocks(blocks)))[
         "gauss_markov"
     ], state
 
@@ -46,14 +46,14 @@ def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], S
 @pytest.mark.parametrize("size", [0.12, 0.18])
 @pytest.mark.parametrize(("share", "steady"), [(1.0, True), (0.5, False)])
 def test_what_comes_and_goes_is_no_steady_wander(size: float, share: float, steady: bool) -> None:
-    parts, state = _wandering(size / np.sqrt(share), share, seed=3)
-    assert parts[0].gain > 10.0
-    assert is_always_present(parts[0], state) == steady
-    assert bool(is_physical(parts, state)) == steady
+    components, state = _wandering(size / np.sqrt(share), share, seed=3)
+    assert components[0].evidence_nats > 10.0
+    assert is_always_present(components[0], state) == steady
+    assert bool(is_physical(components, state)) == steady
 
 
 def test_chance_takes_no_steady_wander_away() -> None:
     assert all(
-        is_always_present(parts[0], state)
-        for parts, state in (_wandering(0.2, 1.0, seed) for seed in range(8))
+        is_always_present(components[0], state)
+        for components, state in (_wandering(0.2, 1.0, seed) for seed in range(8))
     )

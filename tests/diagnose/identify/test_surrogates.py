@@ -33,15 +33,15 @@ def _slides(sensitivity: float, period: float) -> tuple[bool, float]:
             }
         ],
     }
-    reduced = reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
-    baseline = calibrate_noise(reduced)
-    known, _ = effect_candidates(reduced, baseline["coefficient"])
-    one = next(one for one in known if one.effect == "temperature_bias" and one.view == "mean")
+    blocks = reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
+    baseline = calibrate_noise(blocks)
+    known, _ = effect_candidates(blocks, baseline["coefficient"])
+    one = next(one for one in known if one.effect == "temperature_bias" and one.statistic == "mean")
     variant = next(each for each in one.variants if each.columns == ("sensitivity",))
     return passes_time_shift_test(
         [Component(one, variant, ("x",), 50.0)],
-        begin_state(reduced, baseline),
-        fold_blocks(reduced),
+        begin_state(blocks, baseline),
+        fold_blocks(blocks),
     )
 
 

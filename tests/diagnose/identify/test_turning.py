@@ -47,26 +47,28 @@ def test_earth_rate_is_taken_out_and_made_again(around):
             "around": [0.0, around],
         }
     )
-    reduced = reduce_log(log)
-    baseline = calibrate_noise(reduced)
-    known, reasons = effect_candidates(reduced, baseline["coefficient"])
-    orders = [one for one in known if one.view == "order"]
-    start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    parts = by_key(compute_evidence(orders, reduced, start, folds))["earth_rate(rotation_rate)"]
-    assert sum_evidence(parts) > 1000.0
-    state = condition_on(start, parts)
+    blocks = reduce_log(log)
+    baseline = calibrate_noise(blocks)
+    known, reasons = effect_candidates(blocks, baseline["coefficient"])
+    orders = [one for one in known if one.statistic == "order"]
+    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    components = by_key(compute_evidence(orders, blocks, start, folds))["earth_rate(rotation_rate)"]
+    assert sum_evidence(components) > 1000.0
+    state = condition_on(start, components)
     assert (
         max(
             sum_evidence(one)
-            for one in by_key(compute_evidence(orders, reduced, state, folds)).values()
+            for one in by_key(compute_evidence(orders, blocks, state, folds)).values()
         )
         < 5.0
     )
-    claim = Identification(
-        "earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0
+    identification = Identification(
+        "earth_rate", components[0].candidate.driver, ("x", "y"), tuple(components), 500.0, 8.0
     )
-    naming = Identifications((claim,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds)
-    (fitted,) = fit_identifications(naming, baseline)
+    identifications = Identifications(
+        (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds
+    )
+    (fitted,) = fit_identifications(identifications, baseline)
     again = _log(_table(fitted.effect, "latitude", "toolface", "off", "around"))
     assert float(np.abs(again["rate"] - log["rate"]).max()) < 0.01 * float(log["rate"].std())
 
@@ -83,20 +85,27 @@ def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most
             "around": [0.0, 90.0],
         }
     )
-    reduced = reduce_log(log)
-    baseline = calibrate_noise(reduced)
-    known, reasons = effect_candidates(reduced, baseline["coefficient"])
-    start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    parts = by_key(
-        compute_evidence([one for one in known if one.view == "order"], reduced, start, folds)
+    blocks = reduce_log(log)
+    baseline = calibrate_noise(blocks)
+    known, reasons = effect_candidates(blocks, baseline["coefficient"])
+    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    components = by_key(
+        compute_evidence([one for one in known if one.statistic == "order"], blocks, start, folds)
     )["earth_rate(rotation_rate)"]
-    claim = Identification(
-        "earth_rate", parts[0].candidate.driver, ("x", "y"), tuple(parts), 500.0, 8.0
+    identification = Identification(
+        "earth_rate", components[0].candidate.driver, ("x", "y"), tuple(components), 500.0, 8.0
     )
-    naming = Identifications(
-        (claim,), (), 8.0, np.zeros(1), reasons, tuple(known), condition_on(start, parts), folds
+    identifications = Identifications(
+        (identification,),
+        (),
+        8.0,
+        np.zeros(1),
+        reasons,
+        tuple(known),
+        condition_on(start, components),
+        folds,
     )
-    found = fit_identifications(naming, baseline)[0].parameters
+    found = fit_identifications(identifications, baseline)[0].parameters
     assert found["latitude"].low < latitude < found["latitude"].high
     by_size = np.degrees(1.96 * 0.04 / np.tan(np.radians(latitude)))
     assert 0.9 * by_size < (found["latitude"].high - found["latitude"].low) / 2.0 < most
@@ -120,24 +129,33 @@ def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
         {**x, "order": 3.0, "amplitude": [0.4]},
         points=points,
     )
-    reduced = reduce_log(log)
-    baseline = calibrate_noise(reduced)
-    known, reasons = effect_candidates(reduced, baseline["coefficient"])
-    orders = [one for one in known if one.view == "order" and one.effect == "rotation_line"]
-    start, folds = begin_state(reduced, baseline), fold_blocks(reduced)
-    parts = by_key(compute_evidence(orders, reduced, start, folds))["rotation_line(rotation_rate)"]
-    claim = Identification(
+    blocks = reduce_log(log)
+    baseline = calibrate_noise(blocks)
+    known, reasons = effect_candidates(blocks, baseline["coefficient"])
+    orders = [one for one in known if one.statistic == "order" and one.effect == "rotation_line"]
+    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    components = by_key(compute_evidence(orders, blocks, start, folds))[
+        "rotation_line(rotation_rate)"
+    ]
+    identification = Identification(
         "rotation_line",
-        parts[0].candidate.driver,
+        components[0].candidate.driver,
         ("x", "y"),
-        tuple(parts),
-        sum_evidence(parts),
+        tuple(components),
+        sum_evidence(components),
         8.0,
     )
-    naming = Identifications(
-        (claim,), (), 8.0, np.zeros(1), reasons, tuple(known), condition_on(start, parts), folds
+    identifications = Identifications(
+        (identification,),
+        (),
+        8.0,
+        np.zeros(1),
+        reasons,
+        tuple(known),
+        condition_on(start, components),
+        folds,
     )
-    fitted = fit_identifications(naming, baseline)
+    fitted = fit_identifications(identifications, baseline)
     assert [(one.effect.order, one.axes) for one in fitted] == [
         (1.0, ("x", "y")),
         (2.0, ("x",)),

@@ -78,17 +78,17 @@ def test_a_burst_of_noise_has_its_box(share, missing):
     for seed in range(9):
         found = records(base, 1, np.random.default_rng(seed), missing=missing).isel(record=0)
         found["power"][1, 75:90] *= 1.0 + share**2
-        boxes = locate_mismatches(found, base, null)
-        boxes = boxes.sel(mismatch=(boxes["view"] == "davar") & (boxes["axes"] == "y"))
+        regions = locate_mismatches(found, base, null)
+        regions = regions.sel(mismatch=(regions["view"] == "davar") & (regions["axes"] == "y"))
         overlaps.append(
-            _overlap(boxes.isel(mismatch=0), 1500.0, 1800.0) if boxes.sizes["mismatch"] else 0.0
+            _overlap(regions.isel(mismatch=0), 1500.0, 1800.0) if regions.sizes["mismatch"] else 0.0
         )
         if share == 0.5:
-            assert boxes.sizes["mismatch"] == 1
-            assert float(boxes["ratio"][0]) == pytest.approx(1.25, abs=0.08)
-            assert float(boxes["tau_min_s"][0]) == 1.0 / RATE
-            assert float(boxes["p_value"][0]) < 1e-4
-            assert int(boxes["sign"][0]) == 1
+            assert regions.sizes["mismatch"] == 1
+            assert float(regions["ratio"][0]) == pytest.approx(1.25, abs=0.08)
+            assert float(regions["tau_min_s"][0]) == 1.0 / RATE
+            assert float(regions["p_value"][0]) < 1e-4
+            assert int(regions["sign"][0]) == 1
     assert np.median(overlaps) >= 0.7
 
 
@@ -98,15 +98,15 @@ def test_a_step_of_the_mean_has_its_box(base, null):
         found = records(base, 1, np.random.default_rng(seed)).isel(record=0)
         found["mean"][0, 30:45] += 0.1
         found["mean"][0, 120:140] -= 0.1
-        boxes = locate_mismatches(found, base, null)
-        boxes = boxes.sel(mismatch=boxes["view"] == "mean")
-        assert boxes.sizes["mismatch"] == 2
-        assert set(boxes["axes"].values) == {"x"}
-        for box, begin, end in (
-            (boxes["sign"] > 0, 600.0, 900.0),
-            (boxes["sign"] < 0, 2400.0, 2800.0),
+        regions = locate_mismatches(found, base, null)
+        regions = regions.sel(mismatch=regions["view"] == "mean")
+        assert regions.sizes["mismatch"] == 2
+        assert set(regions["axes"].values) == {"x"}
+        for region, begin, end in (
+            (regions["sign"] > 0, 600.0, 900.0),
+            (regions["sign"] < 0, 2400.0, 2800.0),
         ):
-            one = boxes.sel(mismatch=box).isel(mismatch=0)
+            one = regions.sel(mismatch=region).isel(mismatch=0)
             overlaps.append(_overlap(one, begin, end))
             assert abs(float(one["estimate"])) == pytest.approx(0.1, abs=0.045)
     assert np.median(overlaps) >= 0.7
@@ -117,32 +117,32 @@ def test_a_band_has_its_averaging_times(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     inside = (found["frequency"].values > 3.0) & (found["frequency"].values < 12.0)
     found["power"][0, 60:120] *= 1.0 + 3.0 * xr.DataArray(inside.astype(float), dims="band")
-    box = locate_mismatches(found, base, null).isel(mismatch=0)
-    assert str(box["view"].values) == "davar"
-    assert float(box["tau_min_s"]) in (0.02, 0.04)
-    assert float(box["tau_min_s"]) < 0.37 / 7.0 < float(box["tau_max_s"])
-    assert float(box["tau_max_s"]) <= 0.32
-    assert _overlap(box, 1200.0, 2400.0) > 0.95
+    region = locate_mismatches(found, base, null).isel(mismatch=0)
+    assert str(region["view"].values) == "davar"
+    assert float(region["tau_min_s"]) in (0.02, 0.04)
+    assert float(region["tau_min_s"]) < 0.37 / 7.0 < float(region["tau_max_s"])
+    assert float(region["tau_max_s"]) <= 0.32
+    assert _overlap(region, 1200.0, 2400.0) > 0.95
 
 
 def test_less_noise_than_simulated_has_its_sign(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["power"] *= 0.9
-    boxes = locate_mismatches(found, base, null)
-    assert boxes.sizes["mismatch"] == 1  # of all axes together
-    assert sorted(str(boxes["axes"].values[0]).split()) == ["x", "y", "z"]
-    assert (float(boxes["begin"][0]), float(boxes["end"][0])) == (0.0, 3600.0)
-    assert int(boxes["sign"][0]) == -1
-    assert float(boxes["ratio"][0]) == pytest.approx(0.9, abs=0.02)
+    regions = locate_mismatches(found, base, null)
+    assert regions.sizes["mismatch"] == 1  # of all axes together
+    assert sorted(str(regions["axes"].values[0]).split()) == ["x", "y", "z"]
+    assert (float(regions["begin"][0]), float(regions["end"][0])) == (0.0, 3600.0)
+    assert int(regions["sign"][0]) == -1
+    assert float(regions["ratio"][0]) == pytest.approx(0.9, abs=0.02)
 
 
 def test_two_bursts_are_two_boxes(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["power"][0, 30:45] *= 1.3
     found["power"][0, 100:115] *= 1.3
-    boxes = locate_mismatches(found, base, null)
-    begins = sorted(boxes["begin"].values)
-    assert boxes.sizes["mismatch"] == 2
+    regions = locate_mismatches(found, base, null)
+    begins = sorted(regions["begin"].values)
+    assert regions.sizes["mismatch"] == 2
     assert begins[0] == pytest.approx(600.0, abs=2 * BLOCK_S)
     assert begins[1] == pytest.approx(2000.0, abs=2 * BLOCK_S)
 
@@ -150,15 +150,15 @@ def test_two_bursts_are_two_boxes(base, null):
 def test_a_mean_that_wanders_is_one_mismatch(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["mean"][1] += 0.5 * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
-    boxes = locate_mismatches(found, base, null)
-    boxes = boxes.sel(mismatch=boxes["view"] == "mean")
-    assert boxes["sign"].values.tolist() == [0]
-    assert float(boxes["end"][0] - boxes["begin"][0]) > 3000.0
-    assert abs(float(boxes["estimate"][0])) == pytest.approx(0.4, abs=0.15)
+    regions = locate_mismatches(found, base, null)
+    regions = regions.sel(mismatch=regions["view"] == "mean")
+    assert regions["sign"].values.tolist() == [0]
+    assert float(regions["end"][0] - regions["begin"][0]) > 3000.0
+    assert abs(float(regions["estimate"][0])) == pytest.approx(0.4, abs=0.15)
 
 
 def test_pieces_become_one_box_and_strangers_do_not():
-    box = {
+    region = {
         "view": "davar",
         "axes": "x",
         "what": "avar",
@@ -167,18 +167,18 @@ def test_pieces_become_one_box_and_strangers_do_not():
         "tau_min_s": 0.01,
         "tau_max_s": 0.1,
     }
-    box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
+    region |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
     near, far = (
-        box | {"begin": 120.0, "end": 160.0, "z": 6.0},
-        box | {"begin": 400.0, "end": 460.0, "z": 6.0},
+        region | {"begin": 120.0, "end": 160.0, "z": 6.0},
+        region | {"begin": 400.0, "end": 460.0, "z": 6.0},
     )
-    assert [(one["begin"], one["end"]) for one in merge_regions([far, near, box])] == [
+    assert [(one["begin"], one["end"]) for one in merge_regions([far, near, region])] == [
         (0.0, 160.0),
         (400.0, 460.0),
     ]
-    assert len(merge_regions([box, box | {"sign": -1}])) == 2
-    assert len(merge_regions([box, box | {"tau_min_s": 1.0, "tau_max_s": 2.0}])) == 2
-    line = box | {
+    assert len(merge_regions([region, region | {"sign": -1}])) == 2
+    assert len(merge_regions([region, region | {"tau_min_s": 1.0, "tau_max_s": 2.0}])) == 2
+    line = region | {
         "view": "spectrum",
         "what": "line",
         "frequency": 13.35,
@@ -208,24 +208,24 @@ def _nothing(rate, t, rng):
     pass
 
 
-def _baseline_of(reduced):
+def _baseline_of(blocks):
     level = SIGMA**2 / RATE
-    axes = reduced.sizes["axis"]
+    axes = blocks.sizes["axis"]
     return xr.Dataset(
         {
-            "spectrum": (("axis", "block", "band"), np.full(reduced["power"].shape, level)),
-            "known_mean": (("axis", "block"), np.zeros(reduced["mean"].shape)),
-            "mean_variance": (("axis", "block"), SIGMA**2 / reduced["samples"].values),
+            "spectrum": (("axis", "block", "band"), np.full(blocks["power"].shape, level)),
+            "known_mean": (("axis", "block"), np.zeros(blocks["mean"].shape)),
+            "mean_variance": (("axis", "block"), SIGMA**2 / blocks["samples"].values),
             "coefficient": (("axis", "term"), np.tile([0.0, 0.003, 0.0, 0.0, 0.0], (axes, 1))),
         },
-        coords={"axis": reduced["axis"], "term": list("QNBKR"), "frequency": reduced["frequency"]},
+        coords={"axis": blocks["axis"], "term": list("QNBKR"), "frequency": blocks["frequency"]},
     )
 
 
-def _nulls(reduced, base, count, rng):
+def _nulls(blocks, base, count, rng):
     """Null records on the bands of a real reduction."""
-    shape, weight = reduced["shape"].values, reduced["line_weight"].values[..., None]
-    lines = (25, *reduced["line_power"].shape)
+    shape, weight = blocks["shape"].values, blocks["line_weight"].values[..., None]
+    lines = (25, *blocks["line_power"].shape)
     drop = [
         "mean",
         "power",
@@ -238,7 +238,7 @@ def _nulls(reduced, base, count, rng):
         "zeros",
     ]
     for _ in range(count // 25):
-        made = reduced.drop_vars(drop)
+        made = blocks.drop_vars(drop)
         power = (
             base["spectrum"].values * rng.gamma(np.broadcast_to(shape, (25, *shape.shape))) / shape
         )
@@ -255,7 +255,7 @@ def _nulls(reduced, base, count, rng):
             ("record", "axis", "part", "line"),
             base["spectrum"].values[0, 0, 0] * rng.gamma(weight, size=lines) / weight,
         )
-        plane = (25, *reduced["mean"].shape)
+        plane = (25, *blocks["mean"].shape)
         made["mean"] = (
             ("record", "axis", "block"),
             rng.normal(size=plane) * np.sqrt(base["mean_variance"].values),
@@ -273,9 +273,9 @@ def _nulls(reduced, base, count, rng):
 
 @pytest.fixture(scope="module")
 def raw():
-    reduced = _log(1, _nothing)
-    base = _baseline_of(reduced)
-    return base, null_scores(base, _nulls(reduced, base, 100, np.random.default_rng(24))), reduced
+    blocks = _log(1, _nothing)
+    base = _baseline_of(blocks)
+    return base, null_scores(base, _nulls(blocks, base, 100, np.random.default_rng(24))), blocks
 
 
 def _vibration(rate, t, rng):
@@ -297,7 +297,7 @@ def _spikes(rate, t, rng):
 
 
 @pytest.mark.parametrize(
-    ("effect", "view", "axes", "begin", "end"),
+    ("effect", "statistic", "axes", "begin", "end"),
     [
         (_vibration, "davar", {"x"}, 1500.0, 1800.0),
         (_line, "spectrum", {"z"}, 0.0, 3600.0),
@@ -305,12 +305,12 @@ def _spikes(rate, t, rng):
         (_spikes, "distribution", {"x"}, 1800.0, 2700.0),
     ],
 )
-def test_effects_in_samples_are_found_where_they_are(raw, effect, view, axes, begin, end):
+def test_effects_in_samples_are_found_where_they_are(raw, effect, statistic, axes, begin, end):
     base, null, _ = raw
-    boxes = locate_mismatches(_log(2, effect), base, null)
-    boxes = boxes.sel(mismatch=boxes["view"] == view)
-    assert boxes.sizes["mismatch"] >= 1
-    first = boxes.isel(mismatch=0)
+    regions = locate_mismatches(_log(2, effect), base, null)
+    regions = regions.sel(mismatch=regions["view"] == statistic)
+    assert regions.sizes["mismatch"] >= 1
+    first = regions.isel(mismatch=0)
     assert set(str(first["axes"].values).split()) == axes
     assert _overlap(first, begin, end) >= 0.7
     if effect is _line:
@@ -321,17 +321,17 @@ def test_effects_in_samples_are_found_where_they_are(raw, effect, view, axes, be
 
 
 def test_samples_without_an_effect_have_no_box(raw):
-    base, null, reduced = raw
-    assert locate_mismatches(reduced, base, null).sizes["mismatch"] == 0
+    base, null, blocks = raw
+    assert locate_mismatches(blocks, base, null).sizes["mismatch"] == 0
 
 
 def test_the_table_says_what_the_contract_needs(raw):
     base, null, _ = raw
-    boxes = locate_mismatches(_log(2, _vibration), base, null)
-    assert boxes["mismatch"].values[0] == 1
-    assert np.all(np.diff(boxes["p_value"].values) >= 0)
-    start = boxes["start_time"].values[0] - np.datetime64(0, "ns")
-    assert start / np.timedelta64(1, "s") == pytest.approx(float(boxes["begin"][0]))
+    regions = locate_mismatches(_log(2, _vibration), base, null)
+    assert regions["mismatch"].values[0] == 1
+    assert np.all(np.diff(regions["p_value"].values) >= 0)
+    start = regions["start_time"].values[0] - np.datetime64(0, "ns")
+    assert start / np.timedelta64(1, "s") == pytest.approx(float(regions["begin"][0]))
     assert {
         "view",
         "axes",
@@ -341,5 +341,5 @@ def test_the_table_says_what_the_contract_needs(raw):
         "p_value",
         "sign",
         "end_time",
-    } <= set(boxes.variables)
-    assert boxes.attrs["null_records"] == 100
+    } <= set(regions.variables)
+    assert regions.attrs["null_records"] == 100

@@ -274,15 +274,17 @@ def test_largest_gains_of_raw_logs_are_those_of_their_own_null_records(lost):
             list(null_records(record, baseline, count=count, rng=np.random.default_rng(seed)))
         )
         means, powers = candidates(record)
-        for view, gains, tried in (
+        for statistic, gains, tried in (
             ("mean", mean_evidence, means),
             ("power", power_evidence, powers),
         ):
             own = float(gains(record, baseline, tried, axis="x").max())
-            ranks[view].append(
+            ranks[statistic].append(
                 int((gains(nulls, baseline, tried, axis="x").max("candidate") >= own).sum())
             )
-    for view, found in ranks.items():
+    for statistic, found in ranks.items():
         share = (np.array(found) + 0.5) / (count + 1)
-        assert share.mean() == pytest.approx(0.5, abs=3.5 * np.sqrt(1.0 / 12.0 / records)), view
-        assert (share < 0.1).sum() <= 6, view  # 1 in 2000 for a binomial of 16 and 0.1
+        assert share.mean() == pytest.approx(0.5, abs=3.5 * np.sqrt(1.0 / 12.0 / records)), (
+            statistic
+        )
+        assert (share < 0.1).sum() <= 6, statistic  # 1 in 2000 for a binomial of 16 and 0.1

@@ -51,13 +51,13 @@ def test_every_effect_is_tried_or_a_reason_is_given(found):
     tried = {one.effect for one in candidates}
     assert tried.isdisjoint(reasons)
     assert tried | set(reasons) | {"fringe_hop"} == set(effects())
-    assert {one.view for one in candidates} <= set(STATISTIC_NAMES)
+    assert {one.statistic for one in candidates} <= set(STATISTIC_NAMES)
     for reason in reasons.values():
         assert reason.startswith("not identifiable: ")
 
 
 @pytest.mark.parametrize(
-    ("effect", "views"),
+    ("effect", "statistics"),
     [
         ("shupe", {"mean"}),
         ("vibration_noise", {"power"}),
@@ -72,8 +72,8 @@ def test_every_effect_is_tried_or_a_reason_is_given(found):
         ("gauss_markov", {"power", "wander"}),
     ],
 )
-def test_effects_show_where_their_physics_says(found, effect, views):
-    assert {one.view for one in found[0] if one.effect == effect} == views
+def test_effects_show_where_their_physics_says(found, effect, statistics):
+    assert {one.statistic for one in found[0] if one.effect == effect} == statistics
 
 
 def test_without_a_channel_the_reason_names_it(plain):
@@ -119,24 +119,26 @@ def test_no_axis_is_explained_by_its_own_reading(plain, found):
     leak = next(
         one
         for one in effect_candidates(moving, COEFFICIENT)[0]
-        if one.effect == "misalignment" and one.view == "mean"
+        if one.effect == "misalignment" and one.statistic == "mean"
     )
     for variant in leak.variants:
         for name, design in zip(variant.columns, variant.design, strict=True):
             assert not design["xyz".index(name)].any()
     assert not [
-        one for one in found[0] if one.effect in ("dead_zone", "clock_error") and one.view == "mean"
+        one
+        for one in found[0]
+        if one.effect in ("dead_zone", "clock_error") and one.statistic == "mean"
     ]
 
 
 def test_axes_at_rest_cannot_leak(plain, found):
-    assert not [one for one in found[0] if one.effect == "misalignment" and one.view == "mean"]
+    assert not [one for one in found[0] if one.effect == "misalignment" and one.statistic == "mean"]
     course = xr.DataArray(np.linspace(0.0, 500.0, plain.sizes["block"]), dims="block")
     turning = plain.assign(mean=plain["mean"] + course.where(plain["axis"] == "z", 0.0))
     leak = next(
         one
         for one in effect_candidates(turning, COEFFICIENT)[0]
-        if one.effect == "misalignment" and one.view == "mean"
+        if one.effect == "misalignment" and one.statistic == "mean"
     )
     assert [variant.columns for variant in leak.variants] == [("z",)]
 
@@ -152,7 +154,7 @@ def test_mean_designs_are_what_the_simulator_adds(plain):
 
 def test_earth_rate_is_in_quadrature_between_the_cross_axes(rich):
     candidates, _ = effect_candidates(rich, COEFFICIENT)
-    one = next(one for one in candidates if one.effect == "earth_rate" and one.view == "order")
+    one = next(one for one in candidates if one.effect == "earth_rate" and one.statistic == "order")
     pattern = one.variants[0].design[0, :, 0]
     turning = [*WORLD["turning"]]
     table = {"name": "earth_rate", "latitude": 60.0}
@@ -229,11 +231,13 @@ def test_cells_of_powers_are_scored_as_powers(plain, common):
     np.testing.assert_allclose(mine, theirs, atol=1e-6)
 
 
-@pytest.mark.parametrize("view", ["cross", "order"])
-def test_noise_has_the_variance_that_the_weights_say(rich, view):
+@pytest.mark.parametrize("statistic", ["cross", "order"])
+def test_noise_has_the_variance_that_the_weights_say(rich, statistic):
     baseline = calibrate_noise(rich)
     candidates = [
-        one for one in effect_candidates(rich, COEFFICIENT)[0] if one.view == view and one.each
+        one
+        for one in effect_candidates(rich, COEFFICIENT)[0]
+        if one.statistic == statistic and one.each
     ][:1]
     cells = build_linear_model(candidates, 0, rich, begin_state(rich, baseline))
     z = (cells.values[..., 0] * np.sqrt(cells.weight))[
@@ -267,14 +271,19 @@ def test_simulated_wander_has_the_variance_of_the_face():
         rate=1.0,
         seed=5,
     )
-    reduced = reduce_log(log)
-    time, variance = effect.explain(windows_of(reduced, {})).wander["rms"]
+    blocks = reduce_log(log)
+    time, variance = effect.explain(windows_of(blocks, {})).wander["rms"]
     assert time == 50.0
     assert 0.01 * variance[0] == pytest.approx(float(np.var(log["rate"].values)), rel=0.3)
 
 
 def test_generics_have_the_axes_of_the_record(plain):
-    assert {one.view for one in nuisance_alternatives(plain)} == {"mean", "power", "cross", "marks"}
+    assert {one.statistic for one in nuisance_alternatives(plain)} == {
+        "mean",
+        "power",
+        "cross",
+        "marks",
+    }
     alone = plain.isel(axis=[0]).drop_dims("pair") if "pair" in plain.dims else plain
     assert isinstance(alone, xr.Dataset)
-    assert "cross" not in {one.view for one in nuisance_alternatives(alone)}
+    assert "cross" not in {one.statistic for one in nuisance_alternatives(alone)}

@@ -30,13 +30,13 @@ def test_random_gaps_do_not_make_a_shared_band_smaller(log, rows):
     lost = np.random.default_rng(3).random((rows, log.sizes["time"])) < 0.4
     there = xr.DataArray(np.broadcast_to(~lost, (2, lost.shape[1])), dims=("axis", "time"))
     rate = log["rate"].transpose("axis", "time")
-    reduced = reduce_log(log.assign(rate=rate.where(there).assign_attrs(rate.attrs)))
-    baseline = calibrate_noise(reduced)
-    known, _ = effect_candidates(reduced, baseline["coefficient"])
-    one = next(one for one in known if one.effect == "shared_source" and one.view == "cross")
+    blocks = reduce_log(log.assign(rate=rate.where(there).assign_attrs(rate.attrs)))
+    baseline = calibrate_noise(blocks)
+    known, _ = effect_candidates(blocks, baseline["coefficient"])
+    one = next(one for one in known if one.effect == "shared_source" and one.statistic == "cross")
     variant = next(each for each in one.variants if each.values["bandwidth"] == 0.5)
     mean, covariance = component_mixture(
-        Component(one, variant, ("x", "y"), 1.0), begin_state(reduced, baseline)
+        Component(one, variant, ("x", "y"), 1.0), begin_state(blocks, baseline)
     ).moments()
     error = float(np.sqrt(covariance[0, 0]))
     assert abs(mean[0] - 9e-6) < 3.0 * error

@@ -22,19 +22,17 @@ _BACK = 1913.0  # s, between two values of the thinned grid
 @pytest.fixture(scope="module")
 def restarted():
     """An hour whose power was lost for 7 s."""
-    reduced = record([]).drop_vars(
+    blocks = record([]).drop_vars(
         [name for name in ("restart_begin", "restart_end") if name in record([])]
     )
-    return reduced.assign(
-        restart_begin=("restart", [_BACK - 7.0]), restart_end=("restart", [_BACK])
-    )
+    return blocks.assign(restart_begin=("restart", [_BACK - 7.0]), restart_end=("restart", [_BACK]))
 
 
-def _jumps(reduced):
+def _jumps(blocks):
     return next(
         one
-        for one in effect_candidates(reduced, COEFFICIENT)[0]
-        if one.effect == "bias_jump" and one.view == "mean"
+        for one in effect_candidates(blocks, COEFFICIENT)[0]
+        if one.effect == "bias_jump" and one.statistic == "mean"
     )
 
 
@@ -61,9 +59,9 @@ def test_each_time_weighs_as_much_as_the_time_that_it_stands_for():
 
 @pytest.mark.parametrize("at", [1_337.0, 1_350.0, 1_359.0])
 def test_a_large_jump_is_found_at_any_time_of_a_long_record(at):
-    blocks = 2_000
-    windows = 20.0 * np.arange(blocks)
-    means = np.random.default_rng(2).standard_normal(blocks) + 30.0 * np.clip(
+    block_count = 2_000
+    windows = 20.0 * np.arange(block_count)
+    means = np.random.default_rng(2).standard_normal(block_count) + 30.0 * np.clip(
         (windows + 20.0 - at) / 20.0, 0.0, 1.0
     )
     frame = Windows(windows, windows + 20.0, np.ones(1), 10.0, ("x",), own={"x": means})
@@ -94,5 +92,5 @@ def test_a_jump_where_power_came_back_needs_less_to_be_seen(restarted):
     found = [
         compute_evidence([one], moved, state, fold_blocks(moved))[0] for one in (weighed, alike)
     ]
-    assert (found[0].gain > found[1].gain + 0.5).any()
+    assert (found[0].evidence_nats > found[1].evidence_nats + 0.5).any()
     assert {one.values["at"] for one in found[0].best} == {_BACK}

@@ -119,10 +119,10 @@ def test_channels_that_turn_with_the_tool_keep_their_stamps_beside_its_rotation(
 
 def test_a_fast_toolface_is_not_called_too_slow():
     seconds = np.arange(0.0, 600.0, 0.01)
-    reduced, _, _ = candidates_of(
+    blocks, _, _ = candidates_of(
         with_channel(log_of(60_000), "toolface", seconds, np.mod(70.0 * seconds, 360.0), "degree")
     )
-    assert [one["reason"] for one in unused_channels(reduced, ())] == [
+    assert [one["reason"] for one in unused_channels(blocks, ())] == [
         "no effect follows a channel of this name; lines at the rotation are found with the channel rotation_rate"
     ]
 
@@ -210,15 +210,15 @@ def kicked(skew: float, *, size: int = 60_000) -> xr.Dataset:
 
 def candidates_of(log: xr.Dataset) -> tuple[xr.Dataset, list[Any], dict[str, str]]:
     aligned = align_channels(log)
-    reduced = reduce_log(aligned.log.assign_attrs(unused_channels=aligned.unused))
-    return reduced, *effect_candidates(reduced, calibrate_noise(reduced)["coefficient"])
+    blocks = reduce_log(aligned.log.assign_attrs(unused_channels=aligned.unused))
+    return blocks, *effect_candidates(blocks, calibrate_noise(blocks)["coefficient"])
 
 
 def test_a_ramp_of_another_file_reaches_the_search():
-    reduced, found, reasons = candidates_of(kicked(1 / 3))
+    blocks, found, reasons = candidates_of(kicked(1 / 3))
     assert "feedback_reset" not in reasons
-    assert {one.view for one in found if one.effect == "feedback_reset"} >= {"phase_locked"}
-    profile = reduced["profile"].mean("block").values[0]
+    assert {one.statistic for one in found if one.effect == "feedback_reset"} >= {"phase_locked"}
+    profile = blocks["profile"].mean("block").values[0]
     late = 4.17 / RATE / 3.0  # turns between a sample and its value of the ramp
     assert profile[-2:].mean() - profile[2:36].mean() == pytest.approx(
         2.0 * (1.0 - late / 0.05), abs=0.15
@@ -230,11 +230,11 @@ def test_the_reason_of_an_effect_names_the_channel_that_is_not_used():
     slow = with_channel(
         log.drop_vars(["ramp", "time_ramp"]), "ramp", np.arange(0.0, 600.0, 0.5), np.zeros(1200)
     )
-    reduced, found, reasons = candidates_of(slow)
+    blocks, found, reasons = candidates_of(slow)
     assert "the channel ramp is not used: it is sampled at 2 Hz" in reasons["feedback_reset"]
     assert "no channel temperature" in reasons["shupe"]
     (one,) = unused_channels(
-        reduced, {name for each in found for name in (*each.driver, *each.witness)}
+        blocks, {name for each in found for name in (*each.driver, *each.witness)}
     )
     assert one["name"] == "ramp"
 
@@ -265,9 +265,9 @@ def test_the_reason_of_an_effect_names_the_channel_that_is_not_used():
 )
 def test_every_channel_that_is_not_used_is_named(name: str, unit: str, values: Any, reason: str):
     log = with_channel(log_of(60_000), name, np.arange(600.0), values, unit)
-    reduced, found, reasons = candidates_of(log)
+    blocks, found, reasons = candidates_of(log)
     (one,) = unused_channels(
-        reduced, {each for candidate in found for each in (*candidate.driver, *candidate.witness)}
+        blocks, {each for candidate in found for each in (*candidate.driver, *candidate.witness)}
     )
     assert one["name"] == name
     assert reason in one["reason"]
@@ -280,13 +280,13 @@ def test_a_seismometer_on_its_own_stamps_is_compared_sample_by_sample():
     ground = np.random.default_rng(4).standard_normal(60_000)
     log["rate"] = log["rate"] + ground
     log["rate"].attrs["units"] = "degree hour-1"
-    reduced, found, _ = candidates_of(
+    blocks, found, _ = candidates_of(
         with_channel(log, "seismometer_z", (np.arange(60_000) + 0.37) / RATE, ground)
     )
     assert ("real_motion", ("seismometer_z",)) in {
-        (one.effect, one.witness) for one in found if one.view == "transfer"
+        (one.effect, one.witness) for one in found if one.statistic == "transfer"
     }
-    assert unused_channels(reduced, {"seismometer_z"}) == []
+    assert unused_channels(blocks, {"seismometer_z"}) == []
 
 
 def test_the_diagnosis_says_which_channels_it_used(recwarn: pytest.WarningsRecorder):

@@ -58,44 +58,44 @@ def test_powers_are_the_sums_of_their_definition(seed: int, size: int, lost: flo
     rng = np.random.default_rng(seed)
     x = rng.standard_normal((2, 24 * size)) + offset
     x[rng.random(x.shape) < lost] = np.nan
-    reduced = reduce_log(log_of(x), block=f"{size}samples")
+    blocks = reduce_log(log_of(x), block=f"{size}samples")
     weights, edges, number = taper(size), band_edges(size), int(rng.integers(0, 24))
-    part = x[:, number * size : (number + 1) * size]
+    component = x[:, number * size : (number + 1) * size]
     angle = np.exp(-2j * np.pi * np.outer(np.arange(ordinates(size) + 1), np.arange(size)) / size)
     for row in range(2):
-        there = ~np.isnan(part[row])
+        there = ~np.isnan(component[row])
         if there.mean() < 0.25:
-            assert np.isnan(reduced.power.values[row, number]).all()
+            assert np.isnan(blocks.power.values[row, number]).all()
             continue
-        mean = part[row][there].mean()
+        mean = component[row][there].mean()
         # every ordinate is a sum c . y over the samples; the mean is in c
         c = (
             angle[:, there] * weights[there]
             - (angle[:, there] @ weights[there])[:, None] / there.sum()
         )
-        ordinate, expected = c @ (part[row][there] - mean), (np.abs(c) ** 2).sum(axis=1)
+        ordinate, expected = c @ (component[row][there] - mean), (np.abs(c) ** 2).sum(axis=1)
         for band in range(edges.size - 1):
             k = slice(edges[band], edges[band + 1])
-            assert reduced.power.values[row, number, band] == pytest.approx(
+            assert blocks.power.values[row, number, band] == pytest.approx(
                 (np.abs(ordinate[k]) ** 2).sum() / expected[k].sum() / RATE, rel=1e-6
             )
-        assert reduced["mean"].values[row, number] == pytest.approx(mean, rel=1e-12, abs=1e-9)
-    both = ~np.isnan(part).any(axis=0)
+        assert blocks["mean"].values[row, number] == pytest.approx(mean, rel=1e-12, abs=1e-9)
+    both = ~np.isnan(component).any(axis=0)
     if both.mean() >= 0.25:
-        y = part[:, both] - part[:, both].mean(axis=1, keepdims=True)
+        y = component[:, both] - component[:, both].mean(axis=1, keepdims=True)
         c = angle[:, both] * weights[both] - (angle[:, both] @ weights[both])[:, None] / both.sum()
         one, other = c @ y[0], c @ y[1]
         k = slice(edges[3], edges[4])
         wanted = (one[k] * other[k].conj()).sum() / (np.abs(c[k]) ** 2).sum() / RATE
-        assert reduced.cross.values[0, number, 3] == pytest.approx(wanted, rel=1e-6, abs=1e-12)
+        assert blocks.cross.values[0, number, 3] == pytest.approx(wanted, rel=1e-6, abs=1e-12)
 
 
 @pytest.mark.parametrize("gaps", ["none", "random", "stretches"])
 def test_white_noise_has_its_density_and_the_gamma_distribution_of_the_shape(gaps: str):
     rng = np.random.default_rng(4)
     x = with_gaps(3.0 * rng.standard_normal(3000 * 400), gaps, rng)
-    reduced = reduce_log(log_of(x), block="400samples")
-    power, shape = reduced.power.values[0] / (9.0 / RATE), reduced["shape"].values[0]
+    blocks = reduce_log(log_of(x), block="400samples")
+    power, shape = blocks.power.values[0] / (9.0 / RATE), blocks["shape"].values[0]
     there = np.isfinite(power[:, 0])
     power, shape = power[there], shape[there]
     error = np.sqrt(1.0 / shape.mean(axis=0) / power.shape[0])
@@ -112,27 +112,27 @@ def test_white_noise_has_its_density_and_the_gamma_distribution_of_the_shape(gap
 
 
 def test_bands_share_scatter_as_the_taper_says():
-    size, blocks = 50, 40_000
-    x = np.random.default_rng(4).standard_normal((blocks, size))
+    size, block_count = 50, 40_000
+    x = np.random.default_rng(4).standard_normal((block_count, size))
     spectrum = np.fft.rfft((x - x.mean(axis=1, keepdims=True)) * taper(size), axis=1)[
         :, 1 : ordinates(size) + 1
     ]
     power = np.add.reduceat(np.abs(spectrum) ** 2, band_edges(size)[:-1] - 1, axis=1)
     found = np.cov((power / power.mean(axis=0)).T)
-    scatter = np.sqrt(np.outer(np.diag(found), np.diag(found)) / blocks)
+    scatter = np.sqrt(np.outer(np.diag(found), np.diag(found)) / block_count)
     np.fill_diagonal(found, 0.0)
     assert np.abs((found - band_covariance(size)) / scatter).max() < 4.5
     assert np.abs(found / scatter).max() > 6.0  # there is something to see
 
 
 def test_whole_blocks_lose_little_to_the_taper():
-    reduced = reduce_log(
+    blocks = reduce_log(
         log_of(np.random.default_rng(0).standard_normal(40_000)), block="1000samples"
     )
     widths = np.diff(band_edges(1000))
-    share = reduced["shape"].values[0, 0] / widths
+    share = blocks["shape"].values[0, 0] / widths
     assert np.all((share > 0.8) & (share <= 1.0))
-    assert reduced.neighbours.values == pytest.approx(1.0, abs=1e-3)
+    assert blocks.neighbours.values == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -145,8 +145,8 @@ def test_densities_through_random_gaps_are_mixed_by_the_share_of_neighbours(
         {"noise": noise, "log": {"axes": ["x"]}}, duration="2h", rate=50.0, seed=8
     ).compute()
     lost = np.random.default_rng(1).random(log.rate.shape) < 0.4
-    reduced = reduce_log(log.assign(rate=log.rate.where(~lost)), block="10s")
-    f = reduced.frequency.values
+    blocks = reduce_log(log.assign(rate=log.rate.where(~lost)), block="10s")
+    f = blocks.frequency.values
     omega = 2.0 * np.pi * f
     density = np.zeros_like(f)
     fine = np.linspace(0.0, 25.0, 20001)[1:]
@@ -159,32 +159,32 @@ def test_densities_through_random_gaps_are_mixed_by_the_share_of_neighbours(
         density += white + walk / omega**2
         seen = fine[fine >= 0.05]  # block means are taken off
         mean = white + np.sum(walk / (2 * np.pi * seen) ** 2) * (fine[1] - fine[0]) / 25.0
-    share = float(reduced.neighbours.mean())
+    share = float(blocks.neighbours.mean())
     assert share == pytest.approx(0.6, abs=0.01)
     wanted = share * density + (1.0 - share) * mean
-    found = reduced.power.mean("block").values[0]
+    found = blocks.power.mean("block").values[0]
     assert found[4:] == pytest.approx(wanted[4:], rel=tolerance)
 
 
 def test_a_sine_lands_in_its_band_and_on_its_line():
     seconds = np.arange(60_000) / RATE
-    reduced = reduce_log(log_of(2.0 * np.sin(2 * np.pi * 13.0 * seconds)), block="10s")
-    power, width = reduced.power.values[0], (reduced.band_high - reduced.band_low).values
-    band = int(np.searchsorted(reduced.band_low.values, 13.0) - 1)
+    blocks = reduce_log(log_of(2.0 * np.sin(2 * np.pi * 13.0 * seconds)), block="10s")
+    power, width = blocks.power.values[0], (blocks.band_high - blocks.band_low).values
+    band = int(np.searchsorted(blocks.band_low.values, 13.0) - 1)
     assert np.all(np.argmax(power, axis=1) == band)
     assert power[:, band] * width[band] * 2.0 == pytest.approx(
         2.0, rel=0.1
     )  # a square of 2**2 / 2, less or more by the taper's shape
-    lines = reduced.line_power.values[0]
+    lines = blocks.line_power.values[0]
     assert lines.shape[0] == 8
-    assert np.all(reduced.line_frequency.values[np.argmax(lines, axis=1)] == 13.0)
+    assert np.all(blocks.line_frequency.values[np.argmax(lines, axis=1)] == 13.0)
 
 
 def test_line_spectra_average_the_blocks_of_an_eighth():
     rng = np.random.default_rng(3)
-    reduced = reduce_log(log_of(rng.standard_normal(240_000)), block="5s")  # 480 blocks
-    assert reduced.line_weight.values == pytest.approx(60.0, rel=0.01)
-    lines = reduced.line_power.values * RATE
+    blocks = reduce_log(log_of(rng.standard_normal(240_000)), block="5s")  # 480 blocks
+    assert blocks.line_weight.values == pytest.approx(60.0, rel=0.01)
+    lines = blocks.line_power.values * RATE
     assert lines.mean() == pytest.approx(1.0, abs=0.02)
     assert lines.var() * 60.0 == pytest.approx(1.0, abs=0.15)
 
@@ -197,22 +197,22 @@ def test_what_axes_and_channels_share_is_in_their_cross_spectra(gaps: str):
     witness = shared + 0.1 * rng.standard_normal(shared.size)
     x = np.stack([with_gaps(row, gaps, rng) for row in x])
     witness = with_gaps(witness, gaps, rng)
-    reduced = reduce_log(log_of(x, channels={"accel_x": (witness, "g")}), block="500samples")
+    blocks = reduce_log(log_of(x, channels={"accel_x": (witness, "g")}), block="500samples")
     assert [
         (str(a), str(b))
-        for a, b in zip(reduced["first"].values, reduced["second"].values, strict=True)
+        for a, b in zip(blocks["first"].values, blocks["second"].values, strict=True)
     ] == [
         ("x", "y"),
         ("x", "z"),
         ("y", "z"),
     ]
-    cross = reduced.cross.mean("block").values * RATE
+    cross = blocks.cross.mean("block").values * RATE
     assert cross[0].real == pytest.approx(-0.2, abs=0.15)
     assert np.mean(cross[0][-6:]).real == pytest.approx(-0.2, abs=0.02)
     assert np.abs(np.mean(cross[:, -6:], axis=1)[1:]).max() < 0.02
-    coupling = (reduced.witness_cross.sel(axis="x", witness="accel_x").mean("block") * RATE).values
+    coupling = (blocks.witness_cross.sel(axis="x", witness="accel_x").mean("block") * RATE).values
     assert np.mean(coupling[-6:]) == pytest.approx(0.5, abs=0.02)
-    assert (reduced.witness_power.mean("block").values[0] * RATE)[-6:] == pytest.approx(
+    assert (blocks.witness_power.mean("block").values[0] * RATE)[-6:] == pytest.approx(
         1.01, abs=0.03
     )
 
@@ -232,8 +232,8 @@ def test_orders_are_the_amplitudes_that_turn_with_the_tool():
         + 0.5 * rng.standard_normal(size)
     )
     x[rng.random(size) < 0.2] = np.nan
-    reduced = reduce_log(log_of(x, channels={"rotation_rate": (speed, "deg/s")}), block="20s")
-    order = reduced.order.values[0]
+    blocks = reduce_log(log_of(x, channels={"rotation_rate": (speed, "deg/s")}), block="20s")
+    order = blocks.order.values[0]
     assert np.abs(order[:, 0].mean() - 5.0 * np.exp(0.7j)) < 0.15
     assert np.abs(order[:, 2].mean() - 2.0 * np.exp(-1.0j)) < 0.15
     assert np.abs(order[:, 1].mean()) < 0.15
@@ -253,9 +253,9 @@ def test_orders_follow_a_rotation_sensor_with_its_own_slower_time_and_are_silent
         ],
     }
     log = simulate(model, duration="20min", rate=RATE, seed=1).compute()
-    reduced = reduce_log(log, block="20s")
-    order = reduced.order.values[..., 0]
-    still, turning = reduced.end.values <= 580.0, reduced.begin.values >= 610.0
+    blocks = reduce_log(log, block="20s")
+    order = blocks.order.values[..., 0]
+    still, turning = blocks.end.values <= 580.0, blocks.begin.values >= 610.0
     assert np.isnan(order[:, still]).all()
     size = np.abs(order[:, turning])
     assert np.all(np.abs(size / size.mean() - 1.0) < 0.05)
@@ -268,11 +268,11 @@ def test_a_profile_shows_the_error_by_phase_of_the_ramp():
     rng, size = np.random.default_rng(6), 90_000
     ramp = rng.random(size) * 32767
     x = 4.0 * (ramp / 32767 > 0.75) + rng.standard_normal(size) + 1e5
-    reduced = reduce_log(log_of(x, channels={"ramp": (ramp, "1")}), block="5s")
-    weights = reduced.profile_samples.values[0]
-    profile = (np.nan_to_num(reduced.profile.values[0]) * weights).sum(axis=0) / weights.sum(axis=0)
+    blocks = reduce_log(log_of(x, channels={"ramp": (ramp, "1")}), block="5s")
+    weights = blocks.profile_samples.values[0]
+    profile = (np.nan_to_num(blocks.profile.values[0]) * weights).sum(axis=0) / weights.sum(axis=0)
     assert weights.sum() == size
-    assert profile == pytest.approx(np.where(reduced.phase.values > 0.75, 3.0, -1.0), abs=0.15)
+    assert profile == pytest.approx(np.where(blocks.phase.values > 0.75, 3.0, -1.0), abs=0.15)
 
 
 # --------------------------------------------------------------------------------------------------------
@@ -302,16 +302,14 @@ def test_channels_are_averaged_over_blocks_whatever_their_own_time():
     }
     log = simulate(model, duration="20min", rate=RATE, seed=1).compute()
     log["vibration"] = ("time", np.tile([3.0, -4.0], 60_000), {"units": "g"})
-    reduced = reduce_log(log, block="5s")
-    centre = (reduced.begin + reduced.end).values / 2.0
-    warm = reduced.channel_temperature
+    blocks = reduce_log(log, block="5s")
+    centre = (blocks.begin + blocks.end).values / 2.0
+    warm = blocks.channel_temperature
     assert warm.attrs["units"] == "degree_Celsius"
     assert np.isfinite(warm.values[:-2]).all()  # the last sample of the sensor lies before the end
     assert warm.values[:-2] == pytest.approx(20.0 + centre[:-2] / 30.0, abs=0.1)
-    assert reduced.channel_supply_voltage.values == pytest.approx(
-        np.where(centre < 600, 28.0, 24.0)
-    )
-    assert reduced.channel_vibration.values == pytest.approx(np.sqrt(12.5))
+    assert blocks.channel_supply_voltage.values == pytest.approx(np.where(centre < 600, 28.0, 24.0))
+    assert blocks.channel_vibration.values == pytest.approx(np.sqrt(12.5))
 
 
 @pytest.mark.parametrize("own", [True, False], ids=["on stamps of its own", "with the rate"])
@@ -330,17 +328,17 @@ def test_temperatures_keep_their_course_inside_of_blocks_and_lose_their_noise(ow
     log["supply_voltage"] = ("time", true, {"units": "V"})
     log["temperature_2"] = ("time_temperature_2", true[::900], {"units": "degree_Celsius"})
     log = log.assign_coords(time_temperature_2=log.time.values[::900])
-    reduced = reduce_log(log)
-    fine = reduced.fine_temperature
+    blocks = reduce_log(log)
+    fine = blocks.fine_temperature
     assert fine.dims == ("block", "piece")
     assert fine.attrs["units"] == "degree_Celsius"
     error = fine.values - true.reshape(*fine.shape, -1).mean(axis=2)
     raw = 0.1 / np.sqrt(180_000 / every / fine.size) * (1.0 if own else 10.0)
     assert error.std() < 0.6 * raw
-    assert "fine_temperature_2" not in reduced  # slower than the parts
-    parts = true.reshape(*fine.shape, -1).mean(axis=2)
+    assert "fine_temperature_2" not in blocks  # slower than the parts
+    components = true.reshape(*fine.shape, -1).mean(axis=2)
     np.testing.assert_allclose(
-        reduced.fine_supply_voltage.values, parts, atol=0.05
+        blocks.fine_supply_voltage.values, components, atol=0.05
     )  # a supply as well, but for its corners
 
 
@@ -361,18 +359,16 @@ def test_long_gaps_and_restarts_are_listed_in_seconds():
     x[:, 20_000:20_300] = np.nan
     x[0, 30_000:32_000] = np.nan  # one axis only
     x[:, 39_950:41_000] = np.nan  # over the edge of a block
-    reduced = reduce_log(log_of(x), block="10s")
-    assert np.stack([reduced.gap_begin, reduced.gap_end], axis=1).tolist() == [
+    blocks = reduce_log(log_of(x), block="10s")
+    assert np.stack([blocks.gap_begin, blocks.gap_end], axis=1).tolist() == [
         [200.0, 203.0],
         [399.5, 410.0],
     ]
-    assert np.stack([reduced.restart_begin, reduced.restart_end], axis=1).tolist() == [
-        [399.5, 410.0]
-    ]
-    assert reduced.samples.values[0, 30:32].tolist() == [0, 0]
-    assert np.isnan(reduced["mean"].values[0, 30:32]).all()
-    assert np.isfinite(reduced["mean"].values[1, 30:32]).all()
-    assert reduced.attrs["missing_share"] == pytest.approx((50 + 300 + 1000 + 1050) / 60_000)
+    assert np.stack([blocks.restart_begin, blocks.restart_end], axis=1).tolist() == [[399.5, 410.0]]
+    assert blocks.samples.values[0, 30:32].tolist() == [0, 0]
+    assert np.isnan(blocks["mean"].values[0, 30:32]).all()
+    assert np.isfinite(blocks["mean"].values[1, 30:32]).all()
+    assert blocks.attrs["missing_share"] == pytest.approx((50 + 300 + 1000 + 1050) / 60_000)
 
 
 def test_restarts_that_the_log_tells_are_taken():
@@ -382,9 +378,9 @@ def test_restarts_that_the_log_tells_are_taken():
         "environment": [{"profile": "power_cuts", "cuts": [[300, 302], [900, 930]]}],
     }
     log = simulate(model, duration="20min", rate=10.0, seed=1)
-    reduced = reduce_log(log)
-    assert reduced.restart_begin.values == pytest.approx([300.0, 900.0])
-    assert reduced.restart_end.values == pytest.approx([302.0, 930.0])
+    blocks = reduce_log(log)
+    assert blocks.restart_begin.values == pytest.approx([300.0, 900.0])
+    assert blocks.restart_end.values == pytest.approx([302.0, 930.0])
 
 
 @settings(max_examples=10, deadline=None)
@@ -439,8 +435,8 @@ def test_a_single_name_of_a_file_stays_whole():
     log = log_of(np.random.default_rng(1).standard_normal(24 * 100)).assign_attrs(
         source_files="run7.csv", notes="after a repair"
     )
-    reduced = reduce_log(log)
-    assert (reduced.attrs["source_files"], reduced.attrs["notes"]) == (
+    blocks = reduce_log(log)
+    assert (blocks.attrs["source_files"], blocks.attrs["notes"]) == (
         ["run7.csv"],
         ["after a repair"],
     )

@@ -56,11 +56,11 @@ def test_zeros_of_one_axis_are_stuck_and_those_of_all_are_filled():
         lost[first : first + 30] = True
     at = (x[1] == 0.0).sum(), lost.sum(), (lost & (x[1] == 0.0)).sum()
     x[:, lost] = 0.0
-    reduced = reduce_log(log_of(x), block="10s")
-    np.testing.assert_array_equal(reduced.filled.sum("block"), [at[1]] * 3)
-    np.testing.assert_array_equal(reduced.stuck.sum("block"), [0, at[0] - at[2], 0])
-    np.testing.assert_array_equal(reduced.zeros.sum("block"), (x == 0.0).sum(axis=1))
-    assert int(reduced.repeats.sum()) == 0
+    blocks = reduce_log(log_of(x), block="10s")
+    np.testing.assert_array_equal(blocks.filled.sum("block"), [at[1]] * 3)
+    np.testing.assert_array_equal(blocks.stuck.sum("block"), [0, at[0] - at[2], 0])
+    np.testing.assert_array_equal(blocks.zeros.sum("block"), (x == 0.0).sum(axis=1))
+    assert int(blocks.repeats.sum()) == 0
 
 
 @pytest.mark.parametrize("axes", [1, 3])
@@ -68,17 +68,17 @@ def test_wide_dead_zones_are_stuck_and_not_filled(axes: int):
     """A third of the samples stick: by chance two in a row, or two axes at once."""
     x = np.random.default_rng(11).standard_normal((axes, 60 * 1000)) + 0.1
     x[np.abs(x) < 0.43] = 0.0
-    reduced = reduce_log(log_of(x), block="10s")
+    blocks = reduce_log(log_of(x), block="10s")
     zeros = (x == 0.0).sum()
     assert 0.3 < zeros / x.size < 0.36
-    assert reduced.stuck.sum() > 0.96 * zeros
+    assert blocks.stuck.sum() > 0.96 * zeros
 
 
 def test_zeros_at_the_end_of_a_range_are_not_stuck():
     x = np.maximum(np.random.default_rng(12).standard_normal((2, 60 * 1000)), 0.0)
-    reduced = reduce_log(log_of(x), block="10s")
-    assert int(reduced.stuck.sum()) == 0
-    np.testing.assert_array_equal(reduced.extremes.sum("block"), (x == 0.0).sum(axis=1) + 1)
+    blocks = reduce_log(log_of(x), block="10s")
+    assert int(blocks.stuck.sum()) == 0
+    np.testing.assert_array_equal(blocks.extremes.sum("block"), (x == 0.0).sum(axis=1) + 1)
 
 
 def test_held_samples_do_not_make_outliers_of_the_others():

@@ -24,16 +24,16 @@ def turning():
     return record([], environment=(*WORLD["usual"], speed))
 
 
-def claim(reduced, effect, view):
-    candidates, _ = effect_candidates(reduced, COEFFICIENT)
-    one = next(one for one in candidates if one.effect == effect and one.view == view)
-    part = Component(one, one.variants[0], ("x",), 50.0, place=0)
-    return Identification(effect, one.driver, ("x",), (part,), 50.0, 8.0)
+def identification(blocks, effect, statistic):
+    candidates, _ = effect_candidates(blocks, COEFFICIENT)
+    one = next(one for one in candidates if one.effect == effect and one.statistic == statistic)
+    component = Component(one, one.variants[0], ("x",), 50.0, place=0)
+    return Identification(effect, one.driver, ("x",), (component,), 50.0, 8.0)
 
 
 def test_what_is_locked_to_the_rotation_acts_while_the_tool_turns(turning):
     found = spans(
-        active_spans(claim(turning, "rotation_line", "order"), turning),
+        active_spans(identification(turning, "rotation_line", "order"), turning),
         turning["begin"].values,
         turning["end"].values,
     )
@@ -41,8 +41,10 @@ def test_what_is_locked_to_the_rotation_acts_while_the_tool_turns(turning):
 
 
 def test_what_stands_at_rest_as_well_acts_at_rest_as_well(turning):
-    one = claim(turning, "earth_rate", "order")
-    both = replace(one, parts=(*one.parts, *claim(turning, "earth_rate", "mean").parts))
+    one = identification(turning, "earth_rate", "order")
+    both = replace(
+        one, components=(*one.components, *identification(turning, "earth_rate", "mean").components)
+    )
     assert spans(active_spans(both, turning), turning["begin"].values, turning["end"].values) == [
         (0.0, 3600.0)
     ]
@@ -52,7 +54,7 @@ def test_an_effect_of_a_channel_that_rests_less_than_half_of_the_time_acts_while
     turning,
 ):
     (span,) = spans(
-        active_spans(claim(turning, "scale_factor", "mean"), turning),
+        active_spans(identification(turning, "scale_factor", "mean"), turning),
         turning["begin"].values,
         turning["end"].values,
     )
@@ -61,11 +63,11 @@ def test_an_effect_of_a_channel_that_rests_less_than_half_of_the_time_acts_while
 
 @pytest.mark.parametrize(("level", "there"), [(0.5, True), (0.2, False)])
 def test_a_tenth_of_the_largest_counts_as_there(level, there):
-    reduced = record([])
-    g = np.zeros(reduced.sizes["block"])
+    blocks = record([])
+    g = np.zeros(blocks.sizes["block"])
     g[40:60], g[100:120] = 5.0, 5.0 * level
-    shaken = reduced.assign(channel_vibration=reduced["channel_vibration"].copy(data=g))
-    found = active_spans(claim(shaken, "vibration_rectification", "mean"), shaken)
+    shaken = blocks.assign(channel_vibration=blocks["channel_vibration"].copy(data=g))
+    found = active_spans(identification(shaken, "vibration_rectification", "mean"), shaken)
     np.testing.assert_array_equal(
         np.flatnonzero(found), [*range(40, 60), *(range(100, 120) if there else ())]
     )

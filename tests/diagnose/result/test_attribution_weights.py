@@ -29,8 +29,8 @@ NAMES = (
 )
 
 
-def _claim(candidates, effect, view, column):
-    one = next(one for one in candidates if (one.effect, one.view) == (effect, view))
+def _claim(candidates, effect, statistic, column):
+    one = next(one for one in candidates if (one.effect, one.statistic) == (effect, statistic))
     variant = next(
         one
         for one in one.variants
@@ -44,36 +44,36 @@ def _claim(candidates, effect, view, column):
 @pytest.fixture(scope="module")
 def shaken():
     """Vibration that raises noise and bias of x, with the spikes of a few blocks in it; three claims; and what null records do."""
-    reduced = record([])
-    g = reduced["channel_vibration"].values
-    baseline, chance = nulls(reduced, 60)
+    blocks = record([])
+    g = blocks["channel_vibration"].values
+    baseline, chance = nulls(blocks, 60)
     level = np.zeros((3, g.size))
     level[0] = 0.05 * g**2
     spiky = np.zeros((3, g.size), np.int64)
     spiky[0, np.flatnonzero(g > 1.0)[[4, 9]]] = 9
-    changed = reduced.assign(
-        power=reduced["power"] * (1.0 + level[..., None] + 20.0 * (spiky > 0)[..., None]),
-        mean=reduced["mean"] + np.stack([0.004 * g**2, 0 * g, 0 * g]),
+    changed = blocks.assign(
+        power=blocks["power"] * (1.0 + level[..., None] + 20.0 * (spiky > 0)[..., None]),
+        mean=blocks["mean"] + np.stack([0.004 * g**2, 0 * g, 0 * g]),
         outliers=(("axis", "block"), spiky),
     )
     candidates, reasons = effect_candidates(changed, COEFFICIENT)
-    claims = tuple(_claim(candidates, *names) for names in NAMES)
+    identified = tuple(_claim(candidates, *names) for names in NAMES)
     state = begin_state(changed, baseline)
-    for claim in claims[::-1]:  # odd samples are named first
-        state = condition_on(state, list(claim.parts))
-    naming = Identifications(
-        claims, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed)
+    for identification in identified[::-1]:  # odd samples are named first
+        state = condition_on(state, list(identification.components))
+    identifications = Identifications(
+        identified, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed)
     )
-    return changed, baseline, naming, null_scores(baseline, chance)
+    return changed, baseline, identifications, null_scores(baseline, chance)
 
 
 def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(shaken):
-    reduced, baseline, naming, _ = shaken
-    loud, bias, _ = naming.claims
+    blocks, baseline, identifications, _ = shaken
+    loud, bias, _ = identifications.identified
     whole, silent, level = (
-        predicted(naming, baseline, left_out=out) for out in ([], [loud], [bias])
+        predicted(identifications, baseline, left_out=out) for out in ([], [loud], [bias])
     )
-    quiet = reduced["channel_vibration"].values < 1.0
+    quiet = blocks["channel_vibration"].values < 1.0
     np.testing.assert_allclose(silent["known_mean"], whole["known_mean"])
     np.testing.assert_allclose(level["spectrum"], whole["spectrum"])
     np.testing.assert_allclose(
@@ -82,28 +82,28 @@ def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(s
     np.testing.assert_allclose(silent["spectrum"][0][quiet], whole["spectrum"][0][quiet], rtol=0.02)
     ratio = (whole["spectrum"] / silent["spectrum"]).values[0, ~quiet, -1]
     np.testing.assert_allclose(
-        ratio, 1.0 + 0.05 * reduced["channel_vibration"].values[~quiet] ** 2, rtol=0.15
+        ratio, 1.0 + 0.05 * blocks["channel_vibration"].values[~quiet] ** 2, rtol=0.15
     )
     np.testing.assert_allclose((silent["spectrum"] / baseline["spectrum"])[0], 1.0, atol=0.2)
 
 
 def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
-    reduced, baseline, naming, null = shaken
-    found = locate_mismatches(reduced, baseline, null)
-    after = predicted(naming, baseline)
+    blocks, baseline, identifications, null = shaken
+    found = locate_mismatches(blocks, baseline, null)
+    after = predicted(identifications, baseline)
 
-    def told(view, **options):
+    def told(statistic, **options):
         lists = attribute_mismatches(
-            found, naming.claims, reduced, after, null, level=0.005, **options
+            found, identifications.identified, blocks, after, null, level=0.005, **options
         )
         return {
             frozenset(names)
-            for box, names in zip(found["view"].values, lists, strict=True)
-            if box == view
+            for region, names in zip(found["view"].values, lists, strict=True)
+            if region == statistic
         }
 
     def without(out):
-        return predicted(naming, baseline, left_out=out)
+        return predicted(identifications, baseline, left_out=out)
 
     assert {"vibration_noise", "vibration_rectification", "spikes"} in told("davar")
     noise = told("davar", without=without)
@@ -113,15 +113,15 @@ def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
 
 
 def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
-    reduced, baseline, naming, null = shaken
-    loud, _, spikes = naming.claims
-    assert find_anomalous_blocks(spikes.parts[0], reduced).sum() == 2
-    found = locate_mismatches(reduced, baseline, null)
-    after = predicted(naming, baseline)
+    blocks, baseline, identifications, null = shaken
+    loud, _, spikes = identifications.identified
+    assert find_anomalous_blocks(spikes.components[0], blocks).sum() == 2
+    found = locate_mismatches(blocks, baseline, null)
+    after = predicted(identifications, baseline)
     one = attribute_mismatches(
-        found, [loud], reduced, after, null, level=0.005
+        found, [loud], blocks, after, null, level=0.005
     )  # the loudest two blocks are still there
-    both = attribute_mismatches(found, naming.claims, reduced, after, null, level=0.005)
+    both = attribute_mismatches(found, identifications.identified, blocks, after, null, level=0.005)
     davar = found["view"].values.tolist().index("davar")
     assert (one[davar], "vibration_noise" in both[davar]) == ([], True)
 
@@ -130,20 +130,27 @@ def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
 def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
     """The constant of a record is free, so that the mean before a jump stands out as well as that after it."""
     _, baseline, _, null = shaken
-    reduced = record([])
-    after_it = reduced["begin"].values >= 1800.0
-    moved = reduced.assign(
-        mean=reduced["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it])
+    blocks = record([])
+    after_it = blocks["begin"].values >= 1800.0
+    moved = blocks.assign(
+        mean=blocks["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it])
     )
     candidates, reasons = effect_candidates(moved, COEFFICIENT)
-    one = next(one for one in candidates if (one.effect, one.view) == ("bias_jump", "mean"))
+    one = next(one for one in candidates if (one.effect, one.statistic) == ("bias_jump", "mean"))
     variant = next(variant for variant in one.variants if variant.values["at"] == 1800.0)
-    claim = Identification(
+    identification = Identification(
         "bias_jump", one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
     )
-    state = condition_on(begin_state(moved, baseline), list(claim.parts))
-    naming = Identifications(
-        (claim,), (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(moved)
+    state = condition_on(begin_state(moved, baseline), list(identification.components))
+    identifications = Identifications(
+        (identification,),
+        (),
+        8.0,
+        np.zeros(1),
+        reasons,
+        tuple(candidates),
+        state,
+        fold_blocks(moved),
     )
     fields = {
         "view": "mean",
@@ -155,26 +162,35 @@ def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
         "tau_max_s": 600.0,
     }
     fields |= {"frequency": np.nan, "sign": -1, "z": -8.0}
-    box = xr.Dataset({name: ("mismatch", [value]) for name, value in fields.items()})
+    region = xr.Dataset({name: ("mismatch", [value]) for name, value in fields.items()})
     assert mean.score(moved, baseline)["what"].values.tolist() == ["mean"]
 
     def explained(**options):
         return attribute_mismatches(
-            box, [claim], moved, predicted(naming, baseline), null, level=0.005, **options
+            region,
+            [identification],
+            moved,
+            predicted(identifications, baseline),
+            null,
+            level=0.005,
+            **options,
         )[0]
 
     assert explained() == []  # by its time alone
-    assert explained(without=lambda out: predicted(naming, baseline, left_out=out)) == told
+    assert explained(without=lambda out: predicted(identifications, baseline, left_out=out)) == told
 
 
 BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
 
 
-def _shown(*views):
+def _shown(*statistics):
     variant = SimpleNamespace(columns=("white",))
     return [
-        (f"effect {n}", [SimpleNamespace(candidate=SimpleNamespace(view=view), variant=variant)])
-        for n, view in enumerate(views)
+        (
+            f"effect {n}",
+            [SimpleNamespace(candidate=SimpleNamespace(statistic=statistic), variant=variant)],
+        )
+        for n, statistic in enumerate(statistics)
     ]
 
 
@@ -218,8 +234,8 @@ def test_what_a_view_does_not_hold_stays():
     assert needed(BOX, low_pass, _brought(effect_0=9.0, effect_1=0.0)) == ["effect 0", "effect 1"]
 
 
-@pytest.mark.parametrize(("begin", "boxes"), [(70.0, 2), (85.0, 1)])
-def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near(begin, boxes):
+@pytest.mark.parametrize(("begin", "regions"), [(70.0, 2), (85.0, 1)])
+def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near(begin, regions):
     long = {
         "view": "davar",
         "axes": "x y",
@@ -231,7 +247,7 @@ def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near
     }
     long |= {"frequency": float("nan"), "sign": 1, "z": 90.0, "p_value": 1e-9}
     short = long | {"axes": "x", "begin": begin, "end": begin + 10.0, "z": 80.0}
-    assert len(merge_regions([long, short])) == boxes
+    assert len(merge_regions([long, short])) == regions
 
 
 @pytest.mark.parametrize(("axes", "told"), [("xy", ["spectral_line"]), ("x", [])])
@@ -252,8 +268,10 @@ def test_a_line_on_two_axes_is_why_they_vary_together(shaken, axes, told):
     shared = quiet.assign(cross=cross)
     place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
     candidates, _ = effect_candidates(shared, COEFFICIENT)
-    one = next(one for one in candidates if (one.effect, one.view) == ("spectral_line", "line"))
-    claim = Identification(
+    one = next(
+        one for one in candidates if (one.effect, one.statistic) == ("spectral_line", "line")
+    )
+    identification = Identification(
         "spectral_line",
         (),
         tuple(axes),
@@ -264,5 +282,5 @@ def test_a_line_on_two_axes_is_why_they_vary_together(shaken, axes, told):
     found = locate_mismatches(shared, baseline, null)
     found = found.isel(mismatch=found["view"].values == "cross_axis")
     assert found.sizes["mismatch"] >= 1
-    lists = attribute_mismatches(found, [claim], shared, baseline, null, level=0.005)
+    lists = attribute_mismatches(found, [identification], shared, baseline, null, level=0.005)
     assert all(names == told for names in lists)

@@ -376,15 +376,15 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
 
 
 @pytest.mark.parametrize(
-    "view", ["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"]
+    "statistic", ["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"]
 )
 @pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
-def test_every_view_has_a_sentence(view: str, axes: list[str]):
-    box = {
-        "view": view, "what": "outliers", "axes": axes, "begin": 0.0, "end": 3600.0, "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
+def test_every_view_has_a_sentence(statistic: str, axes: list[str]):
+    region = {
+        "view": statistic, "what": "outliers", "axes": axes, "begin": 0.0, "end": 3600.0, "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
         "sign": -1, "p_value": 0.002, "estimate": -0.2, "frequency": 13.0,
     }  # fmt: skip
-    sentence = mismatch_statement(box, 3600.0)
+    sentence = mismatch_statement(region, 3600.0)
     assert sentence[0].isupper()
     assert sentence.endswith(".")
     assert "1 of 500" in sentence
@@ -429,15 +429,15 @@ def test_a_diagnosis_prints_its_verdict_and_sentences():
 def test_a_page_of_many_mismatches_gives_their_chance_in_a_column(tmp_path: Path):
     """24 places: the words on chance are said once for all of them, and each has its number."""
     one = diagnosis()
-    box = one.content["mismatches"][0] | {"p_value": 1e-12, "explained_by": []}
-    box["statement"] = (
+    region = one.content["mismatches"][0] | {"p_value": 1e-12, "explained_by": []}
+    region["statement"] = (
         "Axis x is noisier than simulated (noise alone does that in fewer than 1 of a million such records)."
     )
-    boxes = [box | {"id": number} for number in range(1, 25)]
+    regions = [region | {"id": number} for number in range(1, 25)]
     many = replace(
         one,
         content=one.content
-        | {"mismatches": boxes, "unexplained": list(range(1, 25)), "effects": []},
+        | {"mismatches": regions, "unexplained": list(range(1, 25)), "effects": []},
     )
     text = write_diagnosis_report(many, tmp_path / "page.html").read_text(encoding="utf-8")
     assert text.count("<td>fewer than 1 of a million</td>") == 24

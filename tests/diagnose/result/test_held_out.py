@@ -183,10 +183,10 @@ def test_a_slow_drift_in_a_random_walk_is_worth_more_on_long_stretches(period, b
             for k in range(4)
         )
 
-    gain = held_out(found, base, after)["log_likelihood_gain"]
-    assert gain == pytest.approx(on(best))
+    evidence_nats = held_out(found, base, after)["log_likelihood_gain"]
+    assert evidence_nats == pytest.approx(on(best))
     assert on(best) == max(on(5), on(18), on(45))
-    assert gain > on(5) + 1.0
+    assert evidence_nats > on(5) + 1.0
 
 
 def test_a_forecast_gains_where_the_effect_goes_on():
@@ -195,9 +195,9 @@ def test_a_forecast_gains_where_the_effect_goes_on():
     wave = 0.1 * np.sin(2.0 * np.pi * np.arange(180) / 60.0)
     found["mean"][0] += wave
     after["known_mean"][0] += wave
-    gain = held_out(found, base, after)["forecast_gain"]
+    evidence_nats = held_out(found, base, after)["forecast_gain"]
     tail = wave[126:]
-    assert gain == pytest.approx(0.5 * (tail**2).sum() / VARIANCE, rel=0.5)
+    assert evidence_nats == pytest.approx(0.5 * (tail**2).sum() / VARIANCE, rel=0.5)
 
 
 def test_gain_of_other_views_is_added():
@@ -277,8 +277,8 @@ def test_surfaces_stand_side_by_side():
 
 
 def test_surfaces_of_a_long_record_stay_small():
-    base = baseline(blocks=1000)
-    found = records(base, 1, np.random.default_rng(1), blocks=1000).isel(record=0)
+    base = baseline(block_count=1000)
+    found = records(base, 1, np.random.default_rng(1), block_count=1000).isel(record=0)
     surfaces = make_surfaces(found, base, base)
     assert surfaces.sizes["window"] <= 260
     assert surfaces["time"].dtype.kind == "M"

@@ -42,19 +42,19 @@ def estimate(value: float, error: float) -> Estimate:
 
 
 def claim_of(
-    effect: str, axes: str, gains: tuple[float, ...] | None = None, *, view: str = "mean"
+    effect: str, axes: str, gains: tuple[float, ...] | None = None, *, statistic: str = "mean"
 ) -> Identification:
-    one: Any = Candidate(effect, view, (), ())
+    one: Any = Candidate(effect, statistic, (), ())
     variant: Any = SimpleNamespace(values={}, columns=())
-    parts = tuple(
-        Component(one, variant, (axis,), gain)
-        for axis, gain in zip(axes, gains or (20.0,) * len(axes), strict=True)
+    components = tuple(
+        Component(one, variant, (axis,), evidence_nats)
+        for axis, evidence_nats in zip(axes, gains or (20.0,) * len(axes), strict=True)
     )
-    return Identification(effect, (), tuple(axes), parts, 20.0 * len(axes), 8.0)
+    return Identification(effect, (), tuple(axes), components, 20.0 * len(axes), 8.0)
 
 
-def naming_with(*claims: Identification) -> Identifications:
-    return Identifications(claims, (), 8.0, np.zeros(1), {}, (), *[None] * 2)  # type: ignore[arg-type]
+def naming_with(*identified: Identification) -> Identifications:
+    return Identifications(identified, (), 8.0, np.zeros(1), {}, (), *[None] * 2)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -73,67 +73,73 @@ def naming_with(*claims: Identification) -> Identifications:
 def test_an_axis_is_supported_where_a_size_is_away_from_zero(
     parameters: dict[str, Estimate], axes: tuple[str, ...]
 ):
-    claim = claim_of("temperature_bias", "xy")
-    assert supported_axes(Fitted(claim, ("x", "y"), parameters, None)) == axes
+    identification = claim_of("temperature_bias", "xy")
+    assert supported_axes(Fitted(identification, ("x", "y"), parameters, None)) == axes
 
 
 def test_a_line_of_amplitude_zero_is_no_effect():
-    claim = claim_of("spectral_line", "x", view="line")
+    identification = claim_of("spectral_line", "x", statistic="line")
     nothing = {
         "amplitude": Estimate(0.0, 0.0, 0.0, 0.0, "deg/h"),
         "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz"),
     }
-    naming = keep_supported(naming_with(claim), [[Fitted(claim, ("x",), nothing, None)]])
-    assert not naming.claims
-    assert [(one.axes, one.candidates) for one in naming.unknown] == [(("x",), ("spectral_line",))]
+    identifications = keep_supported(
+        naming_with(identification), [[Fitted(identification, ("x",), nothing, None)]]
+    )
+    assert not identifications.identified
+    assert [(one.axes, one.candidates) for one in identifications.unknown] == [
+        (("x",), ("spectral_line",))
+    ]
 
 
 def test_an_effect_keeps_the_axes_on_which_its_size_is_known():
-    claim, other = claim_of("temperature_bias", "xy"), claim_of("shupe", "z")
+    identification, other = claim_of("temperature_bias", "xy"), claim_of("shupe", "z")
     numbers = [
         [
-            Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None)
+            Fitted(identification, (axis,), {"sensitivity": estimate(0.4, error)}, None)
             for axis, error in (("x", 0.1), ("y", 1.0))
         ],
         [Fitted(other, ("z",), {"sensitivity": estimate(0.4, 0.1)}, None)],
     ]
-    before = naming_with(claim, other)
-    naming = keep_supported(before, numbers)
-    assert [(one.effect, one.axes) for one in naming.claims] == [
+    before = naming_with(identification, other)
+    identifications = keep_supported(before, numbers)
+    assert [(one.effect, one.axes) for one in identifications.identified] == [
         ("temperature_bias", ("x",)),
         ("shupe", ("z",)),
     ]
-    assert naming.claims[0].parts == claim.parts[:1]
-    assert [(one.axes, one.generic) for one in naming.unknown] == [(("y",), "~bias(t)")]
-    assert keep_supported(before, [numbers[0][:1], numbers[1]]).claims[0].axes == ("x",)
-    assert keep_supported(naming, [numbers[0][:1], numbers[1]]) is naming
+    assert identifications.identified[0].components == identification.components[:1]
+    assert [(one.axes, one.generic) for one in identifications.unknown] == [(("y",), "~bias(t)")]
+    assert keep_supported(before, [numbers[0][:1], numbers[1]]).identified[0].axes == ("x",)
+    assert keep_supported(identifications, [numbers[0][:1], numbers[1]]) is identifications
 
 
 def test_what_chance_does_too_is_not_left_as_unknown():
-    claim = claim_of("temperature_bias", "xy", (30.0, 3.0))
+    identification = claim_of("temperature_bias", "xy", (30.0, 3.0))
     numbers = [
         [
-            Fitted(claim, (axis,), {"sensitivity": estimate(0.4, error)}, None)
+            Fitted(identification, (axis,), {"sensitivity": estimate(0.4, error)}, None)
             for axis, error in (("x", 0.1), ("y", 1.0))
         ]
     ]
-    naming = keep_supported(naming_with(claim), numbers)
-    assert [one.axes for one in naming.claims] == [("x",)]
-    assert not naming.unknown
+    identifications = keep_supported(naming_with(identification), numbers)
+    assert [one.axes for one in identifications.identified] == [("x",)]
+    assert not identifications.unknown
 
 
 def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
     """Vibration that does nothing, named by hand: what remains is a mismatch and no effect."""
-    reduced = reduced_of(environment=[SHAKE])
-    baseline = calibrate_noise(reduced)
-    naming = naming_of(reduced, baseline, "vibration_rectification", "mean", ("sensitivity",))
-    naming = replace(naming, null_best=np.arange(8.0))
-    kept, first, fit = conclude.fit_supported(naming, baseline)
-    assert (kept.claims, first, fit.fitted) == ((), [], [])
-    assert effect_tables(fit.fitted, reduced) == []
-    (box,) = unidentified_tables(fit.naming, reduced, [])
-    assert box["explained_by"] == []
-    assert "a bias made by vibration" in box["statement"]
+    blocks = reduced_of(environment=[SHAKE])
+    baseline = calibrate_noise(blocks)
+    identifications = naming_of(
+        blocks, baseline, "vibration_rectification", "mean", ("sensitivity",)
+    )
+    identifications = replace(identifications, null_best=np.arange(8.0))
+    kept, first, fit = conclude.fit_supported(identifications, baseline)
+    assert (kept.identified, first, fit.fitted) == ((), [], [])
+    assert effect_tables(fit.fitted, blocks) == []
+    (region,) = unidentified_tables(fit.identifications, blocks, [])
+    assert region["explained_by"] == []
+    assert "a bias made by vibration" in region["statement"]
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -169,15 +175,15 @@ SHARE = st.none() | st.floats(0.0, 1.0)
 
 
 @given(
-    gain=NUMBER,
+    evidence_nats=NUMBER,
     forecast=NUMBER,
     before=SHARE,
     after=SHARE,
     left=st.lists(st.integers(1, 3), max_size=2),
 )
-def test_explained_means_that_the_evidence_is_for_it(gain, forecast, before, after, left):
+def test_explained_means_that_the_evidence_is_for_it(evidence_nats, forecast, before, after, left):
     held = GOOD | {
-        "log_likelihood_gain": gain,
+        "log_likelihood_gain": evidence_nats,
         "forecast_gain": forecast,
         "coverage95_before": before,
         "coverage95_after": after,
@@ -185,7 +191,7 @@ def test_explained_means_that_the_evidence_is_for_it(gain, forecast, before, aft
     verdict = decide_verdict([{}], ["shupe"], left, held)
     assert (verdict == "explained") == (not left and not failed_checks(held))
     if verdict == "explained":
-        assert gain > 0.0
+        assert evidence_nats > 0.0
         assert forecast is None or forecast >= 0.0
         assert before is None or after is None or after >= min(before, 0.95) - 0.02
     text = summary(content() | {"verdict": verdict, "unexplained": left, "held_out": held})
@@ -219,14 +225,18 @@ def test_a_limit_over_several_laws_lies_between_theirs(laws):
 def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: bool):
     """An event that is over says nothing of later, and the size of one near the end is not known before."""
     shaken = {"profile": "vibration", "points": points}
-    reduced = reduced_of(
+    blocks = reduced_of(
         {"name": "vibration_noise", "white": 0.002, "axes": ["x"]},
         axes=("x",),
         environment=[shaken],
     )
-    baseline = calibrate_noise(reduced)
-    naming = naming_of(reduced, baseline, "vibration_noise", "power", ("white",), exponent=1.0)
-    held = conclude.worth(reduced, baseline, naming, fit_identifications(naming, baseline))
+    baseline = calibrate_noise(blocks)
+    identifications = naming_of(
+        blocks, baseline, "vibration_noise", "power", ("white",), exponent=1.0
+    )
+    held = conclude.worth(
+        blocks, baseline, identifications, fit_identifications(identifications, baseline)
+    )
     assert math.isfinite(held["forecast_gain"]) == told
     assert held["log_likelihood_gain"] > 0.0
     if told:

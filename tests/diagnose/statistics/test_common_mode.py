@@ -87,9 +87,11 @@ def test_axes_that_wander_by_themselves_have_normal_scores(told, true, missing):
 @pytest.mark.parametrize("shares", [(1.0, 0.8, -0.9), (-0.5, 1.0, 0.7)])
 def test_a_waveform_on_all_axes_is_found_where_no_axis_shows_it(base, null, shares):
     found = _with(_quiet(30, 5), shares)
-    z = np.abs(np.nan_to_num(standardise(common.score(found, base), null.views["common"])))
-    assert (z.max(axis=(1, 2, 3)) > null.critical("common", 0.005)).mean() >= 0.9
-    alone = np.abs(np.nan_to_num(standardise(mean.score(found, base), null.views["mean"])))
+    z = np.abs(
+        np.nan_to_num(standardise(common.score(found, base), null.statistics["common_mode"]))
+    )
+    assert (z.max(axis=(1, 2, 3)) > null.critical("common_mode", 0.005)).mean() >= 0.9
+    alone = np.abs(np.nan_to_num(standardise(mean.score(found, base), null.statistics["mean"])))
     assert (alone.max(axis=(1, 2, 3)) > null.critical("mean", 0.005)).mean() <= 0.1
 
 
@@ -162,33 +164,36 @@ def test_one_axis_or_a_short_record_has_nothing_to_compare():
     ]
 
 
-def _claim(view: str, axes: str):
+def _claim(statistic: str, axes: str):
     variant = Variant({}, ("0",), np.broadcast_to(_waveform(), (1, 1, BLOCKS)))
-    parts = tuple(
-        Component(Candidate("cause", view, (), (variant,)), variant, (axis,), 10.0) for axis in axes
+    components = tuple(
+        Component(Candidate("cause", statistic, (), (variant,)), variant, (axis,), 10.0)
+        for axis in axes
     )
-    return SimpleNamespace(effect="cause", axes=tuple(axes), parts=parts)
+    return SimpleNamespace(effect="cause", axes=tuple(axes), components=components)
 
 
 def test_it_becomes_one_box_which_the_effect_explains_that_takes_it_away(base, null):
     shares = np.array([1.0, 0.8, -0.9])
     found = _with(records(baseline(walk=TRUE), 1, np.random.default_rng(5)), shares).isel(record=0)
-    boxes = locate_mismatches(found, base, null)
-    assert boxes["view"].values.tolist() == ["cross_axis"]
-    assert boxes["what"].values.tolist() == ["slow"]
-    assert set(str(boxes["axes"].values[0]).split()) == {"x", "y", "z"}
+    regions = locate_mismatches(found, base, null)
+    assert regions["view"].values.tolist() == ["cross_axis"]
+    assert regions["what"].values.tolist() == ["slow"]
+    assert set(str(regions["axes"].values[0]).split()) == {"x", "y", "z"}
     fields = {
-        str(name): boxes[name].values[0].item()
-        for name in boxes.data_vars
-        if boxes[name].dtype.kind != "M"
+        str(name): regions[name].values[0].item()
+        for name in regions.data_vars
+        if regions[name].dtype.kind != "M"
     }
     said = mismatch_statement(fields | {"axes": ["x", "y", "z"]}, BLOCKS * BLOCK_S)
     assert said.startswith("Axes x, y and z wander together (correlation 0.")
     assert "random walks of independent gyros" in said
     known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _waveform()))
 
-    def told(view, axes, after):
-        return attribute_mismatches(boxes, [_claim(view, axes)], found, after, null, level=0.005)[0]
+    def told(statistic, axes, after):
+        return attribute_mismatches(
+            regions, [_claim(statistic, axes)], found, after, null, level=0.005
+        )[0]
 
     assert told("mean", "xyz", known) == ["cause"]
     assert told("mean", "xyz", base) == []  # is in the model and leaves the mismatch
@@ -208,5 +213,5 @@ def test_it_stays_apart_from_what_axes_share_inside_blocks():
     }
     slow |= {"frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
     fast = slow | {"what": "all in phase", "tau_min_s": 0.01, "tau_max_s": 20.0}
-    assert [box["what"] for box in merge_regions([slow, fast])] == ["slow", "all in phase"]
+    assert [region["what"] for region in merge_regions([slow, fast])] == ["slow", "all in phase"]
     assert len(merge_regions([slow, slow | {"axes": "x y", "tau_min_s": 40.0}])) == 1

@@ -69,7 +69,11 @@ def test_boxcar_kernels_are_the_dense_algebra():
     )
     decay = np.exp(-rng.uniform(0.5, 1.5, (n, 1)) / np.array([1.0, 5.0, 30.0]))
     present = rng.random(n) > 0.3
-    innovation, gain, remaining = np.empty(n), np.empty((n, p + 1)), np.empty((n + 1, p + 1, p + 1))
+    innovation, gain, remaining = (
+        np.empty(n),
+        np.empty((n, p + 1)),
+        np.empty((n + 1, p + 1, p + 1)),
+    )
     filter_gains(variance, present, walk, ou, decay, innovation, gain)
     remaining_information(innovation, gain, decay, remaining)
     inverse = np.linalg.inv(_dense(variance, present, walk, ou, decay))
@@ -81,21 +85,21 @@ def test_boxcar_kernels_are_the_dense_algebra():
     first, stop = np.array([0, 7, 30, 59]), np.array([60, 20, 31, 60])
     found = np.empty(4)
     boxcar_information(first, stop, innovation, gain, decay, remaining, found)
-    for box in range(4):
-        x = ((np.arange(n) >= first[box]) & (np.arange(n) < stop[box]))[present].astype(float)
-        assert found[box] == pytest.approx(x @ inverse @ x, rel=1e-9)
+    for region in range(4):
+        x = ((np.arange(n) >= first[region]) & (np.arange(n) < stop[region]))[present].astype(float)
+        assert found[region] == pytest.approx(x @ inverse @ x, rel=1e-9)
 
 
 @given(st.integers(1, 80), st.lists(st.integers(1, 30), min_size=1, max_size=4, unique=True))
 @settings(max_examples=50, deadline=None)
-def test_window_sums_are_sums_over_windows(blocks, lengths):
-    windows = window_set(blocks, lengths)
-    values = np.random.default_rng(blocks).normal(size=(2, blocks, 3))
+def test_window_sums_are_sums_over_windows(block_count, lengths):
+    windows = window_set(block_count, lengths)
+    values = np.random.default_rng(block_count).normal(size=(2, block_count, 3))
     found = over_windows(values, windows)
     for k, (first, stop) in enumerate(zip(windows.first, windows.stop, strict=True)):
-        assert 0 <= first < stop <= blocks
+        assert 0 <= first < stop <= block_count
         np.testing.assert_allclose(found[:, k], values[:, first:stop].sum(axis=1), atol=1e-12)
-    assert (windows.length == blocks).any()
+    assert (windows.length == block_count).any()
 
 
 def test_transfer_reproduces_the_laws_of_the_allan_variance():
@@ -116,7 +120,7 @@ def test_transfer_reproduces_the_laws_of_the_allan_variance():
 def test_scores_are_normal_without_an_effect(missing, slow):
     base = baseline(missing=missing, **slow)
     found = records(base, 40, np.random.default_rng(3), missing=missing)
-    for name in ("davar", "mean", "cross_axis", "spectrum"):
+    for name in ("power", "mean", "cross_spectrum", "spectral_line"):
         scores = STATISTICS[name](found, base)
         z = scores["z"].values
         z = z[np.isfinite(z)]
@@ -127,17 +131,17 @@ def test_scores_are_normal_without_an_effect(missing, slow):
 
 
 def _detected(scores, null, name, level=0.01):
-    z = np.nan_to_num(np.abs(standardise(scores, null.views[name])))
+    z = np.nan_to_num(np.abs(standardise(scores, null.statistics[name])))
     return float((z.max(axis=(1, 2, 3)) > null.critical(name, level)).mean())
 
 
-def _limits(make, limit, view, name, base, null):
+def _limits(make, limit, statistic, name, base, null):
     """Share of records detected at three quarters and at five quarters of the closed form."""
     shares = []
     for factor in (0.75, 1.25):
         found = records(base, 60, np.random.default_rng(17))
         make(found, factor * limit)
-        shares.append(_detected(view.score(found, base), null, name))
+        shares.append(_detected(statistic.score(found, base), null, name))
     return shares
 
 
@@ -146,8 +150,8 @@ def test_raised_noise_is_seen_from_the_closed_form_on(base, null):
         found["power"][:, 0, EVENT] *= 1.0 + epsilon
 
     samples = 0.86 * 15 * BLOCK_S * RATE  # the taper leaves this many
-    nats = null.critical("davar", 0.01) ** 2 / 2.0
-    below, above = _limits(burst, 2.0 * np.sqrt(nats / samples), davar, "davar", base, null)
+    nats = null.critical("power", 0.01) ** 2 / 2.0
+    below, above = _limits(burst, 2.0 * np.sqrt(nats / samples), davar, "power", base, null)
     assert below < 0.5 < above
 
 
@@ -168,9 +172,9 @@ def test_shared_noise_is_seen_from_the_closed_form_on(base, null):
         for place, (a, b) in enumerate(pairs):
             found["cross"].values[:, place] += rho * np.sqrt(power[:, a] * power[:, b])
 
-    nats = null.critical("cross_axis", 0.01) ** 2 / 2.0
+    nats = null.critical("cross_spectrum", 0.01) ** 2 / 2.0
     limit = np.sqrt(2.0 * nats / (0.86 * 180 * BLOCK_S * RATE) / 3.0)  # three pairs alike
-    below, above = _limits(shared, limit, cross_axis, "cross_axis", base, null)
+    below, above = _limits(shared, limit, cross_axis, "cross_spectrum", base, null)
     assert below < 0.5 < above
 
 
@@ -184,9 +188,9 @@ def test_a_line_is_seen_from_the_closed_form_on(base, null):
         found["line_power"][:, 1, :, 267] = (np.abs(sine + noise) ** 2).mean(axis=-1)
 
     limit = 2.0 * np.sqrt(
-        null.critical("spectrum", 0.01) * LEVEL / (0.926 * BLOCK_S * np.sqrt(180))
+        null.critical("spectral_line", 0.01) * LEVEL / (0.926 * BLOCK_S * np.sqrt(180))
     )
-    below, above = _limits(line, limit, spectrum, "spectrum", base, null)
+    below, above = _limits(line, limit, spectrum, "spectral_line", base, null)
     assert below < 0.5 < above
 
 
@@ -198,20 +202,20 @@ def test_davar_is_blind_to_a_step_between_its_windows_and_the_mean_is_not(base, 
     scores["z"] = scores["z"].where(
         scores["stop"] - scores["first"] <= 15
     )  # the record as a whole sees it at its longest tau
-    assert _detected(scores, null, "davar") < 0.1
+    assert _detected(scores, null, "power") < 0.1
 
 
 def test_a_step_raises_the_allan_variance_by_the_closed_form():
     base = baseline(noise=1e-6)
     found = records(base, 1, np.random.default_rng(4)).isel(record=0)
-    height, blocks = 0.1, 180
+    height, block_count = 0.1, 180
     found["mean"][0, 90:] += height
     surface = davar.allan_surface(found, base)
-    whole = surface["windows"].length == blocks
+    whole = surface["windows"].length == block_count
     for column, tau in enumerate(surface["columns"]["tau_min_s"]):
         if tau >= 4 * BLOCK_S and surface["columns"]["what"][column] == "avar":
             # D^2 tau / (3 (W - 2 tau)), its sum over whole blocks
-            expected = height**2 * tau / (3.0 * (blocks * BLOCK_S - 2.0 * tau))
+            expected = height**2 * tau / (3.0 * (block_count * BLOCK_S - 2.0 * tau))
             assert surface["observed"][0, whole, column] == pytest.approx(expected, rel=0.05)
 
 
@@ -233,12 +237,12 @@ def test_a_line_has_its_amplitude():
 
     rng, n = np.random.default_rng(6), 180_000
     rate = 1.8 * rng.standard_normal((1, n)) + 0.3 * np.sin(2 * np.pi * 13.37 * np.arange(n) / RATE)
-    reduced = reduce_log(make_log(rate, rate=RATE, unit="deg/h"))
+    blocks = reduce_log(make_log(rate, rate=RATE, unit="deg/h"))
     flat = xr.Dataset(
-        {"spectrum": (("axis", "block", "band"), np.full(reduced["power"].shape, LEVEL))},
-        coords={"axis": reduced["axis"], "frequency": reduced["frequency"]},
+        {"spectrum": (("axis", "block", "band"), np.full(blocks["power"].shape, LEVEL))},
+        coords={"axis": blocks["axis"], "frequency": blocks["frequency"]},
     )
-    scores = spectrum.score(reduced, flat)
+    scores = spectrum.score(blocks, flat)
     best = int(np.nanargmax(scores["z"].values[0, -1]))
     assert float(scores["frequency"][best]) == pytest.approx(13.37, abs=0.06)
     assert float(scores["estimate"][0, -1, best]) == pytest.approx(0.3, rel=0.1)
@@ -248,16 +252,16 @@ def test_what_is_locked_to_rotation_and_ramp_is_seen(base):
     rng = np.random.default_rng(9)
     found = records(base, 1, rng).isel(record=0)
     assert locked.score(found, base) is None
-    blocks, samples = 180, BLOCK_S * RATE
+    block_count, samples = 180, BLOCK_S * RATE
     spread = np.sqrt(2.0 * LEVEL * RATE / samples)
     order = spread * (
-        rng.normal(size=(40, 3, blocks, 3)) + 1j * rng.normal(size=(40, 3, blocks, 3))
+        rng.normal(size=(40, 3, block_count, 3)) + 1j * rng.normal(size=(40, 3, block_count, 3))
     )
-    profile = np.sqrt(LEVEL * RATE / 50.0) * rng.normal(size=(40, 3, blocks, 40))
+    profile = np.sqrt(LEVEL * RATE / 50.0) * rng.normal(size=(40, 3, block_count, 40))
     found["order"] = (("record", "axis", "block", "harmonic"), order)
     found["profile"] = (("record", "axis", "block", "phase"), profile)
-    found["profile_samples"] = (("axis", "block", "phase"), np.full((3, blocks, 40), 50))
-    found["channel_rotation_rate"] = ("block", np.full(blocks, 720.0))
+    found["profile_samples"] = (("axis", "block", "phase"), np.full((3, block_count, 40), 50))
+    found["channel_rotation_rate"] = ("block", np.full(block_count, 720.0))
     scores = locked.score(found, base)
     z = scores["z"].values
     assert scores["what"].values.tolist() == ["order 1", "order 2", "order 3", "ramp phase"]
@@ -350,7 +354,7 @@ def test_one_axis_has_no_pairs():
 
 @pytest.mark.parametrize("loud", [(6_050, 12_000), (6_050, 6_540)])
 def test_noise_that_is_loud_for_a_while_is_neither_shared_nor_a_line(loud):
-    largest: dict[str, list[float]] = {"cross_axis": [], "spectrum": []}
+    largest: dict[str, list[float]] = {"cross_spectrum": [], "spectral_line": []}
     for seed in range(8):
         noise = np.random.default_rng(seed).standard_normal((2, 12_000))
         noise[:, slice(*loud)] *= 8.0
@@ -360,5 +364,5 @@ def test_noise_that_is_loud_for_a_while_is_neither_shared_nor_a_line(loud):
         base = calibrate_noise(found, quiet=np.arange(120) < 60)
         for name, values in largest.items():
             values.append(float(np.nanmax(np.abs(STATISTICS[name](found, base)["z"].values))))
-    assert max(largest["cross_axis"]) < 4.8
-    assert max(largest["spectrum"]) < 4.8
+    assert max(largest["cross_spectrum"]) < 4.8
+    assert max(largest["spectral_line"]) < 4.8

@@ -22,7 +22,7 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import taper
 from tests.support.reduced_records import baseline, chunks, records
 
-SMALL = {"rate": 10.0, "blocks": 120}
+SMALL = {"rate": 10.0, "block_count": 120}
 BLOCKS, LINES = 120, 100
 
 
@@ -40,10 +40,10 @@ def _some(base, count, seed):
     return records(base, count, np.random.default_rng(seed), **SMALL)
 
 
-def _largest(view, found, base, null, row=slice(None)):
+def _largest(statistic, found, base, null, row=slice(None)):
     """Largest standardised score of each record."""
-    name = view.__name__.rsplit(".", 1)[1]
-    z = np.nan_to_num(standardise(view.score(found, base), null.views[name]))
+    name = statistic.__name__.rsplit(".", 1)[1]
+    z = np.nan_to_num(standardise(statistic.score(found, base), null.statistics[name]))
     return z[:, row].reshape(z.shape[0], -1).max(axis=1)
 
 
@@ -76,7 +76,7 @@ def test_swelling_noise_is_seen_from_the_closed_form_on(base, null):
     swell = np.sqrt(2.0) * np.sin(
         2.0 * np.pi * np.arange(BLOCKS) / 3.7
     )  # too fast for averages of more than one block
-    critical = null.critical("restless", 0.01)
+    critical = null.critical("variance_stability", 0.01)
     limit = np.sqrt(critical * np.sqrt(2.0 * (BLOCKS - 1)) / (BLOCKS * shape))
     shares = []
     for factor in (0.75, 1.3):
@@ -92,7 +92,7 @@ def test_what_swells_on_all_axes_is_seen_sooner_together(base, null):
     together, alone = (
         np.median(_largest(restless, found, base, null, row=row)) for row in (3, slice(0, 3))
     )
-    assert together > null.critical("restless", 0.01) > alone
+    assert together > null.critical("variance_stability", 0.01) > alone
 
 
 @given(st.floats(0.01, 100.0))
@@ -109,7 +109,9 @@ def test_how_loud_steady_noise_is_does_not_matter(factor):
 def test_a_single_loud_block_is_not_restless(base, null):
     found = _some(base, 20, 6)
     found["power"][:, 0, 50] *= 30.0
-    assert (_largest(restless, found, base, null) > null.critical("restless", 0.01)).mean() <= 0.1
+    assert (
+        _largest(restless, found, base, null) > null.critical("variance_stability", 0.01)
+    ).mean() <= 0.1
 
 
 def test_noise_that_axes_share_is_not_restless(base, null):
@@ -117,7 +119,7 @@ def test_noise_that_axes_share_is_not_restless(base, null):
     found["power"][:, 1] = found["power"][:, 0]
     found["power"][:, 2] = found["power"][:, 0]
     found["cross"][:] = found["power"][:, 0].values[:, None]
-    critical = null.critical("restless", 0.01)
+    critical = null.critical("variance_stability", 0.01)
     assert (_largest(restless, found, base, null, row=3) > critical).mean() <= 0.1
     assert (
         _largest(restless, found.drop_vars("cross"), base, null, row=3) > critical
@@ -127,11 +129,13 @@ def test_noise_that_axes_share_is_not_restless(base, null):
 def test_a_burst_that_has_its_box_is_not_told_again(base, null):
     found = _some(base, 1, 9).isel(record=0)
     found["power"][0, 60:75] *= 1.7
-    boxes = locate_mismatches(found, base, null)
-    assert boxes["what"].values.tolist() == ["level"] or set(boxes["what"].values) == {"avar"}
+    regions = locate_mismatches(found, base, null)
+    assert regions["what"].values.tolist() == ["level"] or set(regions["what"].values) == {"avar"}
     found["power"][1] *= np.exp(0.5 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 9.0))[:, None]
-    boxes = locate_mismatches(found, base, null)
-    new = boxes.sel(mismatch=[str(what).startswith("restless") for what in boxes["what"].values])
+    regions = locate_mismatches(found, base, null)
+    new = regions.sel(
+        mismatch=[str(what).startswith("restless") for what in regions["what"].values]
+    )
     assert "y" in {axis for axes in new["axes"].values for axis in str(axes).split()}
     assert float(new["end"].max() - new["begin"].min()) > 0.9 * BLOCKS * 20.0
 
@@ -151,14 +155,14 @@ def _moving_line(found, row, first, last, energy, bend=0.0):
     """Add a line of so much power over the density in each block on its way between two lines, spread over the blocks of each part."""
     rng = np.random.default_rng(3)
     level = float(found["line_power"].mean())
-    for part in range(8):
+    for component in range(8):
         for block in range(BLOCKS // 8):
-            t = (part + (block + 0.5) / (BLOCKS // 8)) / 8.0
+            t = (component + (block + 0.5) / (BLOCKS // 8)) / 8.0
             line = round(first + (last - first) * (t + bend * t * (1.0 - t)))
             beat = (
                 2.0 * np.sqrt(energy) * rng.normal(0.0, np.sqrt(0.5), found.sizes["record"])
             )  # of the line with the noise
-            found["line_power"].values[:, row, part, line] += (
+            found["line_power"].values[:, row, component, line] += (
                 level * (energy + beat) / (BLOCKS // 8)
             )
 
@@ -172,16 +176,18 @@ def test_a_moving_line_is_seen_where_none_of_its_lines_stands_out(base, null, fi
         abs(last - first) / (8.0 * BLOCKS)
     )  # nine standard deviations by the closed form
     _moving_line(found, 1, first, last, energy, bend)
-    critical = null.critical("gliding", 0.01)
+    critical = null.critical("drifting_line", 0.01)
     assert (_largest(gliding, found, base, null) > critical).mean() > 0.5
     scores = gliding.score(found, base)
     best = scores["what"].values[
-        np.bincount(standardise(scores, null.views["gliding"])[:, 1, 0].argmax(axis=1)).argmax()
+        np.bincount(
+            standardise(scores, null.statistics["drifting_line"])[:, 1, 0].argmax(axis=1)
+        ).argmax()
     ]
-    begins, ends = (float(part) for part in str(best).split()[1:])
+    begins, ends = (float(component) for component in str(best).split()[1:])
     assert begins == pytest.approx(first * 0.05, abs=0.65)
     assert ends == pytest.approx(last * 0.05, abs=0.65)
-    single = null.critical("spectrum", 0.01)
+    single = null.critical("spectral_line", 0.01)
     assert (_largest(spectrum, found, base, null) > single).mean() < 0.5
 
 
@@ -190,20 +196,23 @@ def test_a_line_that_stands_and_a_hump_for_a_while_do_not_move(base, null):
     found["line_power"][:, 0, :, 37] *= 50.0
     found["line_power"][:, 1, 3, 20:60] *= 3.0
     found["line_power"][:, 2, 2:6] *= 4.0
-    assert (_largest(gliding, found, base, null) > null.critical("gliding", 0.01)).mean() <= 0.1
+    assert (
+        _largest(gliding, found, base, null) > null.critical("drifting_line", 0.01)
+    ).mean() <= 0.1
 
 
 def test_steady_noise_has_no_line_that_moves(base, null):
     assert (
-        _largest(gliding, _some(base, 100, 14), base, null) > null.critical("gliding", 0.01)
+        _largest(gliding, _some(base, 100, 14), base, null) > null.critical("drifting_line", 0.01)
     ).mean() <= 0.03
     assert (
-        _largest(restless, _some(base, 100, 15), base, null) > null.critical("restless", 0.01)
+        _largest(restless, _some(base, 100, 15), base, null)
+        > null.critical("variance_stability", 0.01)
     ).mean() <= 0.03
 
 
 def test_short_records_are_left_alone(base):
-    few = {"rate": 10.0, "blocks": 5}
+    few = {"rate": 10.0, "block_count": 5}
     assert (
         restless.score(
             records(baseline(**few), 2, np.random.default_rng(1), **few), baseline(**few)
@@ -216,18 +225,18 @@ def test_short_records_are_left_alone(base):
     assert gliding.score(found, base) is None
 
 
-@pytest.mark.parametrize("blocks", [213, 218, 255])
-def test_windows_behind_the_last_average_have_no_score(blocks):
-    small = {"rate": 10.0, "blocks": blocks}
+@pytest.mark.parametrize("block_count", [213, 218, 255])
+def test_windows_behind_the_last_average_have_no_score(block_count):
+    small = {"rate": 10.0, "block_count": block_count}
     found = restless.score(
         records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small)
     )
-    behind = (found["first"] > blocks // 32 * 32).values
+    behind = (found["first"] > block_count // 32 * 32).values
     assert behind.any()
     long = np.char.startswith(found["what"].values.astype(str), "restless 640 s")
     assert long.any()
     assert np.isnan(found["z"].values[..., behind, :][..., long]).all()
-    whole = (found["stop"] - found["first"] == blocks).values
+    whole = (found["stop"] - found["first"] == block_count).values
     assert np.isfinite(found["z"].values[..., whole, :][..., long]).all()
 
 
@@ -248,7 +257,7 @@ def test_one_axis_has_no_row_of_all():
 
 
 def test_a_level_and_its_scatter_are_two_mismatches():
-    box = {
+    region = {
         "view": "davar",
         "axes": "x",
         "what": "avar",
@@ -257,12 +266,15 @@ def test_a_level_and_its_scatter_are_two_mismatches():
         "tau_min_s": 0.01,
         "tau_max_s": 0.1,
     }
-    box |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
-    assert len(merge_regions([box, box | {"what": "restless 20 s"}])) == 2
+    region |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
+    assert len(merge_regions([region, region | {"what": "restless 20 s"}])) == 2
     assert (
         len(
             merge_regions(
-                [box | {"what": "restless 40 s"}, box | {"what": "restless 20 s", "axes": "x y"}]
+                [
+                    region | {"what": "restless 40 s"},
+                    region | {"what": "restless 20 s", "axes": "x y"},
+                ]
             )
         )
         == 1
@@ -270,7 +282,7 @@ def test_a_level_and_its_scatter_are_two_mismatches():
 
 
 def test_sentences_say_how_fast_and_where_to():
-    box = {
+    region = {
         "view": "davar",
         "what": "restless 40 s",
         "axes": ["x", "y"],
@@ -279,12 +291,12 @@ def test_sentences_say_how_fast_and_where_to():
         "tau_min_s": 0.1,
         "tau_max_s": 2.9,
     }
-    box |= {"ratio": 4.38, "estimate": 0.08, "sign": 1, "p_value": 1e-4, "frequency": np.nan}
-    told = mismatch_statement(box, 2000.0)
+    region |= {"ratio": 4.38, "estimate": 0.08, "sign": 1, "p_value": 1e-4, "frequency": np.nan}
+    told = mismatch_statement(region, 2000.0)
     assert "axes x and y goes up and down over the whole record" in told
     assert "one stretch of 40 s to another" in told
     assert "8 % (rms)" in told
-    glide = box | {"view": "spectrum", "what": "glide 1.58 3.42", "axes": ["y"]}
+    glide = region | {"view": "spectrum", "what": "glide 1.58 3.42", "axes": ["y"]}
     assert (
         "a line that moves over the whole record, from about 1.58 Hz to about 3.42 Hz"
         in mismatch_statement(glide, 2000.0)
@@ -313,9 +325,9 @@ def test_drawn_lines_leak_as_those_of_tapered_noise_do():
 def test_a_stretch_that_ends_within_a_block_leaves_nothing_restless():
     noise = np.random.default_rng(5).standard_normal((2, 60_000))
     noise[:, 20_000:40_400] *= 6.0
-    reduced = reduce_log(
+    blocks = reduce_log(
         make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples"
     )
-    base = calibrate_noise(reduced, quiet=np.arange(60) < 20)
-    told = restless.levelled(reduced, base, [(("x", "y"), 2_000.0, 4_100.0)])
+    base = calibrate_noise(blocks, quiet=np.arange(60) < 20)
+    told = restless.levelled(blocks, base, [(("x", "y"), 2_000.0, 4_100.0)])
     assert float(np.nanmax(restless.score(told, base)["z"].values)) < 4.8
