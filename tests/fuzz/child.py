@@ -118,13 +118,13 @@ def serve() -> None:
     from gyrostab import cli
 
     seen: dict[str, Any] = {"error": None}
-    explain = cli.explain
+    describe_error = cli.describe_error
 
     def spy(error: Exception) -> int:
         seen["error"] = error
-        return explain(error)
+        return describe_error(error)
 
-    cli.explain = spy
+    cli.describe_error = spy
     warm = json.loads(sys.stdin.readline())
     for arguments in warm:
         call(arguments, seen)

@@ -62,11 +62,11 @@ def test_an_input_that_once_failed(
             move_job(data, "@FOLDER@", str(tmp_path)) if name.endswith("job.json") else data
         )
     seen: dict = {"error": None}
-    explain = cli.explain
+    describe_error = cli.describe_error
 
     def spy(error: Exception) -> int:
         seen["error"] = error
-        return explain(error)
+        return describe_error(error)
 
     monkeypatch.setattr(cli, "explain", spy)
     answer = call(arguments_of(item.command, tmp_path, item.main, item.options), seen)
