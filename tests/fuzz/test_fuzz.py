@@ -68,7 +68,7 @@ def test_an_input_that_once_failed(
         seen["error"] = error
         return describe_error(error)
 
-    monkeypatch.setattr(cli, "explain", spy)
+    monkeypatch.setattr(cli, "describe_error", spy)
     answer = call(arguments_of(item.command, tmp_path, item.main, item.options), seen)
     assert answer["code"] in ((0, 2, 3) if item.format == "checkpoint" else (0, 2)), answer
     assert not answer["fault"]
