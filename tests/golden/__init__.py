@@ -1,1 +1,1 @@
-"""Reference outputs of the whole program, to compare before and after a change that must not alter results."""
+"""Reference outputs of the whole program, compared before and after a change of structure."""

@@ -38,9 +38,7 @@ def main() -> int:
             given.folder.resolve(), Path(name), made, rtol=given.rtol
         )
     print(*differences, sep="\n")
-    print(
-        f"{len(made)} outputs, {len(differences)} differences in numbers or structure, {texts} differences in text"
-    )
+    print(f"{len(made)} outputs; differences: {len(differences)} in numbers, {texts} in text")
     return int(bool(differences))
 
 

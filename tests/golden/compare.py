@@ -115,7 +115,7 @@ def compare_items(a: Path, b: Path, rtol: float) -> Iterator[str]:
 
 
 def items(folder: Path) -> set[str]:
-    """Names of the outputs of a job; what the job was given is left out, and a Zarr store counts as one."""
+    """Name the outputs of a job, without its inputs; a Zarr store counts as one output."""
     found = set()
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)

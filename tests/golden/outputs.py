@@ -1,4 +1,4 @@
-"""Make the reference outputs: every format read, the demo, two archives, simulations and ten diagnoses."""
+"""Make the reference outputs: every format, the demo, two archives, ten diagnoses."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Job = Callable[[], None]
 
 
 def call(*arguments: str) -> None:
-    """Run a command in this process; leave its exit code and what it prints in ``NAME.txt`` beside the output."""
+    """Run a command in this process; write its exit code and what it prints to a text file."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()):
         try:

@@ -1,4 +1,4 @@
-"""The comparison of reference outputs reports every changed number and unit, and counts changed text."""
+"""The comparison reports every changed number and unit, and counts changed text."""
 
 from __future__ import annotations
 
