@@ -201,7 +201,7 @@ def files_in(places: list[str]) -> Iterator[Path]:
         found = [path] if path.is_file() else sorted(path.rglob("*"))
         for file in found:
             hidden = any(part.startswith(".") or part == "__pycache__" for part in file.parts)
-            if file.suffix in (".py", ".md", ".html", ".j2", ".toml") and not hidden:
+            if file.suffix in (".py", ".md", ".jinja", ".toml") and not hidden:
                 yield file
 
 
