@@ -28,16 +28,16 @@ $(VENV)/.installed-lint: $(VENV)/.installed-test
 	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[test,lint]"
 	touch $@
 
-demo: $(VENV)/.installed  ## install and run the main job on the shipped log
+demo: $(VENV)/.installed  ## install, and run the main job on the shipped log
 	$(BIN)/gyrostab demo -o $(OUT) --overwrite
 
-test: $(VENV)/.installed-test  ## install and run the tests
+test: $(VENV)/.installed-test  ## install, and run the tests
 	$(BIN)/python -m pytest -n auto --dist loadgroup
 
-test-full: $(VENV)/.installed-test  ## the tests and those that take a minute or more
+test-full: $(VENV)/.installed-test  ## all tests, including those that take a minute or more
 	$(BIN)/python -m pytest -n auto --dist loadgroup -m "slow or not slow"
 
-fuzz: $(VENV)/.installed-test  ## try damaged inputs and write docs/fuzzing.md: N=100000 SEED=1 JOBS=2; stop and repeat as you like
+fuzz: $(VENV)/.installed-test  ## try damaged inputs and write docs/fuzzing.md (N=100000 SEED=1 JOBS=2); can be stopped and repeated
 	$(BIN)/python -W ignore -m tests.fuzz --count $(N) --seed $(SEED) --jobs $(JOBS) --output docs/fuzzing.md
 
 lint: $(VENV)/.installed-lint  ## style, types and imports
@@ -46,30 +46,30 @@ lint: $(VENV)/.installed-lint  ## style, types and imports
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.md anew: twenty minutes of an idle machine
+bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.md again; 20 minutes on an idle machine
 	$(BIN)/python benchmarks/kernels.py --output docs/performance.md
 	$(BIN)/python benchmarks/fit.py --output docs/performance.md
 	$(BIN)/python benchmarks/end_to_end.py --output docs/performance.md
 	$(BIN)/python benchmarks/scaling.py --output docs/scaling.md
 
-prove: $(VENV)/.installed-test  ## the published run on concealed effects: hours; stop and repeat as you like, CASES=400 NULLS=400 PROOF=proof
+prove: $(VENV)/.installed-test  ## the published blind test (CASES=400 NULLS=400 PROOF=proof); takes hours, can be stopped and repeated
 	$(BIN)/gyrostab prove --resume -o $(PROOF) $(if $(wildcard $(PROOF)/benchmark.json),,--cases $(CASES) --nulls $(NULLS))
 	$(BIN)/python benchmarks/publish_proof.py $(PROOF)
 
-prove-quick: $(VENV)/.installed  ## a few concealed effects of a fresh seed, which is printed
+prove-quick: $(VENV)/.installed  ## a short blind test with a fresh seed, which is printed
 	$(BIN)/gyrostab prove --cases 10 --nulls 200 --overwrite -o proof-quick
 
-real-recordings: $(VENV)/.installed  ## remake docs/real-recordings.md from the recordings, where they are present
+real-recordings: $(VENV)/.installed  ## write docs/real-recordings.md from the recordings (environment variable GYROSTAB_RECORDINGS)
 	$(BIN)/python pipelines/real_recordings.py
 
-interop: $(VENV)/.installed-test  ## open the files in other programs, those that are installed (Debian: octave octave-netcdf netcdf-bin)
+interop: $(VENV)/.installed-test  ## open the files in other installed programs (Debian: octave octave-netcdf netcdf-bin)
 	$(BIN)/python -m pytest -n0 -v tests/interop
 
-baseline: $(VENV)/.installed-test  ## remake the pictures that the figures are compared with; look at them afterwards
+baseline: $(VENV)/.installed-test  ## write the reference pictures of the figures again; inspect them afterwards
 	$(BIN)/python -m tests.plot.test_figures
 
-clean-kernels:  ## forget the compiled kernels
+clean-kernels:  ## delete the compiled kernels
 	find gyrostab -name '*.nb[ic]' -delete
 
-clean: clean-kernels  ## remove what the targets made
+clean: clean-kernels  ## delete what the targets made
 	rm -rf $(VENV) $(OUT)
