@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels
-from gyrostab.store.direct import stretch
+from gyrostab.store.lazy_slices import read_slice
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER
 
@@ -117,7 +117,7 @@ def _means(
     chosen = [group for group in groups if group.start < kept.stop and group.stop > kept.start]
     bounds = [ends(group) for group in chosen]
     first, last = int(bounds[0][0][0]), int(bounds[-1][1][-1])
-    together = None if lazy or last - first > _TOGETHER else stretch(data, first, last)
+    together = None if lazy or last - first > _TOGETHER else read_slice(data, first, last)
     parts = []
     for a, b in bounds:
         low, high = int(a[0]), int(b[-1])
@@ -127,7 +127,7 @@ def _means(
             parts.append(da.from_delayed(one, (2, a.size), dtype=np.float64))
         else:
             values = (
-                stretch(data, low, high)
+                read_slice(data, low, high)
                 if together is None
                 else together[low - first : high - first]
             )

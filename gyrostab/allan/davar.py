@@ -27,7 +27,7 @@ from gyrostab.kernels.fit.least_squares import identify_noise
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, avar_columns, sample_squares
 from gyrostab.schema import attributes
-from gyrostab.store.direct import can_fill, fill_row, stretch
+from gyrostab.store.lazy_slices import can_read_into, read_into, read_slice
 from gyrostab.store.output import pass_sources
 from gyrostab.time.grid import first_stamp, grid_times
 
@@ -276,7 +276,7 @@ def _stretches(
     dask must be asked, all axes are read together if they are few.
     """
     begin, end = spans[0][0], spans[-1][1]
-    if isinstance(data, da.Array) and can_fill(data):
+    if isinstance(data, da.Array) and can_read_into(data):
         longest = max(last - first for first, last in spans)
         line = space.array("samples", longest).view(data.dtype)[:longest]
         for row in range(data.shape[0]):
@@ -284,13 +284,13 @@ def _stretches(
             for first, last in spans:
                 shared = max(held_to - first, 0)
                 line[:shared] = line[first - held_from : held_to - held_from]
-                fill_row(data, row, first + shared, line[shared : last - first])
+                read_into(data, row, first + shared, line[shared : last - first])
                 held_from, held_to = first, last
                 yield line[: last - first]
         return
     together = 1 if data.shape[0] * (end - begin) > _TOGETHER else data.shape[0]
     for row in range(0, data.shape[0], together):
-        for whole in stretch(data[row : row + together], begin, end):
+        for whole in read_slice(data[row : row + together], begin, end):
             yield from (whole[first - begin : last - begin] for first, last in spans)
 
 

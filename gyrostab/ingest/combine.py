@@ -17,7 +17,7 @@ from gyrostab.ingest.concat import group_axes, some, split_axes, together
 from gyrostab.ingest.overlap import drop_repeats, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store import common_packing
-from gyrostab.store.direct import end_to_end, one_row, stack_rows
+from gyrostab.store.lazy_slices import concatenate_columns, select_row, stack_rows
 
 __all__ = ["attach_channels", "concatenate", "memory", "to_disk", "with_channels"]
 
@@ -168,7 +168,10 @@ def _join(
     data: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     if "time" in parts[0].variables:
-        coords["time"] = ("row", end_to_end([part["time"].data for part in parts], CHUNK_ROWS))
+        coords["time"] = (
+            "row",
+            concatenate_columns([part["time"].data for part in parts], CHUNK_ROWS),
+        )
     if signal is not None:
         axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
         stack = _stacked(parts, signal, axes)
@@ -186,7 +189,7 @@ def _join(
             for part, size in zip(parts, sizes, strict=True)
         ]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
-        data[channel] = ("row", end_to_end(columns, CHUNK_ROWS), {"units": units}, packing)
+        data[channel] = ("row", concatenate_columns(columns, CHUNK_ROWS), {"units": units}, packing)
         absent[f"channel {channel}"] = _lacking(groups, lambda part, name=channel: name in part)  # type: ignore[misc]
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     gaps = [
@@ -239,13 +242,18 @@ def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
                 )
         return whole
     return stack_rows(
-        [end_to_end([_axis(part, signal, axis) for part in parts], CHUNK_ROWS) for axis in axes]
+        [
+            concatenate_columns([_axis(part, signal, axis) for part in parts], CHUNK_ROWS)
+            for axis in axes
+        ]
     )
 
 
 def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
     if axis in part["axis"].values:
-        return one_row(part[signal].data, [str(name) for name in part["axis"].values].index(axis))
+        return select_row(
+            part[signal].data, [str(name) for name in part["axis"].values].index(axis)
+        )
     return lazily(Pieces(np.float64, [Blank(part.sizes["row"])]))
 
 

@@ -22,9 +22,9 @@ from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, re
 from gyrostab.ingest.convert import as_log
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
 from gyrostab.store import (
-    Misfit,
+    NotCountsError,
     Progress,
-    append_deflated,
+    append_compressed,
     append_netcdf,
     append_zarr,
     as_counts,
@@ -111,7 +111,7 @@ def to_netcdf(
         rest = {name: options for name, options in encoding.items() if name not in long}
         with new_output(path, overwrite=overwrite, inputs=sources) as temporary:
             _begin_netcdf(packed.drop_vars(long), temporary, rest)
-            (append_netcdf if log else append_deflated)(
+            (append_netcdf if log else append_compressed)(
                 temporary, long, encoding, progress=progress
             )
 
@@ -292,7 +292,7 @@ def _write_counts(stored: xr.Dataset, write: Callable[[xr.Dataset], None]) -> No
                     {name: as_counts(str(name), v.variable) for name, v in stored.data_vars.items()}
                 )
             )
-        except Misfit as misfit:
+        except NotCountsError as misfit:
             (name,) = misfit.args
             declared = stored[name].encoding
             if np.dtype(declared["dtype"]) != np.dtype("i4"):

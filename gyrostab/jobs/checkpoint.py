@@ -19,8 +19,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.io.datasets import CHUNK_VALUES
+from gyrostab.store.lazy_slices import with_box_reader
 from gyrostab.store.output import replace_file
-from gyrostab.store.parts import with_part
 
 __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
 
@@ -263,7 +263,7 @@ def _lazily(blocks: Sequence[Block], name: str) -> Any:
         [sizes.get(dim, size) for dim, size in dims], shape=tuple(shape)
     )
     label = f"{blocks[0].header['job']}-{name}"  # without it dask would hash all that `read` knows
-    return with_part(
+    return with_box_reader(
         da.map_blocks(
             read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label
         ),

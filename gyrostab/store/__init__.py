@@ -5,13 +5,13 @@ integers with their factor, if that gives back the same doubles. A chunk that is
 becomes a gap, and a warning says where; never does it in silence.
 """
 
-from gyrostab.store.deflate import append_deflated, large_variables
-from gyrostab.store.layout import stored_attribute
-from gyrostab.store.lock import library_lock
-from gyrostab.store.named import name_file
+from gyrostab.store.file_errors import name_file_in_errors
+from gyrostab.store.layout import read_attribute
+from gyrostab.store.netcdf_compression import append_compressed, large_variables
+from gyrostab.store.netcdf_lock import library_lock
 from gyrostab.store.read import open_stored
 from gyrostab.store.write import (
-    Misfit,
+    NotCountsError,
     Progress,
     append_netcdf,
     append_zarr,
@@ -22,9 +22,9 @@ from gyrostab.store.write import (
 )
 
 __all__ = [
-    "Misfit",
+    "NotCountsError",
     "Progress",
-    "append_deflated",
+    "append_compressed",
     "append_netcdf",
     "append_zarr",
     "as_counts",
@@ -33,7 +33,7 @@ __all__ = [
     "large_variables",
     "library_lock",
     "long_variables",
-    "name_file",
+    "name_file_in_errors",
     "open_stored",
-    "stored_attribute",
+    "read_attribute",
 ]

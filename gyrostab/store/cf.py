@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.schema import check_log, check_product, check_surface, texts
-from gyrostab.store.names import restore_names, store_names
-from gyrostab.store.parts import transposed
+from gyrostab.store.lazy_slices import transpose_lazy
+from gyrostab.store.safe_names import make_names_storable, restore_names
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import ON_DISK, on_disk
 
-__all__ = ["PACKING", "declared_grids", "decode_stamps", "from_disk", "index_dim", "to_disk"]
+__all__ = ["PACKING", "decode_stamps", "from_disk", "index_dim", "parse_time_grids", "to_disk"]
 
 CONVENTIONS = "CF-1.11, ACDD-1.3"
 TITLES = {
@@ -48,11 +48,13 @@ _JSON_NAMES = "json_attributes"
 
 # Names that UDUNITS reads as we mean them. A whole power may follow; a broken one is misread
 # without a word, so it never passes.
-_NAMES = "degree_Celsius|standard_free_fall|degree|hour|microradian|radian|s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
-_SAFE_UNIT = re.compile(rf"(?:{_NAMES})(?:-?[1-9])?(?: (?:{_NAMES})(?:-?[1-9])?)*")
+_SAFE_UNIT_NAMES = "degree_Celsius|standard_free_fall|degree|hour|microradian|radian|s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
+_SAFE_UNIT = re.compile(
+    rf"(?:{_SAFE_UNIT_NAMES})(?:-?[1-9])?(?: (?:{_SAFE_UNIT_NAMES})(?:-?[1-9])?)*"
+)
 
 
-def _kind(dataset: xr.Dataset) -> str:
+def _find_kind(dataset: xr.Dataset) -> str:
     for kind, check in (("product", check_product), ("surface", check_surface), ("log", check_log)):
         with contextlib.suppress(SchemaError):
             check(dataset)
@@ -62,10 +64,10 @@ def _kind(dataset: xr.Dataset) -> str:
 
 def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
     """Lay a dataset out as the file shall hold it; `verb` goes to its history."""
-    kind = _kind(dataset)
-    dataset = store_names(dataset)
-    grids = _grids(dataset)
-    divisor = 1000 if _whole_microseconds(dataset, grids) else 1
+    kind = _find_kind(dataset)
+    dataset = make_names_storable(dataset)
+    grids = _find_time_grids(dataset)
+    divisor = 1000 if _has_whole_microseconds(dataset, grids) else 1
     since = {
         "units": f"{'microseconds' if divisor == 1000 else 'nanoseconds'} since {_EPOCH}",
         **_CALENDAR,
@@ -78,17 +80,19 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
         if name in grids:
-            variables[f"{name}_start"] = _first_stamp(grids[name], variable.attrs, divisor, since)
+            variables[f"{name}_start"] = _encode_first_stamp(
+                grids[name], variable.attrs, divisor, since
+            )
             continue
         stored = (
-            transposed(_lazy(variable), _disk_order(variable.dims))
+            transpose_lazy(_make_lazy(variable), _disk_order(variable.dims))
             if name not in dataset.dims
             else variable
         )
-        attrs = _attributes_to_disk({"long_name": str(name).replace("_", " "), **variable.attrs})
+        attrs = _encode_attributes({"long_name": str(name).replace("_", " "), **variable.attrs})
         data = stored.data if name not in dataset.dims else None
         if variable.dtype.kind == "M":
-            data = _stamps(name, stored, divisor)
+            data = _encode_stamps(name, stored, divisor)
             if name in dataset.dims:
                 attrs = {"standard_name": "time", "axis": "T", **attrs}
             if name not in bounds:
@@ -113,7 +117,7 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
     if "avar" in variables:
         beside = [name for name in ("count", "coverage", "edf", "estimator") if name in variables]
         stored_set["avar"].attrs["ancillary_variables"] = " ".join(beside)
-    stored_set.attrs = _global_attributes(dataset, kind, verb)
+    stored_set.attrs = _make_global_attributes(dataset, kind, verb)
     return stored_set
 
 
@@ -126,14 +130,14 @@ def _disk_order(dims: tuple[Any, ...]) -> list[Any]:
     )
 
 
-def _lazy(variable: xr.Variable) -> xr.Variable:
+def _make_lazy(variable: xr.Variable) -> xr.Variable:
     """Turn a variable that still sits in another file into a dask array, so that it is copied chunk by chunk."""
     return (
         variable if variable._in_memory or variable.chunks is not None else variable.chunk("auto")
     )
 
 
-def _grids(dataset: xr.Dataset) -> dict[Any, Any]:
+def _find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
     """The rules of the time axes that are computed."""
     grids = {
         name: index.transform
@@ -158,7 +162,7 @@ def index_dim(dim: Any) -> str:
     return f"{dim}_index"
 
 
-def _first_stamp(
+def _encode_first_stamp(
     grid: Any, attrs: dict[Any, Any], divisor: int, since: dict[str, Any]
 ) -> xr.Variable:
     """What stands in the file for a computed time axis: its first stamp, with the rate and the exact rule as attributes."""
@@ -183,32 +187,32 @@ def _first_stamp(
     return xr.Variable((), np.int64(first // divisor), {**said, **since})
 
 
-def _whole_microseconds(dataset: xr.Dataset, grids: dict[Any, Any]) -> bool:
+def _has_whole_microseconds(dataset: xr.Dataset, grids: dict[Any, Any]) -> bool:
     """Whether microseconds hold every time in the file exactly; nanoseconds always do, but fewer programs read them."""
     for name, variable in dataset.variables.items():
         if name in grids:
             if int(grid_times(grids[name].start, grids[name].rate, grids[name].first)) % 1000:
                 return False
-        elif variable.dtype.kind == "M" and np.any(_nanoseconds(variable.values) % 1000):
+        elif variable.dtype.kind == "M" and np.any(_as_nanoseconds(variable.values) % 1000):
             return False
     return True
 
 
-def _nanoseconds(stamps: Any) -> NDArray[np.int64]:
+def _as_nanoseconds(stamps: Any) -> NDArray[np.int64]:
     return np.asarray(stamps).astype("datetime64[ns]").view(np.int64)
 
 
-def _stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.int64]:
+def _encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.int64]:
     """Whole microseconds or nanoseconds since 1970."""
     stamps = variable.values
     if np.isnat(stamps).any():
         raise SchemaError(
             f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); every time must be known"
         )
-    return _nanoseconds(stamps) // divisor
+    return _as_nanoseconds(stamps) // divisor
 
 
-def _attributes_to_disk(attrs: dict[str, Any]) -> dict[str, Any]:
+def _encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     """Attributes of types that NetCDF holds, with `units` that UDUNITS reads rightly (any other unit goes to `source_units`)."""
     if "units" in attrs:
         units = on_disk(str(attrs["units"]))
@@ -234,7 +238,7 @@ def _attributes_to_disk(attrs: dict[str, Any]) -> dict[str, Any]:
     return attrs
 
 
-def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, Any]:
+def _make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, Any]:
     now = time_of_day()
     try:
         version = metadata.version("gyrostab")
@@ -271,7 +275,7 @@ def _global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, A
                 0
             ]  # one dimension where the axis is computed
             given[f"time_coverage_{end}"] = f"{stamp.astype('datetime64[us]')}Z"
-    return _attributes_to_disk(given)
+    return _encode_attributes(given)
 
 
 def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
@@ -282,8 +286,8 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
         if "bounds" in variable.attrs
     }
     variables: dict[Any, xr.Variable] = {}
-    grids = declared_grids(stored, where)
-    axes, close = _axes(stored, grids, where), stored._close
+    grids = parse_time_grids(stored, where)
+    axes, close = _make_time_axes(stored, grids, where), stored._close
     dims: dict[Any, Any] = {index_dim(rule["dim"]): rule["dim"] for rule in grids.values()}
     for name, variable in stored.variables.items():
         if name in grids:
@@ -295,7 +299,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
             opened = opened.astype(str)
         if name in stored.coords or name in bounds:
             opened = opened.load()
-        opened.attrs = _attributes_from_disk(dict(opened.attrs))
+        opened.attrs = _decode_attributes(dict(opened.attrs))
         opened.dims = tuple(dims.get(dim, dim) for dim in opened.dims)
         variables[name] = opened.transpose(*_memory_order(opened.dims))
     beside = xr.Coordinates(
@@ -315,7 +319,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     dataset = xr.Dataset(
         variables,
         xr.Coordinates(coords, indexes=indexes),
-        _attributes_from_disk(dict(stored.attrs)),
+        _decode_attributes(dict(stored.attrs)),
     )
     dataset = restore_names(dataset)
     dataset.set_close(close)
@@ -358,7 +362,7 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
     return decoded.astype("datetime64[ns]")
 
 
-def declared_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, Any]]:
+def parse_time_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, Any]]:
     """The rules of the computed time axes that a file declares: name of the variable -> rule; `where` is for messages."""
     declared = {
         str(name): variable.attrs[GRID]
@@ -409,7 +413,7 @@ def _parse_grid(text: Any) -> dict[str, Any]:
     return dict(rule)
 
 
-def _axes(
+def _make_time_axes(
     stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str
 ) -> dict[str, xr.Coordinates]:
     """The computed time axes: name of the variable that declares one -> coordinate."""
@@ -433,7 +437,7 @@ def _axes(
     return axes
 
 
-def _attributes_from_disk(attrs: dict[str, Any]) -> dict[str, Any]:
+def _decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     for name in str(attrs.pop(_JSON_NAMES, "")).split():
         attrs[name] = json.loads(attrs[name])
     for name, value in attrs.items():

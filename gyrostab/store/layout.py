@@ -21,15 +21,21 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.checksum import fletcher32
-from gyrostab.store.lock import library_lock
+from gyrostab.store.netcdf_lock import library_lock
 
 __all__ = [
-    "ChunkDamage", "decoded_chunk", "has_known_filters", "is_readable", "read_chunk", "read_written_chunk", "stored_attribute",
-    "zarr_codecs",
+    "ChunkDamage",
+    "decode_chunk",
+    "find_zarr_codecs",
+    "has_known_filters",
+    "is_readable",
+    "read_attribute",
+    "read_chunk",
+    "read_written_chunk",
 ]  # fmt: skip
 
 #: Variables of files whose layout is remembered: some for each file of a long archive.
-_REMEMBERED = 2**12
+_MAX_CACHED_LAYOUTS = 2**12
 #: Numbers of the filters of HDF5 that are known here.
 _DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD = 1, 2, 3, 32015
 
@@ -55,7 +61,7 @@ class _ZarrLayout:
     separator: str
 
 
-def stored_attribute(path: Path, name: str) -> str:
+def read_attribute(path: Path, name: str) -> str:
     """Look up an attribute of a NetCDF file without opening all of it; empty when it has none, or is of an older format.
 
     Raises
@@ -112,7 +118,9 @@ def read_chunk(
         When there is no such file any more, or it may not be read.
     """
     return (
-        _zarr_chunk(path / name, place, opened) if zarr else _hdf5_chunk(path, name, place, opened)
+        _read_zarr_chunk(path / name, place, opened)
+        if zarr
+        else _read_hdf5_chunk(path, name, place, opened)
     )
 
 
@@ -126,14 +134,14 @@ def read_written_chunk(
     ChunkDamage, FormatError
         As from `read_chunk`.
     """
-    layout = _hdf5_layout(path, name, opened)
+    layout = _read_hdf5_layout(path, name, opened)
     if place not in layout.places and not layout.damage:
         return None
-    return _hdf5_chunk(path, name, place, opened)
+    return _read_hdf5_chunk(path, name, place, opened)
 
 
-def _hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> NDArray[Any]:
-    layout = _hdf5_layout(path, name, opened)
+def _read_hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> NDArray[Any]:
+    layout = _read_hdf5_layout(path, name, opened)
     if place not in layout.places:
         raise ChunkDamage(
             f"is damaged: {layout.damage}"
@@ -148,7 +156,7 @@ def _hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> N
                 begin + size > os.fstat(handle).st_size
             ):  # before memory is taken: a damaged index may hold any number
                 raise ChunkDamage("is missing: the file is cut short")
-            data = _bytes_at(handle, begin, size)
+            data = _read_bytes(handle, begin, size)
         finally:
             os.close(handle)
     except OSError as error:
@@ -159,12 +167,12 @@ def _hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str) -> N
         raise ChunkDamage(f"is damaged: {error}") from error
     if len(data) < size:
         raise ChunkDamage("is missing: the file is cut short")
-    return decoded_chunk(
+    return decode_chunk(
         data, [codec for number, codec in layout.codecs if not mask >> number & 1], layout.dtype
     )
 
 
-def _bytes_at(handle: int, begin: int, size: int) -> bytes:
+def _read_bytes(handle: int, begin: int, size: int) -> bytes:
     os.lseek(handle, begin, os.SEEK_SET)
     data = os.read(handle, size)
     while 0 < len(data) < size and (more := os.read(handle, size - len(data))):
@@ -172,8 +180,8 @@ def _bytes_at(handle: int, begin: int, size: int) -> bytes:
     return data
 
 
-@lru_cache(maxsize=_REMEMBERED)
-def _hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
+@lru_cache(maxsize=_MAX_CACHED_LAYOUTS)
+def _read_hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
     """The places of the chunks; those of a damaged index that can be read."""
     import h5py
 
@@ -190,7 +198,7 @@ def _hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
             variable = file[name]
             dtype, codecs, lengths = (
                 variable.dtype,
-                _hdf5_codecs(variable.id.get_create_plist()),
+                _find_hdf5_codecs(variable.id.get_create_plist()),
                 variable.chunks or (),
             )
 
@@ -207,7 +215,7 @@ def _hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
     return _Hdf5Layout(dtype, codecs, places, damage)
 
 
-def _hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
+def _find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
     """Filters as codecs, in the order of reading, each with its number in the pipeline."""
     from numcodecs import Zlib, Zstd
 
@@ -218,7 +226,11 @@ def _hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
         codecs.append(
             (
                 number,
-                _Shuffle(values[0]) if code == _SHUFFLE else made() if made else _Unknown(code),
+                _Shuffle(values[0])
+                if code == _SHUFFLE
+                else made()
+                if made
+                else _UnknownFilter(code),
             )
         )
     return tuple(codecs)
@@ -276,7 +288,7 @@ class _Blosc:
 
 
 @dataclass(frozen=True)
-class _Unknown:
+class _UnknownFilter:
     code: int
 
     def decode(self, data: bytes) -> bytes:
@@ -285,8 +297,8 @@ class _Unknown:
         )
 
 
-def _zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]:
-    layout = _zarr_layout(folder, opened)
+def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]:
+    layout = _read_zarr_layout(folder, opened)
     name = layout.separator.join(map(str, place))
     try:
         data = (folder / name).read_bytes()
@@ -300,17 +312,17 @@ def _zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]
         if error.errno != errno.EIO:
             raise FormatError(f"{folder / name}: cannot be read ({error.strerror})") from error
         raise ChunkDamage(f"is damaged: {folder.name}/{name}: {error}") from error
-    return decoded_chunk(data, layout.codecs, layout.dtype, name=f"{folder.name}/{name}: ")
+    return decode_chunk(data, layout.codecs, layout.dtype, name=f"{folder.name}/{name}: ")
 
 
-@lru_cache(maxsize=_REMEMBERED)
-def _zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
+@lru_cache(maxsize=_MAX_CACHED_LAYOUTS)
+def _read_zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
     """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk."""
     try:
         layout = json.loads((folder / ".zarray").read_text())
         return _ZarrLayout(
             np.dtype(layout["dtype"]),
-            zarr_codecs(layout),
+            find_zarr_codecs(layout),
             str(layout.get("dimension_separator", ".")),
         )
     except OSError as error:
@@ -323,7 +335,7 @@ def _zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
         ) from error
 
 
-def zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
+def find_zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
     """Compressor and filters of a variable as codecs, in the order of reading."""
     import numcodecs
 
@@ -337,7 +349,7 @@ def zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
     )
 
 
-def decoded_chunk(
+def decode_chunk(
     data: Any, codecs: Iterable[Any], dtype: np.dtype[Any], *, name: str = ""
 ) -> NDArray[Any]:
     """Bytes of a chunk, through the codecs, as numbers.

@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
-from gyrostab.store.cf import declared_grids, decode_stamps, index_dim
-from gyrostab.store.direct import with_fill
-from gyrostab.store.header import SMALL, Header, read_header
-from gyrostab.store.kept import KeptChunks
+from gyrostab.store.cf import decode_stamps, index_dim, parse_time_grids
+from gyrostab.store.chunk_cache import ChunkCache
+from gyrostab.store.file_errors import name_file_in_errors
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
-from gyrostab.store.named import name_file
+from gyrostab.store.lazy_slices import with_row_reader
+from gyrostab.store.log_header import MIN_LAZY_VALUES, Header, read_header
 from gyrostab.store.output import remember_source
 from gyrostab.time.grid import grid_times
 
 __all__ = ["open_stored"]
 
 #: Bytes of the chunks together that are kept when only a part of each was wanted.
-_KEPT_BYTES = 2**24
+_CACHE_BYTES = 2**24
 
 
 def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
@@ -50,16 +50,16 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
     with reading_of(path):
-        return _open(path, strict=strict)
+        return _open_dataset(path, strict=strict)
 
 
-def _open(path: Path, *, strict: bool) -> xr.Dataset:
+def _open_dataset(path: Path, *, strict: bool) -> xr.Dataset:
     header = read_header(path)
     if header is not None:
-        stored = _decoded(header)
-        long = _long_variables(stored, path, strict=strict)
+        stored = _decode_header(header)
+        long = _find_long_variables(stored, path, strict=strict)
         if header.long <= long.keys():
-            return _lazy(stored, long, small=SMALL)
+            return _make_variables_lazy(stored, long, small=MIN_LAZY_VALUES)
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
@@ -70,17 +70,17 @@ def _open(path: Path, *, strict: bool) -> xr.Dataset:
         raise FormatError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
         ) from error
-    stored = name_file(stored, path)
+    stored = name_file_in_errors(stored, path)
     is_log = stored.attrs.get("gyrostab_content") == "log"
-    long = _long_variables(stored, path, strict=strict) if is_log else {}
-    opened = _lazy(stored, long, small=SMALL if is_log else 0)
+    long = _find_long_variables(stored, path, strict=strict) if is_log else {}
+    opened = _make_variables_lazy(stored, long, small=MIN_LAZY_VALUES if is_log else 0)
     if is_log:
         # opened again where needed: no archive of any length holds more than a few files open
         stored.close()
     return opened
 
 
-def _decoded(header: Header) -> xr.Dataset:
+def _decode_header(header: Header) -> xr.Dataset:
     """What xarray makes of a header: text, missing values and factors decoded, times not, no index."""
     decoded, attrs, names = xr.conventions.decode_cf_variables(
         header.variables, header.attrs, decode_times=False
@@ -94,7 +94,9 @@ def _decoded(header: Header) -> xr.Dataset:
     return xr.Dataset(data, xr.Coordinates(coords, indexes={}), attrs)
 
 
-def _lazy(stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int) -> xr.Dataset:
+def _make_variables_lazy(
+    stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int
+) -> xr.Dataset:
     """Load what is small, and make dask arrays, by the chunks on disk, of what is not one yet: making and reading one takes its time."""
     rest = {name: stored.variables[name] for name in stored.data_vars if name not in long}
     ready = {  # text is always small, and dask cannot tell the size of its chunks
@@ -112,7 +114,7 @@ def _lazy(stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int) -> xr
     return lazy
 
 
-def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
+def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
     """The long variables of a log, as arrays that know about damage."""
     import dask.array as da
 
@@ -134,7 +136,7 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
         own = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name), disk)
         if not own or ("scale_factor" in disk and "_FillValue" not in disk):
             continue  # some other program has laid it out anew
-        array = _Chunks(
+        array = _ChunkedVariable(
             path=path.absolute(),
             name=str(name),
             rows=tuple(f"axis {label}" for label in labels)
@@ -145,7 +147,7 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
             length=int(chunks[-1]),
             scale=disk.get("scale_factor"),
             missing=disk.get("_FillValue"),
-            spans=_spans(stored, dim, int(chunks[-1]), path),
+            spans=_find_chunk_spans(stored, dim, int(chunks[-1]), path),
             strict=strict,
             opened=opened,
             zarr=path.is_dir(),
@@ -167,16 +169,16 @@ def _long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any
             else {}
         )
         long[name] = xr.Variable(
-            variable.dims, with_fill(lazy, array.fill), variable.attrs, packing
+            variable.dims, with_row_reader(lazy, array.fill), variable.attrs, packing
         )
     return long
 
 
-def _spans(
+def _find_chunk_spans(
     stored: xr.Dataset, dim: str, length: int, path: Path
 ) -> dict[str, Any] | tuple[tuple[int, int], ...]:
     """The rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
-    rules = {index_dim(rule["dim"]): rule for rule in declared_grids(stored, path).values()}
+    rules = {index_dim(rule["dim"]): rule for rule in parse_time_grids(stored, path).values()}
     if dim in rules:
         return rules[dim]
     if dim not in stored.variables:
@@ -189,7 +191,7 @@ def _spans(
 
 
 @dataclass(frozen=True, eq=False)
-class _Chunks:
+class _ChunkedVariable:
     """One variable on disk, by rows and stretches of `length` samples, behind the few attributes that dask asks for."""
 
     path: Path
@@ -245,11 +247,11 @@ class _Chunks:
     def _stored(self, row: int, number: int, *, whole: bool) -> NDArray[Any]:
         """One chunk as it lies on disk; the last of a row has room for more than there is. One that is not wanted `whole` is kept."""
         place = (number,) if self.ndim == 1 else (row, number)
-        chunk = _KEPT.find((self.opened, self.name, place))
+        chunk = _CACHE.get((self.opened, self.name, place))
         if chunk is None:
             chunk = read_chunk(self.path, self.name, place, zarr=self.zarr, opened=self.opened)
             if not whole:
-                _KEPT.keep((self.opened, self.name, place), chunk)
+                _CACHE.put((self.opened, self.name, place), chunk)
         if chunk.size != self.length:
             raise ChunkDamage(f"is damaged: it holds {chunk.size} values in place of {self.length}")
         return chunk
@@ -270,14 +272,14 @@ class _Chunks:
             raise FormatError(
                 f"{what}; copy it again, or leave out --strict to take these samples as missing"
             )
-        with _TELLING:
+        with _WARNING_LOCK:
             _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
 
 
 #: Where one part of a run ends, another begins.
-_KEPT = KeptChunks(_KEPT_BYTES, _KEPT_BYTES // 2)
+_CACHE = ChunkCache(_CACHE_BYTES, _CACHE_BYTES // 2)
 
-_TELLING = threading.Lock()
+_WARNING_LOCK = threading.Lock()
 
 
 @lru_cache(maxsize=2**16)

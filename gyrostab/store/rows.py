@@ -21,23 +21,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import DamageError
-from gyrostab.store.kept import KeptChunks
+from gyrostab.store.chunk_cache import ChunkCache
 from gyrostab.store.layout import ChunkDamage, has_known_filters, read_written_chunk
 
 __all__ = ["ChunkedRows", "EvenRows", "LibraryRows", "Rows", "hdf5_rows"]
 
 #: Bytes that are read at one time where other variables lie between the rows.
-_SPREAD_BYTES = 2**23
+_STRIDED_READ_BYTES = 2**23
 #: Chunks of a variable whose places are remembered, at about 200 bytes each.
-_MOST_CHUNKS = 2**19
+_MAX_CHUNKS = 2**19
 #: Chunks from this size on are decoded by one thread at a time.
-_LARGE_BYTES = 2**24
+_LARGE_CHUNK_BYTES = 2**24
 #: Small chunks of one column that were not wanted whole: the next part of a run begins in them.
-_EDGES = KeptChunks(2**26, _LARGE_BYTES)
+_EDGE_CACHE = ChunkCache(2**26, _LARGE_CHUNK_BYTES)
 #: A part of a run has up to 2**24 samples (128 MiB) of all axes, and each of two workers may find
 #: all of them in the same chunks.
-_KEPT = KeptChunks(3 * 2**27, 2**28)
-_DECODING = threading.Lock()
+_SHARED_CACHE = ChunkCache(3 * 2**27, 2**28)
+_LARGE_CHUNK_LOCK = threading.Lock()
 
 
 class Rows(Protocol):
@@ -71,7 +71,9 @@ class EvenRows:
         """Return the numbers of some rows as they are stored."""
         out = np.empty(max(stop - start, 0), self.dtype)
         step = (
-            out.size if self.stride == self.dtype.itemsize else max(_SPREAD_BYTES // self.stride, 1)
+            out.size
+            if self.stride == self.dtype.itemsize
+            else max(_STRIDED_READ_BYTES // self.stride, 1)
         )
         with self.path.open("rb", buffering=0) as file:
             for at in range(0, out.size, max(step, 1)):
@@ -146,17 +148,17 @@ class ChunkedRows:
 
     def _chunk(self, at: tuple[int, ...], *, alone: bool, part: bool) -> NDArray[Any] | None:
         """Return a chunk; one that will be wanted again, by another column or for its other rows, is kept."""
-        large = math.prod(self.chunks) * self.dtype.itemsize >= _LARGE_BYTES
-        kept, key = _EDGES if alone and not large else _KEPT, (*self.key, at)
-        chunk = kept.find(key)
+        large = math.prod(self.chunks) * self.dtype.itemsize >= _LARGE_CHUNK_BYTES
+        kept, key = _EDGE_CACHE if alone and not large else _SHARED_CACHE, (*self.key, at)
+        chunk = kept.get(key)
         if chunk is not None:
             return chunk
-        with _DECODING if large else nullcontext():
-            chunk = kept.find(key) if large else None
+        with _LARGE_CHUNK_LOCK if large else nullcontext():
+            chunk = kept.get(key) if large else None
             if chunk is None:
                 chunk = self.load(at)
                 if chunk is not None and (part or not alone):
-                    kept.keep(key, chunk)
+                    kept.put(key, chunk)
         return chunk
 
 
@@ -212,7 +214,7 @@ def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
         and not plist.get_external_count()
         and variable.id.get_offset() is not None
     ):
-        return partial(_even_rows, path.absolute(), dtype, variable.id.get_offset(), shape)
+        return partial(_make_even_rows, path.absolute(), dtype, variable.id.get_offset(), shape)
     if plist.get_layout() != h5py.h5d.CHUNKED or not has_known_filters(plist):
         return None
     if (
@@ -220,7 +222,7 @@ def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
             [-(-size // length) for size, length in zip(shape, variable.chunks, strict=True)],
             dtype=float,
         )
-        > _MOST_CHUNKS
+        > _MAX_CHUNKS
     ):
         return None  # a table of their places would be larger than the chunks
     key = (uuid.uuid4().hex, variable.name)
@@ -230,7 +232,7 @@ def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
     )
 
 
-def _even_rows(
+def _make_even_rows(
     path: Path, dtype: np.dtype[Any], begin: int, shape: tuple[int, ...], along: int, place: int
 ) -> EvenRows:
     wide = dtype.itemsize

@@ -8,16 +8,16 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-__all__ = ["MOST_WORKERS", "in_order"]
+__all__ = ["MAX_WORKERS", "map_in_order"]
 
 #: Threads at most, however many cores there are.
-MOST_WORKERS = 4
+MAX_WORKERS = 4
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def in_order(
+def map_in_order(
     work: Callable[[Item], Result], items: Iterable[Item], *, workers: int | None = None
 ) -> Iterator[Result]:
     """Do the work on the items, a few at a time, and give the results in the order of the items.
@@ -29,14 +29,14 @@ def in_order(
     items : iterable
         Fetched in a thread of its own, one ahead of the work.
     workers : int, optional
-        Threads; one for each core by default, `MOST_WORKERS` at most.
+        Threads; one for each core by default, `MAX_WORKERS` at most.
 
     Examples
     --------
     >>> list(in_order(lambda n: n * n, range(5)))
     [0, 1, 4, 9, 16]
     """
-    workers = workers or min(os.cpu_count() or 1, MOST_WORKERS)
+    workers = workers or min(os.cpu_count() or 1, MAX_WORKERS)
     source = iter(items)
     nothing = object()
     with (

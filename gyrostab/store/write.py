@@ -13,11 +13,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.kernels.encoding.counts import to_counts
-from gyrostab.store.direct import can_fill, fill_row, with_fill
-from gyrostab.store.lock import library_lock
+from gyrostab.store.lazy_slices import can_read_into, read_into, with_row_reader
+from gyrostab.store.netcdf_lock import library_lock
 
 __all__ = [
-    "Misfit",
+    "NotCountsError",
     "Progress",
     "append_netcdf",
     "append_zarr",
@@ -31,15 +31,15 @@ CHUNK_SECONDS = 1200.0
 #: Bounds of the samples in one chunk, for very slow and very fast logs.
 CHUNK_LIMITS = (2**16, 2**22)
 #: Size [bytes] of the doubles that are computed at one time while a lazy log is written.
-STRETCH_BYTES = 2**26
-FILLS = {"int16": -32767, "int32": -2147483647}  # the defaults of NetCDF
+MAX_BATCH_BYTES = 2**26
+FILL_VALUES = {"int16": -32767, "int32": -2147483647}  # the defaults of NetCDF
 
 
 #: Told the share that is done.
 Progress = Callable[[float], None]
 
 
-class Misfit(ValueError):
+class NotCountsError(ValueError):
     """A variable does not consist of counts after all; `args` is its name."""
 
 
@@ -74,7 +74,7 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
     ):
         return xr.Variable(variable.dims, variable.data, variable.attrs)
     dtype = "int16" if declared.itemsize == 1 or declared == np.int16 else "int32"
-    pack = partial(_counts, name=name, scale=float(scale), dtype=dtype)
+    pack = partial(_pack_counts, name=name, scale=float(scale), dtype=dtype)
     data = variable.data
     lazy = variable.chunks is not None
     packed = (
@@ -82,29 +82,29 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
         if lazy
         else pack(data)
     )
-    if lazy and can_fill(data):
-        packed = with_fill(packed, partial(_fill_counts, data, pack))
+    if lazy and can_read_into(data):
+        packed = with_row_reader(packed, partial(_read_counts_into, data, pack))
     return xr.Variable(
         variable.dims,
         packed,
         {
             **variable.attrs,
             "scale_factor": float(scale),
-            "_FillValue": np.dtype(dtype).type(FILLS[dtype]),
+            "_FillValue": np.dtype(dtype).type(FILL_VALUES[dtype]),
         },
     )
 
 
-def _counts(
+def _pack_counts(
     values: NDArray[np.float64], *, name: str, scale: float, dtype: str
 ) -> NDArray[np.integer[Any]]:
-    counts = to_counts(values, scale, dtype, FILLS[dtype])
+    counts = to_counts(values, scale, dtype, FILL_VALUES[dtype])
     if counts is None:
-        raise Misfit(name)
+        raise NotCountsError(name)
     return counts
 
 
-def _fill_counts(
+def _read_counts_into(
     data: Any,
     pack: Callable[[NDArray[np.float64]], NDArray[np.integer[Any]]],
     row: int,
@@ -113,7 +113,7 @@ def _fill_counts(
 ) -> None:
     """Counts of one row of `data` from `begin` on, read without dask."""
     values = np.empty(out.size)
-    fill_row(data, row, begin, values)
+    read_into(data, row, begin, values)
     out[:] = pack(values)
 
 
@@ -152,7 +152,7 @@ def long_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
     }
 
 
-def _names(variable: xr.Variable) -> list[str]:
+def _dim_names(variable: xr.Variable) -> list[str]:
     return [str(dim) for dim in variable.dims]
 
 
@@ -179,7 +179,7 @@ def append_netcdf(
                 options = dict(encoding[name])
                 fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
                 targets[name] = file.createVariable(
-                    name, variable.dtype, _names(variable), fill_value=fill, **options
+                    name, variable.dtype, _dim_names(variable), fill_value=fill, **options
                 )
                 targets[name].setncatts(
                     {key: value for key, value in variable.attrs.items() if key != "_FillValue"}
@@ -190,7 +190,9 @@ def append_netcdf(
             with lock:
                 targets[name][(*row, part)] = values
 
-        _copy(long, {name: encoding[name]["chunksizes"][-1] for name in long}, put, progress)
+        _copy_variables(
+            long, {name: encoding[name]["chunksizes"][-1] for name in long}, put, progress
+        )
     finally:
         with lock:
             file.close()
@@ -217,7 +219,7 @@ def append_zarr(
             shape=variable.shape,
             dtype=variable.dtype,
             fill_value=fill,
-            attributes={"_ARRAY_DIMENSIONS": _names(variable), **attrs},
+            attributes={"_ARRAY_DIMENSIONS": _dim_names(variable), **attrs},
             config={"write_empty_chunks": True},
             **options,
         )
@@ -225,11 +227,11 @@ def append_zarr(
     def put(name: str, row: tuple[int, ...], part: slice, values: NDArray[Any]) -> None:
         targets[name][(*row, part)] = values
 
-    _copy(long, {name: encoding[name]["chunks"][-1] for name in long}, put, progress)
+    _copy_variables(long, {name: encoding[name]["chunks"][-1] for name in long}, put, progress)
     zarr.consolidate_metadata(path, zarr_format=2)
 
 
-def _copy(
+def _copy_variables(
     long: dict[str, xr.Variable],
     lengths: dict[str, int],
     put: Callable[[str, tuple[int, ...], slice, NDArray[Any]], None],
@@ -253,9 +255,9 @@ def _copy(
     with readers, ThreadPoolExecutor(1, thread_name_prefix="gyrostab-write") as pool:
         writing: Future[None] | None = None
         done, total = 0, sum(variable.size for variable in long.values())
-        rooms: tuple[_Room, _Room] = ({}, {})  # one is written while the other is filled
-        for number, parts in enumerate(_stretches(long, lengths)):
-            blocks = _blocks(long, lengths, parts, readers, rooms[number % 2])
+        rooms: tuple[_Buffers, _Buffers] = ({}, {})  # one is written while the other is filled
+        for number, parts in enumerate(_plan_batches(long, lengths)):
+            blocks = _read_blocks(long, lengths, parts, readers, rooms[number % 2])
             if writing is not None:
                 writing.result()
             writing = pool.submit(write, [part[:3] for part in parts], blocks)
@@ -268,16 +270,16 @@ def _copy(
 
 #: Name, row, first sample and number of samples of a part of a variable; arrays by name and row,
 #: which stretch after stretch goes through.
-_Part = tuple[str, tuple[int, ...], int, int]
-_Room = dict[tuple[str, tuple[int, ...]], NDArray[Any]]
+_Segment = tuple[str, tuple[int, ...], int, int]
+_Buffers = dict[tuple[str, tuple[int, ...]], NDArray[Any]]
 
 
-def _blocks(
+def _read_blocks(
     long: dict[str, xr.Variable],
     lengths: dict[str, int],
-    parts: list[_Part],
+    parts: list[_Segment],
     readers: ThreadPoolExecutor,
-    room: _Room,
+    room: _Buffers,
 ) -> list[NDArray[Any]]:
     """Read the parts of a stretch, chunk by chunk where it is known how; dask computes the others, and walks its whole graph each time."""
     import dask
@@ -285,23 +287,23 @@ def _blocks(
     lazy = [
         long[name].data[(*row, slice(begin, begin + span))]
         for name, row, begin, span in parts
-        if not can_fill(long[name].data)
+        if not can_read_into(long[name].data)
     ]
     blocks: list[NDArray[Any]] = []
     filling: list[Future[None]] = []
     computed = iter(dask.compute(*lazy))
     for name, row, begin, span in parts:
         data = long[name].data
-        if not can_fill(data):
+        if not can_read_into(data):
             blocks.append(next(computed))
             continue
-        if room.get((name, row), _NOTHING).size < span:
+        if room.get((name, row), _NO_VALUES).size < span:
             room[name, row] = np.empty(span, data.dtype)
         blocks.append(room[name, row][:span])
         for at in range(0, span, lengths[name]):
             filling.append(
                 readers.submit(
-                    fill_row,
+                    read_into,
                     data,
                     row[0] if row else 0,
                     begin + at,
@@ -317,10 +319,10 @@ def _blocks(
     return blocks
 
 
-_NOTHING = np.empty(0)
+_NO_VALUES = np.empty(0)
 
 
-def _stretches(
+def _plan_batches(
     long: dict[str, xr.Variable], lengths: dict[str, int]
 ) -> Iterator[list[tuple[str, tuple[int, ...], int, int]]]:
     """Stretches of whole chunks, of all variables on one time: name, row, first sample, number of samples of each part."""
@@ -332,7 +334,7 @@ def _stretches(
             for row in np.ndindex(*variable.shape[:-1])
         ]
         name = rows[0][0]
-        span = lengths[name] * max(1, STRETCH_BYTES // (8 * len(rows) * lengths[name]))
+        span = lengths[name] * max(1, MAX_BATCH_BYTES // (8 * len(rows) * lengths[name]))
         size = long[name].shape[-1]
         for begin in range(0, size, span):
             yield [(name, row, begin, min(span, size - begin)) for name, row in rows]

@@ -20,7 +20,7 @@ from gyrostab.kernels.allan.blocks import held_points
 from gyrostab.kernels.allan.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.schema import ESTIMATORS
-from gyrostab.store.direct import held
+from gyrostab.store.lazy_slices import make_lazy
 from gyrostab.time.durations import thin
 from tests.reference import direct_angle_surface, direct_surface
 
@@ -241,7 +241,7 @@ class TestInvariance:
         rows = np.random.default_rng(8).standard_normal((2, 400_000)).astype(dtype)
         rows[1, 5000:9000] = np.nan
         log = log_of(rows)
-        log = log.assign(rate=(log.rate.dims, held(rows, 30_000), log.rate.attrs))
+        log = log.assign(rate=(log.rate.dims, make_lazy(rows, 30_000), log.rate.attrs))
         options = {"window": "4000samples", "step": "1000samples", "taus": 20}
         whole, space = davar(log, **options).load(), Workspace()
         parts = [

@@ -160,9 +160,9 @@ def test_long_files_stay_on_disk_and_are_read_directly(tmp_path, monkeypatch):
     paths = [write(tmp_path / f"{axis}.csv", axis) for axis in "xyz"]
     raw = read_log(paths)
     assert raw.rate.chunks is not None
-    assert hasattr(raw.rate.data, "gyrostab_fill")
+    assert hasattr(raw.rate.data, "gyrostab_row_reader")
     log = regularise(raw)
-    assert hasattr(log.rate.data, "gyrostab_fill")
+    assert hasattr(log.rate.data, "gyrostab_row_reader")
     np.testing.assert_array_equal(log.rate.values, [truth(axis) for axis in "xyz"])
     surface = gyrostab.davar(log, window="5s", step="5s")
     assert np.isfinite(surface.avar.values[:, 0, 0]).all()

@@ -25,7 +25,7 @@ from gyrostab.kernels.encoding.decimals import (
     unroll_steps,
 )
 from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
-from gyrostab.store.threads import in_order
+from gyrostab.store.threads import map_in_order
 
 
 def bits(values: np.ndarray) -> np.ndarray:
@@ -220,9 +220,9 @@ def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():
             fetched.append(n)
             yield n
 
-    found = in_order(lambda n: n * n, items(), workers=2)
+    found = map_in_order(lambda n: n * n, items(), workers=2)
     assert next(found) == 0
     assert len(fetched) <= 5
     assert list(found) == [n * n for n in range(1, 50)]
     with pytest.raises(ZeroDivisionError):
-        list(in_order(lambda n: 1 / n, [2, 1, 0, 3]))
+        list(map_in_order(lambda n: 1 / n, [2, 1, 0, 3]))

@@ -34,7 +34,7 @@ from gyrostab.io.datasets import (
 )
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
-from gyrostab.store import deflate
+from gyrostab.store import netcdf_compression
 from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import INNER
 from tests.support import synthetic
@@ -466,9 +466,9 @@ def test_chunks_that_threads_compress_are_those_of_the_library(tmp_path, monkeyp
     product = synthetic.product()
     product["avar"][0, 1, 2] = np.nan
     monkeypatch.setattr(export, "CHUNK_VALUES", 50)  # several chunks, the last of them not full
-    monkeypatch.setattr(deflate, "_LARGE", 10**9)
+    monkeypatch.setattr(netcdf_compression, "_MIN_PARALLEL_VALUES", 10**9)
     by_library = to_netcdf(product, tmp_path / "library.nc")
-    monkeypatch.setattr(deflate, "_LARGE", 1)
+    monkeypatch.setattr(netcdf_compression, "_MIN_PARALLEL_VALUES", 1)
     by_threads = to_netcdf(
         product.chunk({"axis": 1, "time": 3}) if lazy else product, tmp_path / "threads.nc"
     )

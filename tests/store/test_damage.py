@@ -18,8 +18,8 @@ import gyrostab.store.layout as layout_module
 import gyrostab.store.read as read_module
 from gyrostab.errors import DamageError, FormatError
 from gyrostab.io.datasets import open_log, open_product, to_netcdf, to_zarr
-from gyrostab.store.direct import fill_row
-from gyrostab.store.kept import KeptChunks
+from gyrostab.store.chunk_cache import ChunkCache
+from gyrostab.store.lazy_slices import read_into
 from gyrostab.time.grid import time_coordinate
 from tests.support import synthetic
 from tests.support.stored import CHUNK, START, WRITERS, counts_log, same_bits, spoil
@@ -98,9 +98,9 @@ def test_a_chunk_of_a_few_bytes_is_damaged(tmp_path, content):
 @pytest.mark.parametrize("form", WRITERS)
 def test_chunks_that_are_kept_take_no_more_memory_than_they_may(tmp_path, monkeypatch, form):
     """Parts of the same chunks, in turn: read once while they fit, read anew when others have taken their place."""
-    kept, chunk = KeptChunks(4 * CHUNK * 2, 4 * CHUNK), 4 * CHUNK
+    kept, chunk = ChunkCache(4 * CHUNK * 2, 4 * CHUNK), 4 * CHUNK
     decoded = []
-    monkeypatch.setattr(read_module, "_KEPT", kept)
+    monkeypatch.setattr(read_module, "_CACHE", kept)
     monkeypatch.setattr(
         read_module,
         "read_chunk",
@@ -108,7 +108,7 @@ def test_chunks_that_are_kept_take_no_more_memory_than_they_may(tmp_path, monkey
     )
     with open_log(WRITERS[form](counts_log(), tmp_path / f"log.{form}")) as log:
         for place in (0, 1, 0, 1, 2, 0):
-            fill_row(log.rate.data, 1, place * CHUNK + 10, part := np.empty(10))
+            read_into(log.rate.data, 1, place * CHUNK + 10, part := np.empty(10))
             np.testing.assert_array_equal(
                 part, counts_log().rate[1, place * CHUNK + 10 : place * CHUNK + 20]
             )
@@ -225,10 +225,12 @@ def test_a_worker_of_a_cluster_tells_the_client(tmp_path):
 def test_what_stands_behind_a_chunk_that_is_cut_short_is_not_read():
     """Blosc trusts its header; here it would find the rest of the bytes just behind the end."""
     packed = Blosc("lz4").encode(np.random.default_rng(1).integers(0, 9, 10_000))
-    codecs = layout_module.zarr_codecs({"compressor": Blosc("lz4").get_config(), "filters": None})
-    assert layout_module.decoded_chunk(packed, codecs, np.dtype("i8")).size == 10_000
+    codecs = layout_module.find_zarr_codecs(
+        {"compressor": Blosc("lz4").get_config(), "filters": None}
+    )
+    assert layout_module.decode_chunk(packed, codecs, np.dtype("i8")).size == 10_000
     with pytest.raises(layout_module.ChunkDamage, match="it is cut short"):
-        layout_module.decoded_chunk(memoryview(packed)[:-1], codecs, np.dtype("i8"))
+        layout_module.decode_chunk(memoryview(packed)[:-1], codecs, np.dtype("i8"))
 
 
 def test_a_library_that_fails_in_a_late_read_names_the_file(tmp_path):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.simulate.drivers import Source, make_source
-from gyrostab.store import direct
+from gyrostab.store import lazy_slices
 
 __all__ = [
     "Stretch",
@@ -151,7 +151,7 @@ def channel_at(
     component = (
         None
         if stretch is None
-        else (stretch, direct.stretch(source.values, stretch.low, stretch.high))
+        else (stretch, lazy_slices.read_slice(source.values, stretch.low, stretch.high))
     )
     return source.at(instants, component, carry)
 
@@ -182,7 +182,7 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
     low = 0
     while low < edges.size - 1:
         high = max(int(np.searchsorted(ends, ends[low] + _LONG, side="right")) - 1, low + 1)
-        values = np.asarray(direct.stretch(data, ends[low], ends[high]), dtype=np.float64)
+        values = np.asarray(lazy_slices.read_slice(data, ends[low], ends[high]), dtype=np.float64)
         good = np.isfinite(values)
         at = np.repeat(np.arange(low, high), np.diff(ends[low : high + 1]))[good]
         sums += np.bincount(at, (values**2 if rms else values)[good], minlength=sums.size)

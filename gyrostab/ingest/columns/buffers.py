@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.pieces import Piece, Pieces, Spool, Stored, Words
-from gyrostab.store.direct import stack_rows, with_fill
+from gyrostab.store.lazy_slices import stack_rows, with_row_reader
 
 __all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "lazily", "pieces_of", "put", "take", "together"]
 
@@ -131,7 +131,7 @@ def lazily(values: NDArray[Any] | Pieces) -> Any:
     import dask.array
 
     name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
-    lazy = with_fill(
+    lazy = with_row_reader(
         dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta),
         values.fill,
     )

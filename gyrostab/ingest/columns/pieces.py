@@ -350,7 +350,7 @@ class Pieces:
         return out[:: rows.step]
 
     def fill(self, _row: int, begin: int, out: NDArray[Any]) -> None:
-        """The values from row `begin` of the log on: `gyrostab.store.direct.Fill`."""
+        """The values from row `begin` of the log on: `gyrostab.store.lazy_slices.RowReader`."""
         done, number = 0, bisect_right(self._rows, begin) - 1
         while done < out.size:
             first = begin + done - self._rows[number]

@@ -16,7 +16,7 @@ from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store.seen import Seen, with_seen
+from gyrostab.store.row_inspection import RowInspection, with_inspections
 
 __all__ = ["Intake", "Taken", "summary_of"]
 
@@ -61,7 +61,7 @@ class Taken(NamedTuple):
     cells: int
     low: int
     high: int
-    seen: Seen | None = None
+    seen: RowInspection | None = None
 
 
 _NO_ROWS = np.empty(0, np.int64)
@@ -106,7 +106,7 @@ class Intake:
         self.cell_places: list[str] = []
         self.bad_index: list[NDArray[np.int64]] = []
         self.low, self.high = np.iinfo(np.int64).max, NAT
-        self.seen: list[Seen] = []
+        self.seen: list[RowInspection] = []
         self.whole: dict[int, tuple[float, float] | None] = {
             column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
         }
@@ -285,7 +285,7 @@ class Intake:
         if self.gyro and self.plan.signal is not None:
             axes = [column.name for column in self.gyro]
             stack = together([columns[column.source] for column in self.gyro])
-            stack = with_seen(stack, self.seen) if self.seen else stack
+            stack = with_inspections(stack, self.seen) if self.seen else stack
             data[self.plan.signal] = (
                 ("axis", "row"),
                 stack,

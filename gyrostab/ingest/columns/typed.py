@@ -24,8 +24,8 @@ from gyrostab.ingest.columns.stamps import (
     signed_counts,
 )
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.store.seen import look_at_cells
-from gyrostab.store.threads import in_order
+from gyrostab.store.row_inspection import inspect_rows
+from gyrostab.store.threads import map_in_order
 
 __all__ = [
     "Fetch",
@@ -131,7 +131,7 @@ def read_columns(
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
     take = partial(_take_rows, intake, plan, options, fetch, stay)
-    for taken in in_order(take, spans) if lasting else map(take, spans):
+    for taken in map_in_order(take, spans) if lasting else map(take, spans):
         intake.add(taken)
     return intake.finish(notes)
 
@@ -167,7 +167,7 @@ def _take_rows(
         cells = np.stack(
             [cast(NDArray[np.float64], taken.block[column.source]) for column in intake.gyro]
         )
-        seen = look_at_cells(
+        seen = inspect_rows(
             cells,
             {
                 column.name: cast(NDArray[Any], taken.block[column.source])

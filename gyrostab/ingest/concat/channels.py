@@ -15,7 +15,7 @@ from gyrostab.errors import UnitError
 from gyrostab.ingest.concat.grid import Piece
 from gyrostab.ingest.concat.lazy import Part, fill_parts, place_on_grid
 from gyrostab.schema import log_channels
-from gyrostab.store.direct import can_fill, with_fill
+from gyrostab.store.lazy_slices import can_read_into, with_row_reader
 from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["join_channels"]
@@ -167,8 +167,8 @@ def _taken(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
         return np.asarray(whole)[places]
     taken = da.concatenate([whole[places[a] : places[b - 1] + 1] for a, b in pairwise(edges)])
     return (
-        with_fill(taken, partial(fill_parts, [_parts(arrays, places)]))
-        if all(map(can_fill, arrays))
+        with_row_reader(taken, partial(fill_parts, [_parts(arrays, places)]))
+        if all(map(can_read_into, arrays))
         else taken
     )
 

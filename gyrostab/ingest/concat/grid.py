@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.schema import signal_name
-from gyrostab.store.direct import stretch
+from gyrostab.store.lazy_slices import read_slice
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_times
 
 __all__ = ["Piece", "Source", "Stretch", "log_span", "read_stretches", "runs_of", "source_of"]
@@ -105,7 +105,7 @@ def _read_stretch(place: Stretch) -> NDArray[np.float64]:
     whole = np.full((data.shape[0], end - begin), np.nan)
     low, high = min(max(begin, 0), source.size), max(min(end, source.size), 0)
     if high > low:
-        whole[:, low - begin : high - begin] = stretch(data, low, high)
+        whole[:, low - begin : high - begin] = read_slice(data, low, high)
     return whole
 
 

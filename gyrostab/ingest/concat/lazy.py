@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.store.direct import can_fill, fill_row, with_fill
+from gyrostab.store.lazy_slices import can_read_into, read_into, with_row_reader
 
 __all__ = ["Part", "chunk_of", "fill_parts", "place_on_grid"]
 
@@ -111,7 +111,7 @@ def place_on_grid(
     -------
     dask.array.Array, shape (len(rows), size) or (size,)
         Its graph has one task for each chunk, beside the tasks of the arrays.
-        `gyrostab.store.direct.fill_row` reads it without them where it can read the arrays so.
+        `gyrostab.store.lazy_slices.read_into` reads it without them where it can read the arrays so.
     """
     import dask.array as da
     from dask.highlevelgraph import HighLevelGraph
@@ -156,9 +156,9 @@ def place_on_grid(
     graph = HighLevelGraph.from_collections(name, layer, dependencies=list(sources.values()))
     chunks = (lengths,) if flat else ((1,) * len(rows), lengths)
     joined = da.Array(graph, name, chunks, dtype=np.float64)
-    if not all(can_fill(array) for parts in rows for array, _, _ in parts):
+    if not all(can_read_into(array) for parts in rows for array, _, _ in parts):
         return joined
-    return with_fill(joined, partial(fill_parts, rows))
+    return with_row_reader(joined, partial(fill_parts, rows))
 
 
 def fill_parts(
@@ -182,10 +182,10 @@ def fill_parts(
         earlier = (run for other, runs in taken.items() if other != number for run in runs)
         if any(at < stop and start < at + length for start, stop in earlier):
             values = np.empty(length)
-            fill_row(array, own_row, own, values)
+            read_into(array, own_row, own, values)
             np.copyto(here, values, where=np.isnan(here))
         else:
-            fill_row(array, own_row, own, here)
+            read_into(array, own_row, own, here)
         taken.setdefault(number, []).append((at, at + length))
 
 

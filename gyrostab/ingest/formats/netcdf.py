@@ -36,7 +36,7 @@ from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
-from gyrostab.store import name_file, open_stored, stored_attribute
+from gyrostab.store import name_file_in_errors, open_stored, read_attribute
 from gyrostab.store.cf import from_disk
 from gyrostab.store.rows import LibraryRows, Rows
 from gyrostab.time.grid import grid_times, time_coordinate
@@ -116,7 +116,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     if stored is None:
         return None
     log = _as_in_memory(
-        path, _chunked(decode_variables(path.name, name_file(stored, path)))
+        path, _chunked(decode_variables(path.name, name_file_in_errors(stored, path)))
     )  # an index would hold every stamp
     log.set_close(stored.close)
     check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
@@ -228,7 +228,7 @@ def _content(path: Path) -> str:
     try:
         if path.is_dir():
             return str(json.loads((path / ".zattrs").read_text()).get("gyrostab_content", ""))
-        return stored_attribute(path, "gyrostab_content")
+        return read_attribute(path, "gyrostab_content")
     except Exception:  # whatever the libraries raise on damaged bytes
         return ""
 

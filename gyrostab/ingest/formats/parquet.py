@@ -22,7 +22,7 @@ from gyrostab.ingest.columns.typed import (
 )
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.store.threads import in_order
+from gyrostab.store.threads import map_in_order
 
 __all__ = ["matches", "read", "scan"]
 
@@ -71,7 +71,7 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
             {column.source: _plain(found[names[column.source]]) for column in plan.columns},
         )
 
-    for taken in in_order(
+    for taken in map_in_order(
         convert, file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted)
     ):
         intake.add(taken)

@@ -45,7 +45,7 @@ from gyrostab.ingest.text.layout import (
     split_line,
     unit_of_duration,
 )
-from gyrostab.store.threads import in_order
+from gyrostab.store.threads import map_in_order
 
 __all__ = ["matches", "read", "read_head", "scan"]
 
@@ -112,7 +112,7 @@ def read(
     intake = Intake(plan.check(), options, limit=limit)
     typing = Typing(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
-    for parts in in_order(
+    for parts in map_in_order(
         partial(_take, typing=typing, intake=intake), _blocks(path, layout.offset)
     ):
         if stop is not None and stop():

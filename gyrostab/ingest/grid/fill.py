@@ -13,8 +13,14 @@ from numpy.typing import NDArray
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.survey import BLOCK
 from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
-from gyrostab.store.direct import can_fill, fill_row, held, stretch, with_fill
-from gyrostab.store.threads import in_order
+from gyrostab.store.lazy_slices import (
+    can_read_into,
+    make_lazy,
+    read_into,
+    read_slice,
+    with_row_reader,
+)
+from gyrostab.store.threads import map_in_order
 from gyrostab.time.grid import grid_times
 
 __all__ = ["SMALL", "count_present", "gathered", "on_grid", "samples_of"]
@@ -50,12 +56,12 @@ def _fill_samples(
     rows: Any, runs: NDArray[np.int64], ends: NDArray[np.int64], scale: float, unit: float | None,
     row: int, begin: int, out: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Samples of one row of the grid from `begin` on, as `_fill` makes them: `gyrostab.store.direct.Fill`."""
+    """Samples of one row of the grid from `begin` on, as `_fill` makes them: `gyrostab.store.lazy_slices.RowReader`."""
     done = 0
     for sample, first, length in _cut(runs, ends, begin, begin + out.size).tolist():
         out[done:sample] = np.nan
         done = sample + length
-        fill_row(rows, row, first, out[sample:done])
+        read_into(rows, row, first, out[sample:done])
     out[done:] = np.nan
     _scaled(out, scale, unit)
 
@@ -99,7 +105,7 @@ def on_grid(
     size, lead = placement.size, rows.shape[:-1]
     if size * max(1, int(np.prod(lead))) <= SMALL:
         return _fill(np.asarray(rows), runs=placement.runs, size=size, scale=scale, unit=unit)
-    lazy = rows if isinstance(rows, da.Array) else held(np.asarray(rows), BLOCK)
+    lazy = rows if isinstance(rows, da.Array) else make_lazy(np.asarray(rows), BLOCK)
     ends = placement.runs[:, 0] + placement.runs[:, 2]
     parts, empty = [], 0
     filled: list[tuple[int, int]] = []  # chunks that hold samples at all
@@ -136,9 +142,9 @@ def on_grid(
     flush()
     placed = da.concatenate(parts, axis=-1)
     placed.gyrostab_filled = filled
-    if not can_fill(lazy) or lazy.dtype != np.float64:
+    if not can_read_into(lazy) or lazy.dtype != np.float64:
         return placed
-    return with_fill(placed, partial(_fill_samples, lazy, placement.runs, ends, scale, unit))
+    return with_row_reader(placed, partial(_fill_samples, lazy, placement.runs, ends, scale, unit))
 
 
 def count_present(array: Any) -> int:
@@ -156,9 +162,9 @@ def count_present(array: Any) -> int:
     )
 
     def count(ends: tuple[int, int]) -> int:
-        return int(np.count_nonzero(~np.isnan(stretch(array, *ends))))
+        return int(np.count_nonzero(~np.isnan(read_slice(array, *ends))))
 
-    return sum(in_order(count, ((begin, min(end, array.shape[-1])) for begin, end in filled)))
+    return sum(map_in_order(count, ((begin, min(end, array.shape[-1])) for begin, end in filled)))
 
 
 def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -182,7 +188,7 @@ def gathered(
     )
     stamps, values = [], []
     for begin in range(0, channel.shape[0], BLOCK):
-        block = stretch(channel, begin, min(begin + BLOCK, channel.shape[0])).astype(
+        block = read_slice(channel, begin, min(begin + BLOCK, channel.shape[0])).astype(
             np.float64, copy=False
         )
         rows = np.flatnonzero(np.isfinite(block))
@@ -191,7 +197,7 @@ def gathered(
         when = grid_times(placement.start, rate, sample)
         if clock is not None and not known.all():
             written = (
-                stretch(clock, begin, min(begin + BLOCK, channel.shape[0]))
+                read_slice(clock, begin, min(begin + BLOCK, channel.shape[0]))
                 .astype("datetime64[ns]")
                 .view(np.int64)[rows]
             )

@@ -17,7 +17,7 @@ from gyrostab.ingest.grid.survey import file_of
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
 from gyrostab.kernels.grid.stamps import DUPLICATE, LOOK, NO_STAMP, OUT_OF_ORDER, RESTART, STEP
-from gyrostab.store.direct import stretch
+from gyrostab.store.lazy_slices import read_slice
 from gyrostab.time.grid import period_ns
 
 __all__ = [
@@ -111,7 +111,7 @@ def check_grid(
     widest = int(np.argmax(holes))
     rows = [int(runs[widest, 1] + runs[widest, 2] - 1), int(runs[widest + 1, 1])]
     stamps = [
-        int(stretch(raw["time"].data, row, row + 1).astype("datetime64[ns]").view(np.int64)[0])
+        int(read_slice(raw["time"].data, row, row + 1).astype("datetime64[ns]").view(np.int64)[0])
         for row in rows
     ]
     places = [

@@ -20,7 +20,7 @@ from gyrostab.errors import TimeError
 from gyrostab.ingest.grid.course import Course, count_along, find_course, follow_course
 from gyrostab.ingest.grid.steps import cut, finer_period, refined
 from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
-from gyrostab.store.threads import in_order
+from gyrostab.store.threads import map_in_order
 
 __all__ = [
     "RateEstimate",
@@ -283,7 +283,7 @@ def _pieces(
     work = partial(
         _piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, course=course
     )
-    for first, sums in in_order(work, stamps()):
+    for first, sums in map_in_order(work, stamps()):
         if first is None:
             continue
         zero = first[0] if zero is None else zero

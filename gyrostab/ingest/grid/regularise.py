@@ -43,7 +43,7 @@ from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
 from gyrostab.store import chunk_samples
-from gyrostab.store.direct import stretch
+from gyrostab.store.lazy_slices import read_slice
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
@@ -174,7 +174,7 @@ def _place_even(
     start, step = line
     stamps = (start + step * np.arange(_EVEN_ROWS)).view("datetime64[ns]")
     signal = signal_name(raw)
-    values = stretch(raw[signal].data, 0, _EVEN_ROWS)
+    values = read_slice(raw[signal].data, 0, _EVEN_ROWS)
     head = xr.Dataset(
         {signal: (("axis", "row"), values)},
         {"time": ("row", stamps), "axis": raw["axis"].values},

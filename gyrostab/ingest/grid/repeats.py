@@ -10,7 +10,7 @@ from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.survey import BLOCK
 from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
-from gyrostab.store.direct import stretch
+from gyrostab.store.lazy_slices import read_slice
 
 __all__ = ["find_repeats", "with_repeats"]
 
@@ -55,7 +55,9 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
 
 
 def _stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
-    return stretch(raw["time"].data, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
+    return (
+        read_slice(raw["time"].data, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
+    )
 
 
 def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
@@ -90,7 +92,7 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
     for begin in range(0, length, BLOCK):
         end = min(begin + BLOCK, length)
         left, right = (
-            stretch(raw[name].data, first + begin, first + end) for first in (source, row)
+            read_slice(raw[name].data, first + begin, first + end) for first in (source, row)
         )
         known = np.isfinite(left) & np.isfinite(right)
         rows = known.any(axis=0)

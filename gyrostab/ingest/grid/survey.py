@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.schema import texts
-from gyrostab.store.direct import stretch
-from gyrostab.store.seen import Seen, look_at_cells
-from gyrostab.store.threads import in_order
+from gyrostab.store.lazy_slices import read_slice
+from gyrostab.store.row_inspection import RowInspection, inspect_rows
+from gyrostab.store.threads import map_in_order
 
 __all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
 
@@ -79,22 +79,26 @@ def _join(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
 
 
-def _look_at(raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]) -> Seen:
-    return look_at_cells(
-        stretch(raw[name].data, *ends),
-        {key: stretch(raw[key].data, *ends) for key in channels},
+def _look_at(
+    raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]
+) -> RowInspection:
+    return inspect_rows(
+        read_slice(raw[name].data, *ends),
+        {key: read_slice(raw[key].data, *ends) for key in channels},
         ends[0],
     )
 
 
-def _looks(raw: xr.Dataset, name: str, channels: Sequence[str], block: int) -> Iterable[Seen]:
+def _looks(
+    raw: xr.Dataset, name: str, channels: Sequence[str], block: int
+) -> Iterable[RowInspection]:
     """What is in each block, as the reader found it, or else by a look at it."""
     rows = raw.sizes["row"]
-    seen: list[Seen] = getattr(raw[name].data, "gyrostab_seen", [])
+    seen: list[RowInspection] = getattr(raw[name].data, "gyrostab_inspections", [])
     whole = sum(one.rows for one in seen) == rows and all(one.rows % 8 == 0 for one in seen[:-1])
     if seen and whole and all(one.filled.keys() == set(channels) for one in seen):
         return seen
-    return in_order(
+    return map_in_order(
         partial(_look_at, raw, name, channels),
         ((at, min(rows, at + block)) for at in range(0, rows, block)),
     )
@@ -142,7 +146,7 @@ def blocks(
     raw: xr.Dataset, found: Survey, *, block: int = BLOCK, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Row numbers and stamps [ns, `NO_STAMP` where unreadable] of the rows that hold a sample, block by block, fetched ahead."""
-    return in_order(_same, _blocks(raw, found, block, all_rows=all_rows), workers=1)
+    return map_in_order(_same, _blocks(raw, found, block, all_rows=all_rows), workers=1)
 
 
 def _same(
@@ -157,7 +161,7 @@ def _blocks(
     stamps = raw["time"].data
     for begin in range(0, found.rows, block):
         end = min(found.rows, begin + block)
-        values = stretch(stamps, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
+        values = read_slice(stamps, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
         if not found.repeated and (all_rows or found.absent == 0):
             yield np.arange(begin, end), values
         else:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
 from gyrostab.schema import texts
-from gyrostab.store.direct import held
+from gyrostab.store.lazy_slices import make_lazy
 from gyrostab.time.grid import time_coordinate
 
 __all__ = ["place_samples"]
@@ -74,7 +74,7 @@ def _place_array(array: Any, runs: Runs, size: int) -> Any:
             ..., np.repeat(runs[:, 1], length) + within
         ]
         return out
-    lazy = held(array, CHUNK_SAMPLES) if isinstance(array, np.ndarray) else array
+    lazy = make_lazy(array, CHUNK_SAMPLES) if isinstance(array, np.ndarray) else array
     rows = (
         [[(lazy, None, runs)]]
         if array.ndim == 1

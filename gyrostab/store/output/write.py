@@ -25,7 +25,7 @@ __all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "repla
 
 #: Looks, 20 ms apart, after which what has gone stays gone: a busy machine may hold a thread up
 #: that long.
-_LOOKS = 15
+_MIN_ABSENT_CHECKS = 15
 _MAX_NAME_BYTES = 255  # of one file name on the usual file systems
 _LEFTOVER = re.compile(r"\.(.*\.)?gyrostab-[0-9a-f]{8}\.part")
 
@@ -97,7 +97,7 @@ def new_output(
             _replace_folder(temporary, target, find_foreign)
         elif overwrite and find_foreign is None:
             os.replace(temporary, target)
-            _sync(target.parent)
+            _sync_path(target.parent)
         else:
             _rename_new(temporary, target)
 
@@ -111,7 +111,7 @@ def replace_file(path: Path) -> Iterator[Path]:
         yield temporary
         _sync_tree(temporary)
         os.replace(temporary, path)
-        _sync(path.parent)
+        _sync_path(path.parent)
 
 
 @contextlib.contextmanager
@@ -194,10 +194,12 @@ def _temporary_output(target: Path, temporary: Path, *, make_folder: bool) -> It
             isinstance(error, RuntimeError) and not str(error).startswith("NetCDF:")
         ):
             raise
-        raise OutputError(f"{target}: cannot be written: {_reason(error, target)}") from error
+        raise OutputError(
+            f"{target}: cannot be written: {_describe_reason(error, target)}"
+        ) from error
     finally:
         if not complete:
-            _remove(temporary)
+            _remove_until_gone(temporary)
 
 
 def _hide_name(name: str) -> str:
@@ -232,11 +234,11 @@ def remove_leftovers(output: Path) -> None:
 
 def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) -> None:
     """Let a complete folder and an older one change places, and remove the older one."""
-    if _rename(temporary, target, _EXCHANGE):
+    if _rename_with_flag(temporary, target, _EXCHANGE):
         if (
             find_foreign(temporary) is not None
         ):  # someone has put something there since it was looked through
-            _rename(temporary, target, _EXCHANGE)
+            _rename_with_flag(temporary, target, _EXCHANGE)
             raise OutputError(
                 f"{target}: has changed while the new one was written, so it is not replaced; give another name with -o"
             )
@@ -249,7 +251,7 @@ def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) ->
             aside.rename(target)
             raise
         temporary = aside
-    _sync(target.parent)
+    _sync_path(target.parent)
     _remove_tree(temporary)
     if temporary.exists():
         warnings.warn(
@@ -260,7 +262,7 @@ def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) ->
 def _rename_new(source: Path, target: Path) -> None:
     """Rename a file or folder unless something has the name already, in one step where the system can."""
     try:
-        if not _rename(source, target, _NO_REPLACE):
+        if not _rename_with_flag(source, target, _NO_REPLACE):
             if os.path.lexists(target):
                 raise FileExistsError
             os.rename(source, target)
@@ -268,16 +270,16 @@ def _rename_new(source: Path, target: Path) -> None:
         raise OutputError(
             f"output {str(target)!r} exists already: another process has made it meanwhile; give --overwrite (overwrite=True) to replace it"
         ) from None
-    _sync(target.parent)
+    _sync_path(target.parent)
 
 
 # linux/fs.h; both flags are of Linux 3.15
 _NO_REPLACE, _EXCHANGE = 1, 2
 _AT_FDCWD = -100
-_UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
+_UNSUPPORTED_ERRNOS = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
 
 
-def _rename(source: Path, target: Path, flag: int) -> bool:
+def _rename_with_flag(source: Path, target: Path, flag: int) -> bool:
     """Rename with a flag of ``renameat2``; False where the system or the file system has no such call."""
     call = (
         getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
@@ -289,7 +291,7 @@ def _rename(source: Path, target: Path, flag: int) -> bool:
     if call(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
         return True
     number = ctypes.get_errno()
-    if number in _UNSUPPORTED:
+    if number in _UNSUPPORTED_ERRNOS:
         return False
     raise OSError(number, os.strerror(number), str(target))
 
@@ -298,13 +300,13 @@ def _sync_tree(path: Path) -> None:
     """Bring a file, or a folder with all that is in it, to the disk."""
     for folder, _, names in os.walk(path):
         for name in names:
-            _sync(Path(folder, name))
-        _sync(Path(folder))
+            _sync_path(Path(folder, name))
+        _sync_path(Path(folder))
     if not path.is_dir():
-        _sync(path)
+        _sync_path(path)
 
 
-def _sync(path: Path) -> None:
+def _sync_path(path: Path) -> None:
     """Ask the system to bring a file (or the entries of a directory) to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
@@ -313,13 +315,13 @@ def _sync(path: Path) -> None:
         os.close(handle)
 
 
-def _remove(path: Path) -> None:
+def _remove_until_gone(path: Path) -> None:
     """Remove what was written; a thread that still writes its piece of a directory may bring it back, so look again."""
     folder, gone = path.is_dir(), 0
     for _ in range(100):
         _remove_tree(path)
         gone = 0 if path.exists() else gone + 1
-        if gone == _LOOKS or not folder:
+        if gone == _MIN_ABSENT_CHECKS or not folder:
             return
         time.sleep(0.02)
 
@@ -332,15 +334,15 @@ def _remove_tree(path: Path) -> None:
             path.unlink()
 
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-def _reason(error: Exception, path: Path) -> str:
+def _describe_reason(error: Exception, path: Path) -> str:
     if isinstance(error, PermissionError):
         return f"no permission to write in {path.parent}; choose another directory"
     number = (error.errno or 0) if isinstance(error, OSError) else 0
     text = os.strerror(number) if number > 0 else str(error)
-    if number > 0 and number not in _FULL:
+    if number > 0 and number not in _DISK_FULL_ERRNOS:
         return text
     with contextlib.suppress(OSError):  # the NetCDF and HDF5 libraries say no more than "HDF error"
         free = shutil.disk_usage(path.parent).free / 2**20

@@ -23,10 +23,20 @@ from gyrostab.ingest.grid.place import Placement
 from gyrostab.io.datasets import open_log
 from gyrostab.jobs import checkpoint
 from gyrostab.jobs.run import load_log, run
-from gyrostab.store import deflate, header, read, write
-from gyrostab.store.direct import can_fill, end_to_end, fill_row, held, one_row, stack_rows, stretch
-from gyrostab.store.header import read_header
-from gyrostab.store.parts import read_part, transposed, with_part
+from gyrostab.store import log_header, netcdf_compression, read, write
+from gyrostab.store.lazy_slices import (
+    can_read_into,
+    concatenate_columns,
+    make_lazy,
+    read_box,
+    read_into,
+    read_slice,
+    select_row,
+    stack_rows,
+    transpose_lazy,
+    with_box_reader,
+)
+from gyrostab.store.log_header import read_header
 
 WINDOW = {"window": "40s", "step": "10s", "taus": "8"}
 
@@ -59,21 +69,21 @@ def placed(draw):
 def test_joined_samples_are_those_of_dask(made, data):
     rows, size = made
     joined = place_on_grid(rows, size, data.draw(st.integers(1, size)))
-    assert can_fill(joined)
+    assert can_read_into(joined)
     begin = data.draw(st.integers(0, size))
     for row, expected in enumerate(joined.compute(scheduler="synchronous")):
         found = np.full(data.draw(st.integers(0, size - begin)), 7.0)
-        fill_row(joined, row, begin, found)
+        read_into(joined, row, begin, found)
         np.testing.assert_array_equal(found, expected[begin : begin + found.size])
 
 
 def test_what_is_derived_from_an_array_is_not_read_past_dask():
     joined = place_on_grid([[(np.arange(9.0), None, np.array([[0, 0, 9]]))]], 9, 4)
     doubled = 2.0 * joined
-    assert not can_fill(doubled)
-    assert not can_fill(joined[:, 1:])
+    assert not can_read_into(doubled)
+    assert not can_read_into(joined[:, 1:])
     found = np.empty(3)
-    fill_row(doubled, 0, 4, found)
+    read_into(doubled, 0, 4, found)
     np.testing.assert_array_equal(found, [8.0, 10.0, 12.0])
 
 
@@ -114,12 +124,12 @@ def test_stored_samples_are_those_of_dask(tmp_path, form):
     for name in ("rate", "temperature"):
         data = log[name].data
         assert isinstance(data, da.Array)
-        assert can_fill(data)
+        assert can_read_into(data)
         whole = np.atleast_2d(data.compute())
         for begin, end in np.sort(rng.integers(0, data.shape[-1] + 1, (20, 2)), axis=1).tolist():
             for row, expected in enumerate(whole):
                 found = np.full(end - begin, 7.0)
-                fill_row(data, row, begin, found)
+                read_into(data, row, begin, found)
                 np.testing.assert_array_equal(found, expected[begin:end])
 
 
@@ -127,7 +137,7 @@ def test_stored_samples_are_those_of_dask(tmp_path, form):
 @pytest.mark.parametrize("unit", [0.02, 0.05])
 def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, form, unit):
     monkeypatch.setattr(
-        write, "STRETCH_BYTES", 2**21
+        write, "MAX_BATCH_BYTES", 2**21
     )  # two stretches of 131072 samples of either axis, so that room is used again
     log = opened(stored_logs(tmp_path, form))
     log.rate.encoding = {**log.rate.encoding, "scale_factor": unit}
@@ -138,7 +148,7 @@ def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, fo
         }
     )
     slow.rate.encoding = log.rate.encoding
-    assert not can_fill(slow.rate.data)
+    assert not can_read_into(slow.rate.data)
     store = {"nc": to_netcdf, "zarr": to_zarr}[form]
     found = []
     with warnings.catch_warnings():
@@ -174,7 +184,7 @@ def test_a_netcdf_file_that_is_not_as_expected_is_left_to_xarray(tmp_path, monke
     path = stored_logs(tmp_path, "nc")[0]
     if how == "size":
         monkeypatch.setattr(
-            header, "SMALL", 2
+            log_header, "MIN_LAZY_VALUES", 2
         )  # the small variables are too long to be read at once
     else:
         with netCDF4.Dataset(path, "a") as file:
@@ -225,11 +235,11 @@ def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_pat
         seen = found.map_blocks(
             lambda values: asked.append(name) or values, dtype=found.dtype, meta=found._meta
         )
-        return with_part(seen, found.gyrostab_part)
+        return with_box_reader(seen, found.gyrostab_box_reader)
 
     monkeypatch.setattr(checkpoint, "_SMALL", 0)
     monkeypatch.setattr(checkpoint, "_lazily", watched)
-    monkeypatch.setattr(deflate, "_LARGE", 1000)
+    monkeypatch.setattr(netcdf_compression, "_MIN_PARALLEL_VALUES", 1000)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run(paths, tmp_path / "large.nc", windows=WINDOW)
@@ -262,16 +272,16 @@ def test_a_part_of_a_variable_in_blocks_is_that_of_the_whole(tmp_path):
         place = tuple(
             slice(*np.sort(rng.choice(size + 1, 2, replace=False))) for size in cube.shape
         )
-        np.testing.assert_array_equal(read_part(array, place), cube[place])
-    turned = transposed(xr.Variable(("axis", "time", "tau"), array), ("tau", "axis", "time"))
+        np.testing.assert_array_equal(read_box(array, place), cube[place])
+    turned = transpose_lazy(xr.Variable(("axis", "time", "tau"), array), ("tau", "axis", "time"))
     np.testing.assert_array_equal(
-        read_part(turned.data, (slice(1, 3), slice(0, 1), slice(3, 9))),
+        read_box(turned.data, (slice(1, 3), slice(0, 1), slice(3, 9))),
         cube.transpose(2, 0, 1)[1:3, :1, 3:9],
     )
-    assert hasattr(turned.data, "gyrostab_part")
+    assert hasattr(turned.data, "gyrostab_box_reader")
     blocks[1].path.write_bytes(blocks[1].path.read_bytes()[: blocks[1].begin + 5])
     with pytest.raises(OSError, match="is cut short"):
-        read_part(array, (slice(0, 1), slice(0, 11), slice(0, 4)))
+        read_box(array, (slice(0, 1), slice(0, 11), slice(0, 4)))
 
 
 @pytest.mark.parametrize("options", [{}, {"terms": "NK"}, {"method": "adev"}, {"tau_min": "0.1s"}])
@@ -306,7 +316,7 @@ def test_logs_in_memory_join_as_before():
     ]
     joined = concatenate_logs(parts, ["a.nc", "b.nc"]).rate.data
     found = np.empty(7)
-    fill_row(joined, 0, 0, found)
+    read_into(joined, 0, 0, found)
     np.testing.assert_array_equal(found, joined.compute()[0])
 
 
@@ -335,11 +345,15 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeyp
     }[kept]
     columns = [[lazily(spool.store(piece[row])) if kept == "disk" or (kept == "both" and number) else piece[row]
                 for number, piece in enumerate(pieces)] for row in (0, 1)]  # fmt: skip
-    raw = rows if kept == "memory" else stack_rows([end_to_end(column, 500) for column in columns])
+    raw = (
+        rows
+        if kept == "memory"
+        else stack_rows([concatenate_columns(column, 500) for column in columns])
+    )
     placed = fill.on_grid(
         raw, Placement(0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit
     )
-    assert can_fill(placed)
+    assert can_read_into(placed)
     expected = placed_by_hand(runs, 6100, rows)
     if scale != 1.0:
         expected = expected * scale if unit is None else np.rint(expected / unit) * (unit * scale)
@@ -353,20 +367,22 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeyp
         (2000, 2000),
         (6000, 6100),
     ]:
-        np.testing.assert_array_equal(stretch(placed, begin, end), expected[:, begin:end])
-    np.testing.assert_array_equal(stretch(one_row(placed, 1), 600, 1000), expected[1, 600:1000])
+        np.testing.assert_array_equal(read_slice(placed, begin, end), expected[:, begin:end])
+    np.testing.assert_array_equal(
+        read_slice(select_row(placed, 1), 600, 1000), expected[1, 600:1000]
+    )
 
 
 def test_an_array_in_memory_is_not_copied():
     values = np.arange(24.0).reshape(2, 12)
-    lazy = held(values, 5)
+    lazy = make_lazy(values, 5)
     assert lazy.chunks == ((2,), (5, 5, 2))
     np.testing.assert_array_equal(lazy.compute(), values)
     values[1, 7] = -1.0
-    assert lazy[1, 7].compute() == stretch(lazy, 7, 8)[1, 0] == -1.0
+    assert lazy[1, 7].compute() == read_slice(lazy, 7, 8)[1, 0] == -1.0
 
 
 def test_columns_of_unlike_types_are_left_to_dask():
-    mixed = end_to_end([np.arange(3), held(np.arange(2.0), 10)], 10)
-    assert not can_fill(mixed)
-    np.testing.assert_array_equal(stretch(mixed, 2, 4), [2.0, 0.0])
+    mixed = concatenate_columns([np.arange(3), make_lazy(np.arange(2.0), 10)], 10)
+    assert not can_read_into(mixed)
+    np.testing.assert_array_equal(read_slice(mixed, 2, 4), [2.0, 0.0])

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.grid.stamps import look
 
-__all__ = ["Seen", "look_at_cells", "with_seen"]
+__all__ = ["RowInspection", "inspect_rows", "with_inspections"]
 
-_NONE = np.empty((0, 2), dtype=np.int64)
+_NO_SPANS = np.empty((0, 2), dtype=np.int64)
 
 
-class Seen(NamedTuple):
+class RowInspection(NamedTuple):
     """What a look at some rows found.
 
     Attributes
@@ -42,9 +42,9 @@ class Seen(NamedTuple):
     filled: dict[str, int]
 
 
-def look_at_cells(
+def inspect_rows(
     cells: NDArray[np.float64], channels: Mapping[str, NDArray[Any]], begin: int
-) -> Seen:
+) -> RowInspection:
     """Look at every cell of a block once.
 
     Parameters
@@ -60,18 +60,20 @@ def look_at_cells(
     absent, holes, infinities, low, high = look(
         np.ascontiguousarray(cells, dtype=np.float64), present
     )
-    unreadable = _spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NONE
-    infinite = _spans(np.isinf(cells).any(axis=0), begin) if infinities else _NONE
+    unreadable = _find_spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NO_SPANS
+    infinite = _find_spans(np.isinf(cells).any(axis=0), begin) if infinities else _NO_SPANS
     filled = {name: int(np.isfinite(values).sum()) for name, values in channels.items()}
-    return Seen(present.size, absent, np.packbits(present), unreadable, infinite, low, high, filled)
+    return RowInspection(
+        present.size, absent, np.packbits(present), unreadable, infinite, low, high, filled
+    )
 
 
-def _spans(bad: Any, offset: int) -> NDArray[np.int64]:
+def _find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
 
 
-def with_seen(signal: Any, seen: list[Seen]) -> Any:
+def with_inspections(signal: Any, seen: list[RowInspection]) -> Any:
     """Let a dask array (axis, row) carry what was found in its blocks, so that nobody has to look again; what is derived does not."""
-    signal.gyrostab_seen = seen
+    signal.gyrostab_inspections = seen
     return signal

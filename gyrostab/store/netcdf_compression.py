@@ -12,25 +12,25 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.store.lock import library_lock
-from gyrostab.store.parts import read_part
-from gyrostab.store.threads import in_order
+from gyrostab.store.lazy_slices import read_box
+from gyrostab.store.netcdf_lock import library_lock
+from gyrostab.store.threads import map_in_order
 from gyrostab.store.write import Progress
 
-__all__ = ["append_deflated", "large_variables"]
+__all__ = ["append_compressed", "large_variables"]
 
 #: Values from which the chunks of a variable are compressed side by side.
-_LARGE = 2**15
+_MIN_PARALLEL_VALUES = 2**15
 
 
 def large_variables(
     stored: xr.Dataset, encoding: Mapping[Any, Mapping[str, Any]]
 ) -> dict[str, xr.Variable]:
-    """Variables of numbers that are large enough for `append_deflated`."""
+    """Variables of numbers that are large enough for `append_compressed`."""
     data = {
         str(name): array.variable
         for name, array in stored.data_vars.items()
-        if array.size >= _LARGE and array.dtype.kind in "if"
+        if array.size >= _MIN_PARALLEL_VALUES and array.dtype.kind in "if"
     }
     return {
         name: variable
@@ -39,7 +39,7 @@ def large_variables(
     }
 
 
-def append_deflated(
+def append_compressed(
     path: Path,
     large: Mapping[str, xr.Variable],
     encoding: Mapping[Any, Mapping[str, Any]],
@@ -83,12 +83,14 @@ def append_deflated(
             )
             made.setncatts(variable.attrs)
     total, done = sum(variable.size for variable in large.values()), 0
-    pieces = _pieces(large, encoding)
+    pieces = _list_chunks(large, encoding)
     with lock:
         target = h5py.File(path, "r+")
         chunked = {name: target[name].id for name in large}
     try:
-        for name, begin, size, packed in in_order(partial(_pack, large, encoding), pieces):
+        for name, begin, size, packed in map_in_order(
+            partial(_compress_chunk, large, encoding), pieces
+        ):
             with lock:
                 chunked[name].write_direct_chunk(begin, packed)
             done += size
@@ -99,12 +101,12 @@ def append_deflated(
             target.close()
 
 
-_Piece = tuple[str, tuple[int, ...]]
+_ChunkOrigin = tuple[str, tuple[int, ...]]
 
 
-def _pieces(
+def _list_chunks(
     large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]]
-) -> Iterator[_Piece]:
+) -> Iterator[_ChunkOrigin]:
     """Name and first place of every chunk."""
     for name, variable in large.items():
         steps = encoding[name]["chunksizes"]
@@ -116,8 +118,8 @@ def _pieces(
         )
 
 
-def _pack(
-    large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]], piece: _Piece
+def _compress_chunk(
+    large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]], piece: _ChunkOrigin
 ) -> tuple[str, tuple[int, ...], int, bytes]:
     """A chunk as it stands in the file, with its name, place and number of values."""
     name, begin = piece
@@ -125,7 +127,7 @@ def _pack(
     place = tuple(
         slice(first, first + step) for first, step in zip(begin, options["chunksizes"], strict=True)
     )
-    values = read_part(large[name].data, place)
+    values = read_box(large[name].data, place)
     fill = options["_FillValue"]
     chunk = np.full(options["chunksizes"], 0 if fill is None else fill, values.dtype)
     inside = chunk[tuple(map(slice, values.shape))]

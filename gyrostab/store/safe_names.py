@@ -10,7 +10,7 @@ from typing import Any
 
 import xarray as xr
 
-__all__ = ["is_storable", "restore_names", "store_names"]
+__all__ = ["is_storable", "make_names_storable", "restore_names"]
 
 # NetCDF User's Guide, "Permitted characters in netCDF names"; Zarr adds that a name is part of a
 # path, and reserves two underscores.
@@ -20,7 +20,7 @@ _STORABLE = re.compile(
 _MAX_NAME_BYTES = (
     200  # NetCDF allows 256, a file name 255, and a suffix for the time axis comes on top
 )
-_ORIGINAL = "original_name"
+_ORIGINAL_NAME = "original_name"
 
 
 def is_storable(name: str) -> bool:
@@ -44,7 +44,7 @@ def _make_safe(name: str, taken: Iterable[str]) -> str:
     return safe
 
 
-def store_names(dataset: xr.Dataset) -> xr.Dataset:
+def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
     """Give safe names to the variables whose own names no file can hold; a warning and ``long_name`` tell the own ones.
 
     Examples
@@ -78,7 +78,7 @@ def store_names(dataset: xr.Dataset) -> xr.Dataset:
         renamed[other].attrs = {
             "long_name": shown,
             **renamed[other].attrs,
-            _ORIGINAL: json.dumps(name),
+            _ORIGINAL_NAME: json.dumps(name),
         }
     told = ", ".join(f"{name!a} as {other!r}" for name, other in safe.items())
     warnings.warn(
@@ -89,11 +89,11 @@ def store_names(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def restore_names(dataset: xr.Dataset) -> xr.Dataset:
-    """Give back the names that `store_names` replaced."""
+    """Give back the names that `make_names_storable` replaced."""
     own: dict[Any, str] = {}
     for name, variable in dataset.variables.items():
-        if _ORIGINAL in variable.attrs:
-            own[name] = json.loads(variable.attrs.pop(_ORIGINAL))
+        if _ORIGINAL_NAME in variable.attrs:
+            own[name] = json.loads(variable.attrs.pop(_ORIGINAL_NAME))
     if not own:
         return dataset
     return dataset.rename(

@@ -15,13 +15,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.store.layout import decoded_chunk, zarr_codecs
-from gyrostab.store.lock import library_lock
+from gyrostab.store.layout import decode_chunk, find_zarr_codecs
+from gyrostab.store.netcdf_lock import library_lock
 
-__all__ = ["SMALL", "Header", "read_header"]
+__all__ = ["MIN_LAZY_VALUES", "Header", "read_header"]
 
 #: Values from which a variable of a log is a dask array.
-SMALL = 2**17
+MIN_LAZY_VALUES = 2**17
 
 
 class Header(NamedTuple):
@@ -45,7 +45,7 @@ class Header(NamedTuple):
 def read_header(path: Path) -> Header | None:
     """Look at a log that gyrostab wrote; None when it is something else, or in any way not as expected."""
     try:
-        header = _look_zarr(path) if path.is_dir() else _look_netcdf(path)
+        header = _read_zarr_header(path) if path.is_dir() else _read_netcdf_header(path)
     except Exception:  # whatever the libraries raise on damaged bytes
         return None
     if (
@@ -69,12 +69,12 @@ def _is_long(
     return bool(dims and dims[-1].startswith("time") and doubles and chunks and 0 not in shape)
 
 
-def _nothing(dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def _make_placeholder(dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     """Stands for values that are read later; takes no memory."""
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
-def _look_zarr(folder: Path) -> Header:
+def _read_zarr_header(folder: Path) -> Header:
     described = json.loads((folder / ".zmetadata").read_bytes())["metadata"]
     variables: dict[str, xr.Variable] = {}
     long: set[str] = set()
@@ -99,14 +99,14 @@ def _look_zarr(folder: Path) -> Header:
         }
         if _is_long(dims, attrs, dtype, chunks, shape):
             long.add(name)
-            values = _nothing(dtype, shape)
+            values = _make_placeholder(dtype, shape)
         else:
-            values = _values(folder / name, layout, shape, chunks, dtype)
+            values = _read_values(folder / name, layout, shape, chunks, dtype)
         variables[name] = xr.Variable(dims, values, attrs, encoding)
     return Header(variables, dict(described.get(".zattrs", {})), long)
 
 
-def _look_netcdf(path: Path) -> Header:
+def _read_netcdf_header(path: Path) -> Header:
     import netCDF4
 
     variables: dict[str, xr.Variable] = {}
@@ -130,9 +130,9 @@ def _look_netcdf(path: Path) -> Header:
             encoding: dict[str, Any] = {"dtype": dtype}
             if _is_long(dims, attrs, dtype, chunks, shape):
                 long.add(name)
-                values = _nothing(dtype, shape)
+                values = _make_placeholder(dtype, shape)
                 encoding.update(stored.filters(), chunksizes=chunks)
-            elif stored.size < SMALL or dims == (name,):
+            elif stored.size < MIN_LAZY_VALUES or dims == (name,):
                 values = np.asarray(stored[...])
             else:
                 raise ValueError("size")
@@ -140,7 +140,7 @@ def _look_netcdf(path: Path) -> Header:
         return Header(variables, {key: file.getncattr(key) for key in file.ncattrs()}, long)
 
 
-def _values(
+def _read_values(
     folder: Path,
     layout: dict[str, Any],
     shape: tuple[int, ...],
@@ -149,17 +149,17 @@ def _values(
 ) -> NDArray[Any]:
     if len(shape) > 1:
         raise ValueError("dimensions")
-    codecs = zarr_codecs(layout)
+    codecs = find_zarr_codecs(layout)
     if not shape:
-        return decoded_chunk((folder / "0").read_bytes(), codecs, dtype)[:1].reshape(())
+        return decode_chunk((folder / "0").read_bytes(), codecs, dtype)[:1].reshape(())
     pieces = [
-        decoded_chunk((folder / str(n)).read_bytes(), codecs, dtype)
+        decode_chunk((folder / str(n)).read_bytes(), codecs, dtype)
         for n in range(-(-shape[0] // chunks[0]) if shape[0] else 0)
     ]
-    return _whole(pieces, shape[0], chunks[0], dtype)
+    return _join_chunks(pieces, shape[0], chunks[0], dtype)
 
 
-def _whole(
+def _join_chunks(
     pieces: list[NDArray[Any]], size: int, length: int, dtype: np.dtype[Any]
 ) -> NDArray[Any]:
     """Chunks of `length` values put together to `size`."""

@@ -8,10 +8,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-__all__ = ["KeptChunks"]
+__all__ = ["ChunkCache"]
 
 
-class KeptChunks:
+class ChunkCache:
     """Chunks by opening, variable and place, the latest of them.
 
     Parameters
@@ -28,14 +28,14 @@ class KeptChunks:
         self._chunks: OrderedDict[tuple[Any, ...], NDArray[Any]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def find(self, key: tuple[Any, ...]) -> NDArray[Any] | None:
+    def get(self, key: tuple[Any, ...]) -> NDArray[Any] | None:
         """Return a chunk, or None."""
         with self._lock:
             if key in self._chunks:
                 self._chunks.move_to_end(key)
             return self._chunks.get(key)
 
-    def keep(self, key: tuple[Any, ...], chunk: NDArray[Any]) -> None:
+    def put(self, key: tuple[Any, ...], chunk: NDArray[Any]) -> None:
         """Keep a chunk in place of the oldest ones."""
         with self._lock:
             if key in self._chunks or chunk.nbytes > self._largest:

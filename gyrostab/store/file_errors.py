@@ -13,10 +13,10 @@ from xarray.core.indexing import IndexingSupport, LazilyIndexedArray, explicit_i
 
 from gyrostab.errors import reading_of
 
-__all__ = ["name_file"]
+__all__ = ["name_file_in_errors"]
 
 
-class _NamedArray(BackendArray):
+class _FileArray(BackendArray):
     """A lazy variable whose failing reads are `gyrostab.errors.DamageError`."""
 
     __slots__ = ("path", "variable")
@@ -43,7 +43,7 @@ class _NamedArray(BackendArray):
             return self.variable[place].values
 
 
-def name_file(opened: xr.Dataset, path: Path) -> xr.Dataset:
+def name_file_in_errors(opened: xr.Dataset, path: Path) -> xr.Dataset:
     """Let every read from a dataset that xarray opened lazily be one of `path`, so that its errors name the file.
 
     Parameters
@@ -61,7 +61,7 @@ def name_file(opened: xr.Dataset, path: Path) -> xr.Dataset:
     named = {
         name: xr.Variable(
             variable.dims,
-            LazilyIndexedArray(_NamedArray(variable, path)),
+            LazilyIndexedArray(_FileArray(variable, path)),
             variable.attrs,
             variable.encoding,
         )
