@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from gyrostab.errors import UnitError
 
-__all__ = ["INNER", "ON_DISK", "Unit", "known_units", "on_disk", "parse_unit"]
+__all__ = ["DAY", "HOUR", "INNER", "ON_DISK", "Unit", "known_units", "on_disk", "parse_unit"]
 
 #: Quantity -> the unit that every array of that quantity has in memory.
 INNER = {
@@ -39,7 +39,8 @@ INNER = {
 ON_DISK = {"g": "9.80665 m s-2"}
 
 _DEGREE = math.pi / 180.0
-_RATE = 3600.0  # deg/s -> deg/h
+#: Seconds in an hour and in a day; an hour is also the factor from deg/s to deg/h.
+HOUR, DAY = 3600.0, 86400.0
 
 # spelling -> (quantity, factor to the inner unit, offset in the inner unit)
 _SPELLINGS: dict[str, tuple[str, float, float]] = {}
@@ -97,10 +98,10 @@ def _add(quantity: str, factor: float, *spellings: str, offset: float = 0.0) -> 
 
 
 _add("rate", 1.0, "dph")
-_add("rate", _RATE, "dps")
-_add("rate", 1e-3 * _RATE, "mdps")
-_add("rate", 6.0 * _RATE, "rpm", "r/min")
-_add("rate", 360.0 * _RATE, "r/s")
+_add("rate", HOUR, "dps")
+_add("rate", 1e-3 * HOUR, "mdps")
+_add("rate", 6.0 * HOUR, "rpm", "r/min")
+_add("rate", 360.0 * HOUR, "r/s")
 _add("temperature", 1.0, "degC", "C", "celsius", "deg celsius")
 _add("temperature", 1.0, "K", "kelvin", "degK", offset=-273.15)
 _add("temperature", 5.0 / 9.0, "degF", "F", "fahrenheit", "deg fahrenheit", offset=-160.0 / 9.0)
@@ -144,7 +145,7 @@ _BASES: dict[str, tuple[str, float, float]] = {
     ),
     **dict.fromkeys(
         ("arcsec", "arcsecs", "asec", "arcsecond", "arcseconds", "arc_second", "arc_seconds", '"'),
-        ("angle", 1.0, 3600.0),
+        ("angle", 1.0, HOUR),
     ),
     **dict.fromkeys(
         ("rev", "revs", "revolution", "revolutions", "turn", "turns", "cycle", "cycles"),
@@ -152,8 +153,8 @@ _BASES: dict[str, tuple[str, float, float]] = {
     ),
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), ("time", 1.0, 1.0)),
     **dict.fromkeys(("min", "minute", "minutes"), ("time", 60.0, 1.0)),
-    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours"), ("time", 3600.0, 1.0)),
-    **dict.fromkeys(("d", "day", "days"), ("time", 86400.0, 1.0)),
+    **dict.fromkeys(("h", "hr", "hrs", "hour", "hours"), ("time", HOUR, 1.0)),
+    **dict.fromkeys(("d", "day", "days"), ("time", DAY, 1.0)),
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), ("length", 1.0, 1.0)),
 }
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2}
@@ -161,7 +162,7 @@ _PREFIX_NAMES = {"nano": 1e-9, "micro": 1e-6, "milli": 1e-3, "centi": 1e-2}
 #: Powers of angle, time and length -> quantity, and the factor of degree, s and m to its inner
 #: unit.
 _SIGNATURES = {
-    (1, -1, 0): ("rate", _RATE, 1.0),
+    (1, -1, 0): ("rate", HOUR, 1.0),
     (1, 0, 0): ("angle", 1.0, 1.0),
     (0, -2, 1): ("acceleration", 1.0, 9.80665),
 }

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
+from gyrostab.units import HOUR
 
 __all__ = [
     "CAUSE",
@@ -48,7 +49,7 @@ def duration(seconds: float) -> str:
     """
     if abs(seconds) < 1.0:
         return f"{seconds * 1e3:.3g} ms"
-    return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / 3600:.1f} h"
+    return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / HOUR:.1f} h"
 
 
 def stamp_text(stamp: int) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 
 from gyrostab.ingest.columns.headers import AXIS, TIME, is_time_unit, is_unit_of
 from gyrostab.ingest.inspect import ColumnLook, FileInspection
-from gyrostab.units import parse_unit
+from gyrostab.units import HOUR, parse_unit
 
 __all__ = ["Guess", "guess_columns", "rate_plausibility", "temperature_unit"]
 
@@ -33,7 +33,7 @@ EARTH_TOLERANCE = 0.02
 #: One with a bias of some deg/h measures it this well.
 EARTH_NEIGHBOURHOOD = 0.3
 #: Largest full scale of gyros [deg/h].
-MAX_RATE_DPH = 4000.0 * 3600.0
+MAX_RATE_DPH = 4000.0 * HOUR
 #: Angle random walk of the usual sensor, and how far others are from it [deg/sqrt(h), decades].
 TYPICAL_ARW, ARW_DECADES = 0.3, 1.0
 #: Rates of gyro logs are some decades about this [Hz].

@@ -31,7 +31,7 @@ import xarray as xr
 
 from gyrostab.allan.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
 from gyrostab.errors import SchemaError
-from gyrostab.noise import LAWS
+from gyrostab.noise import HOUR, LAWS
 from gyrostab.schema import texts
 from gyrostab.store.output import new_output
 
@@ -40,8 +40,8 @@ __all__ = ["KEYS", "KalibrValue", "kalibr_noise", "to_kalibr"]
 #: Key -> symbol of the term, factor from the unit of the field, unit of Kalibr.
 KEYS = {
     "gyroscope_noise_density": ("N", math.pi / 180.0 / 60.0, "rad/s/sqrt(Hz)"),
-    "gyroscope_random_walk": ("K", math.pi / 180.0 / 3600.0**1.5, "rad/s^2/sqrt(Hz)"),
-    "gyroscope_bias_instability": ("B", math.pi / 180.0 / 3600.0, "rad/s"),
+    "gyroscope_random_walk": ("K", math.pi / 180.0 / HOUR**1.5, "rad/s^2/sqrt(Hz)"),
+    "gyroscope_bias_instability": ("B", math.pi / 180.0 / HOUR, "rad/s"),
 }
 
 

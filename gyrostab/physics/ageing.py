@@ -9,11 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Stage, Windows, parameter
+from gyrostab.units import DAY, HOUR
 
 __all__ = ["AgeingBias", "AgeingNoise"]
-
-_HOUR = 3600.0
-_DAY = 86400.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,24 +61,24 @@ class AgeingBias(Effect):
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample, at its middle."""
         middle = chunk.seconds + 0.5 / chunk.rate
-        return self.slope * (middle / _DAY) + self.logarithmic * np.log1p(
-            middle / (self.time * _HOUR)
+        return self.slope * (middle / DAY) + self.logarithmic * np.log1p(
+            middle / (self.time * HOUR)
         ), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """Where the logarithm bends: from a fraction of the record to many of it."""
-        length = (windows.end[-1] - windows.begin[0]) / _HOUR
+        length = (windows.end[-1] - windows.begin[0]) / HOUR
         return {"time": np.maximum(length * np.array([0.03, 0.1, 0.3, 1.0, 3.0]), 1e-3)}
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means of both parts."""
-        scale = self.time * _HOUR
+        scale = self.time * HOUR
 
         def integral(t: Array) -> Array:
             return np.asarray((scale + t) * np.log1p(t / scale) - t)
 
         bend = (integral(windows.end) - integral(windows.begin)) / (windows.end - windows.begin)
-        return Prediction(mean={"slope": windows.centre / _DAY, "logarithmic": bend})
+        return Prediction(mean={"slope": windows.centre / DAY, "logarithmic": bend})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""
@@ -131,7 +129,7 @@ class AgeingNoise(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Squared N on every sample."""
-        hours = (chunk.seconds + 0.5 / chunk.rate) / _HOUR
+        hours = (chunk.seconds + 0.5 / chunk.rate) / HOUR
         base = chunk.setup.noise["N"][:, None] ** 2
         return {"N": chunk.level["N"] + base * (self.growth * hours**self.exponent)}, state
 
@@ -142,7 +140,7 @@ class AgeingNoise(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """Growth of N^2 in every window."""
         power = self.exponent + 1.0
-        begin, end = windows.begin / _HOUR, windows.end / _HOUR
+        begin, end = windows.begin / HOUR, windows.end / HOUR
         return Prediction(
             level={("N", "growth"): (end**power - begin**power) / (power * (end - begin))}
         )

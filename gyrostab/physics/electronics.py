@@ -13,11 +13,10 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
 from gyrostab.physics.lorentz import lorentz_density
 from gyrostab.physics.phase import fold, line_density, turn_means
-from gyrostab.units import INNER
+from gyrostab.units import HOUR, INNER
 
 __all__ = ["Clipping", "ClockError", "GaussMarkov", "SupplyBias"]
 
-_HOUR = 3600.0
 _PPM = 1e-6
 _LONGEST = 2**20
 _LAGS = np.array([0.0, 8.0, 25.0, 80.0, 250.0])
@@ -371,7 +370,7 @@ class ClockError(Effect):
 
     def slip(self, seconds: Array, duration: float) -> Array:
         """How far stamps are ahead of time [s], when the clock has counted `seconds` of the log's `duration` [s]."""
-        error, drift = self.error * _PPM, self.drift * _PPM / _HOUR
+        error, drift = self.error * _PPM, self.drift * _PPM / HOUR
 
         def ahead(t: Any) -> Any:
             return error * t + drift * t * t / 2.0
@@ -381,14 +380,14 @@ class ClockError(Effect):
 
     def _extremes(self, duration: float) -> tuple[float, float, float]:
         """Where the slip may be smallest or largest [s]: start, end, and where the error goes through zero."""
-        turning = -self.error / self.drift * _HOUR if self.drift else 0.0
+        turning = -self.error / self.drift * HOUR if self.drift else 0.0
         return 0.0, duration, min(max(turning, 0.0), duration)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """No samples yet; and how many have to be kept."""
         duration = setup.size / setup.rate
         times = np.array(self._extremes(duration))
-        growth = (self.error + self.drift * times / _HOUR) * _PPM
+        growth = (self.error + self.drift * times / HOUR) * _PPM
         if np.abs(growth).max() > 0.3:
             raise OptionError(
                 f"effect {self.name!r}: the clock gets wrong by {np.abs(growth).max():.0%}; make error and drift smaller"
@@ -419,15 +418,13 @@ class ClockError(Effect):
         )
         if self.output == "angle":
             middle = (edges[:-1] + 0.5) / chunk.rate
-            values = values * (1.0 - (self.error + self.drift * middle / _HOUR) * _PPM)
+            values = values * (1.0 - (self.error + self.drift * middle / HOUR) * _PPM)
         return values, (keep, known[:, known.shape[1] - keep :])
 
     def explain(self, windows: Windows) -> Prediction:
         """Window means in proportion to the rate, if the gyro gives increments of angle."""
         own = np.stack([windows.own[axis] for axis in windows.axes]) * (self.output == "angle")
-        return Prediction(
-            mean={"error": -_PPM * own, "drift": -_PPM * own * windows.centre / _HOUR}
-        )
+        return Prediction(mean={"error": -_PPM * own, "drift": -_PPM * own * windows.centre / HOUR})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Say it in one sentence."""

@@ -12,12 +12,12 @@ import numpy as np
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
 from gyrostab.physics.lorentz import lorentz_density
+from gyrostab.units import HOUR
 
 __all__ = ["BiasJump", "FringeHop", "Telegraph", "step_means"]
 
-_HOUR = 3600.0
 _LIGHT = 299_792_458.0  # m/s
-_RADIAN_PER_S = math.degrees(1.0) * _HOUR  # deg/h
+_RADIAN_PER_S = math.degrees(1.0) * HOUR  # deg/h
 
 
 def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, size: int) -> Array:
@@ -144,7 +144,7 @@ class BiasJump(Effect):
         jumps = np.concatenate([self.restart * normal, self.each("step", setup.axes)[None]])
         order = np.argsort(places, kind="stable")
         levels = np.cumsum(np.concatenate([np.zeros((1, count)), jumps[order]]), axis=0)
-        mean = _HOUR * setup.rate / self.shocks_per_hour if self.shocks_per_hour else math.inf
+        mean = HOUR * setup.rate / self.shocks_per_hour if self.shocks_per_hour else math.inf
         return places[order], levels, _Stepping(shocks, np.zeros(count), _wait(shocks, mean)), mean
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
@@ -360,7 +360,7 @@ class FringeHop(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """On the right fringe."""
-        mean = _HOUR * setup.rate / self.per_hour if self.per_hour else math.inf
+        mean = HOUR * setup.rate / self.per_hour if self.per_hour else math.inf
         children = rng.spawn(len(setup.axes))
         if math.isfinite(self.at):
             return [_Stepping(child, 0.0, self.at * setup.rate) for child in children]
@@ -369,9 +369,7 @@ class FringeHop(Effect):
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """The signal with the hops [degree hour-1]."""
         mean = (
-            _HOUR * chunk.rate / self.per_hour
-            if self.per_hour and math.isinf(self.at)
-            else math.inf
+            HOUR * chunk.rate / self.per_hour if self.per_hour and math.isinf(self.at) else math.inf
         )
         losses = chunk.setup.restarts[:, 0].astype(np.float64)
 

@@ -11,10 +11,9 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.units import HOUR
 
 __all__ = ["HeldSamples", "LoggerFilter", "RateQuantization", "Spikes"]
-
-_HOUR = 3600.0
 
 
 def _whole(effect: Effect, name: str) -> int:
@@ -326,7 +325,7 @@ class Spikes(Effect):
 
     def _chance(self, rate: float) -> float:
         """That a sample is wrong."""
-        return min(1.0, self.per_hour / _HOUR / rate)
+        return min(1.0, self.per_hour / HOUR / rate)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """The first wrong sample of every axis."""
@@ -423,7 +422,7 @@ class HeldSamples(Effect):
         """The next loss, with at least one good sample before it."""
         if self.per_hour == 0.0:
             return None
-        first = after + int(rng.geometric(min(1.0, self.per_hour / _HOUR / rate)))
+        first = after + int(rng.geometric(min(1.0, self.per_hour / HOUR / rate)))
         return first, first + int(rng.geometric(1.0 / max(1.0, self.length * rate)))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
@@ -450,10 +449,10 @@ class HeldSamples(Effect):
         """More N at long times; or the window means pulled to zero."""
         count = max(1.0, self.length * windows.rate)
         if self.fill == "zero":
-            share = count / windows.rate / _HOUR
+            share = count / windows.rate / HOUR
             own = np.stack([windows.own[axis] for axis in windows.axes])
             return Prediction(mean={"per_hour": -share * own}, marks=("filled",))
-        growth = 2.0 * count**2 / (_HOUR * windows.rate)
+        growth = 2.0 * count**2 / (HOUR * windows.rate)
         return Prediction(
             level={("N", "per_hour"): np.full(windows.begin.size, growth)}, marks=("repeats",)
         )

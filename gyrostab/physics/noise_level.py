@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.noise import HOUR, URAD_PER_S
+from gyrostab.noise import HOUR, sampled_psd
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Stage, Windows, parameter
 from gyrostab.units import INNER
 
@@ -270,12 +270,12 @@ class VibrationNoise(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """The added spectra, of independent noise on each axis."""
         excited = _excited(windows.drivers["vibration"], self.exponent)[:, None]
-        rounding = (
-            2.0 * URAD_PER_S * np.sin(math.pi * windows.frequency / windows.rate)
-        ) ** 2 * windows.rate
+        white, rounding = (
+            sampled_psd(symbol, windows.frequency, windows.rate) for symbol in ("N", "Q")
+        )
         return Prediction(
             spectrum={
-                "white": excited * np.full(windows.frequency.size, HOUR),
+                "white": excited * white,
                 "quantization": excited * rounding,
             }
         )
@@ -354,8 +354,7 @@ class VibrationRandomWalk(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """The added spectrum: that of a random walk averaged over each sample."""
         excited = _excited(windows.drivers["vibration"], self.exponent)[:, None]
-        cycles = 2.0 * math.pi * windows.frequency / windows.rate
-        walk = (2.0 + np.cos(cycles)) / (6.0 * (1.0 - np.cos(cycles))) / (HOUR * windows.rate**2)
+        walk = sampled_psd("K", windows.frequency, windows.rate)
         return Prediction(
             spectrum={"sensitivity": excited * walk},
             wander={"sensitivity": (math.inf, excited[:, 0] / HOUR)},

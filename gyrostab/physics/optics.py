@@ -10,14 +10,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError
+from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
 from gyrostab.physics.lorentz import lorentz_density
 from gyrostab.physics.phase import fold, line_density
-from gyrostab.units import INNER
+from gyrostab.units import HOUR, INNER
 
 __all__ = ["DeadZone", "FeedbackReset", "SharedSource"]
 
-_NRAD_PER_S = math.degrees(1e-9) * 3600.0  # deg/h
+_NRAD_PER_S = math.degrees(1e-9) * HOUR  # deg/h
 _HARMONICS = 40
 
 
@@ -435,10 +436,10 @@ class SharedSource(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """A spectrum, the same process on all axes."""
-        density = np.full(windows.frequency.size, 3600.0)
+        density = sampled_psd("N", windows.frequency, windows.rate)
         if math.isfinite(self.bandwidth):
             density = (
-                3600.0
+                density
                 * lorentz_density(windows.frequency, self._time(), windows.rate)
                 / (2.0 * self._time())
             )

@@ -16,7 +16,7 @@ import pandas as pd
 
 from gyrostab.errors import OptionError, UnitError
 from gyrostab.physics.base import Effect, Parameter
-from gyrostab.units import parse_unit
+from gyrostab.units import DAY, HOUR, parse_unit
 
 __all__ = ["amount", "close_to", "effect_table", "effects", "make_effect"]
 
@@ -127,7 +127,7 @@ def close_to(word: Any, words: Sequence[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-_SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+_SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": HOUR, "d": DAY}
 _HERTZ = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "1/min": 1 / 60}
 
 

@@ -12,11 +12,10 @@ import numpy as np
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
 from gyrostab.physics.phase import TURN, fold, turn_means, turns_of_samples, turns_of_windows
-from gyrostab.units import INNER
+from gyrostab.units import HOUR, INNER
 
 __all__ = ["EarthRate", "Misalignment", "RealMotion", "ScaleFactor"]
 
-_HOUR = 3600.0
 _PPM = 1e-6
 _MRAD = 1e-3
 
@@ -93,13 +92,13 @@ class ScaleFactor(Effect):
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Rate contribution [degree hour-1] on every sample."""
         if self.rotation == "channel":
-            rate = chunk.drivers["rotation_rate"] * _HOUR
+            rate = chunk.drivers["rotation_rate"] * HOUR
         else:
             rate = np.stack([chunk.true[axis] for axis in chunk.setup.axes])
         error = (
             self.linear * rate
             + self.asymmetry * np.abs(rate)
-            + self.cubic * rate * (rate / _HOUR) ** 2
+            + self.cubic * rate * (rate / HOUR) ** 2
         )
         if self.thermal:
             error = error + self.thermal * (chunk.drivers["temperature"] - self.reference) * rate
@@ -108,10 +107,10 @@ class ScaleFactor(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """Window means: functions of the mean rotation rate, which is all of the mean but for asymmetry and cubic while it wanders."""
         if self.rotation == "channel":
-            rate = windows.drivers["rotation_rate"] * _HOUR
+            rate = windows.drivers["rotation_rate"] * HOUR
         else:
             rate = np.stack([windows.own[axis] for axis in windows.axes])
-        mean = {"linear": rate, "asymmetry": np.abs(rate), "cubic": rate * (rate / _HOUR) ** 2}
+        mean = {"linear": rate, "asymmetry": np.abs(rate), "cubic": rate * (rate / HOUR) ** 2}
         if "temperature" in windows.drivers:
             mean["thermal"] = rate * (windows.drivers["temperature"] - self.reference)
         return Prediction(mean={name: _PPM * design for name, design in mean.items()})
@@ -456,7 +455,7 @@ class RealMotion(Effect):
         )
         motion = self.sway * motion
         if self.spin:
-            motion += self.spin * _HOUR * chunk.drivers["rotation_rate"]
+            motion += self.spin * HOUR * chunk.drivers["rotation_rate"]
         bent = [name for name in "xyz" if getattr(self, name)]
         if bent:
             angle = sum(
@@ -464,7 +463,7 @@ class RealMotion(Effect):
                 np.zeros(chunk.size),
             )
             motion += np.diff(angle, prepend=angle[0] if tilt is None else tilt) * (
-                chunk.rate * _HOUR
+                chunk.rate * HOUR
             )
             tilt = float(angle[-1])
         return self.each("direction", chunk.setup.axes)[:, None] * motion, (
@@ -489,11 +488,11 @@ class RealMotion(Effect):
         direction = self.each("direction", windows.axes)[:, None]
         mean = {}
         if "rotation_rate" in windows.drivers:
-            mean["spin"] = direction * _HOUR * windows.drivers["rotation_rate"]
+            mean["spin"] = direction * HOUR * windows.drivers["rotation_rate"]
         for name in "xyz":
             if f"accel_{name}" in windows.drivers and windows.begin.size > 1:
                 slope = np.gradient(windows.drivers[f"accel_{name}"], windows.centre)
-                mean[name] = direction * (math.degrees(_MRAD) * _HOUR * slope)
+                mean[name] = direction * (math.degrees(_MRAD) * HOUR * slope)
 
         def density(f: Array) -> Array:
             return oscillator_psd(f, self.frequency, self.quality)
@@ -502,7 +501,7 @@ class RealMotion(Effect):
         folded = folded_psd(density, windows.frequency, windows.rate, highest, average=True)
         sway = np.broadcast_to(folded, (windows.begin.size, folded.size))
         place = np.full(windows.begin.size, float(fold(self.frequency, windows.rate)))
-        turning = np.asarray(2j * np.pi * windows.frequency * (math.degrees(_MRAD) * _HOUR))
+        turning = np.asarray(2j * np.pi * windows.frequency * (math.degrees(_MRAD) * HOUR))
         transfer = {(name, f"accel_{name}"): turning for name in "xyz"}
         return Prediction(
             mean=mean, spectrum={"sway": sway}, coherent=True, line=place, transfer=transfer

@@ -9,14 +9,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.errors import OptionError
+from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
-from gyrostab.units import INNER
+from gyrostab.units import HOUR, INNER
 
 __all__ = ["Shupe", "TemperatureBias", "ThermalGradient", "ThermalHysteresis"]
 
 _MINUTE = 60.0
 _AT_ONCE = 1e-3  # s: a lag that is none
-_TWO_SIDED = 1.96
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +162,7 @@ class Shupe(Effect):
         "by how much the sensor of the temperature is later than the surface of the winding",
         default=0.0,
         low=0.0,
-        high=3600.0,
+        high=HOUR,
     )
 
     def __post_init__(self) -> None:
@@ -242,7 +242,7 @@ def _with_lag(effect: Shupe | ThermalGradient, errors: Mapping[str, float] | Non
     if effect.lag > _AT_ONCE:
         return f"with a lag of {effect.quantity('lag', errors)}"
     return (
-        f"with a lag of {_TWO_SIDED * errors['lag']:.2g} s at most"
+        f"with a lag of {NORMAL_95 * errors['lag']:.2g} s at most"
         if errors and "lag" in errors
         else "without a lag"
     )

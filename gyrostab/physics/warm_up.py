@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Stage, Windows, parameter
+from gyrostab.units import HOUR
 
 __all__ = ["WarmUp"]
 
@@ -60,7 +61,7 @@ class WarmUp(Effect):
     slow_amplitude: float = parameter(
         "deg/h", "amplitude of a second, slower part", default=0.0, typical=0.05, low=-1e4, high=1e4
     )
-    slow_time: float = parameter("s", "its time constant", default=3600.0, low=1e-3, high=1e7)
+    slow_time: float = parameter("s", "its time constant", default=HOUR, low=1e-3, high=1e7)
     cooling: float = parameter(
         "s", "time constant of cooling without power; 0 for at once", default=0.0, low=0.0, high=1e6
     )

@@ -17,6 +17,7 @@ from gyrostab.plot.style import COLOURS, GREY, label_log_axis, literal_text, new
 from gyrostab.plot.surface import CHANGE_CMAP
 from gyrostab.schema import signal_name
 from gyrostab.time.durations import duration_seconds
+from gyrostab.units import HOUR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,8 +104,8 @@ def plot_comparison(
     )
     seconds = float(pair[0].attrs["window_s"])
     name = (
-        f"{seconds / 3600:g} h"
-        if seconds >= 3600
+        f"{seconds / HOUR:g} h"
+        if seconds >= HOUR
         else f"{seconds / 60:g} min"
         if seconds >= 600
         else f"{seconds:g} s"
@@ -130,7 +131,7 @@ def plot_comparison(
 
 def _since(log: xr.Dataset, times: Any) -> tuple[Any, str]:
     """Times since the start of the log, and their unit: hours for long logs, else minutes."""
-    hour = np.timedelta64(3600 * 10**9, "ns")
+    hour = np.timedelta64(int(HOUR) * 10**9, "ns")
     start, end = log["time"].values[[0, -1]]
     unit, word = (hour, "h") if end - start > 1.5 * hour else (hour / 60, "min")
     return (np.asarray(times) - start) / unit, word
@@ -146,7 +147,7 @@ def _curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> None:
         label="without, mean",
     )
     for colour, dashes, moment in zip(COLOURS, ("-", "--", "-.", ":"), moments, strict=False):
-        when = moment / {"h": 3600.0, "min": 60.0}[word]
+        when = moment / {"h": HOUR, "min": 60.0}[word]
         curve = np.sqrt(pair[1]["avar"].values[np.abs(centres - when).argmin()])
         panel.loglog(tau, curve, dashes, color=colour, lw=1.3, label=f"with, at {when:g} {word}")
     label_log_axis(panel.yaxis, *panel.get_ylim())

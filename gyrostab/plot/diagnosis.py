@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.noise import NORMAL_95
 from gyrostab.plot.style import (
     COLOURS,
     GREY,
@@ -255,8 +256,8 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
             panel.plot(time, mean, **_STYLES[case], label=f"{_TITLES[case].lower()}, 95 %")
             panel.fill_between(
                 time,
-                mean - 1.96 * error,
-                mean + 1.96 * error,
+                mean - NORMAL_95 * error,
+                mean + NORMAL_95 * error,
                 color=_STYLES[case]["color"],
                 alpha=0.18,
                 lw=0,

@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.units import INNER
+from gyrostab.units import DAY, HOUR, INNER
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,7 +80,7 @@ def duration(seconds: float) -> str:
     >>> duration(90.0), duration(0.25), duration(7200)
     ('1.5 min', '0.25 s', '2 h')
     """
-    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+    for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min")):
         if seconds >= size:
             return f"{seconds / size:.4g} {name}"
     return f"{seconds:.3g} s"
@@ -97,7 +97,7 @@ def unit_of_time(seconds: float) -> tuple[float, str]:
     return next(
         (
             (size, name)
-            for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+            for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min"))
             if seconds >= 3 * size
         ),
         (1.0, "s"),

@@ -15,6 +15,7 @@ from gyrostab.physics.base import STAGES, Chunk, Effect, Setup
 from gyrostab.simulate.drivers import Source, Stretch
 from gyrostab.simulate.noise import Units, shape
 from gyrostab.time.grid import grid_times
+from gyrostab.units import HOUR
 
 __all__ = ["BlockState", "Plan", "Step", "check_effects", "next_block"]
 
@@ -115,7 +116,7 @@ def next_block(
         )
     true = {axis: np.zeros(index.size) for axis in plan.axes}
     if plan.turning:
-        true[plan.turning] += channels["rotation_rate"] * 3600.0
+        true[plan.turning] += channels["rotation_rate"] * HOUR
     by_stage: dict[str, list[int]] = {stage: [] for stage in STAGES}
     for number, step in enumerate(plan.steps):
         by_stage[step.effect.stage].append(number)

@@ -14,6 +14,7 @@ from gyrostab.simulate.channels import Points, check_points
 from gyrostab.simulate.noise import stream
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import stamp_ns
+from gyrostab.units import HOUR
 
 __all__ = ["gaps", "losses", "power_cuts"]
 
@@ -135,7 +136,7 @@ def _poisson(
         raise OptionError(
             f"{per_hour:g} gaps in an hour: give a number from 0 up, for at most 1e8 gaps in all"
         )
-    return np.sort(rng.uniform(begin, end, rng.poisson(per_hour * (end - begin) / 3600.0)))
+    return np.sort(rng.uniform(begin, end, rng.poisson(per_hour * (end - begin) / HOUR)))
 
 
 def power_cuts(

@@ -14,6 +14,7 @@ from cyclopts.validators import Number
 
 from gyrostab.cli.frame import app, work
 from gyrostab.cli.options import Common, Flag
+from gyrostab.units import HOUR
 
 __all__ = ["prove"]
 
@@ -125,7 +126,7 @@ def _lines(stage: Any, *, quiet: bool) -> Iterator[Any]:
 
 def _length(seconds: float) -> str:
     return (
-        f"{seconds / 3600:.1f} h"
+        f"{seconds / HOUR:.1f} h"
         if seconds > 5400
         else f"{seconds / 60:.0f} min"
         if seconds > 90

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.predict.linear_model import effective
 from gyrostab.kernels.spectra.expected import expected_powers
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
-from gyrostab.noise import HOUR, URAD_PER_S
+from gyrostab.noise import LAWS
 
 __all__ = [
     "NOISE",
@@ -38,7 +38,7 @@ def line_columns(blocks: xr.Dataset) -> Array:
     size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
     return np.asarray(
         expected_powers(taper(size), rate, ordinates(size)).T
-        * np.array([URAD_PER_S**2, HOUR, 1.0, 1.0 / HOUR])
+        * np.array([LAWS[term].seconds_factor for term in NOISE])
     )
 
 
@@ -105,6 +105,6 @@ def white_variance(blocks: xr.Dataset, square: Array) -> Array:
     apart = 1.0 - np.where(np.isfinite(near), near, samples / float(blocks.attrs["block_samples"]))
     runs = np.maximum(apart, 0.0) * count + 1.0  # each leaves a rounding of the angle at either end
     return np.asarray(
-        HOUR * rate * square[:, 1:2] / count
-        + 2.0 * URAD_PER_S**2 * rate**2 * square[:, :1] * runs / count**2
+        LAWS["N"].seconds_factor * rate * square[:, 1:2] / count
+        + 2.0 * LAWS["Q"].seconds_factor * rate**2 * square[:, :1] * runs / count**2
     )

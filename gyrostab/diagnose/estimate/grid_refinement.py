@@ -15,9 +15,10 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
 from gyrostab.errors import OptionError
 from gyrostab.physics.registry import effects
+from gyrostab.units import HOUR
 
 __all__ = ["Point", "refined"]
-_SECONDS = {"s": 1.0, "h": 3600.0}
+_SECONDS = {"s": 1.0, "h": HOUR}
 _SCALES, _INSTANT = (
     (*_SECONDS, "degC"),
     "at",

@@ -24,6 +24,7 @@ from gyrostab.diagnose.predict.linear_model import State, begin_state, harmonic_
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.zero_bin import cut_off
 from gyrostab.errors import GyrostabError
+from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 from gyrostab.physics.rotation import EarthRate
@@ -34,7 +35,6 @@ Array = NDArray[np.float64]
 #: Error of the form of an effect, as a share of its size: no effect is exactly what its equation
 #: says.
 FORM_ERROR = 0.04
-_TWO_SIDED = 1.959964
 _ANGLE = "deg"
 _PLACE = "line", "frequency"  # where a line is has nothing to do with what makes it
 _EARTH = 15.041067  # deg/h
@@ -355,10 +355,10 @@ def _estimate(
     """With the error of the `form` in it; `ends` are those of the 95 % interval without it, where that is not symmetric."""
     if sd <= 0.0:  # what is counted, not measured, is exact
         return Estimate(mean, 0.0, mean, mean, unit)
-    low, high = ends or (mean - _TWO_SIDED * sd, mean + _TWO_SIDED * sd)
+    low, high = ends or (mean - NORMAL_95 * sd, mean + NORMAL_95 * sd)
     low, high = (
-        mean - math.hypot(mean - low, _TWO_SIDED * form),
-        mean + math.hypot(high - mean, _TWO_SIDED * form),
+        mean - math.hypot(mean - low, NORMAL_95 * form),
+        mean + math.hypot(high - mean, NORMAL_95 * form),
     )
     return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
 
@@ -438,9 +438,9 @@ def _latitude(across: float, error: float) -> tuple[float, float, float, float]:
     """Latitude [deg], its standard error and the ends of its 95 % interval, by the earth's rate across a tool that points down [deg/h]."""
     low, middle, high = (
         math.degrees(math.acos(min(max(rate, 0.0) / _EARTH, 1.0)))
-        for rate in (across + _TWO_SIDED * error, across, across - _TWO_SIDED * error)
+        for rate in (across + NORMAL_95 * error, across, across - NORMAL_95 * error)
     )
-    return middle, max((high - low) / (2.0 * _TWO_SIDED), 1e-12), low, high
+    return middle, max((high - low) / (2.0 * NORMAL_95), 1e-12), low, high
 
 
 def _amplitude(component: Component, state: State) -> tuple[float, float, float]:

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.predict.candidates import windows_of
-from gyrostab.diagnose.predict.designs import term_density
+from gyrostab.noise import sampled_psd
 
 __all__ = ["add_outlier_power"]
 
@@ -48,7 +48,7 @@ def add_outlier_power(
         for (term, name), share in seen.level.items():
             square = baseline["coefficient"].sel(term=term, axis=list(one.axes)).values ** 2
             own = square[:, None] * getattr(one.effect, name) * share
-            added[rows] += own[..., None] * term_density(term, frequency, rate)
+            added[rows] += own[..., None] * sampled_psd(term, frequency, rate)
     return (
         baseline.assign(spectrum=spectrum.copy(data=spectrum.values + added))
         if added.any()

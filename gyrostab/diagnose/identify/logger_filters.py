@@ -18,6 +18,7 @@ from gyrostab.diagnose.predict.filter_response import is_filter, response_of
 from gyrostab.diagnose.predict.linear_model import State, in_place
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.sizes import component_size
+from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 
 __all__ = ["filter_sizes", "on_all_axes", "without_slopes"]
@@ -25,11 +26,10 @@ __all__ = ["filter_sizes", "on_all_axes", "without_slopes"]
 Array = NDArray[np.float64]
 _KEPT = 0.5  # of its gain, that a line must keep beside a filter
 _FINE, _ZOOMS = 21, 4
-_NEXT, _ELSEWHERE, _TAIL, _TWO_SIDED = (
+_NEXT, _ELSEWHERE, _TAIL = (
     0.25,
     0.02,
     0.025,
-    1.959964,
 )  # reach of a place on the grid; shares of what lies elsewhere
 _APART, _FORM = (
     6.0,
@@ -176,9 +176,9 @@ def _of_all(sharp: tuple[float, float], tried: Sequence[tuple[float, float]]) ->
     if share[~near].sum() < _ELSEWHERE:
         return sharp
     below, above = share.cumsum(), share[::-1].cumsum()[::-1]
-    low = min(float(value[below >= _TAIL].min()), mean - _TWO_SIDED * sd)
-    high = max(float(value[above >= _TAIL].max()), mean + _TWO_SIDED * sd)
-    return mean, (high - low) / (2.0 * _TWO_SIDED), low, high
+    low = min(float(value[below >= _TAIL].min()), mean - NORMAL_95 * sd)
+    high = max(float(value[above >= _TAIL].max()), mean + NORMAL_95 * sd)
+    return mean, (high - low) / (2.0 * NORMAL_95), low, high
 
 
 def _fit(axis: str, state: State) -> tuple[Fit, Array]:

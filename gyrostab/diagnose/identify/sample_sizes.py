@@ -9,6 +9,7 @@ import xarray as xr
 
 from gyrostab.diagnose.predict.search import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
+from gyrostab.units import HOUR
 
 __all__ = ["line_size", "sample_count_sizes"]
 
@@ -52,7 +53,7 @@ def sample_count_sizes(
 
     samples = max(float(blocks["samples"].sel(axis=axis).sum()), 1.0)
     rate = float(blocks.attrs["sampling_rate_hz"])
-    hours = samples / rate / 3600.0
+    hours = samples / rate / HOUR
     if mark == "lattice":
         return {"step": (float(blocks["lattice"].sel(axis=axis)), 0.0)}
     row = [str(one) for one in blocks["axis"].values].index(axis)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, has_coarse_grid
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
-from gyrostab.diagnose.predict.designs import BUILDERS, Candidate, Variant, term_density
+from gyrostab.diagnose.predict.designs import BUILDERS, Candidate, Variant
 from gyrostab.diagnose.predict.step_times import known_instants, tried_instants
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.errors import OptionError
@@ -29,7 +29,6 @@ __all__ = [
     "Variant",
     "channel_units",
     "effect_candidates",
-    "term_density",
     "variants_of",
     "windows_of",
 ]

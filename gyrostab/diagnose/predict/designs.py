@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.noise import HOUR, URAD_PER_S
+from gyrostab.noise import sampled_psd
 from gyrostab.physics.prediction import Prediction
 
-__all__ = ["BUILDERS", "Candidate", "Variant", "term_density"]
+__all__ = ["BUILDERS", "Candidate", "Variant"]
 
 Array = NDArray[Any]
 
@@ -94,23 +94,6 @@ class Candidate:
         return f"{self.effect}({named})" if named else self.effect
 
 
-def term_density(symbol: str, frequency: Array, rate: float) -> Array:
-    """Two-sided density of a noise term per squared coefficient [degree2 hour-2 Hz-1 per unit], as its samples have it."""
-    f = np.asarray(frequency, np.float64)
-    if symbol == "Q":
-        return np.asarray((2.0 * URAD_PER_S * np.sin(np.pi * f / rate)) ** 2 * rate)
-    if symbol == "N":
-        return np.full(f.shape, HOUR)
-    if symbol == "B":
-        return np.asarray(1.0 / (2.0 * np.pi * f))
-    if symbol == "K":
-        cycles = 2.0 * np.pi * f / rate
-        return np.asarray(
-            (2.0 + np.cos(cycles)) / (6.0 * (1.0 - np.cos(cycles))) / (HOUR * rate**2)
-        )
-    raise ValueError(f"no density for the term {symbol!r}")
-
-
 def _choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
     """Each parameter by itself, and all together."""
     alone: list[tuple[str, ...]] = [(name,) for name in columns]
@@ -151,7 +134,7 @@ def _powers(
         component = (
             np.atleast_2d(share)[..., None]
             * square[:, None, None]
-            * term_density(symbol, frequency, rate)
+            * sampled_psd(symbol, frequency, rate)
         )
         level[name] = level.get(name, 0.0) + component
     spectrum = {}
@@ -179,7 +162,7 @@ def _filtered(response: Array, coefficient: xr.DataArray, frequency: Array, rate
     total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
     size, terms = coefficient.transpose("axis", "term").values, list(coefficient["term"].values)
     for symbol in (one for one in "QNBK" if one in terms):
-        total += size[:, terms.index(symbol), None, None] ** 2 * term_density(
+        total += size[:, terms.index(symbol), None, None] ** 2 * sampled_psd(
             symbol, frequency, rate
         )
     return total * (response - 1.0)

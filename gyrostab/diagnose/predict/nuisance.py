@@ -6,7 +6,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Candidate, Variant, term_density
+from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.noise import sampled_psd
 
 __all__ = ["NUISANCE_ALTERNATIVES", "nuisance_alternatives", "splines", "stretches"]
 
@@ -67,7 +68,7 @@ def splines(begin: Array, end: Array, knots: int = _KNOTS) -> Array:
 def nuisance_alternatives(blocks: xr.Dataset) -> list[Candidate]:
     """Generics of all views that the record has."""
     hats = splines(blocks["begin"].values, blocks["end"].values)
-    white = term_density("N", blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"]))
+    white = sampled_psd("N", blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"]))
     bands = blocks.sizes["band"]
     level = hats[:, None, :, None] * white
     shapes = np.eye(bands)[:, None, None, :]

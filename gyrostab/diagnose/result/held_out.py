@@ -16,6 +16,7 @@ from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, values_of
 from gyrostab.errors import OptionError
+from gyrostab.noise import NORMAL_95
 
 __all__ = ["Trained", "forecast_from", "held_out", "log_likelihood", "stretches"]
 
@@ -28,7 +29,6 @@ _STRETCH_S, _FEWEST = (
 _LEAST = 12
 _KNOWN = 0.7  # share of the record that a forecast begins from
 _SHORT = 5  # blocks
-_INSIDE = 1.959964  # standard deviations that hold 95 %
 
 
 def held_out(
@@ -330,7 +330,7 @@ def _misfits(squares: dict[str, list[Array]]) -> dict[str, float]:
     for name in ("before", "after"):
         cells = joined[name]
         found[f"misfit_{name}"] = float(cells.mean()) if cells.size else np.nan
-        found[f"coverage95_{name}"] = float((cells < _INSIDE**2).mean()) if cells.size else np.nan
+        found[f"coverage95_{name}"] = float((cells < NORMAL_95**2).mean()) if cells.size else np.nan
         means = joined[f"mean_{name}"]
         found[f"mean_misfit_{name}"] = float(means.mean()) if means.size else np.nan
     return found

@@ -11,6 +11,7 @@ import numpy as np
 
 from gyrostab.diagnose.result.verdict import failed_checks
 from gyrostab.physics.registry import effects
+from gyrostab.units import DAY, HOUR
 
 __all__ = [
     "axes_text",
@@ -204,7 +205,7 @@ def span_text(begin: float, end: float, whole: float) -> str:
 
 def length_text(seconds: float) -> str:
     """A length of time for people."""
-    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+    for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min")):
         if seconds >= 2 * size:
             return f"{seconds / size:.3g} {name}"
     return f"{seconds:.3g} s" if seconds >= 0.1 else f"{seconds * 1e3:.3g} ms"

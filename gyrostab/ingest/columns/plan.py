@@ -31,7 +31,7 @@ from gyrostab.ingest.columns.preset import Found, find_preset
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.ingest.limits import check_columns, describe_limit, limit_value
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
-from gyrostab.units import INNER, known_units, parse_unit
+from gyrostab.units import HOUR, INNER, known_units, parse_unit
 
 __all__ = ["Column", "Plan", "plan_columns", "split_header"]
 
@@ -559,7 +559,7 @@ class _Work:
             expected = unit_quantity(quantity)
             if is_unit_of(text, (expected,)):
                 unit = parse_unit(text, expected)
-                scale = 1.0 / 3600.0 if quantity == "rotation_rate" else 1.0
+                scale = 1.0 / HOUR if quantity == "rotation_rate" else 1.0
                 factor, offset, units = unit.factor * scale, unit.offset, INNER[quantity]
             elif quantity == "number":
                 units = INNER["number"]

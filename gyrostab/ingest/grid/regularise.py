@@ -47,6 +47,7 @@ from gyrostab.store.lazy_slices import read_slice
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
+from gyrostab.units import HOUR
 
 __all__ = ["gap_table", "regularise"]
 
@@ -404,7 +405,7 @@ def regularise(
 
     increments = raw.attrs.get("kind") == "increment"
     signal = "rate" if increments else name
-    scale = hertz * 3600.0 if increments else 1.0  # degree a sample to degree an hour
+    scale = hertz * HOUR if increments else 1.0  # degree a sample to degree an hour
     attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
     unit = raw[name].encoding.get("scale_factor")
     packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}

@@ -12,7 +12,6 @@ from gyrostab.diagnose.evidence.held_out import linear_model_factors, power_fact
 from gyrostab.diagnose.predict.candidates import (
     STATISTIC_NAMES,
     effect_candidates,
-    term_density,
     windows_of,
 )
 from gyrostab.diagnose.predict.linear_model import (
@@ -25,6 +24,7 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives, splines
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
+from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import simulate
 from tests.support.named import COEFFICIENT, WORLD, record
@@ -171,14 +171,14 @@ def test_earth_rate_is_in_quadrature_between_the_cross_axes(rich):
 
 def test_laws_of_the_terms(plain):
     frequency = np.array([0.01, 0.1, 1.0])
-    np.testing.assert_allclose(term_density("N", frequency, 100.0), 3600.0)
+    np.testing.assert_allclose(sampled_psd("N", frequency, 100.0), 3600.0)
     np.testing.assert_allclose(
-        term_density("K", frequency, 100.0),
+        sampled_psd("K", frequency, 100.0),
         1.0 / (3600.0 * (2 * np.pi * frequency) ** 2),
         rtol=1e-3,
     )
     with pytest.raises(ValueError, match="no density"):
-        term_density("R", frequency, 100.0)
+        sampled_psd("R", frequency, 100.0)
 
 
 def test_gaps_mix_a_density_with_its_mean(plain):
