@@ -237,7 +237,7 @@ class Bench:
         def arm() -> None:
             from gyrostab.jobs import checkpoint, engine
 
-            engine._HELD_SECONDS = 0.0
+            engine._MAX_HELD_SECONDS = 0.0
             done = []
 
             def write(*arguments: object, **options: object) -> object:

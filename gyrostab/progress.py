@@ -60,20 +60,20 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
     if quiet:
         yield no_stage
     elif sys.stderr.isatty():
-        with _bar() as stage:
+        with _show_bar() as stage:
             yield stage
     else:
-        with _line() as stage:
+        with _show_line() as stage:
             yield stage
 
 
-def _speed(amount: float, seconds: float, unit: str) -> str:
+def _format_speed(amount: float, seconds: float, unit: str) -> str:
     """Throughput of samples; other things are too few to have one."""
     return f"{amount / seconds / 1e6:.2f} Msamples/s" if unit == "samples" and seconds > 0 else ""
 
 
 @contextmanager
-def _line() -> Iterator[Stage]:
+def _show_line() -> Iterator[Stage]:
     """One line when the work is done."""
     begun = since = time.perf_counter()
     current, first, amount, worked = "", 0, 0, ""
@@ -84,7 +84,7 @@ def _line() -> Iterator[Stage]:
         if label != current:
             if amount:
                 seconds = max(now - since, 1e-9)
-                worked = f" ({current}: {amount:,} samples in {seconds:.1f} s, {_speed(amount, seconds, 'samples')})"
+                worked = f" ({current}: {amount:,} samples in {seconds:.1f} s, {_format_speed(amount, seconds, 'samples')})"
             since, current, first, amount = now, label, done or 0, 0
         if unit == "samples":
             amount = total - first  # what an earlier run has done counts for nothing here
@@ -95,7 +95,7 @@ def _line() -> Iterator[Stage]:
 
 
 @contextmanager
-def _bar() -> Iterator[Stage]:
+def _show_bar() -> Iterator[Stage]:
     """One bar per stage, with throughput and the time left."""
     from dask.callbacks import Callback
     from rich.console import Console
@@ -130,7 +130,7 @@ def _bar() -> Iterator[Stage]:
                 progress.update(now["task"], total=1.0, completed=1.0)
 
         def show(share: float, amount: float, unit: str) -> None:
-            said = _speed(amount, time.perf_counter() - now["begun"], unit)
+            said = _format_speed(amount, time.perf_counter() - now["begun"], unit)
             progress.update(now["task"], total=1.0, completed=share, speed=said)
 
         def stage(

@@ -61,7 +61,7 @@ _TAU_TOLERANCE = 1e-9
 SIGNAL_UNITS = {"rate": INNER["rate"], "angle": INNER["angle"]}
 
 
-def _flags(meanings: tuple[str, ...]) -> dict[str, Any]:
+def _flag_attributes(meanings: tuple[str, ...]) -> dict[str, Any]:
     return {
         "flag_values": np.arange(len(meanings), dtype=np.int8),
         "flag_meanings": " ".join(meanings),
@@ -90,7 +90,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "units": "1",
     },
     "edf": {"long_name": "equivalent degrees of freedom of the Allan variance", "units": "1"},
-    "estimator": {"long_name": "estimator of the Allan variance", **_flags(ESTIMATORS)},
+    "estimator": {"long_name": "estimator of the Allan variance", **_flag_attributes(ESTIMATORS)},
     "gap_factor": {
         "long_name": "degrees of freedom left by the gaps, share of the gap-free ones",
         "units": "1",
@@ -116,7 +116,10 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "long_name": "share of the window's samples that are present",
         "units": "1",
     },
-    "observable": {"long_name": "what the window can tell of the noise term", **_flags(OBSERVABLE)},
+    "observable": {
+        "long_name": "what the window can tell of the noise term",
+        **_flag_attributes(OBSERVABLE),
+    },
     "fit_chi2": {
         "long_name": "misfit of the five-term model, generalised least squares chi-square",
         "units": "1",
@@ -195,7 +198,7 @@ def log_channels(log: xr.Dataset) -> list[str]:
     ]
 
 
-def _require(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -> None:
+def _require_variables(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -> None:
     if not isinstance(dataset, xr.Dataset):
         raise SchemaError(
             f"this is a {type(dataset).__name__}, not a {what}: give the whole xarray.Dataset; {_MAKERS[what]} makes one"
@@ -223,7 +226,7 @@ _MAKERS = {
 def check_raw(raw: xr.Dataset) -> None:
     """Raise `SchemaError` unless `raw` is what a reader returns (see `gyrostab.ingest`)."""
     name = signal_name(raw)
-    _require(raw, "raw log", {name: ("axis", "row")})
+    _require_variables(raw, "raw log", {name: ("axis", "row")})
     _check_units(raw, name)
 
 
@@ -239,7 +242,7 @@ def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
             "these are raw rows with their stamps as written; call gyrostab.regularise(raw) first"
         )
     name = signal_name(log)
-    _require(log, "log", {name: ("axis", "time"), "time": ("time",)})
+    _require_variables(log, "log", {name: ("axis", "time"), "time": ("time",)})
     _check_units(log, name)
     if log.sizes["axis"] == 0 or log.sizes["time"] == 0:
         raise SchemaError("the log is empty: it has no axis or no sample")
@@ -261,12 +264,14 @@ def _check_units(dataset: xr.Dataset, name: str) -> None:
 def check_surface(surface: xr.Dataset) -> None:
     """Raise `SchemaError` unless `surface` is what `gyrostab.davar` returns, or a part of it."""
     cube = ("axis", "time", "tau")
-    _require(
+    _require_variables(
         surface,
         "DAVAR surface",
         dict.fromkeys(("avar", "count", "coverage", "edf", "estimator"), cube),
     )
-    _require(surface, "DAVAR surface", dict.fromkeys(("window_mean", "window_coverage"), cube[:2]))
+    _require_variables(
+        surface, "DAVAR surface", dict.fromkeys(("window_mean", "window_coverage"), cube[:2])
+    )
     units, expected = surface.variables["avar"].attrs.get("units"), VARIABLES["avar"]["units"]
     if units != expected:
         raise SchemaError(
@@ -306,7 +311,7 @@ def _check_tau(surface: xr.Dataset) -> None:
 def check_product(product: xr.Dataset) -> None:
     """Raise `SchemaError` unless `product` is what `gyrostab.fit_noise` returns."""
     check_surface(product)
-    _require(
+    _require_variables(
         product,
         "product",
         {**dict.fromkeys(TERMS, ("axis", "time")), "observable": ("axis", "time", "term")},

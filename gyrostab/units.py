@@ -48,7 +48,7 @@ _SPELLINGS: dict[str, tuple[str, float, float]] = {}
 # their case only
 _PLAIN: dict[tuple[str, str], tuple[str, float, float] | None] = {}
 
-# Words of unit strings -> the one form that `_plain` gives them.
+# Words of unit strings -> the one form that `_remove_accents` gives them.
 _WORDS = {
     word: short
     for short, words in {
@@ -68,7 +68,7 @@ _WORDS = {
 }
 
 
-def _normal(text: str) -> str:
+def _normalize(text: str) -> str:
     """One spelling for ``rad s^-1``, ``rad*s**-1``, ``rad s⁻¹`` and ``rad s-1``; letters keep their case."""
     text = re.sub(
         "[º˚]", "°", text.strip()
@@ -78,9 +78,9 @@ def _normal(text: str) -> str:
     return re.sub(r"\s+", " ", text)
 
 
-def _plain(text: str) -> str:
+def _remove_accents(text: str) -> str:
     """The form in which spellings are compared where case, blanks and words such as `seconds` make no difference."""
-    text = _normal(text).casefold().replace("°", "deg ").replace(" per ", "/").replace("^", "")
+    text = _normalize(text).casefold().replace("°", "deg ").replace(" per ", "/").replace("^", "")
     text = re.sub(r"[a-zμ]+", lambda word: _WORDS.get(word[0], word[0]), text.replace("_", " "))
     text = re.sub(r"\s*/\s*", "/", text)
     text = re.sub(
@@ -89,49 +89,51 @@ def _plain(text: str) -> str:
     return text.replace(" ", "")
 
 
-def _add(quantity: str, factor: float, *spellings: str, offset: float = 0.0) -> None:
+def _add_unit(quantity: str, factor: float, *spellings: str, offset: float = 0.0) -> None:
     known = (quantity, factor, offset)
     for spelling in spellings:
-        _SPELLINGS[_normal(spelling)] = known
-        key = quantity, _plain(spelling)
+        _SPELLINGS[_normalize(spelling)] = known
+        key = quantity, _remove_accents(spelling)
         _PLAIN[key] = known if _PLAIN.get(key, known) == known else None
 
 
-_add("rate", 1.0, "dph")
-_add("rate", HOUR, "dps")
-_add("rate", 1e-3 * HOUR, "mdps")
-_add("rate", 6.0 * HOUR, "rpm", "r/min")
-_add("rate", 360.0 * HOUR, "r/s")
-_add("temperature", 1.0, "degC", "C", "celsius", "deg celsius")
-_add("temperature", 1.0, "K", "kelvin", "degK", offset=-273.15)
-_add("temperature", 5.0 / 9.0, "degF", "F", "fahrenheit", "deg fahrenheit", offset=-160.0 / 9.0)
-_add("acceleration", 1.0, "g", "gn", "gee", "gs", "g0", "g_n", "9.80665 m s-2")
-_add("acceleration", 1e-3, "mg", "milli-g", "milli g", "millig", "mgee")
-_add("acceleration", 1e-6, "ug", "µg", "micro-g", "microg")
-_add("acceleration", 1.0 / 9.80665, "mps2")
-_add("acceleration", 1e-2 / 9.80665, "gal")
-_add("acceleration", 0.3048 / 9.80665, "ft/s2")
-_add("voltage", 1.0, "V", "volt", "volts", "Vdc")
-_add("voltage", 1e-3, "mV", "millivolt", "millivolts")
-_add("power", 1.0, "W", "watt", "watts")
-_add("power", 1e-3, "mW")
-_add("power", 1e-6, "uW", "µW")
-_add("pressure", 1.0, "Pa", "pascal", "pascals")
-_add("pressure", 1e2, "hPa", "mbar", "millibar", "mb", "hectopascal")
-_add("pressure", 1e3, "kPa", "kilopascal")
-_add("pressure", 1e4, "dbar", "decibar")
-_add("pressure", 1e5, "bar", "bars", "bara")
-_add("pressure", 1e6, "MPa")
-_add("pressure", 1e-3, "mPa")
-_add("pressure", 6894.757293168361, "psi", "psia", "lbf/in2")
-_add("pressure", 101325.0, "atm")
-_add("magnetic", 1.0, "uT", "µT", "microtesla", "microteslas")
-_add("magnetic", 1e-3, "nT", "nanotesla", "gamma")
-_add("magnetic", 1e3, "mT", "millitesla")
-_add("magnetic", 1e6, "T", "tesla")
-_add("magnetic", 100.0, "G", "gauss", "Gs")
-_add("magnetic", 0.1, "mG", "milligauss", "mgauss")
-_add("number", 1.0, "1", "-", "count", "")
+_add_unit("rate", 1.0, "dph")
+_add_unit("rate", HOUR, "dps")
+_add_unit("rate", 1e-3 * HOUR, "mdps")
+_add_unit("rate", 6.0 * HOUR, "rpm", "r/min")
+_add_unit("rate", 360.0 * HOUR, "r/s")
+_add_unit("temperature", 1.0, "degC", "C", "celsius", "deg celsius")
+_add_unit("temperature", 1.0, "K", "kelvin", "degK", offset=-273.15)
+_add_unit(
+    "temperature", 5.0 / 9.0, "degF", "F", "fahrenheit", "deg fahrenheit", offset=-160.0 / 9.0
+)
+_add_unit("acceleration", 1.0, "g", "gn", "gee", "gs", "g0", "g_n", "9.80665 m s-2")
+_add_unit("acceleration", 1e-3, "mg", "milli-g", "milli g", "millig", "mgee")
+_add_unit("acceleration", 1e-6, "ug", "µg", "micro-g", "microg")
+_add_unit("acceleration", 1.0 / 9.80665, "mps2")
+_add_unit("acceleration", 1e-2 / 9.80665, "gal")
+_add_unit("acceleration", 0.3048 / 9.80665, "ft/s2")
+_add_unit("voltage", 1.0, "V", "volt", "volts", "Vdc")
+_add_unit("voltage", 1e-3, "mV", "millivolt", "millivolts")
+_add_unit("power", 1.0, "W", "watt", "watts")
+_add_unit("power", 1e-3, "mW")
+_add_unit("power", 1e-6, "uW", "µW")
+_add_unit("pressure", 1.0, "Pa", "pascal", "pascals")
+_add_unit("pressure", 1e2, "hPa", "mbar", "millibar", "mb", "hectopascal")
+_add_unit("pressure", 1e3, "kPa", "kilopascal")
+_add_unit("pressure", 1e4, "dbar", "decibar")
+_add_unit("pressure", 1e5, "bar", "bars", "bara")
+_add_unit("pressure", 1e6, "MPa")
+_add_unit("pressure", 1e-3, "mPa")
+_add_unit("pressure", 6894.757293168361, "psi", "psia", "lbf/in2")
+_add_unit("pressure", 101325.0, "atm")
+_add_unit("magnetic", 1.0, "uT", "µT", "microtesla", "microteslas")
+_add_unit("magnetic", 1e-3, "nT", "nanotesla", "gamma")
+_add_unit("magnetic", 1e3, "mT", "millitesla")
+_add_unit("magnetic", 1e6, "T", "tesla")
+_add_unit("magnetic", 100.0, "G", "gauss", "Gs")
+_add_unit("magnetic", 0.1, "mG", "milligauss", "mgauss")
+_add_unit("number", 1.0, "1", "-", "count", "")
 
 # Products of powers of angle, time and length: name -> (dimension, numerator, denominator), in
 # degree, s and m.
@@ -220,11 +222,11 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     >>> parse_unit("DEG/HR").factor, parse_unit("G", "acceleration").quantity
     (1.0, 'acceleration')
     """
-    found = _find(text, quantity)
+    found = _find_unit(text, quantity)
     if found is not None:
         return Unit(text, *found)
-    match = _NUMBER.match(_normal(text))
-    found = _find(match.group(2), quantity) if match else None
+    match = _NUMBER.match(_normalize(text))
+    found = _find_unit(match.group(2), quantity) if match else None
     if match and found is not None:
         kind, factor, offset = found
         scale = float(match.group(1))
@@ -264,7 +266,7 @@ def _parse_base(name: str) -> tuple[str, float, float] | None:
 
 def _parse_product(text: str) -> tuple[str, float, float] | None:
     """Read a product of powers as UDUNITS writes them (``rad.s-1``, ``degree per second``): quantity, factor and offset."""
-    text = re.sub(r"\s*[.⋅×]\s*(?=[^\s\d])", " ", _normal(text).replace("^", ""))
+    text = re.sub(r"\s*[.⋅×]\s*(?=[^\s\d])", " ", _normalize(text).replace("^", ""))
     text = re.sub(r"_?\bper\b_?|_per_", "/", text, flags=re.IGNORECASE)
     powers = {"angle": 0, "time": 0, "length": 0}
     up = down = 1.0
@@ -285,12 +287,12 @@ def _parse_product(text: str) -> tuple[str, float, float] | None:
     return None if found is None else (found[0], up * found[1] / (down * found[2]), 0.0)
 
 
-def _find(text: str, quantity: str | None) -> tuple[str, float, float] | None:
+def _find_unit(text: str, quantity: str | None) -> tuple[str, float, float] | None:
     """Return quantity, factor and offset of a spelling: as it is written, then with its case and blanks ignored."""
-    exact = _SPELLINGS.get(_normal(text)) or _parse_product(text)
+    exact = _SPELLINGS.get(_normalize(text)) or _parse_product(text)
     if exact is not None and quantity in (None, exact[0]):
         return exact
-    plain = _plain(text)
+    plain = _remove_accents(text)
     if quantity is not None and (found := _PLAIN.get((quantity, plain))):
         return found
     if exact is not None or len(plain) < 2:  # a single letter means what its case says

@@ -15,10 +15,10 @@ from collections.abc import Sequence
 from gyrostab.cli import commands
 from gyrostab.cli.console import (
     describe_error,
-    plain_notes,
     print_error,
     read_config,
     relaxed_gc,
+    show_plain_warnings,
     sigterm_as_interrupt,
 )
 from gyrostab.cli.frame import app, find_inputs
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         app.config = read_config(
             tokens, [command for command in app if not command.startswith("-")]
         )
-        with plain_notes(), sigterm_as_interrupt(), relaxed_gc():
+        with show_plain_warnings(), sigterm_as_interrupt(), relaxed_gc():
             command, bound, _ = app.parse_args(tokens, exit_on_error=False, print_error=False)
             with protect_inputs(find_inputs(bound.arguments)):
                 command(*bound.args, **bound.kwargs)

@@ -20,10 +20,10 @@ from gyrostab.errors import GyrostabError, OptionError
 
 __all__ = [
     "describe_error",
-    "plain_notes",
     "print_error",
     "read_config",
     "relaxed_gc",
+    "show_plain_warnings",
     "sigterm_as_interrupt",
 ]
 
@@ -61,7 +61,7 @@ def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
 
 
 @contextmanager
-def plain_notes() -> Iterator[None]:
+def show_plain_warnings() -> Iterator[None]:
     """Show each warning of the package once, as one plain line."""
     seen: set[str] = set()
 

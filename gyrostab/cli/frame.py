@@ -12,7 +12,7 @@ from cyclopts import App, Parameter
 
 from gyrostab.cli.options import Common
 
-__all__ = ["Logs", "Output", "Product", "app", "find_inputs", "work"]
+__all__ = ["Logs", "Output", "Product", "app", "find_inputs", "show_stages"]
 
 Logs = Annotated[list[Path], Parameter(name="LOG...", negative=())]
 Product = Annotated[Path, Parameter(name="PRODUCT")]
@@ -29,7 +29,7 @@ app = App(
 
 
 @contextmanager
-def work(common: Common) -> Iterator[Any]:
+def show_stages(common: Common) -> Iterator[Any]:
     """Set the number of cores, and show the stages of the work."""
     import dask
 

@@ -89,10 +89,10 @@ class Reading:
         """Keyword arguments of `gyrostab.jobs.run.load_log`."""
         chosen = {
             **asdict(self),
-            "map": _pairs(self.map, "--map"),
-            "unit": _pairs(self.unit, "--unit"),
+            "map": _parse_pairs(self.map, "--map"),
+            "unit": _parse_pairs(self.unit, "--unit"),
             "channel": tuple(self.channel or ()),
-            "limits": check_limits(_pairs(self.limit, "--limit")),
+            "limits": check_limits(_parse_pairs(self.limit, "--limit")),
         }
         del chosen["limit"]
         return {
@@ -135,8 +135,8 @@ class ChannelFile:
             )
         return {
             "epoch": self.epoch,
-            "map": _pairs(self.map, "--map"),
-            "unit": _pairs(self.unit, "--unit"),
+            "map": _parse_pairs(self.map, "--map"),
+            "unit": _parse_pairs(self.unit, "--unit"),
         }
 
 
@@ -257,7 +257,7 @@ class Common:
     debug: Flag = False
 
 
-def _pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
+def _parse_pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
     """``["wx=gyro_x"]`` as a dict; an item may also name a TOML file of such pairs."""
     found: dict[str, str] = {}
     for item in items or ():

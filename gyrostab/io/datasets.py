@@ -99,13 +99,13 @@ def to_netcdf(
     ...     open_log(to_netcdf(log, folder + "/log.nc")).time.values[1]
     np.datetime64('1970-01-01T00:00:00.003333333')
     """
-    dataset = _with_true_time(dataset)
+    dataset = _compute_time_axes(dataset)
     sources = find_sources(dataset)
     stored = to_disk(dataset, "to_netcdf")
-    filters = _filters(compression)
+    filters = _make_filters(compression)
 
     def write(packed: xr.Dataset) -> None:
-        log = _rate(packed) is not None
+        log = _find_rate(packed) is not None
         encoding = _netcdf_encoding(packed, filters)
         long = long_variables(packed) if log else large_variables(packed, encoding)
         rest = {name: options for name, options in encoding.items() if name not in long}
@@ -119,7 +119,7 @@ def to_netcdf(
     return Path(path)
 
 
-def _with_true_time(dataset: Any) -> xr.Dataset:
+def _compute_time_axes(dataset: Any) -> xr.Dataset:
     """A log on its uniform time, with a true sampling rate and table of gaps; any other dataset as it is."""
     if not isinstance(dataset, xr.Dataset):
         return as_log(dataset)
@@ -167,11 +167,11 @@ def _netcdf_encoding(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, d
                 netCDF4.default_fillvals[variable.dtype.str[1:]]
             )
         if variable.ndim and variable.size and not text:
-            encoding[name] |= {**filters, "chunksizes": _chunks(variable, _rate(stored))}
+            encoding[name] |= {**filters, "chunksizes": _plan_chunks(variable, _find_rate(stored))}
     return encoding
 
 
-def _filters(compression: str | None) -> dict[str, Any]:
+def _make_filters(compression: str | None) -> dict[str, Any]:
     """Compression of a NetCDF file, with checksums where the compression has none of its own."""
     import netCDF4
 
@@ -229,12 +229,12 @@ def to_zarr(
     ...     xr.open_zarr(to_zarr(cube, folder + "/cube.zarr")).avar.dims
     ('axis', 'tau', 'time')
     """
-    dataset = _with_true_time(dataset)
+    dataset = _compute_time_axes(dataset)
     sources = find_sources(dataset)
     stored = to_disk(dataset, "to_zarr")
 
     def write(packed: xr.Dataset) -> None:
-        long = long_variables(packed) if _rate(packed) is not None else {}
+        long = long_variables(packed) if _find_rate(packed) is not None else {}
         encoding = _zarr_encoding(packed)
         rest = {name: options for name, options in encoding.items() if name not in long}
         lazy = {
@@ -274,8 +274,8 @@ def _zarr_encoding(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
         if _is_data(stored, name) and variable.dtype.kind == "f":
             encoding[name]["_FillValue"] = variable.dtype.type(np.nan)
         if variable.ndim and variable.size:
-            encoding[name]["chunks"] = _chunks(variable, _rate(stored))
-            if _rate(stored) is not None and variable.dtype.kind in "if":
+            encoding[name]["chunks"] = _plan_chunks(variable, _find_rate(stored))
+            if _find_rate(stored) is not None and variable.dtype.kind in "if":
                 encoding[name] |= {
                     "compressors": Blosc("lz4", clevel=5, shuffle=Blosc.SHUFFLE),
                     "filters": [Fletcher32()],
@@ -305,7 +305,7 @@ def _write_counts(stored: xr.Dataset, write: Callable[[xr.Dataset], None]) -> No
             stored[name].encoding = {}
 
 
-def _rate(stored: xr.Dataset) -> float | None:
+def _find_rate(stored: xr.Dataset) -> float | None:
     """Sampling rate of a log [Hz]; None for anything else."""
     return (
         float(stored.attrs["sampling_rate_hz"])
@@ -320,7 +320,7 @@ def _is_data(dataset: xr.Dataset, name: Any) -> bool:
     return name not in dataset.coords and name not in bounds
 
 
-def _chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
+def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
     """One axis (and one term) a chunk, every tau, and as much time as fits; of a log 20 minutes."""
     inner = int(
         np.prod(
@@ -409,7 +409,9 @@ def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
     ...         print(product.N.dims, product.N.unit_label)
     ('axis', 'time') deg/sqrt(h)
     """
-    return _open(path, "a product", check_product, "make one with 'gyrostab run' or 'gyrostab fit'")
+    return _open_path(
+        path, "a product", check_product, "make one with 'gyrostab run' or 'gyrostab fit'"
+    )
 
 
 def open_surface(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -432,7 +434,7 @@ def open_surface(path: str | os.PathLike[str]) -> xr.Dataset:
     FormatError
         When there is no such file, when it is damaged, or when it holds something else.
     """
-    return _open(path, "a DAVAR surface", check_surface, "make one with 'gyrostab davar'")
+    return _open_path(path, "a DAVAR surface", check_surface, "make one with 'gyrostab davar'")
 
 
 def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
@@ -469,7 +471,7 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
     ...         print(log.rate.values)
     [[ 1. nan  2.]]
     """
-    log = _open(
+    log = _open_path(
         path,
         "a regular log",
         partial(check_log, rate=False),
@@ -483,7 +485,7 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
         raise type(error)(f"{path}: {error}") from error
 
 
-def _open(
+def _open_path(
     path: str | os.PathLike[str], what: str, check: Any, advice: str, *, strict: bool = False
 ) -> xr.Dataset:
     dataset = open_dataset(path, strict=strict)

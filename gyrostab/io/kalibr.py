@@ -142,12 +142,14 @@ def to_kalibr(
         f"update_rate: {float(rate)!r}  # Hz",
     ]
     for key in KEYS:
-        lines += _entry(key, _worst([values[key] for values in noise.values()]), indent="")
+        lines += _format_entry(
+            key, _find_worst([values[key] for values in noise.values()]), indent=""
+        )
     lines.append("axes:")
     for axis, values in noise.items():
         lines.append(f"  {json.dumps(axis)}:")
         for key, value in values.items():
-            lines += _entry(key, value, indent="    ")
+            lines += _format_entry(key, value, indent="    ")
     with new_output(path, overwrite=overwrite) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return Path(path)
@@ -163,13 +165,13 @@ def _describe_fit(fit: FitSummary) -> str:
     return text
 
 
-def _worst(values: list[KalibrValue]) -> KalibrValue:
+def _find_worst(values: list[KalibrValue]) -> KalibrValue:
     """The largest value that any axis may have; an axis that tells nothing leaves it to the others."""
     known = [value for value in values if not math.isnan(value.value)]
     return max(known, key=lambda value: value.value) if known else values[0]
 
 
-def _entry(key: str, found: KalibrValue, *, indent: str) -> list[str]:
+def _format_entry(key: str, found: KalibrValue, *, indent: str) -> list[str]:
     symbol, _, unit = KEYS[key]
     said = {
         "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, observed in {found.share:.0%} of the windows",

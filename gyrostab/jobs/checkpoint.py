@@ -25,8 +25,8 @@ from gyrostab.store.output import replace_file
 __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
 
 _MAGIC = b"GYROBLK1"
-_ALIGN = 64
-_SMALL = 2**26  # bytes of blocks up to which a product is put together in memory
+_ALIGN_BYTES = 64
+_MAX_MEMORY_BYTES = 2**26  # bytes of blocks up to which a product is put together in memory
 
 
 class Block(NamedTuple):
@@ -87,15 +87,17 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     for (name, values), variable in zip(arrays.items(), dataset.variables.values(), strict=True):
         described[name] = {
             "dims": list(variable.dims), "dtype": values.dtype.str, "shape": list(values.shape), "place": place,
-            "attrs": _to_json(variable.attrs),
+            "attrs": _encode_attributes(variable.attrs),
         }  # fmt: skip
-        place += -(-values.nbytes // _ALIGN) * _ALIGN
+        place += -(-values.nbytes // _ALIGN_BYTES) * _ALIGN_BYTES
     header = {
-        "job": job, "part": [part.start, part.stop], "coords": [str(name) for name in dataset.coords], "attrs": _to_json(dataset.attrs),
+        "job": job, "part": [part.start, part.stop], "coords": [str(name) for name in dataset.coords], "attrs": _encode_attributes(dataset.attrs),
         "variables": described,
     }  # fmt: skip
     text = json.dumps(header).encode()
-    head = (_MAGIC + len(text).to_bytes(8, "little") + text).ljust(_begin(len(text)), b"\0")
+    head = (_MAGIC + len(text).to_bytes(8, "little") + text).ljust(
+        _find_arrays_offset(len(text)), b"\0"
+    )
     path = block_path(folder, part)
     with replace_file(path) as temporary, temporary.open("wb", buffering=0) as file:
         digest = hashlib.sha256()
@@ -104,7 +106,7 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
             *(
                 piece
                 for values in arrays.values()
-                for piece in (values, bytes(-values.nbytes % _ALIGN))
+                for piece in (values, bytes(-values.nbytes % _ALIGN_BYTES))
             ),
         ):
             view = (
@@ -118,9 +120,9 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     return Block(path, part, header, len(head))
 
 
-def _begin(text: int) -> int:
+def _find_arrays_offset(text: int) -> int:
     """Place of the arrays after a header of so many bytes."""
-    return -(-(16 + text) // _ALIGN) * _ALIGN
+    return -(-(16 + text) // _ALIGN_BYTES) * _ALIGN_BYTES
 
 
 def _write_all(file: Any, view: memoryview) -> None:
@@ -136,14 +138,14 @@ def find_blocks(folder: Path, parts: Sequence[slice], *, job: str) -> dict[int, 
     found = {}
     for number, part in enumerate(parts):
         path = block_path(folder, part)
-        text = _verified(path)
+        text = _read_verified_header(path)
         header = json.loads(text) if text else {}
         if header and header["job"] == job and header["part"] == [part.start, part.stop]:
-            found[number] = Block(path, part, header, _begin(len(text)))
+            found[number] = Block(path, part, header, _find_arrays_offset(len(text)))
     return found
 
 
-def _verified(path: Path) -> bytes:
+def _read_verified_header(path: Path) -> bytes:
     """Header of a block file; nothing when it is not there or its checksum is wrong."""
     try:
         with path.open("rb") as file:
@@ -180,30 +182,33 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
         dask arrays in the chunks of the file that will be written.
     """
     first = blocks[0].header
-    small = sum(block.path.stat().st_size for block in blocks) <= _SMALL
+    small = sum(block.path.stat().st_size for block in blocks) <= _MAX_MEMORY_BYTES
     variables: dict[str, xr.Variable] = {}
     maps = [np.memmap(block.path, mode="r") for block in blocks] if small else []
     for name, described in first["variables"].items():
-        dims, attrs = tuple(described["dims"]), _from_json(described["attrs"])
+        dims, attrs = tuple(described["dims"]), _decode_attributes(described["attrs"])
         if "time" not in dims:
-            data = _section(blocks[0], name)
+            data = _map_variable(blocks[0], name)
         elif small:
             data = np.concatenate(
-                [_part(mapped, block, name) for mapped, block in zip(maps, blocks, strict=True)],
+                [
+                    _slice_variable(mapped, block, name)
+                    for mapped, block in zip(maps, blocks, strict=True)
+                ],
                 axis=dims.index("time"),
             )
         elif name in first["coords"]:
             data = np.concatenate(
-                [_section(block, name) for block in blocks], axis=dims.index("time")
+                [_map_variable(block, name) for block in blocks], axis=dims.index("time")
             )
         else:
-            data = _lazily(blocks, name)
+            data = _make_lazy(blocks, name)
         variables[name] = xr.Variable(dims, data, attrs)
-    whole = xr.Dataset(variables, attrs=_from_json(first["attrs"]))
+    whole = xr.Dataset(variables, attrs=_decode_attributes(first["attrs"]))
     return whole.set_coords(first["coords"])
 
 
-def _part(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
+def _slice_variable(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
     """One variable of a block that is mapped as a whole."""
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
@@ -213,7 +218,7 @@ def _part(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
     )
 
 
-def _section(block: Block, name: str) -> NDArray[Any]:
+def _map_variable(block: Block, name: str) -> NDArray[Any]:
     """One variable of a block, mapped."""
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
@@ -224,7 +229,7 @@ def _section(block: Block, name: str) -> NDArray[Any]:
     )
 
 
-def _lazily(blocks: Sequence[Block], name: str) -> Any:
+def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
     """A variable along time as a dask array that reads the block files."""
     import dask.array as da
 
@@ -281,20 +286,20 @@ def _read_into(out: NDArray[Any], block: Block, name: str, place: Sequence[slice
         first = int(np.ravel_multi_index([one.start for one in place], shape)) * out.itemsize
         with block.path.open("rb", buffering=0) as file:
             file.seek(block.begin + block.header["variables"][name]["place"] + first)
-            if _fill(file, out.reshape(-1).view(np.uint8).data):
+            if _read_exactly(file, out.reshape(-1).view(np.uint8).data):
                 return
         raise OSError(f"{block.path}: is cut short")
-    out[...] = _section(block, name)[tuple(place)]
+    out[...] = _map_variable(block, name)[tuple(place)]
 
 
-def _fill(file: Any, view: memoryview) -> bool:
+def _read_exactly(file: Any, view: memoryview) -> bool:
     """Read until a piece of memory is full; False when the file ends before."""
     while view.nbytes and (count := file.readinto(view)):
         view = view[count:]
     return not view.nbytes
 
 
-def _to_json(attrs: Mapping[Any, Any]) -> dict[str, Any]:
+def _encode_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     """Attributes as JSON holds them; arrays and numpy scalars are marked, so that they come back as they were."""
     plain: dict[str, Any] = {}
     for name, value in attrs.items():
@@ -307,7 +312,7 @@ def _to_json(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     return plain
 
 
-def _from_json(plain: Mapping[str, Any]) -> dict[str, Any]:
+def _decode_attributes(plain: Mapping[str, Any]) -> dict[str, Any]:
     attrs: dict[str, Any] = {}
     for name, value in plain.items():
         marked = isinstance(value, dict) and value.keys() == {"dtype", "shape", "values"}

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.allan.summary import TermSummary, summarise_terms
 from gyrostab.errors import OutputError, SchemaError
-from gyrostab.jobs.run import load_log, samples_of
+from gyrostab.jobs.run import count_samples, load_log
 from gyrostab.progress import Stage, no_stage
 
 __all__ = ["find_parts", "format_summary", "run_demo", "sample_log", "summarise"]
@@ -174,16 +174,16 @@ def run_demo(
             log = load_log([sample_log()])
             parts = find_parts(log["vibration"])
             to_netcdf(log, temporary / "log.nc")
-            stage("computing", samples_of(log))
+            stage("computing", count_samples(log))
             product = fit_noise(davar(log, window=WINDOW, step=STEP)).compute()
             to_netcdf(product, temporary / "product.nc")
             stage("drawing", 0)
-            _draw(log, product, temporary)
+            _write_outputs(log, product, temporary)
             write_report(product, temporary / "report.html", log=log)
     return summarise(product, parts), [folder / name for name in FILES]
 
 
-def _draw(log: xr.Dataset, product: xr.Dataset, folder: Path) -> None:
+def _write_outputs(log: xr.Dataset, product: xr.Dataset, folder: Path) -> None:
     from gyrostab.plot import plot_coefficients, plot_davar, plot_davar_3d, plot_signal
     from gyrostab.plot.style import save_png
 

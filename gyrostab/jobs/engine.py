@@ -14,19 +14,19 @@ from gyrostab.allan.davar import davar_part
 from gyrostab.allan.fit import fit_part
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.jobs.checkpoint import Block, assemble, write_block
-from gyrostab.jobs.schedule import Pool, in_any_order
+from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.progress import Stage
 
-__all__ = ["Blocks", "compute_blocks", "compute_part", "share_constant", "write_blocks"]
+__all__ = ["Blocks", "compute_blocks", "compute_part", "find_constant_shares", "write_blocks"]
 
 #: Finished parts by their number.
 Blocks = dict[int, Block]
-_HELD_SECONDS, _HELD_BYTES = (
+_MAX_HELD_SECONDS, _MAX_HELD_BYTES = (
     1.0,
     2**26,
 )  # results wait so long at most until the inputs are looked at again
-_LOOKS = (
+_MIN_CHECK_INTERVAL_RATIO = (
     50  # and no longer than so many of the looks take: what has been written need not be at the end
 )
 
@@ -97,13 +97,13 @@ def compute_blocks(
     function, *arguments = call
     numbers = {parts[number].start: number for number in missing}
     try:
-        for done, result in in_any_order(
+        for done, result in run_calls(
             pool, ((function, *arguments, parts[number]) for number in missing)
         ):
             held.append((numbers[done[-1].start], result))
             if (
-                time.monotonic() - last > min(_HELD_SECONDS, _LOOKS * look)
-                or sum(one.nbytes for _, one in held) > _HELD_BYTES
+                time.monotonic() - last > min(_MAX_HELD_SECONDS, _MIN_CHECK_INTERVAL_RATIO * look)
+                or sum(one.nbytes for _, one in held) > _MAX_HELD_BYTES
             ):
                 keep()
     except BaseException as error:
@@ -157,7 +157,7 @@ def write_blocks(
     return whole
 
 
-def share_constant(product: xr.Dataset) -> dict[str, float]:
+def find_constant_shares(product: xr.Dataset) -> dict[str, float]:
     """Share of the windows in which an axis never moved: the Allan variance is zero at the shortest and the longest tau."""
     ends = product["avar"].isel(tau=[0, -1])
     still = (ends == 0.0).all("tau").mean("time").compute(scheduler="synchronous")

@@ -32,28 +32,28 @@ __all__ = [
     "begin_job",
     "check_job_folder",
     "clear_job",
+    "count_finished_parts",
+    "describe_differences",
     "describe_inputs",
-    "differences",
-    "digest",
-    "folder_of",
-    "hold",
-    "is_begun",
+    "has_finished_work",
+    "hash_fingerprint",
     "is_lock",
-    "kept_parts",
+    "job_folder",
+    "lock_job",
     "make_fingerprint",
     "read_job",
     "remove_damage",
     "remove_job",
-    "seal_store",
+    "write_store_checksum",
 ]
 
 _SCHEMA = "gyrostab.job/1"
 _JOB_FILE = re.compile(r"lock|job\.json|log\.zarr|log\.sha256|windows-\d{10}\.block")
-_STORE_SUM = "log.sha256"
-_SAID = 4  # differences that a message lists
+_STORE_CHECKSUM_FILE = "log.sha256"
+_MAX_DIFFERENCES = 4  # differences that a message lists
 
 
-def folder_of(output: Path) -> Path:
+def job_folder(output: Path) -> Path:
     """Folder of the run that makes `output`."""
     return output.with_name(f".{output.name}.job")
 
@@ -65,7 +65,7 @@ def check_job_folder(folder: Path) -> None:
     """
     if not os.path.lexists(folder):
         return
-    names = _names(folder) if folder.is_dir() and not folder.is_symlink() else [""]
+    names = _list_names(folder) if folder.is_dir() and not folder.is_symlink() else [""]
     foreign = [name for name in names if not (_JOB_FILE.fullmatch(name) or is_leftover(name))]
     if not foreign and names and not any(_is_marked(folder / name) for name in names):
         foreign = names
@@ -87,7 +87,7 @@ def _is_marked(path: Path) -> bool:
 
 
 def is_lock(path: Path) -> bool:
-    """Whether a file is a lock that `hold` has made."""
+    """Whether a file is a lock that `lock_job` has made."""
     start = _read_start(path, 8)
     return start is not None and b"process ".startswith(start)
 
@@ -107,7 +107,7 @@ def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
 
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:
     """All that the numbers of a product depend on: inputs in their order, options, versions and the machine's numbers."""
-    versions = {name: _version(name) for name in ("gyrostab", "numpy", "numba")}
+    versions = {name: _find_version(name) for name in ("gyrostab", "numpy", "numba")}
     return {
         "inputs": describe_inputs(paths),
         "options": json.loads(
@@ -124,14 +124,14 @@ def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[
     }
 
 
-def _version(name: str) -> str:
+def _find_version(name: str) -> str:
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return "unknown"
 
 
-def digest(fingerprint: Mapping[str, Any]) -> str:
+def hash_fingerprint(fingerprint: Mapping[str, Any]) -> str:
     """Short name of a fingerprint; where the inputs lie does not matter, but what they are called, their size and their time do."""
     inputs = [{**item, "path": os.path.basename(item["path"])} for item in fingerprint["inputs"]]
     return (
@@ -142,7 +142,7 @@ def digest(fingerprint: Mapping[str, Any]) -> str:
     )
 
 
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def describe_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """What differs between two fingerprints, in one line; empty when nothing does.
 
     Examples
@@ -152,20 +152,20 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     >>> differences(old, new)
     'run7/b.csv has changed: 100 bytes, was 120; window is 5min, was 10min'
     """
-    said = _input_differences(before["inputs"], now["inputs"])
+    said = _describe_input_changes(before["inputs"], now["inputs"])
     for kind in ("options", "versions"):
         old, new = before[kind], now[kind]
         said += [
-            f"{name} is {_option(new.get(name))}, was {_option(old.get(name))}"
+            f"{name} is {_format_option(new.get(name))}, was {_format_option(old.get(name))}"
             for name in {**old, **new}
             if old.get(name) != new.get(name)
         ]
-    return "; ".join(said[:_SAID]) + (
-        f"; and {len(said) - _SAID} more" if len(said) > _SAID else ""
+    return "; ".join(said[:_MAX_DIFFERENCES]) + (
+        f"; and {len(said) - _MAX_DIFFERENCES} more" if len(said) > _MAX_DIFFERENCES else ""
     )
 
 
-def _option(value: Any) -> str:
+def _format_option(value: Any) -> str:
     if value is None:
         return "not given"
     if isinstance(value, dict):
@@ -173,40 +173,44 @@ def _option(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _input_differences(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:
+def _describe_input_changes(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> list[str]:
     old, new = ({item["path"]: item for item in items} for items in (before, now))
-    said = [f"{_short(path)} is given now and was not before" for path in new if path not in old]
-    said += [f"{_short(path)} was given before and is not now" for path in old if path not in new]
+    said = [
+        f"{_shorten_path(path)} is given now and was not before" for path in new if path not in old
+    ]
+    said += [
+        f"{_shorten_path(path)} was given before and is not now" for path in old if path not in new
+    ]
     for path in [path for path in new if path in old and new[path] != old[path]]:
         size, was = new[path]["bytes"], old[path]["bytes"]
         if size is None:
-            said.append(f"{_short(path)} has vanished")
+            said.append(f"{_shorten_path(path)} has vanished")
         elif size != was:
             said.append(
-                f"{_short(path)} has changed: {size} bytes, was {'missing' if was is None else was}"
+                f"{_shorten_path(path)} has changed: {size} bytes, was {'missing' if was is None else was}"
             )
         elif new[path]["changed_ns"] != old[path]["changed_ns"]:
             said.append(
-                f"{_short(path)} has changed: written {_when(new[path])}, was {_when(old[path])}"
+                f"{_shorten_path(path)} has changed: written {_format_change_time(new[path])}, was {_format_change_time(old[path])}"
             )
         else:
-            said.append(f"{_short(path)} has changed: other files are in it")
+            said.append(f"{_shorten_path(path)} has changed: other files are in it")
     if not said and list(old) != list(new):
         said.append("the logs are given in another order")
     return said
 
 
-def _short(path: str) -> str:
+def _shorten_path(path: str) -> str:
     """Last folder and name of a file."""
     return os.path.join(*Path(path).parts[-2:])
 
 
-def _when(item: Mapping[str, Any]) -> str:
+def _format_change_time(item: Mapping[str, Any]) -> str:
     return f"{datetime.fromtimestamp(item['changed_ns'] / 1e9, UTC):%Y-%m-%dT%H:%M:%S.%f}Z"
 
 
 @contextlib.contextmanager
-def hold(folder: Path) -> Iterator[None]:
+def lock_job(folder: Path) -> Iterator[None]:
     """Be the only process that works in a job folder, which is made if it is not there.
 
     The lock belongs to the process and ends with it, however it ends.
@@ -226,7 +230,7 @@ def hold(folder: Path) -> Iterator[None]:
         with contextlib.suppress(FileNotFoundError):  # removed by the one who held it, just now
             handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
             try:
-                _lock(handle, folder)
+                _take_lock(handle, folder)
                 if not os.path.samestat(os.fstat(handle), os.stat(folder / "lock")):
                     raise FileNotFoundError
             except BaseException:
@@ -243,7 +247,7 @@ def hold(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _lock(handle: int, folder: Path) -> None:
+def _take_lock(handle: int, folder: Path) -> None:
     import fcntl
 
     try:
@@ -278,17 +282,17 @@ def begin_job(folder: Path, fingerprint: Mapping[str, Any], *, parts: int, overw
         )
 
 
-def seal_store(folder: Path) -> None:
+def write_store_checksum(folder: Path) -> None:
     """Write down the checksum of the store of the log in a job folder."""
-    with replace_file(folder / _STORE_SUM) as temporary:
+    with replace_file(folder / _STORE_CHECKSUM_FILE) as temporary:
         temporary.write_text(_hash_tree(folder / "log.zarr"), encoding="ascii")
 
 
 def remove_damage(folder: Path) -> None:
     """Remove from a job folder what a killed run left half written, and the store of the log where its checksum is wrong."""
-    for name in filter(is_leftover, _names(folder)):
-        _remove(folder / name)
-    store, seal = folder / "log.zarr", folder / _STORE_SUM
+    for name in filter(is_leftover, _list_names(folder)):
+        _remove_path(folder / name)
+    store, seal = folder / "log.zarr", folder / _STORE_CHECKSUM_FILE
     try:
         whole = seal.read_text(encoding="ascii") == _hash_tree(store)
     except (OSError, ValueError):
@@ -296,7 +300,7 @@ def remove_damage(folder: Path) -> None:
     if not whole:
         seal.unlink(missing_ok=True)
         if store.exists():
-            _remove(store)
+            _remove_path(store)
 
 
 def _hash_tree(folder: Path) -> str:
@@ -310,26 +314,26 @@ def _hash_tree(folder: Path) -> str:
     return total.hexdigest()
 
 
-def _remove(path: Path) -> None:
+def _remove_path(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
 
 
-def kept_parts(folder: Path) -> int:
+def count_finished_parts(folder: Path) -> int:
     """Count the finished parts in a job folder."""
-    return sum(name.endswith(".block") for name in _names(folder))
+    return sum(name.endswith(".block") for name in _list_names(folder))
 
 
-def is_begun(folder: Path) -> bool:
+def has_finished_work(folder: Path) -> bool:
     """Whether a job folder holds work that is worth keeping: finished parts, or a store of the log."""
     return (folder / "job.json").exists() and (
-        kept_parts(folder) > 0 or "log.zarr" in _names(folder)
+        count_finished_parts(folder) > 0 or "log.zarr" in _list_names(folder)
     )
 
 
-def _names(folder: Path) -> list[str]:
+def _list_names(folder: Path) -> list[str]:
     try:
         return os.listdir(folder)
     except FileNotFoundError:
@@ -339,9 +343,9 @@ def _names(folder: Path) -> list[str]:
 def clear_job(folder: Path) -> None:
     """Forget the work in a job folder; the lock stays."""
     (folder / "job.json").unlink(missing_ok=True)
-    for name in _names(folder):
+    for name in _list_names(folder):
         if name != "lock":
-            _remove(folder / name)
+            _remove_path(folder / name)
 
 
 def remove_job(folder: Path, *, output: Path) -> None:

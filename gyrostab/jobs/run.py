@@ -16,30 +16,36 @@ import xarray as xr
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
 from gyrostab.jobs.checkpoint import find_blocks
 from gyrostab.jobs.checks import check_windows
-from gyrostab.jobs.engine import Blocks, compute_blocks, compute_part, share_constant, write_blocks
+from gyrostab.jobs.engine import (
+    Blocks,
+    compute_blocks,
+    compute_part,
+    find_constant_shares,
+    write_blocks,
+)
 from gyrostab.jobs.job import (
     begin_job,
     check_job_folder,
     clear_job,
+    count_finished_parts,
+    describe_differences,
     describe_inputs,
-    differences,
-    digest,
-    folder_of,
-    hold,
-    is_begun,
-    kept_parts,
+    has_finished_work,
+    hash_fingerprint,
+    job_folder,
+    lock_job,
     make_fingerprint,
     read_job,
     remove_damage,
     remove_job,
-    seal_store,
+    write_store_checksum,
 )
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
 from gyrostab.progress import Stage, no_stage
 from gyrostab.store.output import check_output, protect_inputs, remove_leftovers, resolve_link
 
-__all__ = ["load_log", "run", "samples_of"]
+__all__ = ["count_samples", "load_log", "run"]
 
 
 def load_log(
@@ -86,7 +92,7 @@ def load_log(
             log, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits")
         )
         said = "; ".join(
-            f"{name}: {_said(value)}"
+            f"{name}: {_format_option(value)}"
             for name, value in reading.items()
             if value and name != "on_file"
         )
@@ -100,14 +106,14 @@ def load_log(
     return log
 
 
-def _said(value: Any) -> str:
+def _format_option(value: Any) -> str:
     """An option in one line."""
     if isinstance(value, Mapping):
         return ", ".join(f"{left}={right}" for left, right in value.items())
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-def samples_of(log: xr.Dataset) -> int:
+def count_samples(log: xr.Dataset) -> int:
     """Count the samples of a log over all its axes."""
     return int(log.sizes["axis"] * log.sizes["time"])
 
@@ -185,7 +191,7 @@ def run(
     check_windows(**options["windows"])
     with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
         check_output(output, suffixes=[".nc"], overwrite=True)
-        job = _describe(paths, resolve_link(output), options)
+        job = _describe_job(paths, resolve_link(output), options)
         check_job_folder(job.folder)
         pool = partial(open_pool, scheduler, workers=workers, files=job.files)
         _run_job(job, paths, pool, resume=resume, overwrite=overwrite, stage=stage)
@@ -203,7 +209,7 @@ class _Job(NamedTuple):
     options: dict[str, Any]
 
 
-class _Begun(NamedTuple):
+class _Progress(NamedTuple):
     """What there is of it already."""
 
     complete: bool
@@ -222,28 +228,28 @@ def _run_job(
 ) -> None:
     """Do what is missing of a job, as the only process that works on it."""
     blocks: Blocks = {}
-    with hold(job.folder):
+    with lock_job(job.folder):
         try:
-            begun = _look(job, resume=resume, overwrite=overwrite)
+            begun = _inspect_job(job, resume=resume, overwrite=overwrite)
             if begun.complete:
                 warnings.warn(f"{job.target} is complete already", stacklevel=2)
             else:
                 with open_workers() as pool:
-                    _compute(job, blocks, paths, begun=begun, pool=pool, stage=stage)
-                _write(job, blocks, overwrite=begun.overwrite, stage=stage)
+                    _compute_missing(job, blocks, paths, begun=begun, pool=pool, stage=stage)
+                _write_product(job, blocks, overwrite=begun.overwrite, stage=stage)
         except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(_kept(job, "interrupted")) from stop
+            raise KeyboardInterrupt(_add_resume_advice(job, "interrupted")) from stop
         except GyrostabError as error:
-            if is_begun(job.folder) and not isinstance(error, ResumeError):
-                raise type(error)(_kept(job, str(error))) from error
+            if has_finished_work(job.folder) and not isinstance(error, ResumeError):
+                raise type(error)(_add_resume_advice(job, str(error))) from error
             raise
         finally:
-            if not is_begun(job.folder):
+            if not has_finished_work(job.folder):
                 remove_job(job.folder, output=job.target)
         remove_job(job.folder, output=job.target)
 
 
-def _describe(paths: Sequence[str | Path], target: Path, options: dict[str, Any]) -> _Job:
+def _describe_job(paths: Sequence[str | Path], target: Path, options: dict[str, Any]) -> _Job:
     from gyrostab.ingest.files import expand
 
     extra = options["reading"].get("channel", ())
@@ -257,20 +263,22 @@ def _describe(paths: Sequence[str | Path], target: Path, options: dict[str, Any]
     fingerprint = make_fingerprint(
         files, {**plain, "fit": "left out" if options["fitting"] is None else None}
     )
-    return _Job(target, folder_of(target), files, fingerprint, digest(fingerprint), options)
+    return _Job(
+        target, job_folder(target), files, fingerprint, hash_fingerprint(fingerprint), options
+    )
 
 
-def _look(job: _Job, *, resume: bool, overwrite: bool) -> _Begun:
+def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
     """Find out how far the job is, and refuse what would destroy something or mix two jobs."""
-    before, kept = read_job(job.folder), is_begun(job.folder)
-    if resume and _made_by(job.target) == job.name:
-        return _Begun(complete=True, fresh=False, overwrite=False)
+    before, kept = read_job(job.folder), has_finished_work(job.folder)
+    if resume and _read_job_name(job.target) == job.name:
+        return _Progress(complete=True, fresh=False, overwrite=False)
     if before and kept and not (resume or overwrite):
         raise ResumeError(
-            _kept(job, f"{job.target}: a run of it was begun and not finished")
+            _add_resume_advice(job, f"{job.target}: a run of it was begun and not finished")
             + ", --overwrite starts anew"
         )
-    said = differences(before, job.fingerprint) if before else ""
+    said = describe_differences(before, job.fingerprint) if before else ""
     if resume and kept and said:
         raise ResumeError(
             f"{job.target}: the run that was begun cannot be continued, because {said}; put that back, "
@@ -284,10 +292,10 @@ def _look(job: _Job, *, resume: bool, overwrite: bool) -> _Begun:
             "give --overwrite to replace it, or another name with -o"
         )
     check_output(job.target, overwrite=overwrite)
-    return _Begun(complete=False, fresh=not again, overwrite=overwrite)
+    return _Progress(complete=False, fresh=not again, overwrite=overwrite)
 
 
-def _made_by(path: Path) -> str | None:
+def _read_job_name(path: Path) -> str | None:
     """Digest of the job that made a product; None for anything else."""
     if not path.is_file():
         return None
@@ -300,16 +308,16 @@ def _made_by(path: Path) -> str | None:
         return None
 
 
-def _kept(job: _Job, what: str) -> str:
+def _add_resume_advice(job: _Job, what: str) -> str:
     """A message with what is done and how to go on."""
-    kept, before = kept_parts(job.folder), read_job(job.folder)
-    if not before or not is_begun(job.folder):
+    kept, before = count_finished_parts(job.folder), read_job(job.folder)
+    if not before or not has_finished_work(job.folder):
         return f"{what}; nothing was written under the name of the output. Start the same command again."
     parts = before["parts"]
     return f"{what}; {kept} of {parts} parts ({kept / parts:.0%}) are kept, and the same command with --resume continues"
 
 
-def _is_log(path: Path) -> bool:
+def _is_own_log(path: Path) -> bool:
     """Whether a file is a log that gyrostab wrote, which every worker can open for itself."""
     from gyrostab.io.datasets import open_log
 
@@ -320,12 +328,12 @@ def _is_log(path: Path) -> bool:
     return True
 
 
-def _compute(
+def _compute_missing(
     job: _Job,
     blocks: Blocks,
     paths: Sequence[str | Path],
     *,
-    begun: _Begun,
+    begun: _Progress,
     pool: Pool,
     stage: Stage,
 ) -> None:
@@ -341,7 +349,7 @@ def _compute(
     remove_damage(job.folder)
     remove_leftovers(job.target)
     stage("reading", 0)
-    on_file = partial(_say_file, stage)
+    on_file = partial(_show_file, stage)
     log = load_log([store]) if store.exists() else load_log(paths, **reading, on_file=on_file)
     if "window" not in windows:
         windows = {**windows, "window": choose_window(log)}
@@ -363,22 +371,27 @@ def _compute(
             // parts[-1].stop,
         )
 
-    call: tuple[Any, ...] = (_part_of_log, log, Workspaces(), windows, fitting)
+    call: tuple[Any, ...] = (_compute_part_of_log, log, Workspaces(), windows, fitting)
     if pool.remote and len(blocks) < len(parts):
         source = {
             **reading,
-            "paths": _absolute(paths),
-            "channel": _absolute(reading.get("channel", ())),
+            "paths": _make_absolute(paths),
+            "channel": _make_absolute(reading.get("channel", ())),
         }
         if not store.exists() and not any(
-            map(_is_log, job.files)
+            map(_is_own_log, job.files)
         ):  # some may be damaged; the two kinds do not mix
             stage("storing", 0)
             to_zarr(log, store)
-            seal_store(job.folder)
+            write_store_checksum(job.folder)
         if store.exists():
-            source = {"paths": _absolute([store])}
-        call = (_part_of_files, pool.share(json.dumps(source, default=str)), windows, fitting)
+            source = {"paths": _make_absolute([store])}
+        call = (
+            _compute_part_of_files,
+            pool.share(json.dumps(source, default=str)),
+            windows,
+            fitting,
+        )
     advance(0)
     compute_blocks(
         job.folder,
@@ -392,21 +405,21 @@ def _compute(
     )
 
 
-def _say_file(stage: Stage, number: int, count: int, path: Path) -> None:
+def _show_file(stage: Stage, number: int, count: int, path: Path) -> None:
     stage("reading", count, number - 1, "files")
 
 
 def _check_inputs(job: _Job) -> None:
     now = {**job.fingerprint, "inputs": describe_inputs(job.files)}
-    if said := differences(job.fingerprint, now):
+    if said := describe_differences(job.fingerprint, now):
         raise FormatError(f"{said}; a log must not change while it is read: put it back")
 
 
-def _absolute(paths: Sequence[str | Path]) -> list[str]:
+def _make_absolute(paths: Sequence[str | Path]) -> list[str]:
     return [os.path.abspath(path) for path in paths]
 
 
-def _part_of_log(
+def _compute_part_of_log(
     log: xr.Dataset,
     spaces: Workspaces,
     windows: Mapping[str, Any],
@@ -416,27 +429,27 @@ def _part_of_log(
     return compute_part(log, part, windows, fitting, spaces.own)
 
 
-def _part_of_files(
+def _compute_part_of_files(
     source: str, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice
 ) -> xr.Dataset:
     """In another process: open the log there, once, so that only names travel."""
-    return compute_part(_opened(source), part, windows, fitting)
+    return compute_part(_open_once(source), part, windows, fitting)
 
 
 @lru_cache(maxsize=1)
-def _opened(source: str) -> xr.Dataset:
+def _open_once(source: str) -> xr.Dataset:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the process that sent us here has said it
         return load_log(**json.loads(source))
 
 
-def _write(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) -> None:
+def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) -> None:
     """Write the product, and warn of windows in which an axis never moved."""
     product = write_blocks(
         blocks, job.target, attrs={"gyrostab_job": job.name}, overwrite=overwrite, stage=stage
     )
     stage("checking", 0)
-    for axis, share in share_constant(product).items():
+    for axis, share in find_constant_shares(product).items():
         if share > 0.0:
             warnings.warn(
                 f"gyro axis {axis} is constant in {share:.0%} of the windows: is the sensor stuck, or its column a filler?",

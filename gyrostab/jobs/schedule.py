@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 
 from gyrostab.errors import GyrostabError, OptionError, WorkerError
 
-__all__ = ["Pool", "check_scheduler", "in_any_order", "open_pool"]
+__all__ = ["Pool", "check_scheduler", "open_pool", "run_calls"]
 
-_TIMEOUT = 20.0  # s, for a scheduler to answer and for a first worker to come
-_PATIENCE = 60.0  # s without any worker
+_CONNECT_TIMEOUT_S = 20.0  # s, for a scheduler to answer and for a first worker to come
+_NO_WORKER_TIMEOUT_S = 60.0  # s without any worker
 
 
 class Pool(NamedTuple):
@@ -110,18 +110,23 @@ def open_pool(
 
         count = workers or CPU_COUNT
         remote = scheduler == "processes"
-        executor = _processes(count) if remote else ThreadPoolExecutor(count)
+        executor = _start_processes(count) if remote else ThreadPoolExecutor(count)
         submit: Callable[..., Future[Any]] = executor.submit
         try:
-            yield Pool(partial(submit, _noted) if remote else submit, lambda: count, remote, _same)
+            yield Pool(
+                partial(submit, _call_with_warnings) if remote else submit,
+                lambda: count,
+                remote,
+                _identity,
+            )
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
     else:
-        with _cluster(scheduler, files) as pool:
+        with _connect_cluster(scheduler, files) as pool:
             yield pool
 
 
-def _processes(count: int) -> Any:
+def _start_processes(count: int) -> Any:
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
@@ -148,37 +153,37 @@ def _begin_process(parent: int) -> None:
     )  # the parent opens the same files and says the same
 
 
-class _Noted(NamedTuple):
+class _ResultWithWarnings(NamedTuple):
     """What a call in another process gave, and what it warned of."""
 
     result: Any
     notes: list[str]
 
 
-def _noted(function: Callable[..., Any], *arguments: Any) -> _Noted:
+def _call_with_warnings(function: Callable[..., Any], *arguments: Any) -> _ResultWithWarnings:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", UserWarning)
         result = function(*arguments)
-    return _Noted(result, [str(one.message) for one in caught])
+    return _ResultWithWarnings(result, [str(one.message) for one in caught])
 
 
 @contextlib.contextmanager
-def _cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
+def _connect_cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
     try:
         from distributed import Client
     except ImportError:
         advice = "install it with pip install 'gyrostab[distributed]'"
         raise OptionError(f"--scheduler {address}: this needs dask.distributed; {advice}") from None
     try:
-        client = Client(address, timeout=_TIMEOUT, set_as_default=False, name="gyrostab")
+        client = Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False, name="gyrostab")
     except (OSError, ValueError, TimeoutError) as error:
         raise WorkerError(
             f"--scheduler {address}: no dask scheduler answers there ({error}); start one with 'dask scheduler', or correct the address"
         ) from error
     with contextlib.closing(client):
         try:
-            client.wait_for_workers(1, timeout=_TIMEOUT)
+            client.wait_for_workers(1, timeout=_CONNECT_TIMEOUT_S)
         except TimeoutError as error:
             raise WorkerError(
                 f"--scheduler {address}: the scheduler has no workers; start some with 'dask worker {address} --nthreads 1'"
@@ -191,7 +196,7 @@ def _cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
                 partial(reach, executor.submit),
                 lambda: sum(reach(client.nthreads).values()),
                 True,
-                partial(reach, client.submit, _same, pure=False),
+                partial(reach, client.submit, _identity, pure=False),
             )
         finally:
             executor.shutdown(wait=False)
@@ -214,14 +219,14 @@ def _describe_loss(address: str, error: BaseException) -> str:
     )
 
 
-def _same(value: Any) -> Any:
+def _identity(value: Any) -> Any:
     return value
 
 
 def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
     """Let every worker look for the files; a worker elsewhere has another disk, and another gyrostab perhaps."""
-    sizes = {os.path.abspath(path): _size(path) for path in files}
-    found = _reach_scheduler(address, client.run, _look, list(sizes), on_error="return")
+    sizes = {os.path.abspath(path): _find_size(path) for path in files}
+    found = _reach_scheduler(address, client.run, _inspect_files, list(sizes), on_error="return")
     from gyrostab import __version__
 
     for worker, answer in found.items():
@@ -245,13 +250,13 @@ def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
                 )
 
 
-def _look(paths: Sequence[str]) -> tuple[str, dict[str, int | None]]:
+def _inspect_files(paths: Sequence[str]) -> tuple[str, dict[str, int | None]]:
     from gyrostab import __version__
 
-    return __version__, {path: _size(path) for path in paths}
+    return __version__, {path: _find_size(path) for path in paths}
 
 
-def _size(path: str | Path) -> int | None:
+def _find_size(path: str | Path) -> int | None:
     """Size of a file; of a directory only that it is there; None when nothing is."""
     try:
         return 0 if os.path.isdir(path) else os.stat(path).st_size
@@ -259,7 +264,7 @@ def _size(path: str | Path) -> int | None:
         return None
 
 
-def in_any_order(
+def run_calls(
     pool: Pool, calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """Make calls side by side, few more at a time than can run, and give each back with its result as it comes.
@@ -293,21 +298,21 @@ def in_any_order(
             done, _ = wait(waiting, timeout=1.0, return_when=FIRST_COMPLETED)
             if done or pool.width():
                 idle_since = time.monotonic()
-            elif time.monotonic() - idle_since > _PATIENCE:
+            elif time.monotonic() - idle_since > _NO_WORKER_TIMEOUT_S:
                 raise WorkerError(
-                    f"the scheduler has had no worker for {_PATIENCE:.0f} s; start workers again"
+                    f"the scheduler has had no worker for {_NO_WORKER_TIMEOUT_S:.0f} s; start workers again"
                 )
             for future in done:
-                yield waiting.pop(future), _result(future)
+                yield waiting.pop(future), _unpack_result(future)
     finally:
         for future in waiting:
             future.cancel()
 
 
-def _result(future: Future[Any]) -> Any:
+def _unpack_result(future: Future[Any]) -> Any:
     try:
         found = future.result()
-        if not isinstance(found, _Noted):
+        if not isinstance(found, _ResultWithWarnings):
             return found
         for note in found.notes:
             warnings.warn(note, stacklevel=2)

@@ -53,7 +53,7 @@ def write_diagnosis(
     with new_output(directory, overwrite=overwrite, find_foreign=find_foreign_file) as temporary:
         (temporary / "diagnosis.json").write_text(diagnosis.to_json(), encoding="utf-8")
         (temporary / "model.toml").write_text(
-            model_text(diagnosis.model, heading=_heading(diagnosis)), encoding="utf-8"
+            model_text(diagnosis.model, heading=_make_heading(diagnosis)), encoding="utf-8"
         )
         to_netcdf(diagnosis.surfaces, temporary / "diagnosis.nc")
         write_diagnosis_report(diagnosis, temporary / "report.html")
@@ -86,7 +86,7 @@ def _is_plain_file(path: Path) -> bool:
     return path.is_file() and not path.is_symlink()
 
 
-def _heading(diagnosis: Diagnosis) -> str:
+def _make_heading(diagnosis: Diagnosis) -> str:
     files = (
         ", ".join(Path(name).name for name in diagnosis.content["recording"]["files"])
         or "the recording"

@@ -15,7 +15,7 @@ __all__ = ["TAUS", "averaging_factors", "duration_seconds", "is_bare_number", "s
 
 #: What averaging times may be, for messages.
 TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
-_SAMPLES = re.compile(r"^\s*(\d+)\s*samples?\s*$")
+_SAMPLE_COUNT = re.compile(r"^\s*(\d+)\s*samples?\s*$")
 _NUMBER = re.compile(r"^\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
 
 
@@ -82,7 +82,7 @@ def samples(value: Any, rate: float, option: str) -> int:
         raise OptionError(
             f"{option} {text} has no unit; write '{text}s' for seconds or '{text}samples' for samples"
         )
-    match = _SAMPLES.match(value) if isinstance(value, str) else None
+    match = _SAMPLE_COUNT.match(value) if isinstance(value, str) else None
     if match:
         count = int(match.group(1))
         if count < 1:

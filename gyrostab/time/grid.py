@@ -114,7 +114,7 @@ def stamp_ns(start: Any, what: str = "start") -> int:
         return int(start)
     try:
         if isinstance(start, str):
-            stamp = _text_ns(start)
+            stamp = _parse_stamp_ns(start)
         else:
             time = pd.Timestamp(start)
             if pd.isna(time):
@@ -168,7 +168,7 @@ def check_span(start: int, rate: float, size: int, where: str) -> None:
         )
 
 
-def _text_ns(text: str) -> int:
+def _parse_stamp_ns(text: str) -> int:
     fields = split_instant(text)
     if fields is None:
         raise ValueError("the year does not come first, with four digits")

@@ -388,11 +388,11 @@ def test_overwrite_forgets_what_was_there(small, tmp_path, monkeypatch):
 
 
 def test_only_one_run_works_in_a_folder(small, tmp_path):
-    from gyrostab.jobs.job import hold
+    from gyrostab.jobs.job import lock_job
 
     (tmp_path / "proof").mkdir()
     code = f"import gyrostab; gyrostab.prove({str(tmp_path / 'proof')!r}, cases=1, seed=1)"
-    with hold(tmp_path / "proof"):
+    with lock_job(tmp_path / "proof"):
         done = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, timeout=60
         )

@@ -223,10 +223,10 @@ def test_commands_take_them(files, tmp_path, capsys):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_run_is_not_continued_with_another_part(files, tmp_path):
-    from gyrostab.jobs.run import _describe
+    from gyrostab.jobs.run import _describe_job
 
     names = {
-        _describe(
+        _describe_job(
             files["own"], tmp_path / "p.nc", {"reading": r, "windows": {}, "fitting": {}}
         ).name
         for r in ({}, {"time_from": "1min"}, {"exclude": ["1s/2s"]})

@@ -24,7 +24,7 @@ from gyrostab.errors import OptionError, WorkerError
 from gyrostab.io.datasets import open_log
 from gyrostab.jobs import checkpoint, engine
 from gyrostab.jobs.run import run
-from gyrostab.jobs.schedule import Pool, check_scheduler, in_any_order, open_pool
+from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.xdist_group("distributed")
@@ -195,7 +195,7 @@ def test_a_killed_worker_does_not_lose_the_run(address, log, whole, tmp_path, mo
         return checkpoint.write_block(*arguments, **options)
 
     monkeypatch.setattr(engine, "write_block", write)
-    monkeypatch.setattr(engine, "_HELD_SECONDS", 0.0)
+    monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
     run([log], tmp_path / "product.nc", windows=WINDOW, scheduler=address)
     assert killed
     assert (tmp_path / "product.nc").read_bytes() == whole
@@ -211,14 +211,14 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
                 sent.append(len(pickle.dumps(call)))
                 yield call
 
-        return in_any_order(pool, watched())
+        return run_calls(pool, watched())
 
     @contextmanager
     def elsewhere(*arguments, **options):
         with ThreadPoolExecutor(1) as executor:
             yield Pool(executor.submit, lambda: 1, True, lambda value: value)
 
-    monkeypatch.setattr(engine, "in_any_order", spy)
+    monkeypatch.setattr(engine, "run_calls", spy)
     monkeypatch.setattr("gyrostab.jobs.run.open_pool", elsewhere)
     sizes = {}
     for samples in (130_000, 1_270_000):
@@ -236,7 +236,7 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
 
 
 def test_no_scheduler_there(log, tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr("gyrostab.jobs.schedule._TIMEOUT", 1.0)
+    monkeypatch.setattr("gyrostab.jobs.schedule._CONNECT_TIMEOUT_S", 1.0)
     arguments = [
         "run",
         str(log),
@@ -266,15 +266,15 @@ def _open(address: str, path: Path) -> None:
     """Pretend that the file is there, as it is on another machine's disk."""
     from gyrostab.jobs import schedule
 
-    real = schedule._size
+    real = schedule._find_size
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(schedule, "_size", lambda name: 100 if Path(name) == path else real(name))
+        patch.setattr(schedule, "_find_size", lambda name: 100 if Path(name) == path else real(name))
         with open_pool(address, files=[path]):
             pass
 
 
 def test_a_scheduler_without_workers(monkeypatch):
-    monkeypatch.setattr("gyrostab.jobs.schedule._TIMEOUT", 3.0)
+    monkeypatch.setattr("gyrostab.jobs.schedule._CONNECT_TIMEOUT_S", 3.0)
     cluster = distributed.LocalCluster(
         n_workers=0, dashboard_address=":0", processes=True, silence_logs=50
     )
@@ -355,7 +355,7 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
             return checkpoint.write_block(*arguments, **given)
 
         monkeypatch.setattr(engine, "write_block", write)
-        monkeypatch.setattr(engine, "_HELD_SECONDS", 0.0)
+        monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
         begun = time.monotonic()
         assert main(["run", str(log), "-o", str(output), "--scheduler", found, *options]) == 2
         assert time.monotonic() - begun < 60
@@ -385,7 +385,7 @@ def test_a_worker_process_that_dies_is_explained():
         open_pool("processes", workers=1) as pool,
         pytest.raises(WorkerError, match="a worker process has died"),
     ):
-        list(in_any_order(pool, [(os._exit, 3)]))
+        list(run_calls(pool, [(os._exit, 3)]))
 
 
 def test_a_part_that_kills_every_worker_is_explained(address):
@@ -393,7 +393,7 @@ def test_a_part_that_kills_every_worker_is_explained(address):
         open_pool(address) as pool,
         pytest.raises(WorkerError, match="died again and again on the same part"),
     ):
-        list(in_any_order(pool, [(os._exit, 3)]))
+        list(run_calls(pool, [(os._exit, 3)]))
 
 
 def test_worker_processes_end_with_a_killed_parent(tmp_path):

@@ -16,7 +16,7 @@ from gyrostab.jobs.job import (
     make_fingerprint,
     read_job,
     remove_damage,
-    seal_store,
+    write_store_checksum,
 )
 
 
@@ -43,7 +43,7 @@ def test_a_flipped_bit_in_the_description_of_a_run_is_noticed(tmp_path):
 def test_a_damaged_store_of_a_run_is_removed(tmp_path, damage):
     store = to_zarr(make_log(np.arange(100.0)[None], rate=1.0, unit="deg/h"), tmp_path / "log.zarr")
     if damage != "never sealed":
-        seal_store(tmp_path)
+        write_store_checksum(tmp_path)
     chunk = store / "rate" / "0.0"
     content = chunk.read_bytes()
     if damage == "flipped":

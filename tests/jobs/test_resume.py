@@ -20,7 +20,7 @@ from gyrostab.allan.davar import davar_part, davar_parts
 from gyrostab.cli import main
 from gyrostab.io.datasets import open_log
 from gyrostab.jobs import checkpoint, engine
-from gyrostab.jobs.job import folder_of, hold
+from gyrostab.jobs.job import job_folder, lock_job
 from gyrostab.time.grid import time_coordinate
 from tests.support.crashing import WINDOW
 
@@ -93,7 +93,7 @@ def after_two(monkeypatch):
             return done[-1]
 
         monkeypatch.setattr(engine, "write_block", write)
-        monkeypatch.setattr(engine, "_HELD_SECONDS", 0.0)
+        monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
 
     return plan
 
@@ -225,7 +225,7 @@ def test_without_resume_an_unfinished_run_is_not_touched(stopped, log, whole, co
 
 @pytest.mark.parametrize("damage", ["altered", "cut", "empty"])
 def test_a_damaged_block_is_computed_again(stopped, log, whole, computed, damage):
-    block = sorted(folder_of(stopped).glob("*.block"))[0]
+    block = sorted(job_folder(stopped).glob("*.block"))[0]
     content = bytearray(block.read_bytes())
     content[len(content) // 2] ^= 1
     block.write_bytes({"altered": bytes(content), "cut": content[:-40], "empty": b""}[damage])
@@ -304,25 +304,25 @@ def test_changes_refuse_to_resume_and_say_what(log, tmp_path, after_two, monkeyp
     own.write_bytes(log.read_bytes())
     os.utime(own, ns=(stamp, stamp))
     with monkeypatch.context() as patch:
-        patch.setattr("gyrostab.jobs.job._version", lambda name: "9.9.9")
+        patch.setattr("gyrostab.jobs.job._find_version", lambda name: "9.9.9")
         refused(expected="gyrostab is 9.9.9, was ")
     assert call(own, "-o", output, "--resume") == 0
 
 
 def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
     from gyrostab import to_zarr
-    from gyrostab.jobs.job import differences, make_fingerprint
+    from gyrostab.jobs.job import describe_differences, make_fingerprint
 
     store = to_zarr(open_log(log), tmp_path / "run7.zarr")
     before = make_fingerprint([store], {})
-    assert differences(before, make_fingerprint([store], {})) == ""
+    assert describe_differences(before, make_fingerprint([store], {})) == ""
     chunk = next(
         path for path in sorted((store / "rate").iterdir()) if not path.name.startswith(".")
     )
     while chunk.is_dir():
         chunk = next(chunk.iterdir())
     _touched(chunk)
-    assert "run7.zarr has changed" in differences(before, make_fingerprint([store], {}))
+    assert "run7.zarr has changed" in describe_differences(before, make_fingerprint([store], {}))
 
 
 def test_an_input_that_vanishes_meanwhile(
@@ -332,7 +332,7 @@ def test_an_input_that_vanishes_meanwhile(
     own.write_bytes(log.read_bytes())
     os.utime(own, ns=(log.stat().st_atime_ns, log.stat().st_mtime_ns))
     output = tmp_path / "product.nc"
-    monkeypatch.setattr(engine, "_HELD_SECONDS", 0.0)
+    monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
     after_two(lambda: own.rename(aside))
     assert call(own, "-o", output, "--workers", 1) == 2
     message = one_message(capfd.readouterr())
@@ -412,7 +412,7 @@ def test_no_room_for_the_product(log, whole, tmp_path, monkeypatch, free_again, 
 
 def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
     output = tmp_path / "product.nc"
-    with hold(folder_of(output)):
+    with lock_job(job_folder(output)):
         assert call(log, "-o", output) == 2
         message = one_message(capfd.readouterr())
         assert f"process {os.getpid()}" in message

@@ -216,7 +216,7 @@ def test_a_large_product_is_that_of_the_small_way(tmp_path, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run(paths, tmp_path / "small.nc", windows=WINDOW)
-        monkeypatch.setattr(checkpoint, "_SMALL", 0)
+        monkeypatch.setattr(checkpoint, "_MAX_MEMORY_BYTES", 0)
         run(paths, tmp_path / "large.nc", windows=WINDOW)
     small, large = (
         open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False)
@@ -228,7 +228,7 @@ def test_a_large_product_is_that_of_the_small_way(tmp_path, monkeypatch):
 def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_path, monkeypatch):
     """Every read of their blocks by dask would be one of the tasks that are named after the job."""
     paths, asked = stored_logs(tmp_path, "zarr"), []
-    lazily = checkpoint._lazily
+    lazily = checkpoint._make_lazy
 
     def watched(blocks, name):
         found = lazily(blocks, name)
@@ -237,13 +237,13 @@ def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_pat
         )
         return with_box_reader(seen, found.gyrostab_box_reader)
 
-    monkeypatch.setattr(checkpoint, "_SMALL", 0)
-    monkeypatch.setattr(checkpoint, "_lazily", watched)
+    monkeypatch.setattr(checkpoint, "_MAX_MEMORY_BYTES", 0)
+    monkeypatch.setattr(checkpoint, "_make_lazy", watched)
     monkeypatch.setattr(netcdf_compression, "_MIN_PARALLEL_VALUES", 1000)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run(paths, tmp_path / "large.nc", windows=WINDOW)
-        monkeypatch.setattr(checkpoint, "_SMALL", 2**30)
+        monkeypatch.setattr(checkpoint, "_MAX_MEMORY_BYTES", 2**30)
         run(paths, tmp_path / "small.nc", windows=WINDOW)
     small, large = (
         open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False)
@@ -266,7 +266,7 @@ def test_a_part_of_a_variable_in_blocks_is_that_of_the_whole(tmp_path):
             coords={"time": np.arange(begin, end)},
         )
         blocks.append(checkpoint.write_block(tmp_path, slice(begin, end), part, job="j"))
-    array = checkpoint._lazily(blocks, "avar")
+    array = checkpoint._make_lazy(blocks, "avar")
     np.testing.assert_array_equal(array.compute(), cube)
     for _ in range(200):
         place = tuple(

@@ -107,7 +107,7 @@ def prove(
     >>> proof = gyrostab.prove("proof", cases=20)                                                         # doctest: +SKIP
     >>> print(proof.table)                                                                                # doctest: +SKIP
     """
-    from gyrostab.jobs.job import hold
+    from gyrostab.jobs.job import lock_job
     from gyrostab.progress import no_stage
 
     folder, stage, tell = resolve_link(directory), progress or no_stage, say or (lambda text: None)
@@ -115,7 +115,7 @@ def prove(
     fresh = {**_USUAL, "seed": TUNING + secrets.randbelow(10**9), "salted": salted}
     wanted = {"cases": cases, "seed": seed, "nulls": nulls}
     look(folder, wanted, fresh, resume=resume, overwrite=overwrite)
-    with hold(folder):
+    with lock_job(folder):
         job = begin(folder, wanted, fresh, resume=resume, overwrite=overwrite)
         tell(_opening(job, folder))
         number = (

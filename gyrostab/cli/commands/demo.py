@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gyrostab.cli.frame import Output, app, work
+from gyrostab.cli.frame import Output, app, show_stages
 from gyrostab.cli.options import Common
 
 __all__ = ["demo"]
@@ -26,7 +26,7 @@ def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -
     """
     from gyrostab.jobs.demo import format_summary, run_demo
 
-    with work(common) as stage:
+    with show_stages(common) as stage:
         summary, files = run_demo(output, overwrite=common.overwrite, stage=stage)
     print(format_summary(summary))
     print("\nwritten:", *(f"  {file}" for file in files), sep="\n")

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from gyrostab.cli.frame import app, work
+from gyrostab.cli.frame import app, show_stages
 from gyrostab.cli.options import Common, Reading
 
 __all__ = ["diagnose"]
@@ -67,7 +67,7 @@ def diagnose(
 
     check_output(output, overwrite=common.overwrite, find_foreign=find_foreign_file)
     spans = [parse_quiescent_span(text) for text in quiet or ()]
-    with work(common) as stage:
+    with show_stages(common) as stage:
         stage("reading", 0)
         log = load_log(recording, **reading.options())
         expected = (

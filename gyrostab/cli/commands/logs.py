@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from gyrostab.cli.frame import Logs, Output, app, work
+from gyrostab.cli.frame import Logs, Output, app, show_stages
 from gyrostab.cli.options import Common, Reading
 from gyrostab.errors import FormatError, OptionError
 
@@ -76,7 +76,7 @@ def ingest(
         h5netcdf do not read it (default: zlib).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
-    from gyrostab.jobs.run import load_log, samples_of
+    from gyrostab.jobs.run import count_samples, load_log
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
@@ -85,10 +85,10 @@ def ingest(
         raise OptionError(
             f"--compression {compression} is for NetCDF, and {output} is Zarr; leave it out"
         )
-    with work(common) as stage:
+    with show_stages(common) as stage:
         stage("reading", 0)
         log = load_log(logs, **reading.options())
-        samples = samples_of(log)
+        samples = count_samples(log)
         stage("writing", samples)
 
         def tell(share: float) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from gyrostab.cli.frame import Output, Product, app, work
+from gyrostab.cli.frame import Output, Product, app, show_stages
 from gyrostab.cli.options import ChannelFile, Common
 from gyrostab.errors import OptionError
 
@@ -42,7 +42,7 @@ def report(
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite)
-    with work(common) as stage:
+    with show_stages(common) as stage:
         stage("drawing", 0)
         if product.is_dir() and (product / "diagnosis.json").exists():
             if log is not None:
@@ -102,7 +102,7 @@ def correlate(
     picture = (
         check_output(target.with_suffix(".png"), overwrite=common.overwrite) if target else None
     )
-    with work(common) as stage:
+    with show_stages(common) as stage:
         stage("correlating", 0)
         dataset = open_product(product)
         found = compute(
@@ -139,7 +139,7 @@ def plot(
     from gyrostab.io.datasets import open_product
     from gyrostab.plot.figures import save_figures
 
-    with work(common) as stage:
+    with show_stages(common) as stage:
         stage("drawing", 0)
         files = save_figures(open_product(product), output, overwrite=common.overwrite)
     print(*files, sep="\n")
@@ -177,7 +177,7 @@ def export(
     }
     write, suffixes = writers[format]
     target = check_output(output, suffixes=suffixes, overwrite=common.overwrite)
-    with work(common) as stage:
+    with show_stages(common) as stage:
         stage("writing", 0)
         write(open_product(product), target, overwrite=common.overwrite)
     print(target)

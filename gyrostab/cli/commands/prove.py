@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from gyrostab.cli.frame import app, work
+from gyrostab.cli.frame import app, show_stages
 from gyrostab.cli.options import Common, Flag
 from gyrostab.units import HOUR
 
@@ -70,7 +70,7 @@ def prove(
             file=sys.stderr,
         )
     try:
-        with work(common) as stage, _lines(stage, quiet=common.quiet_progress) as told:
+        with show_stages(common) as stage, _lines(stage, quiet=common.quiet_progress) as told:
             proof = run_benchmark(
                 output,
                 cases=cases,

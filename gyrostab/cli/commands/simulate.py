@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gyrostab.cli.frame import Output, app, work
+from gyrostab.cli.frame import Output, app, show_stages
 from gyrostab.cli.options import Common, Reading
 from gyrostab.errors import OptionError
 
@@ -49,12 +49,12 @@ def simulate(
         effects (default: the model's, or 0).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
-    from gyrostab.jobs.run import load_log, samples_of
+    from gyrostab.jobs.run import count_samples, load_log
     from gyrostab.simulate import simulate as make
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc", ".zarr"], overwrite=common.overwrite)
-    with work(common) as stage:
+    with show_stages(common) as stage:
         stage("reading", 0)
         if like:
             log = make(
@@ -66,7 +66,7 @@ def simulate(
                     "--from, --to and --exclude cut the recording of --like; give that recording too, or --duration"
                 )
             log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
-        stage("simulating", samples_of(log))
+        stage("simulating", count_samples(log))
         write = to_zarr if target.suffix.lower() == ".zarr" else to_netcdf
         write(log, target, overwrite=common.overwrite)
     print(target)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from gyrostab.cli.frame import Logs, Output, app, work
+from gyrostab.cli.frame import Logs, Output, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Reading, Running, Windows
 
 __all__ = ["davar", "fit", "run"]
@@ -38,7 +38,7 @@ def run(
     output
         NetCDF file to write.
     """
-    target = _job(logs, output, windows, reading, running, common, fitting=fitting.options())
+    target = _run_job(logs, output, windows, reading, running, common, fitting=fitting.options())
     _print_product(target)
 
 
@@ -64,7 +64,7 @@ def davar(
     output
         NetCDF file to write.
     """
-    print(_job(logs, output, windows, reading, running, common, surface_only=True))
+    print(_run_job(logs, output, windows, reading, running, common, surface_only=True))
 
 
 @app.command(sort_key=5, help_epilogue="")
@@ -92,7 +92,7 @@ def fit(
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".nc"], overwrite=common.overwrite)
-    with work(common) as stage:
+    with show_stages(common) as stage:
         stage("fitting", 0)
         to_netcdf(
             fit_noise(open_surface(surface), **fitting.options()),
@@ -117,7 +117,7 @@ def _print_product(target: Path) -> None:
     print(target)
 
 
-def _job(
+def _run_job(
     logs: list[Path],
     output: Path,
     windows: Windows,
@@ -129,7 +129,7 @@ def _job(
     """Run the main job with what all its commands let the user choose."""
     from gyrostab.jobs.run import run as run_job
 
-    with work(common) as stage:
+    with show_stages(common) as stage:
         return run_job(
             logs,
             output,

@@ -249,9 +249,7 @@ def kill_commands(inputs: Path, top: Path, seed: int, kills: int) -> dict[str, o
         killed = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -9
         landed += killed
         try:
-            check_tree(
-                folder, before, name, done=not killed, killed=killed, is_yaml="yaml" in name
-            )
+            check_tree(folder, before, name, done=not killed, killed=killed, is_yaml="yaml" in name)
         except AssertionError as error:
             wrong.append(f"{command} -o {name}, killed before call {moment}: {error}")
     return {"kills": landed, "wrong": wrong}

@@ -12,7 +12,7 @@ import xarray as xr
 
 from gyrostab import davar, fit_noise, make_log, open_log, to_netcdf, to_zarr
 from gyrostab.errors import GyrostabError, OptionError, OutputError
-from gyrostab.jobs.job import folder_of
+from gyrostab.jobs.job import job_folder
 from gyrostab.jobs.run import run
 from gyrostab.store.output import (
     check_output,
@@ -414,7 +414,7 @@ def test_a_benchmark_replaces_a_benchmark_only(folder, capfd):
 )
 @pytest.mark.parametrize("option", ["--overwrite", "--resume"])
 def test_a_folder_with_the_name_of_a_job_is_left_alone(folder, content, option, capfd):
-    job = folder_of(folder / "out.nc")
+    job = job_folder(folder / "out.nc")
     if content is None:
         job.write_text("a file")
     else:
