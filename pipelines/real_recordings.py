@@ -1,8 +1,9 @@
-"""Take every recording of real_recordings.toml through gyrostab, and write what is found there as a page."""
+"""Process every recording of real_recordings.toml and write docs/real-recordings.md."""
 
 import os
 import shlex
 import tempfile
+import textwrap
 import tomllib
 from pathlib import Path
 
@@ -19,7 +20,7 @@ ROOT, PLAN = (
 
 
 def pick(value, log, product):
-    """Pick numbers of the log or the product: by name, axis, averaging time, stretch of time, level of a channel."""
+    """Select numbers by name, axis, averaging time, time and level of a channel."""
     if value["of"] == "gaps":
         return gyrostab.gap_table(log).loc[
             lambda gaps: gaps["cause"] == value["cause"], value["column"]
@@ -49,7 +50,7 @@ def pick(value, log, product):
 
 
 def examine(entry, file):
-    """Go from the log to a product on disk and back, and compute every number that the text speaks of."""
+    """Compute the product, write and open it, and compute every number that the text uses."""
     log = gyrostab.regularise(gyrostab.read_log(entry["files"], **entry["read"]))
     product = gyrostab.fit_noise(gyrostab.davar(log, **entry["davar"]), **entry.get("fit", {}))
     product = gyrostab.open_product(gyrostab.to_netcdf(product, file)).load()
@@ -72,7 +73,7 @@ def examine(entry, file):
 
 
 def refusal(entry):
-    """Tell what gyrostab answers when it is told nothing about the log."""
+    """Return what gyrostab answers without any option."""
     try:
         return f"{gyrostab.read_log(entry['files']).sizes['row']} rows"
     except gyrostab.errors.GyrostabError as error:
@@ -80,7 +81,7 @@ def refusal(entry):
 
 
 def command(entry):
-    """Write the same job as a line for the shell."""
+    """Write the same job as a shell command."""
     words = ["gyrostab", "run", *entry["files"], "-o", "product.nc"]
     fit = {
         option.replace("tau_min", "fit_from"): given
@@ -97,7 +98,7 @@ def command(entry):
 
 
 def describe(name, entry, folder):
-    """Process one recording; a row of the table, a section of the page, and what follows temperature."""
+    """Process one recording: its table row, its section, and its rows of the temperature table."""
     log, product, found = examine(entry, Path(folder, f"{name}.nc"))
     notes = "".join(
         f"- {note}\n"
@@ -139,6 +140,23 @@ def describe(name, entry, folder):
     )
 
 
+def wrap(page):
+    """Break paragraphs and list items at 120 columns, but no tables, commands or quotes."""
+    fixed = ("|", "    ", "#", ">", "!")
+    return "\n".join(
+        line
+        if line.startswith(fixed)
+        else textwrap.fill(
+            line,
+            width=120,
+            subsequent_indent="  " if line.startswith("- ") else "",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        for line in page.split("\n")
+    )
+
+
 if __name__ == "__main__":
     os.chdir(os.environ.get("GYROSTAB_RECORDINGS", ROOT.parent / "shared" / "recordings"))
     with tempfile.TemporaryDirectory() as folder:
@@ -147,5 +165,5 @@ if __name__ == "__main__":
             strict=True,
         )
     (ROOT / "docs" / "real-recordings.md").write_text(
-        PLAN["page"]["head"].format(*map("".join, parts)), encoding="utf-8"
+        wrap(PLAN["page"]["head"].format(*map("".join, parts))), encoding="utf-8"
     )

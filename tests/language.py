@@ -1,11 +1,14 @@
 """Find wording that the glossary replaces, in prose and in names.
 
-    python -m tests.language [PATH ...]        every finding as FILE:LINE: text; exit code 1 if there is one
+    python -m tests.language [PATH ...]
 
-The script reads the comments, docstrings and messages of Python files, Markdown pages, HTML templates and the comments of TOML files, and
-the names of functions and classes. It skips code: text in backticks, doctest lines, code blocks, replacement fields of f-strings. Each
-pattern is a phrase that is seldom plain English, or an old name of a thing that docs/glossary.md now names otherwise. `ALLOWED` lists
-the exceptions with their reasons.
+It prints each finding as FILE:LINE: text, and the exit code is 1 if there is one.
+
+The script reads the comments, docstrings and messages of Python files, Markdown pages, HTML
+templates and the comments of TOML files, and the names of functions and classes. It skips code:
+text in backticks, doctest lines, code blocks, replacement fields of f-strings. Each pattern is a
+phrase that is seldom plain English, or an old name of a thing that docs/glossary.md now names
+otherwise. `ALLOWED` lists the exceptions with their reasons.
 """
 
 from __future__ import annotations
@@ -77,10 +80,10 @@ OLD_WORDS_OF_DIAGNOSIS = {
 DIAGNOSIS = ("gyrostab/diagnose/", "gyrostab/blindtest/", "docs/diagnos", "docs/proof.md")
 #: Words of `OLD_WORDS` that are in names of functions and classes.
 OLD_NAME_WORDS = {
-    "salt", "salted", "sever", "severed", "decoy", "seal", "sealed", "naive", "view", "views", "hop", "hops", "hopping",
-    "gliding", "restless", "unrest", "redness", "lattice", "witness", "claim", "claims", "odd", "loud", "louder",
-    "told", "twin", "slide", "slides",
-}  # fmt: skip
+    *("salt", "salted", "sever", "severed", "decoy", "seal", "sealed", "naive", "view", "views"),
+    *("hop", "hops", "hopping", "gliding", "restless", "unrest", "redness", "lattice", "witness"),
+    *("claim", "claims", "odd", "loud", "louder", "told", "twin", "slide", "slides"),
+}
 
 
 class Allowed(NamedTuple):
@@ -188,9 +191,9 @@ def find_names(path: Path, name: str) -> Iterator[Finding]:
 
 
 def find_long_lines(path: Path, name: str) -> Iterator[Finding]:
-    """Lines of prose in Markdown that are too long; tables and links may be longer."""
+    """Find Markdown lines that are too long; tables, links and quotes may be longer."""
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        if len(line) > MAX_MARKDOWN_COLUMNS and not line.startswith(("|", "    ", "![", "[")):
+        if len(line) > MAX_MARKDOWN_COLUMNS and not line.startswith(("|", "    ", "![", "[", ">")):
             yield Finding(name, number, f"{len(line)} columns", f"at most {MAX_MARKDOWN_COLUMNS}")
 
 
@@ -237,9 +240,7 @@ def main(arguments: list[str]) -> int:
         print(f"{finding.path}:{finding.line}: {finding.text}  [{finding.advice}]")
     single, total = single_word_share(ROOT / (arguments[0] if arguments else "gyrostab"))
     share = single / max(total, 1)
-    print(
-        f"{len(found)} findings; {single} of {total} private functions have a name of one word ({share:.0%})"
-    )
+    print(f"{len(found)} findings; {single} of {total} private functions have a one-word name")
     return int(bool(found) or share > MAX_SINGLE_WORD_SHARE)
 
 

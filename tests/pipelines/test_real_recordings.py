@@ -320,7 +320,7 @@ def test_drill_string_without_a_gyro(examine, there, recordings):
         6 * table["top_speed"].mean()
     )  # rpm in deg/s
     assert product["rotation_rate"].attrs["units"] == "degree s-1"
-    assert found["at_slip"] > 3 * found["at_full"]  # a line at 2.7 Hz vanishes at its own period
+    assert found["at_slip"] > 3 * found["at_full"]  # a line at 2.7 Hz does not show at its period
 
 
 def test_one_recording_on_the_page(there, tmp_path):

@@ -200,5 +200,5 @@ def test_a_table_replaces_what_stands_between_its_marks():
 def test_the_script_stays_short():
     assert (
         len((ROOT / "pipelines" / "seed_experiments.py").read_text(encoding="utf-8").splitlines())
-        <= 80
+        <= 110
     )
