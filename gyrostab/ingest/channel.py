@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest.combine import attach_channels
-from gyrostab.ingest.files import _read
+from gyrostab.ingest.files import read_file
 from gyrostab.ingest.options import ReadOptions
 
 __all__ = ["read_channel"]
@@ -55,7 +55,7 @@ def read_channel(
     """
     chosen: dict[str, Any] = {"epoch": epoch, "map": dict(map or {}), "unit": dict(unit or {})}
     held = attach_channels(
-        xr.Dataset(), [_read(Path(path), ReadOptions(channels_only=True, **chosen))]
+        xr.Dataset(), [read_file(Path(path), ReadOptions(channels_only=True, **chosen))]
     )
     if name not in held.data_vars:
         there = ", ".join(map_name for map_name in sorted(str(key) for key in held.data_vars))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -11,44 +12,44 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
-from gyrostab.ingest.columns.buffers import CHUNK_ROWS, lazily, pieces_of
-from gyrostab.ingest.columns.pieces import Blank, Pieces, Spool
-from gyrostab.ingest.concat import group_axes, some, split_axes, together
+from gyrostab.ingest.columns.buffers import CHUNK_ROWS, as_lazy, pieces_of
+from gyrostab.ingest.columns.pieces import NaNPiece, PiecewiseColumn, Spool
+from gyrostab.ingest.concat import group_axes, merge_notes, name_some, split_axes
 from gyrostab.ingest.overlap import drop_repeats, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store import common_packing
 from gyrostab.store.lazy_slices import concatenate_columns, select_row, stack_rows
 
-__all__ = ["attach_channels", "concatenate", "memory", "to_disk", "with_channels"]
+__all__ = ["attach_channels", "concatenate", "memory_bytes", "move_to_disk", "with_channels"]
 
 
-def memory(part: xr.Dataset) -> int:
+def memory_bytes(part: xr.Dataset) -> int:
     """Bytes of the columns of a raw log that are held in memory."""
     arrays = sum(
         variable.nbytes
         for variable in part.variables.values()
         if isinstance(variable._data, np.ndarray)
     )
-    return arrays + sum(pieces.held for pieces in _pieces(part))
+    return arrays + sum(pieces.memory_bytes for pieces in _columns_in_pieces(part))
 
 
-def _pieces(part: xr.Dataset) -> list[Pieces]:
+def _columns_in_pieces(part: xr.Dataset) -> list[PiecewiseColumn]:
     return [pieces for variable in part.variables.values() for pieces in pieces_of(variable._data)]
 
 
-def to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
+def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
     """The same raw log with its columns in a temporary file."""
 
     def moved(variable: xr.Variable) -> Any:
         values = variable.values
         return (
-            lazily(spool.store(values))
+            as_lazy(spool.store(values))
             if values.ndim == 1
-            else stack_rows([lazily(spool.store(row)) for row in values])
+            else stack_rows([as_lazy(spool.store(row)) for row in values])
         )
 
-    for pieces in _pieces(part):
-        pieces.spill(spool)
+    for pieces in _columns_in_pieces(part):
+        pieces.move_to(spool)
     long = {
         name: variable
         for name, variable in part.variables.items()
@@ -73,8 +74,8 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         joined = parts[0]
     else:
         whole = _in_order([group for part in parts for group in split_axes(part)])
-        signal = _signal(whole)
-        own = [_off_rows(part) for part in whole]
+        signal = _common_signal(whole)
+        own = [_slow_channels(part) for part in whole]
         ordered = [
             part.drop_vars([*names, *(f"time_{name}" for name in names)])
             for part, names in zip(whole, own, strict=True)
@@ -82,7 +83,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         groups = _group_by_axes(ordered)
         if "time" in ordered[0].variables:
             groups = [drop_repeats(group) for group in groups]
-        joined = _join([part for group in groups for part in group], signal, groups)
+        joined = _concatenate_parts([part for group in groups for part in group], signal, groups)
         apart = [part[names] for part, names in zip(whole, own, strict=True) if names]
         joined = with_channels(joined, apart)
     if joined.sizes["row"] < 2:
@@ -91,7 +92,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     return joined
 
 
-def _off_rows(part: xr.Dataset) -> list[str]:
+def _slow_channels(part: xr.Dataset) -> list[str]:
     """Channels that have a time of their own."""
     return [
         str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)
@@ -101,9 +102,10 @@ def _off_rows(part: xr.Dataset) -> list[str]:
 def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
     """Put files that have no axis in common, but the same time, into groups of their own; otherwise all are one group."""
     groups = [
-        [parts[number] for number in group] for group in group_axes([_axes(part) for part in parts])
+        [parts[number] for number in group]
+        for group in group_axes([_axis_names(part) for part in parts])
     ]
-    if len(groups) == 1 or not all(_axes(group[0]) for group in groups):
+    if len(groups) == 1 or not all(_axis_names(group[0]) for group in groups):
         return [list(parts)]
     if "time" not in parts[0].variables:
         return groups
@@ -117,7 +119,7 @@ def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
     return [list(parts)] if any(in_time) else groups
 
 
-def _axes(part: xr.Dataset) -> list[str]:
+def _axis_names(part: xr.Dataset) -> list[str]:
     return [str(axis) for axis in part["axis"].values] if "axis" in part.coords else []
 
 
@@ -145,7 +147,7 @@ def _first_stamp(part: xr.Dataset) -> int:
     return int(np.iinfo(np.int64).max)
 
 
-def _signal(parts: Sequence[xr.Dataset]) -> str | None:
+def _common_signal(parts: Sequence[xr.Dataset]) -> str | None:
     first = parts[0]
     for part in parts[1:]:
         if part.attrs.get("kind") != first.attrs.get("kind"):
@@ -159,7 +161,7 @@ def _signal(parts: Sequence[xr.Dataset]) -> str | None:
     return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
 
 
-def _join(
+def _concatenate_parts(
     parts: list[xr.Dataset], signal: str | None, groups: list[list[xr.Dataset]]
 ) -> xr.Dataset:
     sizes = [part.sizes["row"] for part in parts]
@@ -174,9 +176,9 @@ def _join(
         )
     if signal is not None:
         axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
-        stack = _stacked(parts, signal, axes)
+        stack = _stack_signal(parts, signal, axes)
         for axis in axes:
-            absent[f"axis {axis}"] = _lacking(groups, lambda part, axis=axis: axis in _axes(part))  # type: ignore[misc]
+            absent[f"axis {axis}"] = _files_without(groups, partial(_has_axis, axis=axis))
         packing = common_packing(part[signal].encoding for part in parts)
         data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]}, packing)
         coords["axis"] = np.array(axes, dtype=str)
@@ -190,10 +192,10 @@ def _join(
         ]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
         data[channel] = ("row", concatenate_columns(columns, CHUNK_ROWS), {"units": units}, packing)
-        absent[f"channel {channel}"] = _lacking(groups, lambda part, name=channel: name in part)  # type: ignore[misc]
+        absent[f"channel {channel}"] = _files_without(groups, partial(_has_channel, name=channel))
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     gaps = [
-        f"{what} is not in {some(files)} and is missing there"
+        f"{what} is not in {name_some(files)} and is missing there"
         for what, files in absent.items()
         if files
     ]
@@ -201,7 +203,7 @@ def _join(
         source_files=names,
         row_start=[int(start) for start in np.cumsum([0, *sizes[:-1]])],
         notes=[
-            *together((part.attrs["source_files"][0], part.attrs["notes"]) for part in parts),
+            *merge_notes((part.attrs["source_files"][0], part.attrs["notes"]) for part in parts),
             *gaps,
         ],
         unreadable_rows=sum(part.attrs["unreadable_rows"] for part in parts),
@@ -211,14 +213,24 @@ def _join(
         ends = np.cumsum(
             [0, *(sum(part.sizes["row"] for part in group) for group in groups)]
         ).tolist()
-        axes_of = [sorted({axis for part in group for axis in _axes(part)}) for group in groups]
+        axes_of = [
+            sorted({axis for part in group for axis in _axis_names(part)}) for group in groups
+        ]
         joined.attrs["axis_rows"] = [
             [axes, *rows] for axes, rows in zip(axes_of, pairwise(ends), strict=True)
         ]
     return joined
 
 
-def _lacking(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], bool]) -> list[str]:
+def _has_axis(part: xr.Dataset, *, axis: str) -> bool:
+    return axis in _axis_names(part)
+
+
+def _has_channel(part: xr.Dataset, *, name: str) -> bool:
+    return name in part
+
+
+def _files_without(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], bool]) -> list[str]:
     """Name the files that lack something which others of their group have; those of other groups hold other axes."""
     found = [
         (str(part.attrs["source_files"][0]), has(part))
@@ -229,7 +241,7 @@ def _lacking(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], bool]) 
     return [name for name, is_there in found if not is_there]
 
 
-def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
+def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
     """The signal of all parts, (axis, row); NaN where a part lacks an axis."""
     if all(isinstance(part[signal].data, np.ndarray) for part in parts):
         whole = np.full((len(axes), sum(part.sizes["row"] for part in parts)), np.nan)
@@ -243,18 +255,18 @@ def _stacked(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
         return whole
     return stack_rows(
         [
-            concatenate_columns([_axis(part, signal, axis) for part in parts], CHUNK_ROWS)
+            concatenate_columns([_read_axis(part, signal, axis) for part in parts], CHUNK_ROWS)
             for axis in axes
         ]
     )
 
 
-def _axis(part: xr.Dataset, signal: str, axis: str) -> Any:
+def _read_axis(part: xr.Dataset, signal: str, axis: str) -> Any:
     if axis in part["axis"].values:
         return select_row(
             part[signal].data, [str(name) for name in part["axis"].values].index(axis)
         )
-    return lazily(Pieces(np.float64, [Blank(part.sizes["row"])]))
+    return as_lazy(PiecewiseColumn(np.float64, [NaNPiece(part.sizes["row"])]))
 
 
 def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
@@ -293,7 +305,7 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
     for source in sources:
         name = source.attrs["source_files"][0]
         files.append(name)
-        for channel, stamps, values, units in _channels(source, name):
+        for channel, stamps, values, units in _read_channels(source, name):
             if channel in log.variables:
                 fix = (
                     f"rename it with --map {channel}={channel}_2 or drop it with --map {channel}=-"
@@ -303,7 +315,7 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
     for channel, found in pieces.items():
         if len({units for _, _, units in found}) > 1:
             raise UnitError(
-                f"channel {channel!r} has different units in {some(files)}; give one with --unit {channel}=UNIT"
+                f"channel {channel!r} has different units in {name_some(files)}; give one with --unit {channel}=UNIT"
             )
         stamps, values = (np.concatenate([piece[place] for piece in found]) for place in (0, 1))
         order = np.argsort(stamps, kind="stable")
@@ -317,7 +329,9 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
     return log
 
 
-def _channels(source: xr.Dataset, name: str) -> list[tuple[str, NDArray[Any], NDArray[Any], str]]:
+def _read_channels(
+    source: xr.Dataset, name: str
+) -> list[tuple[str, NDArray[Any], NDArray[Any], str]]:
     found = []
     for channel, variable in source.data_vars.items():
         dim = f"time_{channel}" if f"time_{channel}" in source.variables else "time"

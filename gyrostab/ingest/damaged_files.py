@@ -16,10 +16,10 @@ from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import texts
 
-__all__ = ["LostFile", "check_share", "is_damage", "lost_attributes", "lost_spans"]
+__all__ = ["LostFile", "add_lost_notes", "check_share", "find_lost_spans", "is_damage"]
 
 #: When a larger share of the files cannot be read, it is no damage but a wrong option.
-MAX_LOST = 0.5
+MAX_LOST_SHARE = 0.5
 
 #: What the system says of itself and not of the one file.
 _SYSTEM = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EINTR)
@@ -63,7 +63,7 @@ def check_share(lost: Sequence[LostFile], total: int) -> None:
     FormatError
         With the reason of the first.
     """
-    if len(lost) > MAX_LOST * total:
+    if len(lost) > MAX_LOST_SHARE * total:
         what = "that is more than damage: check the names and the reading options"
         raise FormatError(f"{lost[0].reason}; {len(lost)} of {total} files cannot be read, {what}")
 
@@ -77,7 +77,7 @@ def _name_key(path: Path) -> list[tuple[int, int, str]]:
     ]
 
 
-def lost_spans(
+def find_lost_spans(
     lost: Sequence[LostFile], spans: Mapping[Path, Span], look: Callable[[Path], FileSummary]
 ) -> dict[Path, Span]:
     """Where the time of the lost files lies, of those that let it be told.
@@ -106,14 +106,14 @@ def lost_spans(
         place = names.index(path)
         before = next((name for name in reversed(names[:place]) if name in spans), None)
         after = next((name for name in names[place:] if name in spans), None)
-        between = _between(spans, before, after) if before and after else None
-        span = between or _seen(path, look)
+        between = _span_between(spans, before, after) if before and after else None
+        span = between or _span_of_stamps(path, look)
         if span:
             found[path] = span
     return found
 
 
-def _between(spans: Mapping[Path, Span], before: Path, after: Path) -> Span | None:
+def _span_between(spans: Mapping[Path, Span], before: Path, after: Path) -> Span | None:
     """Time between two files that follow each other, in either order, without a third one in between."""
     (_, end), (start, _) = sorted([spans[before], spans[after]])
     others = [span for path, span in spans.items() if path not in (before, after)]
@@ -121,20 +121,20 @@ def _between(spans: Mapping[Path, Span], before: Path, after: Path) -> Span | No
     return (end, start) if free else None
 
 
-def _seen(path: Path, look: Callable[[Path], FileSummary]) -> Span | None:
+def _span_of_stamps(path: Path, look: Callable[[Path], FileSummary]) -> Span | None:
     """First and last stamp that a look at a damaged file shows."""
     with contextlib.suppress(GyrostabError, OSError, RuntimeError, ValueError):
         summary = look(path)
         if summary.first is not None and summary.last is not None and summary.first < summary.last:
-            return _ns(summary.first), _ns(summary.last)
+            return _to_ns(summary.first), _to_ns(summary.last)
     return None
 
 
-def _ns(stamp: np.datetime64) -> int:
+def _to_ns(stamp: np.datetime64) -> int:
     return int(stamp.astype("datetime64[ns]").astype(np.int64))
 
 
-def lost_attributes(
+def add_lost_notes(
     log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Path, Span]
 ) -> xr.Dataset:
     """The log with notes on the lost files, and their names in ``unreadable_files``."""

@@ -19,14 +19,14 @@ import xarray as xr
 from gyrostab.errors import FormatError, GyrostabError, OptionError, reading_of
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.pieces import Spool
-from gyrostab.ingest.combine import attach_channels, concatenate, memory, to_disk
+from gyrostab.ingest.combine import attach_channels, concatenate, memory_bytes, move_to_disk
 from gyrostab.ingest.concat import concatenate_logs, log_span
 from gyrostab.ingest.damaged_files import (
     LostFile,
+    add_lost_notes,
     check_share,
+    find_lost_spans,
     is_damage,
-    lost_attributes,
-    lost_spans,
     reason_of,
 )
 from gyrostab.ingest.formats.binary import has_layout
@@ -39,7 +39,7 @@ __all__ = ["OnFile", "Reader", "check_options", "read_log", "readers", "scan_fil
 
 GROUP = "gyrostab.readers"
 #: Text files that are read side by side.
-_TOGETHER = 2
+_FILES_AHEAD = 2
 
 #: Called with the number of a file, the number of files and the path.
 OnFile = Callable[[int, int, Path], None]
@@ -59,7 +59,7 @@ class Reader(Protocol):
 
 
 @cache
-def _registered() -> dict[str, Any]:
+def _entry_points() -> dict[str, Any]:
     return {
         point.name: point
         for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)
@@ -74,17 +74,17 @@ def readers() -> tuple[str, ...]:
     >>> "text" in readers()
     True
     """
-    return tuple(_registered())
+    return tuple(_entry_points())
 
 
-def _reader(path: Path) -> Reader:
+def _find_reader(path: Path) -> Reader:
     """The reader of a file; text is tried last, as it is the least particular."""
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
     if not has_layout(path):
         refuse_unread(path)
-    for name in sorted(_registered(), key=lambda name: (name == "text", name)):
-        reader = cast(Reader, _registered()[name].load())
+    for name in sorted(_entry_points(), key=lambda name: (name == "text", name)):
+        reader = cast(Reader, _entry_points()[name].load())
         if reader.matches(path):
             return reader
     if path.is_dir():
@@ -151,13 +151,13 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
     (('x',), 2, np.datetime64('1970-01-01T00:00:00.500000000'))
     """
     path = Path(path)
-    reader = _reader(path)
+    reader = _find_reader(path)
     with reading_of(path):
         return reader.scan(path, options or ReadOptions())
 
 
-def _read(path: Path, options: ReadOptions) -> xr.Dataset:
-    reader = _reader(path)
+def read_file(path: Path, options: ReadOptions) -> xr.Dataset:
+    reader = _find_reader(path)
     with reading_of(path):
         return reader.read(path, options)
 
@@ -258,8 +258,12 @@ def read_log(
             f"{regular[0].name} is a regular log already and {raw.name} is not; make a regular log of the latter and its like with "
             "gyrostab ingest, and then join the regular logs"
         )
-    channels = [_read(path, replace(options, channels_only=True, start=None)) for path in extra]
-    spans = lost_spans(lost, _spans(parts), lambda path: scan_file(path, options)) if lost else {}
+    channels = [read_file(path, replace(options, channels_only=True, start=None)) for path in extra]
+    spans = (
+        find_lost_spans(lost, _stamp_spans(parts), lambda path: scan_file(path, options))
+        if lost
+        else {}
+    )
     if regular:
         log = concatenate_logs(
             [_check_regular(part, path.name, options) for path, part in parts.items()],
@@ -279,7 +283,7 @@ def read_log(
             log.attrs["unreadable_spans"] = [
                 list(span) for span in spans.values()
             ]  # where regularise will find the gaps
-    return attach_channels(lost_attributes(log, lost, spans), channels)
+    return attach_channels(add_lost_notes(log, lost, spans), channels)
 
 
 def _read_all(
@@ -290,7 +294,7 @@ def _read_all(
     lost: list[LostFile] = []
     spool = Spool()
     held = 0
-    with closing(_ahead(paths, options, on_file)) as reading:
+    with closing(_read_ahead(paths, options, on_file)) as reading:
         for path, read in zip(paths, reading, strict=True):
             try:
                 part = read()
@@ -299,21 +303,21 @@ def _read_all(
                     raise
                 lost.append(LostFile(path, reason_of(path, error)))
                 continue
-            held += memory(part)
+            held += memory_bytes(part)
             if held > SPILL_BYTES and len(paths) > 1:
-                held -= memory(part)
-                part = to_disk(part, spool)
+                held -= memory_bytes(part)
+                part = move_to_disk(part, spool)
             parts[path] = part
     check_share(lost, len(paths))
     return parts, lost
 
 
-def _ahead(
+def _read_ahead(
     paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None
 ) -> Generator[Callable[[], xr.Dataset], None, None]:
     """What reads each file; a text file is read already, while the one before it is looked at, as its beginning takes one thread."""
     stop = Event()
-    with ThreadPoolExecutor(_TOGETHER, thread_name_prefix="gyrostab-file") as pool:
+    with ThreadPoolExecutor(_FILES_AHEAD, thread_name_prefix="gyrostab-file") as pool:
         waiting: deque[Callable[[], xr.Dataset]] = deque()
         try:
             for number, path in enumerate(paths, 1):
@@ -323,9 +327,9 @@ def _ahead(
                 waiting.append(
                     pool.submit(_read_text, path, options, stop).result
                     if early
-                    else partial(_read, path, options)
+                    else partial(read_file, path, options)
                 )
-                if len(waiting) == _TOGETHER:
+                if len(waiting) == _FILES_AHEAD:
                     yield waiting.popleft()
             while waiting:
                 yield waiting.popleft()
@@ -335,19 +339,19 @@ def _ahead(
 
 
 def _read_text(path: Path, options: ReadOptions, stop: Event) -> xr.Dataset:
-    reader = _registered()["text"].load()
+    reader = _entry_points()["text"].load()
     with reading_of(path):
         return cast(xr.Dataset, reader.read(path, options, stop=stop.is_set))
 
 
 def _is_text(path: Path) -> bool:
     try:
-        return bool(_reader(path) is _registered()["text"].load())
+        return bool(_find_reader(path) is _entry_points()["text"].load())
     except FormatError:
         return False  # which reading will say
 
 
-def _spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:
+def _stamp_spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:
     """First and last stamp [ns since 1970] of the files that have stamps."""
     spans = {}
     for path, part in parts.items():

@@ -17,19 +17,19 @@ __all__ = [
     "COLUMNS",
     "END",
     "FIRST",
-    "MOST_GAPS",
+    "MAX_TABLE_ROWS",
     "ROWS",
     "SAMPLES",
     "clip_table",
-    "duration",
+    "format_duration",
+    "format_stamp",
     "gap_variables",
+    "merge_neighbours",
     "name_lost",
-    "stamp_text",
-    "thinned",
 ]
 
 #: Rows of the table from which on neighbours of one cause are counted in one row.
-MOST_GAPS = 10_000
+MAX_TABLE_ROWS = 10_000
 
 #: Columns of the table: first missing sample, first present sample after, samples missing, rows
 #: concerned, cause.
@@ -39,7 +39,7 @@ _MISSING, _UNREADABLE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("unreadabl
 _NEVER_THINNED = (GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart"))
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Write a duration as people say it.
 
     Examples
@@ -52,7 +52,7 @@ def duration(seconds: float) -> str:
     return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / HOUR:.1f} h"
 
 
-def stamp_text(stamp: int) -> str:
+def format_stamp(stamp: int) -> str:
     """Write a stamp [ns since 1970] as ISO 8601, to the millisecond."""
     return (
         "no stamp"
@@ -61,7 +61,7 @@ def stamp_text(stamp: int) -> str:
     )
 
 
-def thinned(table: NDArray[np.int64], most: int = MOST_GAPS) -> NDArray[np.int64]:
+def merge_neighbours(table: NDArray[np.int64], most: int = MAX_TABLE_ROWS) -> NDArray[np.int64]:
     """At most about `most` lines: the nearest neighbours of one cause are counted together."""
     if len(table) <= most:
         return table

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gyrostab.ingest.columns.headers import AXIS, TIME, is_time_unit, is_unit_of
-from gyrostab.ingest.inspect import ColumnLook, FileInspection
+from gyrostab.ingest.columns.headers import AXIS_PATTERN, TIME_PATTERN, is_time_unit, is_unit_of
+from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.units import HOUR, parse_unit
 
 __all__ = ["Guess", "guess_columns", "rate_plausibility", "temperature_unit"]
@@ -39,7 +39,7 @@ TYPICAL_ARW, ARW_DECADES = 0.3, 1.0
 #: Rates of gyro logs are some decades about this [Hz].
 TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
 #: What a group of columns must score to be called the gyro: one sign in its name, or its unit.
-LEAST_SCORE = 1.5
+MIN_SCORE = 1.5
 
 _STRONG = re.compile(
     r"gyr|omega|ang(ular)?[ _.]?(rate|vel)|rot(ation)?[ _.]?(rate|vel)|turn[ _.]?rate|uncompgyro"
@@ -74,12 +74,12 @@ class Guess:
     where there is no time. `sampling_rate_hz` is the rate that was taken for the guess.
     """
 
-    axes: dict[str, ColumnLook]
+    axes: dict[str, ColumnInspection]
     unit: str | None
-    time: ColumnLook | None
+    time: ColumnInspection | None
     time_unit: str | None
     rate: float | None
-    temperature: ColumnLook | None
+    temperature: ColumnInspection | None
     reasons: tuple[str, ...]
     warnings: tuple[str, ...]
     sampling_rate_hz: float = math.nan
@@ -125,7 +125,7 @@ def guess_columns(
     sampling = (
         rate
         or assumed
-        or (1.0 / (time.pace * _seconds(time_unit)) if time is not None else look.rate_hz)
+        or (1.0 / (time.pace * _unit_seconds(time_unit)) if time is not None else look.rate_hz)
     )
     axes = _guess_axes(look, time, reasons)
     unit = None
@@ -142,7 +142,7 @@ def guess_columns(
     )
 
 
-def _seconds(unit: str | None) -> float:
+def _unit_seconds(unit: str | None) -> float:
     return _SECONDS.get(unit or "s", 1.0)
 
 
@@ -150,8 +150,10 @@ def _seconds(unit: str | None) -> float:
 # ----------------------------------------------------------------------------------------------------
 
 
-def _guess_time(look: FileInspection, reasons: list[str]) -> tuple[ColumnLook | None, str | None]:
-    best: tuple[float, ColumnLook, str, str] | None = None
+def _guess_time(
+    look: FileInspection, reasons: list[str]
+) -> tuple[ColumnInspection | None, str | None]:
+    best: tuple[float, ColumnInspection, str, str] | None = None
     for column in look.columns:
         if (
             column.rows < 2
@@ -162,7 +164,7 @@ def _guess_time(look: FileInspection, reasons: list[str]) -> tuple[ColumnLook | 
         ):
             continue
         low = column.key.lower()
-        named = bool(TIME.match(low) or _TIME_WORD.search(low))
+        named = bool(TIME_PATTERN.match(low) or _TIME_WORD.search(low))
         counter = (
             column.whole
             and abs(column.pace - 1.0) < 1e-6
@@ -181,7 +183,7 @@ def _guess_time(look: FileInspection, reasons: list[str]) -> tuple[ColumnLook | 
     return column, unit
 
 
-def _time_unit(column: ColumnLook) -> tuple[str, str]:
+def _time_unit(column: ColumnInspection) -> tuple[str, str]:
     """The unit of a numeric time column, and by what."""
     if column.unit and is_time_unit(column.unit):
         return column.unit, "its name"
@@ -197,8 +199,10 @@ def _time_unit(column: ColumnLook) -> tuple[str, str]:
     return unit, f"the rate of {1.0 / (column.pace * _SECONDS[unit]):.4g} Hz that it gives"
 
 
-def _rate_distance(column: ColumnLook, unit: str) -> float:
-    return abs(math.log10(1.0 / (column.pace * _seconds(unit)) / TYPICAL_RATE_HZ)) / RATE_DECADES
+def _rate_distance(column: ColumnInspection, unit: str) -> float:
+    return (
+        abs(math.log10(1.0 / (column.pace * _unit_seconds(unit)) / TYPICAL_RATE_HZ)) / RATE_DECADES
+    )
 
 
 # --- the axes
@@ -206,27 +210,27 @@ def _rate_distance(column: ColumnLook, unit: str) -> float:
 
 
 def _guess_axes(
-    look: FileInspection, time: ColumnLook | None, reasons: list[str]
-) -> dict[str, ColumnLook]:
+    look: FileInspection, time: ColumnInspection | None, reasons: list[str]
+) -> dict[str, ColumnInspection]:
     known = {column.name.lower(): column for column in look.columns if column.role == "gyro"}
     if known:
-        return {AXIS.sub(r"\2", name): column for name, column in known.items()}
+        return {AXIS_PATTERN.sub(r"\2", name): column for name, column in known.items()}
     usable = [
         c
         for c in look.columns
         if c is not time and c.rows >= 0.25 * look.rows and c.std > 0 and _may_be_gyro(c)
     ]
-    groups = list(_groups(usable))
-    steady = [_steadiness(list(group.values())) for _, group in groups]
-    best: tuple[float, dict[str, ColumnLook]] | None = None
+    groups = list(_group_columns(usable))
+    steady = [_mean_over_scatter(list(group.values())) for _, group in groups]
+    best: tuple[float, dict[str, ColumnInspection]] | None = None
     for (template, group), own in zip(groups, steady, strict=True):
-        score = _score(template, list(group.values()), look)
+        score = _gyro_score(template, list(group.values()), look)
         others = [other for other in steady if other is not own]
         if others and len(group) == 3:
             score += (
                 0.75 if own <= min(others) else -0.75 if own > max(others) else 0.0
             )  # gravity makes an accelerometer steady
-        if score >= LEAST_SCORE and (best is None or score > best[0]):
+        if score >= MIN_SCORE and (best is None or score > best[0]):
             best = score, group
     if best is None:
         return {}
@@ -238,7 +242,7 @@ def _guess_axes(
     return best[1]
 
 
-def _may_be_gyro(column: ColumnLook) -> bool:
+def _may_be_gyro(column: ColumnInspection) -> bool:
     """Whether its unit, in the header or in the name, is none of another quantity."""
     if column.unit is not None and is_unit_of(column.unit, ("rate", "angle", "number")):
         return True
@@ -253,9 +257,11 @@ def _may_be_gyro(column: ColumnLook) -> bool:
     )
 
 
-def _groups(columns: Sequence[ColumnLook]) -> Iterator[tuple[str, dict[str, ColumnLook]]]:
+def _group_columns(
+    columns: Sequence[ColumnInspection],
+) -> Iterator[tuple[str, dict[str, ColumnInspection]]]:
     """Columns whose names differ in the axis only, with the name that they share; and each column for itself."""
-    templates: dict[str, dict[str, ColumnLook]] = {}
+    templates: dict[str, dict[str, ColumnInspection]] = {}
     for column in columns:
         for match in re.finditer(r"[xyzXYZpqrENZ]|\d+", column.key):
             template = f"{column.key[: match.start()]}*{column.key[match.end() :]}"
@@ -292,7 +298,7 @@ def _groups(columns: Sequence[ColumnLook]) -> Iterator[tuple[str, dict[str, Colu
             )
 
 
-def _score(template: str, group: Sequence[ColumnLook], look: FileInspection) -> float:
+def _gyro_score(template: str, group: Sequence[ColumnInspection], look: FileInspection) -> float:
     """How much a group of columns looks like a gyro."""
     low = template.lower()
     if any(_given_unit(column) for column in group):
@@ -320,7 +326,7 @@ def _score(template: str, group: Sequence[ColumnLook], look: FileInspection) -> 
         norm = math.hypot(*(column.mean for column in group))
         if (
             any(abs(norm / gravity - 1) < 0.05 for gravity in (9.80665, 1.0))
-            and _steadiness(group) > 10
+            and _mean_over_scatter(group) > 10
         ):
             score -= 3.0  # an accelerometer at rest, in m/s^2 or g
     if any(column.rising > 0.9 or column.held > 0.98 for column in group):
@@ -330,7 +336,7 @@ def _score(template: str, group: Sequence[ColumnLook], look: FileInspection) -> 
     return score
 
 
-def _steadiness(group: Sequence[ColumnLook]) -> float:
+def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:
     """Mean over scatter."""
     return math.hypot(*(c.mean for c in group)) / max(
         math.hypot(*(c.scatter for c in group)), 1e-300
@@ -341,11 +347,11 @@ def _steadiness(group: Sequence[ColumnLook]) -> float:
 # ----------------------------------------------------------------------------------------------------
 
 
-def _given_unit(column: ColumnLook) -> bool:
+def _given_unit(column: ColumnInspection) -> bool:
     return column.unit is not None and is_unit_of(column.unit, ("rate",))
 
 
-def _name_unit(column: ColumnLook, quantity: str) -> str | None:
+def _name_unit(column: ColumnInspection, quantity: str) -> str | None:
     """The unit that the end of a name says, ``deg/h`` of ``gx_deg_per_h``."""
     tokens = [
         token for token in re.split(r"[\s_./\-]+", re.sub(r"\[\d+\]$", "", column.key)) if token
@@ -366,13 +372,13 @@ def _name_unit(column: ColumnLook, quantity: str) -> str | None:
     return None
 
 
-def _is_temperature(column: ColumnLook) -> bool:
+def _is_temperature(column: ColumnInspection) -> bool:
     return bool(re.search(r"temp", column.key.lower())) and column.std > 0 and (
         _name_unit(column, "temperature") is not None or (column.unit is not None and is_unit_of(column.unit, ("temperature",)))
     )  # fmt: skip
 
 
-def temperature_unit(column: ColumnLook) -> str:
+def temperature_unit(column: ColumnInspection) -> str:
     """The unit of a column of temperatures, of its header or its name."""
     given = column.unit is not None and is_unit_of(column.unit, ("temperature",))
     return str(column.unit if given else _name_unit(column, "temperature") or "degC")
@@ -380,7 +386,7 @@ def temperature_unit(column: ColumnLook) -> str:
 
 def _guess_unit(
     look: FileInspection,
-    axes: dict[str, ColumnLook],
+    axes: dict[str, ColumnInspection],
     rate: float,
     reasons: list[str],
     warnings: list[str],
@@ -448,7 +454,9 @@ def rate_plausibility(
     return score
 
 
-def _scale_of_counts(group: Sequence[ColumnLook], reasons: list[str], warnings: list[str]) -> str:
+def _scale_of_counts(
+    group: Sequence[ColumnInspection], reasons: list[str], warnings: list[str]
+) -> str:
     """A unit for counts, so that a run is possible: nothing in the file says how much a count is."""
     norm = math.hypot(*(c.mean for c in group))
     if len(group) == 3 and norm > 0:

@@ -13,29 +13,29 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, GyrostabError
-from gyrostab.ingest.files import _read, scan_file
+from gyrostab.ingest.files import read_file, scan_file
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 
-__all__ = ["ColumnLook", "FileInspection", "inspect_file"]
+__all__ = ["ColumnInspection", "FileInspection", "inspect_file"]
 
 #: Columns that are looked into; a log of sensors has tens of them.
-MOST_COLUMNS = 100
+MAX_COLUMNS = 100
 #: Rows that are looked at together.
 CHUNK_ROWS = 2**18
 #: Share of whole numbers above which a column is of counts: junk in the first rows makes no
 #: difference.
 WHOLE_SHARE = 0.999
 #: Numbers of this size are fillers: the squares of smaller ones can be summed.
-MOST_SIZE = 1e100
+MAX_MAGNITUDE = 1e100
 #: Blocks of a chunk in which the mean step is taken.
-PACES = 64
+MEAN_STEP_BLOCKS = 64
 # Median of |x - y| of two normal values with one standard deviation: sqrt(2) times 0.6745, the
 # upper quartile of the normal law.
 _MEDIAN_STEP = 0.6745 * math.sqrt(2.0)
 
 
 @dataclass(frozen=True)
-class ColumnLook:
+class ColumnInspection:
     """What one column holds; the numbers are in the unit of the file, NaN where the column holds no numbers.
 
     `scatter` is the standard deviation of a sample about its neighbours, by the median of the
@@ -69,7 +69,7 @@ class FileInspection:
     """What a file holds: its summary, the columns, the rows, and the column of the time where that is known."""
 
     summary: FileSummary
-    columns: tuple[ColumnLook, ...]
+    columns: tuple[ColumnInspection, ...]
     rows: int
     time: ColumnSummary | None
     rate_hz: float
@@ -89,7 +89,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     Returns
     -------
     FileLook
-        The columns with range, scatter and rate, up to `MOST_COLUMNS` of them.
+        The columns with range, scatter and rate, up to `MAX_COLUMNS` of them.
 
     Raises
     ------
@@ -111,9 +111,9 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
         None,
     )
     others = [column for column in summary.columns if column is not time]
-    names = {f"column_{place}": column for place, column in enumerate(others[:MOST_COLUMNS])}
+    names = {f"column_{place}": column for place, column in enumerate(others[:MAX_COLUMNS])}
     chosen = {column.key: f"{name} [1]" for name, column in names.items()}
-    chosen.update({column.key: "-" for column in others[MOST_COLUMNS:]})
+    chosen.update({column.key: "-" for column in others[MAX_COLUMNS:]})
     if time is not None:
         chosen[time.key] = "time" if time.unit == "ISO 8601" else f"time [{time.unit}]"
         if (
@@ -131,15 +131,15 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
         kind=None,
     )
     try:
-        log = _read(path, reading)
+        log = read_file(path, reading)
     except GyrostabError as error:
         raise FormatError(str(error)) from error
-    columns = [_look(column, log, name) for name, column in names.items()]
+    columns = [_inspect_column(column, log, name) for name, column in names.items()]
     if not any(column.rows for column in columns):
         raise FormatError(f"{path.name}: there is no number in any of its columns; is it a log?")
     notes = (
-        [f"{len(others) - MOST_COLUMNS} further columns are not looked into"]
-        if len(others) > MOST_COLUMNS
+        [f"{len(others) - MAX_COLUMNS} further columns are not looked into"]
+        if len(others) > MAX_COLUMNS
         else []
     )
     rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
@@ -156,27 +156,27 @@ def _row_rate(log: xr.Dataset, dim: str) -> float:
         stamps = np.asarray(log[clock].isel({dim: slice(start, start + CHUNK_ROWS)}).values)
         good = stamps[~np.isnat(stamps)]
         if good.size > 1:
-            paces += _paces((good - good[0]) / np.timedelta64(1, "s"))
+            paces += _mean_steps((good - good[0]) / np.timedelta64(1, "s"))
     pace = float(np.median(paces)) if paces else math.nan
     return 1.0 / pace if pace > 0 else math.nan
 
 
-def _paces(values: NDArray[np.float64]) -> list[float]:
+def _mean_steps(values: NDArray[np.float64]) -> list[float]:
     """Mean step from row to row in each of a few blocks: their median knows of no restarts, gaps and bursts."""
-    blocks = np.array_split(values, min(PACES, max(1, values.size // 8)))
+    blocks = np.array_split(values, min(MEAN_STEP_BLOCKS, max(1, values.size // 8)))
     return [float((block[-1] - block[0]) / (block.size - 1)) for block in blocks if block.size > 1]
 
 
-def _chunks(variable: xr.DataArray) -> Iterator[NDArray[np.float64]]:
+def _value_chunks(variable: xr.DataArray) -> Iterator[NDArray[np.float64]]:
     dim = str(variable.dims[0])
     for start in range(0, variable.size, CHUNK_ROWS):
         values = np.asarray(
             variable.isel({dim: slice(start, start + CHUNK_ROWS)}).values, dtype=np.float64
         )
-        yield values[np.abs(values) < MOST_SIZE]
+        yield values[np.abs(values) < MAX_MAGNITUDE]
 
 
-def _look(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnLook:
+def _inspect_column(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnInspection:
     counts: dict[str, Any] = dict.fromkeys(("rows", "steps", "same", "up"), 0)
     low, high, total, squares, origin, first, last, whole = (
         math.inf,
@@ -190,7 +190,7 @@ def _look(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnLook:
     )
     scatters: list[tuple[float, int]] = []
     paces: list[float] = []
-    for values in _chunks(log[name]) if name in log.data_vars else ():
+    for values in _value_chunks(log[name]) if name in log.data_vars else ():
         if not values.size:
             continue
         if counts["rows"] == 0:
@@ -201,7 +201,7 @@ def _look(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnLook:
         squares += float(((values - origin) ** 2).sum())
         whole += int(np.count_nonzero(values == np.rint(values)))
         steps = np.diff(values)
-        paces += _paces(values)
+        paces += _mean_steps(values)
         counts["rows"] += values.size
         counts["steps"] += steps.size
         counts["same"] += int((steps == 0).sum())
@@ -221,7 +221,7 @@ def _look(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnLook:
     )
     dim = str(log[name].dims[0]) if name in log.data_vars else "row"
     filled = rows / max(1, log.sizes.get(dim, 1))
-    return ColumnLook(
+    return ColumnInspection(
         key=column.key or column.header,
         header=column.header,
         name=column.name,

@@ -13,9 +13,11 @@ from gyrostab.schema import SIGNAL_UNITS
 
 __all__ = ["drop_repeats", "stamp_span"]
 
-_BLOCK = 2**20
-_COMPARED = 2**15  # rows at each end of an overlap whose values are compared
-_SAME = 0.9  # share of the compared rows that must be alike; a copy may have been damaged
+_BLOCK_ROWS = 2**20
+_COMPARED_ROWS = 2**15  # rows at each end of an overlap whose values are compared
+_MIN_ALIKE_SHARE = (
+    0.9  # share of the compared rows that must be alike; a copy may have been damaged
+)
 
 
 def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
@@ -45,15 +47,15 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
             if first > ends[place]:
                 continue
             tail, head = _rows_from(held, first), _rows_until(part, ends[place])
-            if not _alike(held, part, tail, head):
+            if not _is_copy(held, part, tail, head):
                 continue
             if (
                 head > held.sizes["row"] - tail and end >= ends[place]
             ):  # it has rows that the earlier file lost
-                kept[place], part = _shorten(held, slice(0, tail), part)
+                kept[place], part = _drop_rows(held, slice(0, tail), part)
                 ends[place] = first - 1
             else:
-                part, kept[place] = _shorten(part, slice(head, None), held)
+                part, kept[place] = _drop_rows(part, slice(head, None), held)
                 first, end = stamp_span(part)
         kept.append(part)
         ends.append(end)
@@ -62,7 +64,7 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     return kept
 
 
-def _shorten(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+def _drop_rows(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """The rows of `part` that stay, and `other`, which holds the rest; what was left out stands in the notes of one of them."""
     name, holder = (str(one.attrs["source_files"][0]) for one in (part, other))
     shorter = part.isel(row=rows)
@@ -80,7 +82,7 @@ def _with_note(part: xr.Dataset, note: str) -> xr.Dataset:
     return part.assign_attrs(notes=[*part.attrs["notes"], note])
 
 
-def _stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
+def _read_stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
     return (
         np.asarray(part["time"][max(begin, 0) : end].values)
         .astype("datetime64[ns]", copy=False)
@@ -91,8 +93,8 @@ def _stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
 def stamp_span(part: xr.Dataset) -> tuple[int, int]:
     """First and latest stamp of a raw log [ns since 1970]."""
     first, latest = None, NAT
-    for begin in range(0, part.sizes["row"], _BLOCK):
-        stamps = _stamps(part, begin, begin + _BLOCK)
+    for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
+        stamps = _read_stamps(part, begin, begin + _BLOCK_ROWS)
         latest = max(latest, int(stamps.max()))  # NAT is the least integer
         if first is None and latest != NAT:
             first = int(stamps[np.argmax(stamps != NAT)])
@@ -103,7 +105,7 @@ def _rows_from(part: xr.Dataset, first: int) -> int:
     """Row from which the stamps are `first` or later, looked for from the end."""
     row = part.sizes["row"]
     while row > 0:
-        stamps = _stamps(part, row - _BLOCK, row)
+        stamps = _read_stamps(part, row - _BLOCK_ROWS, row)
         early = np.flatnonzero((stamps < first) & (stamps != NAT))
         if len(early):
             return row - len(stamps) + int(early[-1]) + 1
@@ -113,27 +115,29 @@ def _rows_from(part: xr.Dataset, first: int) -> int:
 
 def _rows_until(part: xr.Dataset, last: int) -> int:
     """Number of rows before the first stamp later than `last`."""
-    for begin in range(0, part.sizes["row"], _BLOCK):
-        late = np.flatnonzero(_stamps(part, begin, begin + _BLOCK) > last)
+    for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
+        late = np.flatnonzero(_read_stamps(part, begin, begin + _BLOCK_ROWS) > last)
         if len(late):
             return begin + int(late[0])
     return part.sizes["row"]
 
 
-def _alike(held: xr.Dataset, part: xr.Dataset, tail: int, head: int) -> bool:
+def _is_copy(held: xr.Dataset, part: xr.Dataset, tail: int, head: int) -> bool:
     """Whether the rows of `held` from `tail` on and the first `head` rows of `part` are the same samples."""
-    near = _common(held, part, (tail, tail + _COMPARED), (0, min(head, _COMPARED)))
+    near = _count_common(held, part, (tail, tail + _COMPARED_ROWS), (0, min(head, _COMPARED_ROWS)))
     size = held.sizes["row"]
-    far = _common(held, part, (max(tail, size - _COMPARED), size), (max(0, head - _COMPARED), head))
+    far = _count_common(
+        held, part, (max(tail, size - _COMPARED_ROWS), size), (max(0, head - _COMPARED_ROWS), head)
+    )
     common, same = (int(a + b) for a, b in zip(near, far, strict=True))
-    return common >= 2 and same >= _SAME * common
+    return common >= 2 and same >= _MIN_ALIKE_SHARE * common
 
 
-def _common(
+def _count_common(
     held: xr.Dataset, part: xr.Dataset, rows: tuple[int, int], others: tuple[int, int]
 ) -> tuple[int, int]:
     """How many rows of two stretches have the same stamp, and how many of these the same values; NaN is like anything."""
-    ours, theirs = _stamps(held, *rows), _stamps(part, *others)
+    ours, theirs = _read_stamps(held, *rows), _read_stamps(part, *others)
     stamps, a, b = np.intersect1d(ours, theirs, return_indices=True)
     a, b = a[stamps != NAT], b[stamps != NAT]
     signal = next(

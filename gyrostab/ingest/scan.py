@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COLUMNS",
-    "Examined",
-    "Look",
-    "examine",
+    "InspectedFile",
+    "ScanResult",
     "next_command",
-    "print_look",
+    "print_inspection",
     "print_next",
     "print_scan",
     "scan",
+    "scan_and_inspect",
 ]
 
 #: Share of missing samples above which the sampling rate may be wrong: it is then tried with the
 #: mean rate of the rows.
-MUCH_MISSING = 0.1
+MAX_MISSING_SHARE = 0.1
 
 #: Columns of the table; span in s, rate in Hz, missing as a share of the samples between start and
 #: end.
@@ -90,14 +90,14 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     >>> print(table.loc[0, "rate_hz"], table.loc[0, "axes"], table.loc[0, "rows"])
     10.0 x 50
     """
-    examined = examine(paths, look=False, **reading)
+    examined = scan_and_inspect(paths, look=False, **reading)
     if examined.errors and len(examined.errors) == len(examined.table):
         raise examined.errors[0]
     return examined.table
 
 
 @dataclass(frozen=True)
-class Look:
+class InspectedFile:
     """What was found in a file that cannot be read as it is: its columns, the guess, and the options that read it."""
 
     paths: list[Path]  # with the same columns; the first was looked into
@@ -109,17 +109,17 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Examined:
+class ScanResult:
     """The table of `scan`, the errors of files that cannot be read as they are, and a look into them."""
 
     table: pd.DataFrame
     errors: list[GyrostabError]
-    looks: list[Look]
+    looks: list[InspectedFile]
 
 
-def examine(
+def scan_and_inspect(
     paths: Sequence[str | Path] | str | Path, *, look: bool = True, **reading: Any
-) -> Examined:
+) -> ScanResult:
     """Scan logs, and look into each column of those that cannot be read as they are.
 
     Parameters
@@ -138,25 +138,27 @@ def examine(
 
     rows: list[dict[str, Any]] = []
     errors: list[GyrostabError] = []
-    looks: dict[Any, Look | None] = {}
+    looks: dict[Any, InspectedFile | None] = {}
     for path in expand(paths):
         try:
             rows.append(_scan_one(path, reading))
         except GyrostabError as error:
             errors.append(error)
-            found = _look(path, reading, looks) if look else None
+            found = _inspect_once(path, reading, looks) if look else None
             rows.append({"file": str(path), "odd": str(error)})
             if found is not None:
                 rows[-1].update(format=found.look.summary.format)
                 rows[-1].update(rows=found.look.rows if found.paths == [path] else None)
-    return Examined(
+    return ScanResult(
         pd.DataFrame(rows, columns=list(COLUMNS)),
         errors,
         [found for found in looks.values() if found is not None],
     )
 
 
-def _look(path: Path, reading: dict[str, Any], looks: dict[Any, Look | None]) -> Look | None:
+def _inspect_once(
+    path: Path, reading: dict[str, Any], looks: dict[Any, InspectedFile | None]
+) -> InspectedFile | None:
     """Look into a file, unless one with the same columns was looked into."""
     from gyrostab.ingest import ReadOptions, scan_file
     from gyrostab.ingest.guess import guess_columns
@@ -185,7 +187,9 @@ def _look(path: Path, reading: dict[str, Any], looks: dict[Any, Look | None]) ->
     return found
 
 
-def _try_guess(path: Path, look: FileInspection, guess: Guess, reading: dict[str, Any]) -> Look:
+def _try_guess(
+    path: Path, look: FileInspection, guess: Guess, reading: dict[str, Any]
+) -> InspectedFile:
     """Read the file by the guess, and with the sampling rate if the stamps alone do not tell it."""
     from gyrostab.ingest.guess import temperature_unit
 
@@ -215,18 +219,18 @@ def _try_guess(path: Path, look: FileInspection, guess: Guess, reading: dict[str
     if "rate" not in options and math.isfinite(look.rate_hz):
         tries.append({**options, "rate": float(f"{look.rate_hz:.6g}")})
     reason = "no column looks like a gyro"
-    read: list[Look] = []
+    read: list[InspectedFile] = []
     for trial in tries if guess.axes else []:
         try:
-            read.append(Look([path], look, guess, trial, _scan_one(path, trial), None))
+            read.append(InspectedFile([path], look, guess, trial, _scan_one(path, trial), None))
         except GyrostabError as error:
             reason = str(error)
-        if read and read[-1].row is not None and read[-1].row["missing_share"] < MUCH_MISSING:
+        if read and read[-1].row is not None and read[-1].row["missing_share"] < MAX_MISSING_SHARE:
             break
     best = min(
         read, key=lambda found: found.row["missing_share"] if found.row else 1.0, default=None
     )
-    return best or Look([path], look, guess, options, None, reason)
+    return best or InspectedFile([path], look, guess, options, None, reason)
 
 
 def _named_rate(path: Path) -> float | None:
@@ -358,7 +362,7 @@ def print_scan(table: pd.DataFrame) -> None:
         cells = (
             f"{row['file']} ({row['format']})",
             f"{row['start']:%Y-%m-%d %H:%M:%S}",
-            _span(row["span_s"]),
+            _format_span(row["span_s"]),
             f"{row['rate_hz']:g}",
             row["axes"],
             row["channels"],
@@ -372,15 +376,15 @@ def print_scan(table: pd.DataFrame) -> None:
         console.print(f"[bold]{escape(row['file'])}[/bold]: {escape(row['odd'])}", highlight=False)
 
 
-def _span(seconds: float) -> str:
+def _format_span(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds < 60.0 else str(timedelta(seconds=round(seconds)))
 
 
-LOOK_COLUMNS = ("column", "unit", "low", "high", "mean", "scatter", "rate_hz", "taken_for")
+INSPECTION_COLUMNS = ("column", "unit", "low", "high", "mean", "scatter", "rate_hz", "taken_for")
 
 
-def _look_rows(found: Look) -> list[tuple[str, ...]]:
-    """The columns of a file as texts, one row each, as in `LOOK_COLUMNS`."""
+def _inspection_rows(found: InspectedFile) -> list[tuple[str, ...]]:
+    """The columns of a file as texts, one row each, as in `INSPECTION_COLUMNS`."""
     guess = found.guess
     taken = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
     if guess.time is not None:
@@ -391,7 +395,16 @@ def _look_rows(found: Look) -> list[tuple[str, ...]]:
     if found.look.time is not None:
         time = found.look.time
         rows.append(
-            (time.header, time.unit or "", "", "", "", "", _number(found.look.rate_hz), "time")
+            (
+                time.header,
+                time.unit or "",
+                "",
+                "",
+                "",
+                "",
+                _format_number(found.look.rate_hz),
+                "time",
+            )
         )
     for column in found.look.columns:
         known = math.isfinite(column.rate_hz) or column.rows == 0
@@ -407,32 +420,32 @@ def _look_rows(found: Look) -> list[tuple[str, ...]]:
             (
                 column.key,
                 column.unit or "",
-                *map(_number, numbers),
+                *map(_format_number, numbers),
                 taken.get(column.key, kept) if column.rows else "no numbers",
             )
         )
     return rows
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{value:.6g}" if math.isfinite(value) else ""
 
 
-def print_look(found: Look) -> None:
+def print_inspection(found: InspectedFile) -> None:
     """Print what is in the columns of a file and the guess; in a pipe every line begins with ``#``."""
-    rows = _look_rows(found)
+    rows = _inspection_rows(found)
     guess = found.guess
     told = [*guess.reasons, *(f"check: {warning}" for warning in guess.warnings), *found.look.notes]
     if found.row is not None:
         read = found.row
         told.append(
-            f"read so: {_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes {read['axes']}, {read['missing_share']:.2%} missing"
+            f"read so: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes {read['axes']}, {read['missing_share']:.2%} missing"
         )
     if found.error is not None and guess.axes:
         told.append(f"not readable by this guess: {found.error}")
     if not sys.stdout.isatty():
         print(f"# {found.paths[0]}: {len(rows)} columns, {found.look.rows} rows")
-        for row in [LOOK_COLUMNS, *rows]:
+        for row in [INSPECTION_COLUMNS, *rows]:
             print("# " + "\t".join(row))
         for text in told:
             print(f"# {text}")
@@ -442,7 +455,7 @@ def print_look(found: Look) -> None:
     from rich.table import Table
 
     framed = Table(title=escape(f"{found.paths[0]}: {found.look.rows:,} rows"))
-    for heading in LOOK_COLUMNS:
+    for heading in INSPECTION_COLUMNS:
         framed.add_column(
             heading.replace("_", " "),
             overflow="fold",

@@ -155,7 +155,7 @@ def test_axes_recorded_one_after_the_other_stay_pieces_in_time(tmp_path):
 
 
 def test_long_files_stay_on_disk_and_are_read_directly(tmp_path, monkeypatch):
-    monkeypatch.setattr(buffers, "_SMALL", 0)
+    monkeypatch.setattr(buffers, "_MAX_PLAIN_VALUES", 0)
     monkeypatch.setattr(files, "SPILL_BYTES", 1000)
     paths = [write(tmp_path / f"{axis}.csv", axis) for axis in "xyz"]
     raw = read_log(paths)

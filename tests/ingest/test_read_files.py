@@ -397,7 +397,7 @@ class _Point:
             def read(path: Path, options: ReadOptions) -> xr.Dataset:
                 text = path.with_suffix(".csv")
                 text.write_text("gyro_x [deg/h]\n" + path.read_text())
-                return files._registered()["text"].load().read(text, options)
+                return files._entry_points()["text"].load().read(text, options)
 
         return Counts
 
@@ -405,8 +405,8 @@ class _Point:
 def test_a_format_of_another_package_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    points = {**files._registered(), "counts": _Point()}
-    monkeypatch.setattr(files, "_registered", lambda: points)
+    points = {**files._entry_points(), "counts": _Point()}
+    monkeypatch.setattr(files, "_entry_points", lambda: points)
     path = write(tmp_path / "log.counts", "1\n2\n3\n")
     assert "counts" in readers()
     assert scan_file(path).format == "counts"

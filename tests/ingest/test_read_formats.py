@@ -18,8 +18,8 @@ from scipy.io import savemat
 
 from gyrostab.errors import FormatError, MissingUnitError, OptionError
 from gyrostab.ingest import ReadOptions, read_log, readers, scan_file
-from gyrostab.ingest.columns.buffers import Buffers, lazily, put, take
-from gyrostab.ingest.columns.pieces import Pieces, Spool
+from gyrostab.ingest.columns.buffers import Buffers, as_lazy, set_rows, take_rows
+from gyrostab.ingest.columns.pieces import PiecewiseColumn, Spool
 from gyrostab.schema import check_raw
 
 ROWS = 500
@@ -200,7 +200,7 @@ def test_columns_on_disk_hold_what_columns_in_memory_hold(
 ) -> None:
     path, options = made
     in_memory = read_log(path, **options)
-    module = __import__(f"gyrostab.ingest.{scan_file(path).format}", fromlist=["read"])
+    module = __import__(f"gyrostab.ingest.formats.{scan_file(path).format}", fromlist=["read"])
     on_disk = module.read(path, ReadOptions(**options), limit=1000)
     assert on_disk.rate.chunks is not None
     assert on_disk.time.chunks is not None
@@ -358,14 +358,14 @@ def test_buffers_spill_and_give_back() -> None:
         for block in blocks:
             buffers.add(block)
         found = buffers.finish()
-        assert isinstance(found["a"], Pieces) == (limit < 10**6)
+        assert isinstance(found["a"], PiecewiseColumn) == (limit < 10**6)
         for key in "ab":
-            np.testing.assert_array_equal(np.asarray(lazily(found[key])), expected[key])
+            np.testing.assert_array_equal(np.asarray(as_lazy(found[key])), expected[key])
             for part in (slice(3, 38), slice(6, 6), slice(1, 40, 7), slice(-9, None)):
                 np.testing.assert_array_equal(found[key][part], expected[key][part])
         rows = np.array([4, 5, 6, 42])
-        np.testing.assert_array_equal(take(found["b"], rows), expected["b"][rows])
-        put(found["b"], rows, -1)
+        np.testing.assert_array_equal(take_rows(found["b"], rows), expected["b"][rows])
+        set_rows(found["b"], rows, -1)
         np.testing.assert_array_equal(
             found["b"][:], np.where(np.isin(np.arange(43), rows), -1, expected["b"])
         )

@@ -14,8 +14,14 @@ from hypothesis import strategies as st
 
 from gyrostab.ingest import files, read_log
 from gyrostab.ingest.columns import buffers
-from gyrostab.ingest.columns.pieces import Counts, Pieces, Spool, Steps, Words
-from gyrostab.ingest.combine import memory
+from gyrostab.ingest.columns.pieces import (
+    DecimalPiece,
+    EvenStampsPiece,
+    PiecewiseColumn,
+    PlainPiece,
+    Spool,
+)
+from gyrostab.ingest.combine import memory_bytes
 from gyrostab.ingest.formats import text
 from gyrostab.kernels.encoding.decimals import (
     decimals_of,
@@ -101,27 +107,32 @@ def test_uneven_steps_are_not_packed():
 def test_pieces_of_every_kind_in_memory_and_on_disk(where):
     spool = Spool()
     floats = np.array([0.5, np.nan, 1 / 3])
-    pieces = Pieces(
+    pieces = PiecewiseColumn(
         np.float64,
-        [Counts(np.array([15, -(2**31), 7], np.int32), 10.0, 3600.0, 1.0), Words(bits(floats))],
+        [
+            DecimalPiece(np.array([15, -(2**31), 7], np.int32), 10.0, 3600.0, 1.0),
+            PlainPiece(bits(floats)),
+        ],
     )
     wanted = np.array([1.5 * 3600 + 1, np.nan, 0.7 * 3600 + 1, *floats])
     stamps = np.array([5, 10, 15, 20, 100, 200])
-    times = Pieces("datetime64[ns]", [Steps(np.array([[0, 5, 5]]), 4), Words(stamps[4:].copy())])
+    times = PiecewiseColumn(
+        "datetime64[ns]", [EvenStampsPiece(np.array([[0, 5, 5]]), 4), PlainPiece(stamps[4:].copy())]
+    )
     if where == "both":
-        pieces._pieces[0] = pieces._pieces[0].spilled(spool)
+        pieces._pieces[0] = pieces._pieces[0].to_spool(spool)
     if where == "disk":
-        held = pieces.held
-        pieces.spill(spool)
-        times.view(np.int64).spill(spool)  # a view is the same column
+        held = pieces.memory_bytes
+        pieces.move_to(spool)
+        times.view(np.int64).move_to(spool)  # a view is the same column
         assert held == 12 + 24
-        assert pieces.held == 0
-        assert times.held == 24
+        assert pieces.memory_bytes == 0
+        assert times.memory_bytes == 24
     for begin, end in [(0, 6), (2, 4), (3, 6), (5, 5)]:
         np.testing.assert_array_equal(bits(pieces[begin:end]), bits(wanted[begin:end]))
         np.testing.assert_array_equal(times[begin:end].view(np.int64), stamps[begin:end])
     for row in (1, 5):
-        times.put(row, NO_STAMP)
+        times.set_value(row, NO_STAMP)
         stamps[row] = NO_STAMP
     np.testing.assert_array_equal(times[:].view(np.int64), stamps)
 
@@ -149,7 +160,7 @@ def test_a_log_that_is_packed_is_the_log(tmp_path, monkeypatch, limit, decimals)
     ]
     plain = read_log(paths)
     assert isinstance(plain.rate.data, np.ndarray)
-    monkeypatch.setattr(buffers, "_SMALL", 0)
+    monkeypatch.setattr(buffers, "_MAX_PLAIN_VALUES", 0)
     monkeypatch.setattr(files, "SPILL_BYTES", limit)
     packed = read_log(paths)
     assert packed.rate.chunks is not None
@@ -162,7 +173,7 @@ def test_reading_ahead_ends_with_what_stops_it(tmp_path, monkeypatch):
         text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)
     ]
     taken: list[int] = []
-    take = text._take
+    take = text._parse_block
 
     def slowly(block, **options):
         time.sleep(0.005)
@@ -173,7 +184,7 @@ def test_reading_ahead_ends_with_what_stops_it(tmp_path, monkeypatch):
         if number == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(text, "_take", slowly)
+    monkeypatch.setattr(text, "_parse_block", slowly)
     monkeypatch.setattr(text, "BLOCK_BYTES", 256)
     with pytest.raises(KeyboardInterrupt):
         read_log(paths, on_file=refuse)
@@ -182,9 +193,9 @@ def test_reading_ahead_ends_with_what_stops_it(tmp_path, monkeypatch):
 
 
 def test_whole_numbers_at_even_steps_take_less_than_half_the_room(tmp_path, monkeypatch):
-    monkeypatch.setattr(buffers, "_SMALL", 0)
+    monkeypatch.setattr(buffers, "_MAX_PLAIN_VALUES", 0)
     path = text_log(tmp_path / "log.csv", 0, 3000, decimals=2)
-    assert memory(read_log(path)) < 0.55 * 8 * 4 * 3000
+    assert memory_bytes(read_log(path)) < 0.55 * 8 * 4 * 3000
 
 
 def test_even_stamps_are_placed_as_those_that_are_not_quite():

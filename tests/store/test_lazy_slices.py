@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from gyrostab import make_log, open_product, to_netcdf, to_zarr
 from gyrostab.allan.fit import fit_noise, fit_part
-from gyrostab.ingest.columns.buffers import lazily
+from gyrostab.ingest.columns.buffers import as_lazy
 from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.concat import concatenate_logs
 from gyrostab.ingest.concat.lazy import place_on_grid
@@ -332,7 +332,7 @@ def placed_by_hand(runs, size, rows):
 @pytest.mark.parametrize("kept", ["memory", "disk", "both"])
 @pytest.mark.parametrize(("scale", "unit"), [(1.0, None), (3.0, None), (2.0, 0.1)])
 def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeypatch):
-    monkeypatch.setattr(fill, "SMALL", 10)
+    monkeypatch.setattr(fill, "MAX_PLAIN_NUMBERS", 10)
     rng = np.random.default_rng(8)
     rows = 0.1 * rng.integers(-50, 50, (2, 3000)).astype(float)
     rows[0, 5], rows[1, 1200] = np.inf, np.nan
@@ -343,14 +343,14 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeyp
         "disk": [rows[:, :cut], rows[:, cut:]],
         "both": [rows[:, :cut], rows[:, cut:]],
     }[kept]
-    columns = [[lazily(spool.store(piece[row])) if kept == "disk" or (kept == "both" and number) else piece[row]
+    columns = [[as_lazy(spool.store(piece[row])) if kept == "disk" or (kept == "both" and number) else piece[row]
                 for number, piece in enumerate(pieces)] for row in (0, 1)]  # fmt: skip
     raw = (
         rows
         if kept == "memory"
         else stack_rows([concatenate_columns(column, 500) for column in columns])
     )
-    placed = fill.on_grid(
+    placed = fill.rows_on_grid(
         raw, Placement(0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit
     )
     assert can_read_into(placed)

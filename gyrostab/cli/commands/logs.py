@@ -25,10 +25,16 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     logs
         One or more logs, in any format that gyrostab reads.
     """
-    from gyrostab.ingest.scan import examine, next_command, print_look, print_next, print_scan
+    from gyrostab.ingest.scan import (
+        next_command,
+        print_inspection,
+        print_next,
+        print_scan,
+        scan_and_inspect,
+    )
 
     options = reading.given()
-    examined = examine(logs, **options)
+    examined = scan_and_inspect(logs, **options)
     table = examined.table
     lost = table[table["format"].isna()]
     if len(lost) == len(table):
@@ -38,7 +44,7 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     if len(readable):
         print_next(next_command(list(readable["file"]), options), apart=True)
     for found in examined.looks:
-        print_look(found)
+        print_inspection(found)
         if found.row is not None:
             print_next(next_command(found.paths, found.options))
     if options and examined.errors:

@@ -9,10 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.ingest.columns.pieces import Piece, Pieces, Spool, Stored, Words
+from gyrostab.ingest.columns.pieces import FilePiece, Piece, PiecewiseColumn, PlainPiece, Spool
 from gyrostab.store.lazy_slices import stack_rows, with_row_reader
 
-__all__ = ["CHUNK_ROWS", "SPILL_BYTES", "Buffers", "lazily", "pieces_of", "put", "take", "together"]
+__all__ = [
+    "CHUNK_ROWS",
+    "SPILL_BYTES",
+    "Buffers",
+    "as_lazy",
+    "pieces_of",
+    "set_rows",
+    "stack_as_rows",
+    "take_rows",
+]
 
 #: Columns of one file together stay in memory up to this size [bytes].
 SPILL_BYTES = 128 * 2**20
@@ -21,23 +30,23 @@ SPILL_BYTES = 128 * 2**20
 CHUNK_ROWS = 2**21
 
 #: Values of all columns of a file up to which they are put together to plain arrays.
-_SMALL = 2**21
+_MAX_PLAIN_VALUES = 2**21
 
 
-def take(column: NDArray[Any] | Pieces, rows: NDArray[np.int64]) -> NDArray[Any]:
+def take_rows(column: NDArray[Any] | PiecewiseColumn, rows: NDArray[np.int64]) -> NDArray[Any]:
     """The values of a few rows."""
-    if isinstance(column, Pieces):
+    if isinstance(column, PiecewiseColumn):
         return np.concatenate(
             [np.empty(0, column.dtype), *(column[row : row + 1] for row in rows.tolist())]
         )
     return np.asarray(column[rows])
 
 
-def put(column: NDArray[Any] | Pieces, rows: NDArray[np.int64], value: int) -> None:
+def set_rows(column: NDArray[Any] | PiecewiseColumn, rows: NDArray[np.int64], value: int) -> None:
     """Change a few rows."""
-    if isinstance(column, Pieces):
+    if isinstance(column, PiecewiseColumn):
         for row in rows.tolist():
-            column.put(row, value)
+            column.set_value(row, value)
     else:
         column[rows] = value
 
@@ -64,36 +73,38 @@ class Buffers:
         """Append one block: every column, all of one length."""
         size = 0
         for key, values in block.items():
-            piece = self._words(key, values) if isinstance(values, np.ndarray) else values
+            piece = self._as_piece(key, values) if isinstance(values, np.ndarray) else values
             self._pieces[key].append(piece)
-            self._held += piece.held
+            self._held += piece.memory_bytes
             size = piece.rows
         self.rows += size
         if self._spool or self._held > self.limit:
-            self._spill()
+            self._spill_to_disk()
 
-    def _words(self, key: Any, values: NDArray[Any]) -> Piece:
+    def _as_piece(self, key: Any, values: NDArray[Any]) -> Piece:
         whole = np.ascontiguousarray(values, dtype=self.dtypes[key])
         if isinstance(whole.base, np.ndarray) and whole.base.nbytes > whole.nbytes:
             whole = whole.copy()  # or else what it is a part of would stay in memory
-        return Words(whole.view(np.int64))
+        return PlainPiece(whole.view(np.int64))
 
-    def _spill(self) -> None:
+    def _spill_to_disk(self) -> None:
         self._spool = spool = self._spool or Spool()
         for pieces in self._pieces.values():
-            pieces[self._moved :] = [piece.spilled(spool) for piece in pieces[self._moved :]]
+            pieces[self._moved :] = [piece.to_spool(spool) for piece in pieces[self._moved :]]
         self._held, self._moved = 0, max(map(len, self._pieces.values()))
 
-    def finish(self) -> dict[Any, NDArray[Any] | Pieces]:
+    def finish(self) -> dict[Any, NDArray[Any] | PiecewiseColumn]:
         """The columns: arrays where they are small, or else in pieces."""
-        found: dict[Any, NDArray[Any] | Pieces] = {}
+        found: dict[Any, NDArray[Any] | PiecewiseColumn] = {}
         stays = any(
-            isinstance(piece, Stored) for pieces in self._pieces.values() for piece in pieces
+            isinstance(piece, FilePiece) for pieces in self._pieces.values() for piece in pieces
         )
-        small = not stays and self._spool is None and self.rows * len(self._pieces) <= _SMALL
+        small = (
+            not stays and self._spool is None and self.rows * len(self._pieces) <= _MAX_PLAIN_VALUES
+        )
         matrix = np.empty((len(self.rows_of), self.rows if small else 0))
         for key, pieces in self._pieces.items():
-            column = Pieces(self.dtypes[key], pieces)
+            column = PiecewiseColumn(self.dtypes[key], pieces)
             pieces.clear()
             if small:
                 plain = (
@@ -101,14 +112,14 @@ class Buffers:
                     if key in self.rows_of
                     else np.empty(self.rows, self.dtypes[key])
                 )
-                column.fill(0, 0, plain)
+                column.read_into(0, 0, plain)
                 found[key] = plain
             else:
                 found[key] = column
         return found
 
 
-def together(columns: Sequence[Any]) -> Any:
+def stack_as_rows(columns: Sequence[Any]) -> Any:
     """Columns as the rows of one array, numpy if they are, without a copy if they are the rows of one already."""
     if not isinstance(columns[0], np.ndarray):
         stacked = stack_rows(columns)
@@ -124,22 +135,22 @@ def together(columns: Sequence[Any]) -> Any:
     return whole if same else np.stack(columns)
 
 
-def lazily(values: NDArray[Any] | Pieces) -> Any:
+def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:
     """A dask array over a column in pieces; an array in memory is returned as it is."""
-    if not isinstance(values, Pieces):
+    if not isinstance(values, PiecewiseColumn):
         return values
     import dask.array
 
     name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
     lazy = with_row_reader(
         dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta),
-        values.fill,
+        values.read_into,
     )
     lazy.gyrostab_pieces = [values]
     lazy.gyrostab_line = values.find_line()
     return lazy
 
 
-def pieces_of(array: Any) -> list[Pieces]:
-    """The columns in pieces that an array of `lazily` or `together` reads."""
+def pieces_of(array: Any) -> list[PiecewiseColumn]:
+    """The columns in pieces that an array of `as_lazy` or `stack_as_rows` reads."""
     return list(getattr(array, "gyrostab_pieces", ()))

@@ -12,18 +12,31 @@ from gyrostab.ingest.columns.stamps import parse_time_unit
 from gyrostab.units import known_units, parse_unit
 
 __all__ = [
-    "AXIS", "KNOWN", "LOOKS_GYRO", "TIME", "Header", "distinct_columns", "example_unit", "free_name", "is_contract_name", "is_time_unit",
-    "is_unit", "is_unit_of", "quantity_of", "split_header", "unit_quantity",
+    "AXIS_PATTERN",
+    "GYRO_PATTERNS",
+    "KNOWN_CHANNEL_PATTERN",
+    "TIME_PATTERN",
+    "Header",
+    "distinct_columns",
+    "example_unit",
+    "free_name",
+    "is_contract_name",
+    "is_time_unit",
+    "is_unit",
+    "is_unit_of",
+    "quantity_of",
+    "split_header",
+    "unit_quantity",
 ]  # fmt: skip
 
 _BRACKET = re.compile(r"^(.*?)\s*\[([^\[\]]*)\]\s*$")
 _PARENTHESES = re.compile(r"^(.*?)\s*\(([^()]*)\)\s*$")
-AXIS = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")
+AXIS_PATTERN = re.compile(r"^(gyro|angle)_([a-z]\d*|\d+)$")
 _TIME_SUFFIX = r"s|sec|seconds?|ms|milliseconds?|us|microseconds?|ns|nanoseconds?|utc|iso"
-TIME = re.compile(
+TIME_PATTERN = re.compile(
     rf"^(?:(?:time|timestamp|t)(?:[_ ]({_TIME_SUFFIX}))?|(?:time|timestamp)(sec|ms|us|ns|utc))$"
 )
-LOOKS_GYRO = [
+GYRO_PATTERNS = [
     re.compile(pattern, re.IGNORECASE)
     for pattern in (r"gyr|angular_?(rate|vel)|omega", r"^[gw]_?[xyz](_|$)|^w_rs", r"rate|rot")
 ]
@@ -40,7 +53,7 @@ QUANTITIES = {
     "mag": "magnetic",
     "ramp": "number",
 }
-KNOWN = re.compile(
+KNOWN_CHANNEL_PATTERN = re.compile(
     r"^(temperature|vibration|rotation_rate|supply_voltage|light_power|pressure|ramp|accel_[xyz]|mag_[xyz])$"
 )
 
@@ -182,4 +195,4 @@ def example_unit(quantity: str | None) -> str:
 
 def is_contract_name(low: str) -> bool:
     """Whether a name in small letters is one that has a meaning of its own: an axis, the time or a known channel."""
-    return bool(AXIS.match(low) or KNOWN.match(low) or low == "time")
+    return bool(AXIS_PATTERN.match(low) or KNOWN_CHANNEL_PATTERN.match(low) or low == "time")

@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
 
-__all__ = ["Counts", "Piece", "Pieces", "Spool", "Steps", "Stored", "Words"]
+__all__ = [
+    "DecimalPiece",
+    "EvenStampsPiece",
+    "FilePiece",
+    "Piece",
+    "PiecewiseColumn",
+    "PlainPiece",
+    "Spool",
+]
 
 
 class Spool:
@@ -47,10 +55,12 @@ class Spool:
                 "make room, or name a larger place in the environment variable TMPDIR"
             ) from error
 
-    def store(self, values: NDArray[Any]) -> Pieces:
+    def store(self, values: NDArray[Any]) -> PiecewiseColumn:
         """Move a column to the file."""
-        pieces = Pieces(values.dtype, [Words(np.ascontiguousarray(values).view(np.int64))])
-        pieces.spill(self)
+        pieces = PiecewiseColumn(
+            values.dtype, [PlainPiece(np.ascontiguousarray(values).view(np.int64))]
+        )
+        pieces.move_to(self)
         return pieces
 
     @property
@@ -66,7 +76,7 @@ def _write_all(file: IO[bytes], view: memoryview) -> None:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _SpooledArray:
     """An array in a spool."""
 
     spool: Spool
@@ -93,22 +103,22 @@ class _Place:
         )
 
 
-_Kept = NDArray[Any] | _Place
+_Values = NDArray[Any] | _SpooledArray
 
 
-def _held(kept: _Kept) -> int:
+def _memory_bytes(kept: _Values) -> int:
     return kept.nbytes if isinstance(kept, np.ndarray) else 0
 
 
-def _spilled(kept: _Kept, spool: Spool) -> _Kept:
+def _move_to_spool(kept: _Values, spool: Spool) -> _Values:
     return (
-        _Place(spool, spool.add(kept), kept.size, kept.dtype)
+        _SpooledArray(spool, spool.add(kept), kept.size, kept.dtype)
         if isinstance(kept, np.ndarray) and kept.size
         else kept
     )
 
 
-def _part(kept: _Kept, first: int, size: int) -> NDArray[Any]:
+def _read_part(kept: _Values, first: int, size: int) -> NDArray[Any]:
     if isinstance(kept, np.ndarray):
         return kept[first : first + size]
     out = np.empty(size, kept.dtype)
@@ -124,24 +134,24 @@ class Piece(Protocol):
         """How many."""
 
     @property
-    def held(self) -> int:
+    def memory_bytes(self) -> int:
         """Bytes in memory."""
 
-    def fill(self, first: int, out: NDArray[Any]) -> None:
+    def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Put the values from row `first` on into `out`."""
 
-    def spilled(self, spool: Spool) -> Piece:
+    def to_spool(self, spool: Spool) -> Piece:
         """The same with its values in a spool."""
 
-    def put(self, row: int, value: int) -> Piece:
+    def set_value(self, row: int, value: int) -> Piece:
         """The same with another value in one row, by its bits."""
 
 
 @dataclass(frozen=True)
-class Words:
+class PlainPiece:
     """Values as they are, by their bits."""
 
-    words: _Kept  # int64
+    words: _Values  # int64
 
     @property
     def rows(self) -> int:
@@ -149,11 +159,11 @@ class Words:
         return self.words.size
 
     @property
-    def held(self) -> int:
+    def memory_bytes(self) -> int:
         """Bytes in memory."""
-        return _held(self.words)
+        return _memory_bytes(self.words)
 
-    def fill(self, first: int, out: NDArray[Any]) -> None:
+    def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Put the values from row `first` on into `out`."""
         target = out.view(np.int64)
         if isinstance(self.words, np.ndarray):
@@ -161,11 +171,11 @@ class Words:
         else:
             self.words.read(first, target)
 
-    def spilled(self, spool: Spool) -> Piece:
+    def to_spool(self, spool: Spool) -> Piece:
         """The same with its values in a spool."""
-        return Words(_spilled(self.words, spool))
+        return PlainPiece(_move_to_spool(self.words, spool))
 
-    def put(self, row: int, value: int) -> Piece:
+    def set_value(self, row: int, value: int) -> Piece:
         """The same with another value in one row, by its bits."""
         if isinstance(self.words, np.ndarray):
             self.words[row] = value
@@ -175,10 +185,10 @@ class Words:
 
 
 @dataclass(frozen=True)
-class Counts:
+class DecimalPiece:
     """Decimals as whole numbers of 32 bits (`gyrostab.kernels.encoding.decimals`), to be converted to another unit as they are read."""
 
-    counts: _Kept  # int32
+    counts: _Values  # int32
     tens: float
     factor: float
     offset: float
@@ -189,54 +199,56 @@ class Counts:
         return self.counts.size
 
     @property
-    def held(self) -> int:
+    def memory_bytes(self) -> int:
         """Bytes in memory."""
-        return _held(self.counts)
+        return _memory_bytes(self.counts)
 
-    def fill(self, first: int, out: NDArray[Any]) -> None:
+    def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Put the values from row `first` on into `out`."""
         from gyrostab.kernels.encoding.decimals import from_decimals
 
-        from_decimals(_part(self.counts, first, out.size), self.tens, self.factor, self.offset, out)
+        from_decimals(
+            _read_part(self.counts, first, out.size), self.tens, self.factor, self.offset, out
+        )
 
-    def spilled(self, spool: Spool) -> Piece:
+    def to_spool(self, spool: Spool) -> Piece:
         """The same with its values in a spool."""
-        return Counts(_spilled(self.counts, spool), self.tens, self.factor, self.offset)
+        return DecimalPiece(_move_to_spool(self.counts, spool), self.tens, self.factor, self.offset)
 
-    def put(self, row: int, value: int) -> Piece:
+    def set_value(self, row: int, value: int) -> Piece:
         """The same with another value in one row, by its bits."""
-        return _unpacked(self, np.float64).put(row, value)
+        return _unpack_piece(self, np.float64).set_value(row, value)
 
 
 @dataclass(frozen=True)
-class Steps:
+class EvenStampsPiece:
     """Stamps in stretches of even steps; so few numbers that they stay in memory."""
 
     table: NDArray[np.int64]
     rows: int
 
     @property
-    def held(self) -> int:
+    def memory_bytes(self) -> int:
         """Bytes in memory."""
         return self.table.nbytes
 
-    def fill(self, first: int, out: NDArray[Any]) -> None:
+    def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Put the values from row `first` on into `out`."""
         from gyrostab.kernels.encoding.decimals import unroll_steps
 
         unroll_steps(self.table, first, out.view(np.int64))
 
-    def spilled(self, spool: Spool) -> Piece:
+    def to_spool(self, spool: Spool) -> Piece:
         """The same with its values in a spool."""
         return self
 
-    def put(self, row: int, value: int) -> Piece:
+    def set_value(self, row: int, value: int) -> Piece:
         """The same with another value in one row, by its bits."""
-        return _unpacked(self, np.int64).put(row, value)
+        return _unpack_piece(self, np.int64).set_value(row, value)
 
 
 @dataclass(frozen=True)
-class Stored:
+class FilePiece:
     """Values that stay in the file they came from, and are read and converted each time.
 
     Attributes
@@ -255,54 +267,54 @@ class Stored:
     changes: dict[int, int] = field(default_factory=dict)
 
     @property
-    def held(self) -> int:
+    def memory_bytes(self) -> int:
         """Bytes in memory."""
         return 0
 
-    def fill(self, first: int, out: NDArray[Any]) -> None:
+    def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Put the values from row `first` on into `out`."""
         out[:] = self.read(self.begin + first, self.begin + first + out.size).view(out.dtype)
         for row, value in self.changes.items():
             if first <= row < first + out.size:
                 out.view(np.int64)[row - first] = value
 
-    def spilled(self, spool: Spool) -> Piece:
+    def to_spool(self, spool: Spool) -> Piece:
         """The same, which takes no memory."""
         return self
 
-    def put(self, row: int, value: int) -> Piece:
+    def set_value(self, row: int, value: int) -> Piece:
         """The same with another value in one row, by its bits."""
         self.changes[row] = value
         return self
 
 
 @dataclass(frozen=True)
-class Blank:
+class NaNPiece:
     """Rows without a value; they take no room."""
 
     rows: int
-    held: int = 0
+    memory_bytes: int = 0
 
-    def fill(self, first: int, out: NDArray[Any]) -> None:
+    def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Put NaN into `out`."""
         out[:] = np.nan
 
-    def spilled(self, spool: Spool) -> Piece:
+    def to_spool(self, spool: Spool) -> Piece:
         """Return the same."""
         return self
 
-    def put(self, row: int, value: int) -> Piece:
+    def set_value(self, row: int, value: int) -> Piece:
         """Return the same with another value in one row, by its bits."""
-        return _unpacked(self, np.float64).put(row, value)
+        return _unpack_piece(self, np.float64).set_value(row, value)
 
 
-def _unpacked(piece: Piece, dtype: Any) -> Words:
+def _unpack_piece(piece: Piece, dtype: Any) -> PlainPiece:
     values = np.empty(piece.rows, dtype)
-    piece.fill(0, values)
-    return Words(values.view(np.int64))
+    piece.read_into(0, values)
+    return PlainPiece(values.view(np.int64))
 
 
-class Pieces:
+class PiecewiseColumn:
     """A column, behind the few attributes that dask asks for; dask copies whatever has a ``copy``."""
 
     ndim = 1
@@ -315,21 +327,21 @@ class Pieces:
         ).tolist()  # at which the pieces begin, and the end of the last
         self.shape = (self._rows[-1],)
 
-    def view(self, dtype: Any) -> Pieces:
+    def view(self, dtype: Any) -> PiecewiseColumn:
         """The same bytes as another type; what spills or changes the one does so to the other."""
-        same = Pieces(dtype, ())
+        same = PiecewiseColumn(dtype, ())
         same._pieces, same._rows, same.shape = self._pieces, self._rows, self.shape
         return same
 
     @property
-    def held(self) -> int:
+    def memory_bytes(self) -> int:
         """Bytes in memory."""
-        return sum(piece.held for piece in self._pieces)
+        return sum(piece.memory_bytes for piece in self._pieces)
 
     def find_line(self) -> tuple[int, int] | None:
         """Return the first value and the step, where all values are even steps without a break; None where they are not."""
         if not self._pieces or not all(
-            isinstance(piece, Steps) and len(piece.table) == 1 for piece in self._pieces
+            isinstance(piece, EvenStampsPiece) and len(piece.table) == 1 for piece in self._pieces
         ):
             return None
         _, first, step = (int(number) for number in self._pieces[0].table[0])  # type: ignore[attr-defined]
@@ -339,26 +351,26 @@ class Pieces:
                 return None
         return first, step
 
-    def spill(self, spool: Spool) -> None:
+    def move_to(self, spool: Spool) -> None:
         """Move what is in memory to a file."""
-        self._pieces[:] = [piece.spilled(spool) for piece in self._pieces]
+        self._pieces[:] = [piece.to_spool(spool) for piece in self._pieces]
 
     def __getitem__(self, part: Any) -> NDArray[Any]:
         rows = range(*(part[0] if isinstance(part, tuple) else part).indices(self.shape[0]))
         out = np.empty(max(rows.stop - rows.start, 0), dtype=self.dtype)
-        self.fill(0, rows.start, out)
+        self.read_into(0, rows.start, out)
         return out[:: rows.step]
 
-    def fill(self, _row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, _row: int, begin: int, out: NDArray[Any]) -> None:
         """The values from row `begin` of the log on: `gyrostab.store.lazy_slices.RowReader`."""
         done, number = 0, bisect_right(self._rows, begin) - 1
         while done < out.size:
             first = begin + done - self._rows[number]
             part = out[done : done + self._pieces[number].rows - first]
-            self._pieces[number].fill(first, part)
+            self._pieces[number].read_into(first, part)
             done, number = done + part.size, number + 1
 
-    def put(self, row: int, value: int) -> None:
+    def set_value(self, row: int, value: int) -> None:
         """Change a value, by its bits."""
         number = bisect_right(self._rows, row) - 1
-        self._pieces[number] = self._pieces[number].put(row - self._rows[number], value)
+        self._pieces[number] = self._pieces[number].set_value(row - self._rows[number], value)

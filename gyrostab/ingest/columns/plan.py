@@ -11,10 +11,10 @@ from pathlib import Path
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
 from gyrostab.ingest.columns.headers import (
-    AXIS,
-    KNOWN,
-    LOOKS_GYRO,
-    TIME,
+    AXIS_PATTERN,
+    GYRO_PATTERNS,
+    KNOWN_CHANNEL_PATTERN,
+    TIME_PATTERN,
     Header,
     distinct_columns,
     example_unit,
@@ -27,7 +27,7 @@ from gyrostab.ingest.columns.headers import (
     split_header,
     unit_quantity,
 )
-from gyrostab.ingest.columns.preset import Found, find_preset
+from gyrostab.ingest.columns.preset import PresetMatch, find_preset
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 from gyrostab.ingest.limits import check_columns, describe_limit, limit_value
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
@@ -134,7 +134,7 @@ def plan_columns(
     """
     check_columns(path, len(headers), options.limits)
     preset = _known_program(path, headers, above, is_filled)
-    work = _Work(path, options, rising or (lambda source: True))
+    work = PlanDraft(path, options, rising or (lambda source: True))
     named = work.name(
         headers,
         units or {},
@@ -145,22 +145,24 @@ def plan_columns(
     named = work.separate(named)
     time = work.find_time(named)
     rest = [column for column in named if column is not time]
-    gyro = [column for column in rest if AXIS.match(column.low)]
+    gyro = [column for column in rest if AXIS_PATTERN.match(column.low)]
     signal, kind = work.plan_gyro(gyro, headers)
-    work.plan_channels([column for column in rest if not AXIS.match(column.low)])
+    work.plan_channels([column for column in rest if not AXIS_PATTERN.match(column.low)])
     rate = preset.rate if time is None and options.rate is None else None
     if preset.name:
         told = f", and {rate:g} Hz by the lines above the header" if rate else ""
         work.notes.insert(
             0, f"read as a file of {preset.name}{told}; --map, --unit and --rate overrule it"
         )
-    elif found := [f"{c.header} is {c.name}" for c in named if c.preset and AXIS.match(c.low)]:
-        work.notes.append(f"taken for axes: {_listing(found)}; --map overrules it")
+    elif found := [
+        f"{c.header} is {c.name}" for c in named if c.preset and AXIS_PATTERN.match(c.low)
+    ]:
+        work.notes.append(f"taken for axes: {list_names(found)}; --map overrules it")
     if time is None and options.rate is None and rate is None and not work.problems:
         message = f"{path.name}: there is no time column; give the sampling rate with --rate HZ (and --start)"
         work.problems.append(
             OptionError(
-                f"{message}, or name the column: --map NAME=time. Columns: {_listing(headers)}"
+                f"{message}, or name the column: --map NAME=time. Columns: {list_names(headers)}"
             )
         )
     work.finish(headers)
@@ -189,15 +191,15 @@ def _known_program(
     headers: Sequence[str],
     above: Sequence[str],
     is_filled: Callable[[int], bool] | None,
-) -> Found:
+) -> PresetMatch:
     """The preset of a file, unless the file names its axes in our way."""
     split = [(header, split_header(header)[0]) for header in headers]
-    if any(AXIS.match(name.lower()) for _, name in split):
-        return Found("")
-    return find_preset(path, split, above=above, is_filled=is_filled) or Found("")
+    if any(AXIS_PATTERN.match(name.lower()) for _, name in split):
+        return PresetMatch("")
+    return find_preset(path, split, above=above, is_filled=is_filled) or PresetMatch("")
 
 
-class _Work:
+class PlanDraft:
     """The lists that grow while a file's header is being understood."""
 
     def __init__(self, path: Path, options: ReadOptions, rising: Callable[[int], bool]):
@@ -264,7 +266,7 @@ class _Work:
             asked = [column for column in same if column.mapped]
             if len(same) == 1 or (name == "time" and len(asked) < 2):
                 continue
-            if len(asked) > 1 or (AXIS.match(name) and not asked):
+            if len(asked) > 1 or (AXIS_PATTERN.match(name) and not asked):
                 headers = ", ".join(repr(column.header) for column in same[:5])
                 fix = f'drop the others, for instance --map "{(asked or same)[1].key}=-"'
                 self.problems.append(
@@ -272,11 +274,11 @@ class _Work:
                         f"{self.path.name}: {len(same)} columns are called {name!r} ({headers}); {fix}"
                     )
                 )
-            elif AXIS.match(name):
+            elif AXIS_PATTERN.match(name):
                 others = [column for column in same if not column.mapped]
                 dropped.update(column.source for column in others)
                 self.notes.append(
-                    f"left out, as --map names another column {name}: {_listing([column.header for column in others])}"
+                    f"left out, as --map names another column {name}: {list_names([column.header for column in others])}"
                 )
             else:
                 for number, column in enumerate(
@@ -299,7 +301,7 @@ class _Work:
             found = [
                 c
                 for c in named
-                if not (c.mapped or c.preset) and TIME.match(c.low) and self._may_be_time(c)
+                if not (c.mapped or c.preset) and TIME_PATTERN.match(c.low) and self._may_be_time(c)
             ]
             sure = [c for c in found if c.low != "t" or c.unit or c.stored or c.stamped]
             found = sure or found
@@ -332,7 +334,7 @@ class _Work:
         self.columns.append(
             Column(column.source, column.header, "time", "time", "time", "ns", time_unit=unit)
         )
-        self._summarise(
+        self._add_summary(
             column,
             "time",
             "time",
@@ -361,7 +363,7 @@ class _Work:
         return written is None or names_epoch(written) or is_time_unit(written)
 
     def _time_unit(self, column: Header) -> TimeUnit | None:
-        suffix = TIME.match(split_header(column.header)[0].lower())
+        suffix = TIME_PATTERN.match(split_header(column.header)[0].lower())
         named = next((text for text in suffix.groups() if text), None) if suffix else None
         written = column.unit or (
             named if named not in ("utc", "iso") and column.stored is None else None
@@ -417,10 +419,10 @@ class _Work:
             return None, None
         signal = next(iter(quantities.values()))
         first = next(column for column in gyro if column.header in quantities)
-        return signal, self._kind(signal, first.header, first.key, first.low)
+        return signal, self._find_kind(signal, first.header, first.key, first.low)
 
     def _plan_axis(self, column: Header) -> str | None:
-        match = AXIS.match(column.low)
+        match = AXIS_PATTERN.match(column.low)
         assert match is not None
         stem, axis = match.groups()
         example = "deg/s" if stem == "gyro" else "deg"
@@ -439,7 +441,7 @@ class _Work:
                     f"{message}; {how}, or write it in the header: {column.low} [{example}]"
                 )
             )
-            self._summarise(column, column.low, "gyro", None, None)
+            self._add_summary(column, column.low, "gyro", None, None)
             return None
         try:
             unit = parse_unit(
@@ -458,17 +460,17 @@ class _Work:
                     f"{self.path.name}: column {column.header!r}: unit {text!r} is not known; {hint}"
                 )
             )
-            self._summarise(column, column.low, "gyro", None, text)
+            self._add_summary(column, column.low, "gyro", None, text)
             return None
         if unit.quantity not in allowed:
             message = f"{self.path.name}: column {column.header!r} has the unit {text!r}, which is a unit of {unit.quantity}, not of {allowed[0]}"
             how = f"{allowed[0]} units are {known_units(allowed[0])}; give the right one with --unit {stem}={example}"
             self.problems.append(
                 UnitError(
-                    f'{message}; {how}, or with a factor for counts: --unit "{stem}=0.1 {_arcsec(stem)}"'
+                    f'{message}; {how}, or with a factor for counts: --unit "{stem}=0.1 {_arcsec_unit(stem)}"'
                 )
             )
-            self._summarise(column, column.low, "gyro", unit.quantity, text)
+            self._add_summary(column, column.low, "gyro", unit.quantity, text)
             return None
         inner = INNER[unit.quantity]
         self.columns.append(
@@ -483,10 +485,10 @@ class _Work:
                 unit.offset,
             )
         )
-        self._summarise(column, column.low, "gyro", unit.quantity, text)
+        self._add_summary(column, column.low, "gyro", unit.quantity, text)
         return unit.quantity
 
-    def _kind(self, signal: str, header: str, key: str, name: str) -> str | None:
+    def _find_kind(self, signal: str, header: str, key: str, name: str) -> str | None:
         if signal == "rate":
             if self.options.kind == "angle":
                 message = f"{self.path.name}: --kind angle, but column {header!r} is a rate"
@@ -505,7 +507,7 @@ class _Work:
         """Channels: what carries a unit is kept, the rest is left out with a note, or refused if it was asked for."""
         for column in rest:
             quantity = quantity_of(column.low)
-            known = bool(KNOWN.match(column.low))
+            known = bool(KNOWN_CHANNEL_PATTERN.match(column.low))
             name = column.low if known or quantity else re.sub(r"[/\s]+", "_", column.name)
             keys = [
                 name,
@@ -522,7 +524,7 @@ class _Work:
                 text = "1"  # any scale will do
             asked = (
                 column.mapped
-                or any(key.lower() in _lowered(self.options.unit) for key in keys)
+                or any(key.lower() in _by_lower_name(self.options.unit) for key in keys)
                 or (known and self.options.channels_only)
             )
             if text is None and asked:
@@ -587,7 +589,7 @@ class _Work:
                 offset,
             )
         )
-        self._summarise(column, name, "channel", quantity or "other", text)
+        self._add_summary(column, name, "channel", quantity or "other", text)
 
     def _unit_text(
         self,
@@ -599,7 +601,7 @@ class _Work:
         prefer_given: bool = False,
     ) -> str | None:
         """The unit of a column: that of the header, unless it is none and the user gave one."""
-        given = _lowered(self.options.unit)
+        given = _by_lower_name(self.options.unit)
         key = next((given[low] for low in map(str.lower, keys) if low in given), None)
         if key is None:
             return written or column.stored
@@ -619,9 +621,9 @@ class _Work:
         return written
 
     def _leave_out(self, column: Header) -> None:
-        self._summarise(column, column.name, "left out", None, column.unit or column.stored)
+        self._add_summary(column, column.name, "left out", None, column.unit or column.stored)
 
-    def _summarise(
+    def _add_summary(
         self, column: Header, name: str, role: str, quantity: str | None, unit: str | None
     ) -> None:
         self.summaries.append(ColumnSummary(column.header, name, role, quantity, unit, column.key))
@@ -634,17 +636,17 @@ class _Work:
             )  # one of a known quantity first
             how = f"keep one with a unit: --unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
             self.notes.append(
-                f"left out, as they carry no unit: {_listing([header for _, _, header in self.unitless])} ({how})"
+                f"left out, as they carry no unit: {list_names([header for _, _, header in self.unitless])} ({how})"
             )
         if self.surplus:
             needed = self.kept_channels + len(self.surplus)
             how = f"map those that are needed (--map NAME=NAME); {describe_limit('channels', needed, self.options.limits)}"
             self.notes.append(
-                f"left out, as there are more channels than a log keeps: {_listing(self.surplus, 5)} ({how})"
+                f"left out, as there are more channels than a log keeps: {list_names(self.surplus, 5)} ({how})"
             )
         if self.left_out:
             self.notes.append(
-                f"left out, as the file is read for its channels: {_listing(self.left_out)}"
+                f"left out, as the file is read for its channels: {list_names(self.left_out)}"
             )
         place = {header.strip(): index for index, header in enumerate(headers)}
         self.summaries.sort(key=lambda summary: place.get(summary.header, -1))
@@ -652,26 +654,28 @@ class _Work:
 
 def _is_taken(target: str, asked: set[str]) -> bool:
     """Whether the user has named a column for what a preset has another one for; axes are named all together."""
-    return target in asked or (bool(AXIS.match(target)) and any(AXIS.match(name) for name in asked))
+    return target in asked or (
+        bool(AXIS_PATTERN.match(target)) and any(AXIS_PATTERN.match(name) for name in asked)
+    )
 
 
-def _lowered(names: Mapping[str, str]) -> dict[str, str]:
+def _by_lower_name(names: Mapping[str, str]) -> dict[str, str]:
     return {name.lower(): name for name in names}
 
 
-def _arcsec(stem: str) -> str:
+def _arcsec_unit(stem: str) -> str:
     return "arcsec/s" if stem == "gyro" else "arcsec"
 
 
-def _listing(names: Sequence[str], most: int = 30) -> str:
+def list_names(names: Sequence[str], most: int = 30) -> str:
     shown = ", ".join(name for name in names[:most] if name)
     return shown + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     columns = [column for column in distinct_columns(headers) if column.header]
-    free = [c for c in columns if not TIME.match(c.low) and quantity_of(c.low) is None]
-    looks = (c for pattern in LOOKS_GYRO for c in free if pattern.search(c.name))
+    free = [c for c in columns if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
+    looks = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
     likely = next(looks, free[0] if free else None)
     low = likely.header.lower() if likely else ""
     unit = (
@@ -682,7 +686,7 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
         if likely and likely.unit and is_unit_of(likely.unit, ("rate", "angle"))
         else f" --unit gyro={unit}"
     )
-    message = f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: {_listing([c.name for c in columns], 100)}"
+    message = f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: {list_names([c.name for c in columns], 100)}"
     how = f'Say which they are, for instance: --map "{likely.key if likely else "NAME"}=gyro_x"{given}'
     return FormatError(
         f"{message}. {how}; gyrostab scan {shlex.quote(path.name)} looks into each column"

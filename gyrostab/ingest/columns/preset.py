@@ -18,13 +18,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Found", "find_preset", "preset_names"]
+__all__ = ["PresetMatch", "find_preset", "preset_names"]
 
 _KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
 
 
 @dataclass(frozen=True)
-class Found:
+class PresetMatch:
     """A preset that fits a file: column number -> what it is, and the sampling rate [Hz] where the file tells it."""
 
     name: str
@@ -33,7 +33,7 @@ class Found:
 
 
 @cache
-def _presets() -> dict[str, dict[str, Any]]:
+def _load_presets() -> dict[str, dict[str, Any]]:
     """The presets by the names of their files."""
     found = {}
     for place in sorted(
@@ -54,7 +54,7 @@ def preset_names() -> dict[str, str]:
     >>> preset_names()["phyphox"]
     'phyphox'
     """
-    return {key: preset["name"] for key, preset in _presets().items()}
+    return {key: preset["name"] for key, preset in _load_presets().items()}
 
 
 def find_preset(
@@ -63,7 +63,7 @@ def find_preset(
     *,
     above: Sequence[str] = (),
     is_filled: Callable[[int], bool] | None = None,
-) -> Found | None:
+) -> PresetMatch | None:
     """Find the preset that fits a file.
 
     Parameters
@@ -86,7 +86,7 @@ def find_preset(
     for place, names in reversed(list(enumerate(headers))):
         for name in reversed(names):
             places[name.strip().lower()] = place
-    for key, preset in _presets().items():
+    for key, preset in _load_presets().items():
         gyro = [names for target, names in preset["columns"].items() if target.startswith("gyro_")]
         if not all(
             any(name.lower() in places for name in names)
@@ -97,7 +97,7 @@ def find_preset(
             continue
         if "above" in preset and not any(re.search(preset["above"], line) for line in above):
             continue
-        return _apply(
+        return _apply_preset(
             f"{preset['name']} (preset {key})",
             preset,
             places,
@@ -107,13 +107,13 @@ def find_preset(
     return None
 
 
-def _apply(
+def _apply_preset(
     name: str,
     preset: dict[str, Any],
     places: dict[str, int],
     above: Sequence[str],
     is_filled: Callable[[int], bool],
-) -> Found:
+) -> PresetMatch:
     columns = {
         places[drop.lower()]: "-" for drop in preset.get("drops", ()) if drop.lower() in places
     }
@@ -134,4 +134,4 @@ def _apply(
         for line in above
         if "rate" in preset and (found := re.search(preset["rate"], line))
     ]
-    return Found(name, columns, float(rates[0]) if rates else None)
+    return PresetMatch(name, columns, float(rates[0]) if rates else None)

@@ -10,18 +10,25 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.buffers import SPILL_BYTES, Buffers, lazily, put, take, together
-from gyrostab.ingest.columns.pieces import Counts, Piece, Pieces, Steps
+from gyrostab.ingest.columns.buffers import (
+    SPILL_BYTES,
+    Buffers,
+    as_lazy,
+    set_rows,
+    stack_as_rows,
+    take_rows,
+)
+from gyrostab.ingest.columns.pieces import DecimalPiece, EvenStampsPiece, Piece, PiecewiseColumn
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.row_inspection import RowInspection, with_inspections
 
-__all__ = ["Intake", "Taken", "summary_of"]
+__all__ = ["ConvertedBlock", "RawLogBuilder", "summary_of"]
 
 #: How many bad places a note names.
-NAMED = 10
+MAX_NAMED_PLACES = 10
 #: A file with a larger share of unreadable rows is refused.
 MAX_UNREADABLE = 0.5
 
@@ -29,7 +36,7 @@ Values = dict[int, NDArray[np.float64]]
 Locate = Callable[[Sequence[int]], list[str]]
 
 
-class Taken(NamedTuple):
+class ConvertedBlock(NamedTuple):
     """A block of rows as `Intake.add` takes it; rows are counted from its first.
 
     Attributes
@@ -75,7 +82,7 @@ def _row_names(first: int) -> Locate:
     return lambda rows: [f"row {first + row}" for row in rows]
 
 
-class Intake:
+class RawLogBuilder:
     """Collects the blocks of one file and makes the raw log of them.
 
     Parameters
@@ -111,7 +118,9 @@ class Intake:
             column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
         }
 
-    def prepare(self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0) -> Taken:
+    def prepare(
+        self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0
+    ) -> ConvertedBlock:
         """Convert one block, and pack what can be packed; several threads may do so side by side.
 
         Parameters
@@ -131,13 +140,13 @@ class Intake:
             len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
         )
         if size == 0:
-            return Taken(0, {}, {}, _NO_ROWS, _NO_ROWS, 0, 0, np.iinfo(np.int64).max, NAT)
+            return ConvertedBlock(0, {}, {}, _NO_ROWS, _NO_ROWS, 0, 0, np.iinfo(np.int64).max, NAT)
         bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
         block: dict[int, NDArray[Any] | Piece] = {}
         bad_cells, ranges, masks = words + int(np.count_nonzero(bad)), {}, []
         for column in [*self.gyro, *self.channels]:
             source = column.source
-            block[source], ranges[source] = self._convert(column, values[source])
+            block[source], ranges[source] = self._convert_column(column, values[source])
             unknown = (
                 np.isnan if block[source] is values[source] else _not_finite
             )  # what is packed is not converted yet
@@ -154,14 +163,14 @@ class Intake:
             if len(good):
                 low, high = int(good.min()), int(good.max())
             table = even_steps(stamps)
-            block[self.time.source] = stamps if table is None else Steps(table, size)
-        return Taken(
+            block[self.time.source] = stamps if table is None else EvenStampsPiece(table, size)
+        return ConvertedBlock(
             size, block, ranges, np.flatnonzero(bad) if any_bad else _NO_ROWS,
             np.flatnonzero(np.logical_or.reduce(others)) if others else _NO_ROWS,
             bad_cells, sum(int(np.count_nonzero(mask)) for mask in others), low, high,
         )  # fmt: skip
 
-    def add(self, taken: Taken, locate: Locate | None = None) -> None:
+    def add(self, taken: ConvertedBlock, locate: Locate | None = None) -> None:
         """Take one block.
 
         Parameters
@@ -187,7 +196,7 @@ class Intake:
         self.seen += [taken.seen] if taken.seen is not None else []
         self.buffers.add(taken.block)
 
-    def _convert(
+    def _convert_column(
         self, column: Column, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
         """Convert to the inner unit, in place or packed, infinities to NaN; and what `Taken.ranges` tells of the column."""
@@ -201,7 +210,7 @@ class Intake:
                 fits, *found = to_decimals(values, tens, counts)
                 if fits:
                     self.tens[column.source] = tens
-                    return Counts(counts, tens, column.factor, column.offset), (
+                    return DecimalPiece(counts, tens, column.factor, column.offset), (
                         found[0],
                         found[1],
                         found[2],
@@ -212,7 +221,7 @@ class Intake:
         missing, low, high, whole = clean_column(values, column.factor, column.offset)
         return values, (missing, low, high, whole)
 
-    def _packing(self, columns: Sequence[Column]) -> dict[str, Any]:
+    def _packing_of(self, columns: Sequence[Column]) -> dict[str, Any]:
         """The encoding of columns of whole numbers that have one factor; none for others."""
         spans = [self.whole[column.source] for column in columns]
         factors = {column.factor for column in columns if column.offset == 0.0}
@@ -225,14 +234,18 @@ class Intake:
     def _note_rows(self, rows: NDArray[np.int64], locate: Locate) -> None:
         self.bad_rows += len(rows)
         self.bad_index.append(rows + self.buffers.rows)
-        if len(self.bad_places) < NAMED:
-            self.bad_places += locate([int(row) for row in rows[: NAMED - len(self.bad_places)]])
+        if len(self.bad_places) < MAX_NAMED_PLACES:
+            self.bad_places += locate(
+                [int(row) for row in rows[: MAX_NAMED_PLACES - len(self.bad_places)]]
+            )
 
     def _note_cells(self, rows: NDArray[np.int64], cells: int, locate: Locate) -> None:
         self.cells += cells
         self.cell_rows += len(rows)
-        if len(self.cell_places) < NAMED:
-            self.cell_places += locate([int(row) for row in rows[: NAMED - len(self.cell_places)]])
+        if len(self.cell_places) < MAX_NAMED_PLACES:
+            self.cell_places += locate(
+                [int(row) for row in rows[: MAX_NAMED_PLACES - len(self.cell_places)]]
+            )
 
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
         """The raw log.
@@ -254,12 +267,17 @@ class Intake:
                 f"{name}: {share:.0%} of {rows} rows are unreadable, the first is {first}; look at it, and check {what}"
             )
         columns = self.buffers.finish()
-        stamps = self._stamps(columns)
-        dataset = self._dataset({key: lazily(column) for key, column in columns.items()}, stamps)
+        stamps = self._finish_stamps(columns)
+        dataset = self._make_dataset(
+            {key: as_lazy(column) for key, column in columns.items()}, stamps
+        )
         dataset.attrs.update(
             source_files=[name],
             row_start=[0],
-            notes=[f"{name}: {note}" for note in [*self.plan.notes, *notes, *self._faults(rows)]],
+            notes=[
+                f"{name}: {note}"
+                for note in [*self.plan.notes, *notes, *self._describe_faults(rows)]
+            ],
             unreadable_rows=self.bad_rows,
             unreadable_cells=self.bad_cells,
             unmatched_options=list(self.plan.unmatched),
@@ -267,30 +285,30 @@ class Intake:
         )
         return dataset
 
-    def _stamps(self, columns: dict[int, NDArray[Any] | Pieces]) -> Any:
+    def _finish_stamps(self, columns: dict[int, NDArray[Any] | PiecewiseColumn]) -> Any:
         if self.time is None:
             return None
         stamps = columns.pop(self.time.source)
         if self.bad_index and self.low <= self.high:
             rows = np.concatenate(self.bad_index)
-            written = take(stamps, rows)
-            put(
+            written = take_rows(stamps, rows)
+            set_rows(
                 stamps, rows[(written < self.low) | (written > self.high)], NAT
             )  # scratch numbers in a junk row are no stamp
-        return lazily(stamps.view("datetime64[ns]"))
+        return as_lazy(stamps.view("datetime64[ns]"))
 
-    def _dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:
+    def _make_dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:
         data: dict[str, Any] = {}
         coords: dict[str, Any] = {}
         if self.gyro and self.plan.signal is not None:
             axes = [column.name for column in self.gyro]
-            stack = together([columns[column.source] for column in self.gyro])
+            stack = stack_as_rows([columns[column.source] for column in self.gyro])
             stack = with_inspections(stack, self.seen) if self.seen else stack
             data[self.plan.signal] = (
                 ("axis", "row"),
                 stack,
                 {"units": SIGNAL_UNITS[self.plan.signal]},
-                self._packing(self.gyro),
+                self._packing_of(self.gyro),
             )
             coords["axis"] = np.array(axes, dtype=str)
         for column in self.channels:
@@ -298,7 +316,7 @@ class Intake:
                 "row",
                 columns[column.source],
                 {"units": column.units},
-                self._packing([column]),
+                self._packing_of([column]),
             )
         if stamps is not None:
             coords["time"] = ("row", stamps)
@@ -311,14 +329,14 @@ class Intake:
             dataset.attrs["start"] = self.options.start
         return dataset
 
-    def _faults(self, rows: int) -> list[str]:
+    def _describe_faults(self, rows: int) -> list[str]:
         notes = []
         if self.bad_rows:
             notes.append(
-                f"{self.bad_rows} of {rows} rows are unreadable: {_places(self.bad_places, self.bad_rows)}"
+                f"{self.bad_rows} of {rows} rows are unreadable: {_join_places(self.bad_places, self.bad_rows)}"
             )
         if self.cell_places:
-            where = _places(self.cell_places, self.cell_rows)
+            where = _join_places(self.cell_places, self.cell_rows)
             notes.append(
                 f"{self.cells} gyro cells hold no number in rows that are readable otherwise: {where}"
             )
@@ -327,7 +345,7 @@ class Intake:
         return notes
 
 
-def _places(places: Sequence[str], total: int) -> str:
+def _join_places(places: Sequence[str], total: int) -> str:
     """Bad places in a row: ``lines 7, 8, 9 and others``."""
     kind = places[0].split(" ")[0]
     numbers = ", ".join(place.removeprefix(f"{kind} ") for place in places)

@@ -36,7 +36,7 @@ __all__ = [
 
 #: The integer of ``NaT``.
 NAT = np.iinfo(np.int64).min
-_LIMIT = 2**63 - 1
+_MAX_INT64 = 2**63 - 1
 #: Julian day number of 1970-01-01.
 _ORDINAL_1970 = 2440588
 
@@ -65,7 +65,7 @@ _CALENDARS = {
 }
 #: Characters of a cell above which it is no stamp: a double written in full has at most 325 before
 #: and 1074 after the point.
-_MOST_DIGITS = 1400
+_MAX_DIGITS = 1400
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?$")
 
 
@@ -84,7 +84,7 @@ class TimeUnit:
         Also None when the epoch is outside the years 1678 to 2262, so that sums with it exceed 64
         bits.
         """
-        if self.epoch is not None and abs(self.epoch) > _LIMIT:
+        if self.epoch is not None and abs(self.epoch) > _MAX_INT64:
             return None
         return next((n for n in range(13) if self.ns == 10**n), None)
 
@@ -124,7 +124,7 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
         None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))
     )  # Ms: a megasecond, or a slip
     if ns is None or (
-        factor and not (len(factor) <= _MOST_DIGITS and _NUMBER.match(factor.strip()))
+        factor and not (len(factor) <= _MAX_DIGITS and _NUMBER.match(factor.strip()))
     ):
         known = "s, ms, us, ns, min, h, d, week, with a factor in front if needed"
         raise UnitError(
@@ -204,7 +204,7 @@ def _all_fit(values: NDArray[np.int64], units: int, up: int, rest: int) -> bool:
     """Whether no stamp, nor a step on the way to it, leaves 64 bits: as a rule, and found out by the range of the values alone."""
     ends = (int(values.min()) + units, int(values.max()) + units)
     return all(
-        abs(end) < _LIMIT and abs(end * up) < _LIMIT and abs(end * up + rest) < _LIMIT
+        abs(end) < _MAX_INT64 and abs(end * up) < _MAX_INT64 and abs(end * up + rest) < _MAX_INT64
         for end in ends
     )
 
@@ -216,23 +216,25 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
     # Whole units of the epoch are added to the counts, so that no sum exceeds 64 bits however far
     # back it is.
     units, rest = divmod(zero, up) if down == 1 else (0, zero)
-    limit = (_LIMIT - down) // up - 1
-    if max(abs(units), abs(rest)) > _LIMIT // 2:
+    limit = (_MAX_INT64 - down) // up - 1
+    if max(abs(units), abs(rest)) > _MAX_INT64 // 2:
         return np.full(np.shape(values), NAT, dtype=np.int64)
     if down == 1 and np.size(values) and _all_fit(values, units, up, rest):
         return values if (units, up, rest) == (0, 1, 0) else (values + units) * up + rest
-    inside = (values <= min(limit - units, _LIMIT)) & (values >= max(-limit - units, -_LIMIT))
+    inside = (values <= min(limit - units, _MAX_INT64)) & (
+        values >= max(-limit - units, -_MAX_INT64)
+    )
     scaled = np.where(inside, values + np.where(inside, units, 0), 0) * up
     if down > 1:
         scaled = (scaled + down // 2) // down
-    inside &= (scaled <= _LIMIT - max(rest, 0)) & (scaled >= -_LIMIT - min(rest, 0))
+    inside &= (scaled <= _MAX_INT64 - max(rest, 0)) & (scaled >= -_MAX_INT64 - min(rest, 0))
     return np.where(inside, np.where(inside, scaled, 0) + rest, NAT)
 
 
 def signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
     """Return whole numbers as int64; unsigned ones that exceed it become the largest, which is no stamp."""
     wide = (
-        np.minimum(counts, np.uint64(_LIMIT))
+        np.minimum(counts, np.uint64(_MAX_INT64))
         if counts.dtype.kind == "u" and counts.dtype.itemsize == 8
         else counts
     )
@@ -259,9 +261,9 @@ def cells_to_ns(cells: Sequence[str], unit: TimeUnit | None, epoch: int) -> NDAr
     stamps = np.full(len(cells), NAT, dtype=np.int64)
     for index, cell in enumerate(cells):
         text = cell.strip()
-        if len(text) <= _MOST_DIGITS and _NUMBER.match(text):
+        if len(text) <= _MAX_DIGITS and _NUMBER.match(text):
             value = Fraction(text) * unit.ns
             nanoseconds = round(value) + zero
-            if abs(nanoseconds) <= _LIMIT:
+            if abs(nanoseconds) <= _MAX_INT64:
                 stamps[index] = nanoseconds
     return stamps

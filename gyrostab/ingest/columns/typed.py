@@ -11,9 +11,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
-from gyrostab.ingest.columns.pieces import Steps, Stored
+from gyrostab.ingest.columns.pieces import EvenStampsPiece, FilePiece
 from gyrostab.ingest.columns.plan import Column, Plan
-from gyrostab.ingest.columns.raw_log import Intake, Taken, summary_of
+from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import (
     NAT,
     cells_to_ns,
@@ -33,7 +33,7 @@ __all__ = [
     "convert_batch",
     "holds_dates",
     "read_columns",
-    "summarise",
+    "summarise_columns",
     "to_floats",
     "to_stamps",
 ]
@@ -41,7 +41,7 @@ __all__ = [
 #: Rows and bytes of all columns that are taken at one time, at most.
 BATCH_ROWS = 2**20
 BATCH_BYTES = 2**26
-ENDS = 64
+END_ROWS = 64
 
 #: Column number, first row, row after the last one -> values.
 Fetch = Callable[[int, int, int], Any]
@@ -124,13 +124,13 @@ def read_columns(
         Several threads may call `fetch`, and at any later time: then values above the limit stay in
         the file.
     """
-    intake = Intake(plan.check(), options, limit=limit)
+    intake = RawLogBuilder(plan.check(), options, limit=limit)
     stay = lasting and 8 * rows * len(plan.columns) > limit
     if stay:
         intake.tens = dict.fromkeys(intake.tens, 0.0)  # nothing is packed
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
-    take = partial(_take_rows, intake, plan, options, fetch, stay)
+    take = partial(_convert_span, intake, plan, options, fetch, stay)
     for taken in map_in_order(take, spans) if lasting else map(take, spans):
         intake.add(taken)
     return intake.finish(notes)
@@ -147,14 +147,14 @@ def batch_rows(columns: int) -> int:
     return min(max(BATCH_BYTES // (8 * max(columns, 1)), 2**10), BATCH_ROWS) // 8 * 8
 
 
-def _take_rows(
-    intake: Intake,
+def _convert_span(
+    intake: RawLogBuilder,
     plan: Plan,
     options: ReadOptions,
     fetch: Fetch,
     stay: bool,
     span: tuple[int, int],
-) -> Taken:
+) -> ConvertedBlock:
     """Convert one batch; where the values stay in the file, only what was found in them is kept."""
     taken = convert_batch(
         intake, options, {column.source: fetch(column.source, *span) for column in plan.columns}
@@ -181,7 +181,9 @@ def _take_rows(
         read = partial(
             _read_stamps if column.role == "time" else _read_values, column, options, fetch
         )
-        block[column.source] = piece if isinstance(piece, Steps) else Stored(read, begin, rows)
+        block[column.source] = (
+            piece if isinstance(piece, EvenStampsPiece) else FilePiece(read, begin, rows)
+        )
     return taken._replace(block=block, seen=seen)
 
 
@@ -201,7 +203,9 @@ def _read_stamps(
     return to_stamps(fetch(column.source, start, stop), column, options)
 
 
-def convert_batch(intake: Intake, options: ReadOptions, batch: dict[int, Any]) -> Taken:
+def convert_batch(
+    intake: RawLogBuilder, options: ReadOptions, batch: dict[int, Any]
+) -> ConvertedBlock:
     """Convert one batch of columns for the intake."""
     values, words = {}, 0
     for column in [*intake.gyro, *intake.channels]:
@@ -223,7 +227,7 @@ def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:
     ]
 
 
-def summarise(
+def summarise_columns(
     form: str, plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, notes: Sequence[str] = ()
 ) -> FileSummary:
     """A summary with the first and last stamps fetched from the two ends."""
@@ -232,6 +236,6 @@ def summarise(
         return summary_of(plan, form, rows, notes=notes)
     head, tail = (
         to_stamps(fetch(time.source, *span), time, options)
-        for span in ((0, min(ENDS, rows)), (max(0, rows - ENDS), rows))
+        for span in ((0, min(END_ROWS, rows)), (max(0, rows - END_ROWS), rows))
     )
     return summary_of(plan, form, rows, head=head, tail=tail, notes=notes)

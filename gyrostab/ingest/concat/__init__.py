@@ -2,6 +2,6 @@
 
 from gyrostab.ingest.concat.axes import group_axes, split_axes
 from gyrostab.ingest.concat.core import concatenate_logs, log_span
-from gyrostab.ingest.concat.notes import some, together
+from gyrostab.ingest.concat.notes import merge_notes, name_some
 
-__all__ = ["concatenate_logs", "group_axes", "log_span", "some", "split_axes", "together"]
+__all__ = ["concatenate_logs", "group_axes", "log_span", "merge_notes", "name_some", "split_axes"]

@@ -12,21 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
-from gyrostab.ingest.concat.grid import Piece
-from gyrostab.ingest.concat.lazy import Part, fill_parts, place_on_grid
+from gyrostab.ingest.concat.grid import PlacedLog
+from gyrostab.ingest.concat.lazy import PlacedArray, place_on_grid, read_parts_into
 from gyrostab.schema import log_channels
 from gyrostab.store.lazy_slices import can_read_into, with_row_reader
 from gyrostab.time.grid import grid_index, grid_times
 
-__all__ = ["join_channels"]
+__all__ = ["concatenate_channels"]
 
 # of a sampling period: the stamps of two copies differ by the rounding of each to its own grid
-_SAME_STAMP = 0.75
-_CUTS = 16  # slices for each log up to which values stay lazy
+_SAME_STAMP_PERIODS = 0.75
+_MAX_SLICES_PER_LOG = 16  # slices for each log up to which values stay lazy
 
 
-def join_channels(
-    pieces: Sequence[Piece], start: int, rate: float, size: int, chunk: int
+def concatenate_channels(
+    pieces: Sequence[PlacedLog], start: int, rate: float, size: int, chunk: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Join the channels of logs that lie on one grid.
 
@@ -45,7 +45,7 @@ def join_channels(
     coordinates: dict[str, Any] = {}
     for name in dict.fromkeys(name for piece in pieces for name in log_channels(piece.source.log)):
         holders = [piece for piece in pieces if name in piece.source.log]
-        attributes = _attributes(holders, name)
+        attributes = _channel_attributes(holders, name)
         if all(piece.source.log.variables[name].dims != ("time",) for piece in holders):
             stamps, values = _own_time(holders, name, start, rate)
             variables[name] = (f"time_{name}", values, attributes)
@@ -64,7 +64,7 @@ def join_channels(
     return variables, coordinates
 
 
-def _attributes(holders: Sequence[Piece], name: str) -> dict[str, Any]:
+def _channel_attributes(holders: Sequence[PlacedLog], name: str) -> dict[str, Any]:
     units = {
         str(piece.source.log.variables[name].attrs.get("units", "1")): piece.source.name
         for piece in reversed(holders)
@@ -77,7 +77,7 @@ def _attributes(holders: Sequence[Piece], name: str) -> dict[str, Any]:
     return dict(holders[0].source.log[name].attrs)
 
 
-def _on_time(piece: Piece, name: str, start: int, rate: float) -> Part:
+def _on_time(piece: PlacedLog, name: str, start: int, rate: float) -> PlacedArray:
     """A channel on the time of its log; one that has its own stamps, which other logs have not, at the samples nearest to them."""
     channel = piece.source.log[name]
     if channel.dims == ("time",):
@@ -85,17 +85,17 @@ def _on_time(piece: Piece, name: str, start: int, rate: float) -> Part:
     import dask
     import dask.array as da
 
-    stamps = _stamps(piece, name, start, rate)
+    stamps = _channel_stamps(piece, name, start, rate)
     sample = np.rint(grid_index(start, rate, stamps)).astype(np.int64)
     inside = (sample >= piece.first) & (sample < piece.end)
-    spread = dask.delayed(_spread, pure=False)(
+    spread = dask.delayed(_scatter_values, pure=False)(
         channel.data, sample - piece.first, inside, piece.end - piece.first
     )
     whole = da.from_delayed(spread, (piece.end - piece.first,), dtype=np.float64)
     return whole, None, np.array([[piece.first, 0, piece.end - piece.first]], dtype=np.int64)
 
 
-def _spread(
+def _scatter_values(
     values: NDArray[Any], at: NDArray[np.int64], inside: NDArray[np.bool_], size: int
 ) -> NDArray[np.float64]:
     out = np.full(size, np.nan)
@@ -103,7 +103,7 @@ def _spread(
     return out
 
 
-def _stamps(piece: Piece, name: str, start: int, rate: float) -> NDArray[np.int64]:
+def _channel_stamps(piece: PlacedLog, name: str, start: int, rate: float) -> NDArray[np.int64]:
     """Stamps of a channel [ns since 1970], moved with its log where that stands after a step of the clock."""
     stamps = (
         piece.source.log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
@@ -113,17 +113,17 @@ def _stamps(piece: Piece, name: str, start: int, rate: float) -> NDArray[np.int6
 
 
 def _own_time(
-    holders: Sequence[Piece], name: str, start: int, rate: float
+    holders: Sequence[PlacedLog], name: str, start: int, rate: float
 ) -> tuple[NDArray[np.int64], Any]:
     """Stamps and values in the order of time; of values that two logs have, those of the earlier log."""
-    near = int(_SAME_STAMP * 1e9 / rate)
+    near = int(_SAME_STAMP_PERIODS * 1e9 / rate)
     done: list[
         tuple[NDArray[np.int64], NDArray[np.int64]]
     ] = []  # stamps and places among all values, in the order of time
     arrays, offset = [], 0
     for piece in holders:
         values = piece.source.log.variables[name].data
-        stamps, places = _stamps(piece, name, start, rate), np.arange(len(values)) + offset
+        stamps, places = _channel_stamps(piece, name, start, rate), np.arange(len(values)) + offset
         arrays.append(values)
         offset += len(values)
         touched: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
@@ -152,10 +152,10 @@ def _own_time(
         return np.empty(0, dtype=np.int64), np.empty(0)
     stamps, places = (np.concatenate(column) for column in zip(*done, strict=True))
     done.clear()  # of channels of many days a copy less
-    return stamps, _taken(arrays, places)
+    return stamps, _select_values(arrays, places)
 
 
-def _taken(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
+def _select_values(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
     """The values at `places`, in slices; in memory when that would be very many slices, or when all are there already."""
     if all(isinstance(array, np.ndarray) for array in arrays):
         return np.concatenate(arrays)[places]
@@ -163,21 +163,21 @@ def _taken(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
 
     whole = da.concatenate([da.asarray(array) for array in arrays])
     edges = np.concatenate([[0], np.flatnonzero(np.diff(places) != 1) + 1, [len(places)]])
-    if len(edges) > _CUTS * (len(arrays) + 1):
+    if len(edges) > _MAX_SLICES_PER_LOG * (len(arrays) + 1):
         return np.asarray(whole)[places]
     taken = da.concatenate([whole[places[a] : places[b - 1] + 1] for a, b in pairwise(edges)])
     return (
-        with_row_reader(taken, partial(fill_parts, [_parts(arrays, places)]))
+        with_row_reader(taken, partial(read_parts_into, [_slices_at(arrays, places)]))
         if all(map(can_read_into, arrays))
         else taken
     )
 
 
-def _parts(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[Part]:
+def _slices_at(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[PlacedArray]:
     """The values at `places` as stretches of the arrays."""
     begins = np.cumsum([0, *map(len, arrays)]).tolist()
     edges = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
-    parts: list[Part] = []
+    parts: list[PlacedArray] = []
     for at, end in pairwise(edges):
         while at < end:
             place = int(places[at])

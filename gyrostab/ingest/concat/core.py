@@ -12,13 +12,13 @@ import xarray as xr
 
 from gyrostab.errors import TimeError, UnitError
 from gyrostab.ingest.concat.axes import group_axes
-from gyrostab.ingest.concat.channels import join_channels
-from gyrostab.ingest.concat.gaps import join_gaps
-from gyrostab.ingest.concat.grid import Piece, Source, log_span, source_of
+from gyrostab.ingest.concat.channels import concatenate_channels
+from gyrostab.ingest.concat.gaps import merge_gaps
+from gyrostab.ingest.concat.grid import PlacedLog, Source, log_span, source_of
 from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
-from gyrostab.ingest.concat.notes import some, together
+from gyrostab.ingest.concat.notes import merge_notes, name_some
 from gyrostab.ingest.concat.place import place_logs
-from gyrostab.ingest.gap_table import gap_variables, name_lost, stamp_text
+from gyrostab.ingest.gap_table import format_stamp, gap_variables, name_lost
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
 from gyrostab.store import common_packing
@@ -107,11 +107,11 @@ def concatenate_logs(
     axes = sorted({axis for source in sources for axis in source.axes})
     signal = xr.Variable(
         ("axis", "time"),
-        place_on_grid([_parts(pieces, name, axis) for axis in axes], size, chunk),
+        place_on_grid([_placed_arrays(pieces, name, axis) for axis in axes], size, chunk),
         _signal_attributes(sources, name),
     )
     signal.encoding = common_packing(source.log[name].encoding for source in sources)
-    channels, stamps = join_channels(pieces, start, rate, size, chunk)
+    channels, stamps = concatenate_channels(pieces, start, rate, size, chunk)
     coordinates = (
         xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps})
         .merge(time_coordinate(start, rate, size))
@@ -120,18 +120,20 @@ def concatenate_logs(
     variables = {
         name: signal,
         **channels,
-        **gap_variables(name_lost(join_gaps(pieces), lost, start, rate), start, rate),
+        **gap_variables(name_lost(merge_gaps(pieces), lost, start, rate), start, rate),
     }
     joined = xr.Dataset(
-        variables, coordinates, _attributes(sources, size, [*notes, *_absent(sources, axes)])
+        variables,
+        coordinates,
+        _common_attributes(sources, size, [*notes, *_describe_absent(sources, axes)]),
     )
     joined.set_close(
-        partial(_close, [log._close for log in logs if log._close is not None])
+        partial(_close_files, [log._close for log in logs if log._close is not None])
     )  # and nothing else of them
     return joined
 
 
-def _check_grid(pieces: Sequence[Piece], size: int, limits: Mapping[str, float] | None) -> None:
+def _check_grid(pieces: Sequence[PlacedLog], size: int, limits: Mapping[str, float] | None) -> None:
     """Refuse a common grid that is out of proportion to the samples of the logs."""
     if not is_absurd_grid(size, sum(piece.source.size for piece in pieces), limits):
         return
@@ -141,13 +143,13 @@ def _check_grid(pieces: Sequence[Piece], size: int, limits: Mapping[str, float] 
     )
     before, after = (ordered[place].source for place in (widest - 1, widest))
     raise TimeError(
-        f"{before.name} ends at {stamp_text(before.end)} and {after.name} begins at {stamp_text(after.start)}: the grid of "
+        f"{before.name} ends at {format_stamp(before.end)} and {after.name} begins at {format_stamp(after.start)}: the grid of "
         f"{before.rate:.10g} Hz would have {size:.4g} samples. Correct the time of one of them, or give a shorter --max-gap to take the "
         f"pause for a clock step. If the pause is real: {describe_limit('grid_samples', size, limits)}"
     )
 
 
-def _close(files: Sequence[Callable[[], None]]) -> None:
+def _close_files(files: Sequence[Callable[[], None]]) -> None:
     for close in files:
         close()
 
@@ -169,7 +171,7 @@ def _check_same(sources: Sequence[Source]) -> None:
             )
 
 
-def _parts(pieces: Sequence[Piece], name: str, axis: str) -> list[Any]:
+def _placed_arrays(pieces: Sequence[PlacedLog], name: str, axis: str) -> list[Any]:
     found = []
     for piece in pieces:
         rows = piece.source.axes
@@ -182,27 +184,28 @@ def _signal_attributes(sources: Sequence[Source], name: str) -> dict[str, Any]:
     return {**sources[0].log[name].attrs, "units": SIGNAL_UNITS[name]}
 
 
-def _absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
+def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
     """Sentences on axes and channels that some of the logs lack; logs of other axes are not expected to have them."""
     groups = [
         [sources[number] for number in group]
         for group in group_axes([source.axes for source in sources])
     ]
     names = {
-        f"axis {axis}": _lacking(groups, [s for s in sources if axis in s.axes]) for axis in axes
+        f"axis {axis}": _logs_without(groups, [s for s in sources if axis in s.axes])
+        for axis in axes
     }
     for channel in dict.fromkeys(name for source in sources for name in log_channels(source.log)):
-        names[f"channel {channel}"] = _lacking(
+        names[f"channel {channel}"] = _logs_without(
             groups, [source for source in sources if channel in source.log]
         )
     return [
-        f"{what} is not in {some(files)} and is missing there"
+        f"{what} is not in {name_some(files)} and is missing there"
         for what, files in names.items()
         if files
     ]
 
 
-def _lacking(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:
+def _logs_without(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:
     """Name the logs that lack something, unless they hold other axes over the time that the holders span."""
     if not holders:
         return []
@@ -219,12 +222,14 @@ def _lacking(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> l
     return names
 
 
-def _attributes(sources: Sequence[Source], size: int, notes: Sequence[str]) -> dict[str, Any]:
+def _common_attributes(
+    sources: Sequence[Source], size: int, notes: Sequence[str]
+) -> dict[str, Any]:
     first = sources[0].log.attrs
     kept = {
         key: value
         for key, value in first.items()
-        if all(_equal(source.log.attrs.get(key), value) for source in sources)
+        if all(_is_equal(source.log.attrs.get(key), value) for source in sources)
     }
     files, said = (
         [texts(source.log, name) for source in sources] for name in ("source_files", "notes")
@@ -242,10 +247,10 @@ def _attributes(sources: Sequence[Source], size: int, notes: Sequence[str]) -> d
         "sampling_rate_hz": sources[0].rate,
         "source_files": list(dict.fromkeys(name for names in files for name in names)),
         "history": "\n".join(filter(None, [first.get("history"), done])),
-        "notes": [*together(zip(labels, said, strict=True)), *notes],
+        "notes": [*merge_notes(zip(labels, said, strict=True)), *notes],
         **({"unreadable_files": lost} if lost else {}),
     }
 
 
-def _equal(one: Any, other: Any) -> bool:
+def _is_equal(one: Any, other: Any) -> bool:
     return type(one) is type(other) and bool(np.all(one == other))

@@ -9,24 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.concat.axes import group_axes
-from gyrostab.ingest.concat.grid import Piece
-from gyrostab.ingest.gap_table import CAUSE, END, FIRST, clip_table, thinned
+from gyrostab.ingest.concat.grid import PlacedLog
+from gyrostab.ingest.gap_table import CAUSE, END, FIRST, clip_table, merge_neighbours
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index
 
-__all__ = ["join_gaps"]
+__all__ = ["merge_gaps"]
 
 Table = NDArray[np.int64]
 
 _MISSING, _DUPLICATE = GAP_CAUSES.index("missing"), GAP_CAUSES.index("duplicate")
-_NONE: Table = np.empty((0, 5), dtype=np.int64)
-_FAR = np.iinfo(np.int64).max // 2
+_EMPTY: Table = np.empty((0, 5), dtype=np.int64)
+_MAX_SAMPLE = np.iinfo(np.int64).max // 2
 
 
-def _own_gaps(piece: Piece) -> Table:
+def _own_gaps(piece: PlacedLog) -> Table:
     """The table of one log, on the common grid."""
     log, source = piece.source.log.variables, piece.source
-    table = _NONE
+    table = _EMPTY
     if "gap_start" in log and log["gap_start"].size:
         ends = (
             log[name].values.astype("datetime64[ns]").view(np.int64)
@@ -43,10 +43,10 @@ def _own_gaps(piece: Piece) -> Table:
         table = np.stack(
             [first, end, samples, rows, log["gap_cause"].values.astype(np.int64)], axis=1
         )
-    return np.concatenate([table, _slips(piece)]) if len(piece.runs) > 1 else table
+    return np.concatenate([table, _rate_slips(piece)]) if len(piece.runs) > 1 else table
 
 
-def _slips(piece: Piece) -> Table:
+def _rate_slips(piece: PlacedLog) -> Table:
     """Samples left empty, or left out, where a slightly different rate has drifted by one sample."""
     end, own_end = piece.runs[:-1, 0] + piece.runs[:-1, 2], piece.runs[:-1, 1] + piece.runs[:-1, 2]
     start, own = piece.runs[1:, 0], piece.runs[1:, 1]
@@ -54,7 +54,7 @@ def _slips(piece: Piece) -> Table:
     return np.stack([end, start, start - end, own - own_end, cause], axis=1)
 
 
-def _both(held: Table, new: Table) -> Table:
+def _missing_in_both(held: Table, new: Table) -> Table:
     """What is missing in both of two logs, with the cause that the first of them gives; its events stay."""
     lines = [held[held[:, FIRST] == held[:, END]]]
     lines += [
@@ -65,7 +65,7 @@ def _both(held: Table, new: Table) -> Table:
     return np.concatenate(lines)
 
 
-def join_gaps(pieces: Sequence[Piece]) -> Table:
+def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
     """Return the table of gaps of the joined log; what is missing in some axes only is a gap as well.
 
     Parameters
@@ -86,19 +86,19 @@ def join_gaps(pieces: Sequence[Piece]) -> Table:
         (min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups
     )
     if len(groups) == 1 or any(later[0] >= earlier[1] for earlier, later in pairwise(spans)):
-        table = thinned(
-            _join_group(pieces, pieces[0].first, None)
+        table = merge_neighbours(
+            _merge_group(pieces, pieces[0].first, None)
         )  # the same axes, or others at another time
     else:
         end = max(end for _, end in spans)
-        tables = [_join_group(group, spans[0][0], end) for group in groups]
-        table = thinned(
+        tables = [_merge_group(group, spans[0][0], end) for group in groups]
+        table = merge_neighbours(
             np.unique(np.concatenate(tables), axis=0)
         )  # a gap of several axes is one line
     return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
 
 
-def _join_group(pieces: Sequence[Piece], begin: int, stop_at: int | None) -> Table:
+def _merge_group(pieces: Sequence[PlacedLog], begin: int, stop_at: int | None) -> Table:
     """Return the gaps of logs that have axes in common, from sample `begin` on and up to `stop_at` if it is given."""
     tables: list[Table] = []
     firsts: list[int] = []
@@ -114,18 +114,22 @@ def _join_group(pieces: Sequence[Piece], begin: int, stop_at: int | None) -> Tab
         if piece.first < stop:
             for place in np.flatnonzero((np.array(ends) > piece.first) & (np.array(firsts) < stop)):
                 held = tables[place]
-                inside = _both(
+                inside = _missing_in_both(
                     clip_table(held, piece.first, stop), clip_table(new, piece.first, stop)
                 )
                 tables[place] = np.concatenate(
-                    [clip_table(held, -_FAR, piece.first), inside, clip_table(held, stop, _FAR)]
+                    [
+                        clip_table(held, -_MAX_SAMPLE, piece.first),
+                        inside,
+                        clip_table(held, stop, _MAX_SAMPLE),
+                    ]
                 )
             tables[-1] = np.concatenate(
-                [clip_table(new, -_FAR, piece.first), clip_table(new, stop, _FAR)]
+                [clip_table(new, -_MAX_SAMPLE, piece.first), clip_table(new, stop, _MAX_SAMPLE)]
             )
         firsts.append(min(piece.first, end))
         ends.append(piece.end)
         end = max(end, piece.end)
     if stop_at is not None and stop_at > end:
         tables.append(np.array([[end, stop_at, stop_at - end, 0, _MISSING]], dtype=np.int64))
-    return np.concatenate([*tables, _NONE])
+    return np.concatenate([*tables, _EMPTY])

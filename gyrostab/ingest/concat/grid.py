@@ -16,7 +16,7 @@ from gyrostab.schema import signal_name
 from gyrostab.store.lazy_slices import read_slice
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_times
 
-__all__ = ["Piece", "Source", "Stretch", "log_span", "read_stretches", "runs_of", "source_of"]
+__all__ = ["LogSlice", "PlacedLog", "Source", "log_span", "read_log_slices", "runs_of", "source_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +41,11 @@ class Source:
 
 
 #: A log, and the samples at which a stretch of it begins and ends.
-Stretch = tuple[Source, int, int]
+LogSlice = tuple[Source, int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class PlacedLog:
     """A log on the common grid.
 
     Attributes
@@ -88,7 +88,7 @@ class Piece:
         return np.asarray(self.runs[which, 0] + samples - self.runs[which, 1])
 
 
-def read_stretches(wanted: Iterable[Stretch]) -> dict[Stretch, NDArray[np.float64]]:
+def read_log_slices(wanted: Iterable[LogSlice]) -> dict[LogSlice, NDArray[np.float64]]:
     """The signals of stretches (axis, sample), read side by side; NaN beyond the ends of a log."""
     from dask.system import CPU_COUNT
 
@@ -96,10 +96,10 @@ def read_stretches(wanted: Iterable[Stretch]) -> dict[Stretch, NDArray[np.float6
     if not places:
         return {}
     with ThreadPoolExecutor(CPU_COUNT) as pool:
-        return dict(zip(places, pool.map(_read_stretch, places), strict=True))
+        return dict(zip(places, pool.map(_read_log_slice, places), strict=True))
 
 
-def _read_stretch(place: Stretch) -> NDArray[np.float64]:
+def _read_log_slice(place: LogSlice) -> NDArray[np.float64]:
     source, begin, end = place
     data = source.log.variables[signal_name(source.log)].data
     whole = np.full((data.shape[0], end - begin), np.nan)

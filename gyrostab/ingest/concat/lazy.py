@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from gyrostab.store.lazy_slices import can_read_into, read_into, with_row_reader
 
-__all__ = ["Part", "chunk_of", "fill_parts", "place_on_grid"]
+__all__ = ["PlacedArray", "chunk_of", "place_on_grid", "read_parts_into"]
 
 #: An array (time), or (axis, time) with the row to take, and its runs: first sample of the grid,
 #: first of the array, length.
-Part = tuple[Any, int | None, NDArray[np.int64]]
+PlacedArray = tuple[Any, int | None, NDArray[np.int64]]
 
-_LEAST_CHUNK, _MOST_CHUNK = 2**16, 2**22
+_MIN_CHUNK_SAMPLES, _MAX_CHUNK_SAMPLES = 2**16, 2**22
 
 
 def chunk_of(arrays: Sequence[Any]) -> int:
@@ -31,10 +31,10 @@ def chunk_of(arrays: Sequence[Any]) -> int:
         for array in arrays
         for length in getattr(array, "chunks", [[array.shape[-1]]])[-1][:1]
     )
-    return int(np.clip(lengths.most_common(1)[0][0], _LEAST_CHUNK, _MOST_CHUNK))
+    return int(np.clip(lengths.most_common(1)[0][0], _MIN_CHUNK_SAMPLES, _MAX_CHUNK_SAMPLES))
 
 
-def _filled(
+def _fill_chunk(
     size: int, lead: int, blocks: list[Any], spec: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """One chunk: each line of `spec` puts a stretch of a block in its place; what an earlier line has put there stays."""
@@ -50,17 +50,17 @@ def _filled(
     return out.reshape((1,) * lead + (size,))
 
 
-class _Row:
+class _RowBlocks:
     """Where the samples of one row of an array lie: keys of its blocks, and the runs cut at the edges of blocks."""
 
-    def __init__(self, part: Part):
+    def __init__(self, part: PlacedArray):
         import dask.array as da
 
         array, row, runs = part
         self.array = (
             array
             if isinstance(array, da.Array)
-            else da.from_array(array, chunks=(*(1,) * (array.ndim - 1), _MOST_CHUNK))
+            else da.from_array(array, chunks=(*(1,) * (array.ndim - 1), _MAX_CHUNK_SAMPLES))
         )
         self.edges = np.concatenate([[0], np.cumsum(self.array.chunks[-1])])
         self.row = -1
@@ -72,7 +72,7 @@ class _Row:
         self.runs = runs
         self.first, self.end = int(runs[0, 0]), int(runs[-1, 0] + runs[-1, 2])
 
-    def stretches(self, begin: int, end: int) -> list[tuple[tuple[Any, ...], int, int, int]]:
+    def slices(self, begin: int, end: int) -> list[tuple[tuple[Any, ...], int, int, int]]:
         """Of the samples of the grid from `begin` to `end`: key of the block, first sample in it, first of the grid, length."""
         found = []
         low = np.searchsorted(self.runs[:, 0] + self.runs[:, 2], begin, side="right")
@@ -91,7 +91,7 @@ class _Row:
 
 
 def place_on_grid(
-    rows: Sequence[Sequence[Part]], size: int, chunk: int, *, flat: bool = False
+    rows: Sequence[Sequence[PlacedArray]], size: int, chunk: int, *, flat: bool = False
 ) -> Any:
     """Put arrays on one grid, float64, NaN where none has a sample; where two have one, the first of them that is not NaN counts.
 
@@ -121,7 +121,7 @@ def place_on_grid(
     layer: dict[Any, Any] = {}
     sources: dict[str, Any] = {}
     for number, parts in enumerate(rows):
-        placed = [_Row(part) for part in parts]
+        placed = [_RowBlocks(part) for part in parts]
         sources.update({one.array.name: one.array for one in placed})
         first = np.array([one.first for one in placed], dtype=np.int64)
         end = np.array([one.end for one in placed], dtype=np.int64)
@@ -131,7 +131,7 @@ def place_on_grid(
             spec: list[tuple[int, ...]] = []
             for which in np.flatnonzero((first < begin + length) & (end > begin)):
                 earlier = spec.copy()  # the runs of one part do not overlap
-                for key, at, sample, n in placed[which].stretches(begin, begin + length):
+                for key, at, sample, n in placed[which].slices(begin, begin + length):
                     shared = any(
                         sample - begin < s[3] + s[4] and s[3] < sample - begin + n for s in earlier
                     )
@@ -146,7 +146,7 @@ def place_on_grid(
                         )
                     )
             task = (
-                _filled,
+                _fill_chunk,
                 length,
                 lead,
                 list(keys),
@@ -158,17 +158,17 @@ def place_on_grid(
     joined = da.Array(graph, name, chunks, dtype=np.float64)
     if not all(can_read_into(array) for parts in rows for array, _, _ in parts):
         return joined
-    return with_row_reader(joined, partial(fill_parts, rows))
+    return with_row_reader(joined, partial(read_parts_into, rows))
 
 
-def fill_parts(
-    rows: Sequence[Sequence[Part]], row: int, begin: int, out: NDArray[np.float64]
+def read_parts_into(
+    rows: Sequence[Sequence[PlacedArray]], row: int, begin: int, out: NDArray[np.float64]
 ) -> None:
     """Samples of one row from `begin` on, as the tasks of `place_on_grid` make them."""
     found = [
         (number, *one)
         for number, part in enumerate(rows[row])
-        for one in _reaching(part, begin, begin + out.size)
+        for one in _overlapping_runs(part, begin, begin + out.size)
     ]
     ends = sorted((at, at + length) for *_, at, length in found)
     if any(stop > start for (_, stop), (start, _) in pairwise(ends)):
@@ -189,7 +189,9 @@ def fill_parts(
         taken.setdefault(number, []).append((at, at + length))
 
 
-def _reaching(part: Part, begin: int, end: int) -> list[tuple[Any, int, int, int, int]]:
+def _overlapping_runs(
+    part: PlacedArray, begin: int, end: int
+) -> list[tuple[Any, int, int, int, int]]:
     """Of a part, what lies from `begin` to `end`: array, row, first sample of the array, first after `begin`, length."""
     array, row, runs = part
     low = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-__all__ = ["first_few", "some", "together"]
+__all__ = ["first_notes", "merge_notes", "name_some"]
 
-_NAMED = 5  # of many events of one kind, so many are told one by one
+_MAX_NAMED = 5  # of many events of one kind, so many are told one by one
 
 
-def some(names: Sequence[str], most: int = 3) -> str:
+def name_some(names: Sequence[str], most: int = 3) -> str:
     """Name a few of several files.
 
     Examples
@@ -20,7 +20,7 @@ def some(names: Sequence[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def together(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+def merge_notes(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     """The notes of all files, each with the file's name in front; what several files say alike is said once.
 
     Examples
@@ -32,10 +32,10 @@ def together(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     for name, notes in said:
         for note in notes:
             pooled.setdefault(note.removeprefix(f"{name}: "), []).append(name)
-    return [f"{some(names)}: {note}" for note, names in pooled.items()]
+    return [f"{name_some(names)}: {note}" for note, names in pooled.items()]
 
 
-def first_few(notes: Sequence[str], what: str) -> list[str]:
+def first_notes(notes: Sequence[str], what: str) -> list[str]:
     """The first of many notes of one kind, and how many more there are."""
-    more = len(notes) - _NAMED
-    return [*notes[:_NAMED], *([f"{more} more {what}"] if more > 0 else [])]
+    more = len(notes) - _MAX_NAMED
+    return [*notes[:_MAX_NAMED], *([f"{more} more {what}"] if more > 0 else [])]

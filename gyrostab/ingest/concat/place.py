@@ -15,29 +15,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.ingest.concat.grid import Piece, Source, Stretch, read_stretches, runs_of
-from gyrostab.ingest.concat.notes import first_few, some
-from gyrostab.ingest.gap_table import duration, stamp_text
+from gyrostab.ingest.concat.grid import LogSlice, PlacedLog, Source, read_log_slices, runs_of
+from gyrostab.ingest.concat.notes import first_notes, name_some
+from gyrostab.ingest.gap_table import format_duration, format_stamp
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["place_logs"]
 
 #: Distance from the grid that is not worth a word [samples].
-SMALL = 0.01
+NOTED_OFFSET_SAMPLES = 0.01
 #: Samples that may lie on those of the log before, with other values, before it is taken as a step
 #: of the clock (as among raw rows).
-FEW = 16
+MAX_OVERLAP_SAMPLES = 16
 #: Samples by which the grids of two logs with common samples may be displaced: the first stamp of
 #: each has its own jitter.
-REACH = 64
+MAX_SHIFT_SAMPLES = 64
 
-_COMPARED = 2**13  # samples at each end of an overlap whose values are compared
-_PROBED = 64  # of them, so many are looked at for a displacement
-_SURE = 32  # common samples that it takes to see a displacement
-_SAME = 0.9  # share of the compared samples that must be alike; a copy may have been damaged
-_BATCH = 50  # logs whose overlaps are read at once
-_Cache = dict[Stretch, NDArray[np.float64]]
+_COMPARED_SAMPLES = 2**13  # samples at each end of an overlap whose values are compared
+_PROBED_SAMPLES = 64  # of them, so many are looked at for a displacement
+_MIN_COMMON_SAMPLES = 32  # common samples that it takes to see a displacement
+_MIN_ALIKE_SHARE = (
+    0.9  # share of the compared samples that must be alike; a copy may have been damaged
+)
+_BATCH_LOGS = 50  # logs whose overlaps are read at once
+_Cache = dict[LogSlice, NDArray[np.float64]]
 _STEP, _RESTART = GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart")
 
 
@@ -51,10 +53,10 @@ class _Match:
 
     @property
     def alike(self) -> bool:
-        return self.common >= 2 and self.same >= _SAME * self.common
+        return self.common >= 2 and self.same >= _MIN_ALIKE_SHARE * self.common
 
 
-def _compare(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
+def _count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
     """Number of samples (last dimension) at which both have a number on some axis (first), and at which all numbers are the same."""
     known = np.isfinite(held) & np.isfinite(new)
     told = known.any(axis=0)
@@ -62,69 +64,85 @@ def _compare(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, 
     return told.sum(axis=-1), same.sum(axis=-1)
 
 
-def _best(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
-    """Compare `new` with `held`, which is `REACH` samples longer on either side, in place or displaced by a few samples."""
+def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
+    """Compare `new` with `held`, which is `MAX_SHIFT_SAMPLES` samples longer on either side, in place or displaced by a few samples."""
     size = new.shape[1]
-    here = _Match(*_compare(held[:, REACH : REACH + size], new), 0)
-    if here.alike or here.common < _SURE:
+    here = _Match(*_count_alike(held[:, MAX_SHIFT_SAMPLES : MAX_SHIFT_SAMPLES + size], new), 0)
+    if here.alike or here.common < _MIN_COMMON_SAMPLES:
         return here
-    probe = np.flatnonzero(np.isfinite(new).any(axis=0))[:_PROBED]
-    shifts = np.array(sorted(range(-REACH, REACH + 1), key=abs))
-    common, same = _compare(held[:, REACH + shifts[:, None] + probe], new[:, None, probe])
-    for shift in shifts[(common >= _SURE) & (same >= _SAME * common)].tolist():
-        there = _Match(*_compare(held[:, REACH + shift : REACH + shift + size], new), shift)
-        if there.alike and there.common >= _SURE:
+    probe = np.flatnonzero(np.isfinite(new).any(axis=0))[:_PROBED_SAMPLES]
+    shifts = np.array(sorted(range(-MAX_SHIFT_SAMPLES, MAX_SHIFT_SAMPLES + 1), key=abs))
+    common, same = _count_alike(
+        held[:, MAX_SHIFT_SAMPLES + shifts[:, None] + probe], new[:, None, probe]
+    )
+    for shift in shifts[
+        (common >= _MIN_COMMON_SAMPLES) & (same >= _MIN_ALIKE_SHARE * common)
+    ].tolist():
+        there = _Match(
+            *_count_alike(
+                held[:, MAX_SHIFT_SAMPLES + shift : MAX_SHIFT_SAMPLES + shift + size], new
+            ),
+            shift,
+        )
+        if there.alike and there.common >= _MIN_COMMON_SAMPLES:
             return there
     return here
 
 
-def _lag(held: Source, new: Source) -> int:
+def _lag_samples(held: Source, new: Source) -> int:
     """Sample of `held` at which `new` begins, by the clock."""
     return int(np.rint(grid_index(held.start, held.rate, new.start)))
 
 
-def _stretches(held: Source, new: Source, lag: int) -> list[tuple[Stretch, Stretch]]:
+def _overlap_ends(held: Source, new: Source, lag: int) -> list[tuple[LogSlice, LogSlice]]:
     """The ends of the overlap in both logs, to be compared: the earlier with some more samples on either side."""
     low, high = max(lag, 0), min(lag + new.size, held.size)
     if high <= low:
         return []
-    ends = dict.fromkeys([(low, min(high, low + _COMPARED)), (max(low, high - _COMPARED), high)])
+    ends = dict.fromkeys(
+        [(low, min(high, low + _COMPARED_SAMPLES)), (max(low, high - _COMPARED_SAMPLES), high)]
+    )
     return [
-        ((held, begin - REACH, end + REACH), (new, begin - lag, end - lag)) for begin, end in ends
+        ((held, begin - MAX_SHIFT_SAMPLES, end + MAX_SHIFT_SAMPLES), (new, begin - lag, end - lag))
+        for begin, end in ends
     ]
 
 
-def _neighbours(sources: Sequence[Source]) -> _Cache:
+def _read_overlaps(sources: Sequence[Source]) -> _Cache:
     """What it takes to compare each log with the next, read at once."""
     pairs = [
         pair
         for held, new in pairwise(sources)
         if held.end >= new.start
-        for pair in _stretches(held, new, _lag(held, new))
+        for pair in _overlap_ends(held, new, _lag_samples(held, new))
     ]
-    return read_stretches(one for pair in pairs for one in pair)
+    return read_log_slices(one for pair in pairs for one in pair)
 
 
-def _match(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
+def _match_logs(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
     """Compare two logs where the clock says that both have samples: sample 0 of `new` at sample `lag` of `held`."""
     axes = [axis for axis in held.axes if axis in new.axes]
-    pairs = _stretches(held, new, lag)
+    pairs = _overlap_ends(held, new, lag)
     if not axes or not pairs:
         return _Match(0, 0, 0)
     rows_held, rows_new = ([source.axes.index(axis) for axis in axes] for source in (held, new))
     found: list[_Match] = []
     for there, here in pairs:
-        if found and found[0].common >= _COMPARED // 2 and found[0].same < 0.5 * found[0].common:
+        if (
+            found
+            and found[0].common >= _COMPARED_SAMPLES // 2
+            and found[0].same < 0.5 * found[0].common
+        ):
             break  # no copy, whatever its end is like
-        cache.update(read_stretches(one for one in (there, here) if one not in cache))
-        found.append(_best(cache[there][rows_held], cache[here][rows_new]))
+        cache.update(read_log_slices(one for one in (there, here) if one not in cache))
+        found.append(_find_shift(cache[there][rows_held], cache[here][rows_new]))
     surest = max(found, key=lambda match: (match.alike, match.same))
     return _Match(
         sum(match.common for match in found), sum(match.same for match in found), surest.shift
     )
 
 
-def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Piece], list[str]]:
+def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[PlacedLog], list[str]]:
     """Place logs on the grid of the first.
 
     Parameters
@@ -142,14 +160,14 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Piece
         Sentences on logs between the samples of the grid, on overlaps and on steps of the clock.
     """
     rate = sources[0].rate
-    pieces: list[Piece] = []
+    pieces: list[PlacedLog] = []
     overlaps: list[str] = []
     breaks: list[str] = []
     cache: _Cache = {}
     for number, source in enumerate(sources):
-        if number % _BATCH == 0:
-            cache = _neighbours(sources[max(number - 1, 0) : number + _BATCH])
-        piece, match = _next(pieces, source, rate, max_gap, cache)
+        if number % _BATCH_LOGS == 0:
+            cache = _read_overlaps(sources[max(number - 1, 0) : number + _BATCH_LOGS])
+        piece, match = _place_next(pieces, source, rate, max_gap, cache)
         if match is not None:
             overlaps.append(_overlap_note(piece, *match, rate))
         elif piece.cause >= 0:
@@ -157,17 +175,17 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Piece
         pieces.append(piece)
     notes = [
         *_grid_notes(pieces, rate),
-        *first_few(breaks, "steps of the clock are in the table of gaps"),
-        *first_few(overlaps, "overlaps"),
+        *first_notes(breaks, "steps of the clock are in the table of gaps"),
+        *first_notes(overlaps, "overlaps"),
     ]
     lowest = min(piece.first for piece in pieces)
-    return [_moved(piece, -lowest) for piece in pieces], notes
+    return [_shift_samples(piece, -lowest) for piece in pieces], notes
 
 
-def _moved(piece: Piece, by: int) -> Piece:
+def _shift_samples(piece: PlacedLog, by: int) -> PlacedLog:
     if not by:
         return piece
-    return Piece(
+    return PlacedLog(
         piece.source,
         piece.runs + np.array([by, 0, 0]),
         piece.off,
@@ -176,23 +194,23 @@ def _moved(piece: Piece, by: int) -> Piece:
     )
 
 
-def _next(
-    pieces: list[Piece], source: Source, rate: float, max_gap: float, cache: _Cache
-) -> tuple[Piece, tuple[Piece, _Match] | None]:
+def _place_next(
+    pieces: list[PlacedLog], source: Source, rate: float, max_gap: float, cache: _Cache
+) -> tuple[PlacedLog, tuple[PlacedLog, _Match] | None]:
     """The next log on the grid, and the log that it overlaps, if it does."""
     ratio = rate / source.rate
     if not pieces:
-        return Piece(source, runs_of(0, 0.0, source.size, ratio), 0.0, (source.start, 0)), None
-    differing: tuple[Piece, _Match] | None = None
-    silent: tuple[Piece, _Match] | None = None
+        return PlacedLog(source, runs_of(0, 0.0, source.size, ratio), 0.0, (source.start, 0)), None
+    differing: tuple[PlacedLog, _Match] | None = None
+    silent: tuple[PlacedLog, _Match] | None = None
     for held in reversed(pieces):
         if held.source.end < source.start or not set(held.source.axes) & set(source.axes):
             continue  # other axes over the same time are no overlap
-        lag = _lag(held.source, source)
-        match = _match(held.source, source, lag, cache)
+        lag = _lag_samples(held.source, source)
+        match = _match_logs(held.source, source, lag, cache)
         if match.alike:
             first = int(held.on_grid(lag + match.shift))
-            return Piece(source, runs_of(first, 0.0, source.size, ratio), 0.0, held.clock), (
+            return PlacedLog(source, runs_of(first, 0.0, source.size, ratio), 0.0, held.clock), (
                 held,
                 match,
             )
@@ -203,19 +221,22 @@ def _next(
     clock = pieces[-1].clock
     position = float(grid_index(clock[0], rate, source.start)) + clock[1]
     first, end = int(np.rint(position)), max(piece.end for piece in pieces)
-    back, ahead = end - first > FEW and differing is not None, first - end > max_gap * rate
+    back, ahead = (
+        end - first > MAX_OVERLAP_SAMPLES and differing is not None,
+        first - end > max_gap * rate,
+    )
     if back or ahead:
         cause = _RESTART if back and _begins_again(pieces, source) else _STEP
-        return Piece(
+        return PlacedLog(
             source, runs_of(end + 1, 0.0, source.size, ratio), 0.0, (source.start, end + 1), cause
         ), None
     off = position - first
-    return Piece(source, runs_of(first, off, source.size, ratio), off, clock), (
+    return PlacedLog(source, runs_of(first, off, source.size, ratio), off, clock), (
         differing or silent
     ) if first < end else None
 
 
-def _begins_again(pieces: list[Piece], source: Source) -> bool:
+def _begins_again(pieces: list[PlacedLog], source: Source) -> bool:
     """Whether a clock that was set back began anew, rather than being corrected."""
     latest = max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
     elapsed = latest - pieces[-1].clock[0]
@@ -225,36 +246,38 @@ def _begins_again(pieces: list[Piece], source: Source) -> bool:
     )
 
 
-def _grid_notes(pieces: Sequence[Piece], rate: float) -> list[str]:
+def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
     """Sentences on logs that lie between the samples of the grid or have a slightly different rate."""
     notes = []
-    between = [piece for piece in pieces if abs(piece.off) > SMALL]
+    between = [piece for piece in pieces if abs(piece.off) > NOTED_OFFSET_SAMPLES]
     if between:
         most = max(abs(piece.off) for piece in between)
-        names = some([piece.source.name for piece in between])
+        names = name_some([piece.source.name for piece in between])
         notes.append(
             f"{names}: begin between two samples of the grid of {pieces[0].source.name}; their samples were put on the nearest ones, "
-            f"at most {most:.2g} of a sample ({duration(most / rate)}) away"
+            f"at most {most:.2g} of a sample ({format_duration(most / rate)}) away"
         )
     other = [piece for piece in pieces if piece.source.rate != rate]
     if other:
         most = max(abs(piece.source.rate / rate - 1) for piece in other)
         notes.append(
-            f"{some([piece.source.name for piece in other])}: the sampling rate is up to {1e6 * most:.3g} parts per million from the "
+            f"{name_some([piece.source.name for piece in other])}: the sampling rate is up to {1e6 * most:.3g} parts per million from the "
             f"{rate:.10g} Hz of {pieces[0].source.name}; each sample was put on the nearest one of its grid"
         )
     return notes
 
 
-def _overlap_note(piece: Piece, held: Piece, match: _Match, rate: float) -> str:
+def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float) -> str:
     name, holder = piece.source.name, held.source.name
     first, end = max(piece.first, held.first), min(piece.end, held.end)
     if not match.alike:
         what = "hold other values" if match.common else "are missing in one of them"
         return f"{name}: {max(end - first, 0)} samples lie on samples of {holder} and {what}; those of {holder} are kept where it has them"
-    begin = stamp_text(int(grid_times(*held.clock[:1], rate, first - held.clock[1])))
+    begin = format_stamp(int(grid_times(*held.clock[:1], rate, first - held.clock[1])))
     whole = (
-        "all of it is" if end >= piece.end else f"{duration((end - first) / rate)} from {begin} are"
+        "all of it is"
+        if end >= piece.end
+        else f"{format_duration((end - first) / rate)} from {begin} are"
     )
     differ = (
         f"; {match.common - match.same} of {match.common} compared samples differ"
@@ -264,12 +287,12 @@ def _overlap_note(piece: Piece, held: Piece, match: _Match, rate: float) -> str:
     return f"{name}: {whole} in {holder} too, and counted once{differ}; the samples of {holder} are kept where it has them"
 
 
-def _break_note(pieces: Sequence[Piece], piece: Piece) -> str:
+def _break_note(pieces: Sequence[PlacedLog], piece: PlacedLog) -> str:
     before = max(one.source.end for one in pieces if one.clock == pieces[-1].clock)
     jump = (piece.source.start - before) / 1e9
     what = "time restarts" if piece.cause == _RESTART else "the clock steps"
     return (
-        f"{piece.source.name}: {what}: from {stamp_text(before)} to {stamp_text(piece.source.start)}, {duration(abs(jump))} "
+        f"{piece.source.name}: {what}: from {format_stamp(before)} to {format_stamp(piece.source.start)}, {format_duration(abs(jump))} "
         f"{'back' if jump < 0 else 'ahead'}; the pause is of unknown length, so the samples that follow come after one missing sample"
         + ("" if jump < 0 else "; if the pause is real, raise max_gap")
     )

@@ -54,27 +54,27 @@ def matches(path: Path) -> bool:
 
 def has_layout(path: Path) -> bool:
     """Whether a layout of its own stands beside a file."""
-    return _named(path).is_file()
+    return _layout_path(path).is_file()
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Fields, number of records, the stamps of the two ends."""
-    table, notes = _table(path)
+    table, notes = _make_table(path)
     return scan_tables(path, "binary", [table], options, notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a binary file; see `gyrostab.ingest.read_log`."""
-    table, notes = _table(path)
+    table, notes = _make_table(path)
     return read_tables(path, [table], options, notes=notes, limit=limit)
 
 
-def _named(path: Path) -> Path:
+def _layout_path(path: Path) -> Path:
     return path.with_name(f"{path.name}.toml")
 
 
-def _layout(path: Path) -> tuple[Path, dict[str, Any]]:
-    places = [_named(path), path.with_suffix(".toml"), path.with_name("layout.toml")]
+def _read_layout(path: Path) -> tuple[Path, dict[str, Any]]:
+    places = [_layout_path(path), path.with_suffix(".toml"), path.with_name("layout.toml")]
     place = next((place for place in places if place.is_file()), None)
     if place is None:
         example = 'fields = [{name = "time [us]", type = "uint32"}, {name = "gyro_x [deg/h]", type = "int32"}]'
@@ -87,7 +87,7 @@ def _layout(path: Path) -> tuple[Path, dict[str, Any]]:
         raise OptionError(f"{place.name}: this layout is no TOML ({error}); correct it") from error
 
 
-def _record(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], int]:
+def _record_type(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], int]:
     """The type of a record, and the bytes before the first."""
     known = {"header_bytes", "byte_order", "fields"}
     if odd := sorted(set(layout) - known):
@@ -126,9 +126,9 @@ def _record(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], int]:
     ), header
 
 
-def _table(path: Path) -> tuple[Table, list[str]]:
-    place, layout = _layout(path)
-    record, header = _record(place, layout)
+def _make_table(path: Path) -> tuple[Table, list[str]]:
+    place, layout = _read_layout(path)
+    record, header = _record_type(place, layout)
     rows, rest = divmod(path.stat().st_size - header, record.itemsize)
     if rows < 1:
         what = f"{path.stat().st_size} bytes, but {header} of header and {record.itemsize} a record"
@@ -143,11 +143,13 @@ def _table(path: Path) -> tuple[Table, list[str]]:
         else []
     )
     names = tuple(record.names or ())
-    columns = tuple(partial(_part, path, record, header, name) for name in names)
+    columns = tuple(partial(_read_field, path, record, header, name) for name in names)
     return Table(rows, names, (None,) * len(names), columns), notes
 
 
-def _part(path: Path, record: np.dtype[Any], header: int, name: str, start: int, stop: int) -> Any:
+def _read_field(
+    path: Path, record: np.dtype[Any], header: int, name: str, start: int, stop: int
+) -> Any:
     records = np.memmap(
         path, dtype=record, mode="r", offset=header + start * record.itemsize, shape=(stop - start,)
     )

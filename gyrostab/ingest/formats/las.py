@@ -27,7 +27,7 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 __all__ = ["matches", "read", "scan"]
 
 # Parts of dates, as the units of curves write them -> as `datetime.strptime` does.
-_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
+_DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
 
 
 def matches(path: Path) -> bool:
@@ -40,15 +40,15 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Curves, rows, and the stamps of the two ends."""
-    return scan_tables(path, "las", [_table(path, options)], options)
+    return scan_tables(path, "las", [_read_curves(path, options)], options)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a LAS file; see `gyrostab.ingest.read_log`."""
-    return read_tables(path, [_table(path, options)], options, limit=limit)
+    return read_tables(path, [_read_curves(path, options)], options, limit=limit)
 
 
-def _table(path: Path, options: ReadOptions) -> Table:
+def _read_curves(path: Path, options: ReadOptions) -> Table:
     lasio = library("lasio", path, extra="las")
     try:
         curves = lasio.read(str(path)).curves
@@ -60,7 +60,7 @@ def _table(path: Path, options: ReadOptions) -> Table:
         None if holds_dates(curve.data) else str(curve.unit or "").strip() or None
         for curve in curves
     )
-    columns = tuple(partial(_part, np.asarray(curve.data)) for curve in curves)
+    columns = tuple(partial(_slice_values, np.asarray(curve.data)) for curve in curves)
     clocks = [
         curve
         for curve in curves
@@ -81,7 +81,11 @@ def _table(path: Path, options: ReadOptions) -> Table:
     )
     rows = len(curves[0].data) if len(curves) else 0
     return Table(
-        rows, names, units, columns, None if dates is None else partial(_part, np.asarray(dates))
+        rows,
+        names,
+        units,
+        columns,
+        None if dates is None else partial(_slice_values, np.asarray(dates)),
     )
 
 
@@ -127,7 +131,7 @@ def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
 def _date_order(unit: str, days: list[str]) -> str | None:
     """The format of the dates: as the unit of the curve says (``DD/MM/YY``), or the only one that fits them."""
     said = (
-        re.sub(r"(?i)y{4}|y{2}|m{3}|m{2}|d{2}", lambda part: _CODES[part[0].lower()], unit)
+        re.sub(r"(?i)y{4}|y{2}|m{3}|m{2}|d{2}", lambda part: _DATE_CODES[part[0].lower()], unit)
         if re.search(r"(?i)yy", unit)
         else ""
     )
@@ -142,17 +146,17 @@ def _date_order(unit: str, days: list[str]) -> str | None:
         "%d %b %Y",
     )
     for order in (said, *known):
-        if order and _fits(order, days):
+        if order and _has_date_format(order, days):
             return order
     unclear = [
         order
         for order in ("%d/%m/%Y", "%m/%d/%Y", "%d/%m/%y", "%m/%d/%y", "%d-%m-%Y", "%m-%d-%Y")
-        if _fits(order, days)
+        if _has_date_format(order, days)
     ]
     return unclear[0] if len(unclear) == 1 else None
 
 
-def _fits(order: str, days: list[str]) -> bool:
+def _has_date_format(order: str, days: list[str]) -> bool:
     filled = [day for day in days if day and day.lower() != "nan"]
     try:
         for day in filled:
@@ -162,5 +166,5 @@ def _fits(order: str, days: list[str]) -> bool:
     return bool(filled)
 
 
-def _part(values: Any, start: int, stop: int) -> Any:
+def _slice_values(values: Any, start: int, stop: int) -> Any:
     return values[start:stop]

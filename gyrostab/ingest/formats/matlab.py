@@ -18,9 +18,14 @@ import xarray as xr
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
-from gyrostab.ingest.columns.headers import AXIS, KNOWN, TIME, is_time_unit
+from gyrostab.ingest.columns.headers import (
+    AXIS_PATTERN,
+    KNOWN_CHANNEL_PATTERN,
+    TIME_PATTERN,
+    is_time_unit,
+)
 from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.typed import Fetch, float32_note, read_columns, summarise
+from gyrostab.ingest.columns.typed import Fetch, float32_note, read_columns, summarise_columns
 from gyrostab.ingest.formats.matlab5 import check_structure
 from gyrostab.ingest.formats.packing import ATTRIBUTES, fold_packing, text_attributes
 from gyrostab.ingest.limits import check_chunk, check_stored
@@ -59,15 +64,15 @@ def matches(path: Path) -> bool:
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Variables and their shapes, the stamps of the two ends."""
     with ExitStack() as stack:
-        vectors, plan, fetch, notes = _look(path, options, stack)
+        vectors, plan, fetch, notes = _plan_file(path, options, stack)
         name = "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab"
-        return summarise(name, plan, options, vectors[0].rows, fetch, notes)
+        return summarise_columns(name, plan, options, vectors[0].rows, fetch, notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a MATLAB file; see `gyrostab.ingest.read_log`."""
     with ExitStack() as stack:
-        vectors, plan, fetch, notes = _look(path, options, stack)
+        vectors, plan, fetch, notes = _plan_file(path, options, stack)
         notes += float32_note(plan, [vector.array.dtype for vector in vectors])
         check_stored(path, vectors[0].rows, len(plan.columns), options.limits)
         lasting = all(
@@ -78,14 +83,14 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
         )
 
 
-def _look(
+def _plan_file(
     path: Path, options: ReadOptions, stack: ExitStack
 ) -> tuple[list[_Vector], Plan, Fetch, list[str]]:
     objects: list[str] = []
     found = [
         vector
-        for name, array in _arrays(path, stack, objects)
-        for vector in _vectors(path, name, array, options)
+        for name, array in _find_arrays(path, stack, objects)
+        for vector in _vectors_of(path, name, array, options)
     ]
     if not found and objects:
         what = f"it holds {', '.join(dict.fromkeys(objects))}, which MATLAB alone can read"
@@ -108,7 +113,7 @@ def _look(
         notes.append(
             f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to keep it, {_PLAIN_ARRAYS}"
         )
-    attributes = [_attributes(vector.array) for vector in kept]
+    attributes = [_number_attributes(vector.array) for vector in kept]
     units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
     headers = [vector.header for vector in kept]
     plan = plan_columns(
@@ -126,26 +131,27 @@ def _look(
 def _known_fields(headers: Sequence[str]) -> dict[int, str]:
     """Fields of structures whose own names are ours, ``gyro_x`` of ``S.gyro_x``, where no other field has that name."""
     names = [header.rpartition(".")[2] for header in headers]
-    times = [place for place, name in enumerate(names) if TIME.match(name.lower())]
+    times = [place for place, name in enumerate(names) if TIME_PATTERN.match(name.lower())]
     found = {
         place: name.lower()
         for place, name in enumerate(names)
-        if AXIS.match(name.lower()) or KNOWN.match(name.lower())
+        if AXIS_PATTERN.match(name.lower()) or KNOWN_CHANNEL_PATTERN.match(name.lower())
     }
     found = {place: name for place, name in found.items() if list(found.values()).count(name) == 1}
     if len(times) == 1:
-        suffix = next((text for text in TIME.match(names[times[0]].lower()).groups() if text), None)  # type: ignore[union-attr]
+        match = TIME_PATTERN.match(names[times[0]].lower())
+        suffix = next((text for text in match.groups() if text), None) if match else None
         found[times[0]] = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
     return {place: name for place, name in found.items() if "." in headers[place]}
 
 
-def _attributes(array: Any) -> dict[str, Any]:
+def _number_attributes(array: Any) -> dict[str, Any]:
     """Return what the attributes of an HDF5 dataset say of its numbers; such a file may follow the CF conventions."""
     attributes = getattr(array, "attrs", {})
     return {name: attributes[name] for name in ATTRIBUTES if name in attributes}
 
 
-def _vectors(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[_Vector]:
+def _vectors_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[_Vector]:
     shape = array.shape
     if len(shape) not in (1, 2) or max(shape, default=0) <= 1:
         return
@@ -163,12 +169,12 @@ def _vectors(path: Path, name: str, array: Any, options: ReadOptions) -> Iterato
         )
 
 
-def _arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
+def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
     """Arrays of numbers by their names; what is an object of MATLAB is added to `objects`."""
     with path.open("rb") as file:
         head = file.read(1024)
     if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
-        yield from _arrays_hdf(path, stack, objects)
+        yield from _find_hdf_arrays(path, stack, objects)
         return
     from scipy.io import loadmat
 
@@ -181,20 +187,22 @@ def _arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[
         ) from error
     for name, value in content.items():
         if not name.startswith("__"):
-            yield from _flatten(name, value, objects)
+            yield from _flatten_struct(name, value, objects)
 
 
-def _flatten(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, Any]]:
+def _flatten_struct(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, Any]]:
     from scipy.io.matlab import MatlabObject, MatlabOpaque
 
     fields = value.dtype.names if isinstance(value, np.ndarray) else None
     if isinstance(value, MatlabOpaque):
         entry = value.reshape(-1)[0] if value.size else None
-        kind = _text(entry["s2"]) if entry is not None and fields and "s2" in fields else "object"
+        kind = (
+            _to_text(entry["s2"]) if entry is not None and fields and "s2" in fields else "object"
+        )
         objects.append(
             f"a {kind}"
             + (
-                f" {_text(entry['s0'])!r}"
+                f" {_to_text(entry['s0'])!r}"
                 if entry is not None and fields and "s0" in fields
                 else ""
             )
@@ -203,7 +211,7 @@ def _flatten(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, A
         objects.append(f"an object of class {value.classname!r}")
     elif fields and value.size == 1:
         for field in fields:
-            yield from _flatten(f"{name}.{field}", value.reshape(-1)[0][field], objects)
+            yield from _flatten_struct(f"{name}.{field}", value.reshape(-1)[0][field], objects)
     elif fields and value.size > 1:  # table2struct: one structure a row
         for field in fields:
             cells = [np.asarray(cell) for cell in value[field].reshape(-1)]
@@ -213,11 +221,11 @@ def _flatten(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, A
         yield name, value
 
 
-def _text(value: Any) -> str:
+def _to_text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
-def _arrays_hdf(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
+def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
     import h5py
 
     try:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.formats.optional import library
-from gyrostab.ingest.formats.tables import Part, Table, plain_names, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import ReadSlice, Table, plain_names, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.time.grid import grid_times
 
@@ -27,13 +27,15 @@ __all__ = ["matches", "read", "scan"]
 
 SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
 _HEAD = re.compile(rb"\d{6}[DRQM][ \0]|MS\x03")
-_MOST_RECORD = (
+_MAX_RECORD_BYTES = (
     2**20
 )  # longest record that is looked for [bytes]; version 2 allows more, nobody writes it
 _ROTATION = re.compile(
     r"(?:^|\.)[A-Z]J([A-Z0-9])$"
 )  # band, instrument J, orientation: SEED manual, appendix A
-_TOGETHER = 0.1  # channels that begin so near to each other share their stamps [samples]
+_MAX_START_DIFFERENCE = (
+    0.1  # channels that begin so near to each other share their stamps [samples]
+)
 
 
 @dataclass
@@ -58,14 +60,18 @@ def matches(path: Path) -> bool:
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Channels, and the stamps of the records' headers."""
     return scan_tables(
-        path, "miniseed", _tables(_traces(path, unpack=False)), options, _cut_note(path)
+        path, "miniseed", _group_traces(_read_traces(path, unpack=False)), options, _cut_note(path)
     )
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a miniSEED file; see `gyrostab.ingest.read_log`."""
     return read_tables(
-        path, _tables(_traces(path, unpack=True)), options, notes=_cut_note(path), limit=limit
+        path,
+        _group_traces(_read_traces(path, unpack=True)),
+        options,
+        notes=_cut_note(path),
+        limit=limit,
     )
 
 
@@ -73,7 +79,7 @@ def _cut_note(path: Path) -> list[str]:
     """A note where the last record of version 2 is not complete: all records of such a file have the length of the first."""
     pymseed = library("pymseed", path, extra="miniseed")
     with path.open("rb") as file:
-        head = file.read(_MOST_RECORD)
+        head = file.read(_MAX_RECORD_BYTES)
     if not head or not _HEAD.match(head):
         return []
     try:
@@ -90,7 +96,7 @@ def _cut_note(path: Path) -> list[str]:
     )
 
 
-def _traces(path: Path, *, unpack: bool) -> list[_Trace]:
+def _read_traces(path: Path, *, unpack: bool) -> list[_Trace]:
     pymseed = library("pymseed", path, extra="miniseed")
     traces: dict[tuple[str, float], _Trace] = {}
     try:
@@ -118,7 +124,7 @@ def _traces(path: Path, *, unpack: bool) -> list[_Trace]:
     return list(traces.values())
 
 
-def _tables(traces: list[_Trace]) -> list[Table]:
+def _group_traces(traces: list[_Trace]) -> list[Table]:
     """Channels of one rate whose pieces begin together are one table; the last piece of some may be shorter, as in a file that is cut."""
     groups: list[list[_Trace]] = []
     for trace in traces:
@@ -129,7 +135,7 @@ def _tables(traces: list[_Trace]) -> list[Table]:
     for group in groups:
         longest = max(group, key=lambda trace: sum(trace.sizes))
         rows = sum(longest.sizes)
-        values = tuple(partial(_part, trace.values, rows) for trace in group)
+        values = tuple(partial(_join_values, trace.values, rows) for trace in group)
         own = tuple(names[id(trace)] for trace in group)
         tables.append(
             Table(
@@ -137,15 +143,15 @@ def _tables(traces: list[_Trace]) -> list[Table]:
                 own,
                 (None,) * len(group),
                 values,
-                _stamps(longest),
-                coded=tuple(map(_axis, own)),
+                _trace_stamps(longest),
+                coded=tuple(map(_axis_of_code, own)),
             )
         )
     return tables
 
 
 def _in_step(one: _Trace, other: _Trace) -> bool:
-    apart = _TOGETHER * 1e9 / one.rate
+    apart = _MAX_START_DIFFERENCE * 1e9 / one.rate
     same = (
         one.rate == other.rate
         and one.sizes[:-1] == other.sizes[:-1]
@@ -154,13 +160,13 @@ def _in_step(one: _Trace, other: _Trace) -> bool:
     return same and all(abs(a - b) <= apart for a, b in zip(one.starts, other.starts, strict=True))
 
 
-def _axis(name: str) -> str | None:
+def _axis_of_code(name: str) -> str | None:
     """The gyro axis that a channel of a rotation sensor is."""
     match = _ROTATION.search(name)
     return f"gyro_{match.group(1).lower()}" if match else None
 
 
-def _part(pieces: list[NDArray[Any]], rows: int, start: int, stop: int) -> NDArray[Any]:
+def _join_values(pieces: list[NDArray[Any]], rows: int, start: int, stop: int) -> NDArray[Any]:
     values = (pieces[0] if len(pieces) == 1 else np.concatenate(pieces))[start:stop]
     missing = min(stop, rows) - start - len(values)
     return (
@@ -170,7 +176,7 @@ def _part(pieces: list[NDArray[Any]], rows: int, start: int, stop: int) -> NDArr
     )
 
 
-def _stamps(trace: _Trace) -> Part:
+def _trace_stamps(trace: _Trace) -> ReadSlice:
     ends = np.cumsum(trace.sizes)
 
     def part(start: int, stop: int) -> NDArray[np.datetime64]:

@@ -24,7 +24,7 @@ from gyrostab.errors import FormatError, SchemaError, TimeError, reading_of
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.stamps import names_epoch
-from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise
+from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
 from gyrostab.ingest.formats.netcdf_variables import (
     StoredVariable,
@@ -53,7 +53,7 @@ _UNDECODED: dict[str, Any] = {
     "decode_times": False,
     "create_default_indexes": False,
 }
-_NO_LOGS = {"surface": "a dynamic Allan variance", "product": "a product"}
+_OTHER_CONTENT = {"surface": "a dynamic Allan variance", "product": "a product"}
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,11 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         with log:
             return _summarise_log(path, log)
     with open_variables(path, options.limits) as variables:
-        columns, rows, plan, decoders, notes = _look(path, variables, options)
+        columns, rows, plan, decoders, notes = _plan_file(path, variables, options)
         name = "zarr" if path.is_dir() else "netcdf"
-        return summarise(name, plan, options, rows, partial(_fetch, columns, decoders), notes)
+        return summarise_columns(
+            name, plan, options, rows, partial(_fetch_column, columns, decoders), notes
+        )
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
@@ -89,13 +91,13 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     if log is not None:
         return log
     with open_variables(path, options.limits) as variables:
-        columns, rows, plan, decoders, notes = _look(path, variables, options)
+        columns, rows, plan, decoders, notes = _plan_file(path, variables, options)
         notes += float32_note(plan, [column.variable.dtype for column in columns])
         check_stored(path, rows, len(plan.columns), options.limits)
         lasting = all(
             not isinstance(columns[column.source].rows, LibraryRows) for column in plan.columns
         )
-        fetch = partial(_fetch, columns, decoders)
+        fetch = partial(_fetch_column, columns, decoders)
         return read_columns(plan, options, rows, fetch, notes=notes, limit=limit, lasting=lasting)
 
 
@@ -105,18 +107,18 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
         read_classic_header(
             path
         )  # before the libraries take memory for what a damaged header claims
-    content = _content(path)
+    content = _content_kind(path)
     if content == "log":
         return _open_own(path, options)
-    if content in _NO_LOGS and not options.channels_only:
+    if content in _OTHER_CONTENT and not options.channels_only:
         raise FormatError(
-            f"{path.name}: is {_NO_LOGS[content]} that gyrostab wrote, and no log; give the log that it was made of"
+            f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, and no log; give the log that it was made of"
         )
     stored = _open_regular(path)
     if stored is None:
         return None
     log = _as_in_memory(
-        path, _chunked(decode_variables(path.name, name_file_in_errors(stored, path)))
+        path, _chunk_variables(decode_variables(path.name, name_file_in_errors(stored, path)))
     )  # an index would hold every stamp
     log.set_close(stored.close)
     check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
@@ -203,7 +205,7 @@ def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
         return group.metadata.zarr_format, dict(group.attrs)
 
 
-def _chunked(stored: xr.Dataset) -> xr.Dataset:
+def _chunk_variables(stored: xr.Dataset) -> xr.Dataset:
     """The dataset as arrays of dask, in the chunks of the file."""
     chunks: dict[Any, int] = {}
     for variable in stored.variables.values():
@@ -223,7 +225,7 @@ def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
     return np.array([str(label) for label in values], dtype=str)
 
 
-def _content(path: Path) -> str:
+def _content_kind(path: Path) -> str:
     """What it says that gyrostab wrote it as: log, surface or product; what is damaged as a whole, or another's, says nothing."""
     try:
         if path.is_dir():
@@ -288,26 +290,26 @@ def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
         columns=(*axes, *others),
         axes=tuple(str(axis) for axis in log["axis"].values),
         channels=tuple(channels),
-        first=_stamp(log, 0),
-        last=_stamp(log, -1),
+        first=_stamp_at(log, 0),
+        last=_stamp_at(log, -1),
         n_rows=log.sizes["time"],
         notes=tuple(log.attrs.get("notes", ())),
     )
 
 
-def _stamp(log: xr.Dataset, place: int) -> np.datetime64:
+def _stamp_at(log: xr.Dataset, place: int) -> np.datetime64:
     return np.datetime64(
         int(log["time"][place].values.astype("datetime64[ns]").view(np.int64)), "ns"
     )
 
 
-def _fetch(
+def _fetch_column(
     columns: list[_Column], decoders: dict[int, Decoder], source: int, start: int, stop: int
 ) -> Any:
     return decoders[source](columns[source].rows.read(start, stop))
 
 
-def _look(
+def _plan_file(
     path: Path, variables: Mapping[str, StoredVariable], options: ReadOptions
 ) -> tuple[list[_Column], int, Plan, dict[int, Decoder], list[str]]:
     numeric = [v for v in variables.values() if v.dtype.kind in "iuf" and len(v.shape) in (1, 2)]
@@ -323,7 +325,7 @@ def _look(
     notes: list[str] = []
     left: list[str] = []
     for variable in numeric:
-        found = _columns(variables, variable, dim)
+        found = _columns_of(variables, variable, dim)
         columns += found
         left += [] if found else [variable.name]
     if left:
@@ -337,7 +339,7 @@ def _look(
     return columns, sizes[dim], plan, decoders, notes
 
 
-def _columns(
+def _columns_of(
     variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str
 ) -> list[_Column]:
     if variable.dimensions == (dim,):

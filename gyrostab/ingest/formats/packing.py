@@ -117,7 +117,7 @@ class Packing:
             stored = np.dtype(f"{'u' if text.lower() == 'true' else 'i'}{stored.itemsize}")
         wraps = "_Unsigned" in found
         numbers = {
-            key: _numbers(where, key, value, stored, wraps=wraps)
+            key: _attribute_numbers(where, key, value, stored, wraps=wraps)
             for key, value in found.items()
             if key != "_Unsigned"
         }
@@ -133,7 +133,7 @@ class Packing:
             value for key in ("_FillValue", "missing_value") for value in numbers.get(key, ())
         ]
         low, high = _valid_range(where, numbers, stored, scale, offset)
-        return cls(stored, tuple(_representable(missing, stored)), low, high, scale, offset)
+        return cls(stored, tuple(_representable_values(missing, stored)), low, high, scale, offset)
 
     @property
     def is_identity(self) -> bool:
@@ -195,7 +195,7 @@ def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[
     }
 
 
-def _numbers(
+def _attribute_numbers(
     where: str, key: str, value: Any, stored: np.dtype[Any], *, wraps: bool
 ) -> NDArray[Any]:
     """Return the numbers of an attribute; if `wraps`, signed ones of an unsigned variable are taken by their bits (users guide)."""
@@ -215,16 +215,16 @@ def _numbers(
     return np.where((wide >= -(1 << bits - 1)) & (wide < 1 << bits), wide.astype(stored), wide)
 
 
-def _representable(missing: Iterable[Any], stored: np.dtype[Any]) -> Iterable[Any]:
+def _representable_values(missing: Iterable[Any], stored: np.dtype[Any]) -> Iterable[Any]:
     """Yield the numbers that a variable can hold, in its type; NaN is missing anyway."""
     for value in missing:
         with np.errstate(all="ignore"):
-            own = stored.type(value) if stored.kind == "f" or _fits(value, stored) else None
+            own = stored.type(value) if stored.kind == "f" or _fits_type(value, stored) else None
         if own is not None and own == own:
             yield own
 
 
-def _fits(value: Any, stored: np.dtype[Any]) -> bool:
+def _fits_type(value: Any, stored: np.dtype[Any]) -> bool:
     limits = np.iinfo(stored)
     return (
         bool(np.isfinite(value))
@@ -395,9 +395,9 @@ class _DecodedArray(BackendArray):
         self.shape, self.dtype = variable.shape, np.dtype(dtype)
 
     def __getitem__(self, key: ExplicitIndexer) -> Any:
-        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER, self._read)
+        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER, self._read_key)
 
-    def _read(self, key: tuple[Any, ...]) -> Any:
+    def _read_key(self, key: tuple[Any, ...]) -> Any:
         return self.decode(self.variable[key].values)
 
 

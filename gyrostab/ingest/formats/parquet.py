@@ -12,13 +12,13 @@ import xarray as xr
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.raw_log import Intake, Taken
+from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder
 from gyrostab.ingest.columns.typed import (
     batch_rows,
     convert_batch,
     float32_note,
     holds_dates,
-    summarise,
+    summarise_columns,
 )
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
@@ -41,7 +41,7 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Schema and row count from the footer, the stamps of the two ends."""
-    file, plan = _look(path, options)
+    file, plan = _open_parquet(path, options)
 
     def fetch(source: int, start: int, stop: int) -> Any:
         group = 0 if start == 0 else file.num_row_groups - 1
@@ -49,26 +49,26 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
             batch_size=batch_rows(1), row_groups=[group], columns=[file.schema_arrow.names[source]]
         )
         part = next(parts) if start == 0 else deque(parts, maxlen=1)[0]
-        values = _plain(part.column(0))
+        values = _to_numpy(part.column(0))
         return values[: stop - start] if start == 0 else values[start - stop :]
 
-    return summarise("parquet", plan, options, file.metadata.num_rows, fetch)
+    return summarise_columns("parquet", plan, options, file.metadata.num_rows, fetch)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a Parquet file; see `gyrostab.ingest.read_log`."""
-    file, plan = _look(path, options)
+    file, plan = _open_parquet(path, options)
     names = file.schema_arrow.names
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
-    intake = Intake(plan.check(), options, limit=limit)
+    intake = RawLogBuilder(plan.check(), options, limit=limit)
     wanted = [names[column.source] for column in plan.columns]
 
-    def convert(batch: Any) -> Taken:
+    def convert(batch: Any) -> ConvertedBlock:
         found = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
         return convert_batch(
             intake,
             options,
-            {column.source: _plain(found[names[column.source]]) for column in plan.columns},
+            {column.source: _to_numpy(found[names[column.source]]) for column in plan.columns},
         )
 
     for taken in map_in_order(
@@ -78,7 +78,7 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     return intake.finish(float32_note(plan, file.schema_arrow.types))
 
 
-def _look(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
+def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -98,12 +98,12 @@ def _look(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
     dates = [
         index
         for index in range(len(schema))
-        if head is not None and holds_dates(_plain(head.column(index)))
+        if head is not None and holds_dates(_to_numpy(head.column(index)))
     ]
     return file, plan_columns(path, schema.names, options, units=units, stamped=dates)
 
 
-def _plain(column: Any) -> Any:
+def _to_numpy(column: Any) -> Any:
     """An arrow column as numpy; nulls are masked where the type has no NaN."""
     import pyarrow as pa
 

@@ -13,14 +13,14 @@ import xarray as xr
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.typed import read_columns, summarise
+from gyrostab.ingest.columns.typed import read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["Table", "plain_names", "read_tables", "scan_tables"]
 
 #: First row, row after the last one -> values.
-Part = Callable[[int, int], Any]
+ReadSlice = Callable[[int, int], Any]
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Table:
     rows: int
     names: tuple[str, ...]
     units: tuple[str | None, ...]
-    columns: tuple[Part, ...]
-    stamps: Part | None = None
+    columns: tuple[ReadSlice, ...]
+    stamps: ReadSlice | None = None
     time_unit: str | None = None
     coded: tuple[str | None, ...] = ()
 
@@ -57,7 +57,7 @@ def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class _Planned:
+class _PlannedTables:
     """The tables with the plan of all their columns; source numbers run through the tables, stamps first."""
 
     tables: list[Table]
@@ -88,7 +88,7 @@ class _Planned:
         return replace(self.plan, columns=tuple(columns)), fetch
 
 
-def _plan(path: Path, tables: Sequence[Table], options: ReadOptions) -> _Planned:
+def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _PlannedTables:
     kept = [table for table in tables if table.rows and table.names]
     if not kept:
         raise FormatError(
@@ -127,7 +127,7 @@ def _plan(path: Path, tables: Sequence[Table], options: ReadOptions) -> _Planned
         max(place for place, begin in enumerate(first) if begin <= column.source)
         for column in wanted
     }
-    return _Planned(
+    return _PlannedTables(
         kept, first, plan, sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
     )
 
@@ -136,10 +136,10 @@ def scan_tables(
     path: Path, form: str, tables: Sequence[Table], options: ReadOptions, notes: Sequence[str] = ()
 ) -> FileSummary:
     """A summary, with the first and last stamps of the table of the gyro axes."""
-    planned = _plan(path, tables, options)
+    planned = _plan_tables(path, tables, options)
     main = planned.main[0]
     plan, fetch = planned.part(main)
-    summary = summarise(form, plan, options, planned.tables[main].rows, fetch, notes)
+    summary = summarise_columns(form, plan, options, planned.tables[main].rows, fetch, notes)
     axes, channels = (
         tuple(column.name for column in planned.plan.of(role)) for role in ("gyro", "channel")
     )
@@ -161,7 +161,7 @@ def read_tables(
     FormatError
         When there is nothing in the tables.
     """
-    planned = _plan(path, tables, options)
+    planned = _plan_tables(path, tables, options)
     planned.plan.check()
     main: list[xr.Dataset] = []
     others: list[xr.Dataset] = []

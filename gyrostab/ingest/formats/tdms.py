@@ -20,12 +20,12 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
 from gyrostab.ingest.formats.optional import library
-from gyrostab.ingest.formats.tables import Part, Table, plain_names, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import ReadSlice, Table, plain_names, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
-_NO_DATE = np.datetime64(
+_FIRST_DATE = np.datetime64(
     "1950-01-01", "us"
 )  # LabVIEW counts from 1904, and writes that where it has no clock
 
@@ -40,18 +40,18 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Channels and their lengths, the stamps of the two ends."""
-    with _tables(path) as tables:
+    with _open_tables(path) as tables:
         return scan_tables(path, "tdms", tables, options)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a TDMS file; see `gyrostab.ingest.read_log`."""
-    with _tables(path) as tables:
+    with _open_tables(path) as tables:
         return read_tables(path, tables, options, limit=limit)
 
 
 @contextmanager
-def _tables(path: Path) -> Iterator[list[Table]]:
+def _open_tables(path: Path) -> Iterator[list[Table]]:
     """Channels of one length and one clock are one table; without a clock, also of one group."""
     nptdms = library("nptdms", path, extra="tdms")
     try:
@@ -67,14 +67,16 @@ def _tables(path: Path) -> Iterator[list[Table]]:
         names = plain_names([(channel.group_name, channel.name) for channel in channels])
         found: dict[Any, list[tuple[str, Any]]] = {}
         for name, channel in zip(names, channels, strict=True):
-            clock = _clock(path, channel)
+            clock = _waveform_clock(path, channel)
             found.setdefault((len(channel), clock or channel.group_name), []).append(
                 (name, channel)
             )
-        yield [_table(members, _clock(path, members[0][1])) for members in found.values()]
+        yield [
+            _make_table(members, _waveform_clock(path, members[0][1])) for members in found.values()
+        ]
 
 
-def _clock(path: Path, channel: Any) -> tuple[float, Any] | None:
+def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
     """Interval [s] and start of a waveform."""
     properties = channel.properties
     step = float(properties.get("wf_increment") or 0.0)
@@ -83,7 +85,7 @@ def _clock(path: Path, channel: Any) -> tuple[float, Any] | None:
         return None
     start = (
         None
-        if start is None or np.datetime64(start, "us") < _NO_DATE
+        if start is None or np.datetime64(start, "us") < _FIRST_DATE
         else np.datetime64(start, "us")
     )
     if start is not None:
@@ -97,7 +99,7 @@ def _clock(path: Path, channel: Any) -> tuple[float, Any] | None:
     return step, offset if start is None else start + np.timedelta64(offset, "ns")
 
 
-def _table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> Table:
+def _make_table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> Table:
     own = [(name, channel) for name, channel in members]
     dates = None
     if clock is None:
@@ -106,9 +108,15 @@ def _table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> T
     units = tuple(
         str(channel.properties.get("unit_string") or "").strip() or None for _, channel in own
     )
-    stamps = _stamps(*clock) if clock else None if dates is None else partial(_part, dates)
+    stamps = (
+        _waveform_stamps(*clock)
+        if clock
+        else None
+        if dates is None
+        else partial(_read_slice, dates)
+    )
     dated = clock is None or isinstance(clock[1], np.datetime64)
-    columns = tuple(partial(_part, channel) for _, channel in own)
+    columns = tuple(partial(_read_slice, channel) for _, channel in own)
     return Table(
         len(members[0][1]),
         tuple(name for name, _ in own),
@@ -119,7 +127,7 @@ def _table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None) -> T
     )
 
 
-def _stamps(step: float, start: Any) -> Part:
+def _waveform_stamps(step: float, start: Any) -> ReadSlice:
     def part(begin: int, stop: int) -> NDArray[Any]:
         since = np.rint(np.arange(begin, stop) * (step * 1e9)).astype(np.int64)
         stamps: NDArray[Any] = start + (
@@ -130,5 +138,5 @@ def _stamps(step: float, start: Any) -> Part:
     return part
 
 
-def _part(channel: Any, start: int, stop: int) -> Any:
+def _read_slice(channel: Any, start: int, stop: int) -> Any:
     return np.asarray(channel[start:stop])

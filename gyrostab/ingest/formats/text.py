@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
-from gyrostab.ingest.columns.raw_log import Intake, Taken, summary_of
+from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.text.cells import (
-    VOID,
-    Typing,
+    VOID_CELLS,
+    CellTypes,
     parse_cells,
     parse_fast,
     parse_plain,
@@ -52,7 +52,7 @@ __all__ = ["matches", "read", "read_head", "scan"]
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 #: Bytes of the file in which the layout is looked for; more, up to the second number, where they
 #: hold fewer lines than the third.
-HEAD_BYTES, MOST_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
+HEAD_BYTES, MAX_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
 PIECE_BYTES = 2**18
 LINE_BYTES = 2**8
@@ -69,12 +69,12 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Header, columns, first and (of plain files) last stamp, from the two ends of the file."""
-    layout, plan = _look(path, options)
+    layout, plan = _plan_file(path, options)
     time, rows = plan.time, None
     head = tail = np.empty(0, np.int64)
     if time is not None:
-        head = _stamps(layout, time, layout.samples, options)
-    if not _gzipped(path):
+        head = _sample_stamps(layout, time, layout.samples, options)
+    if not _is_gzipped(path):
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(layout.offset, size - 2**14))
@@ -83,7 +83,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
                 for line in file.read().decode("latin-1").splitlines()
             ]
             if time is not None:
-                tail = _stamps(
+                tail = _sample_stamps(
                     layout,
                     time,
                     [row for row in ends if _is_solid(row, layout, time.source)],
@@ -107,13 +107,13 @@ def read(
     stop: Callable[[], bool] | None = None,
 ) -> xr.Dataset:
     """The raw log of a text file; see `gyrostab.ingest.read_log`. Ends with `CancelledError` where `stop` comes to be true."""
-    layout, plan = _look(path, options)
+    layout, plan = _plan_file(path, options)
     options = options if plan.rate is None else replace(options, rate=plan.rate)
-    intake = Intake(plan.check(), options, limit=limit)
-    typing = Typing(layout, plan, options, stamp_types(layout, plan))
+    intake = RawLogBuilder(plan.check(), options, limit=limit)
+    typing = CellTypes(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
     for parts in map_in_order(
-        partial(_take, typing=typing, intake=intake), _blocks(path, layout.offset)
+        partial(_parse_block, typing=typing, intake=intake), _read_blocks(path, layout.offset)
     ):
         if stop is not None and stop():
             raise CancelledError
@@ -123,13 +123,13 @@ def read(
     return intake.finish(layout.notes)
 
 
-def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
-    with _open(path) as file:
-        size, head = HEAD_BYTES, _chunk(path, file, HEAD_BYTES, 0)
+def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
+    with _open_text(path) as file:
+        size, head = HEAD_BYTES, _read_chunk(path, file, HEAD_BYTES, 0)
         while (
-            len(head) == size and size < MOST_HEAD_BYTES and head.count(b"\n") < HEAD_LINES
+            len(head) == size and size < MAX_HEAD_BYTES and head.count(b"\n") < HEAD_LINES
         ):  # lines of very many cells
-            head += _chunk(path, file, size, size)
+            head += _read_chunk(path, file, size, size)
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
     stamped = [
@@ -141,18 +141,20 @@ def _look(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         path,
         layout.headers,
         options,
-        units=_durations(layout),
+        units=_duration_units(layout),
         stamped=stamped,
-        rising=partial(_rises, layout),
+        rising=partial(_is_rising, layout),
         above=layout.above,
         is_filled=lambda column: any(
-            row[column].strip() not in VOID for row in layout.samples if len(row) == layout.width
+            row[column].strip() not in VOID_CELLS
+            for row in layout.samples
+            if len(row) == layout.width
         ),
     )
     return layout, plan
 
 
-def _durations(layout: Layout) -> dict[int, str]:
+def _duration_units(layout: Layout) -> dict[int, str]:
     """The units of columns whose cells carry them, ``0.01 sec``."""
     rows = [row for row in layout.samples if len(row) == layout.width]
     found = (
@@ -167,7 +169,7 @@ def _durations(layout: Layout) -> dict[int, str]:
     }
 
 
-def _rises(layout: Layout, column: int) -> bool:
+def _is_rising(layout: Layout, column: int) -> bool:
     """Whether the first cells of a column that hold something rise from row to row."""
     cells = [
         row[column] for row in layout.samples if len(row) == layout.width and row[column].strip()
@@ -180,7 +182,7 @@ def _rises(layout: Layout, column: int) -> bool:
     return bool(len(steps) and (steps >= 0).all() and steps.any())
 
 
-def _stamps(
+def _sample_stamps(
     layout: Layout, time: Column, rows: Sequence[Sequence[str]], options: ReadOptions
 ) -> NDArray[np.int64]:
     cells = [row[time.source] for row in rows if len(row) == layout.width]
@@ -197,33 +199,33 @@ def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
     )
 
 
-def _gzipped(path: Path) -> bool:
+def _is_gzipped(path: Path) -> bool:
     with path.open("rb") as file:
         return file.read(2) == b"\x1f\x8b"
 
 
 def _holds_text(path: Path) -> bool:
     try:
-        with _open(path) as file:
+        with _open_text(path) as file:
             head = file.read(4096)
     except (EOFError, zlib.error, OSError):
         return False
     return is_text(head) and any(48 <= code < 58 for code in head)
 
 
-def _open(path: Path) -> IO[bytes]:
-    return cast(IO[bytes], gzip.open(path, "rb")) if _gzipped(path) else path.open("rb")
+def _open_text(path: Path) -> IO[bytes]:
+    return cast(IO[bytes], gzip.open(path, "rb")) if _is_gzipped(path) else path.open("rb")
 
 
 def read_head(path: Path) -> str:
     """The first characters of a text file, plain or gzipped; nothing of other files."""
     if not path.is_file() or not _holds_text(path):
         return ""
-    with _open(path) as file:
+    with _open_text(path) as file:
         return file.read(4096).decode("latin-1")
 
 
-def _chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
+def _read_chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
     """Up to `size` bytes, short only at the end of the file."""
     if isinstance(file, BufferedReader):
         return file.read(size)
@@ -241,12 +243,12 @@ def _chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
     return b"".join(parts)
 
 
-def _blocks(path: Path, offset: int) -> Iterator[bytes]:
+def _read_blocks(path: Path, offset: int) -> Iterator[bytes]:
     """The data rows in blocks that end at the end of a line."""
-    with _open(path) as file:
-        done = len(_chunk(path, file, offset, 0))
+    with _open_text(path) as file:
+        done = len(_read_chunk(path, file, offset, 0))
         rest = b""
-        while chunk := _chunk(path, file, BLOCK_BYTES, done):
+        while chunk := _read_chunk(path, file, BLOCK_BYTES, done):
             done += len(chunk)
             cut = chunk.rfind(b"\n") + 1
             if cut == 0:
@@ -262,69 +264,73 @@ def _blocks(path: Path, offset: int) -> Iterator[bytes]:
             yield rest + b"\n"
 
 
-class _Part(NamedTuple):
+class _ParsedPart(NamedTuple):
     """Rows of a block that were read in one way, and the text, whose lines tell where a row stands."""
 
-    taken: Taken
+    taken: ConvertedBlock
     lines: int
     block: bytes
     span: slice
 
 
-def _take(block: bytes, typing: Typing, intake: Intake) -> list[_Part]:
+def _parse_block(block: bytes, typing: CellTypes, intake: RawLogBuilder) -> list[_ParsedPart]:
     """Read one block."""
-    parts: list[_Part] = []
-    start, reach, left = 0, LINE_BYTES, _lines(block, slice(None))
+    parts: list[_ParsedPart] = []
+    start, reach, left = 0, LINE_BYTES, _count_lines(block, slice(None))
     while start < len(block):
         (values, stamps), stop = parse_plain(block, start, left, typing)
         if stop > start:
-            lines = left if stop == len(block) else _lines(block, slice(start, stop))
-            parts.append(_Part(intake.prepare(values, stamps), lines, block, slice(start, stop)))
+            lines = left if stop == len(block) else _count_lines(block, slice(start, stop))
+            parts.append(
+                _ParsedPart(intake.prepare(values, stamps), lines, block, slice(start, stop))
+            )
             left -= lines
         if stop == len(block):
             break
         reach = LINE_BYTES if stop - start > PIECE_BYTES else min(4 * reach, PIECE_BYTES)
         start = block.find(b"\n", min(stop + reach, len(block) - 1)) + 1
-        parts.append(_take_piece(_tidy(block[stop:start], typing.layout.separator), typing, intake))
+        parts.append(
+            _parse_piece(_clean_lines(block[stop:start], typing.layout.separator), typing, intake)
+        )
         left -= parts[-1].lines
     return parts
 
 
-def _lines(block: bytes, span: slice) -> int:
+def _count_lines(block: bytes, span: slice) -> int:
     return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8)[span] == 10))
 
 
-def _take_piece(piece: bytes, typing: Typing, intake: Intake) -> _Part:
+def _parse_piece(piece: bytes, typing: CellTypes, intake: RawLogBuilder) -> _ParsedPart:
     """Read rows of which one at least is not plain."""
     lines = piece.count(b"\n")
     parsed = parse_fast(piece, typing) if len(piece) > SHORT_BYTES else None
     if parsed is not None:
-        rows = _rows(*parsed)
+        rows = _count_rows(*parsed)
         if (
             rows == lines
             or b'"' not in piece
             or rows == sum(1 for text in piece.split(b"\n") if text.strip())
         ):
-            return _Part(
+            return _ParsedPart(
                 intake.prepare(*parsed), lines, piece, slice(None)
             )  # otherwise a stray quote has swallowed line ends
     values, stamps, words = parse_cells(piece, typing)
-    return _Part(intake.prepare(values, stamps, words=words), lines, piece, slice(None))
+    return _ParsedPart(intake.prepare(values, stamps, words=words), lines, piece, slice(None))
 
 
-def _rows(values: dict[int, NDArray[np.float64]], stamps: NDArray[np.int64] | None) -> int:
+def _count_rows(values: dict[int, NDArray[np.float64]], stamps: NDArray[np.int64] | None) -> int:
     return len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
 
 
-def _line_names(part: _Part, first: int, rows: Sequence[int]) -> list[str]:
+def _line_names(part: _ParsedPart, first: int, rows: Sequence[int]) -> list[str]:
     if part.taken.rows == part.lines:
         return [f"line {first + row}" for row in rows]
-    tidy = _tidy(part.block[part.span], ",")
+    tidy = _clean_lines(part.block[part.span], ",")
     filled = [number for number, text in enumerate(tidy.split(b"\n"), first) if text.strip()]
     return [f"line {filled[row]}" for row in rows]
 
 
-def _tidy(block: bytes, separator: str) -> bytes:
+def _clean_lines(block: bytes, separator: str) -> bytes:
     """Empty the comment lines (so that lines keep their numbers) and, where blanks separate, make each run of them one."""
     if b"#" in block or b"%" in block:
         block = re.sub(rb"(?m)^[ \t]*[#%][^\n]*", b"", block)

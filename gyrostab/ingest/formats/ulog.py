@@ -33,17 +33,17 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Messages and their fields, first and last stamp; the format has no table of contents, so the file is gone through."""
-    tables, notes = _tables(path)
+    tables, notes = _make_tables(path)
     return scan_tables(path, "ulog", tables, options, notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
     """The raw log of a PX4 log; see `gyrostab.ingest.read_log`."""
-    tables, notes = _tables(path)
+    tables, notes = _make_tables(path)
     return read_tables(path, tables, options, notes=notes, limit=limit)
 
 
-def _tables(path: Path) -> tuple[list[Table], list[str]]:
+def _make_tables(path: Path) -> tuple[list[Table], list[str]]:
     pyulog = library("pyulog", path, extra="ulog")
     try:
         log = pyulog.ULog(str(path))
@@ -59,8 +59,8 @@ def _tables(path: Path) -> tuple[list[Table], list[str]]:
     names = iter(plain_names([(name, field) for name, _, fields in found for field, _ in fields]))
     tables = []
     for _, stamps, fields in found:
-        columns = tuple(partial(_part, values) for _, values in fields)
-        clock = None if stamps is None else partial(_part, stamps)
+        columns = tuple(partial(_slice_values, values) for _, values in fields)
+        clock = None if stamps is None else partial(_slice_values, stamps)
         tables.append(
             Table(
                 len(fields[0][1]) if fields else 0,
@@ -87,5 +87,5 @@ def _tables(path: Path) -> tuple[list[Table], list[str]]:
     ]
 
 
-def _part(values: Any, start: int, stop: int) -> Any:
+def _slice_values(values: Any, start: int, stop: int) -> Any:
     return np.asarray(values)[start:stop]

@@ -43,7 +43,7 @@ _FORMATS: list[tuple[str, Callable[[bytes], bool], str]] = [
     ),
     (
         "a file of R data",
-        lambda head: _unpack(head).startswith(
+        lambda head: _decompress(head).startswith(
             (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
         ),
         "save it as CSV in R: write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)",
@@ -85,7 +85,7 @@ def refuse_unread(path: Path) -> None:
             )
 
 
-def _unpack(head: bytes) -> bytes:
+def _decompress(head: bytes) -> bytes:
     """The first bytes of what is compressed, or the bytes as they are."""
     try:
         if head.startswith(b"\x1f\x8b"):

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.grid.place import Placement
-from gyrostab.ingest.grid.survey import BLOCK
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
 from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
 from gyrostab.store.lazy_slices import (
     can_read_into,
@@ -23,13 +23,13 @@ from gyrostab.store.lazy_slices import (
 from gyrostab.store.threads import map_in_order
 from gyrostab.time.grid import grid_times
 
-__all__ = ["SMALL", "count_present", "gathered", "on_grid", "samples_of"]
+__all__ = ["MAX_PLAIN_NUMBERS", "count_present", "gather_channel", "rows_on_grid", "samples_of"]
 
 #: Numbers up to which an array is held in memory instead of being computed when needed.
-SMALL = 2_000_000
+MAX_PLAIN_NUMBERS = 2_000_000
 
 
-def _fill(
+def _rows_to_samples(
     rows: NDArray[Any],
     *,
     runs: NDArray[np.int64],
@@ -41,10 +41,12 @@ def _fill(
     out = np.full((*rows.shape[:-1], size), np.nan)
     for sample, row, length in runs:
         out[..., sample : sample + length] = rows[..., row : row + length]
-    return _scaled(out, scale, unit)
+    return _scale_samples(out, scale, unit)
 
 
-def _scaled(out: NDArray[np.float64], scale: float, unit: float | None) -> NDArray[np.float64]:
+def _scale_samples(
+    out: NDArray[np.float64], scale: float, unit: float | None
+) -> NDArray[np.float64]:
     """The samples themselves, changed: NaN where infinite, times their factor."""
     out[np.isinf(out)] = np.nan
     if scale != 1.0:
@@ -52,21 +54,21 @@ def _scaled(out: NDArray[np.float64], scale: float, unit: float | None) -> NDArr
     return out
 
 
-def _fill_samples(
+def _read_samples_into(
     rows: Any, runs: NDArray[np.int64], ends: NDArray[np.int64], scale: float, unit: float | None,
     row: int, begin: int, out: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Samples of one row of the grid from `begin` on, as `_fill` makes them: `gyrostab.store.lazy_slices.RowReader`."""
+    """Samples of one row of the grid from `begin` on, as `_rows_to_samples` makes them: `gyrostab.store.lazy_slices.RowReader`."""
     done = 0
-    for sample, first, length in _cut(runs, ends, begin, begin + out.size).tolist():
+    for sample, first, length in _clip_runs(runs, ends, begin, begin + out.size).tolist():
         out[done:sample] = np.nan
         done = sample + length
         read_into(rows, row, first, out[sample:done])
     out[done:] = np.nan
-    _scaled(out, scale, unit)
+    _scale_samples(out, scale, unit)
 
 
-def _cut(
+def _clip_runs(
     runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int
 ) -> NDArray[np.int64]:
     """Cut out the parts of the runs that lie in the samples from `begin` to `end`."""
@@ -78,7 +80,7 @@ def _cut(
     return np.stack([first - begin, part[:, 1] + first - part[:, 0], last - first], axis=1)
 
 
-def on_grid(
+def rows_on_grid(
     rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, unit: float | None = None
 ) -> Any:
     """Turn an array by row into an array by sample, float64, NaN where there is no row and where a value is infinite.
@@ -103,9 +105,11 @@ def on_grid(
         they are computed.
     """
     size, lead = placement.size, rows.shape[:-1]
-    if size * max(1, int(np.prod(lead))) <= SMALL:
-        return _fill(np.asarray(rows), runs=placement.runs, size=size, scale=scale, unit=unit)
-    lazy = rows if isinstance(rows, da.Array) else make_lazy(np.asarray(rows), BLOCK)
+    if size * max(1, int(np.prod(lead))) <= MAX_PLAIN_NUMBERS:
+        return _rows_to_samples(
+            np.asarray(rows), runs=placement.runs, size=size, scale=scale, unit=unit
+        )
+    lazy = rows if isinstance(rows, da.Array) else make_lazy(np.asarray(rows), BLOCK_ROWS)
     ends = placement.runs[:, 0] + placement.runs[:, 2]
     parts, empty = [], 0
     filled: list[tuple[int, int]] = []  # chunks that hold samples at all
@@ -118,7 +122,7 @@ def on_grid(
 
     for begin in range(0, size, chunk):
         end = min(size, begin + chunk)
-        runs = _cut(placement.runs, ends, begin, end)
+        runs = _clip_runs(placement.runs, ends, begin, end)
         if len(runs) == 0:
             empty += end - begin
             continue
@@ -130,7 +134,7 @@ def on_grid(
         shape = (*((n,) for n in lead), (end - begin,))
         parts.append(
             source.map_blocks(
-                _fill,
+                _rows_to_samples,
                 runs=runs,
                 size=end - begin,
                 scale=scale,
@@ -144,7 +148,9 @@ def on_grid(
     placed.gyrostab_filled = filled
     if not can_read_into(lazy) or lazy.dtype != np.float64:
         return placed
-    return with_row_reader(placed, partial(_fill_samples, lazy, placement.runs, ends, scale, unit))
+    return with_row_reader(
+        placed, partial(_read_samples_into, lazy, placement.runs, ends, scale, unit)
+    )
 
 
 def count_present(array: Any) -> int:
@@ -158,7 +164,7 @@ def count_present(array: Any) -> int:
     filled = getattr(
         array,
         "gyrostab_filled",
-        [(begin, begin + BLOCK) for begin in range(0, array.shape[-1], BLOCK)],
+        [(begin, begin + BLOCK_ROWS) for begin in range(0, array.shape[-1], BLOCK_ROWS)],
     )
 
     def count(ends: tuple[int, int]) -> int:
@@ -175,7 +181,7 @@ def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int6
     return np.where(inside, runs[which, 0] + rows - runs[which, 1], -1)
 
 
-def gathered(
+def gather_channel(
     raw: xr.Dataset, name: str, placement: Placement, rate: float
 ) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
     """Stamps and values of the filled rows of a slow channel; rows without a sample keep their stamp, moved with their piece."""
@@ -187,8 +193,8 @@ def gathered(
         [[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]]
     )
     stamps, values = [], []
-    for begin in range(0, channel.shape[0], BLOCK):
-        block = read_slice(channel, begin, min(begin + BLOCK, channel.shape[0])).astype(
+    for begin in range(0, channel.shape[0], BLOCK_ROWS):
+        block = read_slice(channel, begin, min(begin + BLOCK_ROWS, channel.shape[0])).astype(
             np.float64, copy=False
         )
         rows = np.flatnonzero(np.isfinite(block))
@@ -197,7 +203,7 @@ def gathered(
         when = grid_times(placement.start, rate, sample)
         if clock is not None and not known.all():
             written = (
-                read_slice(clock, begin, min(begin + BLOCK, channel.shape[0]))
+                read_slice(clock, begin, min(begin + BLOCK_ROWS, channel.shape[0]))
                 .astype("datetime64[ns]")
                 .view(np.int64)[rows]
             )

@@ -8,10 +8,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
-from gyrostab.ingest.gap_table import CAUSE, FIRST, MOST_GAPS, thinned
+from gyrostab.ingest.gap_table import CAUSE, FIRST, MAX_TABLE_ROWS, merge_neighbours
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
-from gyrostab.ingest.grid.survey import Survey
+from gyrostab.ingest.grid.scan_pass import ScanPass
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES
 
@@ -22,7 +22,7 @@ _MISSING, _UNREADABLE, _OUTSIDE = (
 )
 
 
-def _holes(placement: Placement, found: Survey) -> NDArray[np.int64]:
+def _missing_samples(placement: Placement, found: ScanPass) -> NDArray[np.int64]:
     """Stretches of samples without a row, between the runs."""
     runs, events = placement.runs, placement.events
     end, row_end = runs[:-1, 0] + runs[:-1, 2], runs[:-1, 1] + runs[:-1, 2]
@@ -46,7 +46,9 @@ def _holes(placement: Placement, found: Survey) -> NDArray[np.int64]:
     return np.stack([end, start, start - end, skipped, cause], axis=1)[listed]
 
 
-def _cells(spans: NDArray[np.int64], cause: int, placement: Placement) -> NDArray[np.int64]:
+def _unusable_cells(
+    spans: NDArray[np.int64], cause: int, placement: Placement
+) -> NDArray[np.int64]:
     """Rows that were placed although an axis has no usable number there."""
     first, last = samples_of(placement, spans[:, 0]), samples_of(placement, spans[:, 1] - 1)
     kept = (first >= 0) & (last >= first)
@@ -54,7 +56,7 @@ def _cells(spans: NDArray[np.int64], cause: int, placement: Placement) -> NDArra
     return np.stack([first[kept], last[kept] + 1, rows, rows, np.full(len(rows), cause)], axis=1)
 
 
-def _dropped(events: NDArray[np.int64]) -> NDArray[np.int64]:
+def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows dropped or moved; consecutive rows of one cause are one line."""
     rows = events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER))]
     rows = rows[np.argsort(rows[:, 2], kind="stable")]
@@ -67,7 +69,9 @@ def _dropped(events: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([sample, sample, np.zeros_like(count), count, rows[at, 0]], axis=1)
 
 
-def find_gaps(placement: Placement, found: Survey, *, most: int = MOST_GAPS) -> NDArray[np.int64]:
+def find_gaps(
+    placement: Placement, found: ScanPass, *, most: int = MAX_TABLE_ROWS
+) -> NDArray[np.int64]:
     """Make the table of gaps, in samples.
 
     Returns
@@ -77,13 +81,13 @@ def find_gaps(placement: Placement, found: Survey, *, most: int = MOST_GAPS) -> 
     """
     table = np.concatenate(
         [
-            _holes(placement, found),
-            _cells(found.unreadable, _UNREADABLE, placement),
-            _cells(found.infinite, _OUTSIDE, placement),
-            _dropped(placement.events),
+            _missing_samples(placement, found),
+            _unusable_cells(found.unreadable, _UNREADABLE, placement),
+            _unusable_cells(found.infinite, _OUTSIDE, placement),
+            _dropped_rows(placement.events),
         ]
     )
-    table = thinned(table, most)
+    table = merge_neighbours(table, most)
     return table[np.lexsort((table[:, CAUSE], table[:, FIRST]))]
 
 

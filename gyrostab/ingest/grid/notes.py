@@ -6,18 +6,18 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.ingest.gap_table import duration, stamp_text
+from gyrostab.ingest.gap_table import format_duration, format_stamp
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import RateEstimate
-from gyrostab.ingest.grid.survey import Survey, file_of
+from gyrostab.ingest.grid.scan_pass import ScanPass, file_of
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART
 from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.time.grid import grid_times
 
-__all__ = ["describe", "describe_channels", "describe_rate"]
+__all__ = ["describe_channels", "describe_placement", "describe_rate"]
 
-_NAMED = 5  # of many events of one kind, so many are told one by one
+_MAX_NAMED = 5  # of many events of one kind, so many are told one by one
 
 
 def describe_channels(log: xr.Dataset) -> list[str]:
@@ -30,24 +30,24 @@ def describe_channels(log: xr.Dataset) -> list[str]:
         stamps = log[f"time_{name}"].values
         if not ((stamps >= start) & (stamps <= end)).any():
             of = (
-                f"{_count(len(stamps), 'value')}, {_span(stamps.min(), stamps.max())}"
+                f"{_count_of(len(stamps), 'value')}, {_format_span(stamps.min(), stamps.max())}"
                 if len(stamps)
                 else "0 values"
             )
             advice = "check its time column, its unit and --epoch"
             notes.append(
-                f"channel {name}: none of its {of}, lies within the log, {_span(start, end)}; {advice}"
+                f"channel {name}: none of its {of}, lies within the log, {_format_span(start, end)}; {advice}"
             )
     return notes
 
 
-def _span(first: np.datetime64, last: np.datetime64) -> str:
+def _format_span(first: np.datetime64, last: np.datetime64) -> str:
     return " to ".join(
-        stamp_text(int(stamp.astype("datetime64[ns]").view(np.int64))) for stamp in (first, last)
+        format_stamp(int(stamp.astype("datetime64[ns]").view(np.int64))) for stamp in (first, last)
     )
 
 
-def _count(number: int, what: str) -> str:
+def _count_of(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
@@ -68,7 +68,7 @@ def describe_rate(
             else "the stamps come in bursts, as rows arrive and not as they are sampled"
         )
         reach = (
-            f"; stamps and samples differ by up to {duration(placement.wander / rate)} in the long run"
+            f"; stamps and samples differ by up to {format_duration(placement.wander / rate)} in the long run"
             if placement.wander >= 1
             else ""
         )
@@ -85,7 +85,7 @@ def describe_rate(
         )
     elif course is not None:
         notes.append(
-            f"{where}: the stamps scatter by {duration(course.sigma / rate)}, {course.sigma:.2g} of a sampling interval, "
+            f"{where}: the stamps scatter by {format_duration(course.sigma / rate)}, {course.sigma:.2g} of a sampling interval, "
             f"as times of arrival do: rows keep their order at {rate:.10g} Hz, and a missing sample is located to a few rows"
         )
     if estimate.even is not None:
@@ -105,38 +105,38 @@ def describe_rate(
         notes.append(
             f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million from {rate:.10g} Hz"
         )
-    for row, stamp, own in odd[:_NAMED]:
+    for row, stamp, own in odd[:_MAX_NAMED]:
         file, local = file_of(raw, row)
         notes.append(
-            f"{file}: from about {stamp_text(stamp)} (row {local}) the samples come at {own:.6g} Hz and not at {rate:.6g} Hz; "
+            f"{file}: from about {format_stamp(stamp)} (row {local}) the samples come at {own:.6g} Hz and not at {rate:.6g} Hz; "
             "by their stamps samples are missing or dropped there; split the log at that row and run the parts on their own"
         )
     return notes
 
 
-def _breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
+def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
     notes = []
     events = placement.events[
         placement.events[:, 0] >= min(GAP_CAUSES.index("clock_step"), RESTART)
     ]
-    for cause, _sample, row, before, after in events[:_NAMED].tolist():
+    for cause, _sample, row, before, after in events[:_MAX_NAMED].tolist():
         file, local = file_of(raw, row)
         jump = (after - before) / 1e9
         way = "back" if jump < 0 else "ahead"
         what = "time restarts" if cause == RESTART else "the clock steps"
         notes.append(
-            f"{file}: {what} at row {local}: from {stamp_text(before)} to {stamp_text(after)}, {duration(abs(jump))} {way}; "
+            f"{file}: {what} at row {local}: from {format_stamp(before)} to {format_stamp(after)}, {format_duration(abs(jump))} {way}; "
             "the pause is of unknown length, so the rows that follow come after one missing sample"
             + ("" if jump < 0 else "; if the pause is real, raise max_gap")
         )
-    if len(events) > _NAMED:
+    if len(events) > _MAX_NAMED:
         notes.append(
-            f"{file_of(raw)[0]}: {len(events) - _NAMED} more restarts and steps of the clock are in the table of gaps"
+            f"{file_of(raw)[0]}: {len(events) - _MAX_NAMED} more restarts and steps of the clock are in the table of gaps"
         )
     return notes
 
 
-def _missing(
+def _describe_missing(
     raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], rate: float
 ) -> list[str]:
     holes = table[(table[:, 4] == GAP_CAUSES.index("missing")) & (table[:, 2] > 0)]
@@ -144,46 +144,46 @@ def _missing(
         return []
     notes = []
     longest = holes[np.argsort(-holes[:, 2], kind="stable")]
-    longest = longest[longest[:, 2] >= max(2, rate)][:_NAMED]
+    longest = longest[longest[:, 2] >= max(2, rate)][:_MAX_NAMED]
     ends = placement.runs[:, 0] + placement.runs[:, 2]
     for first, _end, samples, _rows, _cause in longest.tolist():
         before = placement.runs[np.searchsorted(ends, first)]
         row = int(before[1] + before[2] - 1)
         file, local = file_of(raw, row)
-        since = stamp_text(int(grid_times(placement.start, rate, first)))
+        since = format_stamp(int(grid_times(placement.start, rate, first)))
         notes.append(
-            f"{file}: {duration(samples / rate)} without samples from {since} (after row {local})"
+            f"{file}: {format_duration(samples / rate)} without samples from {since} (after row {local})"
         )
     if len(holes) > len(longest):
         total = int(holes[:, 2].sum())
         share = total / placement.size
         notes.append(
-            f"{file_of(raw)[0]}: missing: {_count(total, 'sample')} ({duration(total / rate)}, {100 * share:.2g} % of the log) "
-            f"in {_count(len(holes), 'place')}; "
+            f"{file_of(raw)[0]}: missing: {_count_of(total, 'sample')} ({format_duration(total / rate)}, {100 * share:.2g} % of the log) "
+            f"in {_count_of(len(holes), 'place')}; "
             "all are in the table of gaps"
         )
     return notes
 
 
-def describe(
-    raw: xr.Dataset, found: Survey, placement: Placement, table: NDArray[np.int64], rate: float
+def describe_placement(
+    raw: xr.Dataset, found: ScanPass, placement: Placement, table: NDArray[np.int64], rate: float
 ) -> list[str]:
     """Sentences on gaps, restarts, and rows and cells that were dropped or moved."""
     where = file_of(raw)[0]
-    notes = [*_breaks(raw, placement), *_missing(raw, placement, table, rate)]
+    notes = [*_describe_breaks(raw, placement), *_describe_missing(raw, placement, table, rate)]
     events = placement.events
     twice = events[events[:, 0] == DUPLICATE]
     if len(twice):
         file, local = file_of(raw, int(twice[:, 2].min()))
         notes.append(
-            f"{file}: dropped as their sample is taken: {_count(len(twice), 'row')}, first row {local}"
+            f"{file}: dropped as their sample is taken: {_count_of(len(twice), 'row')}, first row {local}"
         )
     late = events[events[:, 0] == OUT_OF_ORDER]
     if len(late):
         kept = int((samples_of(placement, late[:, 2]) >= 0).sum())
         file, local = file_of(raw, int(late[:, 2].min()))
         notes.append(
-            f"{file}: out of order: {_count(len(late), 'row')}, first row {local}; "
+            f"{file}: out of order: {_count_of(len(late), 'row')}, first row {local}; "
             f"{kept} were put in their place, {len(late) - kept} dropped"
         )
     lost = (
@@ -195,11 +195,11 @@ def describe(
     )
     if lost > 0:
         notes.append(
-            f"{where}: dropped for want of a readable time stamp: {_count(lost, 'row')} whose neighbours do not tell where they belong"
+            f"{where}: dropped for want of a readable time stamp: {_count_of(lost, 'row')} whose neighbours do not tell where they belong"
         )
     infinite = int((found.infinite[:, 1] - found.infinite[:, 0]).sum())
     if infinite:
-        notes.append(f"{where}: infinite values in {_count(infinite, 'row')}, taken as missing")
+        notes.append(f"{where}: infinite values in {_count_of(infinite, 'row')}, taken as missing")
     notes += [
         f"{where}: axis {axis} never changes its value; is the sensor dead, or the column the wrong one?"
         for axis in found.constant

@@ -10,10 +10,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
-from gyrostab.ingest.gap_table import duration, stamp_text
-from gyrostab.ingest.grid.course import Course, place_rows
+from gyrostab.ingest.gap_table import format_duration, format_stamp
+from gyrostab.ingest.grid.jitter import JitterModel, place_rows
 from gyrostab.ingest.grid.rate import SECOND, RateEstimate, Stamps
-from gyrostab.ingest.grid.survey import file_of
+from gyrostab.ingest.grid.scan_pass import file_of
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
 from gyrostab.kernels.grid.stamps import DUPLICATE, LOOK, NO_STAMP, OUT_OF_ORDER, RESTART, STEP
@@ -24,14 +24,14 @@ __all__ = [
     "Placement",
     "check_grid",
     "place_by_count",
-    "place_by_course",
     "place_by_stamp",
+    "place_in_order",
     "place_without_time",
 ]
 
 _NO_STAMPS = "{where}: no row has a readable stamp; check the time column and its unit (--map), or give --rate HZ for a log without time"
 #: Rows that the placement kernel takes at a time.
-_STRETCH = 1 << 18
+_STRETCH_ROWS = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Placement:
         return bool((rows[2:] - rows[:-2] == 2).any())
 
 
-def _placement(
+def make_placement(
     start: int, runs: list[NDArray[np.int64]], events: list[NDArray[np.int64]], wander: float = 0.0
 ) -> Placement:
     table = np.concatenate([part for part in runs if len(part)])
@@ -115,16 +115,16 @@ def check_grid(
         for row in rows
     ]
     places = [
-        f"{stamp_text(stamp)} (row {file_of(raw, row)[1]})"
+        f"{format_stamp(stamp)} (row {file_of(raw, row)[1]})"
         for stamp, row in zip(stamps, rows, strict=True)
     ]
     gap = holes[widest] / rate
     if gap >= 1.0:
         fix = f"correct the stamp or the unit of the time column, or give --max-gap {min(max_gap, gap) / 2:.2g}s to take it for a clock step"
     else:
-        fix = f"other stamps are {duration(1.0 / rate)} apart, too close for a log of that length: correct them or the unit of time"
+        fix = f"other stamps are {format_duration(1.0 / rate)} apart, too close for a log of that length: correct them or the unit of time"
     raise TimeError(
-        f"{file_of(raw, rows[0])[0]}: from {places[0]} to {places[1]} there are {duration(gap)} without samples, and the grid of "
+        f"{file_of(raw, rows[0])[0]}: from {places[0]} to {places[1]} there are {format_duration(gap)} without samples, and the grid of "
         f"{rate:.10g} Hz would have {placement.size:.4g} samples for {placement.placed:,} rows; {fix}. If the stamps are right: "
         f"{describe_limit('grid_samples', placement.size, limits)}"
     )
@@ -132,10 +132,12 @@ def check_grid(
 
 def place_without_time(rows: int, start: int) -> Placement:
     """Rows without stamps: every row is the next sample."""
-    return _placement(start, [np.array([[0, 0, rows]], dtype=np.int64)], [])
+    return make_placement(start, [np.array([[0, 0, rows]], dtype=np.int64)], [])
 
 
-def _stretches(stamps: Stamps) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], int]]:
+def _look_ahead_stretches(
+    stamps: Stamps,
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], int]]:
     """Rows and stamps in stretches, each with `LOOK` more rows to look at than the number that is to be placed."""
     rest_rows, rest_stamps = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     for rows, values in stamps():
@@ -145,7 +147,7 @@ def _stretches(stamps: Stamps) -> Iterator[tuple[NDArray[np.int64], NDArray[np.i
         )
         at = 0
         while len(rest_rows) - at > LOOK:
-            n = min(_STRETCH, len(rest_rows) - at - LOOK)
+            n = min(_STRETCH_ROWS, len(rest_rows) - at - LOOK)
             yield rest_rows[at : at + n + LOOK], rest_stamps[at : at + n + LOOK], n
             at += n
         rest_rows, rest_stamps = rest_rows[at:], rest_stamps[at:]
@@ -183,7 +185,7 @@ def place_by_stamp(
     state, ring = kernel.new_state()
     runs: list[NDArray[np.int64]] = []
     events: list[NDArray[np.int64]] = []
-    for rows, values, n in _stretches(stamps):
+    for rows, values, n in _look_ahead_stretches(stamps):
         new, happened = kernel.place(
             rows, values, n, period, 0.5 + tolerance, max_gap * rate, state, ring
         )
@@ -192,7 +194,7 @@ def place_by_stamp(
     if not state[kernel.STARTED]:
         raise TimeError(_NO_STAMPS.format(where=where))
     runs.append(state[kernel.OPEN_RUN][None])
-    return _placement(int(state[kernel.FIRST]), runs, events)
+    return make_placement(int(state[kernel.FIRST]), runs, events)
 
 
 @dataclass
@@ -206,7 +208,7 @@ class _Windows:
     down: NDArray[np.int64]
 
 
-def _windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
+def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
     """Windows of `width` rows, and the first stamp [ns]."""
     parts: list[tuple[NDArray[np.float64], ...]] = []
     rest = np.empty(0, dtype=np.int64)
@@ -249,7 +251,7 @@ def _windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
     return _Windows(low, high, reach, up.astype(np.int64), down.astype(np.int64)), int(first or 0)
 
 
-def _jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]], float]:
+def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]], float]:
     """Lasting shifts of the lower envelope: counted row, size [samples], window, envelope before; and the wander."""
     low = windows.low
     change = np.abs(np.diff(low))
@@ -299,8 +301,8 @@ def place_by_count(
     whole, fraction = period_ns(rate)
     period = whole + fraction
     width = max(64, int(4 * rate))
-    windows, first = _windows(stamps, period, width)
-    jumps, wander = _jumps(windows)
+    windows, first = _make_windows(stamps, period, width)
+    jumps, wander = _find_jumps(windows)
     edge = windows.high[0] if estimate.coarse else windows.low[0]
     start = first + int(np.rint(edge * period)) if abs(edge) < 2 * width else first
     shifts, cuts, events = [0], [0], []
@@ -324,12 +326,12 @@ def place_by_count(
     numbers = np.array(events, dtype=np.int64).reshape(-1, 5)
     if len(numbers):
         numbers[:, 2] = _rows_at(stamps, numbers[:, 2])
-    return _placement(start, runs, [numbers], wander)
+    return make_placement(start, runs, [numbers], wander)
 
 
-def place_by_course(
+def place_in_order(
     stamps: Stamps,
-    course: Course,
+    course: JitterModel,
     rate: float,
     *,
     tolerance: float,
@@ -337,7 +339,7 @@ def place_by_course(
     by_row: bool,
     where: str,
 ) -> Placement:
-    """Place rows in order where single stamps do not tell the sample: see `gyrostab.ingest.grid.course`.
+    """Place rows in order where single stamps do not tell the sample: see `gyrostab.ingest.grid.jitter`.
 
     Parameters
     ----------
@@ -364,7 +366,7 @@ def place_by_course(
     )
     if start is None:
         raise TimeError(_NO_STAMPS.format(where=where))
-    return _placement(start, runs, events)
+    return make_placement(start, runs, events)
 
 
 def _rows_at(stamps: Stamps, counts: NDArray[np.int64]) -> NDArray[np.int64]:

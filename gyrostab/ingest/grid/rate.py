@@ -17,18 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
-from gyrostab.ingest.grid.course import Course, count_along, find_course, follow_course
-from gyrostab.ingest.grid.steps import cut, finer_period, refined
+from gyrostab.ingest.grid.jitter import JitterModel, count_samples, fit_jitter, fit_jitter_near
+from gyrostab.ingest.grid.steps import cut_stretches, finer_period, refine_period
 from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
 from gyrostab.store.threads import map_in_order
 
 __all__ = [
     "RateEstimate",
     "Stamps",
+    "deviating_stretches",
     "estimate_near",
     "estimate_rate",
     "is_far_worse",
-    "odd_stretches",
     "starting_period",
 ]
 
@@ -36,14 +36,14 @@ SECOND = 1e9
 #: Gives the blocks of row numbers and stamps, from the first on, as often as asked.
 Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 _GAIN = 0.1
-_SURE = 500.0  # samples, of a long log
+_MAX_TRUSTED_SAMPLES = 500.0  # samples, of a long log
 _SHARED_SHARE = (
     0.05  # share of rows with the stamp of the row before from which on stamps may be shared
 )
 # share of steps backwards that no jitter makes: 0.12 at a scatter of 0.6 samples, 0.5 in random
 # order
-_DISORDER = 0.35
-_SINGLE = 0.1  # share of the steps that must be one sample of a rate that is given
+_MAX_BACKWARD_SHARE = 0.35
+_MIN_SINGLE_SHARE = 0.1  # share of the steps that must be one sample of a rate that is given
 #: Scatter of the steps about whole samples up to which single stamps tell the sample: jitter of
 #: 0.08 samples, so that half a sample is
 #: 6 standard deviations.
@@ -87,10 +87,12 @@ class RateEstimate:
     raw: float
     even: float | None = None
     finer: float | None = None
-    course: Course | None = None
+    course: JitterModel | None = None
 
 
-def _recut(stamps: Stamps, size: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _recut_blocks(
+    stamps: Stamps, size: int
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Give the same rows and stamps in blocks of `size`, so that no result depends on how they came."""
     held: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
     waiting = 0
@@ -99,16 +101,16 @@ def _recut(stamps: Stamps, size: int) -> Iterator[tuple[NDArray[np.int64], NDArr
         waiting += len(block[0])
         if waiting < size:
             continue
-        rows, values = _in_one(held)
+        rows, values = _concatenate_blocks(held)
         whole = waiting // size * size
         for begin in range(0, whole, size):
             yield rows[begin : begin + size], values[begin : begin + size]
         held, waiting = [(rows[whole:], values[whole:])], waiting - whole
     if waiting:
-        yield _in_one(held)
+        yield _concatenate_blocks(held)
 
 
-def _in_one(
+def _concatenate_blocks(
     held: list[tuple[NDArray[np.int64], NDArray[np.int64]]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Blocks of rows and stamps one after the other; a single one, or what alone is not empty, is not copied."""
@@ -119,17 +121,19 @@ def _in_one(
     return rows, values
 
 
-def _readable(block: NDArray[np.int64]) -> NDArray[np.int64]:
+def _readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
     """The stamps that could be read; all of them, as nearly always, are not copied."""
     known = block != NO_STAMP
     return block if known.all() else block[known]
 
 
-def _pools(stamps: Stamps, *, size: int = 8192, most: int = 64) -> list[NDArray[np.int64]]:
+def _sample_stretches(
+    stamps: Stamps, *, size: int = 8192, most: int = 64
+) -> list[NDArray[np.int64]]:
     """Stretches of stamps from all over the log, a few hundred thousand in all."""
     found: list[NDArray[np.int64]] = []
     for _, block in stamps():
-        block = _readable(block)
+        block = _readable_stamps(block)
         found += [block[i : i + size] for i in range(0, len(block), size)]
         if len(found) > 2 * most:
             found = found[::2]
@@ -140,14 +144,14 @@ def _residual_range(
     parts: list[NDArray[np.int64]], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slope [ns a row] and range of the residuals [ns] of straight lines through stretches of `length` stamps."""
-    values = cut(parts, length)
+    values = cut_stretches(parts, length)
     x = np.arange(length) - (length - 1) / 2
     slope = values @ x / (x @ x)
     rest = values - slope[:, None] * x
     return slope, np.ptp(rest, axis=1) if len(rest) else np.empty(0)
 
 
-def _shared(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
+def _has_shared_stamps(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
     """Whether many rows share a stamp because the clock ticks slowly, and not because rows are doubled."""
     if np.mean(steps == 0) < _SHARED_SHARE:
         return False
@@ -158,19 +162,19 @@ def _shared(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
     return bool(good.any() and np.median(spread[good] / np.maximum(tick, slope[good])) < 1.3)
 
 
-def _misfit(steps: NDArray[np.float64], period: float) -> float:
+def rms_misfit(steps: NDArray[np.float64], period: float) -> float:
     """How far steps are from whole numbers of samples, root mean square [samples]; 0.29 says that they are anywhere."""
     near = steps[np.abs(steps) < 5.5 * period] / period
     return float(np.sqrt(np.mean((near - np.rint(near)) ** 2))) if len(near) else 0.5
 
 
-def _scatter(steps: NDArray[np.float64], period: float) -> float:
+def step_scatter(steps: NDArray[np.float64], period: float) -> float:
     """Robust standard deviation of the steps about whole numbers of samples [samples]; 0.37 says that they are anywhere."""
     near = steps[np.abs(steps) < 5.5 * period] / period
     return 1.4826 * float(np.median(np.abs(near - np.rint(near)))) if len(near) else 0.5
 
 
-def _on_a_line(parts: list[NDArray[np.int64]]) -> float | None:
+def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
     """Period of the stretches in which the row count alone predicts the stamps to less than a sample."""
     length = min(16, max(len(part) for part in parts))
     slope, spread = _residual_range(parts, length)
@@ -197,24 +201,24 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
     """Period [ns] from stretches of stamps, to a part in a thousand or better; whether rows are counted; whether stamps are shared."""
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
     rising = steps[steps > 0]
-    if _shared(parts, steps):
-        return _throughput(parts, ticks=True), True, True
-    period = _on_a_line(parts)
+    if _has_shared_stamps(parts, steps):
+        return _time_per_row(parts, ticks=True), True, True
+    period = period_of_lines(parts)
     if period is None:
-        period = refined(steps, float(np.quantile(rising, 0.5, method="lower")))
+        period = refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
         if (
-            _misfit(steps, period) > 0.2
+            rms_misfit(steps, period) > 0.2
         ):  # with most rows missing, the median step is not one sample
-            shorter = refined(steps, float(np.quantile(rising, 0.1)))
-            period = shorter if _misfit(steps, shorter) < 0.15 else period
+            shorter = refine_period(steps, float(np.quantile(rising, 0.1)))
+            period = shorter if rms_misfit(steps, shorter) < 0.15 else period
     return (
-        (_throughput(parts), True, False)
-        if _bursty(parts, steps, period)
+        (_time_per_row(parts), True, False)
+        if _is_bursty(parts, steps, period)
         else (period, False, False)
     )
 
 
-def _bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
+def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
     """Whether the long steps are pauses between bursts: they do not fit the lattice of the short ones, or make up for them."""
     long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
     near = steps[np.abs(steps) < 50 * period]
@@ -232,13 +236,13 @@ def _bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: 
     return bool(scatter**2 < 0.2 * length * near.var())  # samples lost at random would add up
 
 
-def _throughput(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
+def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
     """Time a row takes [ns], from long stretches; with `ticks`, from the first to the last change of a shared stamp."""
     rates = []
     for part in parts:
         steps = np.diff(part).astype(np.float64)
         if ticks and (steps > 0).sum() > 1:
-            times, counts = _ticks(steps)
+            times, counts = _tick_steps(steps)
         else:
             usual = np.median(steps[steps > 0]) if (steps > 0).any() else SECOND
             good = (steps >= 0) & (steps <= max(SECOND, 1000 * usual))
@@ -250,7 +254,7 @@ def _throughput(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float
     return float(np.median(found[whole, 0] / found[whole, 1]))
 
 
-def _ticks(steps: NDArray[np.float64]) -> tuple[float, int]:
+def _tick_steps(steps: NDArray[np.float64]) -> tuple[float, int]:
     """Time [ns] and rows between changes of a shared stamp; changes that take three times as long a row as usual are gaps.
 
     A change and the rows that share the stamp before it are kept or left out together: some stamps
@@ -263,19 +267,19 @@ def _ticks(steps: NDArray[np.float64]) -> tuple[float, int]:
     return float(times[good].sum()), int(counts[good].sum())
 
 
-def _longest(parts: list[NDArray[np.int64]], period: float) -> float:
+def _longest_step(parts: list[NDArray[np.int64]], period: float) -> float:
     """Step [ns] after which counting starts anew when rows are placed by count."""
     steps = np.concatenate([np.diff(part) for part in parts])
     return float(max(SECOND, 50 * period, 10 * np.quantile(np.abs(steps), 0.99)))
 
 
-def _pieces(
+def _fit_pieces(
     stamps: Stamps,
     period: float,
     counted: bool,
     coarse: bool,
     longest: float,
-    course: Course | None = None,
+    course: JitterModel | None = None,
 ) -> NDArray[np.float64]:
     """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
     table = np.empty((0, 6))
@@ -302,16 +306,16 @@ def _piece_sums(
     counted: bool,
     coarse: bool,
     longest: float,
-    course: Course | None,
+    course: JitterModel | None,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
     """Of one block: its first stamp, that from which the sums count, and the sums of its pieces; None where no stamp is readable."""
     rows, block = found
-    block = _readable(block)
+    block = _readable_stamps(block)
     if len(block) == 0:
         return None, np.empty((0, 6))
     first = int(block[0])
     if course is not None:
-        block, count, piece = count_along(np.arange(len(found[1])), found[1], course, longest)
+        block, count, piece = count_samples(np.arange(len(found[1])), found[1], course, longest)
         return (first, int(block[0])) if len(block) else None, piece_sums(
             block, count, piece, period
         )
@@ -328,7 +332,7 @@ def _piece_sums(
     return (first, int(block[0])), piece_sums(block, count, piece, period)
 
 
-def _pooled(
+def _pool_pieces(
     pieces: NDArray[np.float64], period: float, counted: bool
 ) -> tuple[float, float, float]:
     """Period [ns], its standard error [ns], and the samples of the longest joined stretch."""
@@ -345,10 +349,10 @@ def _pooled(
     error = 3.0 * noise / np.sqrt(cc[sane].sum() if sane.any() else cc.sum())
     if counted or not sane.any():  # no piece has the period that was begun with: nothing to join
         return period, error, float(n.max())
-    return _joined(pieces[sane], period, error, noise)
+    return _join_pieces(pieces[sane], period, error, noise)
 
 
-def _joined(
+def _join_pieces(
     pieces: NDArray[np.float64], period: float, error: float, noise: float
 ) -> tuple[float, float, float]:
     """Join pieces whose distance is surely a known number of samples, and fit again."""
@@ -371,7 +375,7 @@ def _joined(
     return period, error, float(longest)
 
 
-def _plain(rate: float, error: float, samples: float, counted: bool) -> float:
+def _round_rate(rate: float, error: float, samples: float, counted: bool) -> float:
     """Take a number that people would have chosen, when the estimate cannot tell it from itself."""
     room = error if counted else min(error, 0.5 * rate / max(samples, 1.0))
     candidates = [float(round(rate))] if rate > 0.5 else []
@@ -410,18 +414,18 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     >>> estimate_rate(lambda: iter([(np.arange(1000), stamps)]), where="tool.csv").rate
     300.0
     """
-    stamps = partial(_recut, stamps, _BLOCK)
-    parts = _pools(stamps)
+    stamps = partial(_recut_blocks, stamps, _BLOCK)
+    parts = _sample_stretches(stamps)
     if not parts:
         raise TimeError(
             f"{where}: there is only one sample with a readable stamp, so no sampling rate can be found; give it with --rate HZ"
         )
     steps = np.concatenate([np.diff(part) for part in parts])
     backwards = float((steps < 0).mean())
-    if not (steps > 0).any() or backwards > _DISORDER:
+    if not (steps > 0).any() or backwards > _MAX_BACKWARD_SHARE:
         what = (
             "time runs backwards"
-            if backwards > 1 - _DISORDER
+            if backwards > 1 - _MAX_BACKWARD_SHARE
             else "the rows are in no order of time"
             if backwards
             else "all stamps are the same"
@@ -430,23 +434,29 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ"
         )
     period, counted, coarse = starting_period(parts)
-    sure = _sure(len(steps))
+    sure = _trusted_samples(len(steps))
     finer = None if counted else finer_period(parts, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
     if lost is not None:
         return replace(lost, even=_mean_rate(parts))
-    if counted or _scatter(steps, period) > _SHARP_SCATTER or np.mean(steps == 0) >= _SHARED_SHARE:
-        course = _find_course(parts, period, coarse, sure)
+    if (
+        counted
+        or step_scatter(steps, period) > _SHARP_SCATTER
+        or np.mean(steps == 0) >= _SHARED_SHARE
+    ):
+        course = _fit_jitter(parts, period, coarse, sure)
         if course is not None:
-            return _estimate_along(stamps, course, coarse, sure)
-    longest = _longest(parts, period) if counted else sure * period
-    estimate = _estimate(_pieces(stamps, period, counted, coarse, longest), period, counted, coarse)
+            return _estimate_with_jitter(stamps, course, coarse, sure)
+    longest = _longest_step(parts, period) if counted else sure * period
+    estimate = _estimate_pooled(
+        _fit_pieces(stamps, period, counted, coarse, longest), period, counted, coarse
+    )
     return estimate if finer is None else replace(estimate, finer=float(f"{SECOND / finer:.4g}"))
 
 
-def _find_course(
+def _fit_jitter(
     parts: list[NDArray[np.int64]], period: float, coarse: bool, sure: float
-) -> Course | None:
+) -> JitterModel | None:
     """Find the course of noisy stamps: of all rows, or of one row of each group.
 
     A row with the stamp of the row before is the next sample, which arrived together with it, or
@@ -458,18 +468,22 @@ def _find_course(
         once = [part[np.append(np.diff(part) != 0, True)] for part in parts]
         rows, apart = sum(map(len, parts)), sum(map(len, once))
         readings = [parts, once] if (1 - _SHARED_SHARE) * rows < apart < rows else [parts]
-        found = [find_course(reading, [period], "all", sure=sure) for reading in readings]
+        found = [fit_jitter(reading, [period], "all", sure=sure) for reading in readings]
         best = min(filter(None, found), key=attrgetter("code_length"), default=None)
         if best is not None:
             return best
-    return find_course(parts, [period], "first" if coarse else "last", sure=sure)
+    return fit_jitter(parts, [period], "first" if coarse else "last", sure=sure)
 
 
-def _estimate_along(stamps: Stamps, course: Course, coarse: bool, sure: float) -> RateEstimate:
+def _estimate_with_jitter(
+    stamps: Stamps, course: JitterModel, coarse: bool, sure: float
+) -> RateEstimate:
     """The rate from the whole course of noisy stamps."""
     longest = sure * course.period * max(1.0, course.group)
-    pieces = _pieces(stamps, course.period, False, False, longest, course)
-    return replace(_estimate(pieces, course.period, False, False), coarse=coarse, course=course)
+    pieces = _fit_pieces(stamps, course.period, False, False, longest, course)
+    return replace(
+        _estimate_pooled(pieces, course.period, False, False), coarse=coarse, course=course
+    )
 
 
 def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
@@ -480,19 +494,19 @@ def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
     return float(f"{np.median(rates):.4g}")
 
 
-def _sure(steps: int) -> float:
+def _trusted_samples(steps: int) -> float:
     """Samples over which a first estimate of the period, from so many steps, is trusted to count."""
-    return min(_SURE, max(5.0, steps / 20))
+    return min(_MAX_TRUSTED_SAMPLES, max(5.0, steps / 20))
 
 
-def _estimate(
+def _estimate_pooled(
     pieces: NDArray[np.float64], period: float, counted: bool, coarse: bool
 ) -> RateEstimate:
-    period, error, samples = _pooled(pieces, period, counted and not coarse)
+    period, error, samples = _pool_pieces(pieces, period, counted and not coarse)
     rate = SECOND / period
     stderr = rate * error / period
     return RateEstimate(
-        _plain(rate, stderr + 1e-12 * rate, samples, counted and not coarse),
+        _round_rate(rate, stderr + 1e-12 * rate, samples, counted and not coarse),
         stderr,
         counted,
         coarse,
@@ -505,7 +519,7 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
 
     They can be samples of `rate` when their steps are whole numbers of its period and some are one
     period, or when rows of that rate with lost samples and jitter explain them (see
-    `gyrostab.ingest.grid.course`); otherwise the answer is None.
+    `gyrostab.ingest.grid.jitter`); otherwise the answer is None.
 
     Examples
     --------
@@ -514,18 +528,18 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     >>> estimate_rate(stamps, where="tool.csv").rate, estimate_near(stamps, 60.0).rate
     (100.0, 60.0)
     """
-    stamps = partial(_recut, stamps, _BLOCK)
-    parts = _pools(stamps)
+    stamps = partial(_recut_blocks, stamps, _BLOCK)
+    parts = _sample_stretches(stamps)
     if not parts:
         return None
     sharp = _estimate_sharp(stamps, parts, rate)
     if sharp is not None:
         return sharp
-    sure = _sure(sum(len(part) - 1 for part in parts))
+    sure = _trusted_samples(sum(len(part) - 1 for part in parts))
     for observe in ("all", "last"):
-        course = follow_course(parts, SECOND / rate, observe, sure=sure)
+        course = fit_jitter_near(parts, SECOND / rate, observe, sure=sure)
         if course is not None:
-            return _estimate_along(stamps, course, False, sure)
+            return _estimate_with_jitter(stamps, course, False, sure)
     return None
 
 
@@ -543,9 +557,12 @@ def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> boo
     """
     theirs = found.course
     if theirs is None and not found.counted:
-        parts = _pools(partial(_recut, stamps, _BLOCK))
-        theirs = follow_course(
-            parts, SECOND / found.raw, "all", sure=_sure(sum(len(part) - 1 for part in parts))
+        parts = _sample_stretches(partial(_recut_blocks, stamps, _BLOCK))
+        theirs = fit_jitter_near(
+            parts,
+            SECOND / found.raw,
+            "all",
+            sure=_trusted_samples(sum(len(part) - 1 for part in parts)),
         )
     return (
         near.course is not None
@@ -561,16 +578,23 @@ def _estimate_sharp(
     period = SECOND / rate
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
     single = steps[np.abs(steps / period - 1) < 0.25]
-    if len(single) == 0 or len(single) < _SINGLE * len(steps) or _misfit(steps, period) > 0.15:
+    if (
+        len(single) == 0
+        or len(single) < _MIN_SINGLE_SHARE * len(steps)
+        or rms_misfit(steps, period) > 0.15
+    ):
         return None
     if abs(np.median(single) / period - 1) > 0.02:  # another rate, not this one with rows missing
         return None
-    return _estimate(
-        _pieces(stamps, period, False, False, _sure(len(steps)) * period), period, False, False
+    return _estimate_pooled(
+        _fit_pieces(stamps, period, False, False, _trusted_samples(len(steps)) * period),
+        period,
+        False,
+        False,
     )
 
 
-def odd_stretches(
+def deviating_stretches(
     stamps: Stamps, period: float, *, size: int = 1024
 ) -> list[tuple[int, int, float]]:
     """Stretches whose own rate is more than 2 % off: first row, its stamp [ns], rate [Hz].
@@ -579,17 +603,17 @@ def odd_stretches(
     """
     found: list[tuple[int, int, float]] = []
     inside = False
-    for rows, values in _recut(stamps, 64 * size):
+    for rows, values in _recut_blocks(stamps, 64 * size):
         known = values != NO_STAMP
         rows, values = rows[known], values[known]
-        begins, paces = _paces(values, size)
+        begins, paces = _stretch_paces(values, size)
         far = np.abs(paces / period - 1) >= 0.02
         if not far.any():
             inside = False if len(far) else inside
             continue
         for begin, look in zip(begins.tolist(), far.tolist(), strict=True):
             part = values[begin : begin + size]
-            own = _on_a_line([part]) if look else None
+            own = period_of_lines([part]) if look else None
             odd = own is not None and abs(own / period - 1) > 0.02
             if odd and not inside and own is not None:
                 found.append((int(rows[begin]), int(part[0]), SECOND / own))
@@ -597,7 +621,9 @@ def odd_stretches(
     return found
 
 
-def _paces(values: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _stretch_paces(
+    values: NDArray[np.int64], size: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """First row of every stretch of `size` stamps (the last may be shorter), and how far apart its stamps are as a rule [ns]."""
     whole = len(values) // size
     table = np.diff(values[: whole * size].reshape(whole, size)[:, ::16], axis=1)

@@ -17,28 +17,28 @@ import xarray as xr
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.ingest.gap_table import gap_variables, name_lost
 from gyrostab.ingest.grid.axes import regularise_axes
-from gyrostab.ingest.grid.course import Course
-from gyrostab.ingest.grid.fill import gathered, on_grid
+from gyrostab.ingest.grid.fill import gather_channel, rows_on_grid
 from gyrostab.ingest.grid.gaps import find_gaps, gap_table
-from gyrostab.ingest.grid.notes import describe, describe_channels, describe_rate
+from gyrostab.ingest.grid.jitter import JitterModel
+from gyrostab.ingest.grid.notes import describe_channels, describe_placement, describe_rate
 from gyrostab.ingest.grid.place import (
     Placement,
     check_grid,
     place_by_count,
-    place_by_course,
     place_by_stamp,
+    place_in_order,
     place_without_time,
 )
 from gyrostab.ingest.grid.rate import (
     RateEstimate,
     Stamps,
+    deviating_stretches,
     estimate_near,
     estimate_rate,
     is_far_worse,
-    odd_stretches,
 )
 from gyrostab.ingest.grid.repeats import find_repeats, with_repeats
-from gyrostab.ingest.grid.survey import BLOCK, Survey, blocks, file_of, survey
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows, stamp_blocks
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
@@ -51,14 +51,14 @@ from gyrostab.units import HOUR
 
 __all__ = ["gap_table", "regularise"]
 
-_DISAGREE = 0.02  # a declared rate further off than this is a mistake
+_MAX_RATE_DIFFERENCE = 0.02  # a declared rate further off than this is a mistake
 _EVEN_ROWS = 2**18  # rows at the beginning of a log with even stamps that tell its rate
 # jitter up to which a stamp tells its sample, for all rows but one in 100; then they are tried
 # first [samples]
 _SHARP_SIGMA = 0.2
-_MANY_DROPPED = 10  # rows without a sample by their stamps, from which on their order is tried
+_MIN_DROPPED_ROWS = 10  # rows without a sample by their stamps, from which on their order is tried
 _LATE_SHARE = 0.9  # of those rows that the order must give a sample
-_ROUNDS = 4  # a repetition within another shows only when the latter is gone
+_MAX_ROUNDS = 4  # a repetition within another shows only when the latter is gone
 _OWN_ATTRIBUTES = (
     "declared_rate_hz",
     "start",
@@ -70,7 +70,7 @@ _OWN_ATTRIBUTES = (
 )
 
 
-def _checked(*, rate: float | None, tolerance: float, chunk: int | None, block: int) -> None:
+def _check_options(*, rate: float | None, tolerance: float, chunk: int | None, block: int) -> None:
     if rate is not None:
         check_rate(rate, "rate")
     if not 0 <= tolerance < 0.5:
@@ -81,12 +81,12 @@ def _checked(*, rate: float | None, tolerance: float, chunk: int | None, block: 
         )
 
 
-def _declared(raw: xr.Dataset, rate: float | None) -> float | None:
+def _declared_rate(raw: xr.Dataset, rate: float | None) -> float | None:
     value = rate if rate is not None else raw.attrs.get("declared_rate_hz")
     return None if value is None else float(value)
 
 
-def _start(raw: xr.Dataset, notes: list[str]) -> int:
+def _start_stamp(raw: xr.Dataset, notes: list[str]) -> int:
     text = raw.attrs.get("start")
     if not text:
         notes.append(
@@ -96,9 +96,9 @@ def _start(raw: xr.Dataset, notes: list[str]) -> int:
     return stamp_ns(text)
 
 
-def _place(
+def _place_rows(
     raw: xr.Dataset,
-    found: Survey,
+    found: ScanPass,
     declared: float | None,
     *,
     tolerance: float,
@@ -112,26 +112,26 @@ def _place(
             raise TimeError(
                 f"{where}: the file has no time column; give the sampling rate with --rate HZ"
             )
-        return place_without_time(found.rows, _start(raw, notes)), declared
+        return place_without_time(found.rows, _start_stamp(raw, notes)), declared
     everything = (
         found.absent <= 0.01 * found.rows
     )  # single unreadable rows took their time all the same
-    stamps: Stamps = partial(blocks, raw, found, block=block)
-    counted: Stamps = partial(blocks, raw, found, block=block, all_rows=everything)
+    stamps: Stamps = partial(stamp_blocks, raw, found, block=block)
+    counted: Stamps = partial(stamp_blocks, raw, found, block=block, all_rows=everything)
     try:
         estimate = estimate_rate(stamps, where=where)
     except TimeError:
         if declared is None or found.rows - found.absent > 1:
             raise
         estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
-    if declared is not None and abs(declared / estimate.raw - 1) > _DISAGREE:
+    if declared is not None and abs(declared / estimate.raw - 1) > _MAX_RATE_DIFFERENCE:
         near = estimate_near(stamps, declared)
         named = (
-            estimate.even is not None and abs(declared / estimate.even - 1) <= _DISAGREE
+            estimate.even is not None and abs(declared / estimate.even - 1) <= _MAX_RATE_DIFFERENCE
         )  # the other reading of recurring losses
         if (
             near is None
-            or abs(declared / near.raw - 1) > _DISAGREE
+            or abs(declared / near.raw - 1) > _MAX_RATE_DIFFERENCE
             or (not named and is_far_worse(stamps, near, estimate))
         ):
             raise TimeError(
@@ -153,14 +153,14 @@ def _place(
         placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
         odd: list[tuple[int, int, float]] = []
     else:
-        limits = _Limits(tolerance, max_gap, everything, where)
+        limits = _OrderOptions(tolerance, max_gap, everything, where)
         placement, odd = _place_stamped(raw, found, stamps, estimate, rate, limits)
     notes += describe_rate(raw, estimate, rate, odd, placement)
     return placement, rate
 
 
 def _place_even(
-    raw: xr.Dataset, found: Survey, place: Callable[..., tuple[Placement, float]]
+    raw: xr.Dataset, found: ScanPass, place: Callable[..., tuple[Placement, float]]
 ) -> tuple[Placement, float] | None:
     """Place the rows of a long log whose stamps are even steps of the sampling period, by a look at its beginning alone.
 
@@ -196,8 +196,8 @@ def _place_even(
     return replace(placement, runs=np.array([[0, 0, found.rows]], dtype=np.int64)), rate
 
 
-class _Limits(NamedTuple):
-    """What `place_by_course` takes besides."""
+class _OrderOptions(NamedTuple):
+    """What `place_in_order` takes besides."""
 
     tolerance: float
     max_gap: float
@@ -207,18 +207,18 @@ class _Limits(NamedTuple):
 
 def _place_stamped(
     raw: xr.Dataset,
-    found: Survey,
+    found: ScanPass,
     stamps: Stamps,
     estimate: RateEstimate,
     rate: float,
-    limits: _Limits,
+    limits: _OrderOptions,
 ) -> tuple[Placement, list[tuple[int, int, float]]]:
     """Place the rows by their stamps, or in their order where stamps scatter; and the stretches that have another rate."""
     course = estimate.course
 
-    def place_along(course: Course) -> Placement:
+    def place_along(course: JitterModel) -> Placement:
         def place() -> Placement:
-            return place_by_course(
+            return place_in_order(
                 stamps,
                 course,
                 rate,
@@ -237,18 +237,18 @@ def _place_stamped(
     )
     dropped = found.rows - found.absent - found.repeated - placement.placed
     if not found.repeated and (
-        dropped >= _MANY_DROPPED or placement.has_late_rows
+        dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows
     ):  # their order may tell more than their stamps
-        along = place_along(course or Course.of_sharp(1e9 / rate))
+        along = place_along(course or JitterModel.of_sharp(1e9 / rate))
         if along.placed - placement.placed >= _LATE_SHARE * dropped:
             placement = along
-    return placement, odd_stretches(stamps, 1e9 / rate)
+    return placement, deviating_stretches(stamps, 1e9 / rate)
 
 
-def _place_once(raw: xr.Dataset, found: Survey, place: Callable[[], Placement]) -> Placement:
+def _place_once(raw: xr.Dataset, found: ScanPass, place: Callable[[], Placement]) -> Placement:
     """Place the rows, each sample once: stretches of rows that the log holds twice are duplicates and not a restart of the clock."""
     placement, known = place(), np.empty((0, 3), dtype=np.int64)
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         repeats = find_repeats(raw, signal_name(raw), placement)
         if not len(repeats):
             break
@@ -259,8 +259,8 @@ def _place_once(raw: xr.Dataset, found: Survey, place: Callable[[], Placement]) 
     return with_repeats(placement, raw, known) if len(known) else placement
 
 
-def _channels(
-    raw: xr.Dataset, found: Survey, placement: Placement, rate: float, chunk: int
+def _place_channels(
+    raw: xr.Dataset, found: ScanPass, placement: Placement, rate: float, chunk: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Channels and their own time coordinates."""
     variables: dict[str, Any] = {}
@@ -270,12 +270,12 @@ def _channels(
         if rows > 0.5 * (found.rows - found.absent):
             variables[name] = (
                 "time",
-                on_grid(channel.data, placement, chunk=chunk),
+                rows_on_grid(channel.data, placement, chunk=chunk),
                 channel.attrs,
                 channel.encoding,
             )
         elif rows:
-            time, values = gathered(raw, name, placement, rate)
+            time, values = gather_channel(raw, name, placement, rate)
             variables[name] = (f"time_{name}", values, channel.attrs, channel.encoding)
             coordinates[f"time_{name}"] = time
     for key, variable in raw.data_vars.items():
@@ -285,7 +285,7 @@ def _channels(
     return variables, coordinates
 
 
-def _attributes(
+def _log_attributes(
     raw: xr.Dataset, kind: str, rate: float, done: str, notes: list[str]
 ) -> dict[str, Any]:
     kept = {key: value for key, value in raw.attrs.items() if key not in _OWN_ATTRIBUTES}
@@ -311,7 +311,7 @@ def regularise(
     tolerance: float = 0.25,
     max_gap: str | float = "10D",
     chunk: int | None = None,
-    block: int = BLOCK,
+    block: int = BLOCK_ROWS,
     limits: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
     """Put the rows of a raw log on a uniform time axis, with NaN at every missing sample and a table of gaps.
@@ -374,7 +374,7 @@ def regularise(
     if "row" not in raw.dims and "sampling_rate_hz" in raw.attrs:
         return as_uniform(raw)
     check_raw(raw)
-    _checked(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
+    _check_options(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
     if "axis_rows" in raw.attrs:
         each = partial(
             regularise,
@@ -389,10 +389,14 @@ def regularise(
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     allowed = check_limits(limits)
-    found = survey(raw, name, block=block)
+    found = scan_rows(raw, name, block=block)
     notes: list[str] = []
     place = partial(
-        _place, declared=_declared(raw, rate), tolerance=tolerance, max_gap=gap_limit, block=block
+        _place_rows,
+        declared=_declared_rate(raw, rate),
+        tolerance=tolerance,
+        max_gap=gap_limit,
+        block=block,
     )
     placement, hertz = _place_even(raw, found, place) or place(raw, found, notes=notes)
     check_grid(raw, placement, hertz, gap_limit, allowed)
@@ -401,7 +405,7 @@ def regularise(
     table = name_lost(
         find_gaps(placement, found), raw.attrs.get("unreadable_spans", ()), placement.start, hertz
     )
-    notes += describe(raw, found, placement, table, hertz)
+    notes += describe_placement(raw, found, placement, table, hertz)
 
     increments = raw.attrs.get("kind") == "increment"
     signal = "rate" if increments else name
@@ -409,11 +413,11 @@ def regularise(
     attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
     unit = raw[name].encoding.get("scale_factor")
     packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}
-    variables, own = _channels(raw, found, placement, hertz, chunk)
+    variables, own = _place_channels(raw, found, placement, hertz, chunk)
     variables = {
         signal: (
             ("axis", "time"),
-            on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit),
+            rows_on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit),
             attributes,
             packing,
         ),
@@ -426,5 +430,5 @@ def regularise(
         .coords
     )
     done = f"{placement.placed} of {found.rows} rows on {placement.size} samples at {hertz:.10g} Hz"
-    log = xr.Dataset(variables, coordinates, _attributes(raw, signal, hertz, done, notes))
+    log = xr.Dataset(variables, coordinates, _log_attributes(raw, signal, hertz, done, notes))
     return log.assign_attrs(notes=[*log.attrs["notes"], *describe_channels(log)])

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
-from gyrostab.ingest.grid.survey import BLOCK
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
 from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
 from gyrostab.store.lazy_slices import read_slice
 
 __all__ = ["find_repeats", "with_repeats"]
 
-_TRIED = 8  # earlier rows with the stamp of a set-back that are looked at
-_LEAST = 16  # rows; fewer are told from their stamps alone
-_SAME = 0.9  # share of the rows whose values must be alike; a copy may have been damaged
+_MAX_CANDIDATES = 8  # earlier rows with the stamp of a set-back that are looked at
+_MIN_ROWS = 16  # rows; fewer are told from their stamps alone
+_MIN_ALIKE_SHARE = 0.9  # share of the rows whose values must be alike; a copy may have been damaged
 
 
 def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np.int64]:
@@ -48,13 +48,13 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np
             continue
         for source in _rows_at(raw, stamp, row):
             length = _same_stamps(raw, source, row)
-            if length >= _LEAST and _same_values(raw, name, source, row, length):
+            if length >= _MIN_ROWS and _same_values(raw, name, source, row, length):
                 found.append((row, source, length))
                 break
     return np.array(found, dtype=np.int64).reshape(-1, 3)
 
 
-def _stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
+def _read_stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
     return (
         read_slice(raw["time"].data, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
     )
@@ -63,22 +63,24 @@ def _stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
 def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
     """The first few rows with a stamp."""
     rows: list[int] = []
-    for begin in range(0, before, BLOCK):
+    for begin in range(0, before, BLOCK_ROWS):
         rows += (
-            np.flatnonzero(_stamps(raw, begin, min(begin + BLOCK, before)) == stamp) + begin
+            np.flatnonzero(_read_stamps(raw, begin, min(begin + BLOCK_ROWS, before)) == stamp)
+            + begin
         ).tolist()
-        if len(rows) >= _TRIED:
+        if len(rows) >= _MAX_CANDIDATES:
             break
-    return rows[:_TRIED]
+    return rows[:_MAX_CANDIDATES]
 
 
 def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
     """How many rows from `row` on have the stamps of the rows from `source` on, up to the row itself."""
     room = min(raw.sizes["row"] - row, row - source)
-    for begin in range(0, room, BLOCK):
-        end = min(begin + BLOCK, room)
+    for begin in range(0, room, BLOCK_ROWS):
+        end = min(begin + BLOCK_ROWS, room)
         other = np.flatnonzero(
-            _stamps(raw, source + begin, source + end) != _stamps(raw, row + begin, row + end)
+            _read_stamps(raw, source + begin, source + end)
+            != _read_stamps(raw, row + begin, row + end)
         )
         if len(other):
             return begin + int(other[0])
@@ -89,8 +91,8 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
     """Whether the values are alike where both are known, and change at all."""
     told = alike = 0
     changes = False
-    for begin in range(0, length, BLOCK):
-        end = min(begin + BLOCK, length)
+    for begin in range(0, length, BLOCK_ROWS):
+        end = min(begin + BLOCK_ROWS, length)
         left, right = (
             read_slice(raw[name].data, first + begin, first + end) for first in (source, row)
         )
@@ -101,7 +103,7 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
         changes = changes or bool(
             ((np.diff(left, axis=1) != 0) & known[:, 1:] & known[:, :-1]).any()
         )
-    return changes and told >= 2 and alike >= _SAME * told
+    return changes and told >= 2 and alike >= _MIN_ALIKE_SHARE * told
 
 
 def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:
@@ -110,7 +112,7 @@ def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int6
     for row, source, length in repeats.tolist():
         rows = np.arange(length)
         sample = np.maximum.accumulate(np.maximum(samples_of(placement, rows + source), 0))
-        stamps = _stamps(raw, row, row + length)
+        stamps = _read_stamps(raw, row, row + length)
         known = stamps != NO_STAMP
         table = np.stack([np.full(length, DUPLICATE), sample, rows + row, stamps, stamps], axis=1)
         events.append(table[known])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["cut", "finer_period", "refined"]
+__all__ = ["cut_stretches", "finer_period", "refine_period"]
 
 _PATTERN, _ROWS = (
     8,
@@ -15,7 +15,7 @@ _WHOLE = 0.15  # samples that a step of a pattern may be off
 _LONGEST = 5.0  # samples that it may take
 
 
-def cut(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
+def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
     """Stretches of `length` stamps, each from its first on [ns]."""
     stride = length if sum(map(len, parts)) > 200 * length else 1  # of a short log, every stretch
     several = [
@@ -27,7 +27,7 @@ def cut(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
     return np.asarray(table - table[:, :1], dtype=np.float64)
 
 
-def refined(steps: NDArray[np.float64], period: float) -> float:
+def refine_period(steps: NDArray[np.float64], period: float) -> float:
     """Period [ns] near a first guess of which the steps are whole numbers; the guess itself where there is none."""
     start = period
     for _ in range(30):
@@ -49,11 +49,11 @@ def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
     stamps makes patterns, too, but of steps that differ by one tick; steps by jitter do not recur;
     and pauses between bursts are longer.
     """
-    table = np.diff(cut(parts, _PATTERN + _ROWS))
+    table = np.diff(cut_stretches(parts, _PATTERN + _ROWS))
     rising = table[table > 0]
     if rising.size == 0:
         return None
-    single = refined(table.ravel(), float(np.quantile(rising, 0.1)))
+    single = refine_period(table.ravel(), float(np.quantile(rising, 0.1)))
     if single > 0.9 * period:
         return None
     counts = np.rint(table / single)

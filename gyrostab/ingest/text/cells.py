@@ -14,17 +14,17 @@ from gyrostab.ingest.columns.stamps import NAT, TimeUnit, cells_to_ns, integers_
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.text.layout import BLANK, Layout, is_number, split_line
 
-__all__ = ["VOID", "Typing", "parse_cells", "parse_fast", "parse_plain", "stamp_types"]
+__all__ = ["VOID_CELLS", "CellTypes", "parse_cells", "parse_fast", "parse_plain", "stamp_types"]
 
 #: Cells that mean "no value"; other words are unreadable.
-VOID = ("", "nan", "NaN", "NAN", "-nan", "null", "NULL", "NA", "N/A", "None")
-_VOID = frozenset(word.lower() for word in VOID)
+VOID_CELLS = ("", "nan", "NaN", "NAN", "-nan", "null", "NULL", "NA", "N/A", "None")
+_VOID_WORDS = frozenset(word.lower() for word in VOID_CELLS)
 
 Parsed = tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None]
 
 
 @dataclass
-class Typing:
+class CellTypes:
     """How the columns of one file parse; `stamp` counts through the types that are tried for the time column."""
 
     layout: Layout
@@ -52,7 +52,7 @@ class Typing:
         return self.plan.time.time_unit if self.plan.time else None
 
 
-def parse_plain(block: bytes, start: int, rows: int, typing: Typing) -> tuple[Parsed, int]:
+def parse_plain(block: bytes, start: int, rows: int, typing: CellTypes) -> tuple[Parsed, int]:
     """Parse the plain rows of a block (up to `rows`) from the byte `start` on, and tell where the first begins that is not plain."""
     from gyrostab.kernels.encoding.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, read_rows
 
@@ -71,7 +71,7 @@ def parse_plain(block: bytes, start: int, rows: int, typing: Typing) -> tuple[Pa
     return (values, None if typing.time is None else _since_epoch(stamps, typing)), stop
 
 
-def _since_epoch(counts: NDArray[np.int64], typing: Typing) -> NDArray[np.int64]:
+def _since_epoch(counts: NDArray[np.int64], typing: CellTypes) -> NDArray[np.int64]:
     """Stamps [ns since 1970] of whole numbers of nanoseconds, or of units that are no decimal part of a second."""
     unit = typing.unit
     if unit is None:
@@ -112,7 +112,7 @@ def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
     return (*integer, pa.decimal128(38, digits), pa.decimal128(38, digits + 11))
 
 
-def parse_fast(piece: bytes, typing: Typing) -> Parsed | None:
+def parse_fast(piece: bytes, typing: CellTypes) -> Parsed | None:
     """Parse a block with pyarrow; None when it holds anything but numbers, voids and stamps of the expected form."""
     import pyarrow as pa
 
@@ -120,17 +120,19 @@ def parse_fast(piece: bytes, typing: Typing) -> Parsed | None:
         return None
     for attempt in range(typing.stamp, len(typing.stamp_types)):
         try:
-            table = _table(piece, typing, typing.stamp_types[attempt])
+            table = _read_table(piece, typing, typing.stamp_types[attempt])
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
             continue
         typing.stamp = attempt
-        values = {source: _floats(table.column(str(source))) for source in typing.sources}
-        stamps = None if typing.time is None else _stamps(table.column(str(typing.time)), typing)
+        values = {source: _to_floats(table.column(str(source))) for source in typing.sources}
+        stamps = (
+            None if typing.time is None else _table_stamps(table.column(str(typing.time)), typing)
+        )
         return values, stamps
     return None
 
 
-def _table(piece: bytes, typing: Typing, stamp_type: Any) -> Any:
+def _read_table(piece: bytes, typing: CellTypes, stamp_type: Any) -> Any:
     import pyarrow as pa
     from pyarrow import csv as arrow_csv
 
@@ -147,19 +149,19 @@ def _table(piece: bytes, typing: Typing, stamp_type: Any) -> Any:
         convert_options=arrow_csv.ConvertOptions(
             column_types=types,
             include_columns=list(types),
-            null_values=list(VOID),
+            null_values=list(VOID_CELLS),
             check_utf8=False,
             decimal_point="," if layout.decimal_comma else ".",
         ),
     )
 
 
-def _floats(column: Any) -> NDArray[np.float64]:
+def _to_floats(column: Any) -> NDArray[np.float64]:
     parts = [chunk.to_numpy(zero_copy_only=False) for chunk in column.chunks]
     return np.concatenate(parts) if parts else np.empty(0)
 
 
-def _stamps(column: Any, typing: Typing) -> NDArray[np.int64]:
+def _table_stamps(column: Any, typing: CellTypes) -> NDArray[np.int64]:
     import pyarrow as pa
 
     kind = column.type
@@ -173,7 +175,7 @@ def _stamps(column: Any, typing: Typing) -> NDArray[np.int64]:
     return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
 
 
-def _chunk_stamps(chunk: Any, typing: Typing) -> NDArray[np.int64]:
+def _chunk_stamps(chunk: Any, typing: CellTypes) -> NDArray[np.int64]:
     import pyarrow as pa
 
     unit = typing.unit
@@ -203,7 +205,7 @@ def _sum_fits(counts: NDArray[np.int64], zero: int) -> NDArray[np.bool_]:
 
 
 def parse_cells(
-    piece: bytes, typing: Typing
+    piece: bytes, typing: CellTypes
 ) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None, int]:
     """Read a piece of text line by line.
 
@@ -221,26 +223,30 @@ def parse_cells(
     for text in piece.decode("latin-1").split("\n"):
         bare = text.split("#")[0].strip("\r") if "#" in text else text.strip("\r")
         if bare.strip():
-            rows.append(_row(bare, typing.layout, width))
+            rows.append(_split_row(bare, typing.layout, width))
     words = 0
     values = {}
     for source in typing.sources:
         numbers = np.empty(len(rows))
         for index, row in enumerate(rows):
             numbers[index] = (
-                np.nan if row is None else _number(row[source], comma=typing.layout.decimal_comma)
+                np.nan
+                if row is None
+                else _parse_number(row[source], comma=typing.layout.decimal_comma)
             )
         if source not in typing.gyro:
             bad = np.flatnonzero(~np.isfinite(numbers))
             cells = (rows[index] for index in bad)
             words += sum(
-                1 for row in cells if row is not None and row[source].strip().lower() not in _VOID
+                1
+                for row in cells
+                if row is not None and row[source].strip().lower() not in _VOID_WORDS
             )
         values[source] = numbers
     return values, _cell_stamps(rows, typing), words
 
 
-def _row(text: str, layout: Layout, width: int) -> list[str] | None:
+def _split_row(text: str, layout: Layout, width: int) -> list[str] | None:
     """The cells of a row, or None when there are too few or too many."""
     try:
         cells = split_line(text, layout.separator)
@@ -251,7 +257,7 @@ def _row(text: str, layout: Layout, width: int) -> list[str] | None:
     return cells if len(cells) == width else None
 
 
-def _number(cell: str, *, comma: bool) -> float:
+def _parse_number(cell: str, *, comma: bool) -> float:
     try:
         value = float(cell.replace(",", ".") if comma else cell)
     except ValueError:
@@ -259,7 +265,7 @@ def _number(cell: str, *, comma: bool) -> float:
     return np.nan if "_" in cell else value
 
 
-def _cell_stamps(rows: list[list[str] | None], typing: Typing) -> NDArray[np.int64] | None:
+def _cell_stamps(rows: list[list[str] | None], typing: CellTypes) -> NDArray[np.int64] | None:
     if typing.time is None:
         return None
     cells = ["" if row is None else row[typing.time] for row in rows]

@@ -28,7 +28,7 @@ BLANK = " "
 HEAD_LINES = 200
 #: Lines that are looked at: those among which the header may be, those that follow one, and the
 #: first rows of data.
-MOST_LINES = 2 * HEAD_LINES + 20
+MAX_LINES = 2 * HEAD_LINES + 20
 
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
 _HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\]]*\])?(?:[ \t]+\[[^\]]*\])?)")
@@ -108,11 +108,11 @@ def find_layout(
         When the file is empty, is not text, has no data rows, or has more columns than the limit
         allows.
     """
-    lines, notes = _decode(path, head, complete=complete)
+    lines, notes = _decode_lines(path, head, complete=complete)
     filled = (
         index for index, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)
     )
-    content = list(islice(filled, MOST_LINES))
+    content = list(islice(filled, MAX_LINES))
     if not content:
         raise FormatError(
             f"{path.name}: there is no row of data, only {len(lines)} blank or comment lines; copy it again"
@@ -146,7 +146,7 @@ def find_layout(
     )
 
 
-def _decode(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list[str]]:
+def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list[str]]:
     if not head.strip():
         raise FormatError(f"{path.name}: the file is empty; copy it again")
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -182,7 +182,7 @@ def _is_utf8(line: bytes) -> bool:
     return True
 
 
-def _separator(line: str) -> str:
+def _guess_separator(line: str) -> str:
     bare = re.sub(r"\[[^\]]*\]", "", line)
     return next((mark for mark in ("\t", ";", ",") if mark in bare), BLANK)
 
@@ -216,12 +216,14 @@ def _find_header(
 ) -> tuple[list[str] | None, str, int, int]:
     """Header cells (None without one), separator, index of the header line and of the first data line."""
     for place, index in enumerate(content[:HEAD_LINES]):
-        separator = _separator(lines[index])
+        separator = _guess_separator(lines[index])
         cells = split_line(lines[index], separator)
         if _is_data(cells, comma=separator == ";"):
             return _commented_header(lines, index, separator, len(cells)), separator, index, index
         names = _header_cells(lines[index], separator)
-        following = [(_separator(lines[i]), lines[i]) for i in content[place + 1 : place + 21]]
+        following = [
+            (_guess_separator(lines[i]), lines[i]) for i in content[place + 1 : place + 21]
+        ]
         rows = [(mark, split_line(line, mark)) for mark, line in following]
         solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark == ";")]
         widths = {len(row) for mark, row in solid or rows if mark == separator}

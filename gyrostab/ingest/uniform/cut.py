@@ -140,7 +140,7 @@ def cut_log(
         raise OptionError(
             f"nothing is left between --from {time_from} and --to {time_to}; {clock.describe()}"
         )
-    excluded = _merge([clock.span_of(span, low, high) for span in spans])
+    excluded = _merge_spans([clock.span_of(span, low, high) for span in spans])
     kept = _kept_runs(low, high, excluded)
     if not len(kept):
         raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
@@ -149,7 +149,7 @@ def cut_log(
     part = _cut_channels(part, grid, low, high, excluded)
     if has_gap_table(log) or len(excluded):
         part = with_table(part, _cut_table(log, grid, low, high, excluded), start, grid.rate)
-    return part.assign_attrs(history=_history(log, time_from, time_to, spans, size))
+    return part.assign_attrs(history=_extend_history(log, time_from, time_to, spans, size))
 
 
 def _is_pair(value: Any) -> bool:
@@ -170,7 +170,7 @@ class _Clock:
             np.datetime64(int(grid_times(self.grid.start, self.grid.rate, n)), "ns")
             for n in (0, self.grid.size)
         )
-        return f"the record goes from {_short(first)} to {_short(end)} ({self.grid.size / self.grid.rate:.6g} s)"
+        return f"the record goes from {_format_stamp(first)} to {_format_stamp(end)} ({self.grid.size / self.grid.rate:.6g} s)"
 
     def sample_of(self, value: Any, option: str, *, last: int, example: str = _EXAMPLE) -> int:
         """First sample at or after an instant, which must lie in the record."""
@@ -206,12 +206,12 @@ class _Clock:
         return max(first, low), min(end, high)
 
 
-def _short(stamp: np.datetime64) -> str:
+def _format_stamp(stamp: np.datetime64) -> str:
     text = str(stamp)
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
-def _merge(spans: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
+def _merge_spans(spans: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
     """Spans in order, those that touch joined, empty ones left out."""
     merged: list[list[int]] = []
     for first, end in sorted(span for span in spans if span[1] > span[0]):
@@ -273,7 +273,7 @@ def _cut_table(
     return cut
 
 
-def _history(
+def _extend_history(
     log: xr.Dataset, time_from: Any, time_to: Any, spans: Sequence[Span], size: int
 ) -> str:
     given = [

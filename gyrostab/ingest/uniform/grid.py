@@ -111,7 +111,7 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
     )
 
 
-def _blocks(read: ReadStamps, count: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
+def _stamp_blocks(read: ReadStamps, count: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
     """Blocks of stamps, each with the last stamp of the block before."""
     for begin in range(0, max(count - 1, 1), BLOCK_STAMPS):
         yield begin, read(begin, min(begin + BLOCK_STAMPS + 1, count))
@@ -120,7 +120,7 @@ def _blocks(read: ReadStamps, count: int) -> Iterator[tuple[int, NDArray[np.int6
 def _measure_steps(read: ReadStamps, count: int) -> _Steps:
     """Check that the stamps rise, and measure their steps."""
     smallest, medians, first, last = np.iinfo(np.int64).max, [], 0, 0
-    for begin, stamps in _blocks(read, count):
+    for begin, stamps in _stamp_blocks(read, count):
         if np.any(stamps == _NAT):
             raise TimeError(
                 f"sample {begin + int(np.argmax(stamps == _NAT))} of the log has no time (NaT); drop it: log.dropna('time')"
@@ -149,19 +149,19 @@ def _describe_disorder(place: int, before: int, after: int) -> str:
 
 
 def _longest_step(read: ReadStamps, count: int) -> int:
-    return max(int(np.diff(stamps).max()) for _, stamps in _blocks(read, count))
+    return max(int(np.diff(stamps).max()) for _, stamps in _stamp_blocks(read, count))
 
 
 def _fit_period(read: ReadStamps, count: int, span: int, base: float) -> tuple[float, int] | None:
     """Period [ns] whose multiples the steps are, if `base` is near it or a fraction of it, and the samples between first and last stamp."""
     unit_sum = unit_count = 0
-    for _, stamps in _blocks(read, count):
+    for _, stamps in _stamp_blocks(read, count):
         steps = np.diff(stamps)
         single = np.rint(steps / base) == 1
         unit_sum, unit_count = unit_sum + int(steps[single].sum()), unit_count + int(single.sum())
     period = unit_sum / unit_count if unit_count else base
     samples = divisor = 0
-    for _, stamps in _blocks(read, count):
+    for _, stamps in _stamp_blocks(read, count):
         number = np.rint(np.diff(stamps) / period).astype(np.int64)
         if number.min() < 1:
             return None
@@ -176,7 +176,7 @@ def _place_stamps(
 ) -> tuple[float, NDArray[np.int64]] | None:
     """Largest departure from the grid [samples] and the runs of samples; None when a stamp is too far from it."""
     worst, firsts, samples = 0.0, [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
-    for begin, stamps in _blocks(read, count):
+    for begin, stamps in _stamp_blocks(read, count):
         position = grid_index(start, rate, stamps)
         sample = np.rint(position).astype(np.int64)
         worst = max(worst, float(np.abs(position - sample).max()))

@@ -7,7 +7,15 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError
-from gyrostab.ingest.gap_table import CAUSE, END, FIRST, ROWS, SAMPLES, gap_variables, thinned
+from gyrostab.ingest.gap_table import (
+    CAUSE,
+    END,
+    FIRST,
+    ROWS,
+    SAMPLES,
+    gap_variables,
+    merge_neighbours,
+)
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index
 
@@ -106,7 +114,7 @@ def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate
 def add_holes(table: Table, runs: Table) -> Table:
     """The table with the samples between runs that it does not list yet; their cause is "missing"."""
     first, end = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
-    begin, stop = _merged(table[table[:, END] > table[:, FIRST]])
+    begin, stop = _merge_lines(table[table[:, END] > table[:, FIRST]])
     if len(begin):  # take off what the table lists at either end, then count what it lists within
         which = np.maximum(np.searchsorted(begin, first, side="right") - 1, 0)
         first = np.where((begin[which] <= first) & (first < stop[which]), stop[which], first)
@@ -122,10 +130,10 @@ def add_holes(table: Table, runs: Table) -> Table:
     new = (end > first) & (samples > 0)
     cause = np.full(int(new.sum()), _MISSING)
     holes = np.stack([first[new], end[new], samples[new], np.zeros_like(cause), cause], axis=1)
-    return _sorted(np.concatenate([table, holes]))
+    return _sort_table(np.concatenate([table, holes]))
 
 
-def _merged(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First samples and ends of the stretches that the lines of a table cover together."""
     order = np.argsort(table[:, FIRST], kind="stable")
     first, end = (
@@ -143,11 +151,11 @@ def add_spans(table: Table, spans: Table, cause: int) -> Table:
         np.array([[first, end, end - first, 0, cause]], dtype=np.int64)
         for first, end in spans.tolist()
     ]
-    return _sorted(np.concatenate([table, *rows]))
+    return _sort_table(np.concatenate([table, *rows]))
 
 
-def _sorted(table: Table) -> Table:
-    table = thinned(table)
+def _sort_table(table: Table) -> Table:
+    table = merge_neighbours(table)
     return np.asarray(table[np.lexsort((table[:, CAUSE], table[:, FIRST]))])
 
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, OptionError, TimeError
-from gyrostab.ingest.grid.fill import on_grid
+from gyrostab.ingest.grid.fill import rows_on_grid
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.regularise import gap_table, regularise
 from gyrostab.schema import check_log
@@ -129,7 +129,7 @@ def test_lazy_arrays_equal_those_in_memory(chunk, monkeypatch):
     raw = raw_log(stamps_of(samples, 300.0), values)
     truth = np.full((2, samples[-1] + 1), np.nan)
     truth[:, samples] = values
-    monkeypatch.setattr(sys.modules["gyrostab.ingest.grid.fill"], "SMALL", 10)
+    monkeypatch.setattr(sys.modules["gyrostab.ingest.grid.fill"], "MAX_PLAIN_NUMBERS", 10)
     for signal in (values, da.from_array(values, chunks=(1, 1234))):
         log = regularise(raw.assign(rate=raw.rate.copy(data=signal)), chunk=chunk)
         assert isinstance(log.rate.data, da.Array)
@@ -299,7 +299,9 @@ def test_on_grid_of_nothing_but_one_run_is_the_array_itself():
         max_gap=1e9,
         where="x",
     )
-    np.testing.assert_array_equal(on_grid(np.arange(50.0), placement, chunk=7), np.arange(50.0))
+    np.testing.assert_array_equal(
+        rows_on_grid(np.arange(50.0), placement, chunk=7), np.arange(50.0)
+    )
 
 
 def test_a_channel_of_another_day_is_told():

@@ -17,14 +17,14 @@ from gyrostab.store.lazy_slices import read_slice
 from gyrostab.store.row_inspection import RowInspection, inspect_rows
 from gyrostab.store.threads import map_in_order
 
-__all__ = ["BLOCK", "Survey", "blocks", "file_of", "survey"]
+__all__ = ["BLOCK_ROWS", "ScanPass", "file_of", "scan_rows", "stamp_blocks"]
 
 #: Rows that are held in memory at one time.
-BLOCK = 1 << 20
+BLOCK_ROWS = 1 << 20
 
 
 @dataclass
-class Survey:
+class ScanPass:
     """What one pass over the signal found.
 
     Attributes
@@ -67,7 +67,7 @@ class Survey:
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
-def _join(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+def _join_spans(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     spans = np.concatenate([*parts, np.empty((0, 2), dtype=np.int64)])
     if len(spans) < 2:
         return spans
@@ -79,7 +79,7 @@ def _join(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
 
 
-def _look_at(
+def _scan_block(
     raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]
 ) -> RowInspection:
     return inspect_rows(
@@ -89,7 +89,7 @@ def _look_at(
     )
 
 
-def _looks(
+def _scan_blocks(
     raw: xr.Dataset, name: str, channels: Sequence[str], block: int
 ) -> Iterable[RowInspection]:
     """What is in each block, as the reader found it, or else by a look at it."""
@@ -99,12 +99,12 @@ def _looks(
     if seen and whole and all(one.filled.keys() == set(channels) for one in seen):
         return seen
     return map_in_order(
-        partial(_look_at, raw, name, channels),
+        partial(_scan_block, raw, name, channels),
         ((at, min(rows, at + block)) for at in range(0, rows, block)),
     )
 
 
-def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
+def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPass:
     """Look at every cell of a raw log once.
 
     Raises
@@ -120,7 +120,7 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
     low, high = np.full(n_axes, np.inf), np.full(n_axes, -np.inf)
     channels = [str(key) for key, variable in raw.data_vars.items() if variable.dims == ("row",)]
     filled = dict.fromkeys(channels, 0)
-    for one in _looks(raw, name, channels, block):
+    for one in _scan_blocks(raw, name, channels, block):
         absent += one.absent
         bits.append(one.bits)
         unreadable.append(one.unreadable)
@@ -130,7 +130,7 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
             filled[key] += count
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
-            f"{_sources(raw)}: none of the {rows} rows holds a number for any gyro axis; check the columns, the units and --map"
+            f"{_source_names(raw)}: none of the {rows} rows holds a number for any gyro axis; check the columns, the units and --map"
         )
     axes = [str(axis) for axis in raw["axis"].values]
     still = [
@@ -139,24 +139,28 @@ def survey(raw: xr.Dataset, name: str, *, block: int = BLOCK) -> Survey:
         if least == most and rows - absent > 1
     ]
     packed = np.concatenate(bits)
-    return Survey(rows, packed, absent, _join(unreadable), _join(infinite), still, filled)
+    return ScanPass(
+        rows, packed, absent, _join_spans(unreadable), _join_spans(infinite), still, filled
+    )
 
 
-def blocks(
-    raw: xr.Dataset, found: Survey, *, block: int = BLOCK, all_rows: bool = False
+def stamp_blocks(
+    raw: xr.Dataset, found: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Row numbers and stamps [ns, `NO_STAMP` where unreadable] of the rows that hold a sample, block by block, fetched ahead."""
-    return map_in_order(_same, _blocks(raw, found, block, all_rows=all_rows), workers=1)
+    return map_in_order(
+        _identity, _read_stamp_blocks(raw, found, block, all_rows=all_rows), workers=1
+    )
 
 
-def _same(
+def _identity(
     block: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return block
 
 
-def _blocks(
-    raw: xr.Dataset, found: Survey, block: int, *, all_rows: bool
+def _read_stamp_blocks(
+    raw: xr.Dataset, found: ScanPass, block: int, *, all_rows: bool
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     stamps = raw["time"].data
     for begin in range(0, found.rows, block):
@@ -169,7 +173,7 @@ def _blocks(
             yield np.flatnonzero(keep) + begin, values[keep]
 
 
-def _sources(raw: xr.Dataset) -> str:
+def _source_names(raw: xr.Dataset) -> str:
     return ", ".join(texts(raw, "source_files") or ["the raw log"])
 
 

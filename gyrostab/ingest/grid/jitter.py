@@ -19,20 +19,20 @@ from gyrostab.kernels.grid.course import find_breaks, find_phase, follow, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP, piece_sums
 
 __all__ = [
-    "LEAST_SIGMA",
-    "Course",
-    "count_along",
-    "find_course",
-    "follow_course",
+    "MIN_SIGMA",
+    "JitterModel",
+    "count_samples",
+    "fit_jitter",
+    "fit_jitter_near",
     "observe_rows",
     "place_rows",
 ]
 
 Integers = NDArray[np.int64]
-Part = tuple[Integers, Integers]
+ObservedStamps = tuple[Integers, Integers]
 
 #: Standard deviation of the jitter that the kernel is given at least [samples].
-LEAST_SIGMA = 0.1
+MIN_SIGMA = 0.1
 #: Share of a deviation that the phase takes over, while the period is sought, and once it is known.
 #: A sample that is not found missing
 #: costs 1 / (4 gain sigma^2) nats before the phase has taken it over: 140 at a scatter of 0.6,
@@ -40,25 +40,25 @@ LEAST_SIGMA = 0.1
 #: that has no sample.
 _SEARCH_GAIN, _GAIN = 0.02, 0.005
 #: Beyond this scatter [samples] those are less than 80.
-_MOST_SIGMA = 0.8
+_MAX_SIGMA = 0.8
 #: Share of rows without a sample, and cost of a row [nats], beyond which stamps have no course.
 #: Jitter alone costs 0.5 nats, and every
 #: second sample missing at random 2.5 more.
-_MOST_DROPPED, _MOST_NATS = 0.01, 3.0
+_MAX_DROPPED_SHARE, _MAX_NATS = 0.01, 3.0
 #: Rows that a course is sought in, candidates for its period, and those of them that are refined.
-_SEARCH_ROWS, _MOST_CANDIDATES, _MOST_REFINED = 8_000, 200, 4
+_SEARCH_ROWS, _MAX_CANDIDATES, _MAX_REFINED = 8_000, 200, 4
 #: A period wrong by half of this share lags by a fortieth of a sample behind the phase, which
 #: follows with a gain of 0.02.
 _PERIOD_STEP = 0.001
 _TRACE_ROWS = 1 << 13
 _AHEAD_ROWS = 1 << 12
-_MOST_ROWS, _MOST_AHEAD = 1 << 20, 1 << 18
+_MAX_ROWS, _MAX_AHEAD_ROWS = 1 << 20, 1 << 18
 #: Samples that a row may be late without being taken for a clock set back.
 _LATE_SAMPLES = 16.0
 
 
 @dataclass(frozen=True)
-class Course:
+class JitterModel:
     """How noisy stamps follow the samples.
 
     Attributes
@@ -88,12 +88,12 @@ class Course:
     @property
     def code_length(self) -> float:
         """Nats that it takes to write a stamp down: those of its course, and of its deviation to the nanosecond."""
-        return self.nats + float(np.log(max(self.sigma, LEAST_SIGMA) * self.period))
+        return self.nats + float(np.log(max(self.sigma, MIN_SIGMA) * self.period))
 
     @classmethod
-    def of_sharp(cls, period: float) -> Course:
+    def of_sharp(cls, period: float) -> JitterModel:
         """Make the course of stamps that scatter by less than a tenth of a sample."""
-        return cls(period, LEAST_SIGMA, "all", 1.0, 0.5)
+        return cls(period, MIN_SIGMA, "all", 1.0, 0.5)
 
 
 def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
@@ -106,9 +106,9 @@ def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
     return np.asarray(known[np.concatenate([edge, apart] if observe == "first" else [apart, edge])])
 
 
-def find_course(
+def fit_jitter(
     parts: list[Integers], guesses: list[float], observe: str, *, sure: float
-) -> Course | None:
+) -> JitterModel | None:
     """Find the period [ns] that explains stretches of stamps best, each row being the next sample but for rare losses.
 
     Parameters
@@ -118,7 +118,7 @@ def find_course(
     guesses : list of float
         Periods [ns] to try in addition to those of the stretches themselves.
     observe : str
-        See `Course`.
+        See `JitterModel`.
     sure : float
         Samples over which a first estimate of the period is trusted to count.
 
@@ -127,7 +127,7 @@ def find_course(
     Course or None
         None where nothing explains the stamps.
     """
-    seen = _take(parts, observe, guesses[0])
+    seen = _observe_parts(parts, observe, guesses[0])
     lengths = (
         (32, 16) if observe == "all" else (8,)
     )  # few groups in a row are whole where samples are lost
@@ -136,19 +136,21 @@ def find_course(
         return None
     slope, scatter = (values[lines[0] > 0] for values in lines)
     sigma_ns = float(np.median(scatter))
-    group = _group(seen)
-    if sigma_ns > _MOST_SIGMA * float(np.median(slope)):
+    group = _rows_per_group(seen)
+    if sigma_ns > _MAX_SIGMA * float(np.median(slope)):
         return None
     sure *= max(1.0, group)
-    periods = _candidates(seen, slope, group)
-    sample = _shorten(seen, _SEARCH_ROWS)
-    best = sorted(periods, key=lambda period: _cost(sample, period, sigma_ns, sure))[:_MOST_REFINED]
+    periods = _candidate_periods(seen, slope, group)
+    sample = _shorten_parts(seen, _SEARCH_ROWS)
+    best = sorted(periods, key=lambda period: _row_cost(sample, period, sigma_ns, sure))[
+        :_MAX_REFINED
+    ]
     started = [
         *((period, sigma_ns / period) for period in best),
-        *((guess, LEAST_SIGMA) for guess in guesses),
+        *((guess, MIN_SIGMA) for guess in guesses),
     ]
     found = [
-        _refine(seen, Course(period, sigma, observe, group, np.inf), sure)
+        _refine_model(seen, JitterModel(period, sigma, observe, group, np.inf), sure)
         for period, sigma in started
     ]
     explained = min(filter(None, found), key=lambda course: course.code_length, default=None)
@@ -157,19 +159,22 @@ def find_course(
     )  # the best may be stamps of rows that are given twice
 
 
-def follow_course(
+def fit_jitter_near(
     parts: list[Integers], period: float, observe: str, *, sure: float
-) -> Course | None:
+) -> JitterModel | None:
     """Give the course with a period near the one given [ns], None where the stamps do not follow it."""
-    seen = _take(parts, observe, period)
-    group = _group(seen)
-    found = _refine(
-        seen, Course(period, 0.5, observe, group, np.inf), sure * max(1.0, group), most_off=0.02
+    seen = _observe_parts(parts, observe, period)
+    group = _rows_per_group(seen)
+    found = _refine_model(
+        seen,
+        JitterModel(period, 0.5, observe, group, np.inf),
+        sure * max(1.0, group),
+        most_off=0.02,
     )
     return found if found is not None and found.fits else None
 
 
-def _group(seen: list[Part]) -> float:
+def _rows_per_group(seen: list[ObservedStamps]) -> float:
     """Rows to one that is looked at."""
     return float(
         sum(count[-1] - count[0] for count, _ in seen)
@@ -177,7 +182,7 @@ def _group(seen: list[Part]) -> float:
     )
 
 
-def _take(parts: list[Integers], observe: str, period: float) -> list[Part]:
+def _observe_parts(parts: list[Integers], observe: str, period: float) -> list[ObservedStamps]:
     taken = []
     for part in parts:
         rows = observe_rows(part, observe, period)[1:-1]
@@ -187,7 +192,7 @@ def _take(parts: list[Integers], observe: str, period: float) -> list[Part]:
 
 
 def _fit_lines(
-    seen: list[Part], length: int
+    seen: list[ObservedStamps], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], standard deviations of the residuals [ns]."""
     tables = []
@@ -210,25 +215,27 @@ def _fit_lines(
     return slope, np.sqrt((rest**2).sum(axis=1) / (length - 2))
 
 
-def _candidates(seen: list[Part], slope: NDArray[np.float64], group: float) -> list[float]:
+def _candidate_periods(
+    seen: list[ObservedStamps], slope: NDArray[np.float64], group: float
+) -> list[float]:
     """Periods [ns] around the slopes of stretches; losses make slopes larger, so the period is among the smaller ones."""
     longer = _fit_lines(seen, 128)
     slopes = longer[0] if longer is not None and len(longer[0]) >= 16 and group < 2 else slope
     slopes = slopes[slopes > 0.2 * np.median(slope)]
     low, high = np.quantile(slopes, [0.05, 0.6])
     low, high = low * 0.995, max(high * 1.005, np.median(slope))
-    steps = int(min(np.ceil(np.log(high / low) * group / _PERIOD_STEP), _MOST_CANDIDATES)) + 1
+    steps = int(min(np.ceil(np.log(high / low) * group / _PERIOD_STEP), _MAX_CANDIDATES)) + 1
     return [float(period) for period in np.geomspace(low, high, steps)]
 
 
-def _shorten(seen: list[Part], rows: int) -> list[Part]:
+def _shorten_parts(seen: list[ObservedStamps], rows: int) -> list[ObservedStamps]:
     most = max(64, rows // len(seen))
     return [(count[:most], stamps[:most]) for count, stamps in seen]
 
 
-def _cost(seen: list[Part], period: float, sigma_ns: float, sure: float) -> float:
+def _row_cost(seen: list[ObservedStamps], period: float, sigma_ns: float, sure: float) -> float:
     """Cost of a row [nats] with a period [ns]."""
-    sigma = max(sigma_ns / period, LEAST_SIGMA)
+    sigma = max(sigma_ns / period, MIN_SIGMA)
     total = sum(
         follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, _TRACE_ROWS)[3]
         for count, stamps in seen
@@ -236,9 +243,9 @@ def _cost(seen: list[Part], period: float, sigma_ns: float, sure: float) -> floa
     return float(total / sum(len(count) for count, _ in seen))
 
 
-def _refine(
-    seen: list[Part], course: Course, sure: float, *, most_off: float = 0.05
-) -> Course | None:
+def _refine_model(
+    seen: list[ObservedStamps], course: JitterModel, sure: float, *, most_off: float = 0.05
+) -> JitterModel | None:
     """Fit period and scatter along the course; None where it is none."""
     if not seen:
         return None
@@ -247,7 +254,7 @@ def _refine(
         cc = ct = nats = rows = dropped = single = steps = 0.0
         offs = []
         for count, stamps in seen:
-            known = max(sigma, LEAST_SIGMA)
+            known = max(sigma, MIN_SIGMA)
             sample, piece, off, cost = follow(
                 count, stamps, period, known, gain, sure * period, _TRACE_ROWS
             )
@@ -263,24 +270,24 @@ def _refine(
             return None
         period = float(ct / cc)
         sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
-        if not abs(period / course.period - 1) < most_off or sigma > 2 * _MOST_SIGMA:
+        if not abs(period / course.period - 1) < most_off or sigma > 2 * _MAX_SIGMA:
             return None
     fits = (
-        sigma < _MOST_SIGMA
-        and dropped <= 2 + _MOST_DROPPED * rows
-        and nats < _MOST_NATS * rows
+        sigma < _MAX_SIGMA
+        and dropped <= 2 + _MAX_DROPPED_SHARE * rows
+        and nats < _MAX_NATS * rows
         and single > 0.1 * steps
     )
-    return Course(period, sigma, course.observe, course.group, nats / rows, fits)
+    return JitterModel(period, sigma, course.observe, course.group, nats / rows, fits)
 
 
 def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
     """Whether stamps are no outliers: late rows must not pull the period."""
-    return np.asarray(np.abs(off) <= 4 * max(sigma, LEAST_SIGMA))
+    return np.asarray(np.abs(off) <= 4 * max(sigma, MIN_SIGMA))
 
 
-def count_along(
-    rows: Integers, stamps: Integers, course: Course, longest: float
+def count_samples(
+    rows: Integers, stamps: Integers, course: JitterModel, longest: float
 ) -> tuple[Integers, Integers, Integers]:
     """Stamps [ns], sample numbers and numbers of the piece of the rows of a block that are looked at, without outliers."""
     at = observe_rows(stamps, course.observe, course.period)
@@ -290,7 +297,7 @@ def count_along(
         rows[at],
         stamps[at],
         course.period,
-        max(course.sigma, LEAST_SIGMA),
+        max(course.sigma, MIN_SIGMA),
         _GAIN,
         longest,
         _TRACE_ROWS,
@@ -302,9 +309,9 @@ def count_along(
 class _Placer:
     """Rows to samples, stretch by stretch."""
 
-    def __init__(self, course: Course, period: float, hold: float, max_gap_ns: float):
+    def __init__(self, course: JitterModel, period: float, hold: float, max_gap_ns: float):
         self.course, self.period, self.hold, self.max_gap_ns = course, period, hold, max_gap_ns
-        self.sigma = max(course.sigma, LEAST_SIGMA)
+        self.sigma = max(course.sigma, MIN_SIGMA)
         self.start: int | None = None
         self.latest = 0
         self.last = -1  # sample of the latest row
@@ -326,9 +333,9 @@ class _Placer:
         for number, (begin, end) in enumerate(pairwise(cuts)):
             beyond = len(rows) if end == n else end
             if number > 0:
-                self._break(int(rows[begin]), int(breaks[number - 1, 1]), int(stamps[begin]))
+                self._add_break(int(rows[begin]), int(breaks[number - 1, 1]), int(stamps[begin]))
             if begin < end:
-                self._place(
+                self._place_stretch(
                     rows[begin:beyond],
                     count[begin:beyond],
                     stamps[begin:beyond],
@@ -336,7 +343,7 @@ class _Placer:
                     begins=number > 0,
                 )
 
-    def _break(self, row: int, before: int, stamp: int) -> None:
+    def _add_break(self, row: int, before: int, stamp: int) -> None:
         elapsed = before - self.origin
         again = stamp < before and (
             stamp <= self.origin + 0.1 * elapsed or 2 * (before - stamp) > elapsed
@@ -347,14 +354,14 @@ class _Placer:
             )
         )
 
-    def _begin(self, count: Integers, stamps: Integers, at: Integers) -> None:
+    def _begin_piece(self, count: Integers, stamps: Integers, at: Integers) -> None:
         """Begin a piece: its first row is the next sample but one, or the first of the log."""
         ahead = find_phase(count[at], stamps[at], self.period, self.sigma)
         self.origin = int(stamps[at[0]]) + int(np.rint(ahead * self.period))
         self.count0, self.level, self.phase, self.seen = int(count[at[0]]), 0, 0.0, 0
         self.base = int(count[at[0]] - count[0])
 
-    def _anchor(self, level: int) -> None:
+    def _set_first_sample(self, level: int) -> None:
         """Let the piece begin with a row that has lost `level` samples."""
         self.level = level
         self.base -= level
@@ -363,13 +370,13 @@ class _Placer:
         else:
             self.base += self.last + 2
 
-    def _place(
+    def _place_stretch(
         self, rows: Integers, count: Integers, stamps: Integers, n: int, *, begins: bool
     ) -> None:
         at = observe_rows(stamps, self.course.observe, self.period)
         begins = begins or self.start is None
         if begins:
-            self._begin(count, stamps, at)
+            self._begin_piece(count, stamps, at)
         levels, phases = np.empty(len(at), dtype=np.int64), np.empty(len(at))
         if len(at):
             trace(
@@ -377,7 +384,7 @@ class _Placer:
                 self.max_gap_ns / self.period, self.level, self.phase, self.seen, levels, phases,
             )  # fmt: skip
         if begins:
-            self._anchor(int(levels[0]))
+            self._set_first_sample(int(levels[0]))
         nearest = np.searchsorted(
             at, np.arange(n), side="left" if self.course.observe == "last" else "right"
         )
@@ -391,9 +398,9 @@ class _Placer:
                 float(phases[done - 1]),
                 self.seen + done,
             )
-        self._fill(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
+        self._add_rows(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
 
-    def _fill(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
+    def _add_rows(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
         """Give rows their samples; a row that comes to lie on or before the one before it has none."""
         before = np.maximum.accumulate(np.concatenate([[self.last], sample[:-1]]))
         kept = sample > before
@@ -409,10 +416,10 @@ class _Placer:
             rows, sample = rows[kept], sample[kept]
         if len(rows):
             self.last = int(sample[-1])
-            self.runs.append(join_runs(self.runs, sample, rows))
+            self.runs.append(append_runs(self.runs, sample, rows))
 
 
-def join_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integers:
+def append_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integers:
     """Make runs of rows and their samples; what continues the last run of `runs` is added to it."""
     new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
     first = np.concatenate([[0], new])
@@ -430,7 +437,7 @@ def join_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integer
 
 def place_rows(
     blocks: Iterator[tuple[Integers, Integers]],
-    course: Course,
+    course: JitterModel,
     period: float,
     *,
     hold: float,
@@ -461,8 +468,8 @@ def place_rows(
     runs, events : list of ndarray
         As in `gyrostab.ingest.grid.place.Placement`.
     """
-    ahead = int(min(_AHEAD_ROWS * np.ceil(course.group), _MOST_AHEAD))
-    size = int(min(_TRACE_ROWS * np.ceil(course.group), _MOST_ROWS))
+    ahead = int(min(_AHEAD_ROWS * np.ceil(course.group), _MAX_AHEAD_ROWS))
+    size = int(min(_TRACE_ROWS * np.ceil(course.group), _MAX_ROWS))
     placer = _Placer(course, period, hold, max_gap_ns)
     held = [np.empty(0, dtype=np.int64)] * 3
     done = 0
