@@ -25,7 +25,7 @@ from gyrostab.diagnose.identify.identification import Identification, Identifica
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from tests.support.named import COEFFICIENT, record
 
 
@@ -48,7 +48,7 @@ def frames(reduced, baseline, effect, view, column):
         np.zeros(1),
         reasons,
         tuple(known),
-        begin_state(reduced, baseline),
+        initial_state(reduced, baseline),
         fold_blocks(reduced),
     )
 
@@ -62,7 +62,7 @@ def held(reduced, baseline, drawn, effect, view, column, truth, change):
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
         )
-        state = condition_on(begin_state(change(one), baseline), list(frame.claims[0].parts))
+        state = condition_on(initial_state(change(one), baseline), list(frame.claims[0].parts))
         (fitted,) = fit_identifications(replace(frame, state=state), baseline)
         found = fitted.parameters[column]
         inside.append(found.low <= truth <= found.high)

@@ -19,8 +19,8 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import compute_evidence, totals
+from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 
 EFFECTS = ("temperature_bias", "shupe", "warm_up", "vibration_rectification", "bias_jump")
@@ -79,7 +79,9 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
         for one in effect_candidates(reduced, baseline["coefficient"])[0]
         if one.effect == name and one.view == "mean"
     ]
-    scored = totals(compute_evidence(tried, reduced, begin_state(reduced, baseline), folds))
+    scored = evidence_by_effect(
+        compute_evidence(tried, reduced, initial_state(reduced, baseline), folds)
+    )
     return [*total, max(float(gain[0]) for gain in scored.values())]
 
 

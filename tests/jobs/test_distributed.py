@@ -268,7 +268,9 @@ def _open(address: str, path: Path) -> None:
 
     real = schedule._find_size
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(schedule, "_find_size", lambda name: 100 if Path(name) == path else real(name))
+        patch.setattr(
+            schedule, "_find_size", lambda name: 100 if Path(name) == path else real(name)
+        )
         with open_pool(address, files=[path]):
             pass
 

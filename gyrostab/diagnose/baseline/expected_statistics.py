@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.linear_model import effective
+from gyrostab.diagnose.predict.linear_model import spread_by_gaps
 from gyrostab.kernels.spectra.expected import expected_powers
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import LAWS
@@ -70,7 +70,7 @@ def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
         [degree2 hour-2 Hz-1 per squared unit of the noise table].
     """
     whole = band_columns(blocks).T * (1.0 if response is None else response)
-    return np.stack([effective(one[None, None], blocks) for one in whole], axis=-1)
+    return np.stack([spread_by_gaps(one[None, None], blocks) for one in whole], axis=-1)
 
 
 def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:

@@ -13,10 +13,15 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns
 from gyrostab.diagnose.baseline.wandering import Wandering, told_in_full, wandering
-from gyrostab.diagnose.evidence.spectral_lines import LEAK, expected_lines
-from gyrostab.diagnose.predict.candidates import windows_of
-from gyrostab.diagnose.predict.filter_response import inside_bands, response_of
-from gyrostab.diagnose.predict.linear_model import cross_without, effective, in_place, pair_rows
+from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES, expected_lines
+from gyrostab.diagnose.predict.candidates import make_windows
+from gyrostab.diagnose.predict.filter_response import band_response, frequencies_in_bands
+from gyrostab.diagnose.predict.linear_model import (
+    cross_without,
+    pair_rows,
+    spread_by_gaps,
+    unspread_share,
+)
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.logger import LoggerFilter
@@ -119,7 +124,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     }
     return KnownEffects(
         mean=_means(shown, blocks),
-        spectrum=effective((noise + added) * response, blocks),
+        spectrum=spread_by_gaps((noise + added) * response, blocks),
         cross=_cross(powers, response, blocks),
         lines=_known_lines(blocks, narrow, response[:, 0])
         if narrow and "line_power" in blocks
@@ -237,7 +242,7 @@ def _response(acting: Sequence[_Acting], blocks: xr.Dataset) -> Array:
     response = np.ones((blocks.sizes["axis"], 1, blocks.sizes["band"]))
     for one in acting:
         if one.seen.response is not None:
-            response[one.rows] *= response_of(one.effect, blocks)
+            response[one.rows] *= band_response(one.effect, blocks)
     return response
 
 
@@ -256,7 +261,7 @@ def _cross(
             shared[number] += both * np.sqrt(power.density[one] * power.density[other])
     for number, (one, other) in enumerate(pairs):
         shared[number] *= np.sqrt(response[one] * response[other])
-    return effective(shared, blocks, "pair") if shared.any() else None
+    return spread_by_gaps(shared, blocks, "pair") if shared.any() else None
 
 
 def _wander_squares(one: _Acting, blocks: xr.Dataset) -> dict[str, Array]:
@@ -310,7 +315,7 @@ def _known_lines(
     frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
     passed = np.stack([np.interp(np.log(frequency), np.log(bands), one) for one in response])
     steady, most, broad = (np.zeros(passed.shape) for _ in range(3))
-    near, own = in_place(blocks)[..., None], np.zeros((len(axes), bands.size))
+    near, own = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
     leak = _leak(int(blocks.attrs["block_samples"]))
     for effect, rows, density in narrow:
         chosen = tuple(axes[row] for row in rows)
@@ -427,8 +432,8 @@ def remove_known_lines(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         scatter = np.sqrt((noise**2 + 2.0 * noise * most) / weight.values[..., None])
     above = power.values - noise - known
     stands = power.values - noise - most > _SIZE_ERROR * most + _CHANCE * scatter
-    beside = np.pad(stands, ((0, 0), (0, 0), (LEAK, LEAK)))
-    stands = np.lib.stride_tricks.sliding_window_view(beside, 2 * LEAK + 1, axis=-1).any(
+    beside = np.pad(stands, ((0, 0), (0, 0), (LEAK_LINES, LEAK_LINES)))
+    stands = np.lib.stride_tricks.sliding_window_view(beside, 2 * LEAK_LINES + 1, axis=-1).any(
         axis=-1
     )  # with what it leaks into
     freed = noise + np.where(stands | (most < _SLIGHT * noise), above, 0.0)
@@ -466,9 +471,9 @@ def _explained(
             raise driver_error(effect, role, present)
     return effect.explain(
         replace(
-            windows_of(blocks, drivers),
+            make_windows(blocks, drivers),
             axes=axes,
-            frequency=inside_bands(blocks) if frequency is None else frequency,
+            frequency=frequencies_in_bands(blocks) if frequency is None else frequency,
         )
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from gyrostab.diagnose.evidence.products import mean_products, take_out
+from gyrostab.diagnose.evidence.products import marginalise, mean_products
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import HOUR
 
@@ -334,7 +334,7 @@ def noise_posterior(
     products = mean_products(
         values, columns, variance=variance, step=step, K=K, B=B, present=present
     )
-    products = take_out(
+    products = marginalise(
         products,
         columns.shape[1],
         _WIDE * np.eye(columns.shape[1]) / np.maximum(variance[present].min(initial=1.0), 1e-300),

@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.posterior import fit_squares, summed
-from gyrostab.diagnose.reduce.zero_bin import cut_off
+from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.noise import HOUR, URAD_PER_S
 
 __all__ = ["angle_share", "rounded_rates"]
@@ -54,7 +54,7 @@ def rounded_rates(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]
     step = blocks["lattice"].values
     if not (step > 0.0).any():
         return np.zeros(step.shape, np.bool_)
-    return np.asarray(cut_off(blocks) | _by_spectrum(blocks, baseline, step))
+    return np.asarray(truncated_axes(blocks) | _by_spectrum(blocks, baseline, step))
 
 
 def _by_spectrum(

@@ -14,7 +14,7 @@ from gyrostab.diagnose.evidence.spectral_lines import (
     line_skirt,
     local_level,
 )
-from gyrostab.diagnose.predict.linear_model import band_widths, in_place, pair_rows
+from gyrostab.diagnose.predict.linear_model import band_widths, pair_rows, unspread_share
 
 __all__ = ["Shown", "odd_band", "shown_by", "with_shown"]
 
@@ -220,7 +220,7 @@ def with_shown(baseline: xr.Dataset, shown: Shown, blocks: xr.Dataset) -> xr.Dat
         attrs = {"long_name": "power of lines", "units": _POWER}
         out["line_spectrum"] = (
             ("axis", "band"),
-            own * in_place(blocks).mean(axis=1)[:, None],
+            own * unspread_share(blocks).mean(axis=1)[:, None],
             attrs,
         )
         for name, values in (

@@ -10,12 +10,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.predict.condition import FLOOR, Component, condition_on, power_shares
+from gyrostab.diagnose.predict.condition import (
+    MIN_POWER_RATIO,
+    Component,
+    condition_on,
+    power_shares,
+)
 from gyrostab.diagnose.predict.linear_model import (
     State,
-    begin_state,
     cross_column,
-    known_cross,
+    expected_cross,
+    initial_state,
     pair_rows,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
@@ -58,7 +63,7 @@ def predicted(
     for name in ("mean", "power", "cross"):
         if name in seen:
             seen[name] = seen[name].where(xr.DataArray(keep, dims="block"))
-    state = begin_state(seen, baseline)
+    state = initial_state(seen, baseline)
     mine: dict[
         tuple[str, str], list[bool]
     ] = {}  # of each given column: it is of an effect that is left out
@@ -100,7 +105,7 @@ def predicted(
     ]
     if not shared:
         return after
-    expected = known_cross(baseline)
+    expected = expected_cross(baseline)
     cross = _shared(shared, state, identifications)
     return after.assign(
         cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
@@ -112,7 +117,7 @@ def _less(
 ) -> NDArray[np.float64]:
     """Expected powers without some of the columns given to them."""
     weight = state.weight.copy()
-    least = FLOOR * baseline["spectrum"].transpose("axis", "block", "band").values
+    least = MIN_POWER_RATIO * baseline["spectrum"].transpose("axis", "block", "band").values
     for row, axis in enumerate(state.axes):
         chosen = np.array(mine.get(("power", axis), []), np.bool_)
         if chosen.any():

@@ -13,7 +13,7 @@ from gyrostab.diagnose.estimate.conditioned_baseline import predicted
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.predict.condition import condition_on
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 
 __all__ = ["expected_baseline", "fit_expected", "without_expected"]
 
@@ -62,7 +62,7 @@ def without_expected(
     """
     if not expected:
         return blocks
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     for identification in expected:
         state = condition_on(state, list(identification.components))
     moved = xr.DataArray(state.masked, dims=("axis", "block"))

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gyrostab.diagnose.predict.candidates import Variant, variants_of
+from gyrostab.diagnose.predict.candidates import Variant, rebuild_variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
@@ -229,7 +229,7 @@ def _made(
     """A point of another value on the same line; None where the effect cannot have it."""
     wanted = replace(like.point.variant, values={**like.point.variant.values, name: value})
     try:
-        variant = variants_of(
+        variant = rebuild_variant(
             component.candidate, wanted, state.blocks, state.baseline["coefficient"]
         )
     except OptionError:

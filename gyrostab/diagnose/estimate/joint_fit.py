@@ -18,11 +18,11 @@ from gyrostab.diagnose.identify.equivalents import prefer_plainer
 from gyrostab.diagnose.identify.forward_search import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.logger_filters import filter_sizes
 from gyrostab.diagnose.identify.sample_sizes import line_size, sample_count_sizes
-from gyrostab.diagnose.predict.condition import Component, condition_on, mirrored
+from gyrostab.diagnose.predict.condition import Component, condition_on, is_reversed
 from gyrostab.diagnose.predict.filter_response import is_filter
-from gyrostab.diagnose.predict.linear_model import State, begin_state, harmonic_sets
+from gyrostab.diagnose.predict.linear_model import State, harmonic_sets, initial_state
 from gyrostab.diagnose.predict.sizes import component_mixture
-from gyrostab.diagnose.reduce.zero_bin import cut_off
+from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.errors import GyrostabError
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
@@ -106,7 +106,7 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
         An entry for each axis of an effect with one number for all of its axes; one entry for all
         axes where each has its own number.
     """
-    start = begin_state(identifications.state.blocks, baseline)
+    start = initial_state(identifications.state.blocks, baseline)
     found: list[Fitted] = []
     for identification in identifications.identified:
         state = start
@@ -315,12 +315,12 @@ def _words(identification: Identification, component: Component, state: State) -
         return {"fill": "zero" if component.variant.columns[0] == "filled" else "repeat"}
     if (
         identification.effect == "rate_quantization"
-        and cut_off(state.blocks)[state.axes.index(component.row[0])]
+        and truncated_axes(state.blocks)[state.axes.index(component.row[0])]
     ):
         return {"mode": "zero"}
     if identification.effect == "spikes":
         return {"kind": "outlier"}
-    if identification.effect == "earth_rate" and mirrored(component):
+    if identification.effect == "earth_rate" and is_reversed(component):
         off, around = np.degrees(EarthRate.example().directions(identification.axes))
         return {"off": list(off), "around": list(-around)}
     return {}
@@ -363,7 +363,7 @@ def _estimate(
     return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # sizes
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.estimate.joint_fit import Fitted
-from gyrostab.diagnose.predict.candidates import windows_of
+from gyrostab.diagnose.predict.candidates import make_windows
 from gyrostab.noise import sampled_psd
 
 __all__ = ["add_outlier_power"]
@@ -40,7 +40,7 @@ def add_outlier_power(
         ):
             continue
         rows = [axes.index(axis) for axis in one.axes]
-        seen = one.effect.explain(replace(windows_of(blocks, {}), axes=tuple(one.axes)))
+        seen = one.effect.explain(replace(make_windows(blocks, {}), axes=tuple(one.axes)))
         if _IN_ALL in seen.marks:
             continue
         for name, density in seen.spectrum.items():

@@ -25,19 +25,19 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, Fitted, fit_identifications
 from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.predict.candidates import variants_of, windows_of
+from gyrostab.diagnose.predict.candidates import make_windows, rebuild_variant
 from gyrostab.diagnose.predict.condition import (
     Component,
     condition_on,
     condition_on_component,
     find_anomalous_blocks,
 )
-from gyrostab.diagnose.predict.filter_response import is_filter, response_of
+from gyrostab.diagnose.predict.filter_response import band_response, is_filter
 from gyrostab.diagnose.predict.linear_model import (
     State,
-    begin_state,
-    effective,
+    initial_state,
     reference_channel_power,
+    spread_by_gaps,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.base import Effect
@@ -107,7 +107,7 @@ def recalibrate(
         return baseline
     blocks = identifications.state.blocks
     use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     for identification in identifications.identified:
         state = condition_on(state, list(identification.components))
     found: list[Posterior] = []
@@ -233,7 +233,7 @@ def _seen(
         if effect is not None and any(
             is_filter(component.candidate.statistic, component.variant) for component in components
         ):
-            out.response = out.response * response_of(effect, blocks)
+            out.response = out.response * band_response(effect, blocks)
     return out if touched else None
 
 
@@ -253,7 +253,7 @@ def _add(
     axis: str,
 ) -> None:
     statistic = component.candidate.statistic
-    state = begin_state(identifications.state.blocks, baseline)
+    state = initial_state(identifications.state.blocks, baseline)
     if is_filter(statistic, component.variant):
         return
     if statistic == "transfer":
@@ -298,7 +298,7 @@ def _comb(component: Component, state: State) -> Array:
 
 def _said(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
     """Power that an effect says it has on an axis, (block, band)."""
-    windows = replace(windows_of(blocks, find_drivers(effect)), axes=(axis,))
+    windows = replace(make_windows(blocks, find_drivers(effect)), axes=(axis,))
     out = np.zeros((blocks.sizes["block"], blocks.sizes["band"]))
     many = {item.name: item.many for item in effect.parameters()}
     for name, density in effect.explain(windows).spectrum.items():
@@ -307,7 +307,7 @@ def _said(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
             size = size[effect.axes.index(axis)] if len(size) > 1 else size[0]
         rows = np.asarray(density)
         out = out + float(size) ** 2 * (rows[0] if rows.ndim == 3 else rows)
-    return np.asarray(effective(out[None], blocks.sel(axis=[axis]))[0])
+    return np.asarray(spread_by_gaps(out[None], blocks.sel(axis=[axis]))[0])
 
 
 def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -> Posterior | None:
@@ -433,7 +433,7 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
         one = component.candidate
         if one.statistic == "power" and id(one) not in swapped:
             made = [
-                variants_of(one, variant, blocks, baseline["coefficient"]) or variant
+                rebuild_variant(one, variant, blocks, baseline["coefficient"]) or variant
                 for variant in one.variants
             ]
             swapped[id(one)] = (one, replace(one, variants=tuple(made)))

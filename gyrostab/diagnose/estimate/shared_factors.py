@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Variant, variants_of
+from gyrostab.diagnose.predict.candidates import Variant, rebuild_variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State, cross_column, pair_rows
 from gyrostab.diagnose.predict.sizes import component_mixture
@@ -148,7 +148,7 @@ def _of_width(
     if "bandwidth" in variant.values:
         other = replace(variant, values={**variant.values, "bandwidth": width})
         variant = (
-            variants_of(component.candidate, other, state.blocks, state.baseline["coefficient"])
+            rebuild_variant(component.candidate, other, state.blocks, state.baseline["coefficient"])
             or variant
         )
     moments = [

@@ -1,1 +1,1 @@
-"""What a design explains on time that was held out, for many records at once."""
+"""Held-out evidence of designs, for many records at once."""

@@ -1,6 +1,6 @@
-"""Stretches of time that are held out: four interleaved folds, at three lengths.
+"""Held-out intervals: four interleaved folds, at three lengths.
 
-Short folds show events, long ones slow drifts, which a random walk would bridge over a short hole.
+Short folds show events; long ones show slow drifts, which a random walk bridges in a short gap.
 """
 
 from __future__ import annotations
@@ -13,51 +13,51 @@ from gyrostab.errors import SchemaError
 
 __all__ = ["FOLDS", "LENGTHS", "fold_blocks", "fold_subsets"]
 
-#: Folds of each length; the stretches of the record belong to them in turn.
+#: Folds of each length; consecutive intervals belong to them in turn.
 FOLDS = 4
-#: Length of a stretch [s], and the largest part of the record that it may be.
+#: Length of an interval [s], and its largest share of the record. Design choice.
 LENGTHS = ((100.0, 1.0 / 36.0), (350.0, 1.0 / 10.0), (900.0, 1.0 / 4.0))
 
 
 def fold_blocks(blocks: xr.Dataset) -> xr.DataArray:
-    """Fold of every block at every length.
+    """Assign every block to a fold, at every length.
 
     Parameters
     ----------
     blocks : xarray.Dataset
-        From `reduce_log`; its dimension `block`, coordinates or variables `begin` and `end` [s] are
-        used.
+        From `reduce_log`, with dimension `block` and `begin` and `end` [s].
 
     Returns
     -------
     xarray.DataArray
-        ``fold(length, block)``, 0 to 3; coordinate ``length`` is that of a stretch [s], a whole
-        number of blocks.
+        ``fold(length, block)``, 0 to 3; coordinate ``length`` of an interval [s], a whole number of
+        blocks.
 
     Raises
     ------
     SchemaError
-        When there are fewer blocks than folds.
+        If there are fewer blocks than folds.
 
     Examples
     --------
     >>> edges = np.arange(181) * 20.0
     >>> blocks = xr.Dataset({"begin": ("block", edges[:-1]), "end": ("block", edges[1:])})
     >>> folds = fold_blocks(blocks)
-    >>> folds.length.values, folds[0, :22].values
-    (array([100., 360., 900.]), array([0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 0, 0]))
+    >>> folds.length.values, folds[0, ::5][:6].values
+    (array([100., 360., 900.]), array([0, 1, 2, 3, 0, 1]))
     """
     begin, end = blocks["begin"].values, blocks["end"].values
     n = begin.size
     if n < FOLDS:
         raise SchemaError(
-            f"the record has {n} blocks, fewer than the {FOLDS} parts of which each is held out in turn; give a longer record"
+            f"the record has {n} blocks, fewer than the {FOLDS} parts of which each is held out "
+            "in turn; give a longer record"
         )
     step = float(end[0] - begin[0])
     span = n * step
     block_count = [max(1, round(min(seconds, share * span) / step)) for seconds, share in LENGTHS]
     fold = np.stack([np.arange(n) // count % FOLDS for count in block_count])
-    attributes = {"units": "s", "long_name": "length of a stretch that is held out"}
+    attributes = {"units": "s", "long_name": "length of a held-out interval"}
     return xr.DataArray(
         fold,
         dims=("length", "block"),
@@ -68,13 +68,13 @@ def fold_blocks(blocks: xr.Dataset) -> xr.DataArray:
 
 
 def fold_subsets(fold: xr.DataArray) -> NDArray[np.bool_]:
-    """Blocks that are used: all of them, then all but one fold, fold after fold and length after length.
+    """Return the blocks used: all, then all but each fold, fold by fold and length by length.
 
     Returns
     -------
     ndarray of bool, shape (1 + lengths * FOLDS, block)
     """
     values = fold.transpose("length", "block").values
-    components = [values != number for number in range(FOLDS)]
-    held = np.stack(components, axis=1).reshape(-1, values.shape[1])
+    subsets = [values != number for number in range(FOLDS)]
+    held = np.stack(subsets, axis=1).reshape(-1, values.shape[1])
     return np.concatenate([np.ones((1, values.shape[1]), np.bool_), held])

@@ -1,16 +1,16 @@
-"""What a design explains on time that was held out, for many records and many designs in the same few products.
+"""Held-out evidence of designs, for many records and many designs from the same few products.
 
 The data are block means, ``y ~ Normal(X beta, V)`` with V from
 `gyrostab.kernels.regression.state_space`, and band powers, ``P / S - 1 ~ Normal(X beta, 1 /
 shape)`` in every cell. Factors beta have a normal prior whose width is one of `WIDTHS` times the
-error that beta would have in white noise alone; widths, and random walk K and flicker B on a grid,
-are averaged over. So all there is to know of a design are products of whitened columns. They are
-linear in the number of blocks, and records with the same gaps share them.
+error of beta in white noise. Widths, and random walk K and flicker B on a grid, are averaged over.
+A design therefore enters only by products of whitened columns. They take time linear in the number
+of blocks, and records with the same gaps share them.
 
 A *design* is an array of columns, a *candidate* a list of designs, one for every value of its
-nuisance parameters, of equal weight. The *factor* of a design is the logarithm of its Bayes factor
-against the model without it, and the held-out gain of a candidate is the sum over the folds of what
-its factor loses when the fold is taken out.
+nuisance parameters, of equal weight. The *factor* of a design is its log Bayes factor against the
+model without it, and the held-out evidence of a candidate is the sum over the folds of the loss of
+its factor when the fold is held out.
 """
 
 from __future__ import annotations
@@ -27,61 +27,63 @@ from gyrostab.diagnose.evidence.products import (
     WIDTHS,
     Array,
     Products,
-    evidence,
-    limits_of,
+    column_pairs,
+    factor_errors,
+    held_out_evidence,
+    log_evidence,
+    marginalise,
     mean_products,
-    pairs_of,
     power_products,
-    score,
-    share_out,
-    take_out,
+    remove_common_part,
 )
-from gyrostab.diagnose.evidence.wandering import known_wander
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.errors import OptionError
 
 __all__ = [
     "LinearModel",
     "Tier",
-    "independent",
+    "held_out_evidence",
     "linear_model_factors",
     "mean_evidence",
     "mean_factors",
     "noise_columns",
     "power_evidence",
     "power_factors",
-    "score",
+    "with_independent_cells",
 ]
 
-#: "free": any noise may be there (to name an effect); "calibrated": the noise is the calibrated one
-#: (to detect that something is there).
+#: "free": the noise may differ from the calibrated one (to name an effect); "calibrated": it is the
+#: calibrated one (to detect an effect).
 Tier = Literal["free", "calibrated"]
 
 
-def _columns(
+def _stack_designs(
     designs: Sequence[Array], shape: tuple[int, ...]
 ) -> tuple[Array, list[NDArray[np.int64]]]:
-    """All designs beside each other as (cell, column), and the numbers of the columns of each."""
-    components, numbers, first = [], [], 0
+    """Concatenate designs as (cell, column); return them with the column indices of each."""
+    products, numbers, first = [], [], 0
     for design in designs:
         array = np.asarray(design, dtype=np.float64)
         if array.shape[: len(shape)] != shape or array.ndim > len(shape) + 1:
             raise OptionError(
-                f"a design has the shape {array.shape}; it must be {shape}, or that with the number of its columns behind"
+                f"a design has the shape {array.shape}; it must be {shape}, "
+                "or that with the number of its columns behind"
             )
         flat = array.reshape(int(np.prod(shape)), -1)
-        components.append(np.where(np.isfinite(flat), flat, 0.0))
+        products.append(np.where(np.isfinite(flat), flat, 0.0))
         numbers.append(np.arange(first, first + flat.shape[1]))
         first += flat.shape[1]
-    return np.concatenate([*components, np.empty((int(np.prod(shape)), 0))], axis=1), numbers
+    return np.concatenate([*products, np.empty((int(np.prod(shape)), 0))], axis=1), numbers
 
 
-def _records(values: xr.DataArray, *dims: str) -> Array:
-    """Values with `dims` first and the records last, one record when there is no such dimension."""
+def _values_by_record(values: xr.DataArray, *dims: str) -> Array:
+    """Return values with `dims` first and records last; one record if there is no such dim."""
     array = values if "record" in values.dims else values.expand_dims("record")
     return np.asarray(array.transpose(*dims, "record").values, dtype=np.float64)
 
 
 def _log_weight(baseline: xr.Dataset, axis: str, tier: Tier) -> Array:
+    """Return the log weights of the noise grid."""
     if tier not in ("free", "calibrated"):
         raise OptionError(f"tier={tier!r}: there are 'free' and 'calibrated'")
     name = "grid_prior" if tier == "free" else "grid_calibrated"
@@ -98,58 +100,61 @@ def mean_factors(
     given: Array | None = None,
     folds: xr.DataArray | None = None,
 ) -> Array:
-    """Factors of designs in the block means.
+    """Compute factors of designs in the block means.
 
     Parameters
     ----------
     data : xarray.Dataset
-        Reduced data, one record or many with the same gaps: ``mean`` ((record,) axis block) [degree
-        hour-1].
+        Block statistics, one record or many with the same gaps: ``mean`` ((record,) axis block)
+        [degree hour-1].
     baseline : xarray.Dataset
         ``known_mean``, ``mean_variance``, ``grid_K``, ``grid_B``, ``grid_prior``,
         ``grid_calibrated``.
     designs : sequence of ndarray, shape (block,) or (block, column)
         Columns in any unit.
     axis : str
-        Axis looked at.
+        Axis of the data.
     tier : {"free", "calibrated"}
-        What the noise may be.
+        Freedom of the noise.
     given : ndarray, shape (block, column), optional
-        Columns that are in the model with and without the design (effects already named).
+        Columns in the model with and without the design (effects already named).
     folds : xarray.DataArray, optional
         From `fold_blocks`.
 
     Returns
     -------
     ndarray, shape (subset, 1 + design, record)
-        Logarithms of Bayes factors on the subsets of `fold_subsets` [nats]; the first of the
-        designs is the log evidence without any.
+        Log Bayes factors on the subsets of `fold_subsets` [nats]; the first column is the log
+        evidence without any design.
     """
     n = data.sizes["block"]
-    values = _records((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
-    columns, numbers = _columns(designs, (n,))
-    beside = (
+    values = _values_by_record((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
+    columns, numbers = _stack_designs(designs, (n,))
+    columns_given = (
         np.empty((n, 0)) if given is None else np.asarray(given, dtype=np.float64).reshape(n, -1)
     )
-    own = columns.shape[1]
-    columns = np.concatenate([columns, beside], axis=1)
+    design_width = columns.shape[1]
+    columns = np.concatenate([columns, columns_given], axis=1)
     present = np.asarray(np.isfinite(values).all(axis=1))
-    frame: dict[str, Any] = {
+    setup: dict[str, Any] = {
         "variance": np.asarray(baseline["mean_variance"].sel(axis=axis).values, dtype=np.float64),
         "step": float(data["end"][0] - data["begin"][0]),
-        "pairs": pairs_of(columns.shape[1], numbers, beside.shape[1]),
-        "wander": known_wander(baseline, axis),
+        "pairs": column_pairs(columns.shape[1], numbers, columns_given.shape[1]),
+        "wander": expected_processes(baseline, axis),
     }
     white = mean_products(
-        values[:, :0], columns, **frame, K=np.zeros(1), B=np.zeros(1), present=present
+        values[:, :0], columns, **setup, K=np.zeros(1), B=np.zeros(1), present=present
     )
-    before = (np.where(present[:, None], columns, 0.0) ** 2 / frame["variance"][:, None])[
+    before = (np.where(present[:, None], columns, 0.0) ** 2 / setup["variance"][:, None])[
         present
     ].sum(axis=0)
-    wide = limits_of(before, np.diagonal(white.gram[0]))[own:]
-    precision = np.diag(1.0 / np.square(np.where(wide > 0.0, wide, 1.0) * WIDTHS[-1]))
-    limits = limits_of(
-        before[:own], np.diagonal(take_out(white, beside.shape[1], precision).gram[0])
+    widest_limits = factor_errors(before, np.diagonal(white.gram[0]))[design_width:]
+    precision = np.diag(
+        1.0 / np.square(np.where(widest_limits > 0.0, widest_limits, 1.0) * WIDTHS[-1])
+    )
+    limits = factor_errors(
+        before[:design_width],
+        np.diagonal(marginalise(white, columns_given.shape[1], precision).gram[0]),
     )
     grid: dict[str, Any] = {
         "K": baseline["grid_K"].sel(axis=axis).values,
@@ -159,29 +164,28 @@ def mean_factors(
     subsets = fold_subsets(fold_blocks(data) if folds is None else folds)
     out = np.empty((len(subsets), 1 + len(designs), values.shape[1]))
     for number, subset in enumerate(subsets):
-        products = mean_products(values, columns, **frame, **grid, present=present & subset)
-        out[number] = evidence(
-            take_out(products, beside.shape[1], precision), numbers, limits, log_weight
+        products = mean_products(values, columns, **setup, **grid, present=present & subset)
+        out[number] = log_evidence(
+            marginalise(products, columns_given.shape[1], precision), numbers, limits, log_weight
         )
     out[:, 1:] -= out[:, :1]
     return out
 
 
 def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tuple[Array, Array]:
-    """Relative change of the spectrum by constant changes of the noise coefficients, and the precision of its prior.
+    """Return the relative change of the spectrum per noise coefficient, and its prior precision.
 
-    N may take any value in the tier "free"; Q changes by its value and error, B and K by three
+    In the tier "free", N may take any value; Q changes by its value and error, B and K by three
     times that, because the spectrum cannot fall below what the other terms leave. The error of Q is
-    that of its posterior, which ends at zero: a spectrum that falls towards its end, as a filter
-    makes it, is no Q. In the tier "calibrated" all change by their errors.
+    that of its posterior, which ends at zero: Q cannot explain a spectrum that falls towards its
+    end, as after a filter. In the tier "calibrated" all change by their errors.
 
     Returns
     -------
     columns : ndarray, shape (block, band, term)
-        Per unit of the squared coefficient [1 / unit], of the terms that may change: one that is
-        exactly known stays.
+        Per unit of the squared coefficient [1 / unit], for terms with an error.
     precision : ndarray, shape (term, term)
-        Of the change of the squared coefficient.
+        For changes of the squared coefficients.
     """
     spectrum = baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
     columns = (
@@ -204,19 +208,19 @@ def noise_columns(baseline: xr.Dataset, *, axis: str, tier: Tier = "free") -> tu
 
 
 class LinearModel(NamedTuple):
-    """Data that are independent from cell to cell, as a linear model.
+    """A linear model of data that are independent from cell to cell.
 
     Attributes
     ----------
     values : ndarray, shape (block, cell, record)
     weight : ndarray, shape (block, cell)
-        One over the variance; 0 where there are no data.
+        One over the variance; 0 for no data.
     designs : list of ndarray, shape (block, cell, column)
     given : ndarray, shape (block, cell, column)
-        Columns that are in the model with and without a design.
+        Columns in the model with and without a design.
     precision : ndarray, shape (column, column)
-        Of the given columns; negative on the diagonal where it is to be taken from the data (nearly
-        free).
+        For the given columns; negative on the diagonal for a nearly free column, whose precision is
+        taken from the data.
     """
 
     values: Array
@@ -226,25 +230,27 @@ class LinearModel(NamedTuple):
     precision: Array
 
 
-def independent(cells: LinearModel, common: Array, unit: Array | None = None) -> LinearModel:
-    """The same model with independent cells, where those of a block rise and fall together; see `share_out`."""
+def with_independent_cells(
+    model: LinearModel, common: Array, unit: Array | None = None
+) -> LinearModel:
+    """Transform a model whose cells vary together to independent cells; `remove_common_part`."""
     weight = np.where(
-        np.isfinite(cells.weight) & np.isfinite(cells.values).all(axis=2), cells.weight, 0.0
+        np.isfinite(model.weight) & np.isfinite(model.values).all(axis=2), model.weight, 0.0
     )
     seen = weight[..., None] > 0.0
     values, given, *designs = (
-        share_out(np.where(seen & np.isfinite(one), one, 0.0), weight, common, unit)
-        for one in (cells.values, cells.given, *cells.designs)
+        remove_common_part(np.where(seen & np.isfinite(array), array, 0.0), weight, common, unit)
+        for array in (model.values, model.given, *model.designs)
     )
-    return LinearModel(values, weight, designs, given, cells.precision)
+    return LinearModel(values, weight, designs, given, model.precision)
 
 
-def linear_model_factors(cells: LinearModel, folds: xr.DataArray) -> Array:
-    """Factors of designs in independent cells.
+def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
+    """Compute factors of designs in independent cells.
 
     Parameters
     ----------
-    cells : Cells
+    model : LinearModel
     folds : xarray.DataArray
         From `fold_blocks`.
 
@@ -253,77 +259,84 @@ def linear_model_factors(cells: LinearModel, folds: xr.DataArray) -> Array:
     ndarray, shape (subset, 1 + design, record)
         As in `mean_factors`.
     """
-    _, width, records = cells.values.shape
+    _, width, records = model.values.shape
     weight = np.where(
-        np.isfinite(cells.weight) & np.isfinite(cells.values).all(axis=2), cells.weight, 0.0
+        np.isfinite(model.weight) & np.isfinite(model.values).all(axis=2), model.weight, 0.0
     )
-    values = np.where(weight[..., None] > 0.0, cells.values, 0.0)
-    count = cells.given.shape[2]
-    flat = [np.where(np.isfinite(one), one, 0.0) for one in (*cells.designs, cells.given)]
+    values = np.where(weight[..., None] > 0.0, model.values, 0.0)
+    count = model.given.shape[2]
+    flat = [np.where(np.isfinite(array), array, 0.0) for array in (*model.designs, model.given)]
     columns = np.concatenate(flat, axis=2)
-    ends = np.cumsum([one.shape[2] for one in cells.designs])
+    ends = np.cumsum([array.shape[2] for array in model.designs])
     numbers = [
-        np.arange(end - one.shape[2], end) for one, end in zip(cells.designs, ends, strict=True)
+        np.arange(end - array.shape[2], end) for array, end in zip(model.designs, ends, strict=True)
     ]
     classes, member = np.unique(
         folds.transpose("block", "length").values, axis=0, return_inverse=True
     )
-    components = []
+    products = []
     for number in range(len(classes)):
         chosen = member.ravel() == number
         size = int(chosen.sum()) * width
-        components.append(
+        products.append(
             power_products(
                 values[chosen].reshape(size, records),
                 weight[chosen].ravel(),
                 columns[chosen].reshape(size, -1),
             )
         )
-    total = _summed(components)
-    own = columns.shape[2] - count
+    total = _sum_products(products)
+    design_width = columns.shape[2] - count
     before = np.asarray(np.diagonal(total.gram[0]))
-    precision = _nearly_free(cells.precision, before[own:])
-    limits = limits_of(
-        before[:own], np.asarray(np.diagonal(take_out(total, count, precision).gram[0]))
+    precision = _fill_free_precision(model.precision, before[design_width:])
+    limits = factor_errors(
+        before[:design_width], np.asarray(np.diagonal(marginalise(total, count, precision).gram[0]))
     )
-    found = [total]
+    subset_products = [total]
     for length in range(classes.shape[1]):
         for number in range(FOLDS):
-            held = _summed(
+            held = _sum_products(
                 [
-                    component
-                    for component, label in zip(components, classes[:, length], strict=True)
+                    part
+                    for part, label in zip(products, classes[:, length], strict=True)
                     if label == number
                 ],
                 total,
             )
-            found.append(
-                Products(*[a - b for a, b in zip(_fields(total), _fields(held), strict=True)])
+            subset_products.append(
+                Products(
+                    *[
+                        a - b
+                        for a, b in zip(_product_arrays(total), _product_arrays(held), strict=True)
+                    ]
+                )
             )
     out = np.stack(
         [
-            evidence(take_out(component, count, precision), numbers, limits, np.zeros(1))
-            for component in found
+            log_evidence(marginalise(part, count, precision), numbers, limits, np.zeros(1))
+            for part in subset_products
         ]
     )
     out[:, 1:] -= out[:, :1]
     return out
 
 
-def _fields(products: Products) -> tuple[Array, ...]:
+def _product_arrays(products: Products) -> tuple[Array, ...]:
+    """Return the arrays of the products."""
     return products.square, products.cross, products.gram, products.log_determinant
 
 
-def _summed(components: Sequence[Products], like: Products | None = None) -> Products:
-    if not components and like is not None:
-        return Products(*[np.zeros_like(one) for one in _fields(like)])
+def _sum_products(products: Sequence[Products], like: Products | None = None) -> Products:
+    """Add products; zeros like `like` if there are none."""
+    if not products and like is not None:
+        return Products(*[np.zeros_like(array) for array in _product_arrays(like)])
     return Products(
-        *[np.sum(several, axis=0) for several in zip(*map(_fields, components), strict=True)]
+        *[np.sum(several, axis=0) for several in zip(*map(_product_arrays, products), strict=True)]
     )
 
 
-def _nearly_free(precision: Array, square: Array) -> Array:
-    """Precisions of given columns, those that are negative from the widest prior of a design."""
+def _fill_free_precision(precision: Array, square: Array) -> Array:
+    """Return precisions of given columns, negative ones replaced by the widest prior."""
     known = np.diagonal(precision)
     free = np.where(square > 0.0, square, 1.0) / WIDTHS[-1] ** 2
     return np.diag(np.where(known < 0.0, free, known))
@@ -339,16 +352,16 @@ def power_factors(
     given: Array | None = None,
     folds: xr.DataArray | None = None,
 ) -> Array:
-    """Factors of designs in the band powers, for changes that are small against the spectrum.
+    """Compute factors of designs in the band powers, for changes small against the spectrum.
 
     Parameters
     ----------
     data : xarray.Dataset
-        Reduced data, one record or many with the same gaps: ``power`` ((record,) axis block band).
+        Block statistics, one record or many with equal gaps: ``power`` ((record,) axis block band).
     baseline : xarray.Dataset
-        ``spectrum``, ``shape_alone``, ``common``, and what `noise_columns` reads.
+        ``spectrum``, ``shape_alone``, ``common``, and the variables of `noise_columns`.
     designs : sequence of ndarray, shape (block, band) or (block, band, column)
-        Change of the spectrum as a share of it, for a unit of the factor.
+        Relative change of the spectrum per unit of the factor.
     axis, tier, given, folds
         As in `mean_factors`; `given` has the shape (block, band, column), and the level of the
         noise is always given.
@@ -359,34 +372,43 @@ def power_factors(
         As in `mean_factors`.
     """
     shape = (data.sizes["block"], data.sizes["band"])
-    values = _records((data["power"] / baseline["spectrum"] - 1.0).sel(axis=axis), "block", "band")
+    values = _values_by_record(
+        (data["power"] / baseline["spectrum"] - 1.0).sel(axis=axis), "block", "band"
+    )
     weight = np.asarray(
         baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64
     )
     level, precision = noise_columns(baseline, axis=axis, tier=tier)
-    beside = (
+    columns_given = (
         np.empty((*shape, 0))
         if given is None
         else np.asarray(given, dtype=np.float64).reshape(*shape, -1)
     )
-    wide = np.diag([*np.diagonal(precision), *[-1.0] * beside.shape[2]])
-    columns, numbers = _columns(designs, shape)
-    each = [columns[:, chosen].reshape(*shape, -1) for chosen in numbers]
-    cells = LinearModel(values, weight, each, np.concatenate([level, beside], axis=2), wide)
+    widest_limits = np.diag([*np.diagonal(precision), *[-1.0] * columns_given.shape[2]])
+    columns, numbers = _stack_designs(designs, shape)
+    design_columns = [columns[:, chosen].reshape(*shape, -1) for chosen in numbers]
+    model = LinearModel(
+        values,
+        weight,
+        design_columns,
+        np.concatenate([level, columns_given], axis=2),
+        widest_limits,
+    )
     return linear_model_factors(
-        independent(cells, baseline["common"].sel(axis=axis).values),
+        with_independent_cells(model, baseline["common"].sel(axis=axis).values),
         fold_blocks(data) if folds is None else folds,
     )
 
 
-def _gains(factors: Array, candidates: Mapping[str, Sequence[Array]]) -> xr.DataArray:
+def _label_evidence(factors: Array, candidates: Mapping[str, Sequence[Array]]) -> xr.DataArray:
+    """Label the held-out evidence of candidates."""
     owner = np.repeat(np.arange(len(candidates)), [len(designs) for designs in candidates.values()])
     return xr.DataArray(
-        score(factors[:, 1:], owner),
+        held_out_evidence(factors[:, 1:], owner),
         dims=("candidate", "record"),
         coords={"candidate": list(candidates)},
         name="gain",
-        attrs={"units": "1", "long_name": "log likelihood gained on held-out time [nats]"},
+        attrs={"units": "1", "long_name": "held-out evidence [nats]"},
     )
 
 
@@ -399,14 +421,14 @@ def mean_evidence(
     tier: Tier = "free",
     **more: Any,
 ) -> xr.DataArray:
-    """Held-out gains of candidates in the block means.
+    """Compute the held-out evidence of candidates in the block means.
 
     Parameters
     ----------
     data, baseline, axis, tier
-        As in `mean_factors`, and `more` are its further options.
+        As in `mean_factors`, with `more` for its further options.
     candidates : mapping of str to sequence of ndarray
-        Name -> designs, one for every value of the nuisance parameters.
+        Designs by name, one for every value of the nuisance parameters.
 
     Returns
     -------
@@ -414,7 +436,9 @@ def mean_evidence(
         ``gain(candidate, record)`` [nats].
     """
     designs = [design for several in candidates.values() for design in several]
-    return _gains(mean_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates)
+    return _label_evidence(
+        mean_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates
+    )
 
 
 def power_evidence(
@@ -426,6 +450,8 @@ def power_evidence(
     tier: Tier = "free",
     **more: Any,
 ) -> xr.DataArray:
-    """Held-out gains of candidates in the band powers; as `mean_evidence`, with the designs of `power_factors`."""
+    """Compute the held-out evidence of candidates in the band powers, as `mean_evidence`."""
     designs = [design for several in candidates.values() for design in several]
-    return _gains(power_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates)
+    return _label_evidence(
+        power_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates
+    )

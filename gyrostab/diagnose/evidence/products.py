@@ -1,4 +1,4 @@
-"""Products of whitened data and designs, and what they say of a design whose size is unknown."""
+"""Products of whitened data and designs, and the evidence of designs of unknown size from them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
-from gyrostab.diagnose.evidence.wandering import Wander
+from gyrostab.diagnose.evidence.wandering import RandomProcesses
 from gyrostab.kernels.regression.evidence import chosen_products, mixed_evidence
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
@@ -18,28 +18,29 @@ __all__ = [
     "WIDTHS",
     "Array",
     "Products",
-    "evidence",
-    "limits_of",
+    "column_pairs",
+    "factor_errors",
+    "held_out_evidence",
+    "log_evidence",
+    "marginalise",
     "mean_products",
-    "pairs_of",
     "power_products",
-    "score",
-    "share_out",
-    "take_out",
+    "remove_common_part",
 ]
 
 Array = NDArray[np.float64]
-#: Standard deviations of the prior of a factor, in errors that it would have in white noise.
+#: Standard deviations of the prior of a factor, in units of its error in white noise. Design
+#: choice: a mixture over three decades needs no prior size.
 WIDTHS = (1.0, 10.0, 100.0, 1000.0)
-#: A design that keeps less than this share of its square beside constants and given columns is not
-#: there.
-_NOTHING = 1e-9
-_AT_ONCE = 10_000  # designs times records times grid points whose evidence is worked out at once
+#: A design that keeps a smaller share of its square, after constants and given columns are
+#: projected out, counts as absent. Above rounding errors.
+_MIN_SQUARE_SHARE = 1e-9
+_MAX_PRODUCTS_AT_ONCE = 10_000  # designs times records times grid points; limits memory
 
 
 @dataclass(frozen=True)
 class Products:
-    """Products of whitened data and columns on some of the blocks; one grid point where there is no grid.
+    """Products of whitened data and columns on some blocks; without a grid, one grid point.
 
     Attributes
     ----------
@@ -59,8 +60,8 @@ class Products:
     log_determinant: Array
 
 
-def take_out(products: Products, given: int, precision: Array) -> Products:
-    """Take the last `given` columns out: they are in every model, with normal priors of this precision (given, given)."""
+def marginalise(products: Products, given: int, precision: Array) -> Products:
+    """Marginalise the last `given` columns, with normal priors of this precision (given, given)."""
     if not given:
         return products
     keep = slice(None, products.gram.shape[1] - given)
@@ -78,13 +79,13 @@ def take_out(products: Products, given: int, precision: Array) -> Products:
     )
 
 
-def limits_of(before: Array, after: Array) -> Array:
-    """Error of the factor of every column in white noise [1 / unit of the column], 0 where there is nothing to see.
+def factor_errors(before: Array, after: Array) -> Array:
+    """Return the error of every factor in white noise [1 / unit of its column], 0 if invisible.
 
-    `before` and `after` are the squares of the columns, and what is left of them beside the
-    constant and the given columns.
+    `before` and `after` are the squares of the columns, without and with the constant and the given
+    columns projected out.
     """
-    seen = after > _NOTHING * np.maximum(before, np.finfo(float).tiny)
+    seen = after > _MIN_SQUARE_SHARE * np.maximum(before, np.finfo(float).tiny)
     return np.where(seen, 1.0 / np.sqrt(np.where(seen, after, 1.0)), 0.0)
 
 
@@ -98,9 +99,9 @@ def mean_products(
     B: Array,
     present: NDArray[np.bool_],
     pairs: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
-    wander: Wander | None = None,
+    wander: RandomProcesses | None = None,
 ) -> Products:
-    """Products of block means and columns, whitened for every pair of K and B.
+    """Compute products of block means and columns, whitened for every pair of K and B.
 
     Parameters
     ----------
@@ -117,14 +118,14 @@ def mean_products(
     present : ndarray of bool, shape (block,)
         Blocks that are used.
     pairs : two ndarrays, optional
-        Columns whose products with each other are asked for, from `pairs_of`; all by default. The
-        other products stay 0.
+        Columns whose products are needed, from `column_pairs`; other products are 0. All by
+        default.
     wander : Wander, optional
-        What is there beside, whatever K and B are.
+        Other random processes in the means.
     """
     n, width = columns.shape
-    both = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
-    both[~present] = 0.0
+    stacked = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
+    stacked[~present] = 0.0
     spread = np.where(present, variance, 1.0)
     share, time, white = flicker_states(step, n * step)
     steps, walk = np.full(n, step), np.zeros(n)
@@ -137,20 +138,25 @@ def mean_products(
         states = (share * b, time) if b > 0.0 else (share[:0], time[:0])
         if wander is not None:
             states = (np.append(states[0], wander.square), np.append(states[1], wander.time))
-        done, determinant[g] = whiten(both, spread + b * white, steps, present, k + walk, *states)
-        x, y = done[:, :width], done[:, width:]
+        whitened, determinant[g] = whiten(
+            stacked, spread + b * white, steps, present, k + walk, *states
+        )
+        x, y = whitened[:, :width], whitened[:, width:]
         cross[g], square[g] = x.T @ y, np.einsum("ij,ij->j", y, y)
         if pairs is None:
             gram[g] = x.T @ x
         else:
-            gram[g][pairs] = gram[g][pairs[::-1]] = chosen_products(done, *pairs)
+            gram[g][pairs] = gram[g][pairs[::-1]] = chosen_products(whitened, *pairs)
     return Products(square, cross, gram, determinant)
 
 
-def pairs_of(
+def column_pairs(
     width: int, designs: Sequence[NDArray[np.int64]], given: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Numbers of columns that meet in a model: each and itself, those of a design, and the last `given` and any other."""
+    """Return the pairs of columns that meet in a model.
+
+    Each column meets itself, the columns of its design, and the last `given` columns.
+    """
     wanted = np.eye(width, dtype=np.bool_)
     wanted[:, width - given :] = True
     for chosen in designs:
@@ -160,15 +166,15 @@ def pairs_of(
 
 
 def power_products(residual: Array, weight: Array, columns: Array) -> Products:
-    """Products of relative band powers and columns, cells weighted by their shape.
+    """Compute products of relative band powers and columns, cells weighted by their shape.
 
     Parameters
     ----------
     residual : ndarray, shape (cell, record)
         ``power / spectrum - 1``.
     weight : ndarray, shape (cell,)
-        Shape of the gamma distribution of the power; 0 where there is none, where `residual` may be
-        anything finite.
+        Shape of the gamma distribution of the power; 0 for no data, where `residual` may be any
+        finite value.
     columns : ndarray, shape (cell, column)
         Relative change of the spectrum for a unit of each factor.
     """
@@ -179,28 +185,30 @@ def power_products(residual: Array, weight: Array, columns: Array) -> Products:
     )
 
 
-def share_out(values: Array, weight: Array, common: Array, unit: Array | None = None) -> Array:
-    """Take from the cells of each block so much of their common part that they are as good as independent.
+def remove_common_part(
+    values: Array, weight: Array, common: Array, unit: Array | None = None
+) -> Array:
+    """Subtract the common part of the cells of each block, so that they become independent.
 
-    Under random gaps the powers of all bands of a block rise and fall together: their covariance is
-    ``1 / weight`` on the diagonal, and ``common`` times the product of the units everywhere.
-    Products of columns that went through here are those of that covariance.
+    Under random gaps the powers of all bands of a block vary together: their covariance is ``1 /
+    weight`` on the diagonal, plus ``common`` times the product of the units everywhere. Products of
+    columns that were transformed here are those of that covariance.
 
     Parameters
     ----------
     values : ndarray, shape (block, cell, column)
         Data or designs.
     weight : ndarray, shape (block, cell)
-        One over the variance that is not common; 0 where there are no data.
+        One over the variance that is not common; 0 for no data.
     common : ndarray, shape (block,)
         Variance of the common part.
     unit : ndarray, shape (block, cell), optional
-        How strong it is in each cell, 1 by default.
+        Size of the common part in each cell, 1 by default.
 
     Examples
     --------
     >>> weight, values = np.array([[4.0, 1.0]]), np.array([[[1.0], [3.0]]])
-    >>> free = share_out(values, weight, np.array([0.5]))
+    >>> free = remove_common_part(values, weight, np.array([0.5]))
     >>> float((weight[..., None] * free**2).sum().round(9))
     6.0
     >>> float((values[0].T @ np.linalg.inv([[0.75, 0.5], [0.5, 1.5]]) @ values[0])[0, 0].round(9))
@@ -211,24 +219,24 @@ def share_out(values: Array, weight: Array, common: Array, unit: Array | None = 
     taken = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(
         total > 0.0, total, 1.0
     )
-    component = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
-    return np.asarray(values - one[..., None] * component[:, None])
+    common_part = np.einsum("bc,bck->bk", weight * one, values) * taken[:, None]
+    return np.asarray(values - one[..., None] * common_part[:, None])
 
 
-def evidence(
+def log_evidence(
     products: Products, designs: Sequence[NDArray[np.int64]], limits: Array, log_weight: Array
 ) -> Array:
-    """Log marginal likelihood without any design, and with each.
+    """Compute the log marginal likelihood without any design, and with each.
 
     Parameters
     ----------
     products : Products
     designs : sequence of ndarray
-        Numbers of the columns of each design.
+        Indices of the columns of each design.
     limits : ndarray, shape (column,)
-        Error of every factor in white noise; 0 for columns that do nothing.
+        Error of every factor in white noise; 0 for columns without effect.
     log_weight : ndarray, shape (grid,)
-        Logarithm of the weight of every grid point.
+        Logarithm of the weight of every grid point; not normalised.
 
     Returns
     -------
@@ -240,21 +248,21 @@ def evidence(
     )
     out = np.empty((1 + len(designs), base.shape[0]))
     out[0] = np.logaddexp.reduce(base, axis=1)
-    at_once = max(1, _AT_ONCE // max(base.size, 1))
+    at_once = max(1, _MAX_PRODUCTS_AT_ONCE // max(base.size, 1))
     for width in sorted({chosen.size for chosen in designs}):
-        alike = [number for number, chosen in enumerate(designs) if chosen.size == width]
-        for first in range(0, len(alike), at_once):
-            several = alike[first : first + at_once]
-            out[1 + np.array(several)] = _alike_evidence(
-                products, np.stack([designs[number] for number in several]), limits, base
+        same_width = [number for number, chosen in enumerate(designs) if chosen.size == width]
+        for first in range(0, len(same_width), at_once):
+            batch = same_width[first : first + at_once]
+            out[1 + np.array(batch)] = _equal_width_evidence(
+                products, np.stack([designs[number] for number in batch]), limits, base
             )
     return out
 
 
-def _alike_evidence(
+def _equal_width_evidence(
     products: Products, chosen: NDArray[np.int64], limits: Array, base: Array
 ) -> Array:
-    """Log marginal likelihood (design, record) of designs of so many columns each, `chosen` (design, column)."""
+    """Compute log marginal likelihoods (design, record) of equal-width designs (design, column)."""
     scale = limits[chosen]
     gram = products.gram[:, chosen[:, :, None], chosen[:, None, :]] * (
         scale[:, :, None] * scale[:, None, :]
@@ -271,38 +279,38 @@ def _alike_evidence(
     )
 
 
-def score(
+def held_out_evidence(
     factors: Array,
     owner: Sequence[int] | NDArray[np.int64],
     *,
     weight: Sequence[float] | None = None,
     folds: int = FOLDS,
 ) -> Array:
-    """Held-out gain of candidates, the largest over the lengths of the folds.
+    """Compute the held-out evidence of candidates, the largest over the fold lengths.
 
     Parameters
     ----------
     factors : ndarray, shape (subset, design, record)
-        Logarithms of Bayes factors [nats] on the subsets of `fold_subsets`, without the column of
-        the evidence of none. Factors of data that are independent, as means and powers, may be
-        added before.
+        Log Bayes factors [nats] on the subsets of `fold_subsets`, without the column for no design.
+        Factors of independent data, such as means and powers, may be added before.
     owner : sequence of int, shape (design,)
-        Number of the candidate to which each design belongs.
+        Index of the candidate of each design.
     weight : sequence of float, shape (design,), optional
-        Chance of each design before the data are seen, against the others of its candidate; all
-        alike by default.
+        Prior probability of each design relative to the others of its candidate; equal by default.
 
     Returns
     -------
     ndarray, shape (candidate, record)
-        Sum over the folds of log Bayes factor on all less that on all but the fold [nats].
+        Sum over the folds of the log Bayes factor on all blocks minus that without the fold [nats].
 
     Examples
     --------
     >>> factors = np.zeros((5, 2, 1))
     >>> factors[0, 1], factors[1:, 1] = 8.0, 6.0
-    >>> [float(score(factors, [0, 0], weight=share)[0, 0].round(2)) for share in ([1.0, 1.0], [1.0, 9.0])]
-    [7.99, 8.0]
+    >>> for share in (1.0, 9.0):
+    ...     print(held_out_evidence(factors, [0, 0], weight=[1.0, share])[0].round(2))
+    [7.99]
+    [8.]
     """
     owner = np.asarray(owner)
     chance = (
@@ -311,8 +319,8 @@ def score(
     out = []
     for candidate in range(int(owner.max()) + 1 if owner.size else 0):
         chosen = owner == candidate
-        own = chance[chosen] - np.logaddexp.reduce(chance[chosen])
-        mixed = np.logaddexp.reduce(factors[:, chosen] + own[:, None], axis=1)
+        log_prior = chance[chosen] - np.logaddexp.reduce(chance[chosen])
+        mixed = np.logaddexp.reduce(factors[:, chosen] + log_prior[:, None], axis=1)
         out.append(
             (mixed[:1] - mixed[1:]).reshape(-1, folds, mixed.shape[1]).sum(axis=1).max(axis=0)
         )

@@ -1,4 +1,4 @@
-"""Counts of odd samples: gains of what is not linear in a few designs."""
+"""Evidence from counts of anomalous samples, which are not linear in a few designs."""
 
 from __future__ import annotations
 
@@ -13,30 +13,29 @@ from gyrostab.diagnose.evidence.folds import FOLDS
 __all__ = [
     "COUNTS",
     "GRID_COUNTS",
-    "Expected",
-    "beyond_ends",
+    "ExpectedCounts",
+    "excess_extremes",
     "expected_counts",
     "has_coarse_grid",
     "kurtosis_evidence",
+    "quiescent_scatter",
     "sample_count_evidence",
-    "still_scatter",
 ]
 
 Array = NDArray[Any]
-#: Counts of blocks that effects raise.
+#: Counts that effects raise.
 COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
-#: Statistics of the distribution that a coarse lattice makes by itself.
+#: Statistics of the distribution that a coarse quantization grid changes.
 GRID_COUNTS = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
-_COARSE, _STILL = (
-    0.2,
-    0.1,
-)  # step in scatters of the samples; share of the blocks that tell the scatter at rest
-_ENDS = 2  # samples that are the smallest and the largest of any record
-_SHAPE, _RATE = 0.5, 0.05  # of the prior of the factor by which a count is raised
+_MIN_COARSE_SCATTERS = 0.2  # quantization step over the scatter of the samples; design choice
+_QUIESCENT_QUANTILE = 0.1  # of the block variances, taken as that at rest; design choice
+_CERTAIN_EXTREMES = 2  # the smallest and the largest sample of any record
+# Gamma prior of the factor by which a count is raised: nearly flat over its logarithm.
+_PRIOR_SHAPE, _PRIOR_RATE = 0.5, 0.05
 
 
 def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Axes whose lattice is so coarse that equal samples, zeros and tails are its own, and tell of nothing else.
+    """Find the axes with so coarse a quantization grid that it alone causes `GRID_COUNTS`.
 
     Parameters
     ----------
@@ -49,33 +48,39 @@ def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
 
     Examples
     --------
-    >>> one = {"lattice": ("axis", [3.0, 0.1]), "power": (("axis", "block", "band"), np.full((2, 9, 1), 0.5))}
-    >>> coarse_lattice(xr.Dataset(one, coords={"band_low": ("band", [0.0]), "band_high": ("band", [100.0])}))
+    >>> one = {
+    ...     "lattice": ("axis", [3.0, 0.1]),
+    ...     "power": (("axis", "block", "band"), np.full((2, 9, 1), 0.5)),
+    ... }
+    >>> bands = {"band_low": ("band", [0.0]), "band_high": ("band", [100.0])}
+    >>> has_coarse_grid(xr.Dataset(one, coords=bands))
     array([ True, False])
     """
     if "lattice" not in blocks:
         return np.zeros(blocks.sizes["axis"], np.bool_)
-    return np.asarray(blocks["lattice"].values > _COARSE * still_scatter(blocks))
+    return np.asarray(blocks["lattice"].values > _MIN_COARSE_SCATTERS * quiescent_scatter(blocks))
 
 
-def still_scatter(blocks: xr.Dataset) -> NDArray[np.float64]:
-    """Scatter of the samples of every axis in its quiet blocks [degree hour-1]; inf without any."""
+def quiescent_scatter(blocks: xr.Dataset) -> NDArray[np.float64]:
+    """Return the scatter of the samples of every axis at rest [degree hour-1]; inf if unknown."""
     width = blocks["band_high"].values - blocks["band_low"].values
     power = blocks["power"].transpose("axis", ..., "band").values
     square = 2.0 * (power @ width).reshape(len(power), -1)
     return np.sqrt(
         [
-            np.quantile(row[np.isfinite(row)], _STILL) if np.isfinite(row).any() else np.inf
+            np.quantile(row[np.isfinite(row)], _QUIESCENT_QUANTILE)
+            if np.isfinite(row).any()
+            else np.inf
             for row in square
         ]
     )
 
 
-def beyond_ends(values: NDArray[Any]) -> NDArray[Any]:
-    """Samples at the ends of the range, less the first two of the record: one at either end is what any record has.
+def excess_extremes(values: NDArray[Any]) -> NDArray[Any]:
+    """Count samples at the ends of the range, without the first two of the record.
 
-    A count of which two are certain has no Poisson law: without a lattice chance never brings a
-    third one.
+    Every record has a smallest and a largest sample. A count of which two are certain is not
+    Poisson distributed; without a quantization grid there is never a third one by chance.
 
     Parameters
     ----------
@@ -88,52 +93,52 @@ def beyond_ends(values: NDArray[Any]) -> NDArray[Any]:
 
     Examples
     --------
-    >>> beyond_ends(np.array([[0, 1, 0, 1], [1, 3, 0, 2]]))
+    >>> excess_extremes(np.array([[0, 1, 0, 1], [1, 3, 0, 2]]))
     array([[0, 0, 0, 0],
            [0, 2, 0, 2]])
     """
-    beyond = np.maximum(np.cumsum(values, axis=-1) - _ENDS, 0)
+    beyond = np.maximum(np.cumsum(values, axis=-1) - _CERTAIN_EXTREMES, 0)
     return np.asarray(np.diff(beyond, axis=-1, prepend=0))
 
 
-class Expected:
-    """Mean and overdispersion of the counts of null records, by axis, gathered chunk by chunk."""
+class ExpectedCounts:
+    """Mean and overdispersion of the counts of null records, by axis, added batch by batch."""
 
     def __init__(self) -> None:
         self.sums: dict[str, list[Array]] = {name: [] for name in (*COUNTS, "kurtosis")}
 
     def add(self, nulls: xr.Dataset) -> None:
-        """Take in some null records."""
+        """Add some null records."""
         for name in self.sums:
             if name in nulls:
                 values = nulls[name].transpose("record", "axis", "block").values.astype(np.float64)
-                self.sums[name].append(beyond_ends(values) if name == "extremes" else values)
+                self.sums[name].append(excess_extremes(values) if name == "extremes" else values)
 
     def block_count(self, name: str) -> Array:
-        """(record, axis, block)."""
+        """Return the counts (record, axis, block)."""
         return np.concatenate(self.sums[name])
 
 
 def expected_counts(values: Array) -> tuple[Array, Array]:
-    """Mean count of every block (axis, block), and overdispersion of the record's (axis,), from null records (record, axis, block).
+    """Return the mean count (axis, block) and the overdispersion (axis,) of null records.
 
-    Blocks of few samples, and those far from a value that is counted, have few. One record in which
-    all blocks have the same is added, so that none is expected to have nothing at all.
+    Blocks with few samples, and those far from a counted value, have few. One record with equal
+    counts in all blocks is added, so that no mean is 0.
     """
     records, _, block_count = values.shape
     total = values.sum(axis=2)
     mean = np.maximum(total.mean(axis=0), 1.0 / records)
     spread = np.maximum(total.var(axis=0) / mean, 1.0)
-    even = np.broadcast_to(mean[:, None] / block_count, values.shape[1:])
-    own = np.where(total.any(axis=0)[:, None], values.mean(axis=0), even)
-    return (records * own + even) / (records + 1.0), spread
+    equal_counts = np.broadcast_to(mean[:, None] / block_count, values.shape[1:])
+    observed = np.where(total.any(axis=0)[:, None], values.mean(axis=0), equal_counts)
+    return (records * observed + equal_counts) / (records + 1.0), spread
 
 
 def _log_ratio(count: Array, mean: Array) -> Array:
-    """Log Bayes factor of a count that is raised by an unknown factor, over one that is not."""
+    """Return the log Bayes factor of a count raised by an unknown factor."""
     from scipy.special import gammaln
 
-    a, b = _SHAPE, _RATE
+    a, b = _PRIOR_SHAPE, _PRIOR_RATE
     raised = (
         gammaln(count + a)
         - gammaln(a)
@@ -141,20 +146,22 @@ def _log_ratio(count: Array, mean: Array) -> Array:
         - (count + a) * np.log(b + mean)
         + count * np.log(mean)
     )
-    even = -mean + count * np.log(mean)
-    return np.asarray(np.where(count > mean, raised - even, np.minimum(raised - even, 0.0)))
+    expected_log = -mean + count * np.log(mean)
+    return np.asarray(
+        np.where(count > mean, raised - expected_log, np.minimum(raised - expected_log, 0.0))
+    )
 
 
-def _held_out(evidence: Array, lengths: int) -> Array:
-    """Largest over the lengths of the sum over folds, from (subset, ...)."""
-    components = evidence[1:].reshape(lengths, FOLDS, *evidence.shape[1:])
-    return np.asarray((evidence[0] - components).sum(axis=1).max(axis=0))
+def _best_held_out(evidence: Array, lengths: int) -> Array:
+    """Return the largest over the lengths of the sum over folds, from (subset, ...)."""
+    without_fold = evidence[1:].reshape(lengths, FOLDS, *evidence.shape[1:])
+    return np.asarray((evidence[0] - without_fold).sum(axis=1).max(axis=0))
 
 
 def sample_count_evidence(
     values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]
 ) -> Array:
-    """Held-out gain of a raised count.
+    """Compute the held-out evidence of a raised count.
 
     Parameters
     ----------
@@ -168,26 +175,29 @@ def sample_count_evidence(
     -------
     ndarray, shape (record, axis)
     """
-    found = []
+    log_ratios = []
     for subset in subsets:
         count = values[:, :, subset].sum(axis=2) / spread
-        found.append(_log_ratio(count, mean[:, subset].sum(axis=1) / spread))
-    return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
+        log_ratios.append(_log_ratio(count, mean[:, subset].sum(axis=1) / spread))
+    return _best_held_out(np.stack(log_ratios), (len(subsets) - 1) // FOLDS)
 
 
 def kurtosis_evidence(
     values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]
 ) -> Array:
-    """Held-out gain of a higher kurtosis; `mean` and `spread` are those of a block, (axis,); the rest as in `sample_count_evidence`."""
+    """Compute the held-out evidence of a higher kurtosis, as `sample_count_evidence`.
+
+    `mean` and `spread` are those of a block, (axis,).
+    """
     z = np.clip(
         np.where(np.isfinite(values), (values - mean[:, None]) / spread[:, None], 0.0), -8.0, 8.0
     )
-    found = []
+    log_ratios = []
     for subset in subsets:
         total = z[:, :, subset].sum(axis=2) / np.sqrt(subset.sum())
-        size = 100.0  # prior variance, of the total of the whole record
-        component = size * subset.mean()
-        found.append(
-            0.5 * total**2 * component / (1.0 + component) * (total > 0) - 0.5 * np.log1p(component)
+        size = 100.0  # prior variance of the total of the whole record
+        prior = size * subset.mean()
+        log_ratios.append(
+            0.5 * total**2 * prior / (1.0 + prior) * (total > 0) - 0.5 * np.log1p(prior)
         )
-    return _held_out(np.stack(found), (len(subsets) - 1) // FOLDS)
+    return _best_held_out(np.stack(log_ratios), (len(subsets) - 1) // FOLDS)

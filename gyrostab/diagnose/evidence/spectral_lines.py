@@ -1,4 +1,4 @@
-"""Lines in the spectrum: what stands out of the lines on both sides of it, in all parts of the record."""
+"""Evidence of spectral lines that exceed the lines on both sides in all parts of a record."""
 
 from __future__ import annotations
 
@@ -11,25 +11,37 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS
 
-__all__ = ["LEAK", "expected_lines", "level_about", "line_evidence", "line_skirt", "local_level"]
+__all__ = [
+    "LEAK_LINES",
+    "expected_lines",
+    "level_around",
+    "line_evidence",
+    "line_skirt",
+    "local_level",
+]
 
 Array = NDArray[Any]
-#: Lines on each side that a steady line leaks into.
-LEAK = 3
-_NEIGHBOURS = 25  # lines on each side that tell the level
-_BESIDE = 8  # lines of a stretch on either side, which a line must stand out of
-_SLOWEST = 2  # lines at the low end that have no other side
-_LOWEST = 1e-3  # of the median level, below which no level goes
-_FALL = 3.0  # standard deviations above the level at which a skirt ends
-_WIDEST = 40
+#: Lines on each side that a steady line leaks into; of the taper.
+LEAK_LINES = 3
+_LEVEL_LINES = 25  # lines on each side that define the level; design choice
+_SIDE_LINES = 8  # lines next to it, on either side, that a line must exceed; design choice
+_EDGE_LINES = 2  # lowest lines, without lines below them
+_MIN_LEVEL_RATIO = 1e-3  # of the median level, a lower limit of the level; design choice
+_MIN_SKIRT_SIGMA = 3.0  # above the level; the skirt of a line ends below; design choice
+_MAX_SKIRT_LINES = 40  # design choice
 
 
 def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
-    """Mean density of the baseline at frequencies [Hz], (axis, line) [degree2 hour-2 Hz-1], without steady lines that it knows."""
+    """Return the expected density at frequencies [Hz], without known steady lines.
+
+    Shape (axis, line) [degree2 hour-2 Hz-1].
+    """
     spectrum = baseline["spectrum"].mean("block").transpose("axis", "band").values
     bands = np.log(baseline["frequency"].values)
     if "line_spectrum" in baseline:
-        spectrum = np.maximum(spectrum - baseline["line_spectrum"].values, _LOWEST * spectrum)
+        spectrum = np.maximum(
+            spectrum - baseline["line_spectrum"].values, _MIN_LEVEL_RATIO * spectrum
+        )
     smooth = np.stack(
         [np.exp(np.interp(np.log(frequency), bands, np.log(row))) for row in spectrum]
     )
@@ -37,11 +49,11 @@ def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
 
 
 def line_evidence(power: Array, weight: Array, expected: Array | None = None) -> Array:
-    """Gain of a steady line on the parts of the record that were held out, less the logarithm of the number of lines.
+    """Compute the held-out evidence of a steady line, minus the log of the number of lines.
 
-    The level is that of the lines around, in every part for itself, and not below those next to it
-    on either side: a slope or a broad hump is no line. The lowest two lines have nothing below them
-    and are never taken for one.
+    The level is that of the surrounding lines in each part of the record, and at least that of the
+    adjacent lines on either side, so that slopes and broad humps are not lines. The lowest two
+    lines have no lines below them and never count.
 
     Parameters
     ----------
@@ -50,7 +62,7 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
     weight : ndarray, shape (axis, part)
         Independent periodograms in each mean.
     expected : ndarray, shape (axis, line), optional
-        Density whose slope the level has; flat by default.
+        Density that defines the slope of the level; flat by default.
 
     Returns
     -------
@@ -60,7 +72,7 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
     share = np.where(usable, weight, 0.0)[..., None]
     slope = np.ones(power.shape[-1]) if expected is None else expected[:, None]
     clean = np.where(usable[..., None], power / slope, 1.0)
-    level = level_about(clean)
+    level = level_around(clean)
     evidence_nats = np.zeros((*power.shape[:2], power.shape[-1]))
     above, precision = clean - level, share / level**2
     for number in range(FOLDS):
@@ -73,38 +85,40 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
         evidence_nats += (
             share[:, held] * (ratio * excess / (1.0 + excess) - np.log1p(excess))
         ).sum(axis=2)
-    evidence_nats[..., :_SLOWEST] = -np.inf
+    evidence_nats[..., :_EDGE_LINES] = -np.inf
     return np.asarray(evidence_nats - np.log(power.shape[3]))
 
 
-def level_about(power: Array) -> Array:
-    """Level of the lines around each, (..., line), and not below the stretch of lines on either side of its own."""
+def level_around(power: Array) -> Array:
+    """Return the level around each line, (..., line), at least that of the adjacent lines."""
     count = power.shape[-1]
     level = local_level(power)
-    level = np.maximum(level, _LOWEST * np.median(level, axis=-1, keepdims=True))
-    stretches = count // _BESIDE
-    if stretches < 3:
+    level = np.maximum(level, _MIN_LEVEL_RATIO * np.median(level, axis=-1, keepdims=True))
+    group_count = count // _SIDE_LINES
+    if group_count < 3:
         return level
     medians = np.median(
-        power[..., : stretches * _BESIDE].reshape(*power.shape[:-1], stretches, _BESIDE), axis=-1
+        power[..., : group_count * _SIDE_LINES].reshape(
+            *power.shape[:-1], group_count, _SIDE_LINES
+        ),
+        axis=-1,
     )
-    own = np.minimum(np.arange(count) // _BESIDE, stretches - 1)
-    right = medians[..., np.minimum(own + 1, stretches - 1)]
-    left = medians[..., np.maximum(own - 1, 0)]
-    below = np.cumsum(power[..., :_BESIDE], axis=-1) / np.arange(
-        1, _BESIDE + 1
-    )  # the first stretch has only its own lowest lines
-    left[..., :_BESIDE] = below[..., np.maximum(np.arange(_BESIDE) - LEAK, 0)]
-    left[..., :_SLOWEST] = 0.0
-    last = own == stretches - 1
+    group = np.minimum(np.arange(count) // _SIDE_LINES, group_count - 1)
+    right = medians[..., np.minimum(group + 1, group_count - 1)]
+    left = medians[..., np.maximum(group - 1, 0)]
+    # The first lines have only the lines below them.
+    below = np.cumsum(power[..., :_SIDE_LINES], axis=-1) / np.arange(1, _SIDE_LINES + 1)
+    left[..., :_SIDE_LINES] = below[..., np.maximum(np.arange(_SIDE_LINES) - LEAK_LINES, 0)]
+    left[..., :_EDGE_LINES] = 0.0
+    last = group == group_count - 1
     right[..., last] = 0.0
     return np.asarray(np.maximum(level, np.maximum(left, right)))
 
 
 def local_level(total: Array) -> Array:
-    """Medians over stretches of lines, and straight lines between their middles."""
+    """Interpolate linearly between medians over intervals of lines."""
     count = total.shape[-1]
-    ends = np.linspace(0, count, max(1, count // (2 * _NEIGHBOURS)) + 1).astype(int)
+    ends = np.linspace(0, count, max(1, count // (2 * _LEVEL_LINES)) + 1).astype(int)
     medians = np.stack(
         [np.median(total[..., low:high], axis=-1) for low, high in pairwise(ends)], axis=-1
     )
@@ -118,22 +132,26 @@ def local_level(total: Array) -> Array:
 
 
 def line_skirt(blocks: xr.Dataset, axis: str, place: int) -> NDArray[np.bool_]:
-    """Lines that belong to the one at `place`: those it leaks into, and on both sides as far as the power has not come down to the level.
+    """Find the lines that belong to the one at `place`: its leakage and its skirt.
 
-    A line whose phase wanders is wider than the leakage; what stands on its slopes is no other
-    line.
+    The skirt extends on both sides until the power falls to the level. A line with a wandering
+    phase is wider than the leakage; its slopes are not further lines.
     """
     weight = blocks["line_weight"].sel(axis=axis).values
     power = blocks["line_power"].sel(axis=axis).transpose("part", "line").values
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     total = (power[good] * weight[good, None]).sum(axis=0) / max(float(weight[good].sum()), 1e-300)
     limit = local_level(total[None])[0] * (
-        1.0 + _FALL / np.sqrt(max(float(weight[good].sum()), 1.0))
+        1.0 + _MIN_SKIRT_SIGMA / np.sqrt(max(float(weight[good].sum()), 1.0))
     )
-    mine = np.abs(np.arange(total.size) - place) <= LEAK
+    in_skirt = np.abs(np.arange(total.size) - place) <= LEAK_LINES
     for step in (-1, 1):
-        at = place + step
-        while 0 <= at < total.size and abs(at - place) <= _WIDEST and total[at] > limit[at]:
-            mine[at] = True
-            at += step
-    return np.asarray(mine)
+        line = place + step
+        while (
+            0 <= line < total.size
+            and abs(line - place) <= _MAX_SKIRT_LINES
+            and total[line] > limit[line]
+        ):
+            in_skirt[line] = True
+            line += step
+    return np.asarray(in_skirt)

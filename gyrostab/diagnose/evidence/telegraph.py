@@ -1,12 +1,12 @@
-"""How much better block means are explained by two levels between which the bias hops than by free random walk and flicker.
+"""Evidence in block means of a bias that switches between two levels, over free walk and flicker.
 
-Where the bias stands on which level is told by the means themselves, so the course that they tell
-is no column of known form: what it gains as one is only counted beyond what it costs to say it. The
-sum is a lower bound of the logarithm of the Bayes factor of the hopping bias, whatever the random
-walk and the flicker beside it: for the law q of courses that the means and white noise give,
-against the law p that none were seen for, the evidence is at least that of the mean course less
-``KL(q, p)`` and less the scatter of q, ``D^2 / 2 sum var / sigma^2``. What Gauss-Markov noise does,
-a random walk does better than two levels.
+The means themselves determine when the bias is on which level. The course is therefore not a column
+of known form, and the evidence of its column counts only minus the cost of specifying the course.
+The difference is a lower bound of the log Bayes factor, whatever the random walk and flicker are:
+with the distribution q of courses given the means and white noise, and p without the means, the
+evidence is at least that of the mean course minus ``KL(q, p)`` and minus the scatter of q,
+``D^2 / 2 sum var / sigma^2`` (the variational bound). A random walk explains Gauss-Markov noise
+better than two levels do.
 """
 
 from __future__ import annotations
@@ -19,34 +19,39 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.products import WIDTHS, Products, mean_products, pairs_of, take_out
-from gyrostab.diagnose.evidence.wandering import known_wander
+from gyrostab.diagnose.evidence.products import (
+    WIDTHS,
+    Products,
+    column_pairs,
+    marginalise,
+    mean_products,
+)
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.kernels.regression.evidence import mixed_evidence
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
 __all__ = [
-    "MEAN_SWITCHES",
+    "MIN_SWITCHES",
     "TelegraphCourses",
     "course_evidence",
+    "drift_waves",
+    "simulated_courses",
     "telegraph_courses",
     "telegraph_evidence",
-    "usual_courses",
-    "waves",
 ]
 
 Array = NDArray[np.float64]
-#: Parts of a block, each on one level.
-PARTS = 4
-#: Hops that it takes: one or two are jumps.
-MEAN_SWITCHES = 5.0
-_SHORTEST, _FIRST = (
-    0.5,
-    5.0,
-)  # blocks: the shortest mean time on a level, and the one that the search begins with
-#: Quantiles of the means that may be levels.
-STARTS = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
-_TRIAL, _ROUNDS, _MANY_ROUNDS, _STILL = 3, 14, 60, 0.01
-_DRIFTS = (0, 8)  # waves of a drift
+#: Parts of a block, each on one level. Design choice.
+PARTS_PER_BLOCK = 4
+#: Fewest expected switches; one or two are jumps. Design choice.
+MIN_SWITCHES = 5.0
+_MIN_TIME_BLOCKS = 0.5  # shortest mean time on a level
+_START_TIME_BLOCKS = 5.0  # mean time at the start of the search; design choice
+#: Quantiles of the means that start the levels.
+START_QUANTILES = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
+_TRIAL_ROUNDS, _ROUNDS, _FINE_ROUNDS = 3, 14, 60  # of expectation and maximisation; limit time
+_CONVERGED = 0.01  # in white noise deviations, or in the logarithm of a time
+_DRIFT_WAVES = (0, 8)  # slow cosines in the model while the course is searched; design choice
 
 
 @dataclass(frozen=True)
@@ -56,26 +61,26 @@ class TelegraphCourses:
     Attributes
     ----------
     share, spread : ndarray, shape (record, block)
-        Share of each block on the upper level, and the variance of what is known of it.
+        Share of each block on the upper level, and its variance.
     step : ndarray, shape (record,)
-        Upper level less the lower one [degree hour-1].
+        Upper minus lower level [degree hour-1].
     times : ndarray, shape (record, 2)
         Mean times on the lower and on the upper level [blocks].
-    hops : ndarray, shape (record,)
-        Expected number.
+    switch_count : ndarray, shape (record,)
+        Expected number of switches.
     cost : ndarray, shape (record,)
-        Of saying the course [nats].
+        Cost of specifying the course [nats].
     log : ndarray, shape (record,)
-        Logarithm of the likelihood of the means, white noise and all.
+        Log likelihood of the means, including white noise.
     scale : ndarray, shape (record,)
-        Scatter over the white variance.
+        Scatter over the expected white variance.
     """
 
     share: Array
     spread: Array
     step: Array
     times: Array
-    hops: Array
+    switch_count: Array
     cost: Array
     log: Array
     scale: Array
@@ -85,98 +90,103 @@ def telegraph_courses(
     values: Array,
     variance: Array,
     present: NDArray[np.bool_],
-    beside: Array,
+    columns_given: Array,
     *,
-    starts: Sequence[tuple[float, float]] = STARTS,
-    least: float = 1.0,
-    components: int = PARTS,
+    starts: Sequence[tuple[float, float]] = START_QUANTILES,
+    min_scatter: float = 1.0,
+    parts: int = PARTS_PER_BLOCK,
 ) -> TelegraphCourses:
-    """Courses of biases of two levels in white noise, by expectation and maximisation from several starts.
+    """Fit biases of two levels in white noise, by expectation-maximisation from several starts.
 
     Parameters
     ----------
     values : ndarray, shape (block, record)
         Block means [degree hour-1].
     variance : ndarray, shape (block,)
-        White variance of the means, of which the scatter may be more.
+        White variance of the means, a lower limit of the scatter.
     present : ndarray of bool, shape (block,)
         Blocks that are used.
-    beside : ndarray, shape (block, column)
-        Columns of free size, the first of them constant.
+    columns_given : ndarray, shape (block, column)
+        Columns of free size, the first one constant.
     starts : sequence of (float, float)
-        Quantiles of the means that may be the levels.
-    least : float
-        Of the white variance, that the scatter may be.
-    components : int
-        Of a block, at least.
+        Quantiles of the means that start the levels.
+    min_scatter : float
+        Lowest scatter over the white variance.
+    parts : int
+        Parts of a block, at least `PARTS_PER_BLOCK`.
 
     Examples
     --------
     >>> rng = np.random.default_rng(1)
     >>> values = np.repeat([0.0, 1.0, 0.0, 1.0, 0.0, 1.0], 10) + 0.1 * rng.standard_normal(60)
-    >>> found = level_courses(values[:, None], np.full(60, 0.01), np.ones(60, bool), np.ones((60, 1)))
-    >>> found.step.round(1), found.hops.round()
+    >>> variance, present, constant = np.full(60, 0.01), np.ones(60, bool), np.ones((60, 1))
+    >>> found = telegraph_courses(values[:, None], variance, present, constant)
+    >>> found.step.round(1), found.switch_count.round()
     (array([1.]), array([5.]))
     """
     y = np.where(present, values.T, 0.0)
     weight = np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0)
-    plain = np.linalg.lstsq(beside * np.sqrt(weight)[:, None], (y * np.sqrt(weight)).T, rcond=None)[
-        0
-    ].T
-    level = np.quantile((y - plain @ beside.T)[:, present], np.unique(starts), axis=1)
-    tried = []
+    plain = np.linalg.lstsq(
+        columns_given * np.sqrt(weight)[:, None], (y * np.sqrt(weight)).T, rcond=None
+    )[0].T
+    level = np.quantile((y - plain @ columns_given.T)[:, present], np.unique(starts), axis=1)
+    attempts = []
     for start in starts:
         first, last = (level[int(np.searchsorted(np.unique(starts), one))] for one in start)
         size = np.concatenate([plain, (last - first)[:, None]], axis=1)
         size[:, 0] += first
-        fit = _Fit(size, np.full((len(y), 2), _FIRST), np.ones(len(y)))
-        tried.append(_improved(fit, y, weight, beside, _TRIAL, least))
-    chosen = np.argmax([log for _, log in tried], axis=0)
+        fit = _Fit(size, np.full((len(y), 2), _START_TIME_BLOCKS), np.ones(len(y)))
+        attempts.append(_maximise(fit, y, weight, columns_given, _TRIAL_ROUNDS, min_scatter))
+    chosen = np.argmax([log for _, log in attempts], axis=0)
     size, times, scale = (
-        _picked([getattr(fit, name) for fit, _ in tried], chosen)
+        _select_by_record([getattr(fit, name) for fit, _ in attempts], chosen)
         for name in ("size", "times", "scale")
     )
     best = _Fit(size, times, scale)
-    best, _ = _improved(best, y, weight, beside, _ROUNDS, least)
-    told = _told(best, y, weight, beside)
-    if components > PARTS:
-        finer, _ = _improved(
-            _Fit(best.size, best.times, np.ones(len(y)), components),
+    best, _ = _maximise(best, y, weight, columns_given, _ROUNDS, min_scatter)
+    courses = _make_courses(best, y, weight, columns_given)
+    if parts > PARTS_PER_BLOCK:
+        finer, _ = _maximise(
+            _Fit(best.size, best.times, np.ones(len(y)), parts),
             y,
             weight,
-            beside,
-            _MANY_ROUNDS,
-            least,
+            columns_given,
+            _FINE_ROUNDS,
+            min_scatter,
         )
-        told = _told(finer, y, weight, beside)
-    return told
+        courses = _make_courses(finer, y, weight, columns_given)
+    return courses
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Sizes of the columns and of the step (record, column), mean times (record, 2), the scale of the noise (record,); parts of a block."""
+    """State of the fit by record.
+
+    Sizes of the columns and of the step (record, column), mean times (record, 2), scale of the
+    noise (record,), and parts of a block.
+    """
 
     size: Array
     times: Array
     scale: Array
-    components: int = PARTS
+    parts: int = PARTS_PER_BLOCK
 
 
-def _picked(several: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
-    """Of several arrays over records the one that is chosen for each record."""
+def _select_by_record(several: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
+    """Select for each record one of several arrays over records."""
     return np.asarray(np.stack(several)[chosen, np.arange(chosen.size)])
 
 
-def _smoothed(
-    fit: _Fit, y: Array, weight: Array, beside: Array
+def _smooth_courses(
+    fit: _Fit, y: Array, weight: Array, columns_given: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Log likelihood, share and its square, steps up, and the sum of squares over the white variance."""
-    left = y - fit.size[:, :-1] @ beside.T
+    """Return log likelihood, share and its square, steps up, and sum of weighted squares."""
+    left = y - fit.size[:, :-1] @ columns_given.T
     step = fit.size[:, -1]
-    levels = step[:, None, None] * np.arange(fit.components + 1) / fit.components
+    levels = step[:, None, None] * np.arange(fit.parts + 1) / fit.parts
     log = -0.5 * (weight / fit.scale[:, None])[..., None] * (left[..., None] - levels) ** 2
     most = log.max(axis=2)
-    chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], fit.components)
+    chance, rises = level_tables(fit.times[:, 0], fit.times[:, 1], fit.parts)
     start = fit.times / fit.times.sum(axis=1, keepdims=True)
     found, share, square, up = levels_smooth(np.exp(log - most[..., None]), chance, rises, start)
     seen = weight > 0.0
@@ -189,19 +199,19 @@ def _smoothed(
     return found, share, square, up, away @ weight
 
 
-def _improved(
-    fit: _Fit, y: Array, weight: Array, beside: Array, rounds: int, least: float
+def _maximise(
+    fit: _Fit, y: Array, weight: Array, columns_given: Array, rounds: int, min_scatter: float
 ) -> tuple[_Fit, Array]:
-    """Expectation and maximisation, until nothing moves; and the log likelihood."""
+    """Iterate expectation and maximisation until convergence; return also the log likelihood."""
     n, count = y.shape[1], int((weight > 0.0).sum())
-    still = _STILL / np.sqrt(np.median(weight[weight > 0.0]))
-    gram = (beside * weight[:, None]).T @ beside
-    right = (y * weight) @ beside
-    log, share, square, up, total = _smoothed(fit, y, weight, beside)
+    tolerance = _CONVERGED / np.sqrt(np.median(weight[weight > 0.0]))
+    gram = (columns_given * weight[:, None]).T @ columns_given
+    right = (y * weight) @ columns_given
+    log, share, square, up, total = _smooth_courses(fit, y, weight, columns_given)
     for _ in range(rounds):
         normal = np.empty((len(y), len(gram) + 1, len(gram) + 1))
         normal[:, :-1, :-1] = gram
-        normal[:, -1, :-1] = normal[:, :-1, -1] = (share * weight) @ beside
+        normal[:, -1, :-1] = normal[:, :-1, -1] = (share * weight) @ columns_given
         normal[:, -1, -1] = square @ weight
         normal += (
             1e-9 * np.eye(len(gram) + 1) * (np.einsum("rii->ri", normal)[:, None, :] + weight.max())
@@ -212,22 +222,22 @@ def _improved(
         down = np.maximum(up + share[:, 0] - share[:, -1], 0.0)
         times = np.stack([(n - high + 0.5) / (up + 0.5), (high + 0.5) / (down + 0.5)], axis=1)
         moved = np.abs(size - fit.size).max()
-        slow = rounds == _MANY_ROUNDS and np.abs(np.log(times / fit.times)).max() > _STILL
+        slow = rounds == _FINE_ROUNDS and np.abs(np.log(times / fit.times)).max() > _CONVERGED
         fit = _Fit(
             size,
-            np.clip(times, _SHORTEST * PARTS / fit.components, n),
-            np.maximum(total / count, least),
-            fit.components,
+            np.clip(times, _MIN_TIME_BLOCKS * PARTS_PER_BLOCK / fit.parts, n),
+            np.maximum(total / count, min_scatter),
+            fit.parts,
         )
-        log, share, square, up, total = _smoothed(fit, y, weight, beside)
-        if moved < still and not slow:
+        log, share, square, up, total = _smooth_courses(fit, y, weight, columns_given)
+        if moved < tolerance and not slow:
             break
     return fit, log
 
 
-def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> TelegraphCourses:
-    """What a fit says, with the upper level above the lower one."""
-    log, share, square, up, total = _smoothed(fit, y, weight, beside)
+def _make_courses(fit: _Fit, y: Array, weight: Array, columns_given: Array) -> TelegraphCourses:
+    """Return the courses of a fit, with the upper level above the lower one."""
+    log, share, square, up, total = _smooth_courses(fit, y, weight, columns_given)
     seen = weight > 0.0
     spread = np.maximum(square - share**2, 0.0)
     expected = -0.5 * (
@@ -235,57 +245,59 @@ def _told(fit: _Fit, y: Array, weight: Array, beside: Array) -> TelegraphCourses
         - np.log(weight[seen] / (2.0 * np.pi)).sum()
         + seen.sum() * np.log(fit.scale)
     )
-    hops = 2.0 * up + share[:, 0] - share[:, -1]
+    switch_count = 2.0 * up + share[:, 0] - share[:, -1]
     turned = fit.size[:, -1] < 0.0
     return TelegraphCourses(
         share=np.where(turned[:, None], 1.0 - share, share),
         spread=spread,
         step=np.abs(fit.size[:, -1]),
         times=np.where(turned[:, None], fit.times[:, ::-1], fit.times),
-        hops=hops,
-        cost=expected - log + _unknown(hops, y.shape[1]),
+        switch_count=switch_count,
+        cost=expected - log + _time_cost(switch_count, y.shape[1]),
         log=log,
         scale=fit.scale,
     )
 
 
-def usual_courses(
+def simulated_courses(
     found: TelegraphCourses,
     variance: Array,
     present: NDArray[np.bool_],
     *,
-    components: int,
+    parts: int,
     count: int,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Logarithms of the likelihood (record,), and shares (record, block), that means of two levels have that hop as it was found.
+    """Simulate means of two levels with the found parameters; return log likelihoods, shares.
 
     Parameters
     ----------
-    found : Courses
+    found : TelegraphCourses
         Of one record.
     variance, present
-        As for `telegraph_courses`.
-    components : int
-        Of a block.
+        As in `telegraph_courses`.
+    parts : int
+        Parts of a block.
     count : int
-        Records that are drawn.
+        Number of simulated records.
+
+    Returns
+    -------
+    log, share : ndarray, shapes (record,) and (record, block)
     """
     n, (low, high) = present.size, found.times[0]
-    share = np.stack([_drawn_course(n, low, high, rng) for _ in range(count)])
+    share = np.stack([_simulate_course(n, low, high, rng) for _ in range(count)])
     noise = np.sqrt(variance * found.scale[0]) * rng.standard_normal(share.shape)
     y = np.where(present, found.step[0] * share + noise, 0.0)
     size = np.tile([0.0, found.step[0]], (count, 1))
-    fit = _Fit(
-        size, np.tile(found.times[0], (count, 1)), np.full(count, found.scale[0]), components
-    )
-    return _smoothed(
+    fit = _Fit(size, np.tile(found.times[0], (count, 1)), np.full(count, found.scale[0]), parts)
+    return _smooth_courses(
         fit, y, np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0), np.ones((n, 1))
     )[:2]
 
 
-def _drawn_course(n: int, low: float, high: float, rng: np.random.Generator) -> Array:
-    """Share of n blocks on the upper level, for mean times on both levels [blocks]."""
+def _simulate_course(n: int, low: float, high: float, rng: np.random.Generator) -> Array:
+    """Simulate the share of n blocks on the upper level, for mean times on both levels [blocks]."""
     first = int(rng.random() < high / (low + high))
     pairs = 16 + int(2.0 * n / (low + high))
     mean = np.array([low, high])[(np.arange(2 * pairs) + first) % 2]
@@ -297,36 +309,38 @@ def _drawn_course(n: int, low: float, high: float, rng: np.random.Generator) -> 
     return np.diff(np.interp(np.arange(n + 1.0), at, up))
 
 
-def _unknown(hops: Array, block_count: int) -> Array:
-    """What it costs that both mean times are not known [nats]: the logarithm of each is, to the root of one over its hops."""
+def _time_cost(switch_count: Array, block_count: int) -> Array:
+    """Return the cost of both unknown mean times [nats].
+
+    The logarithm of each is known to one over the root of its switches.
+    """
     return np.asarray(
         2.0 * np.log(max(np.log(2.0 * block_count), 1.0))
-        + np.maximum(np.log(np.maximum(hops, 1.0) / (4.0 * np.pi)), 0.0)
+        + np.maximum(np.log(np.maximum(switch_count, 1.0) / (4.0 * np.pi)), 0.0)
     )
 
 
 def telegraph_evidence(
     data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None
 ) -> tuple[Array, TelegraphCourses]:
-    """Gains of a bias of two levels on an axis.
+    """Compute the evidence of a bias of two levels on an axis.
 
     Parameters
     ----------
     data : xarray.Dataset
-        Reduced data, one record or many with the same gaps: ``mean`` ((record,) axis block) [degree
-        hour-1].
+        Block statistics, one record or many with the same gaps: ``mean`` ((record,) axis block)
+        [degree hour-1].
     baseline : xarray.Dataset
-        As for `gyrostab.diagnose.evidence.held_out.mean_factors`.
+        As in `gyrostab.diagnose.evidence.held_out.mean_factors`.
     axis : str
     given : ndarray, shape (block, column), optional
-        Columns that are in the model with and without it (effects already named).
+        Columns in the model with and without it (effects already named).
 
     Returns
     -------
     evidence_nats : ndarray, shape (record,)
-        Lower bound of the log Bayes factor [nats]; -inf where there are fewer than `MEAN_SWITCHES`
-        hops.
-    courses : Courses
+        Lower bound of the log Bayes factor [nats]; -inf with fewer than `MIN_SWITCHES` switches.
+    courses : TelegraphCourses
     """
     mean = (data["mean"] - baseline["known_mean"]).sel(axis=axis)
     values = (
@@ -337,63 +351,65 @@ def telegraph_evidence(
     variance = baseline["mean_variance"].sel(axis=axis).values
     present = np.asarray(np.isfinite(values).all(axis=1)) & np.isfinite(variance)
     n = present.size
-    own = np.empty((n, 0)) if given is None else np.where(np.isfinite(given), given, 0.0)
-    most = np.abs(own).max(axis=0)
-    own = own / np.where(most > 0.0, most, 1.0)
-    frame: dict[str, Any] = {
+    scaled_given = np.empty((n, 0)) if given is None else np.where(np.isfinite(given), given, 0.0)
+    most = np.abs(scaled_given).max(axis=0)
+    scaled_given = scaled_given / np.where(most > 0.0, most, 1.0)
+    setup: dict[str, Any] = {
         "variance": variance,
         "step": float(data["end"][0] - data["begin"][0]),
         "present": present,
-        "wander": known_wander(baseline, axis),
+        "wander": expected_processes(baseline, axis),
     }
     grid: dict[str, Any] = {
         name: baseline[f"grid_{name}"].sel(axis=axis).values for name in ("K", "B")
     }
     log_weight = baseline["grid_prior"].sel(axis=axis).values
     safe = np.where(present[:, None], values, 0.0)
-    tried = []
-    for count in _DRIFTS:
+    attempts = []
+    for count in _DRIFT_WAVES:
         found = telegraph_courses(
-            safe, variance, present, np.concatenate([waves(n, count), own], axis=1)
+            safe, variance, present, np.concatenate([drift_waves(n, count), scaled_given], axis=1)
         )
-        worth = _worth(found, safe, own, frame, grid, log_weight) - np.log(len(_DRIFTS))
-        tried.append((np.where(found.hops >= MEAN_SWITCHES, worth, -np.inf), found))
-    chosen = np.argmax([evidence_nats for evidence_nats, _ in tried], axis=0)
+        worth = _course_evidence_by_record(
+            found, safe, scaled_given, setup, grid, log_weight
+        ) - np.log(len(_DRIFT_WAVES))
+        attempts.append((np.where(found.switch_count >= MIN_SWITCHES, worth, -np.inf), found))
+    chosen = np.argmax([evidence_nats for evidence_nats, _ in attempts], axis=0)
     best = TelegraphCourses(
         *(
-            _picked([getattr(one, item.name) for _, one in tried], chosen)
+            _select_by_record([getattr(one, item.name) for _, one in attempts], chosen)
             for item in fields(TelegraphCourses)
         )
     )
-    return _picked([evidence_nats for evidence_nats, _ in tried], chosen), best
+    return _select_by_record([evidence_nats for evidence_nats, _ in attempts], chosen), best
 
 
-def waves(n: int, count: int) -> Array:
-    """A constant, and slow waves that stand for a drift while the course is sought."""
+def drift_waves(n: int, count: int) -> Array:
+    """Return a constant and `count` slow cosines, (n, 1 + count), that approximate a drift."""
     return np.asarray(np.cos(np.pi * (np.arange(n)[:, None] + 0.5) / n * np.arange(count + 1)))
 
 
-def _worth(
+def _course_evidence_by_record(
     found: TelegraphCourses,
     values: Array,
     given: Array,
-    frame: dict[str, Any],
+    setup: dict[str, Any],
     grid: dict[str, Any],
     log_weight: Array,
 ) -> Array:
-    """Evidence of the courses over that of none, less what they cost; the scatter of a course counts as a datum that has no step."""
-    records, beside = values.shape[1], given.shape[1]
+    """Return the evidence of the courses minus their cost; their scatter counts as a datum."""
+    records, columns_given = values.shape[1], given.shape[1]
     columns = np.concatenate([found.share.T, given], axis=1)
-    present, variance = frame["present"], frame["variance"]
+    present, variance = setup["present"], setup["variance"]
     scatter = found.spread @ np.where(present, 1.0 / np.where(present, variance, 1.0), 0.0)
-    white = mean_products(values[:, :0], columns, **frame, K=np.zeros(1), B=np.zeros(1))
+    white = mean_products(values[:, :0], columns, **setup, K=np.zeros(1), B=np.zeros(1))
     square = np.diagonal(white.gram[0])
     wide = np.where(square[records:] > 0.0, square[records:], 1.0) / WIDTHS[-1] ** 2
-    pairs = pairs_of(columns.shape[1], [], beside)
-    products = take_out(
-        mean_products(values, columns, **frame, **grid, pairs=pairs), beside, np.diag(wide)
+    pairs = column_pairs(columns.shape[1], [], columns_given)
+    products = marginalise(
+        mean_products(values, columns, **setup, **grid, pairs=pairs), columns_given, np.diag(wide)
     )
-    usual = np.diagonal(take_out(white, beside, np.diag(wide)).gram[0])
+    usual = np.diagonal(marginalise(white, columns_given, np.diag(wide)).gram[0])
     weight = log_weight - np.logaddexp.reduce(log_weight)
     out = np.empty(records)
     for r in range(records):
@@ -405,21 +421,20 @@ def _worth(
 def course_evidence(
     products: Products, place: int, scatter: float, log_weight: Array, *, unit: float
 ) -> tuple[float, float]:
-    """Logarithms of the evidence of no course and of one, over a grid of the noise.
+    """Compute log evidences without and with a course, averaged over a noise grid.
 
     Parameters
     ----------
     products : Products
-        Of records and courses, in the same number.
+        Of records and courses, in the same order.
     place : int
-        Of the record and its course.
+        Index of the record and its course.
     scatter : float
-        Of the course, over the white variance.
+        Variance of the course over the white variance.
     log_weight : ndarray, shape (grid,)
-        Of the grid points.
+        Log weights of the grid points.
     unit : float
-        Square of the course over the white variance; the prior of the step has the widths of all
-        factors.
+        Square of the course over the white variance, the scale of the prior of the step (`WIDTHS`).
     """
     base = (log_weight - 0.5 * (products.square[:, place] + products.log_determinant))[None]
     size = 1.0 / np.sqrt(max(unit + scatter, 1e-300))

@@ -1,4 +1,4 @@
-"""What is known to wander in the means beside the noise: processes with an exponential memory, and walks that come and go."""
+"""Random processes in the means other than the noise: exponentially correlated ones and walks."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-__all__ = ["Wander", "known_wander", "mean_share"]
+__all__ = ["RandomProcesses", "block_mean_variance", "expected_processes"]
 
 Array = NDArray[np.float64]
 
 
-class Wander(NamedTuple):
-    """Random means of one axis, beside flicker and random walk of the noise.
+class RandomProcesses(NamedTuple):
+    """Random processes in the means of an axis in addition to flicker and random walk noise.
 
     Attributes
     ----------
     square, time : ndarray, shape (process,)
-        Variances [degree2 hour-2] and correlation times [s] of what comes back.
+        Variances [degree2 hour-2] and correlation times [s] of exponentially correlated processes.
     walk : ndarray, shape (block,)
-        Growth of the variance of what does not [degree2 hour-2 s-1].
+        Growth of the variance of random walks [degree2 hour-2 s-1].
     """
 
     square: Array
@@ -29,35 +29,36 @@ class Wander(NamedTuple):
     walk: Array
 
 
-def known_wander(baseline: xr.Dataset, axis: str | int) -> Wander:
-    """What the mean of an axis is known to do.
+def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses:
+    """Return the random processes expected in the mean of an axis.
 
     Parameters
     ----------
     baseline : xarray.Dataset
-        Of `gyrostab.diagnose.baseline.calibrate.baseline_from_model`, with ``wander_square`` (axis,
-        wander), ``wander_time`` (wander) and ``wander_walk`` (axis, block); nothing without these.
+        From `gyrostab.diagnose.baseline.calibrate.baseline_from_model`, with ``wander_square``
+        (axis, wander), ``wander_time`` (wander) and ``wander_walk`` (axis, block). Without these,
+        there are no such processes.
     axis : str or int
-        Name, or number.
+        Name or index.
     """
     if "wander_square" not in baseline:
-        return Wander(np.empty(0), np.empty(0), np.zeros(baseline.sizes["block"]))
+        return RandomProcesses(np.empty(0), np.empty(0), np.zeros(baseline.sizes["block"]))
     own = baseline[["wander_square", "wander_time", "wander_walk"]]
     own = own.isel(axis=axis) if isinstance(axis, int) else own.sel(axis=axis)
-    there = own["wander_square"].values > 0.0
-    return Wander(
-        own["wander_square"].values[there],
-        own["wander_time"].values[there],
+    active = own["wander_square"].values > 0.0
+    return RandomProcesses(
+        own["wander_square"].values[active],
+        own["wander_time"].values[active],
         own["wander_walk"].values,
     )
 
 
-def mean_share(step: float, time: Array) -> Array:
-    """Variance of means over `step` seconds of processes of unit variance with these correlation times.
+def block_mean_variance(step: float, time: Array) -> Array:
+    """Return the variance of means over `step` [s] of unit processes with correlation `time` [s].
 
     Examples
     --------
-    >>> mean_share(1.0, np.array([1e6, 1.0])).round(3)  # 2 / e
+    >>> block_mean_variance(1.0, np.array([1e6, 1.0])).round(3)  # 2 / e
     array([1.   , 0.736])
     """
     a = step / np.maximum(time, 1e-300)

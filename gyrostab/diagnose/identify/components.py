@@ -8,7 +8,7 @@ import numpy as np
 
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.search import Found, together
+from gyrostab.diagnose.predict.search import CandidateEvidence, combine_rows
 
 __all__ = [
     "LEAST",
@@ -29,7 +29,7 @@ LEAST = 2.0
 PLAIN_LINE = "spectral_line"
 
 
-def find_components(found: Found) -> list[Component]:
+def find_components(found: CandidateEvidence) -> list[Component]:
     """Rows of a candidate that bring something."""
     evidence_nats = found.evidence_nats[0]
     rows = [number for number in range(evidence_nats.size) if evidence_nats[number] > LEAST]
@@ -46,7 +46,7 @@ def find_components(found: Found) -> list[Component]:
     ]
 
 
-def by_key(found: Sequence[Found]) -> dict[str, list[Component]]:
+def by_key(found: Sequence[CandidateEvidence]) -> dict[str, list[Component]]:
     """Parts of every effect, those that bring something, the strongest first."""
     out: dict[str, list[Component]] = {}
     for one in found:
@@ -101,7 +101,7 @@ def lines_only(components: Sequence[Component]) -> bool:
 def sum_evidence(components: Sequence[Component]) -> float:
     """Gain of an effect from its parts [nats]."""
     return (
-        float(together(np.array([component.evidence_nats for component in components])))
+        float(combine_rows(np.array([component.evidence_nats for component in components])))
         if components
         else 0.0
     )

@@ -9,7 +9,7 @@ from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import Found
+from gyrostab.diagnose.predict.search import CandidateEvidence
 from gyrostab.physics.base import Effect
 
 __all__ = ["identify_expected_effects"]
@@ -22,7 +22,7 @@ def identify_expected_effects(
     known: Sequence[Effect],
     candidates: Sequence[Candidate],
     start: State,
-    gains: Callable[[Sequence[Candidate], State], list[Found]],
+    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
 ) -> tuple[list[Identification], State]:
     """Claims of effects that are expected, and the state with them in it; whatever else is named has to stand beside them.
 
@@ -79,7 +79,7 @@ def _parts(
     effect: Effect,
     candidates: Sequence[Candidate],
     state: State,
-    gains: Callable[[Sequence[Candidate], State], list[Found]],
+    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
 ) -> list[Component]:
     """What an effect brings on its axes, in the views and with the channels in which it brings most."""
     by = by_key(gains([one for one in candidates if _follows(one, effect)], state))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.sample_counts import Expected
+from gyrostab.diagnose.evidence.sample_counts import ExpectedCounts
 from gyrostab.diagnose.identify.completeness import (
     excess_low_frequency_noise,
     flexible,
@@ -58,16 +58,16 @@ from gyrostab.diagnose.predict.condition import (
     Component,
     condition_on,
     condition_on_components,
-    reweighted,
+    refit_weights,
 )
-from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
 from gyrostab.diagnose.predict.search import (
+    CandidateEvidence,
     CountEvidence,
-    Found,
     compute_evidence,
-    of_means,
-    totals,
+    evidence_by_effect,
+    reusable_mean_evidence,
 )
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Effect
@@ -141,7 +141,7 @@ def name_effects(
     folds = fold_blocks(blocks)
     tried, reasons = effect_candidates(blocks, baseline["coefficient"])
     candidates = [*tried, *nuisance_alternatives(blocks)]
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     best, count_evidence = _null_best(
         candidates, nulls, state, folds, np.random.default_rng(seed), progress
     )
@@ -182,7 +182,7 @@ def _null_best(
     progress: Stage,
 ) -> tuple[Array, CountEvidence]:
     """Largest gain of any effect in each null record; and what the records say of counts."""
-    expected = Expected()
+    expected = ExpectedCounts()
     linear = [one for one in candidates if one.statistic != "marks"]
     marks = [one for one in candidates if one.statistic == "marks"]
     sums: list[dict[str, Array]] = []
@@ -190,7 +190,7 @@ def _null_best(
     records = 0
     for chunk in nulls:
         expected.add(chunk)
-        sums.append(totals(compute_evidence(linear, chunk, state, folds, rng=rng)))
+        sums.append(evidence_by_effect(compute_evidence(linear, chunk, state, folds, rng=rng)))
         kept.append(chunk[[name for name in expected.sums if name in chunk]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
@@ -201,7 +201,7 @@ def _null_best(
     count_evidence = CountEvidence.gathered(expected, rounded_rates(state.blocks, state.baseline))
     best = []
     for total, chunk in zip(sums, kept, strict=True):
-        counted = totals(
+        counted = evidence_by_effect(
             compute_evidence(marks, chunk, state, folds, count_evidence=count_evidence)
         )
         keys = {*total, *counted}
@@ -251,10 +251,13 @@ class _Search:
             for key in (one.components[0].candidate.key, *self._counted(one))
         }
         rounds, lines = _ROUNDS, _LINES
-        found: list[Found] = []
+        found: list[CandidateEvidence] = []
         before = start
         while rounds and lines:
-            found, before = self._ranked(state, barred, of_means(found, before, state)), state
+            found, before = (
+                self._ranked(state, barred, reusable_mean_evidence(found, before, state)),
+                state,
+            )
             pick = self._pick(found, state, chosen)
             if pick is None:
                 break
@@ -298,12 +301,14 @@ class _Search:
             if other.statistic == "marks" and marks & set(other.marks)
         }
 
-    def _of(self, candidates: Sequence[Candidate], state: State) -> list[Found]:
+    def _of(self, candidates: Sequence[Candidate], state: State) -> list[CandidateEvidence]:
         return compute_evidence(
             candidates, state.blocks, state, self.folds, count_evidence=self.count_evidence
         )
 
-    def _ranked(self, state: State, barred: set[str], known: Sequence[Found] = ()) -> list[Found]:
+    def _ranked(
+        self, state: State, barred: set[str], known: Sequence[CandidateEvidence] = ()
+    ) -> list[CandidateEvidence]:
         """Gains of all that is not barred, with weights that suit the best in the powers: what is loud is loud in every view.
 
         Those that are known are not sought again.
@@ -335,7 +340,10 @@ class _Search:
         return found
 
     def _pick(
-        self, found: list[Found], state: State, chosen: Sequence[Identification | Unidentified]
+        self,
+        found: list[CandidateEvidence],
+        state: State,
+        chosen: Sequence[Identification | Unidentified],
     ) -> tuple[Identification | Unidentified | None, set[str]] | None:
         """The next effect, or generic; None when nothing passes. Second: keys that are out of the race from now on."""
         components = without_lines(by_key(found))
@@ -476,9 +484,9 @@ class _Search:
             ):  # what they add to the powers is fitted once for all of a comb
                 state, waiting = condition_on_components(state, one.components), True
                 continue
-            state = condition_on(reweighted(state) if waiting else state, list(one.components))
+            state = condition_on(refit_weights(state) if waiting else state, list(one.components))
             waiting = False
-        return reweighted(state) if waiting else state
+        return refit_weights(state) if waiting else state
 
     def _pruned(
         self, start: State, chosen: list[Identification | Unidentified]

@@ -13,12 +13,12 @@ from gyrostab.diagnose.identify.identification import Identification, Unidentifi
 from gyrostab.diagnose.identify.jumps import is_lasting, is_sudden, levels
 from gyrostab.diagnose.identify.logger_filters import on_all_axes
 from gyrostab.diagnose.identify.steady import is_always_present
-from gyrostab.diagnose.predict.candidates import LARGEST
+from gyrostab.diagnose.predict.candidates import LARGEST_SIZE
 from gyrostab.diagnose.predict.condition import Component, add_fast_switching
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import fast_switching_evidence
 from gyrostab.diagnose.reduce.block_statistics import measured
-from gyrostab.diagnose.reduce.zero_bin import may_be_cut_off
+from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
 from gyrostab.physics.registry import effects
 
 __all__ = [
@@ -141,9 +141,9 @@ def _possible(component: Component, state: State) -> bool:
         < _SMALLEST_FRINGE
     ):
         return False
-    if effect in LARGEST and component.variant.columns[0] != "any":
+    if effect in LARGEST_SIZE and component.variant.columns[0] != "any":
         return bool(
-            np.abs(component_mixture(component, state).moments()[0]).max() <= LARGEST[effect]
+            np.abs(component_mixture(component, state).moments()[0]).max() <= LARGEST_SIZE[effect]
         )
     if statistic == "mean" and not _in_range(component, state):
         return False
@@ -227,7 +227,8 @@ def find_equivalent_effects(
     ):  # no other axis says whether the sample was lost
         out.append("held_samples")
     if effect == "dead_zone" and any(
-        may_be_cut_off(blocks)[state.axes.index(component.row[0])] for component in components
+        possibly_truncated_axes(blocks)[state.axes.index(component.row[0])]
+        for component in components
     ):
         out.append("rate_quantization")  # cut off towards zero, its cell of zero is twice as wide
     if effect == "telegraph" and not any(

@@ -14,8 +14,8 @@ from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_
 from gyrostab.diagnose.baseline.posterior import Fit, expected_of
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.condition import Component, condition_on
-from gyrostab.diagnose.predict.filter_response import is_filter, response_of
-from gyrostab.diagnose.predict.linear_model import State, in_place
+from gyrostab.diagnose.predict.filter_response import band_response, is_filter
+from gyrostab.diagnose.predict.linear_model import State, unspread_share
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.sizes import component_size
 from gyrostab.noise import NORMAL_95
@@ -114,7 +114,8 @@ def filter_sizes(
 
     def likelihood(values: Mapping[str, Any]) -> float:
         filtered = (
-            band_columns(state.blocks) * response_of(kind.example(**values), state.blocks)[:, None]
+            band_columns(state.blocks)
+            * band_response(kind.example(**values), state.blocks)[:, None]
         )
         return sum(_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
 
@@ -201,7 +202,7 @@ def _fit(axis: str, state: State) -> tuple[Fit, Array]:
             (use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total
         )
 
-    whole = mean(in_place(blocks)[row, :, None])
+    whole = mean(unspread_share(blocks)[row, :, None])
     width = (blocks["band_high"] - blocks["band_low"]).values
     seen = np.diag(whole) + np.outer(1.0 - whole, width / width.sum())
     beside = [mean(one) for one in state.given.get(("power", axis), [])]

@@ -11,7 +11,7 @@ from gyrostab.diagnose.identify.components import by_key, tried_again
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import Found
+from gyrostab.diagnose.predict.search import CandidateEvidence
 
 __all__ = ["found_again", "layers"]
 
@@ -33,7 +33,7 @@ def found_again(
     components: Sequence[Component],
     first: Sequence[Component],
     state: State,
-    gains: Callable[[Sequence[Candidate], State], list[Found]],
+    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
 ) -> list[list[Component]]:
     """For each layer of a claim what is found of it anew with the layers before it in the model.
 

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Candidate, Variant, variants_of
+from gyrostab.diagnose.predict.candidates import Candidate, Variant, rebuild_variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
@@ -104,7 +104,7 @@ def _slid(component: Component, state: State, shift: int) -> Variant | None:
         blocks[key] = blocks[key].copy(
             data=np.roll(blocks[key].values, shift, axis=list(blocks[key].dims).index("block"))
         )
-    made = variants_of(candidate, component.variant, blocks, state.baseline["coefficient"])
+    made = rebuild_variant(candidate, component.variant, blocks, state.baseline["coefficient"])
     return made
 
 

@@ -14,7 +14,7 @@ from gyrostab.diagnose.identify.jumps import jumps_at_will
 from gyrostab.diagnose.predict.condition import Component, mean_columns
 from gyrostab.diagnose.predict.designs import Candidate
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import Found
+from gyrostab.diagnose.predict.search import CandidateEvidence
 
 __all__ = ["followed_first", "hops_alone", "identify_switching", "remove_telegraph_bias", "renewed"]
 
@@ -95,7 +95,7 @@ def identify_switching(
 def hops_alone(
     chosen: Sequence[Identification | Unidentified],
     state_with: Callable[[Sequence[Identification | Unidentified]], State],
-    gains: Callable[[Sequence[Candidate], State], list[Found]],
+    gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
     threshold: float,
 ) -> list[Identification | Unidentified]:
     """What is chosen, without jumps on the axis of hops that the hops explain as well when they are sought without them.
@@ -211,7 +211,7 @@ def _without(
     return out
 
 
-def _sought(component: Component, found: Sequence[Found]) -> Component:
+def _sought(component: Component, found: Sequence[CandidateEvidence]) -> Component:
     """The part as it was found anew."""
     (one,) = found
     row = one.rows.index(component.row)

@@ -7,8 +7,12 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from gyrostab.diagnose.reduce.outliers import CHANCE, beyond_chance, chance_of_all
-from gyrostab.diagnose.reduce.zero_bin import cut_off
+from gyrostab.diagnose.reduce.outliers import (
+    EXPECTED_FALSE_OUTLIERS,
+    probability_all_zero,
+    zeros_beyond_chance,
+)
+from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 
 __all__ = ["COARSE", "null_counts"]
 
@@ -40,7 +44,7 @@ def null_counts(
     adjacent = blocks["adjacent"].transpose("axis", "block").values.astype(np.int64)
     mean = _filled(blocks["mean"].transpose("axis", "block").values)
     repeat, zero = np.zeros(samples.shape), np.zeros(samples.shape)
-    cut = cut_off(blocks)
+    cut = truncated_axes(blocks)
     for axis, step in enumerate(blocks["lattice"].values):
         if step > 0.0:
             repeat[axis], zero[axis] = _lattice_chances(
@@ -56,7 +60,10 @@ def null_counts(
     return {
         "outliers": rng.poisson(
             np.broadcast_to(
-                CHANCE * samples / np.maximum(samples.sum(axis=1, keepdims=True), 1), size
+                EXPECTED_FALSE_OUTLIERS
+                * samples
+                / np.maximum(samples.sum(axis=1, keepdims=True), 1),
+                size,
             )
         ),
         "repeats": rng.binomial(adjacent, np.broadcast_to(repeat, size)),
@@ -82,9 +89,9 @@ def _filled_zeros(
     elif not zeros.any():
         together = np.zeros_like(zeros)
     else:
-        at_once = rng.binomial(number, chance_of_all(share, subset))
+        at_once = rng.binomial(number, probability_all_zero(share, subset))
         together = np.minimum(np.einsum("sa,rsb->rab", subset.astype(np.int64), at_once), zeros)
-    return beyond_chance(together, zeros, samples, subset, number)
+    return zeros_beyond_chance(together, zeros, samples, subset, number)
 
 
 def _filled(mean: Array) -> Array:

@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import line_columns, white_variance
-from gyrostab.diagnose.evidence.wandering import known_wander
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.nulls.counts import COARSE, null_counts
 from gyrostab.diagnose.nulls.shared_noise import Shared, shared_by, shared_spectra, shared_white
 from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
@@ -315,7 +315,7 @@ def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator)
             1.0 / step,
             rng.standard_normal(times.size),
         )
-        known = known_wander(baseline, place[1])
+        known = expected_processes(baseline, place[1])
         steps = rng.standard_normal((2, n)) * np.sqrt((K2 / HOUR + known.walk) * step)
         walk, _ = brownian_means(steps[0], steps[1], 0.0)
         total[place] += np.sqrt(B2) * flicker + walk

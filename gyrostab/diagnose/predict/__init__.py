@@ -1,1 +1,1 @@
-"""What the effects of the registry predict for a reduced record, and how well each does it."""
+"""Predictions of the registered effects for a recording, and the evidence of each."""

@@ -1,4 +1,4 @@
-"""What every effect of the registry predicts for a reduced record, over its nuisance grid: the designs that naming compares."""
+"""Candidates: the predictions of every registered effect over its grid of nuisance parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, has_coarse_grid
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
 from gyrostab.diagnose.predict.designs import BUILDERS, Candidate, Variant
-from gyrostab.diagnose.predict.step_times import known_instants, tried_instants
+from gyrostab.diagnose.predict.step_times import power_on_times, select_step_times
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.errors import OptionError
 from gyrostab.noise import HOUR
@@ -23,18 +23,18 @@ from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
 
 __all__ = [
-    "LARGEST",
+    "LARGEST_SIZE",
     "STATISTIC_NAMES",
     "Candidate",
     "Variant",
     "channel_units",
     "effect_candidates",
-    "variants_of",
-    "windows_of",
+    "make_windows",
+    "rebuild_variant",
 ]
 
 Array = NDArray[Any]
-#: Where an effect can show, in the order in which they are looked at.
+#: Statistics in which an effect can show, in the order of the search.
 STATISTIC_NAMES = (
     "marks",
     "mean",
@@ -47,17 +47,18 @@ STATISTIC_NAMES = (
     "wander",
     "levels",
 )
-_MOST_VALUES, _MOST_VARIANTS = 60, 200
-#: Effect -> largest size that is plausible, of each of its parameters.
-LARGEST = {"misalignment": 20.0, "earth_rate": 20.0}
-_SEEN = 3.0  # standard errors that an effect of the largest size must have to be looked for
-_INSTANT = "at"  # nuisance parameter that is an instant
-_TWINS = {"fringe_hop": "bias_jump"}  # the same design: the size decides
-_SAME = 1e-3  # designs that differ by less of their size are one
+_MAX_VALUES = 60  # of a nuisance parameter; limits time
+_MAX_VARIANTS = 200  # of a candidate; limits time
+#: Effect -> largest plausible size of each of its parameters. Design choice.
+LARGEST_SIZE = {"misalignment": 20.0, "earth_rate": 20.0}
+_MIN_SIZE_STDERRS = 3.0  # of an effect of the largest size, to be tried; design choice
+_TIME_PARAMETER = "at"  # nuisance parameter that is a time
+_SAME_DESIGN = {"fringe_hop": "bias_jump"}  # effects with the same design; the size decides
+_MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
 
 
 def channel_units(blocks: xr.Dataset) -> dict[str, str]:
-    """Channel of the log -> its unit."""
+    """Return the units of the channels of the log."""
     begin = "channel_"
     return {
         str(name)[len(begin) :]: str(blocks[name].attrs.get("units", ""))
@@ -66,21 +67,21 @@ def channel_units(blocks: xr.Dataset) -> dict[str, str]:
     }
 
 
-def windows_of(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
-    """The reduced record as effects see it.
+def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
+    """Return the record in the form that effects take for their predictions.
 
     Parameters
     ----------
     blocks : xarray.Dataset
         From `reduce_log`.
     drivers : mapping of str to str
-        Channel of the effect -> channel of the log.
+        Channels of the log by channel of the effect.
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
     own = dict(
         zip(
             axes,
-            map(_bridged, measured(blocks, "mean").transpose("axis", "block").values),
+            map(_fill_linearly, measured(blocks, "mean").transpose("axis", "block").values),
             strict=True,
         )
     )
@@ -99,7 +100,8 @@ def windows_of(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         rate=float(blocks.attrs["sampling_rate_hz"]),
         axes=axes,
         drivers={
-            inner: _bridged(blocks[f"channel_{name}"].values) for inner, name in drivers.items()
+            inner: _fill_linearly(blocks[f"channel_{name}"].values)
+            for inner, name in drivers.items()
         },
         fine={
             inner: blocks[f"fine_{name}"].values
@@ -116,13 +118,13 @@ def windows_of(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         bands={
             inner: band
             for inner, name in drivers.items()
-            if (band := _band(blocks[f"channel_{name}"])) is not None
+            if (band := _rms_band(blocks[f"channel_{name}"])) is not None
         },
     )
 
 
-def _band(channel: xr.DataArray) -> tuple[float, float] | None:
-    """Edges of the band [Hz] that a channel says it is the rms of; None where it says nothing that can be a band."""
+def _rms_band(channel: xr.DataArray) -> tuple[float, float] | None:
+    """Return the edges of the band of an rms channel [Hz]; None if it does not have any."""
     try:
         low, high = (float(edge) for edge in channel.attrs.get("band_hz", ()))
     except (TypeError, ValueError):
@@ -130,8 +132,8 @@ def _band(channel: xr.DataArray) -> tuple[float, float] | None:
     return (low, high) if 0.0 <= low < high < np.inf else None
 
 
-def _bridged(values: Array) -> Array:
-    """Values with the missing ones on straight lines between their neighbours."""
+def _fill_linearly(values: Array) -> Array:
+    """Interpolate missing values linearly."""
     good = np.isfinite(values)
     if good.all() or not good.any():
         return np.asarray(values, np.float64)
@@ -142,20 +144,20 @@ def _bridged(values: Array) -> Array:
 def effect_candidates(
     blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> tuple[list[Candidate], dict[str, str]]:
-    """All effects of the registry as far as this record can tell about them.
+    """Build the candidates of all registered effects that this record can show.
 
     Parameters
     ----------
     blocks : xarray.Dataset
         From `reduce_log`.
     coefficient : xarray.DataArray
-        ``(axis, term)``: noise of the baseline, in the units of the laws.
+        ``(axis, term)``: noise of the baseline, in units of the noise model.
 
     Returns
     -------
     candidates : list of Candidate
     reasons : dict of str to str
-        Effect -> why it cannot be seen in this record.
+        Why an effect cannot be seen in this record.
 
     Examples
     --------
@@ -163,7 +165,8 @@ def effect_candidates(
     >>> from gyrostab.ingest.make_log import make_log
     >>> noise = 1.8 * np.random.default_rng(1).standard_normal((1, 60_000))
     >>> blocks = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
-    >>> level = xr.DataArray([[0.003, 0.0]], {"axis": ["axis_0"], "term": ["N", "B"]}, ("axis", "term"))
+    >>> coordinates = {"axis": ["axis_0"], "term": ["N", "B"]}
+    >>> level = xr.DataArray([[0.003, 0.0]], coordinates, ("axis", "term"))
     >>> found, reasons = effect_candidates(blocks, level)
     >>> reasons["shupe"]
     'not identifiable: the recording has no channel temperature'
@@ -174,64 +177,63 @@ def effect_candidates(
     found: list[Candidate] = []
     reasons: dict[str, str] = {}
     for name, kind in effects().items():
-        if name in _TWINS:
+        if name in _SAME_DESIGN:
             continue
-        made: list[Candidate] = []
-        said = ""
-        if _by_lattice(kind, blocks):
-            reasons[name] = "not identifiable: the lattice of values is too coarse"
+        built: list[Candidate] = []
+        reason = ""
+        if _is_hidden_by_grid(kind, blocks):
+            reasons[name] = "not identifiable: the quantization grid is too coarse"
             continue
-        for drivers in _drivers(kind, blocks, units):
-            more, why = _of_kind(kind, blocks, drivers, coefficient)
-            made += more
-            said = said or why
-        found += made
-        if not made:
-            reasons[name] = (
-                f"not identifiable: {said or 'it leaves no trace in means, spectra and distribution of this record'}"
-            )
+        for drivers in _driver_assignments(kind, blocks, units):
+            added, why = _candidates_of_effect(kind, blocks, drivers, coefficient)
+            built += added
+            reason = reason or why
+        found += built
+        if not built:
+            why = reason or "it leaves no trace in means, spectra and distribution of this record"
+            reasons[name] = f"not identifiable: {why}"
     return found, reasons
 
 
-def _by_lattice(kind: type[Effect], blocks: xr.Dataset) -> bool:
-    """The effect is told by statistics that, on every axis of this record, are those of the lattice of values."""
+def _is_hidden_by_grid(kind: type[Effect], blocks: xr.Dataset) -> bool:
+    """Return whether a coarse quantization grid hides every statistic of the effect on all axes."""
     if kind.channels or not has_coarse_grid(blocks).all():
         return False
-    marks = kind.example().explain(windows_of(blocks, {})).marks
+    marks = kind.example().explain(make_windows(blocks, {})).marks
     return bool(marks) and set(marks) <= set(GRID_COUNTS)
 
 
-# -------------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------
 # channels
 
 
-def _drivers(
+def _driver_assignments(
     kind: type[Effect], blocks: xr.Dataset, units: Mapping[str, str]
 ) -> Iterator[dict[str, str]]:
-    """Channels of the effect -> channels of the log, in every way that makes sense."""
+    """Yield assignments of the log's channels to the effect's, in all sensible ways."""
     options = [
-        _matches(channel, unit, tuple(kind.channels), blocks, units) or [""]
+        _matching_channels(channel, unit, tuple(kind.channels), blocks, units) or [""]
         for channel, unit in kind.channels.items()
     ]
-    seen = set()
+    assigned = set()
     for chosen in product(*options):
         named = [name for name in chosen if name]
-        if len(set(named)) < len(named) or frozenset(named) in seen:
+        if len(set(named)) < len(named) or frozenset(named) in assigned:
             continue
-        seen.add(frozenset(named))
+        assigned.add(frozenset(named))
         yield {channel: name for channel, name in zip(kind.channels, chosen, strict=True) if name}
-    if not seen:
+    if not assigned:
         yield {}
 
 
-def _matches(
+def _matching_channels(
     channel: str,
     unit: str,
     channels: tuple[str, ...],
     blocks: xr.Dataset,
     units: Mapping[str, str],
 ) -> list[str]:
-    """Channels of the log that can stand for one of the effect's: vectors by their name, others by the beginning of it."""
+    """Return channels of the log for one of the effect's: vectors by name, others by prefix."""
     if sum(other[:-1] == channel[:-1] for other in channels) > 1 and channel[-1] in "xyz":
         names = [channel]
     else:
@@ -248,88 +250,100 @@ def _matches(
     ]
 
 
-# --------------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------
 # variants
 
 
-def _of_kind(
+def _candidates_of_effect(
     kind: type[Effect], blocks: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray
 ) -> tuple[list[Candidate], str]:
-    """Candidates of one effect with its channels, by view; and why there are none."""
+    """Build the candidates of an effect with its channels, by statistic; or say why not."""
     if kind.channels and not drivers:
-        return _strangers(kind, blocks), missing_channel_reason(tuple(kind.channels), blocks)
-    windows = windows_of(blocks, drivers)
+        return _motion_candidates(kind, blocks), missing_channel_reason(
+            tuple(kind.channels), blocks
+        )
+    windows = make_windows(blocks, drivers)
     predictions: list[tuple[dict[str, Any], Prediction]] = []
     why = ""
-    for values in _grid(kind, windows):
+    for values in _nuisance_grid(kind, windows):
         try:
             effect = kind.example(**values)
             predictions.append(
-                (values, _visible(kind.name, _exogenous(effect, windows), blocks, coefficient))
+                (
+                    values,
+                    _drop_hidden_means(
+                        kind.name, _predict_exogenous(effect, windows), blocks, coefficient
+                    ),
+                )
             )
         except KeyError as error:
             why = missing_channel_reason((str(error.args[0]),), blocks)
         except OptionError as error:
             why = str(error)
     driver = tuple(drivers.get(channel, "") for channel in kind.channels) if drivers else ()
-    still = [
-        name for name in drivers.values() if np.ptp(windows.drivers[_inner(drivers, name)]) == 0.0
+    constant_channels = [
+        name
+        for name in drivers.values()
+        if np.ptp(windows.drivers[_effect_channel(drivers, name)]) == 0.0
     ]
-    if still:
-        why = f"{' and '.join(still)} {'does' if len(still) == 1 else 'do'} not change"
+    if constant_channels:
+        verb = "does" if len(constant_channels) == 1 else "do"
+        why = f"{' and '.join(constant_channels)} {verb} not change"
     many = {item.name for item in kind.parameters() if item.many}
-    made = []
+    built = []
     for statistic, build in BUILDERS.items():
-        variants = _distinct(
+        variants = _distinct_variants(
             [
                 one
-                for values, seen in predictions
-                for one in build(values, seen, blocks, coefficient)
+                for values, prediction in predictions
+                for one in build(values, prediction, blocks, coefficient)
             ]
         )
-        variants = _weighed(variants, windows)
+        variants = _weigh_by_time(variants, windows)
         if not variants:
             continue
         marks = (
-            tuple(dict.fromkeys(mark for _, seen in predictions for mark in seen.marks))
+            tuple(dict.fromkeys(mark for _, prediction in predictions for mark in prediction.marks))
             if statistic == "marks"
             else ()
         )
         each = statistic != "order" or bool(many & set(variants[0].columns))
-        made.append(Candidate(kind.name, statistic, driver, variants, marks=marks, each=each))
-    made += [
-        replace(one, driver=driver) for one in _transfers(kind.name, predictions, windows, blocks)
+        built.append(Candidate(kind.name, statistic, driver, variants, marks=marks, each=each))
+    built += [
+        replace(one, driver=driver)
+        for one in _transfer_candidates(kind.name, predictions, windows, blocks)
     ]
-    return made, why
+    return built, why
 
 
-def variants_of(
+def rebuild_variant(
     candidate: Candidate, variant: Variant, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Variant | None:
-    """A variant of a candidate made anew, for other channels or other values of the same parameters; None where it is nothing."""
+    """Rebuild a variant for other channels or parameter values; None if it vanishes."""
     kind = effects()[candidate.effect]
     drivers = {
         inner: name for inner, name in zip(kind.channels, candidate.driver, strict=False) if name
     }
-    seen = _exogenous(kind.example(**variant.values), windows_of(blocks, drivers))
-    made = BUILDERS[candidate.statistic](dict(variant.values), seen, blocks, coefficient)
+    prediction = _predict_exogenous(kind.example(**variant.values), make_windows(blocks, drivers))
+    built = BUILDERS[candidate.statistic](dict(variant.values), prediction, blocks, coefficient)
     return next(
-        (one for one in made if one.columns == variant.columns and one.squared == variant.squared),
+        (one for one in built if one.columns == variant.columns and one.squared == variant.squared),
         None,
     )
 
 
-def _inner(drivers: Mapping[str, str], name: str) -> str:
+def _effect_channel(drivers: Mapping[str, str], name: str) -> str:
+    """Return the effect's name of a channel of the log."""
     return next(inner for inner, outer in drivers.items() if outer == name)
 
 
-def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
-    """Values of the nuisance parameters, and of the words."""
+def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
+    """Yield values of the nuisance parameters and choices."""
     try:
         grid: dict[str, Sequence[Any]] = {
-            name: tried_instants(values, windows)
-            if name == _INSTANT
-            else _thinned(values, _MOST_VALUES)
+            name: select_step_times(values, windows)
+            if name == _TIME_PARAMETER
+            else _thin_out(values, _MAX_VALUES)
             for name, values in kind.example().nuisance(windows).items()
         }
     except KeyError:
@@ -340,7 +354,7 @@ def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
         yield from (dict(point) for point in known)
         return
     points = list(product(*grid.values()))
-    most = max(_MOST_VARIANTS, len(grid.get(_INSTANT, ())))
+    most = max(_MAX_VARIANTS, len(grid.get(_TIME_PARAMETER, ())))
     for point in points[:: max(1, -(-len(points) // most))]:
         yield {
             name: value if isinstance(value, str) else float(value)
@@ -348,22 +362,22 @@ def _grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
         }
 
 
-def _thinned(values: Array, most: int) -> list[Any]:
-    """So many of the values at most."""
+def _thin_out(values: Array, most: int) -> list[Any]:
+    """Select at most `most` values at equal steps."""
     every = max(1, -(-len(values) // most))
     return list(values[every // 2 :: every])
 
 
-def _weighed(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
-    """Variants with the chance of the instant at which something happens.
+def _weigh_by_time(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
+    """Weight variants by the prior probability of their time.
 
-    It is as likely when power comes back as at all other times together, and at these as likely as
-    the time that each stands for is long.
+    Times at which power came back have the same total probability as all others, which have that of
+    the interval they represent.
     """
-    if not variants or not all(_INSTANT in one.values for one in variants):
+    if not variants or not all(_TIME_PARAMETER in one.values for one in variants):
         return variants
-    at = np.array([one.values[_INSTANT] for one in variants])
-    known = np.array([bool(np.isclose(known_instants(windows), instant).any()) for instant in at])
+    at = np.array([one.values[_TIME_PARAMETER] for one in variants])
+    known = np.array([bool(np.isclose(power_on_times(windows), instant).any()) for instant in at])
     others, place = np.unique(at[~known], return_inverse=True)
     if others.size < 2:
         return variants
@@ -376,54 +390,56 @@ def _weighed(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, 
     )
 
 
-def _exogenous(effect: Effect, windows: Windows) -> Prediction:
-    """What an effect predicts, without the means of an axis that come from the axis's own noisy reading."""
-    whole = effect.explain(windows)
-    if not whole.mean:
-        return whole
+def _predict_exogenous(effect: Effect, windows: Windows) -> Prediction:
+    """Predict an effect without those means of an axis that follow its own noisy reading."""
+    full = effect.explain(windows)
+    if not full.mean:
+        return full
     shape = (len(windows.axes), windows.begin.size)
     mean = {
         name: np.array(np.broadcast_to(np.atleast_2d(values), shape))
-        for name, values in whole.mean.items()
+        for name, values in full.mean.items()
     }
     nothing = np.full(windows.begin.size, np.nan)
-    without_any = effect.explain(replace(windows, own=dict.fromkeys(windows.axes, nothing))).mean
+    without_means = effect.explain(replace(windows, own=dict.fromkeys(windows.axes, nothing))).mean
     for name, values in mean.items():
-        if name in without_any and np.isfinite(without_any[name]).all():
+        if name in without_means and np.isfinite(without_means[name]).all():
             continue
         for row, axis in enumerate(windows.axes):
             blind = replace(windows, own=dict(windows.own) | {axis: nothing})
-            seen = np.broadcast_to(np.atleast_2d(effect.explain(blind).mean[name]), shape)[row]
-            if not np.array_equal(seen, values[row]):
+            without_axis = np.broadcast_to(np.atleast_2d(effect.explain(blind).mean[name]), shape)[
+                row
+            ]
+            if not np.array_equal(without_axis, values[row]):
                 values[row] = 0.0
-    return replace(whole, mean=mean)
+    return replace(full, mean=mean)
 
 
-def _visible(
-    name: str, seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
+def _drop_hidden_means(
+    name: str, prediction: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Prediction:
-    """What an effect predicts, without the means that white noise alone hides on every axis at the largest size there is.
+    """Drop predicted means that white noise hides on every axis even at the largest size.
 
-    An axis at rest cannot leak into others: its noise, taken for a motion, would only blur what
-    moves.
+    An axis at rest cannot leak into others: its noise, taken for motion, would only blur real
+    motion.
     """
-    if name not in LARGEST or not seen.mean:
-        return seen
+    if name not in LARGEST_SIZE or not prediction.mean:
+        return prediction
     good = np.isfinite(blocks["mean"].transpose("axis", "block").values)
     white = coefficient.sel(term="N").values * np.sqrt(HOUR / float(blocks.attrs["block_s"]))
     mean = {}
-    for column, design in seen.mean.items():
+    for column, design in prediction.mean.items():
         rows = np.where(good, np.broadcast_to(np.atleast_2d(design), good.shape), np.nan)
         moved = np.sqrt(np.nansum((rows - np.nanmean(rows, axis=1, keepdims=True)) ** 2, axis=1))
-        if (LARGEST[name] * moved > _SEEN * white).any():
+        if (LARGEST_SIZE[name] * moved > _MIN_SIZE_STDERRS * white).any():
             mean[column] = design
-    return replace(seen, mean=mean)
+    return replace(prediction, mean=mean)
 
 
-def _distinct(variants: list[Variant]) -> tuple[Variant, ...]:
-    """Variants without those whose designs another one has already, or are empty of anything."""
+def _distinct_variants(variants: list[Variant]) -> tuple[Variant, ...]:
+    """Drop variants with empty designs, or designs equal to others."""
     kept: list[Variant] = []
-    seen: set[tuple[Any, ...]] = set()
+    known_designs: set[tuple[Any, ...]] = set()
     for one in variants:
         if one.design.size:
             size = np.abs(one.design).max(initial=0.0)
@@ -432,55 +448,62 @@ def _distinct(variants: list[Variant]) -> tuple[Variant, ...]:
             mark: tuple[Any, ...] = (
                 one.columns,
                 one.time,
-                np.round(one.design / size / _SAME).tobytes(),
+                np.round(one.design / size / _MAX_DESIGN_DIFFERENCE).tobytes(),
             )
         else:
             mark = (one.columns,)
-        if mark not in seen:
-            seen.add(mark)
+        if mark not in known_designs:
+            known_designs.add(mark)
             kept.append(one)
     return tuple(kept)
 
 
-def _transfers(
+def _transfer_candidates(
     name: str,
     predictions: list[tuple[dict[str, Any], Prediction]],
     windows: Windows,
     blocks: xr.Dataset,
 ) -> list[Candidate]:
-    """Rates that follow another channel, or another axis, at every frequency."""
-    there = {str(one) for one in blocks["witness"].values} if "witness" in blocks.dims else set()
+    """Build candidates of rates that follow another channel or axis at every frequency."""
+    reference_channels = (
+        {str(one) for one in blocks["witness"].values} if "witness" in blocks.dims else set()
+    )
     axes = set(windows.axes) if "cross" in blocks else set()
     found: dict[str, list[Variant]] = {}
-    for values, seen in predictions:
-        for (parameter, channel), transfer in seen.transfer.items():
-            if channel in there or channel in axes:
+    for values, prediction in predictions:
+        for (parameter, channel), transfer in prediction.transfer.items():
+            if channel in reference_channels or channel in axes:
                 found.setdefault(channel, []).append(
                     Variant(values, (parameter,), np.asarray(transfer)[None])
                 )
     if found and effects()[name].stage == "motion":
-        strange = [channel for channel in sorted(there) if not _known(channel)]
-        for channel in [*found, *strange]:
+        unknown_channels = [
+            channel for channel in sorted(reference_channels) if not _is_known_channel(channel)
+        ]
+        for channel in [*found, *unknown_channels]:
             found[channel] = found.get(channel, []) + _any_transfer(windows.frequency.size)
     return [
-        Candidate(name, "transfer", (), _distinct(variants), witness=(channel,))
+        Candidate(name, "transfer", (), _distinct_variants(variants), witness=(channel,))
         for channel, variants in found.items()
     ]
 
 
-def _strangers(kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
-    """Real motion that only channels of no known effect see, a seismometer for instance."""
+def _motion_candidates(kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
+    """Build real motion that only channels of no known effect see, such as a seismometer."""
     if kind.name != "real_motion" or "witness" not in blocks.dims:
         return []
-    variants = _distinct(_any_transfer(blocks.sizes["band"]))
-    strange = sorted(str(one) for one in blocks["witness"].values if not _known(str(one)))
+    variants = _distinct_variants(_any_transfer(blocks.sizes["band"]))
+    unknown_channels = sorted(
+        str(one) for one in blocks["witness"].values if not _is_known_channel(str(one))
+    )
     return [
-        Candidate(kind.name, "transfer", (), variants, witness=(channel,)) for channel in strange
+        Candidate(kind.name, "transfer", (), variants, witness=(channel,))
+        for channel in unknown_channels
     ]
 
 
-def _known(channel: str) -> bool:
-    """A channel drives some effect of the registry, or is known to be no motion."""
+def _is_known_channel(channel: str) -> bool:
+    """Return whether a channel drives a registered effect, or cannot show motion."""
     bases = {name for kind in effects().values() for name in kind.channels}
     return (
         any(
@@ -492,7 +515,7 @@ def _known(channel: str) -> bool:
 
 
 def _any_transfer(bands: int) -> list[Variant]:
-    """Any factor in a band, and in every band: a mounting may resonate."""
+    """Return any factor in each band, and in all bands: a mounting may resonate."""
     alone = np.eye(bands, dtype=np.complex128)
     one = [Variant({}, ("any",) * 2, np.stack([row, 1j * row])) for row in alone]
     return [*one, Variant({}, ("any",) * (2 * bands), np.concatenate([alone, 1j * alone]))]

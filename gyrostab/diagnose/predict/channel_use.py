@@ -1,4 +1,4 @@
-"""Which channels of a recording no effect can use, and why."""
+"""Channels of a recording that no effect can use, with reasons."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Collection, Iterable, Mapping
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.reduce.aligned_channels import TURNING
+from gyrostab.diagnose.reduce.aligned_channels import ROTATION_WAVE_PREFIXES
 from gyrostab.physics.registry import effects
 
 __all__ = ["CALIBRATION_CHANNELS", "MIN_BLOCK_SHARE", "missing_channel_reason", "unused_channels"]
 
-#: Share of the blocks in which a channel must have values.
+#: Least share of the blocks in which a channel must have values. Design choice.
 MIN_BLOCK_SHARE = 0.5
-#: Beginnings of the names of channels that choose the quiet stretches.
+#: Prefixes of channels that select the quiescent intervals.
 CALIBRATION_CHANNELS = ("vibration", "temperature", "rotation_rate")
 
 
 def missing_channel_reason(channels: Collection[str], blocks: xr.Dataset) -> str:
-    """Say why none of the channels that an effect follows can be used.
+    """Explain why an effect can use none of its channels.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def missing_channel_reason(channels: Collection[str], blocks: xr.Dataset) -> str
     for name in channels:
         if name in unused:
             return f"the channel {name} is not used: {unused[name]}"
-        if problem := _problem(name, blocks):
+        if problem := _describe_problem(name, blocks):
             return f"the channel {name} is not used: {problem}"
     return f"the recording has no channel {' or '.join(channels)}"
 
@@ -43,14 +43,14 @@ def unused_channels(blocks: xr.Dataset, used: Iterable[str]) -> list[dict[str, s
     Parameters
     ----------
     blocks : xarray.Dataset
-        From `reduce_log`; its attribute ``unused_channels`` has those that were left out before.
+        From `reduce_log`; its attribute ``unused_channels`` has those left out before.
     used : iterable of str
-        Channels that some candidate follows or is compared with.
+        Channels that a candidate uses.
 
     Returns
     -------
     list of dict
-        ``name`` and ``reason`` of each.
+        ``name`` and ``reason``.
     """
     found = dict(blocks.attrs.get("unused_channels", {}))
     known = set(used)
@@ -58,14 +58,14 @@ def unused_channels(blocks: xr.Dataset, used: Iterable[str]) -> list[dict[str, s
         name = variable.removeprefix("channel_")
         if name == variable or name in known:
             continue
-        problem = _problem(name, blocks)
+        problem = _describe_problem(name, blocks)
         if problem or not name.startswith(CALIBRATION_CHANNELS):
-            found[name] = problem or _stranger(name, blocks)
+            found[name] = problem or _describe_unused(name, blocks)
     return [{"name": name, "reason": reason} for name, reason in found.items()]
 
 
-def _problem(name: str, blocks: xr.Dataset) -> str:
-    """Say what is wrong with the values or the unit of a channel; empty for nothing."""
+def _describe_problem(name: str, blocks: xr.Dataset) -> str:
+    """Describe what is wrong with the values or the unit of a channel; empty if nothing is."""
     variable = f"channel_{name}"
     if variable not in blocks:
         return ""
@@ -75,14 +75,17 @@ def _problem(name: str, blocks: xr.Dataset) -> str:
         return f"it has values in {share:.0%} of the blocks, and {MIN_BLOCK_SHARE:.0%} are needed"
     unit, wanted = str(blocks[variable].attrs.get("units", "")), _wanted_units(name)
     if wanted and unit not in wanted:
-        return f"its unit is {unit!r}, and effects need {' or '.join(map(repr, wanted))}; give it with --unit {name}=UNIT"
+        return (
+            f"its unit is {unit!r}, and effects need {' or '.join(map(repr, wanted))}; "
+            f"give it with --unit {name}=UNIT"
+        )
     if np.nanmax(values) == np.nanmin(values) and not _is_compared(name, blocks):
         return "it does not change"
     return ""
 
 
 def _wanted_units(name: str) -> list[str]:
-    """Units in which effects follow a channel of this name, or of the beginning of it."""
+    """Return the units in which effects use a channel with this name or prefix."""
     found: dict[str, None] = {}
     for kind in effects().values():
         for channel, unit in kind.channels.items():
@@ -93,14 +96,21 @@ def _wanted_units(name: str) -> list[str]:
 
 
 def _is_compared(name: str, blocks: xr.Dataset) -> bool:
-    """Return whether a channel lies on the time of the gyro, so that their spectra can be compared."""
+    """Return whether a channel is on the time grid of the gyro, so that spectra are comparable."""
     return "witness" in blocks.dims and name in blocks["witness"].values
 
 
-def _stranger(name: str, blocks: xr.Dataset) -> str:
+def _describe_unused(name: str, blocks: xr.Dataset) -> str:
+    """Explain why no effect uses a channel."""
     if _is_compared(name, blocks) or _wanted_units(name):
         return "no effect that this record can show follows it"
-    if name.startswith(TURNING):
-        return "no effect follows a channel of this name; lines at the rotation are found with the channel rotation_rate"
+    if name.startswith(ROTATION_WAVE_PREFIXES):
+        return (
+            "no effect follows a channel of this name; "
+            "lines at the rotation are found with the channel rotation_rate"
+        )
     rate = float(blocks.attrs["sampling_rate_hz"])
-    return f"no effect follows a channel of this name, and it is too slow to be compared with the gyro sample by sample ({rate:.4g} Hz)"
+    return (
+        "no effect follows a channel of this name, and it is too slow to be compared with the gyro "
+        f"sample by sample ({rate:.4g} Hz)"
+    )

@@ -1,4 +1,4 @@
-"""What a named effect leaves for the next ones: given columns in every view that it touches, masked blocks, new weights."""
+"""Conditioning on named effects: given columns in every statistic, masked blocks, new weights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gyrostab.diagnose.evidence.fast_switching import switching_powers
 from gyrostab.diagnose.evidence.held_out import noise_columns
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_skirt
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.filter_response import is_filter, straightened
+from gyrostab.diagnose.predict.filter_response import is_filter, undo_filter
 from gyrostab.diagnose.predict.linear_model import (
     State,
     cross_column,
@@ -27,47 +27,47 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.physics.phase import fold
 
 __all__ = [
-    "FLOOR",
+    "MIN_POWER_RATIO",
     "Component",
     "add_fast_switching",
     "condition_on",
     "condition_on_component",
     "condition_on_components",
+    "drop_changed_tails",
     "find_anomalous_blocks",
+    "is_reversed",
     "mask_anomalous_blocks",
     "mean_columns",
-    "mirrored",
     "power_shares",
-    "reweighted",
-    "without_turns",
+    "refit_weights",
 ]
 
 Array = NDArray[np.float64]
-#: Of the expected power, below which no fit goes.
-FLOOR = 0.2
-_LINE_REACH = 3  # lines on each side of one that belong to it
-_FEW = 0.5  # of the blocks at most may be masked
-_ODD = 0.75  # of those that the axis has may be left out for odd samples
-_THERE = 0.1  # of the samples of the fullest block, above which an axis has a block
-_FLAT = 0.04  # of a density, by which its bands may differ where it is white
-_HOPS = 0.05  # share of a piece, by which a course that hops within a block differs in it
-_TURN = 0.2  # change of the logarithm of the noise power from block to block
+#: Least fitted power over the expected one. Design choice.
+MIN_POWER_RATIO = 0.2
+_LINE_REACH = 3  # lines on each side that belong to a line; leakage of the taper
+_MAX_MASKED_SHARE = 0.5  # of the blocks; design choice
+_MAX_ANOMALOUS_SHARE = 0.75  # of an axis's blocks, left out for anomalous samples; design choice
+_MIN_SAMPLE_SHARE = 0.1  # of the fullest block's samples, from which an axis has a block
+_MAX_WHITE_RANGE = 0.04  # of a density, over the bands, for white noise; design choice
+_MIN_SHARE_RANGE = 0.05  # within a block, of a course that switches there; design choice
+_MAX_LOG_POWER_STEP = 0.2  # of noise, from block to block, for usable tails; design choice
 
 
 @dataclass(frozen=True)
 class Component:
-    """One row of a view in which a named effect shows.
+    """One row of a statistic in which a named effect shows.
 
     Attributes
     ----------
     candidate : Candidate
     variant : Variant
     row : tuple of str
-        Axes.
+        Axes of the row.
     evidence_nats : float
-        On held-out time [nats].
+        Held-out evidence [nats].
     place : int
-        Line, or set of harmonics; -1 where there is none.
+        Index of the line, or of the set of harmonics; -1 if there is none.
     """
 
     candidate: Candidate
@@ -77,8 +77,8 @@ class Component:
     place: int = -1
 
 
-def mirrored(component: Component) -> bool:
-    """Whether the axes see what turns in the other order: y stands at -90 degrees from x, or the channel runs back."""
+def is_reversed(component: Component) -> bool:
+    """Return whether the rotation is reversed: y at -90 degrees from x, or a reversed channel."""
     return (
         component.candidate.statistic == "order"
         and not component.candidate.each
@@ -87,40 +87,44 @@ def mirrored(component: Component) -> bool:
 
 
 def condition_on(state: State, components: list[Component]) -> State:
-    """The state with an effect in it."""
-    return reweighted(condition_on_components(state, components))
+    """Add an effect to the state and refit the powers."""
+    return refit_weights(condition_on_components(state, components))
 
 
 def condition_on_components(state: State, components: Iterable[Component]) -> State:
-    """The state with rows of effects in it, before its powers are fitted anew."""
+    """Add components of effects to the state, without refitting the powers."""
     for component in components:
         state = condition_on_component(state, component)
     return state
 
 
 def condition_on_component(state: State, component: Component) -> State:
-    """The state with one row of an effect in it."""
-    return _TAKERS[component.candidate.statistic](state, component)
+    """Add one component of an effect to the state."""
+    return _CONDITIONERS[component.candidate.statistic](state, component)
 
 
 def mean_columns(variant: Variant, row: int) -> list[Array]:
-    """Columns of the mean on an axis, (block,) each."""
+    """Return the columns of the mean on an axis, (block,) each."""
     return [np.asarray(one[row] if one.shape[0] > 1 else one[0]) for one in variant.design]
 
 
-def _mean(state: State, component: Component) -> State:
+def _condition_mean(state: State, component: Component) -> State:
+    """Condition on a component in the means."""
     axis = component.row[0]
     row = state.axes.index(axis)
     columns = mean_columns(component.variant, row)
     state = state.with_columns("mean", axis, columns)
-    return replace(state, masked=state.masked | _edges(state, row, columns))
+    return replace(state, masked=state.masked | _moving_blocks(state, row, columns))
 
 
-def _hopping(state: State, component: Component) -> State:
-    """A bias of two levels; where it hops within blocks its course is the power there, and their kurtosis says nothing."""
+def _condition_telegraph(state: State, component: Component) -> State:
+    """Condition on a bias of two levels.
+
+    If it switches within blocks, its course is the power there and invalidates their kurtosis.
+    """
     inside = component.variant.inside
     if not inside.size:
-        return _mean(state, component)
+        return _condition_mean(state, component)
     axis = component.row[0]
     row = state.axes.index(axis)
     attrs = state.blocks.attrs
@@ -130,7 +134,7 @@ def _hopping(state: State, component: Component) -> State:
     )
     state = add_fast_switching(state, component)
     state = state.with_columns("power", axis, [power_column(power[None], row, state)])
-    moves = xr.DataArray(np.ptp(inside, axis=1) > _HOPS, dims="block") & (
+    moves = xr.DataArray(np.ptp(inside, axis=1) > _MIN_SHARE_RANGE, dims="block") & (
         state.blocks["axis"] == axis
     )
     blank = {
@@ -141,15 +145,15 @@ def _hopping(state: State, component: Component) -> State:
 
 
 def add_fast_switching(state: State, component: Component) -> State:
-    """The state with the course of a bias that hops within blocks, in the means of blocks and of their pieces."""
+    """Add the course of a bias that switches within blocks to the block and sub-block means."""
     axis = component.row[0]
     return state.with_columns("mean", axis, mean_columns(component.variant, 0)).with_columns(
         "inner", axis, [component.variant.inside]
     )
 
 
-def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
-    """Blocks in which the effect moves so much that it shows in the power of the axis."""
+def _moving_blocks(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
+    """Return the blocks in which the effect moves enough to show in the power of the axis."""
     blocks = state.blocks
     y = blocks["mean"].values[row] - state.baseline["known_mean"].values[row]
     good = np.isfinite(y)
@@ -163,17 +167,18 @@ def _edges(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
     seconds = float(blocks.attrs["block_s"])
     strong = moved**2 * seconds > 5.0 * state.weight[row, :, 0]
     mask = np.zeros_like(state.masked)
-    if strong.mean() <= _FEW:
+    if strong.mean() <= _MAX_MASKED_SHARE:
         mask[row] = strong
     return mask
 
 
-def _power(state: State, component: Component) -> State:
+def _condition_power(state: State, component: Component) -> State:
+    """Condition on a component in the powers."""
     axis = component.row[0]
     row = state.axes.index(axis)
     if is_filter("power", component.variant) and "line_power" in state.blocks:
         expected = expected_lines(state.baseline, state.blocks["line_frequency"].values)[row]
-        blocks, stopped = straightened(
+        blocks, stopped = undo_filter(
             state.blocks, axis, component.candidate.effect, component.variant.values, expected
         )
         state = replace(state, blocks=blocks).with_columns("line", "all", [stopped])
@@ -186,7 +191,8 @@ def _power(state: State, component: Component) -> State:
     )
 
 
-def _cross(state: State, component: Component) -> State:
+def _condition_cross(state: State, component: Component) -> State:
+    """Condition on a component in the cross-spectra."""
     row = pair_rows(state.blocks).index(component.row)
     columns = []
     for one in component.variant.design:
@@ -196,9 +202,8 @@ def _cross(state: State, component: Component) -> State:
     if not component.variant.squared:
         return state
     calibrated = state.baseline.attrs.get("source", "calibrated") == "calibrated"
-    added = [
-        one.real for one in component.variant.design if not (calibrated and _white(one))
-    ]  # white noise was calibrated with it
+    # White noise was calibrated with it.
+    added = [one.real for one in component.variant.design if not (calibrated and _is_white(one))]
     for axis in component.row if added else ():
         powers = [power_column(one, state.axes.index(axis), state) for one in added]
         known = state.given.get(("power", axis), [])
@@ -210,34 +215,35 @@ def _cross(state: State, component: Component) -> State:
     return state
 
 
-def _white(density: NDArray[np.complex128]) -> bool:
-    """Whether a density is the same in all bands, to the error of a form."""
+def _is_white(density: NDArray[np.complex128]) -> bool:
+    """Return whether a density is the same in all bands, up to `_MAX_WHITE_RANGE`."""
     size = np.abs(density)
-    return bool(np.ptp(size, axis=-1).max() <= _FLAT * size.max(initial=0.0))
+    return bool(np.ptp(size, axis=-1).max() <= _MAX_WHITE_RANGE * size.max(initial=0.0))
 
 
-def _coherent(state: State, axes: tuple[str, ...], density: Array) -> State:
-    """Any covariance of these axes with the rest of this density, (block, band)."""
+def _free_covariance(state: State, axes: tuple[str, ...], density: Array) -> State:
+    """Add any covariance of these axes with the others of this density, (block, band)."""
     nothing = np.zeros_like(density)
     for pair in pair_rows(state.blocks) if "cross" in state.blocks else []:
         if set(pair) & set(axes):
-            both = [
+            real_and_imaginary = [
                 np.concatenate([density, nothing], axis=-1),
                 np.concatenate([nothing, density], axis=-1),
             ]
-            state = state.with_columns("cross", ",".join(pair), both)
+            state = state.with_columns("cross", ",".join(pair), real_and_imaginary)
     return state
 
 
-def _bands_of(state: State, frequency: Array) -> NDArray[np.bool_]:
-    """Bands in which frequencies, (block,) or scalar, lie, and the next ones where they are at an edge; (block, band)."""
+def _bands_at(state: State, frequency: Array) -> NDArray[np.bool_]:
+    """Return the bands (block, band) of frequencies, (block,) or scalar, and adjacent ones."""
     low, high = state.blocks["band_low"].values, state.blocks["band_high"].values
     reach = 1.0 / float(state.blocks.attrs["block_s"])
     place = np.broadcast_to(frequency, (state.weight.shape[1],))[:, None]
     return (place >= low - reach) & (place < high + reach)
 
 
-def _order(state: State, component: Component) -> State:
+def _condition_order(state: State, component: Component) -> State:
+    """Condition on a component in the rotation orders."""
     count = state.blocks.sizes["harmonic"]
     turn = np.abs(state.blocks["channel_rotation_rate"].values) / 360.0
     if component.candidate.each:
@@ -247,19 +253,19 @@ def _order(state: State, component: Component) -> State:
         chosen = (0,)
         pattern = (
             np.conj(component.variant.design[0])
-            if mirrored(component)
+            if is_reversed(component)
             else component.variant.design[0]
         )
         patterns = [(axis, pattern[state.axes.index(axis)]) for axis in component.row]
     for axis, pattern in patterns:
         state = state.with_columns("order", axis, order_columns(pattern, chosen))
         for k in chosen:
-            density = _bands_of(state, turn * (k + 1)).astype(float)
+            density = _bands_at(state, turn * (k + 1)).astype(float)
             for band in np.flatnonzero(density.any(axis=0)):
                 column = np.zeros_like(density)
                 column[:, band] = density[:, band]
                 state = state.with_columns("power", axis, [column])
-                state = _coherent(state, (axis,), column)
+                state = _free_covariance(state, (axis,), column)
     lines = state.blocks["line_frequency"].values
     taken = np.zeros(lines.size, np.bool_)
     for k in chosen:
@@ -270,21 +276,23 @@ def _order(state: State, component: Component) -> State:
 
 
 def _free_shape(state: State, axis: str) -> State:
+    """Add any spectrum of constant shape to the powers of an axis."""
     bands = state.weight.shape[2]
     return state.with_columns(
         "power", axis, [np.broadcast_to(one, state.weight.shape[1:]) for one in np.eye(bands)]
     )
 
 
-def _profile(state: State, component: Component) -> State:
+def _condition_profile(state: State, component: Component) -> State:
+    """Condition on a component in the ramp profile."""
     state = state.with_columns("phase_locked", component.row[0], list(component.variant.design))
     if "ramp_turns" in state.blocks:
-        state = state.with_columns("line", "all", [_comb(state)])
+        state = state.with_columns("line", "all", [_ramp_lines(state)])
     return _free_shape(state, component.row[0])
 
 
-def _comb(state: State) -> NDArray[np.bool_]:
-    """Lines at the multiples of the turns of the ramp, folded as samples see them."""
+def _ramp_lines(state: State) -> NDArray[np.bool_]:
+    """Return the lines at multiples of the ramp frequency, aliased by the sampling."""
     lines, rate = (
         state.blocks["line_frequency"].values,
         float(state.blocks.attrs["sampling_rate_hz"]),
@@ -302,7 +310,8 @@ def _comb(state: State) -> NDArray[np.bool_]:
     return np.asarray(near.any(axis=1))
 
 
-def _transfer(state: State, component: Component) -> State:
+def _condition_transfer(state: State, component: Component) -> State:
+    """Condition on a transfer from a reference channel."""
     axis = component.row[0]
     power = reference_channel_power(component.candidate.witness[0], state.blocks)
     power = np.where(np.isfinite(power), power, 0.0)
@@ -319,45 +328,46 @@ def _transfer(state: State, component: Component) -> State:
         column[:, band] = power[:, band] / max(power[:, band].max(initial=0.0), 1e-300)
         if np.ptp(column[:, band]) > 0.5:
             state = state.with_columns("power", axis, [column])
-        state = _coherent(state, (axis,), column)
+        state = _free_covariance(state, (axis,), column)
     return state
 
 
-def _line(state: State, component: Component) -> State:
+def _condition_line(state: State, component: Component) -> State:
+    """Condition on a spectral line."""
     frequency = float(state.blocks["line_frequency"].values[component.place])
     axis = component.row[0]
-    density = _bands_of(state, np.asarray(frequency)).astype(float)
+    density = _bands_at(state, np.asarray(frequency)).astype(float)
     known = state.given.get(("power", axis), [])
     for band in np.flatnonzero(density.any(axis=0)):
         column = np.zeros_like(density)
         column[:, band] = 1.0
         if any(np.array_equal(column, other) for other in known):
-            continue  # another line in the same band has made it free already
+            continue  # another line in the same band is already given
         state = state.with_columns("power", axis, [column])
-        state = _coherent(state, (axis,), column)
+        state = _free_covariance(state, (axis,), column)
     return state.with_columns("line", "all", [line_skirt(state.blocks, axis, component.place)])
 
 
-def _marks(state: State, component: Component) -> State:
-    """Blocks with odd samples say nothing of the rest; where there are too many of them, the shape of the spectrum does not."""
-    if _everywhere(component):
+def _condition_sample_counts(state: State, component: Component) -> State:
+    """Leave out blocks with anomalous samples; if too many, free the shape of the spectrum."""
+    if _is_everywhere(component):
         return state
-    axis, odd = component.row[0], find_anomalous_blocks(component, state.blocks)
-    if not odd.any():
+    axis, anomalous = component.row[0], find_anomalous_blocks(component, state.blocks)
+    if not anomalous.any():
         return _free_shape(state, axis)
-    keep = xr.DataArray(~odd, dims="block")
-    here = state.blocks["axis"] == axis
+    keep = xr.DataArray(~anomalous, dims="block")
+    is_axis = state.blocks["axis"] == axis
     blocks = state.blocks.copy()
     for variable in ("mean", "power"):
-        blocks[variable] = blocks[variable].where(keep | ~here)
+        blocks[variable] = blocks[variable].where(keep | ~is_axis)
     if "cross" in blocks:
         rows = np.array([one == axis for one in state.axes])
-        blocks["cross"] = cross_without(blocks, odd & rows[:, None])
+        blocks["cross"] = cross_without(blocks, anomalous & rows[:, None])
     return replace(state, blocks=blocks)
 
 
-def _everywhere(component: Component) -> bool:
-    """Odd samples that are in every block alike, so that none says less of the rest than others."""
+def _is_everywhere(component: Component) -> bool:
+    """Return whether the samples are anomalous in all blocks alike."""
     return (
         component.candidate.effect == "rate_quantization"
         or component.candidate.effect.startswith("~")
@@ -365,78 +375,77 @@ def _everywhere(component: Component) -> bool:
 
 
 def find_anomalous_blocks(component: Component, blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Blocks with odd samples, which are left out on the axis; none where they would be too many, or the effect is in all alike."""
+    """Return the blocks left out for anomalous samples; none if too many, or if all are alike."""
     samples = blocks["samples"].sel(axis=component.row[0]).values
-    there = samples > _THERE * samples.max(initial=0)
-    if _everywhere(component) or not there.any():
-        return np.zeros(there.size, np.bool_)
+    kept = samples > _MIN_SAMPLE_SHARE * samples.max(initial=0)
+    if _is_everywhere(component) or not kept.any():
+        return np.zeros(kept.size, np.bool_)
     count = blocks[component.variant.columns[0]].sel(axis=component.row[0]).values
-    usual = (
-        0.0 if component.variant.columns[0] == "outliers" else float(np.median(count[there]))
-    )  # noise has as good as none
-    odd = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
-    return np.asarray(odd & (odd[there].mean() <= _ODD))
+    # The noise has a negligible number of outliers.
+    usual = 0.0 if component.variant.columns[0] == "outliers" else float(np.median(count[kept]))
+    anomalous = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
+    return np.asarray(anomalous & (anomalous[kept].mean() <= _MAX_ANOMALOUS_SHARE))
 
 
 def mask_anomalous_blocks(blocks: xr.Dataset, components: Iterable[Component]) -> xr.Dataset:
-    """The record without the blocks of odd samples that are named: their counts tell what they gain, their powers have no model."""
+    """Leave out blocks with named anomalous samples, whose powers have no model."""
     axes = [str(axis) for axis in blocks["axis"].values]
-    odd = np.zeros((len(axes), blocks.sizes["block"]), np.bool_)
+    anomalous = np.zeros((len(axes), blocks.sizes["block"]), np.bool_)
     for component in (
         component for component in components if component.candidate.statistic == "marks"
     ):
-        odd[axes.index(component.row[0])] |= find_anomalous_blocks(component, blocks)
-    if not odd.any():
+        anomalous[axes.index(component.row[0])] |= find_anomalous_blocks(component, blocks)
+    if not anomalous.any():
         return blocks
-    there = xr.DataArray(~odd, dims=("axis", "block"))
-    left = blocks.assign(mean=blocks["mean"].where(there), power=blocks["power"].where(there))
-    return left.assign(cross=cross_without(blocks, odd)) if "cross" in blocks else left
+    kept = xr.DataArray(~anomalous, dims=("axis", "block"))
+    left = blocks.assign(mean=blocks["mean"].where(kept), power=blocks["power"].where(kept))
+    return left.assign(cross=cross_without(blocks, anomalous)) if "cross" in blocks else left
 
 
-_TAKERS = {
-    "mean": _mean,
-    "power": _power,
-    "cross": _cross,
-    "order": _order,
-    "phase_locked": _profile,
-    "transfer": _transfer,
-    "line": _line,
-    "marks": _marks,
-    "levels": _hopping,
+_CONDITIONERS = {
+    "mean": _condition_mean,
+    "power": _condition_power,
+    "cross": _condition_cross,
+    "order": _condition_order,
+    "phase_locked": _condition_profile,
+    "transfer": _condition_transfer,
+    "line": _condition_line,
+    "marks": _condition_sample_counts,
+    "levels": _condition_telegraph,
 }
 
 
-def reweighted(state: State, *, rounds: int = 4) -> State:
-    """The state with weights from a fit of everything given to the powers (Fisher scoring of the gamma likelihood)."""
+def refit_weights(state: State, *, rounds: int = 4) -> State:
+    """Set the weights by a fit of all given power columns (Fisher scoring, gamma likelihood)."""
     weight = state.weight.copy()
     for row, axis in enumerate(state.axes):
         named = state.given.get(("power", axis))
         if named:
-            weight[row] = _fit(
+            weight[row] = _fit_powers(
                 state,
                 row,
                 axis,
                 np.stack([np.broadcast_to(one, weight.shape[1:]) for one in named], axis=-1),
                 rounds,
             )[0]
-    return replace(state, weight=weight, blocks=without_turns(state.blocks, weight))
+    return replace(state, weight=weight, blocks=drop_changed_tails(state.blocks, weight))
 
 
 def power_shares(state: State, axis: str, *, rounds: int = 4) -> Array:
-    """What each column given to the powers of an axis adds to them in the fit of all, (column, block, band)."""
+    """Return the fitted contribution of each power column of an axis, (column, block, band)."""
     row, shape = state.axes.index(axis), state.weight.shape[1:]
     named = [np.broadcast_to(one, shape) for one in state.given.get(("power", axis), [])]
     if not named:
         return np.empty((0, *shape))
-    sizes = _fit(state, row, axis, np.stack(named, axis=-1), rounds)[1]
+    sizes = _fit_powers(state, row, axis, np.stack(named, axis=-1), rounds)[1]
     return np.stack([size * one for size, one in zip(sizes, named, strict=True)])
 
 
-def without_turns(blocks: xr.Dataset, expected: Array) -> xr.Dataset:
-    """The record without the kurtosis and outliers that a changing level of the noise explains.
+def drop_changed_tails(blocks: xr.Dataset, expected: Array) -> xr.Dataset:
+    """Drop kurtosis and outliers that a changing noise level explains.
 
-    Two levels in one block have tails that neither of them has; and noise of another level than
-    usual has another kurtosis, since that of rounding gets lost in what is louder.
+    Two levels in one block have tails that neither level has. Another noise level has another
+    kurtosis, because higher noise hides that of rounding.
 
     Parameters
     ----------
@@ -445,9 +454,11 @@ def without_turns(blocks: xr.Dataset, expected: Array) -> xr.Dataset:
         Expected power.
     """
     level = np.log(expected @ (blocks["band_high"].values - blocks["band_low"].values))
-    step = np.abs(np.diff(level, axis=1)) > _TURN
+    step = np.abs(np.diff(level, axis=1)) > _MAX_LOG_POWER_STEP
     turns = np.pad(step, ((0, 0), (1, 0))) | np.pad(step, ((0, 0), (0, 1)))
-    unusual = turns | (np.abs(level - np.median(level, axis=1, keepdims=True)) > _TURN)
+    unusual = turns | (
+        np.abs(level - np.median(level, axis=1, keepdims=True)) > _MAX_LOG_POWER_STEP
+    )
     left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
     return blocks.assign(
         {
@@ -458,8 +469,10 @@ def without_turns(blocks: xr.Dataset, expected: Array) -> xr.Dataset:
     )
 
 
-def _fit(state: State, row: int, axis: str, named: Array, rounds: int) -> tuple[Array, Array]:
-    """Fitted powers of an axis, and the sizes of the named columns."""
+def _fit_powers(
+    state: State, row: int, axis: str, named: Array, rounds: int
+) -> tuple[Array, Array]:
+    """Fit the powers of an axis; return them and the sizes of the named columns."""
     expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
     level, precision = noise_columns(state.baseline, axis=axis)
     columns = np.concatenate([level * expected[..., None], named], axis=-1).reshape(
@@ -482,5 +495,5 @@ def _fit(state: State, row: int, axis: str, named: Array, rounds: int) -> tuple[
         normal += 1e-9 * np.diag(np.maximum(np.diagonal(normal), 1e-300))
         moved = columns.T @ (w * np.where(good, power - expected.ravel(), 0.0))
         sizes = np.linalg.solve(normal, moved)
-        fitted = np.maximum(expected.ravel() + columns @ sizes, FLOOR * expected.ravel())
+        fitted = np.maximum(expected.ravel() + columns @ sizes, MIN_POWER_RATIO * expected.ravel())
     return np.asarray(fitted.reshape(expected.shape)), (sizes / size)[level.shape[2] :]

@@ -1,4 +1,4 @@
-"""Designs: what a prediction of an effect means for the columns of a linear model, view by view."""
+"""Designs: columns of a linear model for the prediction of an effect, by statistic."""
 
 from __future__ import annotations
 
@@ -20,31 +20,30 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Variant:
-    """One point of the nuisance grid.
+    """One point of the grid of nuisance parameters.
 
     Attributes
     ----------
     values : mapping
-        Parameters that are not linear -> their values.
+        Nonlinear parameters and their values.
     columns : tuple of str
-        Linear parameters, one for each column.
+        Linear parameters, one per column.
     design : ndarray
-        By view. mean: (column, axis, block) [degree hour-1 per unit]; power: (column, axis, block,
-        band), added density [degree2 hour-2 Hz-1 per unit], of the squared parameter where
+        By statistic. mean: (column, axis, block) [degree hour-1 per unit]; power: (column, axis,
+        block, band), added density [degree2 hour-2 Hz-1 per unit], of the squared parameter if
         `squared`; cross: the same for the product of the factors of two axes; order: (1, axis,
         harmonic), complex; phase_locked: (column, phase); transfer: (column, band), complex; marks,
-        line: empty; wander: (column, block); levels: empty before the course is told by the means,
-        then (1, 1, block). The axis has the size 1 where all axes have the same.
+        line: empty; wander: (column, block); levels: (1, 1, block), empty before the means
+        determine the course. The axis has the size 1 if all axes have the same design.
     squared : bool
-        The parameter enters by its square.
+        Whether the parameter enters by its square.
     time : float
-        Of a random mean: the time constant of its memory [s], inf for a walk.
+        Correlation time of a random mean [s], inf for a random walk.
     weight : float
-        Chance of this point before the data are seen, against those of the other variants of the
-        candidate.
+        Prior probability relative to the other variants of the candidate.
     inside : ndarray, shape (block, piece)
-        For levels: the share of pieces of the blocks on the upper level, where the bias hops within
-        blocks; empty where it does not.
+        For levels: share of the sub-blocks on the upper level; empty unless the bias switches
+        within blocks.
     """
 
     values: Mapping[str, Any]
@@ -58,25 +57,25 @@ class Variant:
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect in one view.
+    """An effect in one statistic.
 
     Attributes
     ----------
     effect : str
-        Name in the registry; a generic begins with "~".
+        Name in the registry; that of a nuisance alternative begins with "~".
     statistic : str
-        One of `VIEWS`.
+        One of `STATISTIC_NAMES`.
     driver : tuple of str
-        Channels of the log that it follows, in the order of the effect's channels; empty string for
-        one that is not there.
+        Channels of the log that it follows, in the order of the effect's channels; an empty string
+        for a missing one.
     variants : tuple of Variant
-        Over the nuisance grid.
+        Over the grid of nuisance parameters.
     marks : tuple of str
-        Statistics of the distribution that it raises, for the view "marks".
+        Sample counts that it raises, for the statistic "marks".
     witness : tuple of str
-        Channel or axis of each column, for the view "transfer".
+        Reference channel or axis of each column, for the statistic "transfer".
     each : bool
-        Every axis has a size of its own; else one size holds for all.
+        Whether every axis has its own size; otherwise one size holds for all.
     """
 
     effect: str
@@ -89,25 +88,25 @@ class Candidate:
 
     @property
     def key(self) -> str:
-        """Name with the channels, which tells two candidates of one effect apart."""
+        """Name with the channels, which distinguishes candidates of the same effect."""
         named = ",".join(filter(None, (*self.driver, *self.witness)))
         return f"{self.effect}({named})" if named else self.effect
 
 
-def _choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
-    """Each parameter by itself, and all together."""
+def _column_choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return each parameter alone, and all together."""
     alone: list[tuple[str, ...]] = [(name,) for name in columns]
     return alone if len(alone) < 2 else [*alone, tuple(columns)]
 
 
-# ------------------------------------------------------------------------------------------------------------------
-# views
+# -------------------------------------------------------------------------------
+# statistics
 
 
-def _means(
+def _mean_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
-    """Designs of the mean, each less its mean over time: the constant is free."""
+    """Yield designs of the mean that are not constant; the constant is free."""
     columns = {}
     for name, design in seen.mean.items():
         moved = design - design.mean(axis=-1, keepdims=True)
@@ -115,14 +114,17 @@ def _means(
             initial=1e-300
         ):
             columns[name] = design
-    for chosen in _choices(list(columns)):
+    for chosen in _column_choices(list(columns)):
         yield Variant(values, chosen, np.stack([columns[name] for name in chosen]))
 
 
-def _powers(
+def _power_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
-    """Added densities; a filter as what it adds or takes at its full size. What is constant and coherent is for the cross-spectra."""
+    """Yield added densities; for a filter what it adds or removes at its full size.
+
+    Constant coherent densities are left to the cross-spectra.
+    """
     frequency, rate = blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"])
     level: dict[str, Array] = {}
     for (symbol, name), share in seen.level.items():
@@ -140,25 +142,28 @@ def _powers(
     spectrum = {}
     if seen.line is None:
         spectrum = {
-            name: _rows(density)
+            name: _with_axis(density)
             for name, density in seen.spectrum.items()
-            if _moves(density) or not seen.coherent
+            if _changes_over_time(density) or not seen.coherent
         }
     for columns, squared in ((level, False), (spectrum, True)):
         kept = {
             name: density
             for name, density in columns.items()
-            if np.abs(density).max(initial=0.0) > 0 and not _flat(density)
+            if np.abs(density).max(initial=0.0) > 0 and not _is_white_and_constant(density)
         }
-        for chosen in _choices(list(kept)):
+        for chosen in _column_choices(list(kept)):
             yield Variant(
                 values, chosen, np.stack([kept[name] for name in chosen]), squared=squared
             )
     if seen.response is not None:
-        yield Variant(values, (), _filtered(seen.response, coefficient, frequency, rate)[None])
+        yield Variant(values, (), _filter_change(seen.response, coefficient, frequency, rate)[None])
 
 
-def _filtered(response: Array, coefficient: xr.DataArray, frequency: Array, rate: float) -> Array:
+def _filter_change(
+    response: Array, coefficient: xr.DataArray, frequency: Array, rate: float
+) -> Array:
+    """Return the change of the baseline spectrum by a response."""
     total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
     size, terms = coefficient.transpose("axis", "term").values, list(coefficient["term"].values)
     for symbol in (one for one in "QNBK" if one in terms):
@@ -168,33 +173,33 @@ def _filtered(response: Array, coefficient: xr.DataArray, frequency: Array, rate
     return total * (response - 1.0)
 
 
-def _rows(density: Array) -> Array:
-    """A density with the axis in front."""
+def _with_axis(density: Array) -> Array:
+    """Return a density with the axis first."""
     return np.asarray(density if np.ndim(density) == 3 else np.asarray(density)[None])
 
 
-def _moves(density: Array) -> bool:
-    """A density changes over the windows."""
-    rows = _rows(density)
+def _changes_over_time(density: Array) -> bool:
+    """Return whether a density changes over time."""
+    rows = _with_axis(density)
     return bool(np.abs(rows - rows[:, :1]).max(initial=0.0) > 1e-6 * np.abs(rows).max(initial=0.0))
 
 
-def _flat(density: Array) -> bool:
-    """A density is white and constant in time: a change of N, which is free."""
-    return bool(np.ptp(_rows(density)) <= 1e-6 * np.abs(density).max(initial=0.0))
+def _is_white_and_constant(density: Array) -> bool:
+    """Return whether a density is white and constant: a change of N, which is free."""
+    return bool(np.ptp(_with_axis(density)) <= 1e-6 * np.abs(density).max(initial=0.0))
 
 
-def _crosses(
+def _cross_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
-    """Cross-densities per product of the factors of both axes."""
+    """Yield cross-densities per product of the factors of both axes."""
     if not seen.coherent or seen.line is not None or "cross" not in blocks:
         return
     for name, density in seen.spectrum.items():
-        yield Variant(values, (name,), _rows(density)[None], squared=True)
+        yield Variant(values, (name,), _with_axis(density)[None], squared=True)
 
 
-def _orders(
+def _order_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     if "order" not in blocks:
@@ -204,7 +209,7 @@ def _orders(
         yield Variant(values, (name,), pattern[None, :, :count])
 
 
-def _profiles(
+def _profile_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     if "profile" not in blocks:
@@ -214,21 +219,21 @@ def _profiles(
         for name, design in seen.phase_locked.items()
         if np.isfinite(design).all() and np.ptp(design) > 0
     }
-    for chosen in _choices(list(kept)):
+    for chosen in _column_choices(list(kept)):
         yield Variant(values, chosen, np.stack([kept[name] for name in chosen]))
 
 
-def _marks(
+def _sample_count_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     if seen.marks:
         yield Variant(values, seen.marks, np.empty(0))
 
 
-def _lines(
+def _line_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
-    """A line that does not move, wherever it is; its frequency is found in the spectrum itself."""
+    """Yield a line of constant frequency; the spectrum itself determines the frequency."""
     if (
         seen.line is None
         or "line_power" not in blocks
@@ -239,7 +244,7 @@ def _lines(
     yield Variant({}, tuple(seen.spectrum), np.empty(0), squared=True)
 
 
-def _wanders(
+def _random_process_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
     block = float(blocks.attrs["block_s"])
@@ -248,22 +253,22 @@ def _wanders(
             yield Variant(values, (name,), np.asarray(variance)[None], squared=True, time=time)
 
 
-def _levels(
+def _telegraph_designs(
     values: dict[str, Any], seen: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
 ) -> Iterator[Variant]:
-    """Two levels: the means themselves tell the course and its times."""
+    """Yield two levels; the means determine the course and its times."""
     if seen.levels:
         yield Variant({}, (seen.levels,), np.empty(0))
 
 
 BUILDERS = {
-    "marks": _marks,
-    "mean": _means,
-    "power": _powers,
-    "cross": _crosses,
-    "order": _orders,
-    "phase_locked": _profiles,
-    "line": _lines,
-    "wander": _wanders,
-    "levels": _levels,
+    "marks": _sample_count_designs,
+    "mean": _mean_designs,
+    "power": _power_designs,
+    "cross": _cross_designs,
+    "order": _order_designs,
+    "phase_locked": _profile_designs,
+    "line": _line_designs,
+    "wander": _random_process_designs,
+    "levels": _telegraph_designs,
 }

@@ -1,4 +1,4 @@
-"""What a filter that is named does to every spectrum of the record."""
+"""Effect of a named filter on every spectrum of the record."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.spectral_lines import local_level
-from gyrostab.diagnose.predict.candidates import Variant, windows_of
+from gyrostab.diagnose.predict.candidates import Variant, make_windows
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 
-__all__ = ["inside_bands", "is_filter", "response_of", "straightened"]
+__all__ = ["band_response", "frequencies_in_bands", "is_filter", "undo_filter"]
 
 Array = NDArray[np.float64]
-_INSIDE = 48  # frequencies in a band
-_SHARES, _PASSED = (
-    50,
-    0.002,
-)  # sizes that are tried; least share that a filter of full form lets pass by
-_LOUD = 3.0  # times the level about, beyond which a line is cut
-_STOPPED = 0.05  # of the largest response, below which what is seen is leakage from elsewhere
+_FREQUENCIES_PER_BAND = 48  # to average a response; design choice
+_SIZE_COUNT = 50  # filter sizes that are tried; limits resolution
+_MIN_PASSED_SHARE = 0.002  # smallest passed share that is tried, besides 0
+_MAX_LINE_RATIO = 3.0  # of the local level; higher lines are cut
+_MIN_RESPONSE = 0.05  # of the largest; below, the power is leakage from other frequencies
 
 
-def _share(power: Array, full: Array) -> float:
-    """Share of what a filter takes at its full size, by the likelihood of powers over those without it, whatever their level."""
-    usual = np.minimum(power, _LOUD * local_level(power[None])[0])  # a line is no part of the form
-    passed = full >= _STOPPED * full.max()
-    shares = 1.0 - np.append(np.geomspace(1.0, _PASSED, _SHARES), 0.0)
+def _estimate_size(power: Array, full: Array) -> float:
+    """Estimate the filter size by the likelihood of powers over those without it, at any level."""
+    # Lines do not belong to the shape of the spectrum.
+    usual = np.minimum(power, _MAX_LINE_RATIO * local_level(power[None])[0])
+    passed = full >= _MIN_RESPONSE * full.max()
+    shares = 1.0 - np.append(np.geomspace(1.0, _MIN_PASSED_SHARE, _SIZE_COUNT), 0.0)
     form = 1.0 + shares[:, None] * (full[passed] - 1.0)
     return float(
         shares[np.argmin(np.log((usual[passed] / form).mean(axis=1)) + np.log(form).mean(axis=1))]
@@ -39,36 +38,39 @@ def _share(power: Array, full: Array) -> float:
 
 
 def is_filter(statistic: str, variant: Variant) -> bool:
-    """Whether a variant multiplies the spectrum rather than adds to it."""
+    """Return whether a variant multiplies the spectrum rather than adds to it."""
     return statistic == "power" and not variant.columns
 
 
-def response_of(effect: Effect, blocks: xr.Dataset) -> Array:
-    """Factor of the noise in the bands: the mean over the frequencies of each, for a filter is steep."""
+def band_response(effect: Effect, blocks: xr.Dataset) -> Array:
+    """Return the noise power factor of each band, averaged over its frequencies."""
     return np.asarray(
-        _response(effect, blocks, inside_bands(blocks)).reshape(-1, _INSIDE).mean(axis=1)
+        _response_at(effect, blocks, frequencies_in_bands(blocks))
+        .reshape(-1, _FREQUENCIES_PER_BAND)
+        .mean(axis=1)
     )
 
 
-def inside_bands(blocks: xr.Dataset) -> Array:
-    """Frequencies evenly inside of every band, as many in each, one band after the other [Hz]."""
+def frequencies_in_bands(blocks: xr.Dataset) -> Array:
+    """Return equally many evenly spaced frequencies in every band, band after band [Hz]."""
     low, high = blocks["band_low"].values, blocks["band_high"].values
-    place = (np.arange(_INSIDE) + 0.5) / _INSIDE
+    place = (np.arange(_FREQUENCIES_PER_BAND) + 0.5) / _FREQUENCIES_PER_BAND
     return np.asarray((low[:, None] + (high - low)[:, None] * place).ravel())
 
 
-def _response(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Array:
-    found = effect.explain(replace(windows_of(blocks, {}), frequency=frequency)).response
-    return np.ones(frequency.size) if found is None else np.asarray(found)
+def _response_at(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Array:
+    """Return the power response at frequencies, 1 if there is none."""
+    response = effect.explain(replace(make_windows(blocks, {}), frequency=frequency)).response
+    return np.ones(frequency.size) if response is None else np.asarray(response)
 
 
-def straightened(
+def undo_filter(
     blocks: xr.Dataset, axis: str, effect: str, values: Mapping[str, Any], expected: Array
 ) -> tuple[xr.Dataset, NDArray[np.bool_]]:
-    """The record with the line spectrum of an axis as it was before a filter, once only; and the lines that the filter stops.
+    """Undo a filter in the line spectrum of an axis, once only; return the lines that it stops.
 
-    A filter is named by the form of what it takes, of any size: a weak one is straightened by as
-    much as the spectrum asks for.
+    A filter is named by the shape of its response, at any size: a weak one is undone by as much as
+    the spectrum requires.
 
     Parameters
     ----------
@@ -76,12 +78,12 @@ def straightened(
     axis : str
     effect : str
     values : mapping
-        Of the filter at its full size.
+        Parameters of the filter at its full size.
     expected : ndarray, shape (line,)
-        Density without it, but for a factor.
+        Density without the filter, up to a factor.
     """
     frequency = blocks["line_frequency"].values
-    full = _response(effects()[effect].example(**values), blocks, frequency)
+    full = _response_at(effects()[effect].example(**values), blocks, frequency)
     weight, power = (
         blocks["line_weight"].sel(axis=axis).values,
         blocks["line_power"].sel(axis=axis).transpose("part", "line").values,
@@ -89,17 +91,17 @@ def straightened(
     good = (weight > 0) & np.isfinite(power).all(axis=1)
     response = full
     if good.any():
-        response = 1.0 + _share(
+        response = 1.0 + _estimate_size(
             np.average(power[good], axis=0, weights=weight[good]) / np.maximum(expected, 1e-300),
             full,
         ) * (full - 1.0)
-    stopped = response < _STOPPED * response.max()
+    stopped = response < _MIN_RESPONSE * response.max()
     done = str(blocks.attrs.get("straightened", "")).split()
     if axis in done:
         return blocks, stopped
-    here = blocks["axis"] == axis
-    factor = xr.DataArray(np.maximum(response, _STOPPED * response.max()), dims="line")
+    is_axis = blocks["axis"] == axis
+    factor = xr.DataArray(np.maximum(response, _MIN_RESPONSE * response.max()), dims="line")
     before = blocks["line_power"]
-    return blocks.assign(line_power=before.where(~here, before / factor)).assign_attrs(
+    return blocks.assign(line_power=before.where(~is_axis, before / factor)).assign_attrs(
         straightened=" ".join([*done, axis])
     ), stopped

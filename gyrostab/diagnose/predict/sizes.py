@@ -1,4 +1,4 @@
-"""Sizes of linear parameters and their errors, averaged over the noise: of block means by least squares, of cells by weights."""
+"""Sizes of linear parameters and their errors: least squares on block means, weighted on cells."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.evidence.wandering import known_wander
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.predict.candidates import Variant
 from gyrostab.diagnose.predict.condition import Component, mean_columns
 from gyrostab.diagnose.predict.linear_model import State, build_linear_model, statistic_rows
@@ -18,12 +18,12 @@ from gyrostab.diagnose.predict.linear_model import State, build_linear_model, st
 __all__ = ["Mixture", "component_mixture", "component_size", "mean_mixture"]
 
 Array = NDArray[np.float64]
-_RIDGE = 1e-12
+_RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """A mixture of normal laws of some sizes.
+    """A mixture of normal distributions of some sizes.
 
     Attributes
     ----------
@@ -38,16 +38,16 @@ class Mixture:
     covariance: Array
 
     def weights(self) -> Array:
-        """Probabilities of the points."""
+        """Return the probabilities of the points."""
         return np.asarray(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)))
 
     def moments(self) -> tuple[Array, Array]:
-        """Mean and covariance of the whole."""
+        """Return mean and covariance of the mixture."""
         weight = self.weights()
         mean = weight @ self.mean
-        apart = self.mean - mean
+        deviation = self.mean - mean
         return mean, np.einsum("g,gij->ij", weight, self.covariance) + np.einsum(
-            "g,gi,gj->ij", weight, apart, apart
+            "g,gi,gj->ij", weight, deviation, deviation
         )
 
 
@@ -59,7 +59,9 @@ def mean_mixture(
     tier: str = "free",
     variance: Array | None = None,
 ) -> Mixture:
-    """Sizes of columns of the block means on an axis, over the grid of random walk and flicker; given columns are free beside them.
+    """Compute the sizes of columns of the block means of an axis, over the grid of K and B.
+
+    The columns of named effects are free.
 
     Parameters
     ----------
@@ -67,17 +69,17 @@ def mean_mixture(
     axis : str
     columns : sequence of ndarray, shape (block,)
     tier : {"free", "calibrated"}
-        What the noise may be, as in `gyrostab.diagnose.evidence.held_out.mean_factors`.
+        Freedom of the noise, as in `gyrostab.diagnose.evidence.held_out.mean_factors`.
     variance : ndarray, shape (block,), optional
-        White variance of the means in place of that of the baseline [degree2 hour-2].
+        White variance of the means instead of the baseline's [degree2 hour-2].
     """
     baseline = state.baseline
     row = state.axes.index(axis)
     y = (state.blocks["mean"] - baseline["known_mean"]).transpose("axis", "block").values[row]
-    every = [*columns, *state.given.get(("mean", axis), [])]
-    whole = np.stack(every, axis=1) if every else np.empty((y.size, 0))
+    all_columns = [*columns, *state.given.get(("mean", axis), [])]
+    stacked = np.stack(all_columns, axis=1) if all_columns else np.empty((y.size, 0))
     present = np.isfinite(y)
-    size = np.abs(whole - whole.mean(axis=0)).max(axis=0)
+    size = np.abs(stacked - stacked.mean(axis=0)).max(axis=0)
     size = np.where(size > 0.0, size, 1.0)
     grid: dict[str, Any] = {
         "K": baseline["grid_K"].sel(axis=axis).values,
@@ -85,16 +87,16 @@ def mean_mixture(
     }
     products = mean_products(
         np.where(present, y, 0.0)[:, None],
-        whole / size,
+        stacked / size,
         variance=baseline["mean_variance"].sel(axis=axis).values if variance is None else variance,
         step=float(state.blocks.attrs["block_s"]),
         present=present,
-        wander=known_wander(baseline, axis),
+        wander=expected_processes(baseline, axis),
         **grid,
     )
     prior = baseline["grid_prior" if tier == "free" else "grid_calibrated"].sel(axis=axis).values
-    own = len(columns)
-    gram = products.gram + _RIDGE * np.eye(whole.shape[1]) * (
+    own_count = len(columns)
+    gram = products.gram + _RIDGE * np.eye(stacked.shape[1]) * (
         1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
     )
     covariance = np.linalg.inv(gram)
@@ -103,9 +105,11 @@ def mean_mixture(
     log_weight = prior - 0.5 * (
         products.square[:, 0] - fitted + products.log_determinant + np.linalg.slogdet(gram)[1]
     )
-    scale = size[:own]
+    scale = size[:own_count]
     return Mixture(
-        log_weight, mean[:, :own] / scale, covariance[:, :own, :own] / np.outer(scale, scale)
+        log_weight,
+        mean[:, :own_count] / scale,
+        covariance[:, :own_count, :own_count] / np.outer(scale, scale),
     )
 
 
@@ -116,45 +120,49 @@ def component_mixture(
     *,
     variance: Array | None = None,
 ) -> Mixture:
-    """Sizes of a part's columns, in the unit of the parameters (or their squares), when `state` is in the model beside it."""
+    """Compute the sizes of a component's columns, in units of the parameters (or squares).
+
+    All effects of `state` are in the model.
+    """
     variant = variant or component.variant
     if component.candidate.statistic in ("mean", "levels"):
         row = state.axes.index(component.row[0])
         return mean_mixture(state, component.row[0], mean_columns(variant, row), variance=variance)
     candidate = replace(component.candidate, variants=(variant,))
     row = statistic_rows(candidate, state).index(component.row)
-    cells = build_linear_model([candidate], row, state.blocks, state)
-    design = cells.designs[
+    model = build_linear_model([candidate], row, state.blocks, state)
+    design = model.designs[
         max(component.place, 0) if component.candidate.statistic == "order" else 0
     ]
-    columns = np.concatenate([design, cells.given], axis=2).reshape(
-        -1, design.shape[2] + cells.given.shape[2]
+    columns = np.concatenate([design, model.given], axis=2).reshape(
+        -1, design.shape[2] + model.given.shape[2]
     )
     weight = np.where(
-        np.isfinite(cells.weight) & np.isfinite(cells.values[..., 0]), cells.weight, 0.0
+        np.isfinite(model.weight) & np.isfinite(model.values[..., 0]), model.weight, 0.0
     ).ravel()
-    values = np.where(weight > 0.0, np.nan_to_num(cells.values[..., 0]).ravel(), 0.0)
+    values = np.where(weight > 0.0, np.nan_to_num(model.values[..., 0]).ravel(), 0.0)
     columns = np.where(np.isfinite(columns), columns, 0.0)
     size = np.sqrt(np.maximum((weight[:, None] * columns**2).sum(axis=0), 1e-300))
     columns = columns / size
-    own = design.shape[2]
-    known = np.diagonal(cells.precision)
-    prior = np.concatenate([np.zeros(own), np.where(known < 0.0, 0.0, known) / size[own:] ** 2])
+    own_count = design.shape[2]
+    known = np.diagonal(model.precision)
+    prior = np.concatenate(
+        [np.zeros(own_count), np.where(known < 0.0, 0.0, known) / size[own_count:] ** 2]
+    )
     normal = (columns * weight[:, None]).T @ columns + np.diag(prior + 1e-9)
-    moved = columns.T @ (weight * values)
+    projected = columns.T @ (weight * values)
     covariance = np.linalg.inv(normal)
-    mean = covariance @ moved
-    log_weight = 0.5 * mean @ moved - 0.5 * np.linalg.slogdet(normal)[1]
-    scale = size[:own]
-    with np.errstate(
-        over="ignore"
-    ):  # of a column that is nowhere but 0 the record says nothing: its variance is infinite
-        own_covariance = covariance[:own, :own] / np.outer(scale, scale)
-    return Mixture(np.array([log_weight]), (mean[:own] / scale)[None], own_covariance[None])
+    mean = covariance @ projected
+    log_weight = 0.5 * mean @ projected - 0.5 * np.linalg.slogdet(normal)[1]
+    scale = size[:own_count]
+    # A column that is 0 everywhere has an infinite variance.
+    with np.errstate(over="ignore"):
+        own_covariance = covariance[:own_count, :own_count] / np.outer(scale, scale)
+    return Mixture(np.array([log_weight]), (mean[:own_count] / scale)[None], own_covariance[None])
 
 
 def component_size(component: Component, state: State) -> tuple[float, float]:
-    """Size of the first column and its standard error; zero and infinite for a view that has no size."""
+    """Return size and standard error of the first column; 0 and inf for statistics without size."""
     if component.candidate.statistic in ("marks", "line", "wander"):
         return 0.0, np.inf
     mean, covariance = component_mixture(component, state).moments()

@@ -1,1 +1,1 @@
-"""A log becomes block statistics: it is read once, and all later steps ask these."""
+"""Reduction of a log to block statistics, the only input of all later steps."""

@@ -1,4 +1,4 @@
-"""The arrays that fill up while a log is read, block by block."""
+"""Arrays of block statistics that are filled while a log is read."""
 
 from __future__ import annotations
 
@@ -10,8 +10,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.reduce.log_blocks import Stretch, channel_at, numeric_channels
-from gyrostab.diagnose.reduce.outliers import Peaks, find_peaks, samples_at_once, zeros_together
+from gyrostab.diagnose.reduce.log_blocks import BlockBatch, channel_at, numeric_channels
+from gyrostab.diagnose.reduce.outliers import (
+    Peaks,
+    find_peaks,
+    simultaneous_samples,
+    simultaneous_zeros,
+)
 from gyrostab.errors import UnitError
 from gyrostab.kernels.spectra import periodogram as kernel
 from gyrostab.kernels.spectra.outliers import HISTOGRAM
@@ -19,31 +24,42 @@ from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
-__all__ = ["FINE", "FOLLOWED", "HARMONICS", "PARTS", "PHASES", "PIECES", "Accumulator"]
+__all__ = [
+    "CHANNEL_PARTS",
+    "HARMONICS",
+    "LAGGED_CHANNEL_PREFIXES",
+    "RAMP_PHASE_BINS",
+    "RECORD_PARTS",
+    "SUB_BLOCKS",
+    "Accumulator",
+]
 
 Array = NDArray[np.float64]
-#: Parts of the record with a line spectrum each; harmonics of the rotation; bins of the ramp's
-#: phase.
-PARTS, HARMONICS, PHASES = 8, (1, 2, 3), 40
-#: Parts of a block over which channels are averaged, and the beginnings of the names of those that
-#: effects follow with a lag.
-FINE, FOLLOWED = 4, ("temperature", "supply_voltage", "light_power")
-#: Pieces of a block over which the axes are averaged.
-PIECES = 16
-_POWER_SHARE = 0.25  # of a block that must be present for its spectrum
-_BESIDE = (
-    1,
-    5,
-)  # turns in a block, from and below, beside those of the tool, where the noise about an order is measured
-_APART = 0.9  # turns in a block, that these are away from what was taken off
-_GAP_S = 1.0  # shorter gaps are not listed
-_FOR_LATTICE, _KEPT = 64, 2**16  # blocks whose values are kept; of each axis, about
+#: Parts of the record, each with its own line spectrum. Design choice: eight show whether a line
+#: persists or drifts.
+RECORD_PARTS = 8
+#: Multiples of the tool rotation that are measured.
+HARMONICS = (1, 2, 3)
+#: Bins of the ramp phase. Design choice.
+RAMP_PHASE_BINS = 40
+#: Parts of a block over which lagged channels are averaged. Design choice.
+CHANNEL_PARTS = 4
+#: Prefixes of channels that effects follow with a lag.
+LAGGED_CHANNEL_PREFIXES = ("temperature", "supply_voltage", "light_power")
+#: Sub-blocks of a block over which the axes are averaged. Design choice: fast switching.
+SUB_BLOCKS = 16
+_MIN_SPECTRUM_SHARE = 0.25  # of a block that must be present for its spectrum; design choice
+_NEIGHBOUR_TURNS = (1, 5)  # range, turns per block from an order at which its noise is measured
+_MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just below one DFT bin
+_MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
+_GRID_BLOCKS = 64  # blocks of which samples are kept for the quantization grid; limits memory
+_GRID_SAMPLES_PER_AXIS = 2**16  # limits memory
 
 
 class Accumulator:
-    """Block statistics of a log, from its stretches in their order.
+    """Block statistics of a log, filled batch by batch in order of time.
 
-    Rows are the axes, then the channels on the log's own time.
+    Rows are the axes, then the channels on the log's own time stamps.
     """
 
     def __init__(self, log: xr.Dataset, length: int, block_count: int, rate: float):
@@ -54,20 +70,20 @@ class Accumulator:
             first_stamp(log),
         )
         self.axes = log.sizes["axis"]
-        self.beside = numeric_channels(log)[0]
-        rows = self.rows = self.axes + len(self.beside)
+        self.channels = numeric_channels(log)[0]
+        rows = self.rows = self.axes + len(self.channels)
         self.edges = kernel.band_edges(length)
         self.weights = kernel.taper(length)
         whole = np.ones((1, length), bool)
-        self.whole = kernel.gap_spectra(whole, self.weights)
-        self.whole_shape = kernel.shape_of_bands(
-            *_swap(self.whole), np.array([length]), self.edges, length
+        self.full = kernel.gap_spectra(whole, self.weights)
+        self.full_shape = kernel.shape_of_bands(
+            *_reorder_spectra(self.full), np.array([length]), self.edges, length
         )[0]
-        self.whole_neighbours = _neighbours(whole, self.weights)[0]
+        self.full_neighbours = _neighbour_share(whole, self.weights)[0]
         bands = self.edges.size - 1
         self.moments = np.full((rows, block_count, 5), np.nan)
         self.counts = np.zeros((rows, block_count, 9), np.int64)
-        self.together = np.zeros((self.axes, block_count), np.int64)
+        self.common_zeros = np.zeros((self.axes, block_count), np.int64)
         self.at_once: dict[tuple[bool, ...], NDArray[np.int64]] = {
             (True,) * self.axes: np.zeros(block_count, np.int64)
         }
@@ -82,124 +98,140 @@ class Accumulator:
         self.cross_shape = np.full(self.cross.shape, np.nan)
         self.cross_neighbours = np.full(self.cross.shape[:2], np.nan)
         self.cross_samples = np.zeros(self.cross.shape[:2], np.int64)
-        self.line_sum = np.zeros((self.axes, PARTS, kernel.ordinates(length)))
+        self.line_sum = np.zeros((self.axes, RECORD_PARTS, kernel.ordinates(length)))
         self.line_expected = np.zeros_like(self.line_sum)
-        self.line_counts = np.zeros((self.axes, PARTS, 2))
-        self.pieces = np.zeros((2, self.axes, block_count, PIECES))  # sums and numbers of samples
-        self.fine = {
-            name: np.full((block_count, FINE), np.nan)
-            for name in self.beside
-            if name.startswith(FOLLOWED)
+        self.line_counts = np.zeros((self.axes, RECORD_PARTS, 2))
+        self.sub_blocks = np.zeros(
+            (2, self.axes, block_count, SUB_BLOCKS)
+        )  # sums and numbers of samples
+        self.channel_parts = {
+            name: np.full((block_count, CHANNEL_PARTS), np.nan)
+            for name in self.channels
+            if name.startswith(LAGGED_CHANNEL_PREFIXES)
         }
-        self.kept: list[Array] = []
+        self.kept_samples: list[Array] = []
         self.gaps: list[tuple[int, int]] = []
-        self.open: int | None = None
-        self.turning, self.turning_factor = _turning(log)
-        self.turn_carry: float | None = None
+        self.gap_begin: int | None = None
+        self.rotation_source, self.rotation_factor = _find_rotation_source(log)
+        self.rotation_carry: float | None = None
         self.turns = 0.0
         self.order = (
-            np.full((self.axes, block_count, len(HARMONICS)), np.nan + 0j) if self.turning else None
+            np.full((self.axes, block_count, len(HARMONICS)), np.nan + 0j)
+            if self.rotation_source
+            else None
         )
         self.order_level = np.full(self.order.shape, np.nan) if self.order is not None else None
-        self.ramp = self.beside.index("ramp") + self.axes if "ramp" in self.beside else None
-        self.ramp_range = _range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
+        self.ramp = self.channels.index("ramp") + self.axes if "ramp" in self.channels else None
+        self.ramp_range = _finite_range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
         if self.ramp_range[0] >= self.ramp_range[1]:
             self.ramp = None
         self.profile_sums = (
-            np.zeros((self.axes, block_count, PHASES)) if self.ramp is not None else None
+            np.zeros((self.axes, block_count, RAMP_PHASE_BINS)) if self.ramp is not None else None
         )
-        self.profile_counts = np.zeros((self.axes, block_count, PHASES), np.int64)
+        self.profile_counts = np.zeros((self.axes, block_count, RAMP_PHASE_BINS), np.int64)
         self.ramp_turns = np.full(block_count, np.nan) if self.ramp is not None else None
 
-    def add(self, stretch: Stretch) -> None:
-        """Take in some blocks."""
-        component = slice(stretch.first, stretch.first + stretch.values.shape[1])
-        present = ~np.isnan(stretch.values)
-        centred = np.empty_like(stretch.values)
+    def add(self, batch: BlockBatch) -> None:
+        """Add some blocks."""
+        block_range = slice(batch.first, batch.first + batch.values.shape[1])
+        present = ~np.isnan(batch.values)
+        centred = np.empty_like(batch.values)
         for row in range(self.rows):
             kernel.block_samples(
-                stretch.values[row],
+                batch.values[row],
                 centred[row],
-                self.moments[row, component],
-                self.counts[row, component],
+                self.moments[row, block_range],
+                self.counts[row, block_range],
             )
             if row < self.axes:
-                found = find_peaks(stretch.values[row], self.histogram[row, component])
-                self.peaks[row].append(found._replace(block=found.block + stretch.first))
-        self._spectra(component, centred, present)
-        self.together[:, component] = zeros_together(stretch.values[: self.axes])
-        for kind, number in samples_at_once(present[: self.axes]).items():
-            self.at_once.setdefault(kind, np.zeros(self.block_count, np.int64))[component] = number
-        self.adjacent[:, component] = np.count_nonzero(
+                found = find_peaks(batch.values[row], self.histogram[row, block_range])
+                self.peaks[row].append(found._replace(block=found.block + batch.first))
+        self._add_spectra(block_range, centred, present)
+        self.common_zeros[:, block_range] = simultaneous_zeros(batch.values[: self.axes])
+        for kind, number in simultaneous_samples(present[: self.axes]).items():
+            self.at_once.setdefault(kind, np.zeros(self.block_count, np.int64))[block_range] = (
+                number
+            )
+        self.adjacent[:, block_range] = np.count_nonzero(
             present[: self.axes, :, 1:] & present[: self.axes, :, :-1], axis=-1
         )
-        self._find_gaps(component, present[: self.axes])
-        inner = np.arange(PIECES) * self.length // PIECES
+        self._find_gaps(block_range, present[: self.axes])
+        inner = np.arange(SUB_BLOCKS) * self.length // SUB_BLOCKS
         for row in range(self.axes):
-            self.pieces[0, row, component] = np.add.reduceat(
-                np.where(present[row], stretch.values[row], 0.0), inner, axis=1
+            self.sub_blocks[0, row, block_range] = np.add.reduceat(
+                np.where(present[row], batch.values[row], 0.0), inner, axis=1
             )
-            self.pieces[1, row, component] = np.add.reduceat(
+            self.sub_blocks[1, row, block_range] = np.add.reduceat(
                 present[row], inner, axis=1, dtype=np.float64
             )
-        for name, fine in self.fine.items():
-            row, edges = self.axes + self.beside.index(name), np.arange(FINE) * self.length // FINE
-            total = np.add.reduceat(np.where(present[row], stretch.values[row], 0.0), edges, axis=1)
+        for name, fine in self.channel_parts.items():
+            row, edges = (
+                self.axes + self.channels.index(name),
+                np.arange(CHANNEL_PARTS) * self.length // CHANNEL_PARTS,
+            )
+            total = np.add.reduceat(np.where(present[row], batch.values[row], 0.0), edges, axis=1)
             with np.errstate(invalid="ignore", divide="ignore"):
-                fine[component] = total / np.add.reduceat(
+                fine[block_range] = total / np.add.reduceat(
                     present[row].astype(np.float64), edges, axis=1
                 )
-        every = max(1, self.block_count // _FOR_LATTICE)
+        every = max(1, self.block_count // _GRID_BLOCKS)
         chosen = [
-            number for number in range(component.start, component.stop) if number % every == 0
+            number for number in range(block_range.start, block_range.stop) if number % every == 0
         ]
-        self.kept += [
-            stretch.values[: self.axes, number - component.start, : _KEPT // _FOR_LATTICE].copy()
+        self.kept_samples += [
+            batch.values[
+                : self.axes,
+                number - block_range.start,
+                : _GRID_SAMPLES_PER_AXIS // _GRID_BLOCKS,
+            ].copy()
             for number in chosen
         ]
         if self.order is not None:
-            self._orders(component, centred[: self.axes])
+            self._add_rotation_orders(block_range, centred[: self.axes])
         if self.profile_sums is not None:
-            phase = stretch.values[self.ramp]
-            self._turn_ramp(component, phase)
+            phase = batch.values[self.ramp]
+            self._count_ramp_turns(block_range, phase)
             for row in range(self.axes):
                 sums, counts = (
-                    self.profile_sums[row, component],
-                    self.profile_counts[row, component],
+                    self.profile_sums[row, block_range],
+                    self.profile_counts[row, block_range],
                 )
                 kernel.phase_profile(
                     centred[row], present[row], phase, *self.ramp_range, sums, counts
                 )
 
-    def _turn_ramp(self, component: slice, phase: Array) -> None:
-        """How often the ramp turns in each block, from the moves between samples, none of them half a turn."""
+    def _count_ramp_turns(self, block_range: slice, phase: Array) -> None:
+        """Measure the ramp's turns per second; a move between samples is below half a turn."""
         assert self.ramp_turns is not None
         low, high = self.ramp_range
         moved = np.diff(phase, axis=1) / (high - low)
         moved -= np.round(moved)
-        there = np.isfinite(moved)
-        total = np.where(there, moved, 0.0).sum(axis=1)
-        self.ramp_turns[component] = (
-            np.where(there.any(axis=1), total / np.maximum(there.sum(axis=1), 1), np.nan)
+        known = np.isfinite(moved)
+        total = np.where(known, moved, 0.0).sum(axis=1)
+        self.ramp_turns[block_range] = (
+            np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan)
             * self.rate
         )
 
-    def _spectra(self, component: slice, centred: Array, present: NDArray[np.bool_]) -> None:
+    def _add_spectra(self, block_range: slice, centred: Array, present: NDArray[np.bool_]) -> None:
+        """Add band powers, cross-powers and line spectra."""
         inside = slice(1, kernel.ordinates(self.length) + 1)
-        counts = self.counts[:, component, 0]
+        counts = self.counts[:, block_range, 0]
         spectra = np.fft.rfft(centred * self.weights, axis=-1)[..., inside]
-        used = counts >= max(_POWER_SHARE * self.length, 2)
+        used = counts >= max(_MIN_SPECTRUM_SHARE * self.length, 2)
         places, tables = [], []
         for row in range(self.rows):
-            place, table = self._masks(row, component, present[row], counts[row], used[row])
+            place, table = self._tabulate_masks(
+                row, block_range, present[row], counts[row], used[row]
+            )
             places.append(place)
             tables.append(table)
             power = kernel.band_powers(
                 spectra[row], spectra[row], table, place, self.edges, self.rate
             ).real
-            self.power[row, component] = np.where(used[row][:, None], power, np.nan)
+            self.power[row, block_range] = np.where(used[row][:, None], power, np.nan)
             if row < self.axes:
-                self._lines(row, component, spectra[row], table, place, used[row])
+                self._add_line_spectra(row, block_range, spectra[row], table, place, used[row])
         for number, (a, b) in enumerate(self.pairs):
             both = np.count_nonzero(present[a] & present[b], axis=-1)
             cross = kernel.band_powers(
@@ -207,76 +239,77 @@ class Accumulator:
             )
             differ = (both != counts[a]) | (both != counts[b])
             differ &= used[a] & used[b]
-            self.cross_shape[number, component] = self.shape[a, component]
-            self.cross_neighbours[number, component] = self.neighbours[a, component]
-            self.cross_samples[number, component] = both
+            self.cross_shape[number, block_range] = self.shape[a, block_range]
+            self.cross_neighbours[number, block_range] = self.neighbours[a, block_range]
+            self.cross_samples[number, block_range] = both
             if differ.any():
-                both_there = (present[a] & present[b])[differ]
-                cross[differ], self.cross_shape[number, component][differ] = self._jointly(
-                    centred[[a, b]][:, differ], both_there
+                joint = (present[a] & present[b])[differ]
+                cross[differ], self.cross_shape[number, block_range][differ] = self._joint_spectra(
+                    centred[[a, b]][:, differ], joint
                 )
-                self.cross_neighbours[number, component][differ] = _neighbours(
-                    both_there, self.weights
+                self.cross_neighbours[number, block_range][differ] = _neighbour_share(
+                    joint, self.weights
                 )
             cross[~(used[a] & used[b])] = np.nan
-            cross[both < max(_POWER_SHARE * self.length, 2)] = np.nan
-            self.cross[number, component] = cross
+            cross[both < max(_MIN_SPECTRUM_SHARE * self.length, 2)] = np.nan
+            self.cross[number, block_range] = cross
 
-    def _masks(
+    def _tabulate_masks(
         self,
         row: int,
-        component: slice,
+        block_range: slice,
         present: NDArray[np.bool_],
         counts: NDArray[np.int64],
         used: NDArray[np.bool_],
     ) -> tuple[NDArray[np.int64], Array]:
-        """Expected powers of the masks that occur, number 0 being the full one, and which of them each block has."""
+        """Return the mask index of each block (0 is full), and the expected powers by mask."""
         gappy = used & (counts < self.length)
         place = np.zeros(counts.size, np.int64)
         place[gappy] = 1 + np.arange(np.count_nonzero(gappy))
-        table = self.whole[0]
+        table = self.full[0]
         if gappy.any():
             expected, mask, squared = kernel.gap_spectra(present[gappy], self.weights)
             table = np.concatenate([table, expected])
         if row < self.axes:
-            shape = np.broadcast_to(self.whole_shape, (counts.size, self.whole_shape.size)).copy()
-            neighbours = np.full(counts.size, self.whole_neighbours)
+            shape = np.broadcast_to(self.full_shape, (counts.size, self.full_shape.size)).copy()
+            neighbours = np.full(counts.size, self.full_neighbours)
             if gappy.any():
                 shape[gappy] = kernel.shape_of_bands(
                     mask, squared, expected, counts[gappy], self.edges, self.length
                 )
-                neighbours[gappy] = _neighbours(present[gappy], self.weights)
+                neighbours[gappy] = _neighbour_share(present[gappy], self.weights)
             shape[~used] = neighbours[~used] = np.nan
-            self.shape[row, component], self.neighbours[row, component] = shape, neighbours
+            self.shape[row, block_range], self.neighbours[row, block_range] = shape, neighbours
         return place, table
 
-    def _lines(
+    def _add_line_spectra(
         self,
         row: int,
-        component: slice,
+        block_range: slice,
         spectra: NDArray[np.complex128],
         table: Array,
         place: NDArray[np.int64],
         used: NDArray[np.bool_],
     ) -> None:
-        part_of = np.arange(component.start, component.stop) * PARTS // self.block_count
-        for piece in np.unique(part_of):
-            chosen = used & (part_of == piece)
-            self.line_sum[row, piece] += (
-                spectra[chosen].real ** 2 + spectra[chosen].imag ** 2
-            ).sum(axis=0)
+        """Add periodograms at full resolution to the parts of the record."""
+        part_of = np.arange(block_range.start, block_range.stop) * RECORD_PARTS // self.block_count
+        for part in np.unique(part_of):
+            chosen = used & (part_of == part)
+            self.line_sum[row, part] += (spectra[chosen].real ** 2 + spectra[chosen].imag ** 2).sum(
+                axis=0
+            )
             expected = table[place[chosen]]
-            self.line_expected[row, piece] += expected.sum(axis=0)
+            self.line_expected[row, part] += expected.sum(axis=0)
             middle = expected.mean(axis=1)
-            self.line_counts[row, piece] += [middle.sum(), (middle**2).sum()]
+            self.line_counts[row, part] += [middle.sum(), (middle**2).sum()]
 
-    def _jointly(
+    def _joint_spectra(
         self, centred: Array, present: NDArray[np.bool_]
     ) -> tuple[NDArray[np.complex128], Array]:
-        """Cross-periodogram of blocks over the samples that both signals have, and the shape that powers of these would have."""
+        """Return cross-periodogram and gamma shape of blocks over the samples of both signals."""
         out = np.full((present.shape[0], self.edges.size - 1), np.nan + 0j)
         shape = np.full(out.shape, np.nan)
-        enough = present.sum(axis=-1) >= max(_POWER_SHARE * self.length, 2)
+        enough = present.sum(axis=-1) >= max(_MIN_SPECTRUM_SHARE * self.length, 2)
         if enough.any():
             present, centred = present[enough], centred[:, enough]
             centred = np.where(
@@ -296,76 +329,80 @@ class Accumulator:
             )
         return out, shape
 
-    def _find_gaps(self, component: slice, present: NDArray[np.bool_]) -> None:
-        """List the long stretches in which no axis has a sample."""
-        lost = np.concatenate([[self.open is not None], ~present.any(axis=0).ravel()])
-        first = component.start * self.length
+    def _find_gaps(self, block_range: slice, present: NDArray[np.bool_]) -> None:
+        """List the long gaps, in which no axis has a sample."""
+        lost = np.concatenate([[self.gap_begin is not None], ~present.any(axis=0).ravel()])
+        first = block_range.start * self.length
         for place in np.flatnonzero(lost[1:] != lost[:-1]) if lost.any() else ():
             if lost[place + 1]:
-                self.open = first + int(place)
+                self.gap_begin = first + int(place)
             else:
-                begin = self.open if self.open is not None else first
-                if first + place - begin >= _GAP_S * self.rate:
+                begin = self.gap_begin if self.gap_begin is not None else first
+                if first + place - begin >= _MIN_GAP_S * self.rate:
                     self.gaps.append((begin, first + int(place)))
-                self.open = None
+                self.gap_begin = None
 
-    def _orders(self, component: slice, centred: Array) -> None:
-        assert self.turning is not None
+    def _add_rotation_orders(self, block_range: slice, centred: Array) -> None:
+        """Demodulate the axes at multiples of the tool rotation."""
+        assert self.rotation_source is not None
         assert self.order is not None
         assert self.order_level is not None
-        index = np.arange(component.start * self.length, component.stop * self.length)
-        rotation, self.turn_carry = channel_at(
-            self.turning, grid_times(self.start, self.rate, index), self.turn_carry
+        index = np.arange(block_range.start * self.length, block_range.stop * self.length)
+        rotation, self.rotation_carry = channel_at(
+            self.rotation_source, grid_times(self.start, self.rate, index), self.rotation_carry
         )
-        inside = rotation * self.turning_factor / (360.0 * self.rate)
+        inside = rotation * self.rotation_factor / (360.0 * self.rate)
         edges = np.cumsum(np.concatenate([[self.turns], inside]))
         self.turns = math.fmod(float(edges[-1]), 1.0)
         turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
         often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
         turned = np.abs(often) >= 1.0
-        counts = self.counts[: self.axes, component, 0]
-        enough = turned & (counts >= max(_POWER_SHARE * self.length, 2))
+        counts = self.counts[: self.axes, block_range, 0]
+        enough = turned & (counts >= max(_MIN_SPECTRUM_SHARE * self.length, 2))
         wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
         present, left = centred != 0.0, centred  # missing samples count as zero
         with np.errstate(invalid="ignore", divide="ignore"):
             for number, wheel in enumerate(wheels):
                 value = 2.0 * np.einsum("abi,bi->ab", centred, wheel) / counts
-                self.order[:, component, number] = np.where(enough, value, np.nan)
+                self.order[:, block_range, number] = np.where(enough, value, np.nan)
                 left = left - np.where(present, (value[..., None] * np.conj(wheel)).real, 0.0)
             for number, wheel in enumerate(wheels):
-                level = _power_beside(left * wheel, often, HARMONICS[number]) / (counts * self.rate)
-                self.order_level[:, component, number] = np.where(enough, level, np.nan)
+                level = _power_near_order(left * wheel, often, HARMONICS[number]) / (
+                    counts * self.rate
+                )
+                self.order_level[:, block_range, number] = np.where(enough, level, np.nan)
 
 
-def _power_beside(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
-    """Mean power (axis, block) of what turns a few times in the block more or less than a harmonic, NaN where nothing tells it.
+def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
+    """Measure the mean power (axis, block) a few turns per block from a harmonic, NaN if unknown.
 
-    Places at which the mean of the block or a harmonic was taken off, or would be seen in the
-    mirror, do not count.
+    Lines at which the block mean or a harmonic was removed, and their mirror lines, do not count.
 
     Parameters
     ----------
     turned : ndarray, shape (axis, block, sample)
-        Samples without the harmonics, by the wheel of this one.
+        Samples without the harmonics, demodulated by this harmonic.
     often : ndarray, shape (block,)
-        Turns of the tool in the block, negative where it turns back.
+        Turns of the tool in the block, negative if it turns back.
     harmonic : int
     """
-    beside = np.concatenate([-np.arange(*_BESIDE)[::-1], np.arange(*_BESIDE)])
-    power = np.abs(np.fft.fft(turned, axis=-1)[..., beside]) ** 2
-    place = np.abs(harmonic * often[:, None] + beside)
+    neighbours = np.concatenate([-np.arange(*_NEIGHBOUR_TURNS)[::-1], np.arange(*_NEIGHBOUR_TURNS)])
+    power = np.abs(np.fft.fft(turned, axis=-1)[..., neighbours]) ** 2
+    place = np.abs(harmonic * often[:, None] + neighbours)
     taken = np.abs(often)[:, None, None] * np.array([0, *HARMONICS])
-    free = (np.abs(place[..., None] - taken) >= _APART).all(axis=-1)
+    free = (np.abs(place[..., None] - taken) >= _MIN_TURNS_APART).all(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
 
 
-def _swap(found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+def _reorder_spectra(found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+    """Return the result of `gap_spectra` in the order of the arguments of `shape_of_bands`."""
     expected, mask, squared = found
     return mask, squared, expected
 
 
-def _neighbours(present: NDArray[np.bool_], weights: Array) -> Array:
+def _neighbour_share(present: NDArray[np.bool_], weights: Array) -> Array:
+    """Return the tapered share of neighbouring pairs of samples."""
     tapered = present * weights
     with np.errstate(invalid="ignore"):
         return np.asarray(
@@ -373,12 +410,12 @@ def _neighbours(present: NDArray[np.bool_], weights: Array) -> Array:
         )
 
 
-def _turning(log: xr.Dataset) -> tuple[Source | None, float]:
-    """The rotation rate of the tool at any instant, and the factor to degree s-1; None when the log has it not, or without a number."""
+def _find_rotation_source(log: xr.Dataset) -> tuple[Source | None, float]:
+    """Return the rotation rate of the tool and its factor to degree s-1; None if not in the log."""
     name = "rotation_rate"
     if (
         name not in numeric_channels(log)[0] + numeric_channels(log)[1]
-        or not np.isfinite(_range(log[name].data)).all()
+        or not np.isfinite(_finite_range(log[name].data)).all()
     ):
         return None, 1.0
     wanted = parse_unit(INNER[name])
@@ -393,8 +430,8 @@ def _turning(log: xr.Dataset) -> tuple[Source | None, float]:
     )
 
 
-def _range(data: Any) -> tuple[float, float]:
-    """Smallest and largest number; infinite and the wrong way round when there is none."""
+def _finite_range(data: Any) -> tuple[float, float]:
+    """Return the smallest and largest number; infinite and in reverse order without numbers."""
     import dask.array as da
 
     array = da.asarray(data)

@@ -1,4 +1,4 @@
-"""A log to block statistics: the recording is read once, and everything that is asked of it later is asked of these."""
+"""Reduction of a log to block statistics in one pass over the recording."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.accumulate import (
-    FINE,
-    FOLLOWED,
+    CHANNEL_PARTS,
     HARMONICS,
-    PARTS,
-    PHASES,
+    LAGGED_CHANNEL_PREFIXES,
+    RAMP_PHASE_BINS,
+    RECORD_PARTS,
     Accumulator,
 )
 from gyrostab.diagnose.reduce.log_blocks import (
     channel_means,
+    count_rows,
+    count_samples,
     numeric_channels,
-    read_stretches,
-    row_count,
-    sample_count,
+    read_batches,
 )
-from gyrostab.diagnose.reduce.outliers import beyond_chance, count_outliers, quantization_step
-from gyrostab.diagnose.reduce.zero_bin import CELLS, cell_widths
+from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
+from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths
 from gyrostab.errors import OptionError
 from gyrostab.kernels.regression.smooth import smooth_curve
 from gyrostab.progress import Stage, no_stage
@@ -35,8 +35,8 @@ from gyrostab.units import INNER
 
 __all__ = [
     "HARMONICS",
-    "PARTS",
-    "PHASES",
+    "RAMP_PHASE_BINS",
+    "RECORD_PARTS",
     "block_samples",
     "measured",
     "noise_at_orders",
@@ -44,19 +44,23 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-_BLOCK_S, _FEWEST, _MOST, _LEAST_SAMPLES, _MUST = 20.0, 90, 6000, 100, 24
-_SMOOTH = 2.0  # blocks over which the course of a channel is smoothed at most
-_FOR_STEP = 256  # values of a block that tell the step of the lattice
-_MEAN_SHARE = 0.1  # of a block that must be present for its mean
-_POWER = "degree2 hour-2 Hz-1"
-_RATE = INNER["rate"]
-_LOUDER = (
-    2.0  # times the expected density, beyond which what is measured beside an order is no chance
-)
+_BLOCK_S = 20.0  # default block; design choice
+_MIN_DEFAULT_BLOCKS = 90  # shorter blocks in shorter records; design choice
+_MAX_BLOCKS = 6000  # longer blocks in longer records; limits memory and time
+_MIN_BLOCK_SAMPLES = 100  # of a default block; design choice
+_MIN_BLOCKS = 24  # fewer are refused: held-out stretches and calibration need them
+_MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
+_STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
+_MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
+_POWER_UNIT = "degree2 hour-2 Hz-1"
+_RATE_UNIT = INNER["rate"]
+_MIN_NEIGHBOUR_RATIO = 2.0  # times expected density from which noise near an order is significant
 
 
 def block_samples(size: int, rate: float, block: Any = None) -> int:
-    """Samples of a block: 20 s, less in short records and more beyond 33 h, a product of small primes.
+    """Choose the block length: 20 s, less in short records, more beyond 33 h; in samples.
+
+    The length is a product of small primes.
 
     Parameters
     ----------
@@ -65,7 +69,7 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
     rate : float
         Sampling rate [Hz].
     block : str or timedelta, optional
-        Length that the user asks for: a duration, or a number of samples such as ``"2000samples"``.
+        Requested length: a duration, or a number of samples such as ``"2000samples"``.
 
     Raises
     ------
@@ -78,26 +82,30 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
     (2000, 800, 100)
     """
     if block is None:
-        wanted = max(min(_BLOCK_S * rate, size / _FEWEST), size / _MOST, _LEAST_SAMPLES)
-        length = _smooth(int(wanted))
+        wanted = max(
+            min(_BLOCK_S * rate, size / _MIN_DEFAULT_BLOCKS), size / _MAX_BLOCKS, _MIN_BLOCK_SAMPLES
+        )
+        length = _round_to_small_primes(int(wanted))
     else:
         length = samples(block, rate, "block")
         if length < 16:
             raise OptionError(
-                f"block {block!r} holds {length} samples at {rate:g} Hz; a block needs 16 ({16 / rate:g} s) at least"
+                f"block {block!r} holds {length} samples at {rate:g} Hz; "
+                f"a block needs 16 ({16 / rate:g} s) at least"
             )
-    if size < _MUST * length:
-        what = f"{_MUST} blocks of {length / rate:g} s"
+    if size < _MIN_BLOCKS * length:
+        what = f"{_MIN_BLOCKS} blocks of {length / rate:g} s"
         raise OptionError(
-            f"the record of {size / rate:.4g} s ({size} samples at {rate:g} Hz) is too short to diagnose: "
-            f"it must hold {what}, {_MUST * length / rate:g} s at least"
+            f"the record of {size / rate:.4g} s ({size} samples at {rate:g} Hz) "
+            "is too short to diagnose: "
+            f"it must hold {what}, {_MIN_BLOCKS * length / rate:g} s at least"
             + ("; give a shorter block" if block is not None else "")
         )
     return length
 
 
-def _smooth(length: int) -> int:
-    """Largest even product of 2, 3 and 5 up to `length`."""
+def _round_to_small_primes(length: int) -> int:
+    """Return the largest even product of 2, 3 and 5 up to `length`."""
     while True:
         rest = length
         for prime in (2, 3, 5):
@@ -116,50 +124,51 @@ def reduce_log(
     left_out: NDArray[np.bool_] | None = None,
     progress: Stage = no_stage,
 ) -> xr.Dataset:
-    """Reduce a log to what the diagnosis works on: means, band powers and counts of blocks of equal length.
+    """Reduce a log to statistics of blocks of equal length: means, band powers, sample counts.
 
     Parameters
     ----------
     log : xarray.Dataset
         Regular log, in memory or lazy; it is read once, from front to back.
     block : str or timedelta, optional
-        Length of a block; 20 s, or less in short records, by default.
+        Length of a block; by default 20 s, or less in short records.
     restart_gap : str or float
-        Gap from which on the power is taken to have been off [s].
+        Shortest gap that counts as a power-off [s].
     left_out : ndarray of bool, shape (axis, block), optional
         Blocks that count as missing on an axis.
     progress : Stage
-        Is told of the progress, in samples over all axes.
+        Progress, in samples over all axes.
 
     Returns
     -------
     xarray.Dataset
         By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``,
+        By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``,
         ``neighbours``, ``adjacent``, ``kurtosis``, ``peaks``, ``outliers``, ``repeats`` and their
-        ``repeat_runs``, ``extremes``, ``zeros`` and their ``zero_runs``, and of these ``stuck`` and
-        ``filled``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1], two-sided, and the
-        ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair, block, band),
-        ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``, ``witness_cross``,
-        ``line_power(axis, part, line)``, ``line_weight``, ``order`` and ``order_level`` (axis,
-        block, harmonic), ``profile(axis, block, phase)``, ``piece_mean`` and ``piece_samples``
-        (axis, block, inner), ``lattice(axis)``, ``cell_width(axis, cell)`` [steps of the lattice],
-        ``axes_at_once(subset, axis)``, ``at_once(subset, block)``, ``channel_<name>(block)``,
-        ``fine_<name>(block, piece)`` of what effects follow late, and the gaps and restarts in
-        seconds. Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of
-        the bands.
+        ``repeat_runs``, ``extremes``, ``zeros`` and their ``zero_runs``, and among the zeros
+        ``stuck`` and ``filled``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1],
+        two-sided, and the ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair,
+        block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
+        ``witness_cross`` (reference channels), ``line_power(axis, part, line)``, ``line_weight``,
+        ``order`` and ``order_level`` (axis, block, harmonic), ``profile(axis, block, phase)``,
+        ``piece_mean`` and ``piece_samples`` (axis, block, inner) of sub-blocks, ``lattice(axis)``
+        (quantization step), ``bin_width(axis, bin)`` [quantization steps], ``axes_at_once(subset,
+        axis)``, ``at_once(subset, block)``, ``channel_<name>(block)``, ``fine_<name>(block,
+        piece)`` of channels that effects follow with a lag, and gaps and restarts in seconds.
+        Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
     ------
     SchemaError
-        When it is no regular log.
+        If the log is not regular.
     OptionError
-        When the record is too short.
+        If the record is too short.
 
     Notes
     -----
-    Block means are taken off and samples that are missing count as zero; powers are unbiased for
-    white noise with any gaps (see `gyrostab.kernels.spectra.periodogram`). Under random gaps a
-    density S(f) is seen as ``neighbours * S + (1 - neighbours) * mean(S)``.
+    Block means are subtracted and missing samples count as zero; powers are unbiased for white
+    noise with any gaps (see `gyrostab.kernels.spectra.periodogram`). Under random gaps a density
+    S(f) is seen as ``neighbours * S + (1 - neighbours) * mean(S)``.
 
     Examples
     --------
@@ -170,35 +179,35 @@ def reduce_log(
     (180, 20.0, 0.18)
     """
     check_log(log)
-    rate, size = float(log.attrs["sampling_rate_hz"]), sample_count(log)
+    rate, size = float(log.attrs["sampling_rate_hz"]), count_samples(log)
     length = block_samples(size, rate, block)
     work = Accumulator(log, length, size // length, rate)
-    rows = row_count(log)
+    rows = count_rows(log)
     progress("reducing", rows * work.block_count * length)
-    for stretch in read_stretches(log, length):
+    for batch in read_batches(log, length):
         if left_out is not None:
-            stretch.values[: work.axes][
-                left_out[:, stretch.first : stretch.first + stretch.values.shape[1]]
+            batch.values[: work.axes][
+                left_out[:, batch.first : batch.first + batch.values.shape[1]]
             ] = np.nan
-        work.add(stretch)
+        work.add(batch)
         progress(
             "reducing",
             rows * work.block_count * length,
-            rows * (stretch.first + stretch.values.shape[1]) * length,
+            rows * (batch.first + batch.values.shape[1]) * length,
         )
-    return _labelled(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
+    return _label_statistics(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
 
 
 def measured(blocks: xr.Dataset, name: str) -> xr.DataArray:
-    """A variable of the reduced record as the axes measured it, with what of it is left out because they moved."""
+    """Return a variable of the block statistics as measured, including what motion left out."""
     return blocks[f"measured_{name}"] if f"measured_{name}" in blocks else blocks[name]
 
 
 def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
-    """Density of the noise about the orders of the rotation: the expected one, or what turns almost as often where that is surely more.
+    """Return the noise density near the rotation orders: the expected or a higher measured one.
 
-    Waves in the recording that have nothing to do with the tool, as those of the ground, are as
-    loud at an order as beside it.
+    Waves unrelated to the tool, such as those of the ground, have the same power at an order as
+    next to it.
 
     Parameters
     ----------
@@ -209,164 +218,194 @@ def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
     """
     if "order_level" not in blocks:
         return expected
-    beside = blocks["order_level"].transpose("axis", "block", "harmonic").values
-    return np.where(beside > _LOUDER * expected, beside, expected)
+    nearby = blocks["order_level"].transpose("axis", "block", "harmonic").values
+    return np.where(nearby > _MIN_NEIGHBOUR_RATIO * expected, nearby, expected)
 
 
-def _labelled(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:
+def _label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:
+    """Assemble the dataset of block statistics."""
     axes = slice(0, work.axes)
     counts, moments = work.counts[axes], work.moments[axes]
     present = counts[..., 0]
     plane, cube = ("axis", "block"), ("axis", "block", "band")
-    enough = present >= max(_MEAN_SHARE * work.length, 1)
+    enough = present >= max(_MIN_MEAN_SHARE * work.length, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
     peaks, outliers = count_outliers(work.histogram, work.peaks)
     subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
-    filled = beyond_chance(work.together, counts[..., 1], present, subset, at_once)
-    lattice = np.array([quantization_step(_kept(work, row, _FOR_STEP)) for row in range(work.axes)])
-    cells = np.array([cell_widths(_kept(work, row), step) for row, step in enumerate(lattice)])
-    weight = np.divide(work.line_counts[..., 0] ** 2, work.line_counts[..., 1], where=work.line_counts[..., 1] > 0,
-                       out=np.zeros(work.line_counts.shape[:2]))  # fmt: skip
-    weight *= _evenness(work.power[axes], work.shape, present, weight.shape[1])
+    filled = zeros_beyond_chance(work.common_zeros, counts[..., 1], present, subset, at_once)
+    steps = np.array(
+        [
+            quantization_step(_kept_values(work, row, _STEP_VALUES_PER_BLOCK))
+            for row in range(work.axes)
+        ]
+    )
+    widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
+    line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
+    weight = np.divide(
+        line_total**2, line_square, where=line_square > 0, out=np.zeros(line_total.shape)
+    )
+    weight *= _equal_block_share(work.power[axes], work.shape, present, weight.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         lines = work.line_sum / (work.line_expected * work.rate)
     variables: dict[str, Any] = {
         "mean": (
             plane,
             np.where(enough, moments[..., 0], np.nan),
-            _named("mean rate of the block", _RATE),
+            _make_attrs("mean rate of the block", _RATE_UNIT),
         ),
         "variance": (
             plane,
             np.where(enough, moments[..., 1], np.nan),
-            _named("variance of the samples about it", "degree2 hour-2"),
+            _make_attrs("variance of the samples about it", "degree2 hour-2"),
         ),
-        "samples": (plane, present, _named("samples present", "1")),
+        "samples": (plane, present, _make_attrs("samples present", "1")),
         "power": (
             cube,
             work.power[axes],
-            _named("mean periodogram of the band, two-sided density", _POWER),
+            _make_attrs("mean periodogram of the band, two-sided density", _POWER_UNIT),
         ),
         "shape": (
             cube,
             work.shape,
-            _named("shape of the gamma distribution of the power in white noise", "1"),
+            _make_attrs("shape of the gamma distribution of the power in white noise", "1"),
         ),
         "neighbours": (
             plane,
             work.neighbours,
-            _named("share of neighbouring pairs of samples, tapered", "1"),
+            _make_attrs("share of neighbouring pairs of samples, tapered", "1"),
         ),
         "kurtosis": (
             plane,
             np.where(np.isnan(work.neighbours), np.nan, kurtosis),
-            _named("excess kurtosis of the block", "1"),
+            _make_attrs("excess kurtosis of the block", "1"),
         ),
-        "peaks": (plane, peaks, _named("samples that jump out alone", "1")),
+        "peaks": (plane, peaks, _make_attrs("isolated outliers", "1")),
         "outliers": (
             plane,
             outliers,
-            _named("samples that jump out alone, three times those beyond twice the limit", "1"),
+            _make_attrs("isolated outliers, three times those beyond twice the limit", "1"),
         ),
         "adjacent": (
             plane,
             work.adjacent,
-            _named("samples with another one right before them in the block", "1"),
+            _make_attrs("samples with another one right before them in the block", "1"),
         ),
         "repeats": (
             plane,
-            _repeats(moments, counts),
-            _named("samples equal to the one before, but for zeros and the ends", "1"),
+            _count_repeats(moments, counts),
+            _make_attrs("samples equal to the one before, except zeros and range ends", "1"),
         ),
         "repeat_runs": (
             plane,
             counts[..., 7],
-            _named("runs of samples equal to the one before, but for zeros", "1"),
+            _make_attrs("runs of samples equal to the one before, except zeros", "1"),
         ),
-        "zero_runs": (plane, counts[..., 8], _named("runs of samples that are exactly 0", "1")),
+        "zero_runs": (
+            plane,
+            counts[..., 8],
+            _make_attrs("runs of samples that are exactly 0", "1"),
+        ),
         "extremes": (
             plane,
-            _extremes(moments, counts),
-            _named("samples equal to the smallest or largest of the record", "1"),
+            _count_extremes(moments, counts),
+            _make_attrs("samples equal to the smallest or largest of the record", "1"),
         ),
-        "zeros": (plane, counts[..., 1], _named("samples that are exactly 0", "1")),
+        "zeros": (plane, counts[..., 1], _make_attrs("samples that are exactly 0", "1")),
         "stuck": (
             plane,
-            _stuck(moments, counts, filled),
-            _named("zeros of one axis, within its range", "1"),
+            _count_stuck(moments, counts, filled),
+            _make_attrs("zeros of one axis, within its range", "1"),
         ),
         "filled": (
             plane,
             filled,
-            _named("zeros of all axes at once; of a single axis in runs", "1"),
+            _make_attrs("simultaneous zeros of all axes; of a single axis, zeros in runs", "1"),
         ),
-        "axes_at_once": (("subset", "axis"), subset, _named("axes that have samples at once", "1")),
+        "axes_at_once": (
+            ("subset", "axis"),
+            subset,
+            _make_attrs("axes that have samples at once", "1"),
+        ),
         "at_once": (
             ("subset", "block"),
             at_once,
-            _named("samples that these axes have at once, and no other one", "1"),
+            _make_attrs("samples that exactly these axes have at once", "1"),
         ),
-        "lattice": ("axis", lattice, _named("step of the lattice of values, 0 for none", _RATE)),
+        "lattice": (
+            "axis",
+            steps,
+            _make_attrs("quantization step of the values, 0 for none", _RATE_UNIT),
+        ),
         "line_power": (
             ("axis", "part", "line"),
             lines,
-            _named("mean periodogram at full resolution, two-sided density", _POWER),
+            _make_attrs("mean periodogram at full resolution, two-sided density", _POWER_UNIT),
         ),
         "line_weight": (
             ("axis", "part"),
             weight,
-            _named("blocks in each mean, as many as equal ones would do", "1"),
+            _make_attrs("equivalent number of equal blocks in each mean", "1"),
         ),
     }
     variables |= {
-        "cell_width": (
-            ("axis", "cell"),
-            cells[:, 0],
-            _named("width of the cell of 0 and of those beside it, in steps of the lattice", "1"),
+        "bin_width": (
+            ("axis", "bin"),
+            widths[:, 0],
+            _make_attrs("width of the zero bin and of its neighbours, in quantization steps", "1"),
         ),
-        "cell_width_stderr": (("axis", "cell"), cells[:, 1], _named("standard error of it", "1")),
+        "bin_width_stderr": (
+            ("axis", "bin"),
+            widths[:, 1],
+            _make_attrs("standard error of it", "1"),
+        ),
     }
     variables |= (
-        _inner(work)
-        | _beside(work, log)
-        | _locked(work)
-        | _channels(work, log)
-        | _fine(work, log)
-        | _spans(work, log, restart)
+        _sub_block_means(work)
+        | _cross_spectra(work, log)
+        | _phase_locked_statistics(work)
+        | _channel_means(work, log)
+        | _channel_part_means(work, log)
+        | _gap_table(work, log, restart)
     )
     return xr.Dataset(
-        variables, coords=_coordinates(work, log), attrs=_attributes(work, log, present)
+        variables, coords=_make_coordinates(work, log), attrs=_make_attributes(work, log, present)
     ).set_coords(["first", "second"])
 
 
-def _kept(work: Accumulator, row: int, most: int | None = None) -> Array:
-    """Values of an axis that were kept, so many of each block at most."""
-    return np.concatenate([kept[row][:most] for kept in work.kept])
+def _kept_values(work: Accumulator, row: int, most: int | None = None) -> Array:
+    """Return the kept samples of an axis, up to `most` of each block."""
+    return np.concatenate([kept[row][:most] for kept in work.kept_samples])
 
 
-def _inner(work: Accumulator) -> dict[str, Any]:
-    """Means over pieces of the blocks, in which a bias that hops within blocks can be seen."""
-    total, count = work.pieces
+def _sub_block_means(work: Accumulator) -> dict[str, Any]:
+    """Return means over sub-blocks, which show a bias that switches within blocks."""
+    total, count = work.sub_blocks
     dims = ("axis", "block", "inner")
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = total / count
     return {
-        "piece_mean": (dims, mean, _named("mean rate of a piece of the block", _RATE)),
+        "piece_mean": (dims, mean, _make_attrs("mean rate of a piece of the block", _RATE_UNIT)),
         "piece_samples": (
             dims,
             count.astype(np.int64),
-            _named("samples of a piece of the block", "1"),
+            _make_attrs("samples of a piece of the block", "1"),
         ),
     }
 
 
-def _named(name: str, units: str) -> dict[str, Any]:
+def _make_attrs(name: str, units: str) -> dict[str, Any]:
+    """Return the attributes of a variable."""
     return {"long_name": name, "units": units}
 
 
-def _evenness(power: Array, shape: Array, samples: NDArray[np.int64], components: int) -> Array:
-    """Share of the blocks of each part that as many blocks of equal power would be, (axis, part): a few loud ones have all the weight."""
+def _equal_block_share(
+    power: Array, shape: Array, samples: NDArray[np.int64], part_count: int
+) -> Array:
+    """Return the equivalent share of equal-power blocks of each part, (axis, part).
+
+    A few noisy blocks carry all the weight of a mean.
+    """
     good = np.isfinite(power) & np.isfinite(shape) & (shape > 0.0)
     ordinates = np.where(good, shape, 0.0)
     known = np.where(good, power, 0.0)
@@ -377,132 +416,146 @@ def _evenness(power: Array, shape: Array, samples: NDArray[np.int64], components
     level = (ordinates * np.divide(known, usual, out=np.zeros_like(known), where=usual > 0.0)).sum(
         axis=2
     ) / total
-    out = np.ones((len(power), components))
-    for component in range(components):
-        mine = np.arange(power.shape[1]) * components // power.shape[1] == component
-        size, loud = samples[:, mine].astype(np.float64), level[:, mine]
+    out = np.ones((len(power), part_count))
+    for part in range(part_count):
+        in_part = np.arange(power.shape[1]) * part_count // power.shape[1] == part
+        size, level_of_part = samples[:, in_part].astype(np.float64), level[:, in_part]
         square = size.sum(axis=1) * (
-            size * loud**2 * (1.0 - 1.0 / np.maximum(total[:, mine], 2.0))
-        ).sum(axis=1)  # less its own scatter
-        out[:, component] = np.divide(
-            (size * loud).sum(axis=1) ** 2, square, out=np.ones(len(power)), where=square > 0.0
+            size * level_of_part**2 * (1.0 - 1.0 / np.maximum(total[:, in_part], 2.0))
+        ).sum(axis=1)  # minus the scatter of the levels
+        out[:, part] = np.divide(
+            (size * level_of_part).sum(axis=1) ** 2,
+            square,
+            out=np.ones(len(power)),
+            where=square > 0.0,
         )
     return np.minimum(out, 1.0)
 
 
-def _ends(moments: Array) -> tuple[Array, Array]:
-    """Smallest and largest value of every axis, (axis, 1)."""
+def _record_range(moments: Array) -> tuple[Array, Array]:
+    """Return the smallest and largest value of every axis, (axis, 1)."""
     return np.fmin.reduce(moments[..., 3], axis=1, keepdims=True), np.fmax.reduce(
         moments[..., 4], axis=1, keepdims=True
     )
 
 
-def _at_ends(moments: Array, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Counts at the smallest and largest value of each block, where these are those of the record."""
-    lowest, highest = _ends(moments)
+def _count_at_range_ends(
+    moments: Array, low: NDArray[np.int64], high: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Count samples at the record's smallest and largest value in each block."""
+    lowest, highest = _record_range(moments)
     return np.asarray(
         np.where(moments[..., 3] == lowest, low, 0)
         + np.where((moments[..., 4] == highest) & (lowest < highest), high, 0)
     )
 
 
-def _extremes(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    return _at_ends(moments, counts[..., 3], counts[..., 4])
+def _count_extremes(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    return _count_at_range_ends(moments, counts[..., 3], counts[..., 4])
 
 
-def _repeats(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Held samples stand wherever the rate was: what stands at zero or at an end of the range is something else."""
-    return counts[..., 2] - _at_ends(moments, counts[..., 5], counts[..., 6])
+def _count_repeats(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Count held samples; those at zero or at an end of the range have another cause."""
+    return counts[..., 2] - _count_at_range_ends(moments, counts[..., 5], counts[..., 6])
 
 
-def _stuck(
+def _count_stuck(
     moments: Array, counts: NDArray[np.int64], filled: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Zeros of an axis by itself, unless zero is the end of its range."""
-    lowest, highest = _ends(moments)
+    """Count zeros of one axis alone, unless zero is the end of its range."""
+    lowest, highest = _record_range(moments)
     return np.asarray(np.where((lowest < 0.0) & (highest > 0.0), counts[..., 1] - filled, 0))
 
 
-def _beside(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
-    """Cross-spectra of the axes, and spectra of the channels on the log's own time with each axis."""
+def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
     axes, names = work.axes, [str(name) for name in log["axis"].values]
-    found: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     own = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
-    attrs = _named(
-        "mean cross-periodogram of the samples that both axes have, two-sided density", _POWER
+    attrs = _make_attrs(
+        "mean cross-periodogram of the samples that both axes have, two-sided density", _POWER_UNIT
     )
-    found["cross"] = (("pair", "block", "band"), work.cross[own], attrs)
-    attrs = _named(
+    variables["cross"] = (("pair", "block", "band"), work.cross[own], attrs)
+    attrs = _make_attrs(
         "shape of the gamma distribution of powers over the samples that both axes have", "1"
     )
-    found["cross_shape"] = (("pair", "block", "band"), work.cross_shape[own], attrs)
-    attrs = _named("share of neighbouring pairs of the samples that both axes have, tapered", "1")
-    found["cross_neighbours"] = (("pair", "block"), work.cross_neighbours[own], attrs)
-    found["cross_samples"] = (
+    variables["cross_shape"] = (("pair", "block", "band"), work.cross_shape[own], attrs)
+    attrs = _make_attrs(
+        "share of neighbouring pairs of the samples that both axes have, tapered", "1"
+    )
+    variables["cross_neighbours"] = (("pair", "block"), work.cross_neighbours[own], attrs)
+    variables["cross_samples"] = (
         ("pair", "block"),
         work.cross_samples[own],
-        _named("samples that both axes have", "1"),
+        _make_attrs("samples that both axes have", "1"),
     )
-    found["first"] = (
+    variables["first"] = (
         "pair",
         np.array([names[work.pairs[number][0]] for number in own], dtype=object),
     )
-    found["second"] = (
+    variables["second"] = (
         "pair",
         np.array([names[work.pairs[number][1]] for number in own], dtype=object),
     )
-    if work.beside:
-        shape = (axes, len(work.beside), *work.cross.shape[1:])
+    if work.channels:
+        shape = (axes, len(work.channels), *work.cross.shape[1:])
         with_axes = np.full(shape, np.nan + 0j)
         for number, (a, b) in enumerate(work.pairs):
             if b >= axes:
                 with_axes[a, b - axes] = work.cross[number]
-        units = [str(log[name].attrs.get("units", "1")) for name in work.beside]
-        told = ", ".join(f"{name} in {unit}" for name, unit in zip(work.beside, units, strict=True))
+        units = [str(log[name].attrs.get("units", "1")) for name in work.channels]
+        unit_list = ", ".join(
+            f"{name} in {unit}" for name, unit in zip(work.channels, units, strict=True)
+        )
         attrs = {
             "long_name": "mean periodogram of a channel, two-sided density",
-            "units": f"square of the channel's unit per Hz ({told})",
+            "units": f"square of the channel's unit per Hz ({unit_list})",
         }
-        found["witness_power"] = (("witness", "block", "band"), work.power[axes:], attrs)
+        variables["witness_power"] = (("witness", "block", "band"), work.power[axes:], attrs)
         attrs = {"long_name": "mean cross-periodogram of axis and channel, F_axis conj(F_channel)",
-                 "units": f"degree hour-1 Hz-1 times the channel's unit ({told})"}  # fmt: skip
-        found["witness_cross"] = (("axis", "witness", "block", "band"), with_axes, attrs)
-    return found
+                 "units": f"degree hour-1 Hz-1 times the channel's unit ({unit_list})"}  # fmt: skip
+        variables["witness_cross"] = (("axis", "witness", "block", "band"), with_axes, attrs)
+    return variables
 
 
-def _locked(work: Accumulator) -> dict[str, Any]:
-    """What is locked to the rotation of the tool, and to the phase of the ramp."""
-    found: dict[str, Any] = {}
+def _phase_locked_statistics(work: Accumulator) -> dict[str, Any]:
+    """Return what is locked to the tool rotation and to the ramp phase."""
+    variables: dict[str, Any] = {}
     if work.order is not None:
-        attrs = _named(
-            "complex amplitude at multiples of the tool's rotation, NaN below one turn in the block",
-            _RATE,
+        attrs = _make_attrs(
+            "complex amplitude at multiples of the rotation, NaN below one turn per block",
+            _RATE_UNIT,
         )
-        found["order"] = (("axis", "block", "harmonic"), work.order, attrs)
-        level = _named(
+        variables["order"] = (("axis", "block", "harmonic"), work.order, attrs)
+        level = _make_attrs(
             "density of what turns 1 to 4 times in the block more or less than that, two-sided",
-            _POWER,
+            _POWER_UNIT,
         )
-        found["order_level"] = (("axis", "block", "harmonic"), work.order_level, level)
+        variables["order_level"] = (("axis", "block", "harmonic"), work.order_level, level)
     if work.profile_sums is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
             profile = work.profile_sums / work.profile_counts
         dims = ("axis", "block", "phase")
-        found["profile"] = (
+        variables["profile"] = (
             dims,
             profile,
-            _named("mean rate less the block's mean, by phase of the ramp", _RATE),
+            _make_attrs("mean rate less the block's mean, by phase of the ramp", _RATE_UNIT),
         )
-        found["profile_samples"] = (dims, work.profile_counts, _named("samples of each mean", "1"))
-        attrs = _named("turns of the ramp in a second, negative where it falls", "Hz") | dict(
+        variables["profile_samples"] = (
+            dims,
+            work.profile_counts,
+            _make_attrs("samples of each mean", "1"),
+        )
+        attrs = _make_attrs("turns of the ramp in a second, negative where it falls", "Hz") | dict(
             zip(("low", "high"), work.ramp_range, strict=True)
         )
-        found["ramp_turns"] = ("block", work.ramp_turns, attrs)
-    return found
+        variables["ramp_turns"] = ("block", work.ramp_turns, attrs)
+    return variables
 
 
-def _channels(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def _channel_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Return block means of the channels; the rms of vibration."""
+    variables: dict[str, Any] = {}
     inside, own = numeric_channels(log)
     edges = grid_times(work.start, work.rate, np.arange(work.block_count + 1) * work.length)
     for name in (*inside, *own):
@@ -513,44 +566,50 @@ def _channels(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         else:
             values = channel_means(log, name, edges, rms=rms)
         units = str(log[name].attrs.get("units", "1"))
-        told = {"band_hz": log[name].attrs["band_hz"]} if "band_hz" in log[name].attrs else {}
-        found[f"channel_{name}"] = (
+        band = {"band_hz": log[name].attrs["band_hz"]} if "band_hz" in log[name].attrs else {}
+        variables[f"channel_{name}"] = (
             "block",
             values,
-            _named(f"{'rms' if rms else 'mean'} of {name} over the block", units) | told,
+            _make_attrs(f"{'rms' if rms else 'mean'} of {name} over the block", units) | band,
         )
-    return found
+    return variables
 
 
-def _fine(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
-    """Channels in parts of the blocks, less their noise, where each part has a value of its own: effects follow them with a lag."""
-    found: dict[str, Any] = {}
+def _channel_part_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Return smoothed channels in parts of the blocks, if sampled often enough."""
+    variables: dict[str, Any] = {}
     edges = grid_times(
-        work.start, work.rate, np.arange(work.block_count * FINE + 1) * work.length // FINE
+        work.start,
+        work.rate,
+        np.arange(work.block_count * CHANNEL_PARTS + 1) * work.length // CHANNEL_PARTS,
     )
     for name in numeric_channels(log)[1]:
-        if not name.startswith(FOLLOWED):
+        if not name.startswith(LAGGED_CHANNEL_PREFIXES):
             continue
         span = np.ptp(log[f"time_{name}"].values.astype("datetime64[ns]").astype(np.int64)) / 1e9
-        if log.sizes[f"time_{name}"] * work.length >= span * work.rate * FINE > 0.0:
-            work.fine[name] = channel_means(log, name, edges, rms=False).reshape(-1, FINE)
-    for name, values in work.fine.items():
+        if log.sizes[f"time_{name}"] * work.length >= span * work.rate * CHANNEL_PARTS > 0.0:
+            work.channel_parts[name] = channel_means(log, name, edges, rms=False).reshape(
+                -1, CHANNEL_PARTS
+            )
+    for name, values in work.channel_parts.items():
         good = np.isfinite(values)
         if good.mean() > 1.0 / 2.0:
             place = np.arange(values.size)
             bridged = np.interp(place, place[good.ravel()], values[good])
             units = str(log[name].attrs.get("units", "1"))
-            smooth = smooth_curve(bridged, longest=_SMOOTH * FINE).reshape(values.shape)
-            found[f"fine_{name}"] = (
+            smooth = smooth_curve(bridged, longest=_MAX_SMOOTHING_BLOCKS * CHANNEL_PARTS).reshape(
+                values.shape
+            )
+            variables[f"fine_{name}"] = (
                 ("block", "piece"),
                 smooth,
-                _named(f"{name} in parts of the block, without noise", units),
+                _make_attrs(f"{name} in parts of the block, without noise", units),
             )
-    return found
+    return variables
 
 
-def _spans(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, Any]:
-    """Gaps, and those after which the tool started anew, in seconds since the start."""
+def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, Any]:
+    """Return gaps, and those after which the tool restarted, in seconds since the start."""
     gaps = np.array(work.gaps, dtype=np.float64).reshape(-1, 2) / work.rate
     starts = gaps[gaps[:, 1] - gaps[:, 0] >= restart].tolist()
     if "gap_cause" in log.variables:
@@ -559,30 +618,38 @@ def _spans(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, Any]
             log[name].values[known].astype("datetime64[ns]").astype(np.int64)
             for name in ("gap_start", "gap_end")
         ]
-        told = (
+        known_restarts = (
             np.stack([grid_index(work.start, work.rate, stamp) for stamp in stamps], axis=-1)
             / work.rate
         )
         starts += [
             span
-            for span in told.tolist()
+            for span in known_restarts.tolist()
             if not any(low <= span[1] and span[0] <= high for low, high in starts)
         ]
     restarts = np.array(sorted(starts), dtype=np.float64).reshape(-1, 2)
     return {
-        "gap_begin": ("gap", gaps[:, 0], _named("first missing sample, since the start", "s")),
-        "gap_end": ("gap", gaps[:, 1], _named("first sample present again, since the start", "s")),
-        "restart_begin": ("restart", restarts[:, 0], _named("power lost, since the start", "s")),
-        "restart_end": ("restart", restarts[:, 1], _named("power back, since the start", "s")),
+        "gap_begin": ("gap", gaps[:, 0], _make_attrs("first missing sample, since the start", "s")),
+        "gap_end": (
+            "gap",
+            gaps[:, 1],
+            _make_attrs("first sample present again, since the start", "s"),
+        ),
+        "restart_begin": (
+            "restart",
+            restarts[:, 0],
+            _make_attrs("power lost, since the start", "s"),
+        ),
+        "restart_end": ("restart", restarts[:, 1], _make_attrs("power back, since the start", "s")),
     }
 
 
-def _coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     ends = np.arange(work.block_count + 1) * work.length
     stamps = grid_times(work.start, work.rate, ends)
     step = work.rate / work.length
     coordinates: dict[str, Any] = {
-        "cell": ("cell", np.array(CELLS, dtype=object)),
+        "bin": ("bin", np.array(BINS, dtype=object)),
         "axis": ("axis", np.array([str(name) for name in log["axis"].values], dtype=object)),
         "time": (
             "block",
@@ -592,53 +659,59 @@ def _coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         "begin": (
             "block",
             ends[:-1] / work.rate,
-            _named("start of the block, since the start", "s"),
+            _make_attrs("start of the block, since the start", "s"),
         ),
-        "end": ("block", ends[1:] / work.rate, _named("end of the block, since the start", "s")),
+        "end": (
+            "block",
+            ends[1:] / work.rate,
+            _make_attrs("end of the block, since the start", "s"),
+        ),
         "frequency": (
             "band",
             (work.edges[:-1] + work.edges[1:] - 1) / 2.0 * step,
-            _named("centre of the band", "Hz"),
+            _make_attrs("centre of the band", "Hz"),
         ),
         "band_low": (
             "band",
             (work.edges[:-1] - 0.5) * step,
-            _named("lower edge of the band", "Hz"),
+            _make_attrs("lower edge of the band", "Hz"),
         ),
         "band_high": (
             "band",
             (work.edges[1:] - 0.5) * step,
-            _named("upper edge of the band", "Hz"),
+            _make_attrs("upper edge of the band", "Hz"),
         ),
         "line_frequency": (
             "line",
             np.arange(1, work.line_sum.shape[-1] + 1) * step,
-            _named("frequency", "Hz"),
+            _make_attrs("frequency", "Hz"),
         ),
     }
-    if work.beside:
-        coordinates["witness"] = ("witness", np.array(work.beside, dtype=object))
+    if work.channels:
+        coordinates["witness"] = ("witness", np.array(work.channels, dtype=object))
     if work.order is not None:
         coordinates["harmonic"] = (
             "harmonic",
             np.array(HARMONICS),
-            _named("multiple of the rotation", "1"),
+            _make_attrs("multiple of the rotation", "1"),
         )
     if work.profile_sums is not None:
         low, high = work.ramp_range
         coordinates["phase"] = (
             "phase",
-            (np.arange(PHASES) + 0.5) / PHASES,
-            _named(f"phase of the ramp, {low:g} to {high:g}", "1"),
+            (np.arange(RAMP_PHASE_BINS) + 0.5) / RAMP_PHASE_BINS,
+            _make_attrs(f"phase of the ramp, {low:g} to {high:g}", "1"),
         )
     return coordinates
 
 
-def _attributes(work: Accumulator, log: xr.Dataset, present: NDArray[np.int64]) -> dict[str, Any]:
+def _make_attributes(
+    work: Accumulator, log: xr.Dataset, present: NDArray[np.int64]
+) -> dict[str, Any]:
     end = grid_times(work.start, work.rate, log.sizes["time"])
     return {
-        "start": _iso(work.start),
-        "end": _iso(int(end)),
+        "start": _format_stamp(work.start),
+        "end": _format_stamp(int(end)),
         "start_ns": work.start,
         "sampling_rate_hz": work.rate,
         "block_s": work.length / work.rate,
@@ -650,6 +723,6 @@ def _attributes(work: Accumulator, log: xr.Dataset, present: NDArray[np.int64]) 
     }
 
 
-def _iso(stamp: int) -> str:
+def _format_stamp(stamp: int) -> str:
     """Stamp [ns since 1970] as ISO 8601, to the millisecond."""
     return str(np.datetime64(stamp, "ns").astype("datetime64[ms]")) + "Z"

@@ -1,4 +1,4 @@
-"""What values tell beside their spectrum: how many jump out, where they stick, and the lattice that they stand on."""
+"""Sample counts that a spectrum does not show: outliers, exact zeros, and the quantization step."""
 
 from __future__ import annotations
 
@@ -11,37 +11,36 @@ from numpy.typing import NDArray
 from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
 __all__ = [
-    "CHANCE",
+    "EXPECTED_FALSE_OUTLIERS",
     "Peaks",
-    "beyond_chance",
-    "chance_of_all",
     "count_outliers",
     "find_peaks",
     "outlier_limit",
+    "probability_all_zero",
     "quantization_step",
-    "samples_at_once",
-    "zeros_together",
+    "simultaneous_samples",
+    "simultaneous_zeros",
+    "zeros_beyond_chance",
 ]
 
 Array = NDArray[np.float64]
-#: Outliers that a record of Gaussian noise has on average, by axis.
-CHANCE = 0.02
-_LOWEST = 4.0  # deviations of the block's own from which on a sample may be an outlier
-_SWELLS = np.linspace(0.0, 0.6, 61)  # scatter of the logarithm of a level within blocks
-_FAIR = (
-    2.5,
-    3.7,
-)  # deviations between which departures tell how much the level swells, and outliers hardly count
-_CLEAR = 64.0  # a lattice is as many times coarser than the last digit
-_RARE = 0.01  # of the values, which may stand off a lattice that is coarse
-_TAILS = 0.1  # of the values, where spikes may be as common as those of the lattice
-_NEAR = 2  # blocks on either side that help to tell a block's own noise
-_LOUDER = 1.5  # times, that a block beside counts as louder
-_MEDIAN = 0.6745  # of the absolute value of a standard normal number
+#: Expected number of false outliers of an axis in a record of Gaussian noise. Design choice.
+EXPECTED_FALSE_OUTLIERS = 0.02
+_MIN_OUTLIER_SIGMA = 4.0  # deviations of the block; lower peaks are not stored; design choice
+_LEVEL_LOG_SCATTERS = np.linspace(0.0, 0.6, 61)  # tried scatters of log noise level within blocks
+#: Deviations between which departures show a fluctuating noise level but few outliers. Design
+#: choice.
+_TAIL_RANGE_SIGMA = (2.5, 3.7)
+_MIN_STEP_ERRORS = 64.0  # rounding errors in the smallest quantization step; design choice
+_MAX_OFF_GRID_SHARE = 0.01  # of the values, off a coarse quantization grid; design choice
+_SPIKE_SHARE = 0.1  # of the values, where spikes may be as common as grid values; design choice
+_NEIGHBOUR_BLOCKS = 2  # on either side, that enter the deviation of a block; design choice
+_NOISIER_NEIGHBOUR_RATIO = 1.5  # of deviations, from which a noisier neighbour counts
+_NORMAL_MEDIAN_ABS = 0.6745  # median of |x| of a standard normal variable
 
 
 class Peaks(NamedTuple):
-    """Samples that stand alone, far from those about them: `gyrostab.kernels.spectra.outliers.peaks` of an axis."""
+    """Isolated extreme samples of an axis, from `gyrostab.kernels.spectra.outliers.peaks`."""
 
     block: NDArray[np.int64]
     size: Array
@@ -49,13 +48,14 @@ class Peaks(NamedTuple):
 
 
 def find_peaks(values: Array, histogram: NDArray[np.uint32]) -> Peaks:
-    """Peaks of some blocks of an axis that may be outliers; the histogram of the departures is added to.
+    """Find the peaks of some blocks of an axis that may be outliers; count in the histogram.
 
     Parameters
     ----------
     values : ndarray, shape (block, sample)
         NaN where missing.
     histogram : ndarray, shape (block, `HISTOGRAM`)
+        Numbers of departures by size; updated.
 
     Examples
     --------
@@ -65,13 +65,20 @@ def find_peaks(values: Array, histogram: NDArray[np.uint32]) -> Peaks:
     >>> int(found.block[found.size.argmax()]), float(found.size.max().round())
     (7, 29.0)
     """
-    away = np.empty_like(values)
-    departures(values, away, histogram)
-    return Peaks(*peaks(values, away, _deviation(histogram.astype(np.int64)), _LOWEST))
+    departure = np.empty_like(values)
+    departures(values, departure, histogram)
+    return Peaks(
+        *peaks(
+            values,
+            departure,
+            _deviation_from_median(histogram.astype(np.int64)),
+            _MIN_OUTLIER_SIGMA,
+        )
+    )
 
 
 def outlier_limit(samples: float) -> float:
-    """Standard deviations beyond which so many normal numbers have `CHANCE` on average, four at least.
+    """Return the limit [standard deviations], at least 4, with `EXPECTED_FALSE_OUTLIERS` beyond.
 
     Examples
     --------
@@ -80,29 +87,31 @@ def outlier_limit(samples: float) -> float:
     """
     from scipy.special import ndtri
 
-    return float(max(-ndtri(CHANCE / (2.0 * max(samples, 1.0))), _LOWEST))
+    return float(
+        max(-ndtri(EXPECTED_FALSE_OUTLIERS / (2.0 * max(samples, 1.0))), _MIN_OUTLIER_SIGMA)
+    )
 
 
 def count_outliers(
     histogram: NDArray[np.uint32], found: Sequence[Sequence[Peaks]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Samples that jump out, and their count for evidence: one that does by twice the limit has three, since no chance makes it.
+    """Count outliers, and weigh them: beyond twice the limit one counts three times.
 
-    The limit is so many standard deviations of the departures that Gaussian noise as long as the
-    record has `CHANCE` beyond. The deviation is from the median: the larger of the block's own and
-    of that which it has together with two neighbours on either side, that of the next one where
-    this is louder by half, for the noise may have risen within the block, at least a tenth of the
-    record's, and at least what the noise right before or after the sample has. Where departures of
-    2.5 to 3.7 deviations are more than those of Gaussian noise, the level swells faster than that
-    can follow: the limit is moved out to where a level of a log-normal law with as many of them has
-    `CHANCE` beyond.
+    The limit is the number of standard deviations of the departures that Gaussian noise as long as
+    the record exceeds `EXPECTED_FALSE_OUTLIERS` times. The deviation is from the median: the larger
+    of that of the block and of that of the block with two neighbours on either side. It is that of
+    the noisier adjacent block where this is larger by half, because the noise may have risen within
+    the block. It is at least a tenth of the record's, and at least that of the noise right before or after the
+    sample. If departures of 2.5 to 3.7 deviations are more frequent than in Gaussian noise, the
+    noise level fluctuates faster than that can follow. The limit is then the one that a log-normal
+    level with the same surplus exceeds `EXPECTED_FALSE_OUTLIERS` times.
 
     Parameters
     ----------
     histogram : ndarray, shape (axis, block, `HISTOGRAM`)
-        Number of departures by size.
+        Numbers of departures by size.
     found : sequence of sequence of Peaks
-        Of each axis, with the numbers of the blocks in the record.
+        Of each axis, with block indices of the record.
 
     Returns
     -------
@@ -126,48 +135,50 @@ def count_outliers(
         axis=1,
     )
     block_count = np.arange(histogram.shape[1])
-    near = (
-        sums[:, np.minimum(block_count + _NEAR + 1, block_count.size)]
-        - sums[:, np.maximum(block_count - _NEAR, 0)]
+    nearby = (
+        sums[:, np.minimum(block_count + _NEIGHBOUR_BLOCKS + 1, block_count.size)]
+        - sums[:, np.maximum(block_count - _NEIGHBOUR_BLOCKS, 0)]
     )
-    own, wide = _deviation(np.diff(sums, axis=1)), _deviation(near)
-    beside = np.pad(own, ((0, 0), (1, 1)))
-    beside = np.maximum(beside[:, :-2], beside[:, 2:])
-    usual = np.maximum(np.maximum(own, wide), 0.1 * _deviation(sums[:, -1:]))
-    scale = np.where(beside > _LOUDER * usual, beside, usual)
+    own, wide = _deviation_from_median(np.diff(sums, axis=1)), _deviation_from_median(nearby)
+    adjacent = np.pad(own, ((0, 0), (1, 1)))
+    adjacent = np.maximum(adjacent[:, :-2], adjacent[:, 2:])
+    usual = np.maximum(np.maximum(own, wide), 0.1 * _deviation_from_median(sums[:, -1:]))
+    scale = np.where(adjacent > _NOISIER_NEIGHBOUR_RATIO * usual, adjacent, usual)
     number, outliers = np.zeros((2, *scale.shape), np.int64)
-    for axis, components in enumerate(found):
-        limit = _swollen_limit(histogram[axis], scale[axis])
-        for one in components:
-            away = one.size / np.maximum(scale[axis, one.block], one.level)
-            np.add.at(number[axis], one.block, away > limit)
+    for axis, batches in enumerate(found):
+        limit = _fluctuating_level_limit(histogram[axis], scale[axis])
+        for one in batches:
+            departure = one.size / np.maximum(scale[axis, one.block], one.level)
+            np.add.at(number[axis], one.block, departure > limit)
             np.add.at(
-                outliers[axis], one.block, np.where(away > 2.0 * limit, 3, 1) * (away > limit)
+                outliers[axis],
+                one.block,
+                np.where(departure > 2.0 * limit, 3, 1) * (departure > limit),
             )
     return number, outliers
 
 
-def _swollen_limit(histogram: NDArray[np.uint32], scale: Array) -> float:
-    """Limit in deviations for an axis whose level may swell within its blocks."""
+def _fluctuating_level_limit(histogram: NDArray[np.uint32], scale: Array) -> float:
+    """Return the limit in deviations of an axis whose noise level may fluctuate within blocks."""
     from scipy.special import ndtr
 
     total = float(histogram.sum())
     limit = outlier_limit(total)
-    low, high = _FAIR
-    fair = 2.0 * (ndtr(-low) - ndtr(-high))
-    surplus = _number_between(histogram, scale, low, high) / max(total * fair, 1e-300)
+    low, high = _TAIL_RANGE_SIGMA
+    expected_share = 2.0 * (ndtr(-low) - ndtr(-high))
+    surplus = _count_between(histogram, scale, low, high) / max(total * expected_share, 1e-300)
     place, weight = np.polynomial.hermite_e.hermegauss(31)
     weight = weight / weight.sum()
-    level = np.exp(_SWELLS[:, None] * place)
-    more = 2.0 * ((ndtr(-low / level) - ndtr(-high / level)) @ weight) / fair
-    level = np.exp(np.interp(surplus, more, _SWELLS) * place)
-    tried = np.geomspace(limit, 3.0 * limit, 200)
-    beyond = np.log(2.0 * (ndtr(-tried[:, None] / level) @ weight))
-    return float(np.interp(-np.log(2.0 * ndtr(-limit)), -beyond, tried))
+    level = np.exp(_LEVEL_LOG_SCATTERS[:, None] * place)
+    surplus_ratio = 2.0 * ((ndtr(-low / level) - ndtr(-high / level)) @ weight) / expected_share
+    level = np.exp(np.interp(surplus, surplus_ratio, _LEVEL_LOG_SCATTERS) * place)
+    tried_limits = np.geomspace(limit, 3.0 * limit, 200)
+    beyond = np.log(2.0 * (ndtr(-tried_limits[:, None] / level) @ weight))
+    return float(np.interp(-np.log(2.0 * ndtr(-limit)), -beyond, tried_limits))
 
 
-def _number_between(histogram: NDArray[np.uint32], scale: Array, low: float, high: float) -> float:
-    """Departures from `low` to `high` deviations, those of a bin shared out as normal ones."""
+def _count_between(histogram: NDArray[np.uint32], scale: Array, low: float, high: float) -> float:
+    """Count departures from `low` to `high` deviations; a split bin is shared as if normal."""
     from scipy.special import ndtr
 
     edges = (
@@ -183,8 +194,8 @@ def _number_between(histogram: NDArray[np.uint32], scale: Array, low: float, hig
     return float((histogram * share).sum())
 
 
-def _deviation(histogram: NDArray[np.int64]) -> Array:
-    """Standard deviation from the median of those that are not 0, which held samples make."""
+def _deviation_from_median(histogram: NDArray[np.int64]) -> Array:
+    """Return the standard deviation from the median, without zeros, which held samples cause."""
     total = np.cumsum(histogram[..., 1:], axis=-1)
     wanted = total[..., -1] / 2.0
     number = np.argmax(total >= np.maximum(wanted, 1)[..., None], axis=-1)
@@ -192,15 +203,15 @@ def _deviation(histogram: NDArray[np.int64]) -> Array:
     before = np.take_along_axis(total, number[..., None], axis=-1)[..., 0] - inside
     share = np.divide(wanted - before, inside, out=np.ones(wanted.shape), where=inside > 0)
     return np.asarray(
-        np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / _MEDIAN, 0.0)
+        np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / _NORMAL_MEDIAN_ABS, 0.0)
     )
 
 
-def zeros_together(values: Array) -> NDArray[np.int64]:
-    """Exact zeros that all axes have at once; on a single axis those that have another one beside them.
+def simultaneous_zeros(values: Array) -> NDArray[np.int64]:
+    """Count exact zeros that all axes have at once; on a single axis, zeros in runs.
 
-    That is how lost samples look which were filled with zeros. A loop that sticks at zero does it
-    in each axis by itself, whenever its rate goes by.
+    Lost samples that were filled with zeros look like this. A loop that sticks at zero does so in
+    each axis separately, whenever its rate passes zero.
 
     Parameters
     ----------
@@ -212,10 +223,10 @@ def zeros_together(values: Array) -> NDArray[np.int64]:
 
     Examples
     --------
-    >>> zeros_together(np.array([[[0.0, 0.0, 0.0, 1.0]], [[0.0, 2.0, np.nan, 0.0]]]))
+    >>> simultaneous_zeros(np.array([[[0.0, 0.0, 0.0, 1.0]], [[0.0, 2.0, np.nan, 0.0]]]))
     array([[1],
            [1]])
-    >>> zeros_together(np.array([[[0.0, 0.0, 1.0, 0.0]]]))
+    >>> simultaneous_zeros(np.array([[[0.0, 0.0, 1.0, 0.0]]]))
     array([[2]])
     """
     zero = values == 0.0
@@ -232,8 +243,8 @@ def zeros_together(values: Array) -> NDArray[np.int64]:
     return np.asarray(found.sum(axis=-1))
 
 
-def samples_at_once(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArray[np.int64]]:
-    """How many samples of each block two axes or more have at once, by which axes these are.
+def simultaneous_samples(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArray[np.int64]]:
+    """Count the samples of each block that two or more axes have at once, by set of axes.
 
     Parameters
     ----------
@@ -242,12 +253,16 @@ def samples_at_once(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArra
     Returns
     -------
     dict of tuple of bool to ndarray of int64, shape (block,)
-        The axes that have a sample, and no other one -> number of instants.
+        Set of axes with a sample -> number of instants at which exactly these have one.
 
     Examples
     --------
-    >>> samples_at_once(np.array([[[True, True, True]], [[True, False, True]], [[True, True, False]]]))
-    {(True, False, True): array([1]), (True, True, False): array([1]), (True, True, True): array([1])}
+    >>> present = [[[True, True, True]], [[True, False, True]], [[True, True, False]]]
+    >>> for axes, number in simultaneous_samples(np.array(present)).items():
+    ...     print(axes, number)
+    (True, False, True) [1]
+    (True, True, False) [1]
+    (True, True, True) [1]
     """
     axes, block_count = present.shape[:2]
     if axes < 2:
@@ -267,22 +282,23 @@ def samples_at_once(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArra
     return {kind: found[kind] for kind in sorted(found) if sum(kind) > 1}
 
 
-def beyond_chance(
+def zeros_beyond_chance(
     together: NDArray[Any],
     zeros: NDArray[Any],
     samples: NDArray[Any],
     subset: NDArray[np.bool_],
     at_once: NDArray[Any],
 ) -> NDArray[np.int64]:
-    """Zeros of `zeros_together` less those that independent zeros of the axes, or of a single axis, would bring together.
+    """Subtract the zeros that independent axes, or a single axis, have at once by chance.
 
     Parameters
     ----------
     together, zeros, samples : ndarray of int, shape (..., axis, block)
+        Zeros of `simultaneous_zeros`, all zeros, and samples.
     subset : ndarray of bool, shape (subset, axis)
-        Which axes have samples at once; nothing is asked of it where there is a single axis.
+        Axes that have samples at once; unused with a single axis.
     at_once : ndarray of int, shape (subset, block)
-        Number of samples that these axes have at once, and no other one.
+        Number of samples that exactly these axes have at once.
 
     Returns
     -------
@@ -291,7 +307,8 @@ def beyond_chance(
     Examples
     --------
     >>> both = np.array([[True, True]])
-    >>> beyond_chance(np.array([[30], [30]]), np.array([[40], [50]]), np.array([[100], [100]]), both, np.array([[100]]))
+    >>> together, zeros, samples = np.array([[[30], [30]], [[40], [50]], [[100], [100]]])
+    >>> zeros_beyond_chance(together, zeros, samples, both, np.array([[100]]))
     array([[10],
            [10]])
     """
@@ -299,34 +316,38 @@ def beyond_chance(
     if zeros.shape[-2] == 1:
         chance = zeros * (1.0 - (1.0 - share) ** 2)
     else:
-        all_zero = chance_of_all(share, subset)
+        all_zero = probability_all_zero(share, subset)
         chance = np.moveaxis(
             np.tensordot(subset.T.astype(np.float64), all_zero * at_once, axes=(1, -2)), 0, -2
         )
     return np.asarray(np.maximum(together - np.rint(chance), 0), np.int64)
 
 
-def chance_of_all(share: Array, subset: NDArray[np.bool_]) -> Array:
-    """Chance that all axes of each subset are zero at once, (..., subset, block), from the shares (..., axis, block) of zeros."""
+def probability_all_zero(share: Array, subset: NDArray[np.bool_]) -> Array:
+    """Return the probability (..., subset, block) that all axes of a subset are zero at once.
+
+    The shares of zeros are (..., axis, block).
+    """
     return np.asarray(
         np.stack([np.prod(share[..., np.flatnonzero(one), :], axis=-2) for one in subset], axis=-2)
     )
 
 
 def quantization_step(values: Array) -> float:
-    """Step of the lattice that values stand on, whatever its offset; 0 when there is none, or when it is too fine to matter.
+    """Find the quantization step of values with any offset; 0 if there is none, or it is too fine.
 
     Parameters
     ----------
     values : ndarray
-        Some thousand values; NaN is passed over.
+        A few thousand values; NaN is ignored.
 
     Examples
     --------
     >>> noise = np.random.default_rng(1).standard_normal(5000)
-    >>> lattice_step(noise), round(lattice_step(np.round(noise / 0.3) * 0.3 + 0.1), 9)
+    >>> grid = np.round(noise / 0.3) * 0.3
+    >>> quantization_step(noise), round(quantization_step(grid + 0.1), 9)
     (0.0, 0.3)
-    >>> round(lattice_step(np.append(np.round(noise / 0.3) * 0.3, [17.77, -23.91])), 9)  # two spikes off the lattice
+    >>> round(quantization_step(np.append(grid, [17.77, -23.91])), 9)  # two spikes off the grid
     0.3
     """
     finite = values[np.isfinite(values)]
@@ -334,49 +355,49 @@ def quantization_step(values: Array) -> float:
         return 0.0
     levels, times = np.unique(finite, return_counts=True)
     size = float(np.abs(levels).max())
-    kept = [_common_levels(levels, times, rare) for rare in (_RARE, _TAILS)]
-    for several in (one for one in kept if one.size) if kept[0].size else (levels,):
+    kept = [_frequent_levels(levels, times, rare) for rare in (_MAX_OFF_GRID_SHARE, _SPIKE_SHARE)]
+    for kept_levels in (one for one in kept if one.size) if kept[0].size else (levels,):
         for resolution in (2.0**-23, 2.0**-52):  # as written in single and in double precision
             fine = 8.0 * resolution * size
-            apart = np.diff(several)
-            apart = apart[apart > fine]
-            if 0 < apart.size <= 0.8 * finite.size:
-                step = _common(apart, fine)
+            distances = np.diff(kept_levels)
+            distances = distances[distances > fine]
+            if 0 < distances.size <= 0.8 * finite.size:
+                step = _common_divisor(distances, fine)
                 if step > 0.0 and (
-                    several is levels or _share_off(levels, times, step, fine) <= _RARE
+                    kept_levels is levels
+                    or _off_grid_share(levels, times, step, fine) <= _MAX_OFF_GRID_SHARE
                 ):
                     return step
     return 0.0
 
 
-def _common_levels(levels: Array, times: NDArray[np.int64], rare: float) -> Array:
-    """Levels without the rarest, which hold this share of the values: spikes, off the lattice; empty where those left are no coarse one."""
+def _frequent_levels(levels: Array, times: NDArray[np.int64], rare: float) -> Array:
+    """Drop the rarest levels, `rare` of the values, as spikes; empty if the rest has no grid."""
     order = np.argsort(times, kind="stable")
     common = np.sort(order[np.cumsum(times[order]) > rare * times.sum()])
     return levels[common] if common.size and times[common].min() > 1 else levels[:0]
 
 
-def _share_off(levels: Array, times: NDArray[np.int64], step: float, fine: float) -> float:
-    """Share of the values that do not stand on the lattice of this step on which the most common one stands."""
-    away = np.abs(levels - levels[times.argmax()]) / step
-    whole = np.round(away)
-    off = np.abs(away - whole) * step > 2.0 * fine * (1.0 + whole)
+def _off_grid_share(levels: Array, times: NDArray[np.int64], step: float, fine: float) -> float:
+    """Return the share of values off the grid of this step through the most common value."""
+    departure = np.abs(levels - levels[times.argmax()]) / step
+    whole = np.round(departure)
+    off = np.abs(departure - whole) * step > 2.0 * fine * (1.0 + whole)
     return float(times[off].sum() / times.sum())
 
 
-def _common(apart: Array, fine: float) -> float:
-    """Largest number of which all distances are multiples, but for `fine` errors; 0 when there is none well above these."""
-    step = float(apart.min())
-    while step > _CLEAR * fine:
-        whole = np.round(apart / step)
-        near = whole < step / (
-            16.0 * fine
-        )  # farther ones may be off by their number times the error of the step
-        rest = np.abs(apart - whole * step)
-        wrong = near & (rest > 2.0 * fine * (1.0 + whole))
-        if not near.any():
+def _common_divisor(distances: Array, fine: float) -> float:
+    """Return the largest common divisor of distances with `fine` errors; 0 if there is none."""
+    step = float(distances.min())
+    while step > _MIN_STEP_ERRORS * fine:
+        whole = np.round(distances / step)
+        # Farther distances may be off by their number times the error of the step.
+        nearby = whole < step / (16.0 * fine)
+        rest = np.abs(distances - whole * step)
+        wrong = nearby & (rest > 2.0 * fine * (1.0 + whole))
+        if not nearby.any():
             return 0.0
         if not wrong.any():
-            return float(apart[near].sum() / whole[near].sum())
+            return float(distances[nearby].sum() / whole[nearby].sum())
         step = float(rest[wrong].min())
     return 0.0

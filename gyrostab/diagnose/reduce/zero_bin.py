@@ -1,9 +1,8 @@
-"""How wide the cell of a lattice is that the value 0 stands for: a rate that is cut off towards zero has one of two steps there.
+"""Width of the zero bin of a quantization grid, which shows a rate truncated towards zero.
 
-Rounding to the nearest value, or to the one below, makes all cells as wide as the step. Cutting off
-towards zero takes what is less than a step on either side of zero together, and leaves all other
-cells as they are. A loop that sticks at zero makes that cell wider too, but what it takes is
-missing beside it.
+Rounding to the nearest value, or down, makes all bins one step wide. Truncation towards zero takes
+everything less than a step on either side of zero together: the zero bin is two steps wide, all
+others one. A loop that sticks at zero widens that bin too, but its neighbours then lack samples.
 """
 
 from __future__ import annotations
@@ -12,47 +11,49 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-__all__ = ["CELLS", "cell_widths", "cut_off", "may_be_cut_off"]
+__all__ = ["BINS", "bin_widths", "possibly_truncated_axes", "truncated_axes"]
 
 Array = NDArray[np.float64]
-#: Cells whose widths are measured: that of 0, and the two beside it.
-CELLS = ("zero", "next")
-_CUT = np.array([2.0, 1.0])  # widths [steps] of a rate that is cut off towards zero
-_FORM = 0.05  # of a width, by which the noise may have another law than the fit
-_SURE, _LIKE = (
-    5.0,
-    3.5,
-)  # standard errors by which the cell must be wider than one step, and by which a width may be off
-_TOLD = 0.25  # largest standard error of its width, over all axes
-_COARSEST = 0.7  # scatters of the samples; beyond, the cells follow no parabola
-_REACH, _FEWEST, _MOST = 1.0, 4, 200  # scatters, and cells on either side, that the fit goes out to
-_OFF = 0.01  # share of the values that may stand off the lattice
-_TURNS = 50
+#: Bins whose widths are measured: the zero bin, and its two neighbours together.
+BINS = ("zero", "next")
+_TRUNCATED_WIDTHS_STEPS = np.array([2.0, 1.0])  # bin widths under truncation; derived
+_WIDTH_MODEL_ERROR_SHARE = 0.05  # of a width, from non-normal noise; design choice
+_MIN_EXCESS_STDERRS = 5.0  # by which the zero bin must be wider than one step; design choice
+_MAX_MISFIT_STDERRS = 3.5  # by which a width may differ from truncation; design choice
+_MAX_WIDTH_STDERR_STEPS = 0.25  # of the width over all axes; design choice
+_MAX_STEP_SCATTERS = 0.7  # coarser bins of normal noise do not follow a parabola
+_FIT_REACH_SCATTERS = 1.0  # range of the fit on either side of zero; design choice
+_MIN_FIT_BINS, _MAX_FIT_BINS = 4, 200  # on either side; design choice
+_OFF_GRID_SHARE = 0.01  # of the values, and of a step, that values may be off the grid
+_MAX_ITERATIONS = 50
 
 
-def cell_widths(values: Array, step: float) -> tuple[Array, Array]:
-    """Widths of the cell of 0 and of the two beside it, in steps, with their standard errors; NaN where they cannot be told.
+def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
+    """Measure the widths of the zero bin and of its neighbours, in steps, with standard errors.
 
-    The logarithms of the counts of the cells beyond are a parabola in the rate, as those of normal
-    noise are, which says how many values there are to a step.
+    The logarithms of the counts of the other bins are a parabola in the rate, as in normal noise.
+    It gives the number of values per step.
 
     Parameters
     ----------
     values : ndarray
-        Values on a lattice [degree hour-1]; NaN is passed over.
+        Values on a quantization grid [degree hour-1]; NaN is ignored.
     step : float
-        Of the lattice, which must go through 0 [degree hour-1]; 0 for none.
+        Quantization step of a grid through 0 [degree hour-1]; 0 for none.
 
     Returns
     -------
     width, error : ndarray, shape (2,)
-        In the order of `CELLS`.
+        In the order of `BINS`; NaN where not measurable.
 
     Examples
     --------
-    >>> noise = np.random.default_rng(1).standard_normal(60_000)
-    >>> [cell_widths(how(noise / 0.2) * 0.2, 0.2)[0].round().tolist() for how in (np.rint, np.floor, np.trunc)]
-    [[1.0, 1.0], [1.0, 1.0], [2.0, 1.0]]
+    >>> noise = np.random.default_rng(1).standard_normal(60_000) / 0.2
+    >>> for rounded in (np.rint(noise), np.floor(noise), np.trunc(noise)):
+    ...     print(bin_widths(rounded * 0.2, 0.2)[0].round())
+    [1. 1.]
+    [1. 1.]
+    [2. 1.]
     """
     nothing = np.full(2, np.nan)
     finite = values[np.isfinite(values)]
@@ -60,42 +61,48 @@ def cell_widths(values: Array, step: float) -> tuple[Array, Array]:
         return nothing, nothing
     place = np.rint(finite / step)
     scatter = float(finite.std())
-    if step > _COARSEST * scatter or (np.abs(finite - place * step) > _OFF * step).mean() > _OFF:
+    if (
+        step > _MAX_STEP_SCATTERS * scatter
+        or (np.abs(finite - place * step) > _OFF_GRID_SHARE * step).mean() > _OFF_GRID_SHARE
+    ):
         return nothing, nothing
-    reach = int(np.clip(_REACH * scatter / step, _FEWEST, _MOST))
+    reach = int(np.clip(_FIT_REACH_SCATTERS * scatter / step, _MIN_FIT_BINS, _MAX_FIT_BINS))
     count = np.bincount(
         (place[np.abs(place) <= reach] + reach).astype(np.int64), minlength=2 * reach + 1
     )
     number = np.arange(-reach, reach + 1)
     beyond = np.abs(number) > 1
-    fit = _parabola((number + 0.5 * np.sign(number))[beyond], count[beyond], float(reach))
+    fit = _fit_log_counts((number + 0.5 * np.sign(number))[beyond], count[beyond], float(reach))
     if fit is None:
         return nothing, nothing
     size, covariance = fit
-    found = [
+    counted = [
         (count[reach], np.array([-0.5, 0.5])),
         (count[reach - 1] + count[reach + 1], np.array([-1.5, 1.5])),
     ]
     width, error = np.empty(2), np.empty(2)
-    for cell, (seen, at) in enumerate(found):
-        columns = _columns(at, float(reach))
-        each = np.exp(columns @ size)
-        slope = each @ columns / each.sum()
-        usual = float(each.mean() if cell == 0 else each.sum())
-        width[cell] = seen / usual
-        error[cell] = np.hypot(
-            np.sqrt(max(seen, 1)) / usual, width[cell] * np.sqrt(slope @ covariance @ slope)
+    for bin_index, (seen, at) in enumerate(counted):
+        columns = _parabola_columns(at, float(reach))
+        density = np.exp(columns @ size)
+        slope = density @ columns / density.sum()
+        usual = float(density.mean() if bin_index == 0 else density.sum())
+        width[bin_index] = seen / usual
+        error[bin_index] = np.hypot(
+            np.sqrt(max(seen, 1)) / usual, width[bin_index] * np.sqrt(slope @ covariance @ slope)
         )
     return width, error
 
 
-def _columns(at: Array, reach: float) -> Array:
+def _parabola_columns(at: Array, reach: float) -> Array:
+    """Return the columns of a parabola."""
     return np.stack([np.ones(at.size), at / reach, np.square(at / reach)], axis=1)
 
 
-def _parabola(at: Array, count: NDArray[np.int64], reach: float) -> tuple[Array, Array] | None:
-    """Parabola of the logarithm of Poisson counts, by their likelihood, and the covariance of its factors; None where it cannot be told."""
-    columns = _columns(at, reach)
+def _fit_log_counts(
+    at: Array, count: NDArray[np.int64], reach: float
+) -> tuple[Array, Array] | None:
+    """Fit a parabola to the logarithms of Poisson counts; return it with its covariance."""
+    columns = _parabola_columns(at, reach)
     if (count > 0).sum() <= columns.shape[1]:
         return None
     size = np.linalg.lstsq(
@@ -103,7 +110,7 @@ def _parabola(at: Array, count: NDArray[np.int64], reach: float) -> tuple[Array,
         np.log(np.maximum(count, 0.5)) * np.sqrt(count),
         rcond=None,
     )[0]
-    for _ in range(_TURNS):
+    for _ in range(_MAX_ITERATIONS):
         expected = np.exp(np.clip(columns @ size, -30.0, 30.0))
         normal = (columns.T * expected) @ columns + 1e-9 * np.eye(columns.shape[1])
         move = np.linalg.solve(normal, columns.T @ (count - expected))
@@ -113,8 +120,10 @@ def _parabola(at: Array, count: NDArray[np.int64], reach: float) -> tuple[Array,
     return None
 
 
-def cut_off(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Axes whose rate is cut off towards zero on its lattice; the axes tell it together, since one logger writes all of them in one way.
+def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Find the axes whose rate is truncated towards zero on its quantization grid.
+
+    The axes are judged together, because one logger writes all of them in the same way.
 
     Parameters
     ----------
@@ -125,34 +134,49 @@ def cut_off(blocks: xr.Dataset) -> NDArray[np.bool_]:
     -------
     ndarray of bool, shape (axis,)
     """
-    on_lattice = np.asarray(blocks["lattice"].values > 0.0)
-    width, error, known = _widths(blocks)
-    like = known & _like_cut(width, error)
-    narrower = known & (width[:, 0] < _CUT[0] - _LIKE * np.hypot(error[:, 0], _FORM * _CUT[0]))
-    if not like.any() or narrower.any():
-        return np.zeros_like(on_lattice)
-    weight = error[like, 0] ** -2.0
-    together = float(weight @ width[like, 0] / weight.sum())
-    sure = weight.sum() ** -0.5 < _TOLD and (together - 1.0) * np.sqrt(weight.sum()) > _SURE
-    return np.asarray(on_lattice & sure)
+    quantized = np.asarray(blocks["lattice"].values > 0.0)
+    width, error, known = _read_widths(blocks)
+    like_truncation = known & _is_like_truncation(width, error)
+    narrower = known & (
+        width[:, 0]
+        < _TRUNCATED_WIDTHS_STEPS[0]
+        - _MAX_MISFIT_STDERRS
+        * np.hypot(error[:, 0], _WIDTH_MODEL_ERROR_SHARE * _TRUNCATED_WIDTHS_STEPS[0])
+    )
+    if not like_truncation.any() or narrower.any():
+        return np.zeros_like(quantized)
+    weight = error[like_truncation, 0] ** -2.0
+    mean_width = float(weight @ width[like_truncation, 0] / weight.sum())
+    sure = (
+        weight.sum() ** -0.5 < _MAX_WIDTH_STDERR_STEPS
+        and (mean_width - 1.0) * np.sqrt(weight.sum()) > _MIN_EXCESS_STDERRS
+    )
+    return np.asarray(quantized & sure)
 
 
-def may_be_cut_off(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Axes on a lattice of which the cells do not tell that they are not cut off towards zero; the rest as for `cut_off`."""
-    width, error, known = _widths(blocks)
-    return np.asarray((blocks["lattice"].values > 0.0) & (~known | _like_cut(width, error)))
+def possibly_truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Find the quantized axes whose bins do not rule out truncation; see `truncated_axes`."""
+    width, error, known = _read_widths(blocks)
+    return np.asarray(
+        (blocks["lattice"].values > 0.0) & (~known | _is_like_truncation(width, error))
+    )
 
 
-def _widths(blocks: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _read_widths(blocks: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the widths, their errors, and which axes have them."""
     width, error = (
-        blocks[name].transpose("axis", "cell").values
-        for name in ("cell_width", "cell_width_stderr")
+        blocks[name].transpose("axis", "bin").values for name in ("bin_width", "bin_width_stderr")
     )
     return width, error, np.isfinite(width).all(axis=1) & np.isfinite(error).all(axis=1)
 
 
-def _like_cut(width: Array, error: Array) -> NDArray[np.bool_]:
+def _is_like_truncation(width: Array, error: Array) -> NDArray[np.bool_]:
+    """Return which axes have the bin widths of truncation."""
     with np.errstate(invalid="ignore"):
         return np.asarray(
-            (np.abs(width - _CUT) <= _LIKE * np.hypot(error, _FORM * _CUT)).all(axis=1)
+            (
+                np.abs(width - _TRUNCATED_WIDTHS_STEPS)
+                <= _MAX_MISFIT_STDERRS
+                * np.hypot(error, _WIDTH_MODEL_ERROR_SHARE * _TRUNCATED_WIDTHS_STEPS)
+            ).all(axis=1)
         )

@@ -13,7 +13,7 @@ from gyrostab.diagnose.baseline.known_effects import remove_known_motion
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.locate.mismatches import louder
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
-from gyrostab.diagnose.predict.condition import Component, mask_anomalous_blocks, without_turns
+from gyrostab.diagnose.predict.condition import Component, drop_changed_tails, mask_anomalous_blocks
 from gyrostab.diagnose.predict.filter_response import is_filter
 from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.statistics import STATISTICS
@@ -68,7 +68,7 @@ def statistic_scores(
         blocks,
         [component for identification in identified for component in identification.components],
     )
-    turns_left_out = without_turns(
+    turns_left_out = drop_changed_tails(
         blocks, after["spectrum"].transpose("axis", "block", "band").values
     )
     special = {

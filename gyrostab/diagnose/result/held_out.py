@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks
 from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.evidence.wandering import known_wander
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, values_of
@@ -292,7 +292,7 @@ def _mean_evidence(
         K=np.asarray(walk, dtype=float),
         B=np.asarray(flicker, dtype=float),
         present=present,
-        wander=known_wander(baseline, axis),
+        wander=expected_processes(baseline, axis),
     )
     log = weight - np.logaddexp.reduce(weight) - 0.5 * (found.square[:, 0] + found.log_determinant)
     return float(np.logaddexp.reduce(log))

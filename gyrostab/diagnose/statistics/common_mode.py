@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.wandering import known_wander
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
 from gyrostab.diagnose.statistics.scores import (
     Array,
@@ -124,7 +124,7 @@ def _increments(
         variance = np.where(present, white[axis] + b**2 * faster, 1.0)
         series = residual[..., axis, :].reshape(-1, residual.shape[-1])
         columns = np.ascontiguousarray(np.where(present, series, 0.0).T)
-        known = known_wander(baseline, axis)
+        known = expected_processes(baseline, axis)
         states = np.append(b**2 * share, known.square), np.append(times, known.time)
         made, _ = whiten(columns, variance, end - begin, present, k**2 / HOUR + known.walk, *states)
         new[..., axis, :] = made.T.reshape(new[..., axis, :].shape)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.evidence.wandering import known_wander, mean_share
+from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -153,9 +153,9 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Arr
     step = np.diff((begin + end) / 2.0, append=end[-1])
     block, span = float(blocks.attrs["block_s"]), float(end[-1] - begin[0])
     share, times, white = flicker_states(block, span)
-    known = known_wander(baseline, axis)
+    known = expected_processes(baseline, axis)
     slow, times = (
-        np.append(b**2 * share, known.square * mean_share(block, known.time)),
+        np.append(b**2 * share, known.square * block_mean_variance(block, known.time)),
         np.append(times, known.time),
     )
     decay = np.exp(-step[:, None] / times)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, beyond_ends, has_coarse_grid
+from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, excess_extremes, has_coarse_grid
 from gyrostab.diagnose.statistics.scores import (
     Array,
     over_windows,
@@ -51,7 +51,7 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         name: np.nan_to_num(values_of(blocks, name, "axis", "block").astype(float))
         for name in COUNTS
     }
-    each["extremes"] = beyond_ends(each["extremes"])
+    each["extremes"] = excess_extremes(each["extremes"])
     counts = over_windows(np.stack([each[name] for name in COUNTS], axis=-1), windows)
     heavy, used = kurtosis_score(values_of(blocks, "kurtosis", "axis", "block"), samples)
     usual = np.median(

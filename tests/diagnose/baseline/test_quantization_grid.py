@@ -13,9 +13,9 @@ from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_equivalent_effects
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.reduce.zero_bin import cut_off, may_be_cut_off
+from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes, truncated_axes
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
 
@@ -132,9 +132,9 @@ def cut_record(
 def test_a_rate_that_is_cut_off_towards_zero_is_told_by_the_cell_of_zero(step: float) -> None:
     for how, cut in ((np.trunc, True), (np.rint, False), (np.floor, False)):
         blocks = cut_record(how, step=step)
-        assert (cut_off(blocks) == cut).all()
-        assert (may_be_cut_off(blocks) == cut).all()
-        width, error = blocks["cell_width"].values, blocks["cell_width_stderr"].values
+        assert (truncated_axes(blocks) == cut).all()
+        assert (possibly_truncated_axes(blocks) == cut).all()
+        width, error = blocks["bin_width"].values, blocks["bin_width_stderr"].values
         assert (np.abs(width - [2.0 if cut else 1.0, 1.0]) < 4.0 * error + 0.15).all()
         assert rounded_rates(blocks, calibrate_noise(blocks)).all() == cut or step > 0.4
 
@@ -142,10 +142,10 @@ def test_a_rate_that_is_cut_off_towards_zero_is_told_by_the_cell_of_zero(step: f
 @pytest.mark.parametrize("zone", [1.0, 2.0])
 def test_what_sticks_at_zero_is_missing_beside_it(zone: float) -> None:
     blocks = cut_record(np.rint, zone=zone)
-    width = blocks["cell_width"].sel(axis="x", cell="next")
+    width = blocks["bin_width"].sel(axis="x", bin="next")
     assert abs(float(width) - max(1.5 - zone, 0.0)) < 0.1
-    assert not cut_off(blocks).any()
-    assert not may_be_cut_off(blocks).any()
+    assert not truncated_axes(blocks).any()
+    assert not possibly_truncated_axes(blocks).any()
 
 
 @pytest.mark.parametrize(
@@ -169,13 +169,13 @@ def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(
 def test_where_the_cells_do_not_tell_both_names_stand() -> None:
     """Three standard deviations away a cell holds three of 15 000 samples: nothing tells whether that of zero is twice as wide."""
     blocks = cut_record(np.rint, step=0.04, mean=(-3.0, 2.8), zone=0.0, size=15_000)
-    assert may_be_cut_off(blocks).all()
-    assert not cut_off(blocks).any()
+    assert possibly_truncated_axes(blocks).all()
+    assert not truncated_axes(blocks).any()
     variant = Variant({}, ("stuck",), np.empty(0))
     component = Component(Candidate("dead_zone", "marks", (), (variant,)), variant, ("x",), 20.0)
-    state = begin_state(blocks, calibrate_noise(blocks))
+    state = initial_state(blocks, calibrate_noise(blocks))
     assert "rate_quantization" in find_equivalent_effects("dead_zone", [component], state)
     told = cut_record(np.rint, zone=1.0, size=15_000)
     assert "rate_quantization" not in find_equivalent_effects(
-        "dead_zone", [component], begin_state(told, calibrate_noise(told))
+        "dead_zone", [component], initial_state(told, calibrate_noise(told))
     )

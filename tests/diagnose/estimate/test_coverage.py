@@ -13,7 +13,7 @@ from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.condition import condition_on
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from tests.diagnose.estimate.test_joint_fit import claimed
 from tests.support.named import WORLD, record
 
@@ -54,7 +54,7 @@ def fits(
     for number in range(RECORDS):
         mean = drawn["mean"].isel(record=number).transpose("axis", "block") + in_blocks(shape)
         state = condition_on(
-            begin_state(blocks.assign(mean=mean), baseline), list(frame.identified[0].components)
+            initial_state(blocks.assign(mean=mean), baseline), list(frame.identified[0].components)
         )
         out.append(dict(fit_identifications(replace(frame, state=state), baseline)[0].parameters))
     return out
@@ -144,7 +144,7 @@ def test_what_is_there_but_slower_than_others_is_below_its_limit():
             mean=drawn["mean"].isel(record=number).transpose("axis", "block") + there
         )
         found.append(
-            find_upper_limits(replace(frame, state=begin_state(seen, baseline)))[
+            find_upper_limits(replace(frame, state=initial_state(seen, baseline)))[
                 "shupe"
             ].upper_limit
         )

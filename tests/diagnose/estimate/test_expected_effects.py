@@ -9,7 +9,7 @@ from scipy import signal
 import gyrostab
 from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
-from gyrostab.diagnose.evidence.wandering import known_wander, mean_share
+from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
@@ -99,7 +99,7 @@ def test_null_means_wander_as_the_model_does(blocks, memory, rms):
     assert (drawn[:, 1:] * drawn[:, :-1]).mean() == pytest.approx(
         rms**2 * next_one, rel=0.08, abs=0.02 * rms**2
     )
-    assert mean_share(a, np.array([1.0])) == pytest.approx(own)
+    assert block_mean_variance(a, np.array([1.0])) == pytest.approx(own)
 
 
 def test_null_means_walk_while_it_shakes(blocks):
@@ -120,7 +120,7 @@ def test_null_means_walk_while_it_shakes(blocks):
         (0.3 * 6.0) ** 2 * (span - block / 3.0), rel=0.15
     )  # K^2 t, less what the means smooth
     assert np.diff(nulls[:, still]).var() < 0.02 * moved.var()
-    walk = known_wander(baseline, "x").walk
+    walk = expected_processes(baseline, "x").walk
     assert walk[shaken] == pytest.approx((0.3 * 6.0) ** 2 / 3600.0, rel=0.02)
 
 

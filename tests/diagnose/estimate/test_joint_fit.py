@@ -18,7 +18,7 @@ from gyrostab.diagnose.identify.sample_sizes import line_size
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.simulate import simulate
 from tests.support.named import COEFFICIENT, nulls, record
 
@@ -40,7 +40,7 @@ def claimed(
     variant = next(variant for variant in one.variants if variant.columns == columns)
     component = Component(one, variant, ("x",), 50.0)
     identification = Identification(effect, one.driver, ("x",), (component,), 50.0, 8.0)
-    state = condition_on(begin_state(blocks, baseline), [component])
+    state = condition_on(initial_state(blocks, baseline), [component])
     return Identifications(
         (identification,),
         (),
@@ -71,7 +71,7 @@ def fits(quiet, change, effect, statistic, columns):
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
         )
         state = condition_on(
-            begin_state(change(one), baseline), list(frame.identified[0].components)
+            initial_state(change(one), baseline), list(frame.identified[0].components)
         )
         (fitted,) = fit_identifications(replace(frame, state=state), baseline)
         out.append(fitted.parameters[columns[0]])
@@ -292,7 +292,7 @@ def test_axes_that_the_strongest_view_lacks_have_their_sizes_from_the_next():
     identification = Identification(
         effect["name"], power.driver, tuple(truth), tuple(components), 130.0, 8.0
     )
-    state = condition_on(begin_state(blocks, baseline), components)
+    state = condition_on(initial_state(blocks, baseline), components)
     (fitted,) = fit_identifications(
         Identifications(
             (identification,),

@@ -10,7 +10,7 @@ import pytest
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.predict.condition import condition_on
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.physics.registry import make_effect
 from tests.diagnose.estimate.test_joint_fit import claimed
 from tests.support.named import record
@@ -56,7 +56,7 @@ def fitted(quiet, effect, statistic, column, *, true, size, named):
         )
     component = replace(component, variant=_variant(identifications, component, named))
     identification = replace(identifications.identified[0], components=(component,))
-    state = condition_on(begin_state(seen, baseline), [component])
+    state = condition_on(initial_state(seen, baseline), [component])
     (found,) = fit_identifications(
         replace(identifications, identified=(identification,), state=state), baseline
     )

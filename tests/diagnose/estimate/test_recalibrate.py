@@ -16,7 +16,7 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import CountEvidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
@@ -53,7 +53,7 @@ def naming_of(blocks, baseline, effect, statistic, columns, **values):
     rows = [("x", "y")] if statistic == "cross" else [("x",)]
     components = tuple(Component(one, variant, row, 500.0) for row in rows)
     identification = Identification(effect, one.driver, rows[0], components, 500.0, 8.0)
-    state = condition_on(begin_state(blocks, baseline), list(components))
+    state = condition_on(initial_state(blocks, baseline), list(components))
     return Identifications(
         (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(blocks)
     )
@@ -200,7 +200,7 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
     identification = Identification(
         "aliased_vibration", statistics["power"].driver, ("x", "y"), components, 500.0, 8.0
     )
-    state = condition_on(begin_state(blocks, baseline), list(components))
+    state = condition_on(initial_state(blocks, baseline), list(components))
     identifications = Identifications(
         (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, fold_blocks(blocks)
     )

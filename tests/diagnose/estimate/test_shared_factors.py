@@ -12,7 +12,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.shared_factors import estimate_shared_factors
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.linear_model import begin_state, cross_column, pair_rows
+from gyrostab.diagnose.predict.linear_model import cross_column, initial_state, pair_rows
 from tests.support.named import COEFFICIENT, record
 
 AXES = ("x", "y", "z")
@@ -48,7 +48,7 @@ def sizes(quiet, factors, number, *, bandwidth=math.inf, axes=AXES):
         cross[row] = (
             factors[i] * factors[j] * cross_column(density[None, None], row, blocks) + noise
         )
-    state = begin_state(
+    state = initial_state(
         blocks.assign(cross=xr.DataArray(cross, dims=("pair", "block", "band"))), baseline
     )
     variant = candidate.variants[-1]

@@ -11,18 +11,18 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.held_out import (
+    held_out_evidence,
     mean_evidence,
     mean_factors,
     noise_columns,
     power_evidence,
     power_factors,
-    score,
 )
 from gyrostab.diagnose.evidence.products import WIDTHS
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import compute_evidence, totals
+from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
@@ -239,7 +239,7 @@ def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(tier):
 def test_gain_is_what_the_folds_lose_at_the_best_length():
     rng = np.random.default_rng(0)
     factors = rng.standard_normal((1 + 3 * FOLDS, 3, 5))
-    gains = score(factors, [0, 0, 1])
+    gains = held_out_evidence(factors, [0, 0, 1])
     for record in range(5):
         mixed = np.log(np.exp(factors[:, :2, record]).mean(axis=1))
         components = [
@@ -376,9 +376,9 @@ def test_a_weak_filter_gains_more_than_noise_reaches(share, least, most):
         if one.effect == "logger_filter"
     ]
     (noise,) = null_records(blocks, baseline, count=200, rng=np.random.default_rng(3), chunk=200)
-    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
-    (found,) = totals(compute_evidence(filters, blocks, start, folds)).values()
-    (drawn,) = totals(
+    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
+    (found,) = evidence_by_effect(compute_evidence(filters, blocks, start, folds)).values()
+    (drawn,) = evidence_by_effect(
         compute_evidence(filters, noise, start, folds, rng=np.random.default_rng(1))
     ).values()
     assert least < found[0] < most

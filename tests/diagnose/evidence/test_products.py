@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gyrostab.diagnose.evidence.products import evidence, mean_products, pairs_of, take_out
+from gyrostab.diagnose.evidence.products import (
+    column_pairs,
+    log_evidence,
+    marginalise,
+    mean_products,
+)
 
 
 def test_products_of_columns_that_never_meet_are_not_needed():
@@ -19,14 +24,16 @@ def test_products_of_columns_that_never_meet_are_not_needed():
     }
     numbers = [np.array(chosen) for chosen in ([0], [1, 2], [3], [4, 5])]
     whole = mean_products(values, columns, **frame_of)
-    some = mean_products(values, columns, **frame_of, pairs=pairs_of(7, numbers, 1))
+    some = mean_products(values, columns, **frame_of, pairs=column_pairs(7, numbers, 1))
     assert some.gram[0, 0, 1] == 0.0 != whole.gram[0, 0, 1]
     wanted, got = (
-        evidence(take_out(one, 1, np.eye(1)), numbers, np.full(6, 0.2), np.array([-1.0, -2.0]))
+        log_evidence(
+            marginalise(one, 1, np.eye(1)), numbers, np.full(6, 0.2), np.array([-1.0, -2.0])
+        )
         for one in (whole, some)
     )
     np.testing.assert_allclose(got, wanted, rtol=1e-12)
-    alone = evidence(
-        take_out(whole, 1, np.eye(1)), numbers[3:], np.full(6, 0.2), np.array([-1.0, -2.0])
+    alone = log_evidence(
+        marginalise(whole, 1, np.eye(1)), numbers[3:], np.full(6, 0.2), np.array([-1.0, -2.0])
     )
     np.testing.assert_allclose(alone[1], got[4], rtol=1e-12)

@@ -18,9 +18,9 @@ from gyrostab.diagnose.identify.sample_sizes import line_size
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.designs import Candidate, Variant
-from gyrostab.diagnose.predict.filter_response import straightened
-from gyrostab.diagnose.predict.linear_model import begin_state
-from gyrostab.diagnose.predict.search import compute_evidence, of_means
+from gyrostab.diagnose.predict.filter_response import undo_filter
+from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.predict.search import compute_evidence, reusable_mean_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
@@ -106,20 +106,20 @@ def test_each_line_is_a_claim_of_its_own(lines: tuple[Identification, ...]) -> N
 
 def test_a_line_changes_no_gain_of_the_means() -> None:
     blocks = sines({0.7: 0.4}, size=9_000, axes=1)
-    state, folds = begin_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
+    state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
     candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
     found = compute_evidence(candidates, blocks, state, folds)
     line, jump = (by_key(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
     assert line.evidence_nats > 10.0
     named = condition_on(state, [line])
-    kept = of_means(found, state, named)
+    kept = reusable_mean_evidence(found, state, named)
     assert {one.candidate.statistic for one in kept} == {"mean", "levels"}
     again = compute_evidence([one.candidate for one in kept], named.blocks, named, folds)
     for one, other in zip(kept, again, strict=True):
         np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
-    assert not of_means(found, state, condition_on(state, [jump]))
+    assert not reusable_mean_evidence(found, state, condition_on(state, [jump]))
     lost = replace(state, blocks=blocks.assign(mean=blocks["mean"].where(blocks["begin"] > 0.0)))
-    assert not of_means(found, state, lost)
+    assert not reusable_mean_evidence(found, state, lost)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -211,7 +211,7 @@ def test_a_spectrum_is_straightened_by_as_much_as_its_filter_takes(weight: float
     )
     lines = record["line_frequency"].values
     mean_of_two = {"cutoff": 0.0, "order": 2.0, "length": 0.2, "pick": 0.0, "instrument": 1.0}
-    found, stopped = straightened(record, "x", "logger_filter", mean_of_two, np.ones(lines.size))
+    found, stopped = undo_filter(record, "x", "logger_filter", mean_of_two, np.ones(lines.size))
     power = found["line_power"].mean("part").values[0] * 10.0
     near = np.abs(lines - 4.0) < 0.2
     kept = ~near & ~stopped
@@ -223,5 +223,5 @@ def test_a_spectrum_is_straightened_by_as_much_as_its_filter_takes(weight: float
     assert lines[gains.argmax()] == pytest.approx(4.0, abs=0.1)
     assert gains.max() > 20.0
     assert np.where(near | stopped, -np.inf, gains).max() < 5.0
-    again, _ = straightened(found, "x", "logger_filter", mean_of_two, np.ones(lines.size))
+    again, _ = undo_filter(found, "x", "logger_filter", mean_of_two, np.ones(lines.size))
     xr.testing.assert_identical(again, found)

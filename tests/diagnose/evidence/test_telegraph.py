@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.estimate.telegraph_sizes import estimate_telegraph
 from gyrostab.diagnose.evidence.telegraph import (
-    MEAN_SWITCHES,
+    MIN_SWITCHES,
     telegraph_courses,
     telegraph_evidence,
 )
@@ -21,7 +21,7 @@ from gyrostab.diagnose.identify.switching import followed_first, hops_alone
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.condition import Component, condition_on_components
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import Found
+from gyrostab.diagnose.predict.search import CandidateEvidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
@@ -129,8 +129,8 @@ def test_one_jump_and_back_are_no_two_levels() -> None:
     evidence_nats, found = telegraph_evidence(
         *frame(mean + white(np.random.default_rng(5), 1)), axis="x"
     )
-    assert found.hops[0] == pytest.approx(2.0, abs=0.2)
-    assert found.hops[0] < MEAN_SWITCHES
+    assert found.switch_count[0] == pytest.approx(2.0, abs=0.2)
+    assert found.switch_count[0] < MIN_SWITCHES
     assert evidence_nats[0] == -np.inf
 
 
@@ -270,7 +270,7 @@ def test_jumps_that_are_hops_themselves_are_none(
     start = state_of(0.7 * course + size * (np.arange(BLOCKS) >= REAL) + white(rng, 1)[0])
     candidate = component(start, course).candidate
 
-    def gains(_: object, state: State) -> list[Found]:
+    def gains(_: object, state: State) -> list[CandidateEvidence]:
         columns = state.given.get(("mean", "x"), [])
         evidence_nats, found = telegraph_evidence(
             state.blocks,
@@ -279,7 +279,7 @@ def test_jumps_that_are_hops_themselves_are_none(
             given=np.stack(columns, axis=-1) if columns else None,
         )
         return [
-            Found(
+            CandidateEvidence(
                 candidate,
                 [("x",)],
                 evidence_nats[:, None],

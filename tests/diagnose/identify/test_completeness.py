@@ -12,10 +12,10 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.completeness import variance_fluctuation
 from gyrostab.diagnose.identify.forward_search import _Search, name_effects
-from gyrostab.diagnose.predict.condition import reweighted
-from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.condition import refit_weights
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
-from gyrostab.diagnose.predict.search import CountEvidence, Found, compute_evidence
+from gyrostab.diagnose.predict.search import CandidateEvidence, CountEvidence, compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
@@ -36,12 +36,12 @@ def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Datas
 
 def left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
     """Unrest beside columns (block,) of added white power."""
-    state: State = begin_state(blocks, calibrate_noise(blocks))
+    state: State = initial_state(blocks, calibrate_noise(blocks))
     spread = [
         np.broadcast_to(one[:, None], state.weight.shape[1:]).astype(float) for one in columns
     ]
     return variance_fluctuation(
-        reweighted(state.with_columns("power", "x", spread)) if columns else state, "x"
+        refit_weights(state.with_columns("power", "x", spread)) if columns else state, "x"
     )
 
 
@@ -71,7 +71,7 @@ def test_blocks_that_are_masked_do_not_count() -> None:
     burst = np.ones(BLOCKS)
     burst[20:40] = 1.5
     blocks = record(burst)
-    state = begin_state(blocks, calibrate_noise(blocks))
+    state = initial_state(blocks, calibrate_noise(blocks))
     assert variance_fluctuation(state, "x") > 8.0
     assert variance_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
 
@@ -110,10 +110,10 @@ def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
             unit="deg/h",
         )
     )
-    state = begin_state(blocks, calibrate_noise(blocks))
+    state = initial_state(blocks, calibrate_noise(blocks))
     search = _Search(nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0)
 
-    def common(found: list[Found]) -> float:
+    def common(found: list[CandidateEvidence]) -> float:
         return max(
             float(one.evidence_nats.max()) for one in found if one.candidate.effect == "~cov"
         )

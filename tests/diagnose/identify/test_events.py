@@ -16,8 +16,8 @@ from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, effect_candidates
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.linear_model import State, begin_state
-from gyrostab.diagnose.predict.nuisance import stretches
+from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.nuisance import burst_intervals
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import phase_locked as locked
@@ -46,7 +46,7 @@ def loud(factor: np.ndarray) -> np.ndarray:
 
 def started(rate: np.ndarray) -> State:
     blocks = reduced_of(rate)
-    return begin_state(
+    return initial_state(
         blocks,
         baseline_from_model(
             blocks, {**MODEL, "log": {"axes": [str(one) for one in blocks["axis"].values]}}
@@ -89,7 +89,7 @@ def test_noise_gets_louder_with_age_and_not_the_other_way(
 
 def test_stretches_of_all_lengths_are_tried_at_both_ends() -> None:
     for block_count in (5, 92, 540, 4320):
-        tried = {tuple(one) for one in stretches(block_count).tolist()}
+        tried = {tuple(one) for one in burst_intervals(block_count).tolist()}
         assert len(tried) <= 240
         assert {
             (0, 1),
@@ -231,7 +231,7 @@ def turned(rate: np.ndarray, turns: np.ndarray) -> State:
     blocks = reduce_log(
         log.assign(rotation_rate=("time", turning, {"units": "degree s-1"})), block="20s"
     )
-    return begin_state(blocks, baseline_from_model(blocks, {**MODEL, "log": {"axes": ["x"]}}))
+    return initial_state(blocks, baseline_from_model(blocks, {**MODEL, "log": {"axes": ["x"]}}))
 
 
 @pytest.mark.parametrize("size", [0.0, 6.0])

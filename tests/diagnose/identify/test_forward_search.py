@@ -16,7 +16,7 @@ from gyrostab.diagnose.identify.forward_search import Identification, name_effec
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.condition import Component, condition_on
-from gyrostab.diagnose.predict.search import together
+from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError
 from gyrostab.ingest.make_log import make_log
@@ -182,9 +182,9 @@ def test_claims_are_plain(shaken):
 
 
 def test_other_axes_must_pay_for_themselves():
-    assert together(np.array([10.0, 1.0, -5.0])) == 10.0
-    assert together(np.array([10.0, 10.0, 10.0])) == 27.0
-    assert together(np.array([-2.0, -1.0])) == -1.0
+    assert combine_rows(np.array([10.0, 1.0, -5.0])) == 10.0
+    assert combine_rows(np.array([10.0, 10.0, 10.0])) == 27.0
+    assert combine_rows(np.array([-2.0, -1.0])) == -1.0
 
 
 def test_level_of_an_exponential_tail():

@@ -12,7 +12,7 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.predict.condition import Component, without_turns
+from gyrostab.diagnose.predict.condition import Component, drop_changed_tails
 from gyrostab.diagnose.predict.designs import Candidate, Variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.tables import identification_tables
@@ -214,7 +214,7 @@ def test_two_levels_in_a_block_make_no_tails(loud) -> None:
         / loud.attrs["block_s"]
     )
     base = flat(loud, 1.0 + share * 899.0)
-    calm = without_turns(loud, base["spectrum"].values)
+    calm = drop_changed_tails(loud, base["spectrum"].values)
     before, after = (
         distribution.score(one, base).isel(tau=-1)["ratio"].max() for one in (loud, calm)
     )

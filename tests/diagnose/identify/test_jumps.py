@@ -12,7 +12,7 @@ from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.jumps import is_sudden, jumps_at_will
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
@@ -38,7 +38,7 @@ def test_what_goes_over_within_some_blocks_is_no_jump(way: float, size: float, j
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if (one.effect, one.statistic) == ("bias_jump", "mean")
     )
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     components = by_key(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[jumps.key]
     assert sum_evidence(components) > 10.0
     assert abs(float(components[0].variant.values["at"]) - MIDDLE) <= 30.0
@@ -60,7 +60,7 @@ def test_where_power_came_back_a_jump_may_settle() -> None:
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if (one.effect, one.statistic) == ("bias_jump", "mean")
     )
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     at = np.array([one.values["at"] for one in jumps.variants])
     components = {
         instant: Component(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0)

@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab import diagnose
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.moving_axes import moving_blocks, unexplained_motion, without_motion
-from gyrostab.diagnose.predict.candidates import windows_of
+from gyrostab.diagnose.predict.candidates import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
 from gyrostab.diagnose.result.tables import motion_tables
 from gyrostab.errors import SchemaError
@@ -80,7 +80,7 @@ def test_left_out_on_the_axis_alone_and_kept_as_measured(seen):
     np.testing.assert_array_equal(rest["mean"].values[:2], whole["mean"].values[:2])
     np.testing.assert_array_equal(measured(rest, "mean"), whole["mean"])
     np.testing.assert_array_equal(measured(rest, "cross"), whole["cross"])
-    np.testing.assert_array_equal(windows_of(rest, {}).own["z"], whole["mean"].sel(axis="z"))
+    np.testing.assert_array_equal(make_windows(rest, {}).own["z"], whole["mean"].sel(axis="z"))
     assert rest.sizes["gap"] == whole.sizes["gap"]
 
 

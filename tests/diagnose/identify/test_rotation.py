@@ -12,7 +12,7 @@ from gyrostab.diagnose.identify.components import by_key
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, is_physical
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
@@ -51,7 +51,7 @@ def _parts(blocks: xr.Dataset):
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect in ("scale_factor", "real_motion")
     ]
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     components = by_key(
         compute_evidence(
             [one for one in known if one.statistic == "mean"], blocks, state, fold_blocks(blocks)

@@ -13,7 +13,7 @@ from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.steady import is_always_present
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
@@ -37,7 +37,7 @@ def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], S
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.key == "gauss_markov" and one.statistic == "power"
     ]
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     return by_key(compute_evidence(biases, blocks, state, fold_blocks(blocks)))[
         "gauss_markov"
     ], state

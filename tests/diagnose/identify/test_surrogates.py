@@ -9,7 +9,7 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
@@ -40,7 +40,7 @@ def _slides(sensitivity: float, period: float) -> tuple[bool, float]:
     variant = next(each for each in one.variants if each.columns == ("sensitivity",))
     return passes_time_shift_test(
         [Component(one, variant, ("x",), 50.0)],
-        begin_state(blocks, baseline),
+        initial_state(blocks, baseline),
         fold_blocks(blocks),
     )
 

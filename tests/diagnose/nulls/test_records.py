@@ -12,7 +12,7 @@ from gyrostab.diagnose.baseline.calibrate import baseline_from_model, calibrate_
 from gyrostab.diagnose.evidence.held_out import mean_evidence, power_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.reduce.outliers import CHANCE
+from gyrostab.diagnose.reduce.outliers import EXPECTED_FALSE_OUTLIERS
 from gyrostab.kernels.spectra.periodogram import band_covariance
 from gyrostab.simulate import simulate
 
@@ -104,7 +104,7 @@ def test_statistics_are_those_of_raw_logs(lost):
     assert (
         0.0
         < float(nulls["outliers"].sum(["axis", "block"]).mean())
-        < 5.0 * CHANCE * nulls.sizes["axis"]
+        < 5.0 * EXPECTED_FALSE_OUTLIERS * nulls.sizes["axis"]
     )
 
 

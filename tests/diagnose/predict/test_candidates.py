@@ -12,16 +12,16 @@ from gyrostab.diagnose.evidence.held_out import linear_model_factors, power_fact
 from gyrostab.diagnose.predict.candidates import (
     STATISTIC_NAMES,
     effect_candidates,
-    windows_of,
+    make_windows,
 )
 from gyrostab.diagnose.predict.linear_model import (
-    begin_state,
     build_linear_model,
-    drawn,
-    effective,
+    initial_state,
     power_column,
+    simulate_noise,
+    spread_by_gaps,
 )
-from gyrostab.diagnose.predict.nuisance import nuisance_alternatives, splines
+from gyrostab.diagnose.predict.nuisance import hat_functions, nuisance_alternatives
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import sampled_psd
@@ -186,17 +186,18 @@ def test_gaps_mix_a_density_with_its_mean(plain):
     half = plain.assign(
         neighbours=plain["neighbours"] * 0.25
     )  # a quarter of what a block without gaps has
-    mixed = effective(density, half)
+    mixed = spread_by_gaps(density, half)
     assert np.ptp(mixed[0, 0]) == pytest.approx(0.25)
     np.testing.assert_allclose(
-        effective(density, plain.assign(neighbours=plain["neighbours"] * 0.0 + 1.0))[0, 0], density
+        spread_by_gaps(density, plain.assign(neighbours=plain["neighbours"] * 0.0 + 1.0))[0, 0],
+        density,
     )
 
 
 def test_channels_with_holes_are_bridged(plain):
     values = plain["channel_temperature"].values.copy()
     values[10:14] = np.nan
-    seen = windows_of(
+    seen = make_windows(
         plain.assign(channel_temperature=("block", values)), {"temperature": "temperature"}
     ).drivers["temperature"]
     np.testing.assert_allclose(
@@ -205,7 +206,9 @@ def test_channels_with_holes_are_bridged(plain):
 
 
 def test_splines_add_to_one():
-    np.testing.assert_allclose(splines(np.arange(50.0), np.arange(1.0, 51.0)).sum(axis=0), 1.0)
+    np.testing.assert_allclose(
+        hat_functions(np.arange(50.0), np.arange(1.0, 51.0)).sum(axis=0), 1.0
+    )
 
 
 # -----------------------------------------------------------------------------------------------------------------
@@ -218,7 +221,7 @@ def test_cells_of_powers_are_scored_as_powers(plain, common):
     baseline = baseline.assign(common=baseline["common"] + common)
     folds = fold_blocks(plain)
     generic = [one for one in nuisance_alternatives(plain) if one.effect == "~N(t)"]
-    state = begin_state(plain, baseline)
+    state = initial_state(plain, baseline)
     cells = build_linear_model(generic, 0, plain, state)
     mine = linear_model_factors(cells, folds)[:, 1:]
     designs = [
@@ -239,12 +242,12 @@ def test_noise_has_the_variance_that_the_weights_say(rich, statistic):
         for one in effect_candidates(rich, COEFFICIENT)[0]
         if one.statistic == statistic and one.each
     ][:1]
-    cells = build_linear_model(candidates, 0, rich, begin_state(rich, baseline))
+    cells = build_linear_model(candidates, 0, rich, initial_state(rich, baseline))
     z = (cells.values[..., 0] * np.sqrt(cells.weight))[
         (cells.weight > 0) & np.isfinite(cells.values[..., 0])
     ]
     assert np.mean(z**2) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / z.size) + 0.03)
-    some = drawn(cells, np.random.default_rng(1), 3)
+    some = simulate_noise(cells, np.random.default_rng(1), 3)
     assert some.values.shape[2] == 3
     assert not some.values[cells.weight == 0].any()
 
@@ -272,7 +275,7 @@ def test_simulated_wander_has_the_variance_of_the_face():
         seed=5,
     )
     blocks = reduce_log(log)
-    time, variance = effect.explain(windows_of(blocks, {})).wander["rms"]
+    time, variance = effect.explain(make_windows(blocks, {})).wander["rms"]
     assert time == 50.0
     assert 0.01 * variance[0] == pytest.approx(float(np.var(log["rate"].values)), rel=0.3)
 

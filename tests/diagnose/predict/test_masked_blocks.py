@@ -12,7 +12,7 @@ from gyrostab.diagnose.predict.condition import (
     condition_on_component,
     mask_anomalous_blocks,
 )
-from gyrostab.diagnose.predict.linear_model import begin_state, cross_without
+from gyrostab.diagnose.predict.linear_model import cross_without, initial_state
 from tests.support.reduced_records import baseline, records
 
 BLOCKS = 40
@@ -79,7 +79,7 @@ def test_blocks_of_named_spikes_are_left_out_of_means_powers_and_what_axes_share
 
 
 def test_they_are_left_out_for_the_effects_that_are_sought_next(blocks: xr.Dataset) -> None:
-    state = begin_state(blocks, baseline(block_count=BLOCKS))
+    state = initial_state(blocks, baseline(block_count=BLOCKS))
     found = condition_on_component(state, spikes("y")).blocks
     for name in ("mean", "power"):
         assert lost(found[name], blocks[name]) == {("y", 5), ("y", 9)}

@@ -9,7 +9,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
@@ -36,7 +36,7 @@ def test_random_gaps_do_not_make_a_shared_band_smaller(log, rows):
     one = next(one for one in known if one.effect == "shared_source" and one.statistic == "cross")
     variant = next(each for each in one.variants if each.values["bandwidth"] == 0.5)
     mean, covariance = component_mixture(
-        Component(one, variant, ("x", "y"), 1.0), begin_state(blocks, baseline)
+        Component(one, variant, ("x", "y"), 1.0), initial_state(blocks, baseline)
     ).moments()
     error = float(np.sqrt(covariance[0, 0]))
     assert abs(mean[0] - 9e-6) < 3.0 * error

@@ -10,9 +10,9 @@ import pytest
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.predict.step_times import tried_instants
+from gyrostab.diagnose.predict.step_times import select_step_times
 from gyrostab.physics.prediction import Windows
 from tests.support.named import COEFFICIENT, record
 
@@ -66,7 +66,7 @@ def test_a_large_jump_is_found_at_any_time_of_a_long_record(at):
     )
     frame = Windows(windows, windows + 20.0, np.ones(1), 10.0, ("x",), own={"x": means})
     possible = np.unique(np.concatenate([windows[1:], windows + 10.0]))
-    tried = np.array(tried_instants(possible, frame))
+    tried = np.array(select_step_times(possible, frame))
     assert tried.size < 350
     assert np.abs(tried - at).min() <= 5.0
 
@@ -86,7 +86,7 @@ def test_two_restarts_share_their_weight(restarted):
 def test_a_jump_where_power_came_back_needs_less_to_be_seen(restarted):
     middle = (restarted["begin"] + restarted["end"]) / 2.0
     moved = restarted.assign(mean=restarted["mean"] + 0.08 * (middle > _BACK))
-    state = begin_state(moved, calibrate_noise(moved))
+    state = initial_state(moved, calibrate_noise(moved))
     weighed = _jumps(moved)
     alike = replace(weighed, variants=tuple(replace(one, weight=1.0) for one in weighed.variants))
     found = [

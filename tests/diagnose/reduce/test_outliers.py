@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.reduce.outliers import CHANCE, count_outliers, find_peaks
+from gyrostab.diagnose.reduce.outliers import EXPECTED_FALSE_OUTLIERS, count_outliers, find_peaks
 from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures
 
 SIZE, BLOCK, RATE = 18_000, 180, 10.0  # half an hour
@@ -96,9 +96,9 @@ def test_a_slope_departs_nowhere_and_a_spike_only_where_it_is():
 
 
 def test_gaussian_noise_has_no_more_than_chance():
-    assert total(lambda rng: rng.standard_normal(SIZE), 40) <= 40 * CHANCE + 3.0 * np.sqrt(
-        40 * CHANCE
-    )
+    assert total(
+        lambda rng: rng.standard_normal(SIZE), 40
+    ) <= 40 * EXPECTED_FALSE_OUTLIERS + 3.0 * np.sqrt(40 * EXPECTED_FALSE_OUTLIERS)
 
 
 @pytest.mark.parametrize(("size", "least"), [(5.0, 0.2), (6.0, 0.5), (8.0, 0.9)])

@@ -16,7 +16,7 @@ from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on, find_anomalous_blocks
-from gyrostab.diagnose.predict.linear_model import begin_state
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.attribution_weights import needed
 from gyrostab.diagnose.statistics import mean
@@ -58,7 +58,7 @@ def shaken():
     )
     candidates, reasons = effect_candidates(changed, COEFFICIENT)
     identified = tuple(_claim(candidates, *names) for names in NAMES)
-    state = begin_state(changed, baseline)
+    state = initial_state(changed, baseline)
     for identification in identified[::-1]:  # odd samples are named first
         state = condition_on(state, list(identification.components))
     identifications = Identifications(
@@ -141,7 +141,7 @@ def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
     identification = Identification(
         "bias_jump", one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
     )
-    state = condition_on(begin_state(moved, baseline), list(identification.components))
+    state = condition_on(initial_state(moved, baseline), list(identification.components))
     identifications = Identifications(
         (identification,),
         (),
