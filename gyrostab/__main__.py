@@ -1,4 +1,4 @@
-"""``python -m gyrostab`` and the command ``gyrostab``: the command line, which may be interrupted while it still loads."""
+"""Entry point of ``gyrostab`` and ``python -m gyrostab``; handles Ctrl-C while modules load."""
 
 import sys
 
@@ -6,7 +6,7 @@ __all__ = ["main"]
 
 
 def main() -> int:
-    """Run the command line; the exit code."""
+    """Run the command line and return the exit code."""
     try:
         from gyrostab.cli import main as run
 

@@ -1,4 +1,6 @@
-"""The command line: parse, call, print. Every module of `gyrostab.cli.commands` adds its commands by itself.
+"""The command line: parse arguments, call functions, print results.
+
+Every module of `gyrostab.cli.commands` registers its commands when it is imported.
 
 Exit codes: 0 done; 2 bad input or usage, with one message on stderr; 3 interrupted; 1 anything
 else. No traceback unless ``--debug``.
@@ -50,9 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
-    logging.getLogger(
-        "asyncio"
-    ).disabled = not debug  # tasks of zarr that nobody asked after would print tracebacks
+    # abandoned tasks of zarr would print tracebacks
+    logging.getLogger("asyncio").disabled = not debug
     try:
         app.config = read_config(
             tokens, [command for command in app if not command.startswith("-")]
@@ -62,12 +63,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with protect_inputs(find_inputs(bound.arguments)):
                 command(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as stop:
-        said = (
-            str(stop)
-            or "interrupted; nothing was written under the name of the output. Start the same command again."
+        nothing_written = (
+            "interrupted; nothing was written under the name of the output. "
+            "Start the same command again."
         )
-        return print_error(said, 3)
-    except BrokenPipeError:  # the reader of our output, for instance `head`, has left
+        return print_error(str(stop) or nothing_written, 3)
+    except BrokenPipeError:  # the reader of the output, for instance `head`, has ended
         sys.stderr.close()
         return 0
     except Exception as error:

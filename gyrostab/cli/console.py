@@ -1,4 +1,4 @@
-"""What the command line needs beside its commands: defaults from a file, notes and errors in one line, a polite way to stop."""
+"""Defaults from a file, warnings and errors as single lines, and orderly interruption."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 
 
 def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
-    """Reader of the option defaults in the file that ``--config`` names, for cyclopts; None without one."""
+    """Make the cyclopts reader of option defaults from the file of ``--config``; None without it."""
     name = None
     for place, token in enumerate(tokens):
         if token == "--config" and place + 1 < len(tokens):
@@ -39,12 +39,12 @@ def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
     if name is None:
         return None
     table = read_toml(Path(name))
-    strange = [
+    unknown = [
         key for key, value in table.items() if isinstance(value, dict) and key not in commands
     ]
-    if strange:
+    if unknown:
         raise OptionError(
-            f"{name}: table [{strange[0]}] is not a command; the commands are {', '.join(commands)}"
+            f"{name}: table [{unknown[0]}] is not a command; the commands are {', '.join(commands)}"
         )
 
     def apply(current: Any, path: tuple[str, ...], arguments: Any) -> None:
@@ -86,15 +86,17 @@ def show_plain_warnings() -> Iterator[None]:
 
 @contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Let a polite ``kill``, a time limit or a closed terminal end the work as Ctrl-C does, with nothing left behind."""
+    """Treat ``kill``, a time limit or a closed terminal like Ctrl-C, so that nothing is left behind.
+
+    Windows has no SIGHUP, and its SIGTERM cannot be caught when another process sends it.
+    """
 
     def stop(number: int, frame: Any) -> None:
         raise KeyboardInterrupt
 
     signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = [
-        number for number in signals if signal.getsignal(number) is signal.SIG_DFL
-    ]  # not under nohup
+    # nohup ignores SIGHUP, and that stays so
+    ours = [number for number in signals if signal.getsignal(number) is signal.SIG_DFL]
     if threading.current_thread() is not threading.main_thread():
         ours = []
     for number in ours:
@@ -108,7 +110,7 @@ def sigterm_as_interrupt() -> Iterator[None]:
 
 @contextmanager
 def relaxed_gc() -> Iterator[None]:
-    """Let Python look for unreachable cycles seldom: by its own measure it looks through all that is loaded four times while loading."""
+    """Run the garbage collector less often: by default it scans all modules four times at start."""
     before = gc.get_threshold()
     gc.set_threshold(10_000, *before[1:])
     try:
@@ -118,13 +120,13 @@ def relaxed_gc() -> Iterator[None]:
 
 
 def print_error(text: str, code: int) -> int:
-    """Say what is wrong; the exit code."""
+    """Print an error message and return the exit code."""
     print(f"gyrostab: {text}", file=sys.stderr)
     return code
 
 
 def describe_error(error: Exception) -> int:
-    """One message for an error, and the exit code."""
+    """Print an exception as one message and return the exit code."""
     if isinstance(error, CycloptsError):
         return print_error(f"{error} See gyrostab --help, or the command's own --help.", 2)
     if isinstance(error, GyrostabError):
@@ -141,10 +143,11 @@ def describe_error(error: Exception) -> int:
         )
     if isinstance(error, MemoryError):
         return print_error(
-            f"the memory is not enough ({error}); give fewer --taus, a longer --step, or fewer --workers",
+            f"out of memory ({error}); give fewer --taus, a longer --step, or fewer --workers",
             1,
         )
     return print_error(
-        f"unexpected {type(error).__name__}: {error}. Give --debug to see where it arose, and please report it.",
+        f"unexpected {type(error).__name__}: {error}. "
+        "Give --debug to see where it arose, and please report it.",
         1,
     )

@@ -1,4 +1,4 @@
-"""What the commands share: the program that they belong to, their usual arguments, and the frame of their work."""
+"""The application object, arguments shared by the commands, and the progress display."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ Output = Annotated[Path, Parameter(name=["--output", "-o"], metavar="FILE")]
 
 app = App(
     name="gyrostab",
-    help="Dynamic Allan variance of gyro logs: from raw logs of drilling tools to noise coefficients that vary with time.",
-    help_epilogue="First try: gyrostab demo -o demo-output. Each command explains itself: gyrostab run --help.",
+    help="Dynamic Allan variance of gyro logs: noise coefficients over time, and a diagnosis of the "
+    "physical effects that a simulation leaves out.",
+    help_epilogue="Try it: gyrostab demo -o demo-output. Options of a command: gyrostab run --help.",
     version_flags=["--version"],
-    help_format="plaintext",
+    help_format="markdown",
     suppress_keyboard_interrupt=False,
 )
 
 
 @contextmanager
 def show_stages(common: Common) -> Iterator[Any]:
-    """Set the number of cores, and show the stages of the work."""
+    """Set the number of processor cores and show the progress of each stage."""
     import dask
 
     from gyrostab.progress import show_progress
@@ -44,7 +45,7 @@ def show_stages(common: Common) -> Iterator[Any]:
 
 
 def find_inputs(arguments: Mapping[str, Any]) -> list[Path]:
-    """Find the files that a command reads: every path among its arguments but the output, and every TOML file of an option.
+    """Find the input files of a command: its path arguments except the output, and TOML options.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The options that several commands share, as they stand on the command line, and their way to the functions."""
+"""Options shared by several commands, and their conversion to keyword arguments."""
 
 from __future__ import annotations
 
@@ -27,40 +27,41 @@ Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 @Parameter(name="*", group=_READING)
 @dataclass(frozen=True)
 class Reading:
-    """How a log is to be read where it does not say so itself.
+    """How to read a log, as far as it does not say so itself.
 
     Parameters
     ----------
     rate
-        Sampling rate in Hz, for a log without a time column (otherwise the rate is found from the
-        time stamps and checked against this).
+        Sampling rate in Hz of a log without a time column. With a time column, the rate found from
+        the time stamps must agree with this one.
     start
-        Time of the first row, for a log without a time column: 2026-11-20T14:00:00.
+        Time of the first row of a log without a time column: 2026-11-20T14:00:00.
     epoch
-        Day from which a time column in seconds counts: 2026-11-20 (default 1970-01-01).
+        Date from which a numeric time column counts: 2026-11-20 (default: 1970-01-01).
     map
-        Rename a column: wx=gyro_x. Repeat for more columns, or give a TOML file with one line per
-        column: wx = "gyro_x".
+        Rename a column: wx=gyro_x. Repeat for more, or give a TOML file with one line per column:
+        wx = "gyro_x".
     unit
-        Unit of a column that has none: gyro=deg/s, gyro_x=deg/s, temperature=degC; of counts:
-        "gyro=0.1 arcsec/s". Repeat for more.
+        Unit of a column that states none: gyro=deg/s for all gyro axes, gyro_x=deg/s,
+        temperature=degC; for counts the size of one count, "gyro=0.1 arcsec/s". Repeat for more.
     kind
-        Whether the gyro columns are rotation rates or angles.
+        Whether the gyro columns hold rotation rates or angles.
     channel
-        Another file with a channel (temperature, vibration ...) of the same time. Repeat for more.
+        Another file with a channel of the same recording (temperature, vibration, ...). Repeat for
+        more.
     max_gap
-        Longest gap; a longer step of the time stamps is taken for a step of the clock.
+        Longest gap. A larger step of the time stamps is treated as a step of the clock.
     strict
         Stop at a damaged or missing file instead of leaving a gap.
     time_from
-        Use the log from this time on: 2026-11-20T14:00 (UTC), or 10min after its start.
+        Use the log from this time on: 2026-11-20T14:00 (UTC), or a duration after its start, 10min.
     time_to
-        Use the log up to this time, in the same manner.
+        Use the log up to this time, given like --from.
     exclude
-        Take the samples of a span as missing: 2026-11-20T14:00/2026-11-20T14:05, or 10min/15min
-        after the start. Repeat for more.
+        Treat the samples of a time span as missing: 2026-11-20T14:00/2026-11-20T14:05, or
+        10min/15min after the start. Repeat for more.
     limit
-        Raise a limit that a message names: columns=50000. Repeat for more.
+        Raise a limit that an error message names: columns=50000. Repeat for more.
     """
 
     rate: Annotated[float | None, Parameter(metavar="HZ")] = None
@@ -78,7 +79,7 @@ class Reading:
     limit: Annotated[list[str] | None, Parameter(metavar="NAME=NUMBER", negative=())] = None
 
     def given(self) -> dict[str, Any]:
-        """The options that differ from their defaults."""
+        """Return the options that differ from their defaults."""
         return {
             name: value
             for name, value in self.options().items()
@@ -86,7 +87,7 @@ class Reading:
         }
 
     def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.jobs.run.load_log`."""
+        """Return the keyword arguments of `gyrostab.jobs.run.load_log`."""
         chosen = {
             **asdict(self),
             "map": _parse_pairs(self.map, "--map"),
@@ -105,21 +106,19 @@ class Reading:
 @Parameter(name="*", group=_READING)
 @dataclass(frozen=True)
 class ChannelFile:
-    """One channel of another file.
+    """A channel to read from another file.
 
     Parameters
     ----------
     channel
-        Another file that holds the channel, in any format that gyrostab reads; aligned by its time
-        stamps.
+        File that holds the channel, in any supported format. It is aligned by its time stamps.
     epoch
-        Day from which a time column in seconds counts in that file: 2026-11-20 (default
-        1970-01-01).
+        Date from which a numeric time column of that file counts: 2026-11-20 (default: 1970-01-01).
     map
         Rename a column of that file: T_probe=temperature, or "T_probe=temperature [degC]". Repeat
-        for more columns.
+        for more.
     unit
-        Unit of a column that has none: temperature=degC. Repeat for more.
+        Unit of a column of that file that states none: temperature=degC. Repeat for more.
     """
 
     channel: Annotated[Path | None, Parameter(metavar="FILE")] = None
@@ -128,7 +127,7 @@ class ChannelFile:
     unit: Annotated[list[str] | None, Parameter(metavar="NAME=UNIT", negative=())] = None
 
     def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.read_channel`, apart from the file and the name."""
+        """Return the keyword arguments of `gyrostab.read_channel` except file and name."""
         if self.channel is None and (self.epoch or self.map or self.unit):
             raise OptionError(
                 "--epoch, --map and --unit say how to read the file of --channel; name that file too"
@@ -148,23 +147,23 @@ class Windows:
     Parameters
     ----------
     window
-        Length of the sliding window: 10min, 500ms, 2h or 2000samples (default: 10min, or a shorter
-        one that fits four times into the record).
+        Length of the sliding window: 10min, 500ms, 2h or 2000samples (default: 10min, or less, so
+        that at least four windows fit into the record).
     step
-        Distance from one window to the next, in the same manner (default: a tenth of the window).
+        Time from one window to the next, written like --window (default: one tenth of the window).
     taus
-        Averaging times: how many (40, spread evenly on a logarithmic scale), octave (1, 2, 4 ...
-        samples), all, or a list: 0.1s,1s,10s.
+        Averaging times: their number, evenly spaced on a logarithmic scale; octave (1, 2, 4, ...
+        samples); all; or a list, 0.1s,1s,10s.
     tau_max
-        Longest averaging time (default: a third of the window; at most half of it).
+        Longest averaging time, at most half of the window (default: one third of the window).
     overlap
-        full uses every second difference; octave thins them out where tau is long: faster on long
-        windows, 1 % more scatter.
+        full uses all second differences. octave uses fewer of them at long averaging times: faster
+        on long windows, 1 % more scatter.
     gaps
-        bridge counts only what is there; zero divides by the gap-free number, as some papers do,
-        which digs a canyon at every gap.
+        bridge divides by the number of second differences present. zero divides by the gap-free
+        number, as some papers do, which biases the variance low at every gap.
     axis
-        Only this gyro axis: x. Repeat for more.
+        Analyse this gyro axis only: x. Repeat for more.
     """
 
     window: Annotated[str | None, Parameter(metavar="DURATION")] = None
@@ -176,7 +175,7 @@ class Windows:
     axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None
 
     def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.allan.davar.davar`."""
+        """Return the keyword arguments of `gyrostab.allan.davar.davar`."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -188,12 +187,13 @@ class Fitting:
     Parameters
     ----------
     terms
-        Terms of the model, letters of QNBKR.
+        Noise terms to fit, letters of QNBKR.
     fit_method
-        gls fits variances with their covariance; adev fits deviations, as some papers do, for
-        comparison.
+        gls fits variances by generalised least squares, with their covariance. adev fits
+        deviations, as some papers do, for comparison.
     fit_from
-        Shortest averaging time to fit: 1s leaves out a filter or a line below that (default: all).
+        Shortest averaging time to fit; a longer one leaves out the effect of a filter or a spectral
+        line (default: all).
     fit_to
         Longest averaging time to fit (default: all).
     """
@@ -204,7 +204,7 @@ class Fitting:
     fit_to: Annotated[str | None, Parameter(metavar="DURATION")] = None
 
     def options(self) -> dict[str, Any]:
-        """Keyword arguments of `gyrostab.allan.fit.fit_noise`."""
+        """Return the keyword arguments of `gyrostab.allan.fit.fit_noise`."""
         return {
             "terms": self.terms,
             "method": self.fit_method,
@@ -216,15 +216,15 @@ class Fitting:
 @Parameter(name="*", group=_RUNNING)
 @dataclass(frozen=True)
 class Running:
-    """How long work is done, and done again.
+    """How a long computation runs.
 
     Parameters
     ----------
     resume
-        Continue a run that was stopped or killed; begin one where there is none.
+        Continue an interrupted run, or start a new one if there is none.
     scheduler
-        Who does the work: threads, processes, or the workers of a dask scheduler at this address,
-        tcp://cluster:8786.
+        Where to compute: threads, processes, or the workers of a dask scheduler, given by its
+        address, tcp://cluster:8786.
     """
 
     resume: Flag = False
@@ -234,20 +234,20 @@ class Running:
 @Parameter(name="*", group=_COMMON)
 @dataclass(frozen=True)
 class Common:
-    """What every command takes.
+    """Options of every command.
 
     Parameters
     ----------
     config
-        TOML file with defaults for the options: [run] window = "10min".
+        TOML file with default values of options, in a table per command: [run] window = "10min".
     workers
-        Processor cores to use (default: all).
+        Number of processor cores to use (default: all).
     overwrite
-        Replace an output that exists.
+        Replace an existing output.
     quiet_progress
-        Show no progress.
+        Do not show progress.
     debug
-        Show where in the program an error arose.
+        Show the traceback of an error.
     """
 
     config: Annotated[Path | None, Parameter(metavar="FILE.toml")] = None
@@ -258,12 +258,11 @@ class Common:
 
 
 def _parse_pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
-    """``["wx=gyro_x"]`` as a dict; an item may also name a TOML file of such pairs."""
+    """Parse ``["wx=gyro_x"]`` to a dict; an item may also name a TOML file of such pairs."""
     found: dict[str, str] = {}
     for item in items or ():
-        name, equals, value = item.rpartition(
-            "="
-        )  # a header may hold the sign, a name or a unit does not
+        # a header may contain "="; a name or a unit does not
+        name, equals, value = item.rpartition("=")
         if equals and name.strip() and value.strip():
             found[name.strip()] = value.strip()
         elif item.endswith(".toml"):
@@ -279,7 +278,7 @@ _PAIR_EXAMPLES = {"--map": "wx=gyro_x", "--unit": "gyro=deg/s", "--limit": "colu
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file of options, or say what is wrong with it."""
+    """Read a TOML file of options."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -1,1 +1,1 @@
-"""The commands, one module for each group. A new one is one more file here; ``sort_key`` is its place in the help."""
+"""The commands, one module per group; ``sort_key`` sets the place of a command in the help."""

@@ -1,4 +1,4 @@
-"""The first try."""
+"""The demonstration command."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ __all__ = ["demo"]
 
 @app.command(sort_key=0, help_epilogue="")
 def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -> None:
-    """Run the main job on the simulated log that comes with gyrostab.
+    """Run the whole analysis on the simulated log shipped with gyrostab.
 
-    Writes the product, the regular log, a report and figures into a folder, and prints the noise
-    coefficients before, during and after the vibration.
+    Writes the product, the log, a report and figures to a folder, and prints the noise coefficients
+    before, during and after vibration.
 
     Example: gyrostab demo -o demo-output
 
     Parameters
     ----------
     output
-        Folder to write into.
+        Folder to write to.
     """
     from gyrostab.jobs.demo import format_summary, run_demo
 

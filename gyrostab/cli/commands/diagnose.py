@@ -1,4 +1,4 @@
-"""A recording against a simulation."""
+"""The command that compares a recording with a simulation."""
 
 from __future__ import annotations
 
@@ -29,35 +29,37 @@ def diagnose(
     reading: Reading = Reading(),
     common: Common = Common(),
 ) -> None:
-    """Find where a recording differs from its simulation, name the physics that is missing, and add it to the model.
+    """Compare a recording with its simulation and identify missing physical effects.
 
-    Writes diagnosis.json, model.toml (for gyrostab simulate), diagnosis.nc and report.html into a
-    folder, and prints the verdict.
+    Finds where the recording differs from its simulation, identifies the effects that explain the
+    difference, and adds them to the model. Writes diagnosis.json, model.toml (input of gyrostab
+    simulate), diagnosis.nc and report.html to a folder, and prints the verdict.
 
     Example: gyrostab diagnose run7.nc -o run7-diagnosis
 
     Parameters
     ----------
     recording
-        One or more logs of the recording, in any format that gyrostab reads, with its channels.
+        One or more logs of the recording, with its channels, in any supported format.
     output
-        Folder to make.
+        Folder to write.
     simulation
-        What the recording is compared with: a model, or a simulated log on the same stamps
-        (default: noise calibrated on quiet stretches of the recording).
+        Simulation to compare with: a model, or a simulated log with the same time stamps (default:
+        noise calibrated on quiescent intervals of the recording).
     quiet
-        Stretch of the recording in which nothing happens, for the calibration:
+        Quiescent interval of the recording, on which the noise is calibrated:
         2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after the start. Repeat for more (default:
-        detected automatically). With --simulation it calibrates the level of the simulated noise,
-        by one factor for each axis.
+        detected automatically). With --simulation, it calibrates the level of the simulated noise
+        by one factor per axis.
     block
-        Length of the blocks that are looked at (default: 20s, less in short records).
+        Length of the blocks in which statistics are computed (default: 20s, less for short
+        records).
     level
-        Chance that anything is found where nothing is.
+        False-alarm probability: how often anything is reported for a recording of noise alone.
     nulls
-        Simulated records that say what noise alone does.
+        Number of null records (simulated noise) from which the thresholds are computed.
     seed
-        Of these records.
+        Seed of the null records.
     """
     from gyrostab.diagnose.core import diagnose as run_diagnosis
     from gyrostab.diagnose.core import parse_quiescent_span

@@ -1,4 +1,4 @@
-"""Commands that take logs and give what is in them."""
+"""Commands that inspect and convert logs."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ __all__ = ["ingest", "scan"]
 
 @app.command(sort_key=1, help_epilogue="")
 def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common()) -> None:
-    """Say what is in some logs: span, sampling rate, axes, channels, gaps, what is odd, and the command to run next.
+    """Summarise logs: time span, sampling rate, axes, channels, gaps and anomalies.
 
-    A file that cannot be read as it is needs no options here: every column of it is shown, with a
-    guess at the gyro, its unit and the time.
+    Prints a table and the command to run next. A file that cannot be read without further options
+    is shown too: every column, with a guess at the gyro axes, their unit and the time column.
 
     Example: gyrostab scan run7/*.csv
 
     Parameters
     ----------
     logs
-        One or more logs, in any format that gyrostab reads.
+        One or more logs, in any supported format.
     """
     from gyrostab.ingest.scan import (
         next_command,
@@ -65,9 +65,9 @@ def ingest(
     reading: Reading = Reading(),
     common: Common = Common(),
 ) -> None:
-    """Put logs on one uniform time axis, with the gaps marked, and write them as NetCDF or Zarr.
+    """Convert logs to one log on a uniform time axis, with gaps marked (NetCDF or Zarr).
 
-    Integer counts stay integers. The logs may be larger than the memory.
+    Integer counts are stored as integers. The logs may be larger than memory.
 
     Example: gyrostab ingest run7/*.csv -o run7.nc
 
@@ -76,10 +76,10 @@ def ingest(
     logs
         One or more logs, in any order.
     output
-        File to write, LOG.nc or LOG.zarr.
+        File to write: LOG.nc or LOG.zarr.
     compression
-        Of a NetCDF file: zlib is read by every program; zstd is faster, but Octave, MATLAB and
-        h5netcdf do not read it (default: zlib).
+        Compression of a NetCDF file. Every program reads zlib; zstd is faster, but Octave, MATLAB
+        and h5netcdf cannot read it (default: zlib).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.jobs.run import count_samples, load_log

@@ -1,4 +1,4 @@
-"""Commands that take a product."""
+"""Commands that read a product."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def report(
     log: Path | None = None,
     common: Common = Common(),
 ) -> None:
-    """Make one self-contained HTML page of a product or of a diagnosis, with figures.
+    """Write a self-contained HTML report of a product or a diagnosis, with figures.
 
     Example: gyrostab report product.nc -o report.html --log run7.nc
 
     Parameters
     ----------
     product
-        File that gyrostab run or gyrostab fit wrote, or folder that gyrostab diagnose wrote.
+        File written by gyrostab run or gyrostab fit, or folder written by gyrostab diagnose.
     output
         HTML file to write.
     log
-        Log that the product was made of, to show the signal too.
+        Log from which the product was computed; adds a figure of the signal.
     """
     from gyrostab.io.datasets import open_log, open_product
     from gyrostab.report import write_diagnosis_report, write_report
@@ -72,22 +72,23 @@ def correlate(
     other: ChannelFile = ChannelFile(),
     common: Common = Common(),
 ) -> None:
-    """Say whether noise coefficients and window means follow temperature or another channel, how much and how late.
+    """Correlate noise coefficients and window means with temperature or another channel.
+
+    Prints which quantities follow the channel, how strongly, and with what lag.
 
     Example: gyrostab correlate product.nc --with temperature --max-lag 2h -o coupling.nc
 
     Parameters
     ----------
     product
-        File that gyrostab run or gyrostab fit wrote.
+        File written by gyrostab run or gyrostab fit.
     with_
         Channel of the product, or of the file given by --channel.
     max_lag
-        Longest time by which the gyro may follow the channel (default: a tenth of the record; 0s
-        for none).
+        Longest lag of the gyro behind the channel (default: one tenth of the record; 0s for none).
     output
-        NetCDF file to write: the product with the correlation beside it; a figure of the same name
-        in PNG stands beside it.
+        NetCDF file to write: the product with the correlation added. A figure with the same name is
+        written as PNG.
     """
     from gyrostab.correlate import correlate as compute
     from gyrostab.correlate import format_correlation, join
@@ -125,16 +126,19 @@ def plot(
     output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")],
     common: Common = Common(),
 ) -> None:
-    """Draw all the figures of a product as PNG: coefficients, also against temperature, dynamic Allan deviation as map and surface.
+    """Draw the figures of a product as PNG files.
+
+    The figures show the coefficients over time and against temperature, and the dynamic Allan
+    deviation as a map and as a surface.
 
     Example: gyrostab plot product.nc -o figures
 
     Parameters
     ----------
     product
-        File that gyrostab run or gyrostab fit wrote.
+        File written by gyrostab run or gyrostab fit.
     output
-        Folder to write into.
+        Folder to write to.
     """
     from gyrostab.io.datasets import open_product
     from gyrostab.plot.figures import save_figures
@@ -154,18 +158,18 @@ def export(
     format: Literal["kalibr", "zarr"],
     common: Common = Common(),
 ) -> None:
-    """Hand a product over to other programs: the noise for Kalibr and the ROS tools (YAML), or the whole product as Zarr.
+    """Export a product to other programs: YAML for Kalibr and ROS, or Zarr.
 
     Example: gyrostab export product.nc -o imu.yaml --format kalibr
 
     Parameters
     ----------
     product
-        File that gyrostab run or gyrostab fit wrote.
+        File written by gyrostab run or gyrostab fit.
     output
-        File to write (YAML), or directory (Zarr).
+        File (YAML) or folder (Zarr) to write.
     format
-        kalibr: N, K and B in radians, the worst axis and each of them; zarr: everything.
+        kalibr: N, K and B in radians, for the worst axis and for each axis. zarr: the whole product.
     """
     from gyrostab.io.datasets import open_product, to_zarr
     from gyrostab.io.kalibr import to_kalibr

@@ -1,4 +1,4 @@
-"""A log from a model."""
+"""The command that simulates a log."""
 
 from __future__ import annotations
 
@@ -26,27 +26,28 @@ def simulate(
     reading: Reading = Reading(),
     common: Common = Common(),
 ) -> None:
-    """Simulate a gyro log from a model of its noise, its environment and physical effects.
+    """Simulate a gyro log from a model of noise, environment and physical effects.
 
-    Every other command takes the log. It may be larger than the memory.
+    Every command that reads logs also reads simulated ones. The log may be larger than memory.
 
     Example: gyrostab simulate model.toml -o log.nc --duration 1h --rate 100 --seed 1
 
     Parameters
     ----------
     model
-        TOML file with [noise], [[effect]], [[environment]] and [log]; see docs/simulate.md.
+        TOML file with the tables [noise], [[effect]], [[environment]] and [log]; see
+        docs/simulate.md.
     output
-        File to write, LOG.nc or LOG.zarr.
+        File to write: LOG.nc or LOG.zarr.
     duration
-        Length of the log: 1h, 200h. --rate and --start give sampling rate and first time; all three
-        may stand in the model.
+        Length of the log: 1h, 200h. --rate and --start set its sampling rate and first time. All
+        three may be set in the model instead.
     like
-        Recording whose time stamps, gaps and channels are taken instead. Repeat for more files of
-        it.
+        Recording whose time stamps, gaps and channels the log takes over. Repeat for a recording in
+        several files.
     seed
-        Seed of the random numbers: the same log for the same seed, the same noise with and without
-        effects (default: the model's, or 0).
+        Seed of the random numbers. The same seed gives the same log, and the same noise with and
+        without effects (default: the seed in the model, or 0).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
     from gyrostab.jobs.run import count_samples, load_log

@@ -1,4 +1,4 @@
-"""Commands on the way from logs to the product."""
+"""Commands that compute the product: the whole analysis, or one stage of it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,11 @@ def run(
     running: Running = Running(),
     common: Common = Common(),
 ) -> None:
-    """Go the whole way from logs to the product: uniform time, dynamic Allan variance, noise coefficients, NetCDF.
+    """Analyse logs: dynamic Allan variance and noise coefficients of every window.
 
-    The log may be larger than the memory. A run that was stopped goes on with --resume.
+    Reads the logs, puts them on a uniform time axis, computes the dynamic Allan variance, fits the
+    noise coefficients and writes the product, one NetCDF file. The logs may be larger than memory.
+    An interrupted run is continued with --resume.
 
     Example: gyrostab run run7/*.csv -o product.nc --window 10min --step 1min
 
@@ -53,14 +55,14 @@ def davar(
     running: Running = Running(),
     common: Common = Common(),
 ) -> None:
-    """Compute the dynamic Allan variance of a log.
+    """Compute the dynamic Allan variance of logs, without fitting noise coefficients.
 
     Example: gyrostab davar run7.nc -o davar.nc --window 10min --step 1min
 
     Parameters
     ----------
     logs
-        Log that gyrostab ingest wrote, or logs in any format.
+        Log written by gyrostab ingest, or logs in any supported format.
     output
         NetCDF file to write.
     """
@@ -76,14 +78,14 @@ def fit(
     fitting: Fitting = Fitting(),
     common: Common = Common(),
 ) -> None:
-    """Fit the noise coefficients Q, N, B, K and R in every window of a dynamic Allan variance.
+    """Fit the noise coefficients Q, N, B, K and R to every window of a dynamic Allan variance.
 
     Example: gyrostab fit davar.nc -o product.nc
 
     Parameters
     ----------
     surface
-        File that gyrostab davar wrote.
+        File written by gyrostab davar.
     output
         NetCDF file to write.
     """
@@ -103,7 +105,7 @@ def fit(
 
 
 def _print_product(target: Path) -> None:
-    """Print what a product says, the command to run next, and the file."""
+    """Print the summary of a product, the command to run next, and the file name."""
     from shlex import quote
 
     from gyrostab.allan.summary import format_product
@@ -126,7 +128,7 @@ def _run_job(
     common: Common,
     **more: Any,
 ) -> Path:
-    """Run the main job with what all its commands let the user choose."""
+    """Run the analysis with the options of a command."""
     from gyrostab.jobs.run import run as run_job
 
     with show_stages(common) as stage:
