@@ -13,7 +13,7 @@ from pathlib import Path
 
 import gyrostab
 from gyrostab.errors import GyrostabError
-from gyrostab.ingest.scan import print_scan
+from gyrostab.ingest.scan_output import print_scan
 from gyrostab.jobs.run import load_log, run
 
 

@@ -9,9 +9,30 @@ options)``, found by the entry point group ``gyrostab.readers``; another package
 declaring such an entry point.
 """
 
-from gyrostab.ingest.channel import read_channel
-from gyrostab.ingest.files import read_log, readers, scan_file
-from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gyrostab.ingest.channel import read_channel as read_channel
+    from gyrostab.ingest.files import read_log as read_log
+    from gyrostab.ingest.files import readers as readers
+    from gyrostab.ingest.files import scan_file as scan_file
+    from gyrostab.ingest.options import ColumnSummary as ColumnSummary
+    from gyrostab.ingest.options import FileSummary as FileSummary
+    from gyrostab.ingest.options import ReadOptions as ReadOptions
+
+#: Public name -> module, imported on first use: the command line needs `limits` only.
+_MODULES = {
+    "ColumnSummary": "options",
+    "FileSummary": "options",
+    "ReadOptions": "options",
+    "read_channel": "channel",
+    "read_log": "files",
+    "readers": "files",
+    "scan_file": "files",
+}
 
 __all__ = [
     "ColumnSummary",
@@ -22,3 +43,9 @@ __all__ = [
     "readers",
     "scan_file",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -18,50 +18,58 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from gyrostab.ingest.columns.headers import AXIS_PATTERN, TIME_PATTERN, is_time_unit, is_unit_of
+from gyrostab.ingest.guess_unit import given_unit, guess_unit, name_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
-from gyrostab.units import HOUR, parse_unit
 
-__all__ = ["Guess", "guess_columns", "rate_plausibility", "temperature_unit"]
+__all__ = ["Guess", "guess_columns"]
 
-#: Rotation of the Earth [deg/h].
-EARTH_RATE_DPH = 15.041
-#: A fine gyro at rest measures it this well: its bias is a few tenths of a deg/h.
-EARTH_TOLERANCE = 0.02
-#: One with a bias of some deg/h measures it this well.
-EARTH_NEIGHBOURHOOD = 0.3
-#: Largest full scale of gyros [deg/h].
-MAX_RATE_DPH = 4000.0 * HOUR
-#: Angle random walk of the usual sensor, and how far others are from it [deg/sqrt(h), decades].
-TYPICAL_ARW, ARW_DECADES = 0.3, 1.0
+
 #: Rates of gyro logs are some decades about this [Hz].
 TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
+
+
 #: What a group of columns must score to be called the gyro: one sign in its name, or its unit.
 MIN_SCORE = 1.5
+
 
 _STRONG = re.compile(
     r"gyr|omega|ang(ular)?[ _.]?(rate|vel)|rot(ation)?[ _.]?(rate|vel)|turn[ _.]?rate|uncompgyro"
 )
+
+
 _LETTER = re.compile(r"(^|[^a-z])[wg]_?\*|w_rs_s_\*|(^|[^a-z])rate|^\*?j\*$")
+
+
 _OTHER = re.compile(
     r"acc|(^|[^a-z])[amft]_?\*|mag|quat|pos|euler|orient|gps|temp|press|cov|force|free|linear|lat|lon|field|torque|curr|volt|batt|state"
 )
+
+
 _DERIVED = re.compile(
     r"est|pred|filt|ref|bias|cal|std|var|noise|err|setpoint|sp_|integral|delta|dt|ramp|theta|incr"
 )
+
+
 _TIME_WORD = re.compile(r"time|stamp|tow|clock|epoch|elapsed|seconds|(^|[^a-z])t($|[^a-z])|sec$")
+
+
 _COUNTER_WORD = re.compile(
     r"count|packet|seq|index|sample|(^|[^a-z])(n|no|nr|id|row|frame)($|[^a-z])"
 )
+
+
 _EPOCHS = {
     "s": 1e9,
     "ms": 1e12,
     "us": 1e15,
     "ns": 1e18,
 }  # Unix time between 2001 and 2033 is 1 to 2 of these
+
+
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
 _AXES = {**{a: a for a in "xyz"}, **dict(zip("012", "xyz", strict=True)), "pqr": "xyz"}
 
 
@@ -129,8 +137,8 @@ def guess_columns(
     )
     axes = _guess_axes(look, time, reasons)
     unit = None
-    if axes and not all(_given_unit(column) for column in axes.values()):
-        unit = _guess_unit(look, axes, sampling, reasons, warnings, angles=angles)
+    if axes and not all(given_unit(column) for column in axes.values()):
+        unit = guess_unit(look, axes, sampling, reasons, warnings, angles=angles)
     if not axes:
         warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
@@ -144,10 +152,6 @@ def guess_columns(
 
 def _unit_seconds(unit: str | None) -> float:
     return _SECONDS.get(unit or "s", 1.0)
-
-
-# --- the time
-# ----------------------------------------------------------------------------------------------------
 
 
 def _guess_time(
@@ -205,10 +209,6 @@ def _rate_distance(column: ColumnInspection, unit: str) -> float:
     )
 
 
-# --- the axes
-# ----------------------------------------------------------------------------------------------------
-
-
 def _guess_axes(
     look: FileInspection, time: ColumnInspection | None, reasons: list[str]
 ) -> dict[str, ColumnInspection]:
@@ -236,7 +236,7 @@ def _guess_axes(
         return {}
     names = ", ".join(column.key for column in best[1].values())
     named = _STRONG.search(names.lower()) or any(
-        _given_unit(column) or _name_unit(column, "rate") for column in best[1].values()
+        given_unit(column) or name_unit(column, "rate") for column in best[1].values()
     )
     reasons.append(f"{names}: the gyro, by {'name' if named else 'name and numbers'}")
     return best[1]
@@ -252,8 +252,8 @@ def _may_be_gyro(column: ColumnInspection) -> bool:
     ):
         return False
     kinds = ("acceleration", "temperature", "magnetic", "pressure", "voltage")
-    return _name_unit(column, "rate") is not None or not any(
-        _name_unit(column, kind) for kind in kinds
+    return name_unit(column, "rate") is not None or not any(
+        name_unit(column, kind) for kind in kinds
     )
 
 
@@ -301,13 +301,13 @@ def _group_columns(
 def _gyro_score(template: str, group: Sequence[ColumnInspection], look: FileInspection) -> float:
     """How much a group of columns looks like a gyro."""
     low = template.lower()
-    if any(_given_unit(column) for column in group):
+    if any(given_unit(column) for column in group):
         score = 4.0
     else:
-        score = 2.5 * any(_name_unit(column, "rate") for column in group)
+        score = 2.5 * any(name_unit(column, "rate") for column in group)
         score += (
             1.0
-            * any(_name_unit(column, "angle") is not None for column in group)
+            * any(name_unit(column, "angle") is not None for column in group)
             * bool(_STRONG.search(low))
         )
     score += (
@@ -343,145 +343,7 @@ def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:
     )
 
 
-# --- the unit
-# ----------------------------------------------------------------------------------------------------
-
-
-def _given_unit(column: ColumnInspection) -> bool:
-    return column.unit is not None and is_unit_of(column.unit, ("rate",))
-
-
-def _name_unit(column: ColumnInspection, quantity: str) -> str | None:
-    """The unit that the end of a name says, ``deg/h`` of ``gx_deg_per_h``."""
-    tokens = [
-        token for token in re.split(r"[\s_./\-]+", re.sub(r"\[\d+\]$", "", column.key)) if token
-    ]
-    for count in range(min(4, len(tokens) - 1), 0, -1):
-        last = tokens[-count:]
-        for text in (" ".join(last), "/".join(last)):
-            if len(text) > 1 or text in ("C", "K", "F", "g", "V", "T", "G"):
-                text = (
-                    text.replace("degs", "deg/s")
-                    if text == "degs"
-                    else "rad/s"
-                    if text == "rads"
-                    else text
-                )
-                if is_unit_of(text, (quantity,)) and text not in ("1", "-"):
-                    return parse_unit(text, quantity).text.replace(" per ", "/")
-    return None
-
-
 def _is_temperature(column: ColumnInspection) -> bool:
     return bool(re.search(r"temp", column.key.lower())) and column.std > 0 and (
-        _name_unit(column, "temperature") is not None or (column.unit is not None and is_unit_of(column.unit, ("temperature",)))
+        name_unit(column, "temperature") is not None or (column.unit is not None and is_unit_of(column.unit, ("temperature",)))
     )  # fmt: skip
-
-
-def temperature_unit(column: ColumnInspection) -> str:
-    """The unit of a column of temperatures, of its header or its name."""
-    given = column.unit is not None and is_unit_of(column.unit, ("temperature",))
-    return str(column.unit if given else _name_unit(column, "temperature") or "degC")
-
-
-def _guess_unit(
-    look: FileInspection,
-    axes: dict[str, ColumnInspection],
-    rate: float,
-    reasons: list[str],
-    warnings: list[str],
-    *,
-    angles: bool,
-) -> str:
-    group = list(axes.values())
-    for column in group:
-        named = _name_unit(column, "rate")
-        if named is None and not angles and (angle := _name_unit(column, "angle")):
-            named = f"{angle}/s"
-        if named is not None and is_unit_of(named, ("rate",)):
-            reasons.append(f"unit {named}, by name")
-            return named
-    if angles:
-        warnings.append(
-            "nothing says the unit of the angles; deg is an assumption, put the true one in its place"
-        )
-        return "deg"
-    counts = [
-        *(c.unit for c in group if c.unit),
-        *(c.key for c in group if re.search(r"count|lsb|raw", c.key.lower())),
-    ]
-    large = (
-        look.summary.format == "miniseed"
-        and max(max(abs(c.low), abs(c.high)) for c in group) > 10.0
-    )
-    if counts or large or all(c.whole for c in group):
-        return _scale_of_counts(group, reasons, warnings)
-    means = np.array([c.mean for c in group])
-    scatter = float(np.median([c.scatter for c in group]))
-    top = max(max(abs(c.low), abs(c.high)) for c in group)
-    scores = {
-        unit: rate_plausibility(means, scatter, top, parse_unit(unit).factor, rate)
-        for unit in ("rad/s", "deg/s", "deg/h")
-    }
-    unit = max(scores, key=lambda unit: scores[unit])
-    factor = parse_unit(unit).factor
-    walk = scatter * factor / (60.0 * math.sqrt(rate)) if rate > 0 else math.nan
-    reasons.append(
-        f"unit {unit}, by the noise: {walk:.2g} deg/sqrt(h); the mean is {np.linalg.norm(means) * factor:.4g} deg/h"
-    )
-    warnings.append(
-        f"the unit {unit} is a guess from the numbers, as the file says none; check it with the data sheet"
-    )
-    return unit
-
-
-def rate_plausibility(
-    means: np.ndarray, scatter: float, top: float, factor: float, rate: float
-) -> float:
-    """How well a unit of `factor` deg/h fits the numbers of a gyro, as a logarithm."""
-    if top * factor > MAX_RATE_DPH:
-        return -math.inf
-    walk = max(scatter, 1e-300) * factor / (60.0 * math.sqrt(rate)) if rate > 0 else TYPICAL_ARW
-    score = -((math.log10(walk / TYPICAL_ARW) / ARW_DECADES) ** 2) / 2
-    norm = float(np.linalg.norm(means)) * factor
-    if len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_TOLERANCE:
-        # the rotation of the Earth; by chance 0.04 of 4 ln 10 in the logarithm, which is e^-5
-        score += 4.0
-    elif len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_NEIGHBOURHOOD:
-        score += 2.0  # with a bias of some deg/h; by chance 0.6 of 4 ln 10, which is e^-3
-    elif len(means) == 3 and norm < 0.5 * EARTH_RATE_DPH:
-        score -= 1.0  # less than the Earth turns: only if the mean was taken off
-    return score
-
-
-def _scale_of_counts(
-    group: Sequence[ColumnInspection], reasons: list[str], warnings: list[str]
-) -> str:
-    """A unit for counts, so that a run is possible: nothing in the file says how much a count is."""
-    norm = math.hypot(*(c.mean for c in group))
-    if len(group) == 3 and norm > 0:
-        per_count = EARTH_RATE_DPH / norm  # deg/h = arcsec/s
-        decade = 10.0 ** math.floor(math.log10(per_count))
-        round_one = min(
-            (digit * decade for digit in (1.0, 2.0, 2.5, 5.0, 10.0)),
-            key=lambda scale: abs(math.log(scale / per_count)),
-        )
-        if abs(round_one / per_count - 1) < EARTH_TOLERANCE:
-            reasons.append(
-                f"{round_one:g} arcsec/s a count, as the mean of the three axes is then the rotation of the Earth"
-            )
-            warnings.append(
-                f"the scale of {round_one:g} arcsec/s a count is a guess; put that of the data sheet in its place"
-            )
-            return f"{round_one:g} arcsec/s"
-    earth = EARTH_RATE_DPH / parse_unit("rad/s").factor
-    exponent = math.floor(math.log10(earth / norm)) if norm > 0 else -9
-    unit = "nrad/s" if exponent == -9 else f"1e{exponent:d} rad/s"
-    text = f"1 {unit}" if unit == "nrad/s" else unit
-    reasons.append(
-        f"{text} a count is the largest decimal scale at which the mean is not more than the rotation of the Earth"
-    )
-    warnings.append(
-        f"the columns are counts, and nothing in the file says how much one is: put the scale of the data sheet for {text}"
-    )
-    return text

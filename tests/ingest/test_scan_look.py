@@ -12,7 +12,8 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from gyrostab.ingest.guess import EARTH_RATE_DPH, guess_columns, rate_plausibility
+from gyrostab.ingest.guess import guess_columns
+from gyrostab.ingest.guess_unit import EARTH_RATE_DPH, rate_plausibility
 from gyrostab.ingest.inspect import inspect_file
 from gyrostab.io.datasets import open_product
 from tests.support.command_line import call

@@ -25,13 +25,8 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     logs
         One or more logs, in any supported format.
     """
-    from gyrostab.ingest.scan import (
-        next_command,
-        print_inspection,
-        print_next,
-        print_scan,
-        scan_and_inspect,
-    )
+    from gyrostab.ingest.scan import scan_and_inspect
+    from gyrostab.ingest.scan_output import next_command, print_inspection, print_next, print_scan
 
     options = reading.given()
     examined = scan_and_inspect(logs, **options)

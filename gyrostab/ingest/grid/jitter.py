@@ -8,53 +8,65 @@ packets, or a slow clock gives many rows one stamp, only one row of each group i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.grid.course import find_breaks, find_phase, follow, trace
-from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP, piece_sums
+from gyrostab.kernels.grid.course import follow
+from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums
 
 __all__ = [
+    "GAIN",
     "MIN_SIGMA",
+    "TRACE_ROWS",
+    "Integers",
     "JitterModel",
     "count_samples",
     "fit_jitter",
     "fit_jitter_near",
     "observe_rows",
-    "place_rows",
 ]
 
+
 Integers = NDArray[np.int64]
+
+
 ObservedStamps = tuple[Integers, Integers]
+
 
 #: Standard deviation of the jitter that the kernel is given at least [samples].
 MIN_SIGMA = 0.1
+
+
 #: Share of a deviation that the phase takes over, while the period is sought, and once it is known.
 #: A sample that is not found missing
 #: costs 1 / (4 gain sigma^2) nats before the phase has taken it over: 140 at a scatter of 0.6,
 #: against 5 for the loss and 30 for a row
 #: that has no sample.
-_SEARCH_GAIN, _GAIN = 0.02, 0.005
+_SEARCH_GAIN, GAIN = 0.02, 0.005
+
+
 #: Beyond this scatter [samples] those are less than 80.
 _MAX_SIGMA = 0.8
+
+
 #: Share of rows without a sample, and cost of a row [nats], beyond which stamps have no course.
 #: Jitter alone costs 0.5 nats, and every
 #: second sample missing at random 2.5 more.
 _MAX_DROPPED_SHARE, _MAX_NATS = 0.01, 3.0
+
+
 #: Rows that a course is sought in, candidates for its period, and those of them that are refined.
 _SEARCH_ROWS, _MAX_CANDIDATES, _MAX_REFINED = 8_000, 200, 4
+
+
 #: A period wrong by half of this share lags by a fortieth of a sample behind the phase, which
 #: follows with a gain of 0.02.
 _PERIOD_STEP = 0.001
-_TRACE_ROWS = 1 << 13
-_AHEAD_ROWS = 1 << 12
-_MAX_ROWS, _MAX_AHEAD_ROWS = 1 << 20, 1 << 18
-#: Samples that a row may be late without being taken for a clock set back.
-_LATE_SAMPLES = 16.0
+
+
+TRACE_ROWS = 1 << 13
 
 
 @dataclass(frozen=True)
@@ -237,7 +249,7 @@ def _row_cost(seen: list[ObservedStamps], period: float, sigma_ns: float, sure: 
     """Cost of a row [nats] with a period [ns]."""
     sigma = max(sigma_ns / period, MIN_SIGMA)
     total = sum(
-        follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, _TRACE_ROWS)[3]
+        follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, TRACE_ROWS)[3]
         for count, stamps in seen
     )
     return float(total / sum(len(count) for count, _ in seen))
@@ -250,13 +262,13 @@ def _refine_model(
     if not seen:
         return None
     period, sigma = course.period, course.sigma
-    for gain in (_SEARCH_GAIN, _SEARCH_GAIN / 2, _GAIN, _GAIN):
+    for gain in (_SEARCH_GAIN, _SEARCH_GAIN / 2, GAIN, GAIN):
         cc = ct = nats = rows = dropped = single = steps = 0.0
         offs = []
         for count, stamps in seen:
             known = max(sigma, MIN_SIGMA)
             sample, piece, off, cost = follow(
-                count, stamps, period, known, gain, sure * period, _TRACE_ROWS
+                count, stamps, period, known, gain, sure * period, TRACE_ROWS
             )
             near = _is_near(off, sigma)
             sums = piece_sums(stamps[near], sample[near], piece[near], period)
@@ -298,191 +310,9 @@ def count_samples(
         stamps[at],
         course.period,
         max(course.sigma, MIN_SIGMA),
-        _GAIN,
+        GAIN,
         longest,
-        _TRACE_ROWS,
+        TRACE_ROWS,
     )
     near = _is_near(off, course.sigma)
     return stamps[at][near], sample[near], piece[near]
-
-
-class _Placer:
-    """Rows to samples, stretch by stretch."""
-
-    def __init__(self, course: JitterModel, period: float, hold: float, max_gap_ns: float):
-        self.course, self.period, self.hold, self.max_gap_ns = course, period, hold, max_gap_ns
-        self.sigma = max(course.sigma, MIN_SIGMA)
-        self.start: int | None = None
-        self.latest = 0
-        self.last = -1  # sample of the latest row
-        self.runs: list[Integers] = []
-        self.events: list[Integers] = []
-
-    def add(self, rows: Integers, count: Integers, stamps: Integers, n: int) -> None:
-        """Place the first `n` rows of a stretch; the others are what follows."""
-        at = observe_rows(stamps, self.course.observe, self.period)
-        if len(at) == 0:
-            return
-        if self.start is None:
-            self.latest = int(stamps[at[0]])
-        reach = _LATE_SAMPLES * max(self.period, self.course.group * self.period)
-        breaks, self.latest = find_breaks(
-            stamps[at], int(np.searchsorted(at, n)), self.latest, reach, self.max_gap_ns
-        )
-        cuts = [0, *at[breaks[:, 0]].tolist(), n]
-        for number, (begin, end) in enumerate(pairwise(cuts)):
-            beyond = len(rows) if end == n else end
-            if number > 0:
-                self._add_break(int(rows[begin]), int(breaks[number - 1, 1]), int(stamps[begin]))
-            if begin < end:
-                self._place_stretch(
-                    rows[begin:beyond],
-                    count[begin:beyond],
-                    stamps[begin:beyond],
-                    end - begin,
-                    begins=number > 0,
-                )
-
-    def _add_break(self, row: int, before: int, stamp: int) -> None:
-        elapsed = before - self.origin
-        again = stamp < before and (
-            stamp <= self.origin + 0.1 * elapsed or 2 * (before - stamp) > elapsed
-        )
-        self.events.append(
-            np.array(
-                [[RESTART if again else STEP, self.last + 1, row, before, stamp]], dtype=np.int64
-            )
-        )
-
-    def _begin_piece(self, count: Integers, stamps: Integers, at: Integers) -> None:
-        """Begin a piece: its first row is the next sample but one, or the first of the log."""
-        ahead = find_phase(count[at], stamps[at], self.period, self.sigma)
-        self.origin = int(stamps[at[0]]) + int(np.rint(ahead * self.period))
-        self.count0, self.level, self.phase, self.seen = int(count[at[0]]), 0, 0.0, 0
-        self.base = int(count[at[0]] - count[0])
-
-    def _set_first_sample(self, level: int) -> None:
-        """Let the piece begin with a row that has lost `level` samples."""
-        self.level = level
-        self.base -= level
-        if self.start is None:
-            self.start = self.origin - int(np.rint(self.base * self.period))
-        else:
-            self.base += self.last + 2
-
-    def _place_stretch(
-        self, rows: Integers, count: Integers, stamps: Integers, n: int, *, begins: bool
-    ) -> None:
-        at = observe_rows(stamps, self.course.observe, self.period)
-        begins = begins or self.start is None
-        if begins:
-            self._begin_piece(count, stamps, at)
-        levels, phases = np.empty(len(at), dtype=np.int64), np.empty(len(at))
-        if len(at):
-            trace(
-                count[at], stamps[at], self.count0, self.origin, self.period, self.sigma, _GAIN, self.hold,
-                self.max_gap_ns / self.period, self.level, self.phase, self.seen, levels, phases,
-            )  # fmt: skip
-        if begins:
-            self._set_first_sample(int(levels[0]))
-        nearest = np.searchsorted(
-            at, np.arange(n), side="left" if self.course.observe == "last" else "right"
-        )
-        nearest -= self.course.observe != "last"
-        known = np.append(levels, self.level if len(at) == 0 else levels[-1])
-        level = np.where(nearest < 0, self.level, known[np.clip(nearest, 0, len(at))])
-        done = int(np.searchsorted(at, n))
-        if done:
-            self.level, self.phase, self.seen = (
-                int(levels[done - 1]),
-                float(phases[done - 1]),
-                self.seen + done,
-            )
-        self._add_rows(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
-
-    def _add_rows(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
-        """Give rows their samples; a row that comes to lie on or before the one before it has none."""
-        before = np.maximum.accumulate(np.concatenate([[self.last], sample[:-1]]))
-        kept = sample > before
-        if not kept.all():
-            lost = np.flatnonzero(~kept)
-            same = np.full(len(lost), DUPLICATE)
-            self.events.append(
-                np.stack(
-                    [same, np.maximum(sample[lost], 0), rows[lost], stamps[lost], stamps[lost]],
-                    axis=1,
-                )
-            )
-            rows, sample = rows[kept], sample[kept]
-        if len(rows):
-            self.last = int(sample[-1])
-            self.runs.append(append_runs(self.runs, sample, rows))
-
-
-def append_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integers:
-    """Make runs of rows and their samples; what continues the last run of `runs` is added to it."""
-    new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
-    first = np.concatenate([[0], new])
-    table = np.stack([sample[first], rows[first], np.diff(np.append(first, len(rows)))], axis=1)
-    before = runs[-1][-1] if runs and len(runs[-1]) else None
-    if (
-        before is not None
-        and before[0] + before[2] == table[0, 0]
-        and before[1] + before[2] == table[0, 1]
-    ):
-        before[2] += table[0, 2]
-        table = table[1:]
-    return table
-
-
-def place_rows(
-    blocks: Iterator[tuple[Integers, Integers]],
-    course: JitterModel,
-    period: float,
-    *,
-    hold: float,
-    max_gap_ns: float,
-    by_row: bool,
-) -> tuple[int | None, list[Integers], list[Integers]]:
-    """Place rows in order along the course of their stamps.
-
-    Parameters
-    ----------
-    blocks : iterator
-        Blocks of (row numbers, stamps [ns]).
-    course : Course
-        How the stamps follow the samples.
-    period : float
-        Sampling period of the grid [ns].
-    hold : float
-        A phase further from zero is turned into a sample left out, or a row dropped [samples].
-    max_gap_ns : float
-        A longer step ahead is a step of the clock [ns].
-    by_row : bool
-        Rows that are left out took their time all the same.
-
-    Returns
-    -------
-    start : int or None
-        Stamp of sample 0 [ns]; None where no stamp is readable.
-    runs, events : list of ndarray
-        As in `gyrostab.ingest.grid.place.Placement`.
-    """
-    ahead = int(min(_AHEAD_ROWS * np.ceil(course.group), _MAX_AHEAD_ROWS))
-    size = int(min(_TRACE_ROWS * np.ceil(course.group), _MAX_ROWS))
-    placer = _Placer(course, period, hold, max_gap_ns)
-    held = [np.empty(0, dtype=np.int64)] * 3
-    done = 0
-    for rows, stamps in blocks:
-        count = rows if by_row else np.arange(done, done + len(rows))
-        done += len(rows)
-        held = [np.concatenate(pair) for pair in zip(held, (rows, count, stamps), strict=True)]
-        at = 0
-        while len(held[0]) - at >= size + ahead:
-            part = slice(at, at + size + ahead)
-            placer.add(held[0][part], held[1][part], held[2][part], size)
-            at += size
-        held = [column[at:] for column in held]
-    if len(held[0]):
-        placer.add(held[0], held[1], held[2], len(held[0]))
-    return placer.start, placer.runs, placer.events

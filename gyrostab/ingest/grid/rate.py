@@ -8,7 +8,6 @@ stretch tells the rate, and the row's place is its count.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -17,39 +16,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
-from gyrostab.ingest.grid.jitter import JitterModel, count_samples, fit_jitter, fit_jitter_near
-from gyrostab.ingest.grid.steps import cut_stretches, finer_period, refine_period
-from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
-from gyrostab.store.threads import map_in_order
-
-__all__ = [
-    "RateEstimate",
-    "Stamps",
-    "deviating_stretches",
-    "estimate_near",
-    "estimate_rate",
-    "is_far_worse",
-    "starting_period",
-]
-
-SECOND = 1e9
-#: Gives the blocks of row numbers and stamps, from the first on, as often as asked.
-Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
-_GAIN = 0.1
-_MAX_TRUSTED_SAMPLES = 500.0  # samples, of a long log
-_SHARED_SHARE = (
-    0.05  # share of rows with the stamp of the row before from which on stamps may be shared
+from gyrostab.ingest.grid.jitter import JitterModel, fit_jitter, fit_jitter_near
+from gyrostab.ingest.grid.period_fit import fit_pieces, longest_step, pool_pieces
+from gyrostab.ingest.grid.starting_period import (
+    SHARED_SHARE,
+    period_of_lines,
+    rms_misfit,
+    starting_period,
+    step_scatter,
 )
+from gyrostab.ingest.grid.steps import finer_period
+from gyrostab.ingest.grid.stretches import SECOND, Stamps, recut_blocks, sample_stretches
+from gyrostab.kernels.grid.stamps import NO_STAMP
+
+__all__ = ["RateEstimate", "deviating_stretches", "estimate_near", "estimate_rate", "is_far_worse"]
+
+
+_MAX_TRUSTED_SAMPLES = 500.0  # samples, of a long log
+
+
 # share of steps backwards that no jitter makes: 0.12 at a scatter of 0.6 samples, 0.5 in random
 # order
 _MAX_BACKWARD_SHARE = 0.35
+
+
 _MIN_SINGLE_SHARE = 0.1  # share of the steps that must be one sample of a rate that is given
+
+
 #: Scatter of the steps about whole samples up to which single stamps tell the sample: jitter of
 #: 0.08 samples, so that half a sample is
 #: 6 standard deviations.
 _SHARP_SCATTER = 0.12
-_MAX_PIECES = 200_000
+
+
 _FAR_WORSE_NATS = 0.2  # a row
+
+
 _BLOCK = 1 << 20
 
 
@@ -88,291 +90,6 @@ class RateEstimate:
     even: float | None = None
     finer: float | None = None
     course: JitterModel | None = None
-
-
-def _recut_blocks(
-    stamps: Stamps, size: int
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Give the same rows and stamps in blocks of `size`, so that no result depends on how they came."""
-    held: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
-    waiting = 0
-    for block in stamps():
-        held.append(block)
-        waiting += len(block[0])
-        if waiting < size:
-            continue
-        rows, values = _concatenate_blocks(held)
-        whole = waiting // size * size
-        for begin in range(0, whole, size):
-            yield rows[begin : begin + size], values[begin : begin + size]
-        held, waiting = [(rows[whole:], values[whole:])], waiting - whole
-    if waiting:
-        yield _concatenate_blocks(held)
-
-
-def _concatenate_blocks(
-    held: list[tuple[NDArray[np.int64], NDArray[np.int64]]],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Blocks of rows and stamps one after the other; a single one, or what alone is not empty, is not copied."""
-    held = [block for block in held if len(block[0])]
-    if len(held) == 1:
-        return held[0]
-    rows, values = (np.concatenate(column) for column in zip(*held, strict=True))
-    return rows, values
-
-
-def _readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The stamps that could be read; all of them, as nearly always, are not copied."""
-    known = block != NO_STAMP
-    return block if known.all() else block[known]
-
-
-def _sample_stretches(
-    stamps: Stamps, *, size: int = 8192, most: int = 64
-) -> list[NDArray[np.int64]]:
-    """Stretches of stamps from all over the log, a few hundred thousand in all."""
-    found: list[NDArray[np.int64]] = []
-    for _, block in stamps():
-        block = _readable_stamps(block)
-        found += [block[i : i + size] for i in range(0, len(block), size)]
-        if len(found) > 2 * most:
-            found = found[::2]
-    return [part for part in found if len(part) > 1]
-
-
-def _residual_range(
-    parts: list[NDArray[np.int64]], length: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slope [ns a row] and range of the residuals [ns] of straight lines through stretches of `length` stamps."""
-    values = cut_stretches(parts, length)
-    x = np.arange(length) - (length - 1) / 2
-    slope = values @ x / (x @ x)
-    rest = values - slope[:, None] * x
-    return slope, np.ptp(rest, axis=1) if len(rest) else np.empty(0)
-
-
-def _has_shared_stamps(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
-    """Whether many rows share a stamp because the clock ticks slowly, and not because rows are doubled."""
-    if np.mean(steps == 0) < _SHARED_SHARE:
-        return False
-    tick = np.median(steps[steps > 0])
-    length = min(512, *(len(part) for part in parts)) if parts else 0
-    slope, spread = _residual_range(parts, length) if length >= 8 else (np.empty(0), np.empty(0))
-    good = slope > 0
-    return bool(good.any() and np.median(spread[good] / np.maximum(tick, slope[good])) < 1.3)
-
-
-def rms_misfit(steps: NDArray[np.float64], period: float) -> float:
-    """How far steps are from whole numbers of samples, root mean square [samples]; 0.29 says that they are anywhere."""
-    near = steps[np.abs(steps) < 5.5 * period] / period
-    return float(np.sqrt(np.mean((near - np.rint(near)) ** 2))) if len(near) else 0.5
-
-
-def step_scatter(steps: NDArray[np.float64], period: float) -> float:
-    """Robust standard deviation of the steps about whole numbers of samples [samples]; 0.37 says that they are anywhere."""
-    near = steps[np.abs(steps) < 5.5 * period] / period
-    return 1.4826 * float(np.median(np.abs(near - np.rint(near)))) if len(near) else 0.5
-
-
-def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
-    """Period of the stretches in which the row count alone predicts the stamps to less than a sample."""
-    length = min(16, max(len(part) for part in parts))
-    slope, spread = _residual_range(parts, length)
-    good = (slope > 0) & (spread < 0.95 * slope)
-    if length < 12 or good.sum() < max(1, 0.03 * len(slope)):
-        return None
-    period = float(np.median(slope[good]))
-    for gain in (0.5, 0.5, 0.2, 0.1, _GAIN):
-        time = samples = 0
-        for part in parts:
-            count, piece = track(part, period, gain, 20 * period)
-            same = np.diff(piece) == 0
-            time, samples = (
-                time + int(np.diff(part)[same].sum()),
-                samples + int(np.diff(count)[same].sum()),
-            )
-        if samples <= 0:
-            return None
-        period = time / samples
-    return period
-
-
-def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
-    """Period [ns] from stretches of stamps, to a part in a thousand or better; whether rows are counted; whether stamps are shared."""
-    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
-    rising = steps[steps > 0]
-    if _has_shared_stamps(parts, steps):
-        return _time_per_row(parts, ticks=True), True, True
-    period = period_of_lines(parts)
-    if period is None:
-        period = refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
-        if (
-            rms_misfit(steps, period) > 0.2
-        ):  # with most rows missing, the median step is not one sample
-            shorter = refine_period(steps, float(np.quantile(rising, 0.1)))
-            period = shorter if rms_misfit(steps, shorter) < 0.15 else period
-    return (
-        (_time_per_row(parts), True, False)
-        if _is_bursty(parts, steps, period)
-        else (period, False, False)
-    )
-
-
-def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
-    """Whether the long steps are pauses between bursts: they do not fit the lattice of the short ones, or make up for them."""
-    long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
-    near = steps[np.abs(steps) < 50 * period]
-    if len(long) <= max(10, 0.02 * len(steps)) or near.sum() <= 1.2 * period * len(near):
-        return False
-    if abs(np.exp(2j * np.pi * long / period).mean()) < 0.2:
-        return True
-    length = min(256, len(steps) // 16)
-    if np.median(long) < 3 * period or length < 16:
-        return False
-    spans = np.concatenate(
-        [(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]
-    ).astype(np.float64)
-    scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
-    return bool(scatter**2 < 0.2 * length * near.var())  # samples lost at random would add up
-
-
-def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
-    """Time a row takes [ns], from long stretches; with `ticks`, from the first to the last change of a shared stamp."""
-    rates = []
-    for part in parts:
-        steps = np.diff(part).astype(np.float64)
-        if ticks and (steps > 0).sum() > 1:
-            times, counts = _tick_steps(steps)
-        else:
-            usual = np.median(steps[steps > 0]) if (steps > 0).any() else SECOND
-            good = (steps >= 0) & (steps <= max(SECOND, 1000 * usual))
-            times, counts = float(steps[good].sum()), int(good.sum())
-        if times > 0 and counts > 0:
-            rates.append((times, counts))
-    found = np.array(rates, dtype=np.float64)
-    whole = found[:, 1] >= 0.5 * found[:, 1].max()
-    return float(np.median(found[whole, 0] / found[whole, 1]))
-
-
-def _tick_steps(steps: NDArray[np.float64]) -> tuple[float, int]:
-    """Time [ns] and rows between changes of a shared stamp; changes that take three times as long a row as usual are gaps.
-
-    A change and the rows that share the stamp before it are kept or left out together: some stamps
-    may be shared by one row and others by five.
-    """
-    rising = np.flatnonzero(steps > 0)
-    times, counts = steps[rising[1:]], np.diff(rising)
-    paces = times / counts
-    good = paces <= 3 * np.median(np.repeat(paces, counts))
-    return float(times[good].sum()), int(counts[good].sum())
-
-
-def _longest_step(parts: list[NDArray[np.int64]], period: float) -> float:
-    """Step [ns] after which counting starts anew when rows are placed by count."""
-    steps = np.concatenate([np.diff(part) for part in parts])
-    return float(max(SECOND, 50 * period, 10 * np.quantile(np.abs(steps), 0.99)))
-
-
-def _fit_pieces(
-    stamps: Stamps,
-    period: float,
-    counted: bool,
-    coarse: bool,
-    longest: float,
-    course: JitterModel | None = None,
-) -> NDArray[np.float64]:
-    """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
-    table = np.empty((0, 6))
-    zero: int | None = None
-    work = partial(
-        _piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, course=course
-    )
-    for first, sums in map_in_order(work, stamps()):
-        if first is None:
-            continue
-        zero = first[0] if zero is None else zero
-        sums[:, 2] += first[1] - zero
-        table = np.concatenate([table, sums])
-        if len(table) > _MAX_PIECES:  # a log in shreds: the largest pieces tell the rate
-            table = table[np.argsort(-table[:, 3], kind="stable")[: _MAX_PIECES // 2]]
-            table = table[np.argsort(table[:, 2], kind="stable")]
-    return table
-
-
-def _piece_sums(
-    found: tuple[NDArray[np.int64], NDArray[np.int64]],
-    *,
-    period: float,
-    counted: bool,
-    coarse: bool,
-    longest: float,
-    course: JitterModel | None,
-) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
-    """Of one block: its first stamp, that from which the sums count, and the sums of its pieces; None where no stamp is readable."""
-    rows, block = found
-    block = _readable_stamps(block)
-    if len(block) == 0:
-        return None, np.empty((0, 6))
-    first = int(block[0])
-    if course is not None:
-        block, count, piece = count_samples(np.arange(len(found[1])), found[1], course, longest)
-        return (first, int(block[0])) if len(block) else None, piece_sums(
-            block, count, piece, period
-        )
-    if counted:
-        known = np.flatnonzero(rows != NO_STAMP)
-        piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
-        count = known  # a row counts, with or without a stamp
-    else:
-        count, piece = track(block, period, _GAIN, longest)
-    if (
-        coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1
-    ):  # only there the true time is known
-        block, count, piece = block[tick], count[tick], piece[tick]
-    return (first, int(block[0])), piece_sums(block, count, piece, period)
-
-
-def _pool_pieces(
-    pieces: NDArray[np.float64], period: float, counted: bool
-) -> tuple[float, float, float]:
-    """Period [ns], its standard error [ns], and the samples of the longest joined stretch."""
-    n, cc, ct, rest = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
-    if cc.sum() <= 0:
-        return period, period, 1.0
-    noise = np.sqrt(rest.sum() / max(1.0, n.sum() - 2 * len(n)))
-    slope = ct / np.where(cc > 0, cc, 1.0)
-    sane = (cc > 0) & (
-        np.abs(slope / period - 1) < 0.02 + 5 * noise / period / np.sqrt(np.maximum(cc, 1e-9))
-    )
-    if sane.any():
-        period = float(ct[sane].sum() / cc[sane].sum())
-    error = 3.0 * noise / np.sqrt(cc[sane].sum() if sane.any() else cc.sum())
-    if counted or not sane.any():  # no piece has the period that was begun with: nothing to join
-        return period, error, float(n.max())
-    return _join_pieces(pieces[sane], period, error, noise)
-
-
-def _join_pieces(
-    pieces: NDArray[np.float64], period: float, error: float, noise: float
-) -> tuple[float, float, float]:
-    """Join pieces whose distance is surely a known number of samples, and fit again."""
-    for _ in range(3):
-        total_cc = total_ct = longest = 0.0
-        n, mc, mt, cc, ct = pieces[0, :5]
-        for n2, mc2, mt2, cc2, ct2 in pieces[1:, :5]:
-            apart = (mt2 - mt) / period
-            if apart > 0 and (apart * error + 3 * noise / np.sqrt(min(n, n2))) / period < 0.35:
-                shift = np.rint(apart - (mc2 - mc)) + mc2 - mc  # distance of the mean counts
-                weight, share = n * n2 / (n + n2), n2 / (n + n2)
-                cc, ct = cc + cc2 + weight * shift**2, ct + ct2 + weight * shift * (mt2 - mt)
-                mc, mt, n = mc + shift * share, mt + (mt2 - mt) * share, n + n2
-            else:
-                total_cc, total_ct, longest = total_cc + cc, total_ct + ct, max(longest, n)
-                n, mc, mt, cc, ct = n2, mc2, mt2, cc2, ct2
-        total_cc, total_ct, longest = total_cc + cc, total_ct + ct, max(longest, n)
-        if total_cc > 0:
-            period, error = float(total_ct / total_cc), 3.0 * noise / np.sqrt(total_cc)
-    return period, error, float(longest)
 
 
 def _round_rate(rate: float, error: float, samples: float, counted: bool) -> float:
@@ -414,8 +131,8 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     >>> estimate_rate(lambda: iter([(np.arange(1000), stamps)]), where="tool.csv").rate
     300.0
     """
-    stamps = partial(_recut_blocks, stamps, _BLOCK)
-    parts = _sample_stretches(stamps)
+    stamps = partial(recut_blocks, stamps, _BLOCK)
+    parts = sample_stretches(stamps)
     if not parts:
         raise TimeError(
             f"{where}: there is only one sample with a readable stamp, so no sampling rate can be found; give it with --rate HZ"
@@ -442,14 +159,14 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     if (
         counted
         or step_scatter(steps, period) > _SHARP_SCATTER
-        or np.mean(steps == 0) >= _SHARED_SHARE
+        or np.mean(steps == 0) >= SHARED_SHARE
     ):
         course = _fit_jitter(parts, period, coarse, sure)
         if course is not None:
             return _estimate_with_jitter(stamps, course, coarse, sure)
-    longest = _longest_step(parts, period) if counted else sure * period
+    longest = longest_step(parts, period) if counted else sure * period
     estimate = _estimate_pooled(
-        _fit_pieces(stamps, period, counted, coarse, longest), period, counted, coarse
+        fit_pieces(stamps, period, counted, coarse, longest), period, counted, coarse
     )
     return estimate if finer is None else replace(estimate, finer=float(f"{SECOND / finer:.4g}"))
 
@@ -467,7 +184,7 @@ def _fit_jitter(
     if not coarse:
         once = [part[np.append(np.diff(part) != 0, True)] for part in parts]
         rows, apart = sum(map(len, parts)), sum(map(len, once))
-        readings = [parts, once] if (1 - _SHARED_SHARE) * rows < apart < rows else [parts]
+        readings = [parts, once] if (1 - SHARED_SHARE) * rows < apart < rows else [parts]
         found = [fit_jitter(reading, [period], "all", sure=sure) for reading in readings]
         best = min(filter(None, found), key=attrgetter("code_length"), default=None)
         if best is not None:
@@ -480,7 +197,7 @@ def _estimate_with_jitter(
 ) -> RateEstimate:
     """The rate from the whole course of noisy stamps."""
     longest = sure * course.period * max(1.0, course.group)
-    pieces = _fit_pieces(stamps, course.period, False, False, longest, course)
+    pieces = fit_pieces(stamps, course.period, False, False, longest, course)
     return replace(
         _estimate_pooled(pieces, course.period, False, False), coarse=coarse, course=course
     )
@@ -502,7 +219,7 @@ def _trusted_samples(steps: int) -> float:
 def _estimate_pooled(
     pieces: NDArray[np.float64], period: float, counted: bool, coarse: bool
 ) -> RateEstimate:
-    period, error, samples = _pool_pieces(pieces, period, counted and not coarse)
+    period, error, samples = pool_pieces(pieces, period, counted and not coarse)
     rate = SECOND / period
     stderr = rate * error / period
     return RateEstimate(
@@ -528,8 +245,8 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
     >>> estimate_rate(stamps, where="tool.csv").rate, estimate_near(stamps, 60.0).rate
     (100.0, 60.0)
     """
-    stamps = partial(_recut_blocks, stamps, _BLOCK)
-    parts = _sample_stretches(stamps)
+    stamps = partial(recut_blocks, stamps, _BLOCK)
+    parts = sample_stretches(stamps)
     if not parts:
         return None
     sharp = _estimate_sharp(stamps, parts, rate)
@@ -557,7 +274,7 @@ def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> boo
     """
     theirs = found.course
     if theirs is None and not found.counted:
-        parts = _sample_stretches(partial(_recut_blocks, stamps, _BLOCK))
+        parts = sample_stretches(partial(recut_blocks, stamps, _BLOCK))
         theirs = fit_jitter_near(
             parts,
             SECOND / found.raw,
@@ -587,7 +304,7 @@ def _estimate_sharp(
     if abs(np.median(single) / period - 1) > 0.02:  # another rate, not this one with rows missing
         return None
     return _estimate_pooled(
-        _fit_pieces(stamps, period, False, False, _trusted_samples(len(steps)) * period),
+        fit_pieces(stamps, period, False, False, _trusted_samples(len(steps)) * period),
         period,
         False,
         False,
@@ -603,7 +320,7 @@ def deviating_stretches(
     """
     found: list[tuple[int, int, float]] = []
     inside = False
-    for rows, values in _recut_blocks(stamps, 64 * size):
+    for rows, values in recut_blocks(stamps, 64 * size):
         known = values != NO_STAMP
         rows, values = rows[known], values[known]
         begins, paces = _stretch_paces(values, size)

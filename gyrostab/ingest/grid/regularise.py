@@ -24,14 +24,13 @@ from gyrostab.ingest.grid.notes import describe_channels, describe_placement, de
 from gyrostab.ingest.grid.place import (
     Placement,
     check_grid,
-    place_by_count,
     place_by_stamp,
-    place_in_order,
     place_without_time,
 )
+from gyrostab.ingest.grid.place_by_count import place_by_count
+from gyrostab.ingest.grid.place_in_order import place_in_order
 from gyrostab.ingest.grid.rate import (
     RateEstimate,
-    Stamps,
     deviating_stretches,
     estimate_near,
     estimate_rate,
@@ -39,6 +38,7 @@ from gyrostab.ingest.grid.rate import (
 )
 from gyrostab.ingest.grid.repeats import find_repeats, with_repeats
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows, stamp_blocks
+from gyrostab.ingest.grid.stretches import Stamps
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts

@@ -1,0 +1,351 @@
+"""Assign roles to the named columns of a file: time, gyro axes, channels."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
+from gyrostab.ingest.columns.headers import (
+    AXIS_PATTERN,
+    GYRO_PATTERNS,
+    KNOWN_CHANNEL_PATTERN,
+    TIME_PATTERN,
+    Header,
+    distinct_columns,
+    example_unit,
+    is_time_unit,
+    is_unit,
+    is_unit_of,
+    quantity_of,
+    split_header,
+    unit_quantity,
+)
+from gyrostab.ingest.columns.plan_draft import Column, PlanDraft, by_lower_name, list_names
+from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
+from gyrostab.ingest.limits import limit_value
+from gyrostab.units import HOUR, INNER, known_units, parse_unit
+
+__all__ = ["find_time", "plan_channels", "plan_gyro"]
+
+
+def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
+    """The one time column, with its unit; others that look like it are left out with a note."""
+    found = [c for c in named if c.low == "time" and c.mapped] or [
+        c for c in named if c.low == "time" and c.preset
+    ]
+    if not found:
+        found = [
+            c
+            for c in named
+            if not (c.mapped or c.preset) and TIME_PATTERN.match(c.low) and _may_be_time(c)
+        ]
+        sure = [c for c in found if c.low != "t" or c.unit or c.stored or c.stamped]
+        found = sure or found
+    if not found:
+        found = [
+            c for c in named if c.stamped and draft.rising(c.source) and not (c.mapped or c.preset)
+        ]
+        if found:
+            draft.notes.append(
+                f"{found[0].header!r} is taken for the time column, as it holds dates"
+            )
+    if not found:
+        return None
+    found.sort(key=lambda c: not draft.rising(c.source))
+    column = found[0]
+    candidates = {id(c) for c in found}
+    others = found[1:] + [c for c in named if id(c) not in candidates and c.low == "time"]
+    if others:
+        names = " and ".join(repr(c.header) for c in [column, *others][:3])
+        draft.notes.append(
+            f'{names} look like the time; {column.header!r} is used (for another: --map "{others[0].key}=time")'
+        )
+        for other in others:
+            draft.leave_out(other)
+        dropped = {id(other) for other in others}
+        named[:] = [c for c in named if id(c) not in dropped]
+    unit = None if column.stamped else _time_unit(draft, column)
+    draft.columns.append(
+        Column(column.source, column.header, "time", "time", "time", "ns", time_unit=unit)
+    )
+    draft.add_summary(
+        column,
+        "time",
+        "time",
+        "time",
+        unit.text if unit else "ISO 8601" if column.stamped else None,
+    )
+    if (
+        unit is not None
+        and unit.epoch is None
+        and draft.options.epoch is None
+        and not draft.options.channels_only
+    ):
+        draft.notes.append(
+            "numeric time is counted from 1970-01-01T00:00:00 UTC; give --epoch for another zero"
+        )
+    if unit is not None and unit.epoch is not None and draft.options.epoch is not None:
+        draft.notes.append(
+            f"--epoch is not used: the time column {column.header!r} is in {unit.text!r}"
+        )
+    return column
+
+
+def _may_be_time(column: Header) -> bool:
+    written = column.unit or column.stored
+    # An epoch that cannot be read is reported, not passed over.
+    return written is None or names_epoch(written) or is_time_unit(written)
+
+
+def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
+    suffix = TIME_PATTERN.match(split_header(column.header)[0].lower())
+    named = next((text for text in suffix.groups() if text), None) if suffix else None
+    written = column.unit or (
+        named if named not in ("utc", "iso") and column.stored is None else None
+    )
+    keys = [column.name, column.key, column.header, "time"]
+    text = draft.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
+    if text is None:
+        message = f"{draft.path.name}: the time column {column.header!r} holds numbers and carries no unit"
+        draft.problems.append(
+            MissingUnitError(f"{message}; give it with --unit time=s (or ms, us, ns)")
+        )
+        return None
+    try:
+        return parse_time_unit(text, column.calendar if text == column.stored else None)
+    except GyrostabError as error:
+        how = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
+        draft.problems.append(
+            UnitError(
+                f"{draft.path.name}: column {column.header!r}: {error}; or give it with --unit {how}"
+            )
+        )
+        return None
+
+
+def plan_gyro(
+    draft: PlanDraft, gyro: list[Header], headers: Sequence[str]
+) -> tuple[str | None, str | None]:
+    """Units of the gyro axes, and whether they are rates, increments or cumulative angles."""
+    if draft.options.channels_only:
+        for column in gyro:
+            draft.leave_out(column)
+        draft.left_out.extend(c.header for c in gyro)
+        return None, None
+    if not gyro:
+        if not draft.problems:
+            draft.problems.append(_no_gyro(draft.path, headers))
+        return None, None
+    quantities: dict[str, str] = {}
+    for column in gyro:
+        quantity = _plan_axis(draft, column)
+        if quantity is not None:
+            quantities[column.header] = quantity
+    if len(set(quantities.values())) > 1:
+        listed = ", ".join(f"{header!r} ({quantity})" for header, quantity in quantities.items())
+        message = f"{draft.path.name}: the gyro axes are partly rates, partly angles: {listed}"
+        draft.problems.append(
+            UnitError(f"{message}; keep one kind and drop the others with --map NAME=-")
+        )
+    if not quantities:
+        return None, None
+    signal = next(iter(quantities.values()))
+    first = next(column for column in gyro if column.header in quantities)
+    return signal, _find_kind(draft, signal, first.header, first.key, first.low)
+
+
+def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
+    match = AXIS_PATTERN.match(column.low)
+    assert match is not None
+    stem, axis = match.groups()
+    example = "deg/s" if stem == "gyro" else "deg"
+    allowed = ("rate", "angle") if stem == "gyro" else ("angle",)
+    keys = [column.low, column.key, column.header, stem]
+    text = draft.find_unit(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
+    if text is None:
+        message = f"{draft.path.name}: the gyro column {column.header!r} carries no unit"
+        how = f"give it with --unit {stem}={example} (all axes) or --unit {column.low}={example}"
+        draft.problems.append(
+            MissingUnitError(
+                f"{message}; {how}, or write it in the header: {column.low} [{example}]"
+            )
+        )
+        draft.add_summary(column, column.low, "gyro", None, None)
+        return None
+    try:
+        unit = parse_unit(
+            text,
+            next((quantity for quantity in allowed if is_unit_of(text, (quantity,))), None),
+        )
+    except UnitError as error:
+        if "factor" in str(error):
+            draft.problems.append(
+                UnitError(f"{draft.path.name}: column {column.header!r}: {error}")
+            )
+            return None
+        hint = f'known are {known_units("rate")}; give it with --unit {stem}={example}, or with a factor --unit "{stem}=0.1 arcsec/s"'
+        draft.problems.append(
+            UnitError(
+                f"{draft.path.name}: column {column.header!r}: unit {text!r} is not known; {hint}"
+            )
+        )
+        draft.add_summary(column, column.low, "gyro", None, text)
+        return None
+    if unit.quantity not in allowed:
+        message = f"{draft.path.name}: column {column.header!r} has the unit {text!r}, which is a unit of {unit.quantity}, not of {allowed[0]}"
+        how = f"{allowed[0]} units are {known_units(allowed[0])}; give the right one with --unit {stem}={example}"
+        draft.problems.append(
+            UnitError(
+                f'{message}; {how}, or with a factor for counts: --unit "{stem}=0.1 {_arcsec_unit(stem)}"'
+            )
+        )
+        draft.add_summary(column, column.low, "gyro", unit.quantity, text)
+        return None
+    inner = INNER[unit.quantity]
+    draft.columns.append(
+        Column(
+            column.source,
+            column.header,
+            "gyro",
+            axis,
+            unit.quantity,
+            inner,
+            unit.factor,
+            unit.offset,
+        )
+    )
+    draft.add_summary(column, column.low, "gyro", unit.quantity, text)
+    return unit.quantity
+
+
+def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) -> str | None:
+    if signal == "rate":
+        if draft.options.kind == "angle":
+            message = f"{draft.path.name}: --kind angle, but column {header!r} is a rate"
+            fix = f'leave --kind out, or correct the unit with --map "{key}={name} [deg]"'
+            draft.problems.append(OptionError(f"{message}; {fix}"))
+        return "rate"
+    if draft.options.kind is None:
+        message = (
+            f"{draft.path.name}: column {header!r} is an angle, and nothing says of which kind"
+        )
+        how = "--kind angle if it is the cumulative angle, --kind rate if each row is the increment since the row before"
+        draft.problems.append(OptionError(f"{message}; give {how}"))
+    return "angle" if draft.options.kind == "angle" else "increment"
+
+
+def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
+    """Channels: what carries a unit is kept, the rest is left out with a note, or refused if it was asked for."""
+    for column in rest:
+        quantity = quantity_of(column.low)
+        known = bool(KNOWN_CHANNEL_PATTERN.match(column.low))
+        name = column.low if known or quantity else re.sub(r"[/\s]+", "_", column.name)
+        keys = [
+            name,
+            column.name,
+            column.key,
+            column.header,
+            *([column.low.split("_")[0]] if quantity else []),
+        ]
+        usable = partial(is_unit_of, quantities=(unit_quantity(quantity),)) if quantity else is_unit
+        text = draft.find_unit(column, keys, column.unit, usable)
+        if column.low == "ramp" and text is None:
+            text = "1"  # any scale will do
+        asked = (
+            column.mapped
+            or any(key.lower() in by_lower_name(draft.options.unit) for key in keys)
+            or (known and draft.options.channels_only)
+        )
+        if text is None and asked:
+            message = f"{draft.path.name}: column {column.header!r} carries no unit; give it with --unit {name}={example_unit(quantity)}"
+            draft.problems.append(
+                MissingUnitError(f'{message}, or drop the column with --map "{column.key}=-"')
+            )
+        if (
+            text is not None
+            and not (known or asked)
+            and draft.kept_channels >= limit_value("channels", draft.options.limits)
+        ):
+            draft.surplus.append(column.header)
+            draft.leave_out(column)
+            continue
+        if text is None:
+            draft.unitless.append((name, quantity, column.header))
+            draft.leave_out(column)
+            continue
+        _plan_channel(draft, column, name, quantity, text, known=known, asked=asked)
+
+
+def _plan_channel(
+    draft: PlanDraft,
+    column: Header,
+    name: str,
+    quantity: str | None,
+    text: str,
+    *,
+    known: bool,
+    asked: bool,
+) -> None:
+    factor, offset, units = 1.0, 0.0, text
+    if quantity is not None:
+        expected = unit_quantity(quantity)
+        if is_unit_of(text, (expected,)):
+            unit = parse_unit(text, expected)
+            scale = 1.0 / HOUR if quantity == "rotation_rate" else 1.0
+            factor, offset, units = unit.factor * scale, unit.offset, INNER[quantity]
+        elif quantity == "number":
+            units = INNER["number"]
+        elif known:
+            message = f"column {column.header!r}: {text!r} is no known unit of {expected}"
+            how = f"known are {known_units(expected)}; give it with --unit {name}={example_unit(quantity)}"
+            if not asked:
+                draft.notes.append(f"{message}, so it is left out; {how}")
+                draft.leave_out(column)
+                return
+            fix = f'{how}, or drop the column with --map "{column.key}=-"'
+            draft.problems.append(UnitError(f"{draft.path.name}: {message}; {fix}"))
+        else:
+            quantity = None
+    draft.kept_channels += 1
+    draft.columns.append(
+        Column(
+            column.source,
+            column.header,
+            "channel",
+            name,
+            quantity or "other",
+            units,
+            factor,
+            offset,
+        )
+    )
+    draft.add_summary(column, name, "channel", quantity or "other", text)
+
+
+def _arcsec_unit(stem: str) -> str:
+    return "arcsec/s" if stem == "gyro" else "arcsec"
+
+
+def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
+    columns = [column for column in distinct_columns(headers) if column.header]
+    free = [c for c in columns if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
+    looks = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
+    likely = next(looks, free[0] if free else None)
+    low = likely.header.lower() if likely else ""
+    unit = (
+        "deg/h" if re.search(r"deg_?(per_?|/)?h|dph", low) else "rad/s" if "rad" in low else "deg/s"
+    )
+    given = (
+        ""
+        if likely and likely.unit and is_unit_of(likely.unit, ("rate", "angle"))
+        else f" --unit gyro={unit}"
+    )
+    message = f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: {list_names([c.name for c in columns], 100)}"
+    how = f'Say which they are, for instance: --map "{likely.key if likely else "NAME"}=gyro_x"{given}'
+    return FormatError(
+        f"{message}. {how}; gyrostab scan {shlex.quote(path.name)} looks into each column"
+    )

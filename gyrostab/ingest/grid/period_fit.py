@@ -1,0 +1,127 @@
+"""Fit the sampling period to all unbroken pieces of a log."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.ingest.grid.jitter import JitterModel, count_samples
+from gyrostab.ingest.grid.starting_period import GAIN
+from gyrostab.ingest.grid.stretches import SECOND, Stamps, readable_stamps
+from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
+from gyrostab.store.threads import map_in_order
+
+__all__ = ["fit_pieces", "longest_step", "pool_pieces"]
+
+
+_MAX_PIECES = 200_000
+
+
+def longest_step(parts: list[NDArray[np.int64]], period: float) -> float:
+    """Step [ns] after which counting starts anew when rows are placed by count."""
+    steps = np.concatenate([np.diff(part) for part in parts])
+    return float(max(SECOND, 50 * period, 10 * np.quantile(np.abs(steps), 0.99)))
+
+
+def fit_pieces(
+    stamps: Stamps,
+    period: float,
+    counted: bool,
+    coarse: bool,
+    longest: float,
+    course: JitterModel | None = None,
+) -> NDArray[np.float64]:
+    """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
+    table = np.empty((0, 6))
+    zero: int | None = None
+    work = partial(
+        _piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, course=course
+    )
+    for first, sums in map_in_order(work, stamps()):
+        if first is None:
+            continue
+        zero = first[0] if zero is None else zero
+        sums[:, 2] += first[1] - zero
+        table = np.concatenate([table, sums])
+        if len(table) > _MAX_PIECES:  # a log in shreds: the largest pieces tell the rate
+            table = table[np.argsort(-table[:, 3], kind="stable")[: _MAX_PIECES // 2]]
+            table = table[np.argsort(table[:, 2], kind="stable")]
+    return table
+
+
+def _piece_sums(
+    found: tuple[NDArray[np.int64], NDArray[np.int64]],
+    *,
+    period: float,
+    counted: bool,
+    coarse: bool,
+    longest: float,
+    course: JitterModel | None,
+) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
+    """Of one block: its first stamp, that from which the sums count, and the sums of its pieces; None where no stamp is readable."""
+    rows, block = found
+    block = readable_stamps(block)
+    if len(block) == 0:
+        return None, np.empty((0, 6))
+    first = int(block[0])
+    if course is not None:
+        block, count, piece = count_samples(np.arange(len(found[1])), found[1], course, longest)
+        return (first, int(block[0])) if len(block) else None, piece_sums(
+            block, count, piece, period
+        )
+    if counted:
+        known = np.flatnonzero(rows != NO_STAMP)
+        piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
+        count = known  # a row counts, with or without a stamp
+    else:
+        count, piece = track(block, period, GAIN, longest)
+    if (
+        coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1
+    ):  # only there the true time is known
+        block, count, piece = block[tick], count[tick], piece[tick]
+    return (first, int(block[0])), piece_sums(block, count, piece, period)
+
+
+def pool_pieces(
+    pieces: NDArray[np.float64], period: float, counted: bool
+) -> tuple[float, float, float]:
+    """Period [ns], its standard error [ns], and the samples of the longest joined stretch."""
+    n, cc, ct, rest = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
+    if cc.sum() <= 0:
+        return period, period, 1.0
+    noise = np.sqrt(rest.sum() / max(1.0, n.sum() - 2 * len(n)))
+    slope = ct / np.where(cc > 0, cc, 1.0)
+    sane = (cc > 0) & (
+        np.abs(slope / period - 1) < 0.02 + 5 * noise / period / np.sqrt(np.maximum(cc, 1e-9))
+    )
+    if sane.any():
+        period = float(ct[sane].sum() / cc[sane].sum())
+    error = 3.0 * noise / np.sqrt(cc[sane].sum() if sane.any() else cc.sum())
+    if counted or not sane.any():  # no piece has the period that was begun with: nothing to join
+        return period, error, float(n.max())
+    return _join_pieces(pieces[sane], period, error, noise)
+
+
+def _join_pieces(
+    pieces: NDArray[np.float64], period: float, error: float, noise: float
+) -> tuple[float, float, float]:
+    """Join pieces whose distance is surely a known number of samples, and fit again."""
+    for _ in range(3):
+        total_cc = total_ct = longest = 0.0
+        n, mc, mt, cc, ct = pieces[0, :5]
+        for n2, mc2, mt2, cc2, ct2 in pieces[1:, :5]:
+            apart = (mt2 - mt) / period
+            if apart > 0 and (apart * error + 3 * noise / np.sqrt(min(n, n2))) / period < 0.35:
+                shift = np.rint(apart - (mc2 - mc)) + mc2 - mc  # distance of the mean counts
+                weight, share = n * n2 / (n + n2), n2 / (n + n2)
+                cc, ct = cc + cc2 + weight * shift**2, ct + ct2 + weight * shift * (mt2 - mt)
+                mc, mt, n = mc + shift * share, mt + (mt2 - mt) * share, n + n2
+            else:
+                total_cc, total_ct, longest = total_cc + cc, total_ct + ct, max(longest, n)
+                n, mc, mt, cc, ct = n2, mc2, mt2, cc2, ct2
+        total_cc, total_ct, longest = total_cc + cc, total_ct + ct, max(longest, n)
+        if total_cc > 0:
+            period, error = float(total_ct / total_cc), 3.0 * noise / np.sqrt(total_cc)
+    return period, error, float(longest)

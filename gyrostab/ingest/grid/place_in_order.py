@@ -1,0 +1,257 @@
+"""Place rows in order along the most likely sequence of samples of jittered stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from gyrostab.errors import TimeError
+from gyrostab.ingest.grid.jitter import (
+    GAIN,
+    MIN_SIGMA,
+    TRACE_ROWS,
+    Integers,
+    JitterModel,
+    observe_rows,
+)
+from gyrostab.ingest.grid.place import NO_STAMPS, Placement, make_placement
+from gyrostab.ingest.grid.stretches import SECOND, Stamps
+from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
+from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
+from gyrostab.time.grid import period_ns
+
+__all__ = ["place_in_order", "place_rows"]
+
+
+_AHEAD_ROWS = 1 << 12
+
+
+_MAX_ROWS, _MAX_AHEAD_ROWS = 1 << 20, 1 << 18
+
+
+#: Samples that a row may be late without being taken for a clock set back.
+_LATE_SAMPLES = 16.0
+
+
+class _Placer:
+    """Rows to samples, stretch by stretch."""
+
+    def __init__(self, course: JitterModel, period: float, hold: float, max_gap_ns: float):
+        self.course, self.period, self.hold, self.max_gap_ns = course, period, hold, max_gap_ns
+        self.sigma = max(course.sigma, MIN_SIGMA)
+        self.start: int | None = None
+        self.latest = 0
+        self.last = -1  # sample of the latest row
+        self.runs: list[Integers] = []
+        self.events: list[Integers] = []
+
+    def add(self, rows: Integers, count: Integers, stamps: Integers, n: int) -> None:
+        """Place the first `n` rows of a stretch; the others are what follows."""
+        at = observe_rows(stamps, self.course.observe, self.period)
+        if len(at) == 0:
+            return
+        if self.start is None:
+            self.latest = int(stamps[at[0]])
+        reach = _LATE_SAMPLES * max(self.period, self.course.group * self.period)
+        breaks, self.latest = find_breaks(
+            stamps[at], int(np.searchsorted(at, n)), self.latest, reach, self.max_gap_ns
+        )
+        cuts = [0, *at[breaks[:, 0]].tolist(), n]
+        for number, (begin, end) in enumerate(pairwise(cuts)):
+            beyond = len(rows) if end == n else end
+            if number > 0:
+                self._add_break(int(rows[begin]), int(breaks[number - 1, 1]), int(stamps[begin]))
+            if begin < end:
+                self._place_stretch(
+                    rows[begin:beyond],
+                    count[begin:beyond],
+                    stamps[begin:beyond],
+                    end - begin,
+                    begins=number > 0,
+                )
+
+    def _add_break(self, row: int, before: int, stamp: int) -> None:
+        elapsed = before - self.origin
+        again = stamp < before and (
+            stamp <= self.origin + 0.1 * elapsed or 2 * (before - stamp) > elapsed
+        )
+        self.events.append(
+            np.array(
+                [[RESTART if again else STEP, self.last + 1, row, before, stamp]], dtype=np.int64
+            )
+        )
+
+    def _begin_piece(self, count: Integers, stamps: Integers, at: Integers) -> None:
+        """Begin a piece: its first row is the next sample but one, or the first of the log."""
+        ahead = find_phase(count[at], stamps[at], self.period, self.sigma)
+        self.origin = int(stamps[at[0]]) + int(np.rint(ahead * self.period))
+        self.count0, self.level, self.phase, self.seen = int(count[at[0]]), 0, 0.0, 0
+        self.base = int(count[at[0]] - count[0])
+
+    def _set_first_sample(self, level: int) -> None:
+        """Let the piece begin with a row that has lost `level` samples."""
+        self.level = level
+        self.base -= level
+        if self.start is None:
+            self.start = self.origin - int(np.rint(self.base * self.period))
+        else:
+            self.base += self.last + 2
+
+    def _place_stretch(
+        self, rows: Integers, count: Integers, stamps: Integers, n: int, *, begins: bool
+    ) -> None:
+        at = observe_rows(stamps, self.course.observe, self.period)
+        begins = begins or self.start is None
+        if begins:
+            self._begin_piece(count, stamps, at)
+        levels, phases = np.empty(len(at), dtype=np.int64), np.empty(len(at))
+        if len(at):
+            trace(
+                count[at], stamps[at], self.count0, self.origin, self.period, self.sigma, GAIN, self.hold,
+                self.max_gap_ns / self.period, self.level, self.phase, self.seen, levels, phases,
+            )  # fmt: skip
+        if begins:
+            self._set_first_sample(int(levels[0]))
+        nearest = np.searchsorted(
+            at, np.arange(n), side="left" if self.course.observe == "last" else "right"
+        )
+        nearest -= self.course.observe != "last"
+        known = np.append(levels, self.level if len(at) == 0 else levels[-1])
+        level = np.where(nearest < 0, self.level, known[np.clip(nearest, 0, len(at))])
+        done = int(np.searchsorted(at, n))
+        if done:
+            self.level, self.phase, self.seen = (
+                int(levels[done - 1]),
+                float(phases[done - 1]),
+                self.seen + done,
+            )
+        self._add_rows(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
+
+    def _add_rows(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
+        """Give rows their samples; a row that comes to lie on or before the one before it has none."""
+        before = np.maximum.accumulate(np.concatenate([[self.last], sample[:-1]]))
+        kept = sample > before
+        if not kept.all():
+            lost = np.flatnonzero(~kept)
+            same = np.full(len(lost), DUPLICATE)
+            self.events.append(
+                np.stack(
+                    [same, np.maximum(sample[lost], 0), rows[lost], stamps[lost], stamps[lost]],
+                    axis=1,
+                )
+            )
+            rows, sample = rows[kept], sample[kept]
+        if len(rows):
+            self.last = int(sample[-1])
+            self.runs.append(append_runs(self.runs, sample, rows))
+
+
+def append_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integers:
+    """Make runs of rows and their samples; what continues the last run of `runs` is added to it."""
+    new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
+    first = np.concatenate([[0], new])
+    table = np.stack([sample[first], rows[first], np.diff(np.append(first, len(rows)))], axis=1)
+    before = runs[-1][-1] if runs and len(runs[-1]) else None
+    if (
+        before is not None
+        and before[0] + before[2] == table[0, 0]
+        and before[1] + before[2] == table[0, 1]
+    ):
+        before[2] += table[0, 2]
+        table = table[1:]
+    return table
+
+
+def place_rows(
+    blocks: Iterator[tuple[Integers, Integers]],
+    course: JitterModel,
+    period: float,
+    *,
+    hold: float,
+    max_gap_ns: float,
+    by_row: bool,
+) -> tuple[int | None, list[Integers], list[Integers]]:
+    """Place rows in order along the course of their stamps.
+
+    Parameters
+    ----------
+    blocks : iterator
+        Blocks of (row numbers, stamps [ns]).
+    course : Course
+        How the stamps follow the samples.
+    period : float
+        Sampling period of the grid [ns].
+    hold : float
+        A phase further from zero is turned into a sample left out, or a row dropped [samples].
+    max_gap_ns : float
+        A longer step ahead is a step of the clock [ns].
+    by_row : bool
+        Rows that are left out took their time all the same.
+
+    Returns
+    -------
+    start : int or None
+        Stamp of sample 0 [ns]; None where no stamp is readable.
+    runs, events : list of ndarray
+        As in `gyrostab.ingest.grid.place.Placement`.
+    """
+    ahead = int(min(_AHEAD_ROWS * np.ceil(course.group), _MAX_AHEAD_ROWS))
+    size = int(min(TRACE_ROWS * np.ceil(course.group), _MAX_ROWS))
+    placer = _Placer(course, period, hold, max_gap_ns)
+    held = [np.empty(0, dtype=np.int64)] * 3
+    done = 0
+    for rows, stamps in blocks:
+        count = rows if by_row else np.arange(done, done + len(rows))
+        done += len(rows)
+        held = [np.concatenate(pair) for pair in zip(held, (rows, count, stamps), strict=True)]
+        at = 0
+        while len(held[0]) - at >= size + ahead:
+            part = slice(at, at + size + ahead)
+            placer.add(held[0][part], held[1][part], held[2][part], size)
+            at += size
+        held = [column[at:] for column in held]
+    if len(held[0]):
+        placer.add(held[0], held[1], held[2], len(held[0]))
+    return placer.start, placer.runs, placer.events
+
+
+def place_in_order(
+    stamps: Stamps,
+    course: JitterModel,
+    rate: float,
+    *,
+    tolerance: float,
+    max_gap: float,
+    by_row: bool,
+    where: str,
+) -> Placement:
+    """Place rows in order where single stamps do not tell the sample: see `gyrostab.ingest.grid.jitter`.
+
+    Parameters
+    ----------
+    stamps, rate, tolerance, max_gap, where
+        As for `place_by_stamp`.
+    course : Course
+        How the stamps scatter.
+    by_row : bool
+        Rows that `stamps` leaves out took their time all the same.
+
+    Raises
+    ------
+    TimeError
+        When no stamp can be read.
+    """
+    whole, fraction = period_ns(rate)
+    start, runs, events = place_rows(
+        stamps(),
+        course,
+        whole + fraction,
+        hold=0.5 + tolerance,
+        max_gap_ns=max_gap * SECOND,
+        by_row=by_row,
+    )
+    if start is None:
+        raise TimeError(NO_STAMPS.format(where=where))
+    return make_placement(start, runs, events)

@@ -1,0 +1,154 @@
+"""Find a first estimate of the sampling period from stretches of stamps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gyrostab.ingest.grid.steps import cut_stretches, refine_period
+from gyrostab.ingest.grid.stretches import SECOND
+from gyrostab.kernels.grid.stamps import track
+
+__all__ = [
+    "GAIN",
+    "SHARED_SHARE",
+    "period_of_lines",
+    "rms_misfit",
+    "starting_period",
+    "step_scatter",
+]
+
+
+GAIN = 0.1
+
+
+SHARED_SHARE = (
+    0.05  # share of rows with the stamp of the row before from which on stamps may be shared
+)
+
+
+def _residual_range(
+    parts: list[NDArray[np.int64]], length: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slope [ns a row] and range of the residuals [ns] of straight lines through stretches of `length` stamps."""
+    values = cut_stretches(parts, length)
+    x = np.arange(length) - (length - 1) / 2
+    slope = values @ x / (x @ x)
+    rest = values - slope[:, None] * x
+    return slope, np.ptp(rest, axis=1) if len(rest) else np.empty(0)
+
+
+def _has_shared_stamps(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
+    """Whether many rows share a stamp because the clock ticks slowly, and not because rows are doubled."""
+    if np.mean(steps == 0) < SHARED_SHARE:
+        return False
+    tick = np.median(steps[steps > 0])
+    length = min(512, *(len(part) for part in parts)) if parts else 0
+    slope, spread = _residual_range(parts, length) if length >= 8 else (np.empty(0), np.empty(0))
+    good = slope > 0
+    return bool(good.any() and np.median(spread[good] / np.maximum(tick, slope[good])) < 1.3)
+
+
+def rms_misfit(steps: NDArray[np.float64], period: float) -> float:
+    """How far steps are from whole numbers of samples, root mean square [samples]; 0.29 says that they are anywhere."""
+    near = steps[np.abs(steps) < 5.5 * period] / period
+    return float(np.sqrt(np.mean((near - np.rint(near)) ** 2))) if len(near) else 0.5
+
+
+def step_scatter(steps: NDArray[np.float64], period: float) -> float:
+    """Robust standard deviation of the steps about whole numbers of samples [samples]; 0.37 says that they are anywhere."""
+    near = steps[np.abs(steps) < 5.5 * period] / period
+    return 1.4826 * float(np.median(np.abs(near - np.rint(near)))) if len(near) else 0.5
+
+
+def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
+    """Period of the stretches in which the row count alone predicts the stamps to less than a sample."""
+    length = min(16, max(len(part) for part in parts))
+    slope, spread = _residual_range(parts, length)
+    good = (slope > 0) & (spread < 0.95 * slope)
+    if length < 12 or good.sum() < max(1, 0.03 * len(slope)):
+        return None
+    period = float(np.median(slope[good]))
+    for gain in (0.5, 0.5, 0.2, 0.1, GAIN):
+        time = samples = 0
+        for part in parts:
+            count, piece = track(part, period, gain, 20 * period)
+            same = np.diff(piece) == 0
+            time, samples = (
+                time + int(np.diff(part)[same].sum()),
+                samples + int(np.diff(count)[same].sum()),
+            )
+        if samples <= 0:
+            return None
+        period = time / samples
+    return period
+
+
+def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
+    """Period [ns] from stretches of stamps, to a part in a thousand or better; whether rows are counted; whether stamps are shared."""
+    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
+    rising = steps[steps > 0]
+    if _has_shared_stamps(parts, steps):
+        return _time_per_row(parts, ticks=True), True, True
+    period = period_of_lines(parts)
+    if period is None:
+        period = refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
+        if (
+            rms_misfit(steps, period) > 0.2
+        ):  # with most rows missing, the median step is not one sample
+            shorter = refine_period(steps, float(np.quantile(rising, 0.1)))
+            period = shorter if rms_misfit(steps, shorter) < 0.15 else period
+    return (
+        (_time_per_row(parts), True, False)
+        if _is_bursty(parts, steps, period)
+        else (period, False, False)
+    )
+
+
+def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
+    """Whether the long steps are pauses between bursts: they do not fit the lattice of the short ones, or make up for them."""
+    long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
+    near = steps[np.abs(steps) < 50 * period]
+    if len(long) <= max(10, 0.02 * len(steps)) or near.sum() <= 1.2 * period * len(near):
+        return False
+    if abs(np.exp(2j * np.pi * long / period).mean()) < 0.2:
+        return True
+    length = min(256, len(steps) // 16)
+    if np.median(long) < 3 * period or length < 16:
+        return False
+    spans = np.concatenate(
+        [(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]
+    ).astype(np.float64)
+    scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
+    return bool(scatter**2 < 0.2 * length * near.var())  # samples lost at random would add up
+
+
+def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
+    """Time a row takes [ns], from long stretches; with `ticks`, from the first to the last change of a shared stamp."""
+    rates = []
+    for part in parts:
+        steps = np.diff(part).astype(np.float64)
+        if ticks and (steps > 0).sum() > 1:
+            times, counts = _tick_steps(steps)
+        else:
+            usual = np.median(steps[steps > 0]) if (steps > 0).any() else SECOND
+            good = (steps >= 0) & (steps <= max(SECOND, 1000 * usual))
+            times, counts = float(steps[good].sum()), int(good.sum())
+        if times > 0 and counts > 0:
+            rates.append((times, counts))
+    found = np.array(rates, dtype=np.float64)
+    whole = found[:, 1] >= 0.5 * found[:, 1].max()
+    return float(np.median(found[whole, 0] / found[whole, 1]))
+
+
+def _tick_steps(steps: NDArray[np.float64]) -> tuple[float, int]:
+    """Time [ns] and rows between changes of a shared stamp; changes that take three times as long a row as usual are gaps.
+
+    A change and the rows that share the stamp before it are kept or left out together: some stamps
+    may be shared by one row and others by five.
+    """
+    rising = np.flatnonzero(steps > 0)
+    times, counts = steps[rising[1:]], np.diff(rising)
+    paces = times / counts
+    good = paces <= 3 * np.median(np.repeat(paces, counts))
+    return float(times[good].sum()), int(counts[good].sum())

@@ -1,0 +1,192 @@
+"""Guess the unit of gyro columns from their names and numbers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from gyrostab.ingest.columns.headers import is_unit_of
+from gyrostab.ingest.inspect import ColumnInspection, FileInspection
+from gyrostab.units import HOUR, parse_unit
+
+__all__ = [
+    "EARTH_RATE_DPH",
+    "given_unit",
+    "guess_unit",
+    "name_unit",
+    "rate_plausibility",
+    "temperature_unit",
+]
+
+
+#: Rotation of the Earth [deg/h].
+EARTH_RATE_DPH = 15.041
+
+
+#: A fine gyro at rest measures it this well: its bias is a few tenths of a deg/h.
+EARTH_TOLERANCE = 0.02
+
+
+#: One with a bias of some deg/h measures it this well.
+EARTH_NEIGHBOURHOOD = 0.3
+
+
+#: Largest full scale of gyros [deg/h].
+MAX_RATE_DPH = 4000.0 * HOUR
+
+
+#: Angle random walk of the usual sensor, and how far others are from it [deg/sqrt(h), decades].
+TYPICAL_ARW, ARW_DECADES = 0.3, 1.0
+
+
+def given_unit(column: ColumnInspection) -> bool:
+    """Return whether the header gives a unit of rates."""
+    return column.unit is not None and is_unit_of(column.unit, ("rate",))
+
+
+def name_unit(column: ColumnInspection, quantity: str) -> str | None:
+    """The unit that the end of a name says, ``deg/h`` of ``gx_deg_per_h``."""
+    tokens = [
+        token for token in re.split(r"[\s_./\-]+", re.sub(r"\[\d+\]$", "", column.key)) if token
+    ]
+    for count in range(min(4, len(tokens) - 1), 0, -1):
+        last = tokens[-count:]
+        for text in (" ".join(last), "/".join(last)):
+            if len(text) > 1 or text in ("C", "K", "F", "g", "V", "T", "G"):
+                text = (
+                    text.replace("degs", "deg/s")
+                    if text == "degs"
+                    else "rad/s"
+                    if text == "rads"
+                    else text
+                )
+                if is_unit_of(text, (quantity,)) and text not in ("1", "-"):
+                    return parse_unit(text, quantity).text.replace(" per ", "/")
+    return None
+
+
+def temperature_unit(column: ColumnInspection) -> str:
+    """The unit of a column of temperatures, of its header or its name."""
+    given = column.unit is not None and is_unit_of(column.unit, ("temperature",))
+    return str(column.unit if given else name_unit(column, "temperature") or "degC")
+
+
+def guess_unit(
+    look: FileInspection,
+    axes: dict[str, ColumnInspection],
+    rate: float,
+    reasons: list[str],
+    warnings: list[str],
+    *,
+    angles: bool,
+) -> str:
+    """Guess the unit of the gyro columns, and add the reasons and warnings.
+
+    Parameters
+    ----------
+    inspection : FileInspection
+        The inspected file.
+    axes : dict
+        Axis -> gyro column.
+    rate : float
+        Sampling rate [Hz].
+    reasons, warnings : list of str
+        Lists to extend.
+    angles : bool
+        Whether the columns are angles.
+    """
+    group = list(axes.values())
+    for column in group:
+        named = name_unit(column, "rate")
+        if named is None and not angles and (angle := name_unit(column, "angle")):
+            named = f"{angle}/s"
+        if named is not None and is_unit_of(named, ("rate",)):
+            reasons.append(f"unit {named}, by name")
+            return named
+    if angles:
+        warnings.append(
+            "nothing says the unit of the angles; deg is an assumption, put the true one in its place"
+        )
+        return "deg"
+    counts = [
+        *(c.unit for c in group if c.unit),
+        *(c.key for c in group if re.search(r"count|lsb|raw", c.key.lower())),
+    ]
+    large = (
+        look.summary.format == "miniseed"
+        and max(max(abs(c.low), abs(c.high)) for c in group) > 10.0
+    )
+    if counts or large or all(c.whole for c in group):
+        return _scale_of_counts(group, reasons, warnings)
+    means = np.array([c.mean for c in group])
+    scatter = float(np.median([c.scatter for c in group]))
+    top = max(max(abs(c.low), abs(c.high)) for c in group)
+    scores = {
+        unit: rate_plausibility(means, scatter, top, parse_unit(unit).factor, rate)
+        for unit in ("rad/s", "deg/s", "deg/h")
+    }
+    unit = max(scores, key=lambda unit: scores[unit])
+    factor = parse_unit(unit).factor
+    walk = scatter * factor / (60.0 * math.sqrt(rate)) if rate > 0 else math.nan
+    reasons.append(
+        f"unit {unit}, by the noise: {walk:.2g} deg/sqrt(h); the mean is {np.linalg.norm(means) * factor:.4g} deg/h"
+    )
+    warnings.append(
+        f"the unit {unit} is a guess from the numbers, as the file says none; check it with the data sheet"
+    )
+    return unit
+
+
+def rate_plausibility(
+    means: np.ndarray, scatter: float, top: float, factor: float, rate: float
+) -> float:
+    """How well a unit of `factor` deg/h fits the numbers of a gyro, as a logarithm."""
+    if top * factor > MAX_RATE_DPH:
+        return -math.inf
+    walk = max(scatter, 1e-300) * factor / (60.0 * math.sqrt(rate)) if rate > 0 else TYPICAL_ARW
+    score = -((math.log10(walk / TYPICAL_ARW) / ARW_DECADES) ** 2) / 2
+    norm = float(np.linalg.norm(means)) * factor
+    if len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_TOLERANCE:
+        # the rotation of the Earth; by chance 0.04 of 4 ln 10 in the logarithm, which is e^-5
+        score += 4.0
+    elif len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_NEIGHBOURHOOD:
+        score += 2.0  # with a bias of some deg/h; by chance 0.6 of 4 ln 10, which is e^-3
+    elif len(means) == 3 and norm < 0.5 * EARTH_RATE_DPH:
+        score -= 1.0  # less than the Earth turns: only if the mean was taken off
+    return score
+
+
+def _scale_of_counts(
+    group: Sequence[ColumnInspection], reasons: list[str], warnings: list[str]
+) -> str:
+    """A unit for counts, so that a run is possible: nothing in the file says how much a count is."""
+    norm = math.hypot(*(c.mean for c in group))
+    if len(group) == 3 and norm > 0:
+        per_count = EARTH_RATE_DPH / norm  # deg/h = arcsec/s
+        decade = 10.0 ** math.floor(math.log10(per_count))
+        round_one = min(
+            (digit * decade for digit in (1.0, 2.0, 2.5, 5.0, 10.0)),
+            key=lambda scale: abs(math.log(scale / per_count)),
+        )
+        if abs(round_one / per_count - 1) < EARTH_TOLERANCE:
+            reasons.append(
+                f"{round_one:g} arcsec/s a count, as the mean of the three axes is then the rotation of the Earth"
+            )
+            warnings.append(
+                f"the scale of {round_one:g} arcsec/s a count is a guess; put that of the data sheet in its place"
+            )
+            return f"{round_one:g} arcsec/s"
+    earth = EARTH_RATE_DPH / parse_unit("rad/s").factor
+    exponent = math.floor(math.log10(earth / norm)) if norm > 0 else -9
+    unit = "nrad/s" if exponent == -9 else f"1e{exponent:d} rad/s"
+    text = f"1 {unit}" if unit == "nrad/s" else unit
+    reasons.append(
+        f"{text} a count is the largest decimal scale at which the mean is not more than the rotation of the Earth"
+    )
+    warnings.append(
+        f"the columns are counts, and nothing in the file says how much one is: put the scale of the data sheet for {text}"
+    )
+    return text

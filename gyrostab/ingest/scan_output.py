@@ -1,0 +1,204 @@
+"""Print the table of `scan`, the columns of inspected files and the command to run next."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+if TYPE_CHECKING:
+    from gyrostab.ingest.scan import InspectedFile
+
+__all__ = ["next_command", "print_inspection", "print_next", "print_scan"]
+
+
+def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
+    """The complete command that makes a product of logs.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        The logs.
+    options : dict
+        Options of reading, as `scan` takes them.
+
+    Examples
+    --------
+    >>> next_command(["run 7.csv"], {"map": {"wx": "gyro_x"}, "unit": {"gyro": "deg/s"}})
+    "gyrostab run 'run 7.csv' -o product.nc --map wx=gyro_x --unit gyro=deg/s"
+    """
+    number, target = 2, Path("product.nc")
+    while target.exists():
+        number, target = number + 1, Path(f"product_{number}.nc")
+    words = ["gyrostab", "run", *map(str, paths), "-o", str(target)]
+    for name, value in options.items():
+        flag = {"limits": "--limit"}.get(name, f"--{name.replace('_', '-')}")
+        if isinstance(value, Mapping):
+            for key, text in value.items():
+                words += [flag, f"{key}={text}"]
+        elif isinstance(value, tuple | list):
+            for item in value:
+                words += [flag, str(item)]
+        elif value is True:
+            words.append(flag)
+        else:
+            words += [flag, f"{value:.10g}" if isinstance(value, float) else str(value)]
+    return shlex.join(words)
+
+
+def print_scan(table: pd.DataFrame) -> None:
+    """Print the table of `scan`: framed on a terminal, plain tab-separated text elsewhere."""
+    if not sys.stdout.isatty():
+        table.to_csv(sys.stdout, sep="\t", index=False)
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    framed = Table()
+    for heading in (
+        "file",
+        "start (UTC)",
+        "span",
+        "rate [Hz]",
+        "axes",
+        "channels",
+        "rows",
+        "gaps",
+        "missing",
+    ):
+        framed.add_column(
+            heading,
+            overflow="fold",
+            justify="right" if heading in ("rows", "gaps", "missing") else "left",
+        )
+    for _, row in table.iterrows():
+        if pd.isna(row["rate_hz"]):
+            told = "cannot be read" if pd.isna(row["format"]) else "needs options, see below"
+            framed.add_row(escape(row["file"]), f"[red]{told}[/red]")
+            continue
+        cells = (
+            f"{row['file']} ({row['format']})",
+            f"{row['start']:%Y-%m-%d %H:%M:%S}",
+            _format_span(row["span_s"]),
+            f"{row['rate_hz']:g}",
+            row["axes"],
+            row["channels"],
+            f"{row['rows']:,.0f}",
+            f"{row['gaps']:,.0f}",
+            f"{row['missing_share']:.2%}",
+        )
+        framed.add_row(*map(escape, cells))
+    console.print(framed)
+    for _, row in table[table["odd"].fillna("") != ""].iterrows():
+        console.print(f"[bold]{escape(row['file'])}[/bold]: {escape(row['odd'])}", highlight=False)
+
+
+def _format_span(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds < 60.0 else str(timedelta(seconds=round(seconds)))
+
+
+INSPECTION_COLUMNS = ("column", "unit", "low", "high", "mean", "scatter", "rate_hz", "taken_for")
+
+
+def _inspection_rows(found: InspectedFile) -> list[tuple[str, ...]]:
+    """The columns of a file as texts, one row each, as in `INSPECTION_COLUMNS`."""
+    guess = found.guess
+    taken = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
+    if guess.time is not None:
+        taken[guess.time.key] = "time"
+    if guess.temperature is not None:
+        taken.setdefault(guess.temperature.key, "temperature")
+    rows: list[tuple[str, ...]] = []
+    if found.look.time is not None:
+        time = found.look.time
+        rows.append(
+            (
+                time.header,
+                time.unit or "",
+                "",
+                "",
+                "",
+                "",
+                _format_number(found.look.rate_hz),
+                "time",
+            )
+        )
+    for column in found.look.columns:
+        known = math.isfinite(column.rate_hz) or column.rows == 0
+        numbers = (
+            column.low,
+            column.high,
+            column.mean,
+            column.scatter,
+            column.rate_hz if known else guess.sampling_rate_hz,
+        )
+        kept = column.name if column.role == "channel" else ""
+        rows.append(
+            (
+                column.key,
+                column.unit or "",
+                *map(_format_number, numbers),
+                taken.get(column.key, kept) if column.rows else "no numbers",
+            )
+        )
+    return rows
+
+
+def _format_number(value: float) -> str:
+    return f"{value:.6g}" if math.isfinite(value) else ""
+
+
+def print_inspection(found: InspectedFile) -> None:
+    """Print what is in the columns of a file and the guess; in a pipe every line begins with ``#``."""
+    rows = _inspection_rows(found)
+    guess = found.guess
+    told = [*guess.reasons, *(f"check: {warning}" for warning in guess.warnings), *found.look.notes]
+    if found.row is not None:
+        read = found.row
+        told.append(
+            f"read so: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes {read['axes']}, {read['missing_share']:.2%} missing"
+        )
+    if found.error is not None and guess.axes:
+        told.append(f"not readable by this guess: {found.error}")
+    if not sys.stdout.isatty():
+        print(f"# {found.paths[0]}: {len(rows)} columns, {found.look.rows} rows")
+        for row in [INSPECTION_COLUMNS, *rows]:
+            print("# " + "\t".join(row))
+        for text in told:
+            print(f"# {text}")
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    framed = Table(title=escape(f"{found.paths[0]}: {found.look.rows:,} rows"))
+    for heading in INSPECTION_COLUMNS:
+        framed.add_column(
+            heading.replace("_", " "),
+            overflow="fold",
+            justify="left" if heading in ("column", "unit", "taken_for") else "right",
+        )
+    for row in rows:
+        framed.add_row(*map(escape, row))
+    console = Console()
+    console.print(framed)
+    for text in told:
+        console.print(escape(text), highlight=False)
+
+
+def print_next(command: str, *, apart: bool = False) -> None:
+    """Print the command to run next; with `apart` on stderr if stdout is a pipe, which then holds the plain table only."""
+    if sys.stdout.isatty():
+        print(f"next: {command}")
+    elif apart:
+        print(f"next: {command}", file=sys.stderr)
+    else:
+        print(f"# next: {command}")
