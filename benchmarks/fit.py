@@ -51,10 +51,10 @@ def record(missing: bool) -> np.ndarray:
 def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     """Averaging times, and microseconds a window: all, kernel, limits and the rest, quick fit of davar; seconds of the tables."""
     surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="5min", step="15s", taus=taus)
-    cells, ks, rate, window = fit._inputs(surface)
+    cells, ks, rate, window = fit._fit_inputs(surface)
     flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells]
     shifts = np.zeros_like(ks)
-    tables = fit._tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
+    tables = fit._cached_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
     diagonals = diagonal_products(window, ks, shifts)
     arguments = (tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 31)
     quick = (tables.columns, tables.weight, tables.to_samples, *diagonals)

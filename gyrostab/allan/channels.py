@@ -22,7 +22,7 @@ __all__ = ["window_channels"]
 
 TEMPERATURE_RATE = "K hour-1"
 #: Values of a channel up to which those of all windows of a part are read at once.
-_TOGETHER = 2**20
+_MAX_VALUES_READ_AT_ONCE = 2**20
 
 
 def window_channels(
@@ -73,7 +73,7 @@ def window_channels(
                 for edge in (first, first + window)
             )  # type: ignore[return-value]
 
-        mean, slope = _means(channel.data, stamps, rate, groups, ends, part)
+        mean, slope = _average_windows(channel.data, stamps, rate, groups, ends, part)
         units = channel.attrs.get("units", "1")
         label = str(channel.attrs.get("long_name", name.replace("_", " ")))
         out[name] = xr.Variable(
@@ -91,7 +91,7 @@ def window_channels(
     return out
 
 
-def _trend(
+def _fit_trends(
     values: Any,
     stamps: NDArray[np.int64] | None,
     rate: float,
@@ -103,7 +103,7 @@ def _trend(
     return np.asarray(window_trend(data, seconds, a, b))
 
 
-def _means(
+def _average_windows(
     data: Any,
     stamps: NDArray[np.int64] | None,
     rate: float,
@@ -117,13 +117,17 @@ def _means(
     chosen = [group for group in groups if group.start < kept.stop and group.stop > kept.start]
     bounds = [ends(group) for group in chosen]
     first, last = int(bounds[0][0][0]), int(bounds[-1][1][-1])
-    together = None if lazy or last - first > _TOGETHER else read_slice(data, first, last)
+    together = (
+        None if lazy or last - first > _MAX_VALUES_READ_AT_ONCE else read_slice(data, first, last)
+    )
     parts = []
     for a, b in bounds:
         low, high = int(a[0]), int(b[-1])
         piece = None if stamps is None else stamps[low:high]
         if lazy:
-            one = dask.delayed(_trend, pure=False)(data[low:high], piece, rate, a - low, b - low)
+            one = dask.delayed(_fit_trends, pure=False)(
+                data[low:high], piece, rate, a - low, b - low
+            )
             parts.append(da.from_delayed(one, (2, a.size), dtype=np.float64))
         else:
             values = (
@@ -131,7 +135,7 @@ def _means(
                 if together is None
                 else together[low - first : high - first]
             )
-            parts.append(_trend(values, piece, rate, a - low, b - low))
+            parts.append(_fit_trends(values, piece, rate, a - low, b - low))
     both = (da if lazy else np).concatenate(parts, axis=1)[
         :, kept.start - chosen[0].start : kept.stop - chosen[0].start
     ]

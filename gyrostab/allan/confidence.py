@@ -64,7 +64,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
         ("avar_upper", 0.5 - level / 2, "upper"),
     ):
         limit = xr.apply_ufunc(
-            _limit,
+            _interval_limit,
             surface["avar"],
             surface["edf"],
             side,
@@ -79,7 +79,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     return out
 
 
-def _limit(avar: NDArray[np.float64], edf: NDArray[np.float64], side: float) -> Any:
+def _interval_limit(avar: NDArray[np.float64], edf: NDArray[np.float64], side: float) -> Any:
     from scipy.special import gammaincinv
 
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -33,15 +33,15 @@ from gyrostab.time.grid import first_stamp, grid_times
 
 __all__ = ["davar", "davar_part", "davar_parts"]
 
-#: Variables by axis and window, in the order of the arrays that `_work` returns.
+#: Variables by axis and window, in the order of the arrays that `_compute_unit` returns.
 _PLANE_FIELDS = ("window_mean", "window_coverage", "outlier_count")
 #: Samples of a part up to which all its axes are read together.
-_TOGETHER = 2**21
+_MAX_SAMPLES_READ_AT_ONCE = 2**21
 #: Parts at least of a surface of so many units of work, for the threads to share.
-_LEAST_PARTS = 4
+_MIN_PARTS = 4
 #: A part gets this share at most of the units of work that are left: two threads that share the
 #: parts then end at about the same time.
-_SHARE = 1 / 2
+_MAX_SHARE_OF_REST = 1 / 2
 
 
 def davar(
@@ -146,12 +146,12 @@ def davar(
         min_coverage=min_coverage, method=method, convention=convention,
     )  # fmt: skip
     if method == "blocks":
-        cells, means = _blocks(plan.signal.data, plan.unit, plan.rate)
+        cells, means = _run_units(plan.signal.data, plan.unit, plan.rate)
     else:
-        cells, means = _reference(
+        cells, means = _run_published_method(
             plan.signal, plan.unit, plan.rate, method, paper=convention == "paper"
         )
-    return _label(cells, means, log, plan)
+    return _attach_labels(cells, means, log, plan)
 
 
 def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> list[slice]:
@@ -188,12 +188,12 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
         min(
             samples // (axes * per_unit * plan.unit.step),
             MOST_CELLS // (cells * per_unit),
-            -(-len(units) // _LEAST_PARTS),
+            -(-len(units) // _MIN_PARTS),
         ),
     )
     edges = [0]
     while left := len(units) - edges[-1]:
-        edges.append(edges[-1] + max(1, min(together, int(left * _SHARE))))
+        edges.append(edges[-1] + max(1, min(together, int(left * _MAX_SHARE_OF_REST))))
     return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
 
 
@@ -243,7 +243,7 @@ def davar_part(
             f"method={plan.attrs['method']!r} is for whole logs; parts are computed with method='blocks'"
         )
     data, unit = plan.signal.data, plan.unit
-    tables = _kept_tables(plan)
+    tables = _cached_tables_of(plan)
     units = [
         one
         for one in units_of_work(data.shape[1], unit)
@@ -251,14 +251,14 @@ def davar_part(
     ]
     spans = [(one.start * unit.step, last_sample(one, unit)) for one in units]
     space = space or Workspace()
-    done = [_work(x, unit, tables, space) for x in _stretches(data, spans, space)]
+    done = [_compute_unit(x, unit, tables, space) for x in _read_spans(data, spans, space)]
     rows = range(0, len(done), len(units))
     cells, means = (
         [np.concatenate([one[i] for one in done[row : row + len(units)]], axis=1) for row in rows]
         for i in range(2)
     )
     kept = slice(part.start - units[0].start, part.stop - units[0].start)
-    return _label(
+    return _attach_labels(
         np.stack(cells, axis=1)[:, :, kept],
         np.stack(means, axis=1)[:, :, kept],
         log,
@@ -267,7 +267,7 @@ def davar_part(
     )
 
 
-def _stretches(
+def _read_spans(
     data: Any, spans: Sequence[tuple[int, int]], space: Workspace
 ) -> Iterator[NDArray[np.generic]]:
     """The samples of each span, of one axis after the other; each is to be used before the next is asked for.
@@ -288,19 +288,19 @@ def _stretches(
                 held_from, held_to = first, last
                 yield line[: last - first]
         return
-    together = 1 if data.shape[0] * (end - begin) > _TOGETHER else data.shape[0]
+    together = 1 if data.shape[0] * (end - begin) > _MAX_SAMPLES_READ_AT_ONCE else data.shape[0]
     for row in range(0, data.shape[0], together):
         for whole in read_slice(data[row : row + together], begin, end):
             yield from (whole[first - begin : last - begin] for first, last in spans)
 
 
-def _work(
+def _compute_unit(
     x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...], space: Workspace | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Cells (9, n_windows, n_tau), the last field the degrees of freedom, and plane fields (3, n_windows) of one unit."""
     x = np.ascontiguousarray(x)
     if x.dtype.kind == "f" and np.isnan(x[[0, x.size // 2, -1]]).all() and np.isnan(x).all():
-        cells, means = (part.copy() for part in _empty_surface(_hashable(unit), x.size))
+        cells, means = (part.copy() for part in _empty_surface(_with_tuples(unit), x.size))
     else:
         cells, means = surface_unit(x, unit, space)
     outliers = count_outliers(x, np.arange(means.shape[1]) * unit.step, unit.window)
@@ -313,13 +313,13 @@ def _work(
     return np.concatenate([cells, dof[None]]), np.concatenate([means, outliers[None]])
 
 
-def _kept_tables(plan: Plan) -> tuple[Any, ...]:
+def _cached_tables_of(plan: Plan) -> tuple[Any, ...]:
     """`_noise_tables`, made once for all parts of a log."""
-    return _tables_of(_hashable(plan.unit), plan.rate)
+    return _cached_noise_tables(_with_tuples(plan.unit), plan.rate)
 
 
 @lru_cache(maxsize=4)
-def _tables_of(unit: Unit, rate: float) -> tuple[Any, ...]:
+def _cached_noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
     return _noise_tables(_with_arrays(unit), rate)
 
 
@@ -329,7 +329,7 @@ def _empty_surface(unit: Unit, size: int) -> tuple[NDArray[np.float64], NDArray[
     return surface_unit(np.full(size, np.nan), _with_arrays(unit), None)
 
 
-def _hashable(unit: Unit) -> Unit:
+def _with_tuples(unit: Unit) -> Unit:
     return unit._replace(ks=tuple(unit.ks.tolist()), shifts=tuple(unit.shifts.tolist()))  # type: ignore[arg-type]
 
 
@@ -351,12 +351,12 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
     return columns, weight, to_samples, pairs, ramps
 
 
-def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
+def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
     """Run the units of work: cells (9, axis, time, tau) and plane fields (3, axis, time), dask if `data` is."""
     lazy = isinstance(data, da.Array)
     tables = _noise_tables(unit, rate)
     shared = dask.delayed(tables, pure=True, traverse=False) if lazy else tables
-    work = dask.delayed(_work, nout=2, pure=False)
+    work = dask.delayed(_compute_unit, nout=2, pure=False)
     rows_cells, rows_means = [], []
     for row in range(data.shape[0]):
         cells, means = [], []
@@ -379,7 +379,7 @@ def _blocks(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
     return stacked if lazy else dask.compute(*stacked)
 
 
-def _reference(
+def _run_published_method(
     signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool
 ) -> tuple[Any, Any]:
     """The published algorithms, eager: cells (9, axis, time, tau) and plane fields (3, axis, time)."""
@@ -420,7 +420,7 @@ def _reference(
     return cells, means
 
 
-def _label(
+def _attach_labels(
     cells: Any, means: Any, log: xr.Dataset, plan: Plan, *, part: slice | None = None
 ) -> xr.Dataset:
     cube, plane = ("axis", "time", "tau"), ("axis", "time")

@@ -27,16 +27,16 @@ __all__ = ["fit_noise", "fit_part", "is_described", "refit"]
 #: number.
 MOST_TAUS = 48
 #: One-sided normal quantiles: 95 % for limits, 99 % for the claim that a term is there.
-_LIMIT, _CLAIM = 1.6449, 2.3263
+_LIMIT_SIGMA, _OBSERVED_SIGMA = 1.6449, 2.3263
 #: The model does not fit where chance alone would make the misfit in fewer windows than this.
-_MISFIT = 1e-3
+_MISFIT_PROBABILITY = 1e-3
 #: A window that the model does not fit bounds its terms (but Q) within its longest averaging times:
 #: a decade of them.
-_DECADE = 10.0
+_LIMIT_SPAN = 10.0
 #: More degrees of freedom than this are as good as infinitely many for the limit of a cell.
-_MOST_FREEDOM = 1e6
+_MAX_FREEDOM = 1e6
 #: A column that the other terms imitate to all but this share cannot be told apart.
-_SEPARATION = 1e-4
+_MIN_SEPARATION = 1e-4
 
 
 def fit_noise(
@@ -107,7 +107,7 @@ def fit_noise(
     >>> round(float(product.N.mean()), 3)
     0.01
     """
-    return _fit(
+    return _fit_checked(
         surface,
         terms=terms,
         method=method,
@@ -178,7 +178,7 @@ def is_described(chi2: Any, dof: Any) -> Any:
         np.nan_to_num(np.asarray(chi2, np.float64)),
         np.nan_to_num(np.asarray(dof, np.float64)),
     )
-    return ~((dof > 0) & (gammaincc(np.maximum(dof, 1.0) / 2.0, chi2 / 2.0) < _MISFIT))
+    return ~((dof > 0) & (gammaincc(np.maximum(dof, 1.0) / 2.0, chi2 / 2.0) < _MISFIT_PROBABILITY))
 
 
 def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
@@ -205,10 +205,10 @@ def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
     >>> fit_part(surface, terms="NK").equals(fit_noise(surface, terms="NK"))
     True
     """
-    return _fit(surface, **options, here=True)
+    return _fit_checked(surface, **options, here=True)
 
 
-def _fit(
+def _fit_checked(
     surface: xr.Dataset,
     *,
     terms: str | Iterable[str] = "QNBKR",
@@ -226,7 +226,7 @@ def _fit(
     if method not in ("gls", "adev"):
         raise OptionError(f"method={method!r}: give 'gls' or 'adev'")
     allowed = sum(1 << TERMS.index(term) for term in wanted)
-    chosen = _within(surface["tau"].values, tau_min, tau_max)
+    chosen = _select_taus(surface["tau"].values, tau_min, tau_max)
     if method == "gls":
         product = _fit_gls(surface, allowed, chosen, here=here, observed_only=observed_only)
     else:
@@ -237,7 +237,7 @@ def _fit(
     )
 
 
-def _within(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
+def _select_taus(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
     """Positions of the averaging times to fit."""
     low = 0.0 if tau_min is None else duration_seconds(tau_min, "tau_min")
     high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max")
@@ -250,7 +250,7 @@ def _within(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.
     return chosen
 
 
-def _inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, int]:
+def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, int]:
     """Cells as (axis, time, tau) arrays, averaging factors, rate and window length."""
     try:
         rate, window = (
@@ -276,10 +276,10 @@ def _inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, i
 def _fit_gls(
     surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool, observed_only: bool
 ) -> xr.Dataset:
-    cells, ks, rate, window = _inputs(surface)
-    chosen = within[_choose(ks[within])]
+    cells, ks, rate, window = _fit_inputs(surface)
+    chosen = within[_thin_factors(ks[within])]
     shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
-    tables = _tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window)
+    tables = _cached_tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window)
 
     def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
         flat = [
@@ -314,7 +314,7 @@ def _fit_gls(
         chosen.size == surface.sizes["tau"]
     ):  # otherwise davar's own, for every averaging time, stands
         extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
-    return _assemble(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
+    return _assemble_product(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
 
 
 class _Tables:
@@ -356,12 +356,14 @@ def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
 
 
 @lru_cache(maxsize=4)
-def _tables(ks: tuple[int, ...], shifts: tuple[int, ...], rate: float, window: int) -> _Tables:
+def _cached_tables(
+    ks: tuple[int, ...], shifts: tuple[int, ...], rate: float, window: int
+) -> _Tables:
     """The same tables for every part of a record that is fitted part by part."""
     return _Tables(np.array(ks, dtype=np.int64), np.array(shifts, dtype=np.int64), rate, window)
 
 
-def _choose(ks: NDArray[np.int64]) -> NDArray[np.int64]:
+def _thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
     """Positions of the averaging factors to fit: all, or `MOST_TAUS` of them in even log spacing."""
     if ks.size <= MOST_TAUS:
         return np.arange(ks.size)
@@ -378,7 +380,7 @@ def _fit_block(
     )
     field = {name: result[:, i] for i, name in enumerate(FIT_FIELDS)}
     square, error = field["square"], field["square_stderr"]
-    fails = _widen(field, misfit)
+    fails = _widen_misfits(field, misfit)
     with np.errstate(invalid="ignore", divide="ignore"):
         value = np.sqrt(square)
         # d(sqrt s) = ds / (2 sqrt s); near zero the root itself of the error of the square is the
@@ -388,11 +390,11 @@ def _fit_block(
             error / (2.0 * value),
             np.sqrt(np.maximum(error, 0.0)) / np.where(square > error, 1.0, 2.0),
         )
-        visible = np.isfinite(square) & (field["separation"] > _SEPARATION)
+        visible = np.isfinite(square) & (field["separation"] > _MIN_SEPARATION)
         observed = (
             visible
             & (square > 0)
-            & (field["free"] > _CLAIM * np.sqrt(np.maximum(field["variance_null"], 0.0)))
+            & (field["free"] > _OBSERVED_SIGMA * np.sqrt(np.maximum(field["variance_null"], 0.0)))
         )
         limit = np.minimum(
             _limit_of_estimate(field, tables), _limit_of_cell(flat, square, dof, tables)
@@ -409,7 +411,9 @@ def _fit_block(
     return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
 
 
-def _widen(field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _widen_misfits(
+    field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Say which windows the model does not fit, and multiply their variances in `field` by chi-square over its degrees of freedom."""
     chi2, dof = misfit.T
     fails = ~is_described(chi2, dof)
@@ -437,9 +441,10 @@ def _limit_of_estimate(
     )
     lower = interpolate_quantile(2.0 / np.maximum(c, 1e-12), *tables.quantile)
     curve = 1.0 - (1.0 - lower) ** 2
-    half = estimate + 0.5 * _LIMIT**2 * b
+    half = estimate + 0.5 * _LIMIT_SIGMA**2 * b
     return np.asarray(
-        (half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT**2 * a), 0.0))) / curve
+        (half + np.sqrt(np.maximum(half**2 - curve * (estimate**2 - _LIMIT_SIGMA**2 * a), 0.0)))
+        / curve
     )
 
 
@@ -461,7 +466,7 @@ def _limit_of_cell(
             tables.own_dof,
             tables.ks,
             span,
-            _MOST_FREEDOM,
+            _MAX_FREEDOM,
             *tables.quantile,
         )
     )
@@ -480,7 +485,7 @@ def _limit_of_curve(
     cells are those of the last decade. Quantization, which is what the shortest times tell, is
     bounded by all. A ramp is given the scatter of the noise that scatters most.
     """
-    span = np.array([np.inf, *[_DECADE] * (len(TERMS) - 1)])
+    span = np.array([np.inf, *[_LIMIT_SPAN] * (len(TERMS) - 1)])
     own_dof = np.vstack([tables.own_dof[:STOCHASTIC], tables.own_dof[:STOCHASTIC].min(axis=0)])
     square = np.ascontiguousarray(square)
     return np.asarray(
@@ -492,13 +497,13 @@ def _limit_of_curve(
             own_dof,
             tables.ks,
             span,
-            _MOST_FREEDOM,
+            _MAX_FREEDOM,
             *tables.quantile,
         )
     )
 
 
-def _assemble(
+def _assemble_product(
     surface: xr.Dataset,
     values: list[Any],
     errors: list[Any],
@@ -513,7 +518,7 @@ def _assemble(
         out[symbol] = (plane, value, attributes(symbol))
         out[f"{symbol}_stderr"] = (plane, error, attributes(f"{symbol}_stderr"))
         out[f"{symbol}_upper"] = (plane, limit, attributes(f"{symbol}_upper"))
-        if f"{symbol}_squared" in _SQUARED:
+        if f"{symbol}_squared" in _SQUARED_NAMES:
             out[f"{symbol}_squared"] = (plane, value**2, attributes(f"{symbol}_squared"))
     stack = da.stack if isinstance(observable[0], da.Array) else np.stack
     out["observable"] = (
@@ -524,7 +529,7 @@ def _assemble(
     return surface.assign({**out, **extra, "term": ("term", list(TERMS), attributes("term"))})
 
 
-_SQUARED = ("N_squared", "K_squared")
+_SQUARED_NAMES = ("N_squared", "K_squared")
 
 
 def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64]) -> xr.Dataset:
@@ -545,4 +550,4 @@ def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64])
         name: (("axis", "time"), nothing[0], attributes(name)) for name in ("fit_chi2", "fit_dof")
     }
     coefficients = [values[..., i] for i in range(len(TERMS))]
-    return _assemble(surface, coefficients, nothing, nothing, seen, extra=extra)
+    return _assemble_product(surface, coefficients, nothing, nothing, seen, extra=extra)

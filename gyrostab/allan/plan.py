@@ -52,7 +52,7 @@ def make_plan(
     """Check the options of `davar` against the log, as `gyrostab.ingest.convert.as_log` returns it."""
     _check_choices(method=method, gaps=gaps, overlap=overlap, convention=convention)
     name = signal_name(log)
-    signal = log[name] if axis is None else _pick(log[name], axis)
+    signal = log[name] if axis is None else _select_axes(log[name], axis)
     rate = float(log.attrs["sampling_rate_hz"])
     intervals = signal.sizes["time"] - (1 if name == "angle" else 0)
     length, hop = _window_and_step(
@@ -127,7 +127,7 @@ def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> 
         )
 
 
-def _pick(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
+def _select_axes(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
     wanted = [axis] if isinstance(axis, str) else list(axis)
     known = [str(name) for name in signal["axis"].values]
     unknown = [name for name in wanted if name not in known]

@@ -26,18 +26,18 @@ __all__ = [
 _LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
 #: Windows, spread over the record, that are fitted again to find the averaging time from which the
 #: terms describe them.
-_TRIED_WINDOWS = 24
+_MAX_TRIED_WINDOWS = 24
 #: A share of failing windows that is not worth a remark: a window that the terms do describe fails
 #: in 0.1 to 2 % of cases
 #: (docs/method.md), and in a record of few windows one of them is no evidence.
-_FAILING_SHARE = 0.05
+_MAX_FAILING_SHARE = 0.05
 #: Least ratio of longest to shortest averaging time: over a decade, the Allan variances of
 #: neighbouring terms, whose slopes
 #: differ by one, part by a factor of ten.
-_LEAST_SPAN = 10.0
+_MIN_TAU_RATIO = 10.0
 #: Twice the rotation of the Earth, 15.041 deg/h: no change of attitude at rest moves the mean rate
 #: further.
-_MOST_AT_REST_DEG_H = 30.082
+_MAX_CHANGE_AT_REST_DPH = 30.082
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class FitSummary:
     @property
     def fails(self) -> bool:
         """Whether more windows fail than chance explains."""
-        return self.failing_share > _FAILING_SHARE
+        return self.failing_share > _MAX_FAILING_SHARE
 
 
 def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
@@ -141,8 +141,8 @@ def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
 
 def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
     state = part["observable"].sel(term=symbol).values
-    values = _finite(part[symbol].values[state == _SEEN])
-    limits = _finite(part[f"{symbol}_upper"].values[state == _LIMIT])
+    values = _drop_nans(part[symbol].values[state == _SEEN])
+    limits = _drop_nans(part[f"{symbol}_upper"].values[state == _LIMIT])
     status: Literal["observed", "upper_limit_only", "not_observable"] = "not_observable"
     if values.size >= max(limits.size, 1):
         status = "observed"
@@ -164,7 +164,7 @@ def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
     )
 
 
-def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _drop_nans(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return values[np.isfinite(values)]
 
 
@@ -225,12 +225,12 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     if not failing:
         return None
     count = product.sizes["time"]
-    tried = np.unique(np.linspace(0, count - 1, min(_TRIED_WINDOWS, count)).round().astype(int))
+    tried = np.unique(np.linspace(0, count - 1, min(_MAX_TRIED_WINDOWS, count)).round().astype(int))
     windows = product.sel(axis=failing).isel(time=tried).compute()
     tau = windows["tau"].values
     longest = float(product.attrs.get("fit_tau_max_s", tau[-1]))
     shortest = 2.0 * float(product.attrs.get("fit_tau_min_s", tau[0]))
-    for start in tau[tau <= longest / _LEAST_SPAN]:
+    for start in tau[tau <= longest / _MIN_TAU_RATIO]:
         if start < shortest:
             continue
         if not any(
@@ -261,16 +261,20 @@ def format_product(product: xr.Dataset) -> str:
     ]
     rows = [("axis", "term", "median", "5 % to 95 %", "unit", "observed in")]
     for term in summarise_terms(product):
-        spread = f"{_number(term.low)} to {_number(term.high)}" if term.status == "observed" else ""
+        spread = (
+            f"{_number_text(term.low)} to {_number_text(term.high)}"
+            if term.status == "observed"
+            else ""
+        )
         sign = "< " if term.status == "upper_limit_only" else ""
         rows.append(
             (
                 term.axis,
                 term.symbol,
-                sign + _number(term.value),
+                sign + _number_text(term.value),
                 spread,
                 term.unit,
-                _share(term.observed_share),
+                _share_text(term.observed_share),
             )
         )
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
@@ -297,11 +301,11 @@ def describe_record(product: xr.Dataset) -> list[str]:
     return [*_describe_misfit(product), *_describe_outliers(product), *_describe_motion(product)]
 
 
-def _number(value: float) -> str:
+def _number_text(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}" if np.isfinite(value) else "-"
 
 
-def _share(share: float) -> str:
+def _share_text(share: float) -> str:
     return "all" if share == 1.0 else f"{share:.0%}"
 
 
@@ -309,10 +313,12 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
     fits = [summary for summary in summarise_fit(product) if summary.windows]
     if not fits:
         return []
-    ratios = ", ".join(f"{fit.axis} {_number(fit.chi2_per_dof)}" for fit in fits)
+    ratios = ", ".join(f"{fit.axis} {_number_text(fit.chi2_per_dof)}" for fit in fits)
     lines = [f"Misfit, median chi2/dof (1 is right): {ratios}."]
     failing = [
-        f"{fit.axis} in {_share(fit.failing_share)} of its windows" for fit in fits if fit.fails
+        f"{fit.axis} in {_share_text(fit.failing_share)} of its windows"
+        for fit in fits
+        if fit.fails
     ]
     if failing:
         line = f"The terms do not describe {', '.join(failing)}, where no term is called observed"
@@ -349,10 +355,10 @@ def _describe_motion(product: xr.Dataset) -> list[str]:
     for axis in product["axis"].values:
         mean = product["window_mean"].sel(axis=axis).values
         away = np.abs(mean - np.nanmedian(mean)) if np.isfinite(mean).any() else np.zeros(1)
-        count = int(np.count_nonzero(away > _MOST_AT_REST_DEG_H))
+        count = int(np.count_nonzero(away > _MAX_CHANGE_AT_REST_DPH))
         if count:
             said.append(
-                f"{axis} in {count} windows (up to {_number(float(np.nanmax(away)))} deg/h)"
+                f"{axis} in {count} windows (up to {_number_text(float(np.nanmax(away)))} deg/h)"
             )
     if not said:
         return []

@@ -10,20 +10,20 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.correlate.dataset import assemble
-from gyrostab.correlate.drivers import Driver, drivers, other_channels, slope_units
-from gyrostab.correlate.judge import VERDICTS, driver_limits, statement
+from gyrostab.correlate.drivers import Driver, align_drivers, other_channels, slope_units
+from gyrostab.correlate.judge import VERDICTS, describe_coupling, driver_limits
 from gyrostab.errors import OptionError
 from gyrostab.kernels.regression.coupling import (
     Laws,
-    averages,
-    beside,
+    block_averages,
     calibrated,
-    chances,
     decompose,
     fit_lags,
     noise_laws,
     null_weights,
     p_values,
+    project_out,
+    simulate_p_values,
     slope_interval,
     uncalibrated,
     weights,
@@ -35,19 +35,21 @@ from gyrostab.time.durations import duration_seconds
 __all__ = ["correlate"]
 
 Array = NDArray[np.float64]
-_BLOCKS = 160  # at most; longer records are averaged further
-_LAGS = 48  # at most
-_SIMULATED = 12  # lags in the simulation of the search, at most: those between tell nothing new
-_PER_WINDOW = 8  # windows used per window length; more add nothing
-_FEWEST = 12
-_CLAIM = 0.05
-_DRAWS = (300, 4000)  # of noise; the second where the first leaves a claim possible
-_LEVERAGE = (
+_MAX_BLOCKS = 160  # at most; longer records are averaged further
+_MAX_LAGS = 48  # at most
+_MAX_SIMULATED_LAGS = (
+    12  # lags in the simulation of the search, at most: those between tell nothing new
+)
+_MAX_WINDOWS_PER_LENGTH = 8  # windows used per window length; more add nothing
+_MIN_BLOCKS = 12
+_SIGNIFICANCE = 0.05
+_NOISE_DRAWS = (300, 4000)  # of noise; the second where the first leaves a claim possible
+_MAX_LEVERAGE = (
     0.35  # share of the driver's variance in one block, above which the record hangs on that block
 )
 
 
-class _Frame(NamedTuple):
+class _Blocks(NamedTuple):
     """Blocks of the windows that some series share, and what is beside the driver in the model."""
 
     average: Any
@@ -97,7 +99,7 @@ def correlate(
         By ``(axis, variable, driver)``: ``coupling_lag`` [s], ``correlation``,
         ``partial_correlation_time``, ``partial_correlation_channels``, ``p_value``,
         ``p_value_adjusted``, ``effective_samples``, ``windows_used``, ``coupling_verdict``,
-        ``coupling_limits`` (flags), ``statement``; by ``axis`` the sensitivity
+        ``coupling_limits`` (flags), ``describe_coupling``; by ``axis`` the sensitivity
         ``<variable>_per_<driver>`` with ``_stderr``, ``_low``, ``_high``, ``_rising``, ``_falling``
         [units of the variable per unit of the driver]; and the series themselves.
 
@@ -118,19 +120,19 @@ def correlate(
         raise OptionError(
             f"level {level:g}: the level of an interval lies between 0.5 and 1, for instance 0.95"
         )
-    names = _variables(product, variables)
+    names = _select_variables(product, variables)
     time = (product["time"].values - product["time"].values[0]) / np.timedelta64(1, "s")
-    length, step = _lengths(product, time)
-    lags = _lags(max_lag, float(time[-1] - time[0]) if time.size else 0.0, step)
-    found = drivers(product, channel, lags, step)
+    length, step = _window_lengths(product, time)
+    lags = _choose_lags(max_lag, float(time[-1] - time[0]) if time.size else 0.0, step)
+    found = align_drivers(product, channel, lags, step)
     others = other_channels(product, found[0].name)
     entries: dict[tuple[int, int, int], dict[str, Any]] = {}
     groups: dict[bytes, list[tuple[int, int]]] = {}
-    masks, lags, found = _usable(product, names, lags, found)
+    masks, lags, found = _usable_windows(product, names, lags, found)
     for place, mask in masks.items():
         groups.setdefault(mask.tobytes(), []).append(place)
     for places in groups.values():
-        frame = _frame(
+        frame = _make_blocks(
             masks[places[0]], time, length, step, product["window_coverage"].values[places[0][0]]
         )
         series = (
@@ -142,19 +144,21 @@ def correlate(
             others_there = [product[name].values for name in others]
             for place, entry in zip(
                 places,
-                _fit(frame, series, driver, others_there, lags.astype(np.float64) * step, level),
+                _fit_driver(
+                    frame, series, driver, others_there, lags.astype(np.float64) * step, level
+                ),
                 strict=True,
             ):
                 entries[(*place, d)] = entry
-    _adjust(entries)
+    _adjust_p_values(entries)
     for (a, v, d), entry in entries.items():
         entry["units"] = slope_units(str(product[names[v]].attrs.get("units", "1")), found[d].units)
         what = f"{names[v].replace('_', ' ')} of axis {product['axis'].values[a]}"
-        entry["statement"] = statement(entry, found[d].label, what)
+        entry["statement"] = describe_coupling(entry, found[d].label, what)
     return assemble(product, names, found, entries, level=level, longest=float(lags[-1] * step))
 
 
-def _variables(product: xr.Dataset, variables: str | Sequence[str] | None) -> list[str]:
+def _select_variables(product: xr.Dataset, variables: str | Sequence[str] | None) -> list[str]:
     if variables is None:
         seen = [
             term
@@ -171,7 +175,7 @@ def _variables(product: xr.Dataset, variables: str | Sequence[str] | None) -> li
     return names
 
 
-def _lengths(product: xr.Dataset, time: Array) -> tuple[float, float]:
+def _window_lengths(product: xr.Dataset, time: Array) -> tuple[float, float]:
     """Length and step of the windows [s]."""
     bounds = product["time_bounds"].values
     length = (
@@ -183,7 +187,7 @@ def _lengths(product: xr.Dataset, time: Array) -> tuple[float, float]:
     return length, float(product.attrs.get("step_s", apart))
 
 
-def _lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
+def _choose_lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
     longest = (
         0.1 * span if max_lag is None else duration_seconds(max_lag, "max_lag") if max_lag else 0.0
     )
@@ -192,10 +196,10 @@ def _lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
             f"max_lag {max_lag} is longer than the record ({span:g} s); give a shorter --max-lag"
         )
     most = int(longest / step + 1e-9)
-    return np.unique(np.rint(np.linspace(0, most, min(most + 1, _LAGS))).astype(np.int64))
+    return np.unique(np.rint(np.linspace(0, most, min(most + 1, _MAX_LAGS))).astype(np.int64))
 
 
-def _usable(
+def _usable_windows(
     product: xr.Dataset, names: list[str], lags: NDArray[np.int64], found: list[Driver]
 ) -> tuple[dict[tuple[int, int], NDArray[np.bool_]], NDArray[np.int64], list[Driver]]:
     """Windows of each (axis, variable) in which series and driver are known at every lag; lags that cost over a third are left out."""
@@ -218,36 +222,36 @@ def _usable(
     return masks, lags, found
 
 
-def _frame(
+def _make_blocks(
     mask: NDArray[np.bool_], time: Array, length: float, step: float, share: Array
-) -> _Frame | None:
+) -> _Blocks | None:
     """Blocks of whole windows, as long as a window at least; None when there are too few."""
     windows = np.flatnonzero(mask)
-    every = max(1, round(length / step / _PER_WINDOW))
+    every = max(1, round(length / step / _MAX_WINDOWS_PER_LENGTH))
     windows = (
         windows[np.rint(time[windows] / step).astype(np.int64) % every == 0]
         if every > 1
         else windows
     )
-    if windows.size < _FEWEST:
+    if windows.size < _MIN_BLOCKS:
         return None
     at = time[windows]
-    hop = max(length, step, (np.count_nonzero(mask) * step) / _BLOCKS)
+    hop = max(length, step, (np.count_nonzero(mask) * step) / _MAX_BLOCKS)
     numbers = np.unique((at / hop).astype(np.int64), return_inverse=True)[1]
-    if numbers[-1] + 1 < _FEWEST:
+    if numbers[-1] + 1 < _MIN_BLOCKS:
         return None
-    average, centre, white = averages(numbers, at, length, np.clip(share[windows], 0.05, 1.0))
+    average, centre, white = block_averages(numbers, at, length, np.clip(share[windows], 0.05, 1.0))
     apart = np.diff(centre)
     held = (numbers[-1] + 1) * hop
     pieces = np.concatenate([[0], np.cumsum(apart > max(3 * length + hop, 0.1 * held))])
     pieces = pieces.astype(np.int64)
     offsets = (pieces[:, None] == np.arange(pieces[-1] + 1)).astype(np.float64)
     trend = ((centre - centre.mean()) / (np.ptp(centre) or 1.0))[:, None]
-    return _Frame(average, windows, pieces, offsets, trend, noise_laws(centre, white))
+    return _Blocks(average, windows, pieces, offsets, trend, noise_laws(centre, white))
 
 
-def _fit(
-    frame: _Frame | None,
+def _fit_driver(
+    frame: _Blocks | None,
     series: Array,
     driver: Driver,
     others: list[Array],
@@ -256,7 +260,7 @@ def _fit(
 ) -> list[dict[str, Any]]:
     """Every number of the entries of some series that share their windows, against one driver."""
     if frame is None:
-        return [_empty({"too_few"}) for _ in range(series.shape[1])]
+        return [_empty_entry({"too_few"}) for _ in range(series.shape[1])]
     x = np.asarray(frame.average @ driver.values[:, frame.windows].T)
     y = np.asarray(frame.average @ series)
     limits = driver_limits(
@@ -266,60 +270,64 @@ def _fit(
     nuisance = frame.offsets if "no_reversal" in limits else timed
     if not limits & {"constant", "too_few"}:
         if (
-            x.shape[0] - nuisance.shape[1] - 1 < _FEWEST // 2
+            x.shape[0] - nuisance.shape[1] - 1 < _MIN_BLOCKS // 2
         ):  # nearly every block is a stretch of its own
             limits = limits | {"too_few"}
-        elif _heaviest(x[:, 0], nuisance) > _LEVERAGE:
+        elif _largest_leverage(x[:, 0], nuisance) > _MAX_LEVERAGE:
             limits = limits | {"one_moment"}
     if limits & {"constant", "too_few", "one_moment"}:
-        return [_empty(limits, windows=frame.windows.size) for _ in range(series.shape[1])]
+        return [_empty_entry(limits, windows=frame.windows.size) for _ in range(series.shape[1])]
     others = [
         np.asarray(frame.average @ np.nan_to_num(row[frame.windows]))
         for row in others
         if np.isfinite(row[frame.windows]).all()
     ]
     more = np.concatenate(
-        [timed, *(_unit(row)[:, None] for row in others if np.ptp(row) > 0)], axis=1
+        [timed, *(_standardise_series(row)[:, None] for row in others if np.ptp(row) > 0)], axis=1
     )
-    laws = beside(frame.laws, nuisance)
+    laws = project_out(frame.laws, nuisance)
     alone = (
-        beside(decompose([_covariance(frame, 0)], np.zeros(1)), nuisance)
+        project_out(decompose([_law_covariance(frame, 0)], np.zeros(1)), nuisance)
         if "no_reversal" in limits
         else None
     )
     entries = []
     for row in y.T:
         if np.ptp(row) == 0.0:
-            entries.append(_empty(limits | {"too_few"}, windows=frame.windows.size))
+            entries.append(_empty_entry(limits | {"too_few"}, windows=frame.windows.size))
             continue
-        entry = _sensitivity(laws, row, x, lags, level) | {
+        entry = _estimate_sensitivity(laws, row, x, lags, level) | {
             "limits": set(limits),
             "windows": frame.windows.size,
         }
         column = x[:, entry["best"]]
         entry |= {
-            "correlation": _partial(row, column, np.ones((row.size, 1))),
-            "partial_time": _partial(row, column, timed),
-            "partial_channels": _partial(row, column, more),
-            "effective": _effective(row, column, nuisance, entry["stderr"]),
+            "correlation": _partial_correlation(row, column, np.ones((row.size, 1))),
+            "partial_time": _partial_correlation(row, column, timed),
+            "partial_channels": _partial_correlation(row, column, more),
+            "effective": _effective_samples(row, column, nuisance, entry["stderr"]),
         }
-        entry |= _ramps(frame, entry["law"], nuisance, row[:, None], column[:, None])
+        entry |= _fit_ramps(frame, entry["law"], nuisance, row[:, None], column[:, None])
         if alone is not None:
-            white = _sensitivity(alone, row, x, lags, level)
+            white = _estimate_sensitivity(alone, row, x, lags, level)
             entry |= {
                 f"{key}_white": white[other]
                 for key, other in (("p", "p_search"), ("slope", "slope"), ("lag", "lag"))
             }
         if timed.shape[1] < more.shape[1] < row.size - 3:
             again = fit_lags(
-                beside(frame.laws, more), row[:, None] / np.std(row), _unit(column)[:, None]
+                project_out(frame.laws, more),
+                row[:, None] / np.std(row),
+                _standardise_series(column)[:, None],
             )
             entry["p_channels"] = float(p_values(again)[0, 0])
         entries.append(entry)
     return entries
 
 
-def _sensitivity(laws: Laws, y: Array, x: Array, lags: Array, level: float) -> dict[str, Any]:
+def _estimate_sensitivity(
+    laws: Laws, y: Array, x: Array, lags: Array, level: float
+) -> dict[str, Any]:
     """Lag, slope and interval of one series, and how often noise alone would do as much: at that lag, and at any.
 
     The noise is simulated under the laws by their weights. The interval leaves out 0 where the
@@ -331,14 +339,17 @@ def _sensitivity(laws: Laws, y: Array, x: Array, lags: Array, level: float) -> d
     p = p_values(fit)[0]
     best = int(np.argmin(p))
     few = np.unique(
-        np.append(np.linspace(0, lags.size - 1, min(lags.size, _SIMULATED)).astype(np.int64), best)
+        np.append(
+            np.linspace(0, lags.size - 1, min(lags.size, _MAX_SIMULATED_LAGS)).astype(np.int64),
+            best,
+        )
     )
-    for draws in _DRAWS:
-        chance = chances(laws, driver[:, few], null_weights(fit, 0), draws)
+    for draws in _NOISE_DRAWS:
+        chance = simulate_p_values(laws, driver[:, few], null_weights(fit, 0), draws)
         alone = chance[:, np.searchsorted(few, best)]
         single = calibrated(float(p[best]), alone)
         search = max(single, calibrated(float(p[best]), chance.min(axis=1)))
-        if search > _CLAIM:
+        if search > _SIGNIFICANCE:
             break
     found = slope_interval(fit, 0, best, uncalibrated(1.0 - level, alone))
     slope, error, low, high = (value * scale / float(reach[best]) for value in found)
@@ -352,11 +363,11 @@ def _sensitivity(laws: Laws, y: Array, x: Array, lags: Array, level: float) -> d
     return entry | {"slope": slope, "stderr": error, "low": low, "high": high}
 
 
-def _covariance(frame: _Frame, law: int) -> Array:
+def _law_covariance(frame: _Blocks, law: int) -> Array:
     return np.asarray(frame.laws.factor[law] @ frame.laws.factor[law].T)
 
 
-def _empty(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
+def _empty_entry(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
     names = (
         "lag",
         "slope",
@@ -375,25 +386,25 @@ def _empty(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
     return {**empty, "limits": limits, "windows": windows}
 
 
-def _heaviest(x: Array, given: Array) -> float:
+def _largest_leverage(x: Array, given: Array) -> float:
     """Largest share of one block in the variance of the driver."""
     q, _ = np.linalg.qr(given)
     left = (x - q @ (q.T @ x)) ** 2
     return float(left.max() / max(float(left.sum()), 1e-300))
 
 
-def _unit(row: Array) -> Array:
+def _standardise_series(row: Array) -> Array:
     return np.asarray((row - row.mean()) / np.std(row))
 
 
-def _partial(y: Array, x: Array, given: Array) -> float:
+def _partial_correlation(y: Array, x: Array, given: Array) -> float:
     q, _ = np.linalg.qr(given)
     y, x = y - q @ (q.T @ y), x - q @ (q.T @ x)
     size = float(np.sqrt((y @ y) * (x @ x)))
     return float(np.clip(y @ x / size, -1.0, 1.0)) if size > 0 else np.nan
 
 
-def _effective(y: Array, x: Array, nuisance: Array, error: float) -> float:
+def _effective_samples(y: Array, x: Array, nuisance: Array, error: float) -> float:
     """Number of independent samples whose ordinary regression would have this standard error; at most the blocks there are."""
     q, _ = np.linalg.qr(np.concatenate([nuisance, x[:, None]], axis=1))
     rest = y - q @ (q.T @ y)
@@ -405,10 +416,10 @@ def _effective(y: Array, x: Array, nuisance: Array, error: float) -> float:
     return float(min(y.size, wanted + nuisance.shape[1] + 1))
 
 
-def _ramps(frame: _Frame, law: int, nuisance: Array, y: Array, x: Array) -> dict[str, float]:
+def _fit_ramps(frame: _Blocks, law: int, nuisance: Array, y: Array, x: Array) -> dict[str, float]:
     """Slope while the driver rises and while it falls, each with a constant of its own."""
     up = np.gradient(x[:, 0]) > 0
-    covariance = _covariance(frame, law)
+    covariance = _law_covariance(frame, law)
     out = {}
     for name, part in (("rising", up), ("falling", ~up)):
         keep = np.flatnonzero(part)
@@ -421,15 +432,17 @@ def _ramps(frame: _Frame, law: int, nuisance: Array, y: Array, x: Array) -> dict
             ],
             axis=1,
         )
-        if keep.size < _FEWEST // 2 + columns.shape[1] or np.ptp(x[keep]) < 0.1 * np.ptp(x):
+        if keep.size < _MIN_BLOCKS // 2 + columns.shape[1] or np.ptp(x[keep]) < 0.1 * np.ptp(x):
             continue
         if (
-            np.linalg.matrix_rank(np.concatenate([columns, _unit(x[keep, 0])[:, None]], axis=1))
+            np.linalg.matrix_rank(
+                np.concatenate([columns, _standardise_series(x[keep, 0])[:, None]], axis=1)
+            )
             <= columns.shape[1]
         ):
             continue
         fit = fit_lags(
-            beside(decompose([covariance[np.ix_(keep, keep)]], np.zeros(1)), columns),
+            project_out(decompose([covariance[np.ix_(keep, keep)]], np.zeros(1)), columns),
             y[keep],
             x[keep],
         )
@@ -437,7 +450,7 @@ def _ramps(frame: _Frame, law: int, nuisance: Array, y: Array, x: Array) -> dict
     return out
 
 
-def _adjust(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:
+def _adjust_p_values(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:
     """Allow for all the entries by Holm's steps, and give every entry its verdict."""
     tested = sorted(
         (entry for entry in entries.values() if np.isfinite(entry["p_search"])),
@@ -454,12 +467,15 @@ def _adjust(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:
             entry["p_search"]
         ):
             verdict = "cannot_tell"
-        elif entry["p_adjusted"] >= _CLAIM and entry.get("p_white", 1.0) * len(tested) < _CLAIM:
+        elif (
+            entry["p_adjusted"] >= _SIGNIFICANCE
+            and entry.get("p_white", 1.0) * len(tested) < _SIGNIFICANCE
+        ):
             verdict = "not_told_apart"
-        elif entry["p_adjusted"] >= _CLAIM:
+        elif entry["p_adjusted"] >= _SIGNIFICANCE:
             verdict = "none_seen"
         else:
-            if entry.get("p_channels", 0.0) >= _CLAIM:
+            if entry.get("p_channels", 0.0) >= _SIGNIFICANCE:
                 entry["limits"].add("other_channel")
             verdict = (
                 "not_told_apart"

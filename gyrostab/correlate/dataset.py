@@ -15,7 +15,7 @@ from gyrostab.noise import TERMS
 __all__ = ["assemble", "join"]
 
 # variable -> (key of the entry, long name, units)
-_NUMBERS = {
+_STATISTICS = {
     "coupling_lag": ("lag", "time by which the variable follows the driver", "s"),
     "correlation": ("correlation", "correlation of the block means at that lag", "1"),
     "partial_correlation_time": (
@@ -69,7 +69,7 @@ def assemble(
             if driver.name in product.data_vars
             else ("time", driver.values[0], what)
         )
-    for name, (key, label, units) in _NUMBERS.items():
+    for name, (key, label, units) in _STATISTICS.items():
         made[name] = (dims, table(key), {"long_name": label, "units": units})
     made["windows_used"] = (
         dims,
@@ -90,9 +90,7 @@ def assemble(
         for d, driver in enumerate(found):
             units = slope_units(str(product[name].attrs.get("units", "1")), driver.units)
             for suffix, key in _SLOPES.items():
-                label = (
-                    f"sensitivity of {name.replace('_', ' ')} to {driver.label}{_said(key, level)}"
-                )
+                label = f"sensitivity of {name.replace('_', ' ')} to {driver.label}{_slope_label(key, level)}"
                 made[f"{name}_per_{driver.name}{suffix}"] = (
                     "axis",
                     table(key)[:, v, d],
@@ -138,7 +136,7 @@ def _limit_flags(
     return bits, {"long_name": "what limits the verdict", **meanings}
 
 
-def _said(key: str, level: float) -> str:
+def _slope_label(key: str, level: float) -> str:
     ends = {
         "stderr": "standard error",
         "low": f"lower end of the {level:.0%} interval",

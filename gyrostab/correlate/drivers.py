@@ -14,16 +14,20 @@ from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.noise import HOUR
 from gyrostab.units import INNER
 
-__all__ = ["Driver", "drivers", "other_channels", "slope_units"]
+__all__ = ["Driver", "align_drivers", "other_channels", "slope_units"]
 
 Array = NDArray[np.float64]
 
 # a hole is bridged when it is no longer than this many spacings of the channel, or than a window
-_SPACINGS = 3.0
+_MAX_GAP_SPACINGS = 3.0
 
 # Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS
 # takes "g" for the gram.
-_DIFFERENCE = {"degree_Celsius": "K", "g": "standard_free_fall", "9.80665": "standard_free_fall"}
+_DIFFERENCE_UNITS = {
+    "degree_Celsius": "K",
+    "g": "standard_free_fall",
+    "9.80665": "standard_free_fall",
+}
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Driver:
     values: Array
 
 
-def drivers(
+def align_drivers(
     product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.int64], step: float
 ) -> list[Driver]:
     """Channel and its rate of change, averaged inside the windows, for every lag.
@@ -60,22 +64,22 @@ def drivers(
     """
     if isinstance(channel, str):
         if channel not in product.data_vars or product[channel].dims != ("time",):
-            there = ", ".join(_channels(product)) or "none"
+            there = ", ".join(_channel_names(product)) or "none"
             raise OptionError(
                 f"the product has no channel {channel!r}; it has {there}; give another, or a file with --channel"
             )
         name, units = channel, str(product[channel].attrs.get("units", "1"))
-        both = _of_product(product, channel, lags, step)
+        both = _align_product_channel(product, channel, lags, step)
     else:
-        name, units = _name(channel, product), str(channel.attrs.get("units", "1"))
-        both = _of_file(channel, product, lags, step)
+        name, units = _name_channel(channel, product), str(channel.attrs.get("units", "1"))
+        both = _align_file_channel(channel, product, lags, step)
     label = name.replace("_", " ")
     return [
         Driver(name, label, units, both[0]),
         Driver(
             f"{name}_rate",
             f"rate of change of {label}",
-            _times(_difference(units), {"hour": -1}),
+            _multiply_units(_difference_unit(units), {"hour": -1}),
             both[1],
         ),
     ]
@@ -84,37 +88,39 @@ def drivers(
 def other_channels(product: xr.Dataset, driver: str) -> list[str]:
     """Channels of the product beside the driver and what is derived from it."""
     bare = driver.removesuffix("_of_file")
-    return [name for name in _channels(product) if name not in (driver, bare, f"{bare}_rate")]
+    return [name for name in _channel_names(product) if name not in (driver, bare, f"{bare}_rate")]
 
 
-def _channels(product: xr.Dataset) -> list[str]:
+def _channel_names(product: xr.Dataset) -> list[str]:
     numeric = (
         name for name, v in product.data_vars.items() if v.dims == ("time",) and v.dtype.kind == "f"
     )
     return [str(name) for name in numeric]
 
 
-def _name(channel: xr.DataArray, product: xr.Dataset) -> str:
+def _name_channel(channel: xr.DataArray, product: xr.Dataset) -> str:
     name = str(channel.name or "channel")
     return f"{name}_of_file" if name in product.variables else name
 
 
-def _nanoseconds(stamps: Any) -> NDArray[np.int64]:
+def _to_nanoseconds(stamps: Any) -> NDArray[np.int64]:
     return np.asarray(stamps).astype("datetime64[ns]").astype(np.int64)
 
 
-def _grid(product: xr.Dataset, step: float) -> NDArray[np.int64]:
-    time = _nanoseconds(product["time"].values)
+def _grid_positions(product: xr.Dataset, step: float) -> NDArray[np.int64]:
+    time = _to_nanoseconds(product["time"].values)
     return np.asarray(np.rint((time - time[0]) / 1e9 / step), dtype=np.int64)
 
 
-def _lagged(whole: Array, before: int, place: NDArray[np.int64], lags: NDArray[np.int64]) -> Array:
+def _shift_by_lags(
+    whole: Array, before: int, place: NDArray[np.int64], lags: NDArray[np.int64]
+) -> Array:
     """Values that lie each lag earlier, of a row on the grid of windows that begins `before` steps ahead of the first window."""
     at = place[None, :] - lags[:, None] + before
     return np.where(at >= 0, whole[np.maximum(at, 0)], np.nan)
 
 
-def _bridged(whole: Array, most: float) -> Array:
+def _bridge_gaps(whole: Array, most: float) -> Array:
     """Draw a line across holes of at most so many windows; longer ones and the ends stay as they are."""
     known = np.flatnonzero(np.isfinite(whole))
     wide = np.diff(known)
@@ -124,44 +130,44 @@ def _bridged(whole: Array, most: float) -> Array:
     return whole
 
 
-def _length(product: xr.Dataset) -> int:
+def _window_length_ns(product: xr.Dataset) -> int:
     """Length of a window [ns]."""
-    bounds = _nanoseconds(product["time_bounds"].values)
+    bounds = _to_nanoseconds(product["time_bounds"].values)
     return int(np.median(bounds[:, 1] - bounds[:, 0]))
 
 
-def _of_product(
+def _align_product_channel(
     product: xr.Dataset, name: str, lags: NDArray[np.int64], step: float
 ) -> list[Array]:
-    place = _grid(product, step)
+    place = _grid_positions(product, step)
     mean = np.full(int(place[-1]) + 1, np.nan)
     mean[place] = product[name].values
     apart = np.diff(np.flatnonzero(np.isfinite(mean)))
     most = (
         max(
-            _length(product) / 1e9 / step,
-            _SPACINGS * float(np.median(apart)) if apart.size else 0.0,
+            _window_length_ns(product) / 1e9 / step,
+            _MAX_GAP_SPACINGS * float(np.median(apart)) if apart.size else 0.0,
         )
         + 1e-6
     )
-    mean = _bridged(mean, most)
+    mean = _bridge_gaps(mean, most)
     if f"{name}_rate" in product.data_vars:
         rate = np.full(mean.size, np.nan)
         rate[place] = product[f"{name}_rate"].values
-        rate = _bridged(rate, most)
+        rate = _bridge_gaps(rate, most)
     else:
-        rate = _slope(mean, step)
-    return [_lagged(row, 0, place, lags) for row in (mean, rate)]
+        rate = _difference_means(mean, step)
+    return [_shift_by_lags(row, 0, place, lags) for row in (mean, rate)]
 
 
-def _slope(mean: Array, step: float) -> Array:
+def _difference_means(mean: Array, step: float) -> Array:
     """Rate of change [1/hour] of a row of window means, from its neighbours."""
     slope = np.full(mean.size, np.nan)
     slope[1:-1] = (mean[2:] - mean[:-2]) / (2.0 * step / HOUR)
     return slope
 
 
-def _of_file(
+def _align_file_channel(
     channel: xr.DataArray, product: xr.Dataset, lags: NDArray[np.int64], step: float
 ) -> list[Array]:
     """Mean and slope of a channel on its own time inside the windows, from the longest lag before the first window on.
@@ -169,29 +175,29 @@ def _of_file(
     A channel with fewer than two values in a window is interpolated to the middle of the windows
     instead.
     """
-    values, stamps = _checked(channel, product)
-    place, before = _grid(product, step), int(lags[-1])
+    values, stamps = _check_channel(channel, product)
+    place, before = _grid_positions(product, step), int(lags[-1])
     start = np.rint(np.arange(-before, place[-1] + 1) * step * 1e9).astype(np.int64)
-    start += _nanoseconds(product["time_bounds"].values[0, 0])
-    start[before + place] = _nanoseconds(product["time_bounds"].values[:, 0])
-    length = _length(product)
+    start += _to_nanoseconds(product["time_bounds"].values[0, 0])
+    start[before + place] = _to_nanoseconds(product["time_bounds"].values[:, 0])
+    length = _window_length_ns(product)
     first, last = np.searchsorted(stamps, start), np.searchsorted(stamps, start + length)
     held = last - first
     spacing = float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
-    longest = max(length, _SPACINGS * spacing)
+    longest = max(length, _MAX_GAP_SPACINGS * spacing)
     if spacing > 0.5 * length:
-        mean = _between(values, stamps, start + length // 2, longest)
-        rate = _slope(mean, step)
+        mean = _interpolate_values(values, stamps, start + length // 2, longest)
+        rate = _difference_means(mean, step)
     else:
         mean, rate = window_trend(values, (stamps - stamps[0]) / 1e9, first, last)
         thin = held < 0.5 * np.median(held[held > 0])
         mean[thin] = rate[thin] = np.nan
         most = longest / 1e9 / step + 1e-6
-        mean, rate = _bridged(mean, most), _bridged(rate * HOUR, most)
-    return [_lagged(row, before, place, lags) for row in (mean, rate)]
+        mean, rate = _bridge_gaps(mean, most), _bridge_gaps(rate * HOUR, most)
+    return [_shift_by_lags(row, before, place, lags) for row in (mean, rate)]
 
 
-def _between(
+def _interpolate_values(
     values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], longest: float
 ) -> Array:
     """A line from each value to the next, NaN before the first, after the last and where two are too far apart."""
@@ -204,7 +210,7 @@ def _between(
     return np.where(inside, values[after - 1] + share * (values[after] - values[after - 1]), np.nan)
 
 
-def _checked(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray[np.int64]]:
+def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray[np.int64]]:
     if channel.ndim != 1 or channel.dtype.kind not in "iuf":
         raise SchemaError(
             f"channel {channel.name!r} must be numbers along one dimension of time; it has dimensions {channel.dims}"
@@ -215,28 +221,28 @@ def _checked(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray
             f"channel {channel.name!r} has no coordinate {dim!r} of dates; give it one"
         )
     good = np.isfinite(channel.values) & ~np.isnat(channel[dim].values)
-    stamps = _nanoseconds(channel[dim].values[good])
+    stamps = _to_nanoseconds(channel[dim].values[good])
     order = np.argsort(stamps, kind="stable")
     stamps, values = stamps[order], channel.values[good][order].astype(np.float64)
-    bounds = _nanoseconds(product["time_bounds"].values)
+    bounds = _to_nanoseconds(product["time_bounds"].values)
     if not stamps.size or stamps[-1] < bounds[0, 0] or stamps[0] >= bounds[-1, 1]:
         said = (
             "holds no value"
             if not stamps.size
-            else f"spans {_day(stamps[0])} to {_day(stamps[-1])}"
+            else f"spans {_stamp_text(stamps[0])} to {_stamp_text(stamps[-1])}"
         )
         raise TimeError(
-            f"channel {channel.name!r} {said}, the product {_day(bounds[0, 0])} to {_day(bounds[-1, 1])}: they do not overlap; "
+            f"channel {channel.name!r} {said}, the product {_stamp_text(bounds[0, 0])} to {_stamp_text(bounds[-1, 1])}: they do not overlap; "
             "check the file, or the zero of its time with --epoch"
         )
     return values, stamps
 
 
-def _day(stamp: Any) -> str:
+def _stamp_text(stamp: Any) -> str:
     return str(np.datetime64(int(stamp), "ns").astype("datetime64[s]"))
 
 
-def _powers(units: str) -> dict[str, int]:
+def _unit_powers(units: str) -> dict[str, int]:
     powers: dict[str, int] = {}
     for word in units.split():
         bare = word.rstrip("-0123456789") or word
@@ -245,13 +251,13 @@ def _powers(units: str) -> dict[str, int]:
     return powers
 
 
-def _difference(units: str) -> str:
+def _difference_unit(units: str) -> str:
     """Unit of a difference: kelvin for degrees Celsius."""
-    return " ".join(_DIFFERENCE.get(word, word) for word in units.split())
+    return " ".join(_DIFFERENCE_UNITS.get(word, word) for word in units.split())
 
 
-def _times(units: str, more: dict[str, int]) -> str:
-    powers = _powers(units)
+def _multiply_units(units: str, more: dict[str, int]) -> str:
+    powers = _unit_powers(units)
     for name, power in more.items():
         powers[name] = powers.get(name, 0) + power
     words = [name if power == 1 else f"{name}{power}" for name, power in powers.items() if power]
@@ -266,5 +272,5 @@ def slope_units(units: str, driver: str) -> str:
     >>> slope_units(INNER["rate"], INNER["temperature"]), slope_units("microradian", "K hour-1")
     ('degree hour-1 K-1', 'microradian K-1 hour')
     """
-    below = {name: -power for name, power in _powers(_difference(driver)).items()}
-    return _times(_difference(units) if units in INNER.values() else units, below)
+    below = {name: -power for name, power in _unit_powers(_difference_unit(driver)).items()}
+    return _multiply_units(_difference_unit(units) if units in INNER.values() else units, below)

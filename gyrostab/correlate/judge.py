@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LIMITS", "VERDICTS", "chance", "driver_limits", "plain_units", "statement"]
+__all__ = [
+    "LIMITS",
+    "VERDICTS",
+    "describe_coupling",
+    "driver_limits",
+    "format_p_value",
+    "readable_units",
+]
 
 Array = NDArray[np.float64]
 
@@ -24,17 +31,17 @@ LIMITS = {
     "no_plateau": "{driver} never rests, so a lasting effect and one of its rate of change look alike",
     "other_channel": "another channel explains it as well",
 }
-_FEWEST = 12
-_QUANTUM = {"degree_Celsius": 0.02}  # a smaller range of the channel counts as none
+_MIN_BLOCKS = 12
+_MIN_RANGE = {"degree_Celsius": 0.02}  # a smaller range of the channel counts as none
 
 
 def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: bool) -> set[str]:
     """Say why a driver may not tell, from its block means `x` in the stretches `pieces` between long gaps."""
     found = set()
     span = float(np.ptp(x)) if x.size else 0.0
-    if x.size < _FEWEST:
+    if x.size < _MIN_BLOCKS:
         found.add("too_few")
-    if span <= max(_QUANTUM.get(units, 0.0), 1e-9 * float(np.abs(x).max(initial=0.0))):
+    if span <= max(_MIN_RANGE.get(units, 0.0), 1e-9 * float(np.abs(x).max(initial=0.0))):
         return found | {"constant"}
     inside = sum(
         float(((x[pieces == piece] - x[pieces == piece].mean()) ** 2).sum())
@@ -46,14 +53,14 @@ def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: b
     fall = float((np.maximum.accumulate(x) - x).max())
     if min(rise, fall) < 0.25 * span:
         found.add("no_reversal")
-    if not derived and x.size >= _FEWEST:
+    if not derived and x.size >= _MIN_BLOCKS:
         pace = np.abs(np.gradient(x))
         if np.mean(pace < 0.1 * np.quantile(pace, 0.95)) < 0.1:
             found.add("no_plateau")
     return found
 
 
-def plain_units(units: str) -> str:
+def readable_units(units: str) -> str:
     """Spell a unit of UDUNITS as people write it.
 
     Examples
@@ -75,7 +82,7 @@ def plain_units(units: str) -> str:
     return (" ".join(above) or "1") + below
 
 
-def chance(p: float) -> str:
+def format_p_value(p: float) -> str:
     """Write a p-value; beyond the reach of the simulation only that it is small.
 
     Examples
@@ -86,7 +93,7 @@ def chance(p: float) -> str:
     return "<0.0001" if p < 1e-4 else f"{p:.2g}"
 
 
-def statement(entry: dict[str, Any], driver: str, series: str) -> str:
+def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
     """One sentence of plain words about an entry."""
     reasons = [LIMITS[name].format(driver=driver) for name in LIMITS if name in entry["limits"]]
     verdict = VERDICTS[entry["verdict"]]
@@ -97,12 +104,12 @@ def statement(entry: dict[str, Any], driver: str, series: str) -> str:
             if name in entry["limits"]
         ]
         return f"The record cannot tell whether {series} follows {driver}: {'; '.join(hard) or 'no window holds both'}."
-    units = plain_units(entry["units"])
+    units = readable_units(entry["units"])
     between = f"{entry['low']:.3g} to {entry['high']:.3g}"
     number = f"{entry['slope']:.3g} ({between}) {units}"
     late = f" {entry['lag']:.3g} s later" if entry["lag"] else ""
     start = series[0].upper() + series[1:]
-    odds = f"p {'' if entry['p_adjusted'] < 1e-4 else '= '}{chance(entry['p_adjusted'])}"
+    odds = f"p {'' if entry['p_adjusted'] < 1e-4 else '= '}{format_p_value(entry['p_adjusted'])}"
     if verdict == "none_seen":
         apart = not entry["low"] <= 0.0 <= entry["high"]
         note = (

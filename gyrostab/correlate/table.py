@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.correlate.judge import VERDICTS, chance, plain_units
+from gyrostab.correlate.judge import VERDICTS, format_p_value, readable_units
 
 __all__ = ["correlation_rows", "format_correlation"]
 
@@ -50,10 +50,10 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                         f"{result.attrs['interval_level']:.0%} interval": "-"
                         if np.isnan(low)
                         else f"{low:.3g} .. {high:.3g}",
-                        "unit": plain_units(str(slope.attrs["units"])),
+                        "unit": readable_units(str(slope.attrs["units"])),
                         "r": r,
                         "n eff": n,
-                        "p adjusted": "-" if np.isnan(p) else chance(p),
+                        "p adjusted": "-" if np.isnan(p) else format_p_value(p),
                         "verdict": VERDICTS[int(cell["coupling_verdict"])].replace("_", " "),
                     }
                 )

@@ -64,7 +64,7 @@ def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
 
 
 @njit(**KERNEL)
-def _relax(
+def _relax_mode(
     change: Array, decay: Array, gain: Array, weight: Array, carry: Array
 ) -> tuple[Array, Array]:
     size, count = change.size, decay.size
@@ -108,14 +108,14 @@ def relax(
     """
     last, position = carry
     change = np.diff(values, prepend=last) * rate
-    total, position = _relax(
+    total, position = _relax_mode(
         change, np.exp(-1.0 / (rate * times)), -np.expm1(-1.0 / (rate * times)), weight, position
     )
     return total, (float(values[-1]), position)
 
 
 @njit(**KERNEL)
-def _follow(at: Array, values: Array, time: float) -> Array:
+def _follow_values(at: Array, values: Array, time: float) -> Array:
     behind = 0.0
     out = np.empty(at.size)
     out[0] = values[0]
@@ -153,8 +153,8 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
     >>> mean_changes(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.01)
     array([0.1998, 0.2   ])
     """
-    at, line = _joined(known, values, begin, end)
-    followed = _follow(at, line, time)
+    at, line = _polygon_corners(known, values, begin, end)
+    followed = _follow_values(at, line, time)
     return np.asarray(
         (followed[np.searchsorted(at, end)] - followed[np.searchsorted(at, begin)]) / (end - begin)
     )
@@ -178,8 +178,8 @@ def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: f
     >>> mean_followed(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.5).round(4)
     array([0.905, 2.9  ])
     """
-    at, line = _joined(known, values, begin, end)
-    followed = _follow(at, line, time)
+    at, line = _polygon_corners(known, values, begin, end)
+    followed = _follow_values(at, line, time)
     total = np.concatenate([[0.0], np.cumsum((line[1:] + line[:-1]) / 2.0 * np.diff(at))])
     whole = total - time * followed  # the integral of y is that of T less t times the growth of y
     return np.asarray(
@@ -205,13 +205,13 @@ def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
     >>> mean_rates(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]))
     array([0.2, 0.2])
     """
-    at, line = _joined(known, values, begin, end)
+    at, line = _polygon_corners(known, values, begin, end)
     return np.asarray(
         (line[np.searchsorted(at, end)] - line[np.searchsorted(at, begin)]) / (end - begin)
     )
 
 
-def _joined(known: Array, values: Array, begin: Array, end: Array) -> tuple[Array, Array]:
+def _polygon_corners(known: Array, values: Array, begin: Array, end: Array) -> tuple[Array, Array]:
     """Times and values of the polygon through the known values, with corners at the edges of intervals as well."""
     at = np.unique(np.concatenate([known, begin, end]))
     line = np.interp(at, known, values)
@@ -271,7 +271,7 @@ def mean_play(known: Array, values: Array, begin: Array, end: Array, width: floa
     >>> mean_play(np.array([0.0, 10.0, 20.0]), np.array([0.0, 10.0, 0.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 2.5).round(2)
     array([ 2.19, -1.25])
     """
-    at, line = _joined(known, values, begin, end)
+    at, line = _polygon_corners(known, values, begin, end)
     corner = (
         np.arange(8 * (at.size - 1) + 1) / 8.0
     )  # the slider starts and stops between the corners of the polygon

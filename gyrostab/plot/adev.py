@@ -55,7 +55,9 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     """
     check_surface(product)
     (name,) = axis_names(product, axis)
-    windows = product.sel(axis=[name]).isel(time=[_window(product.sel(axis=name), when)]).compute()
+    windows = (
+        product.sel(axis=[name]).isel(time=[_select_window(product.sel(axis=name), when)]).compute()
+    )
     window = windows.isel(axis=0, time=0)
     tau = window["tau"].values
     figure = new_figure(8.0, 5.8, stacked=True)
@@ -133,7 +135,7 @@ def band(avar: Any, edf: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     return avar * edf / chdtri(edf, 0.025), avar * edf / chdtri(edf, 0.975)
 
 
-def _window(part: xr.Dataset, when: Any) -> int:
+def _select_window(part: xr.Dataset, when: Any) -> int:
     time = part["time"].values.astype("datetime64[ns]")
     if when is None:
         coverage = part["window_coverage"].values

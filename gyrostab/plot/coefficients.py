@@ -62,20 +62,20 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
     figure = new_figure(10.0, 10.5, stacked=True)
     panels = figure.subplots(len(LAWS), 1, sharex=True)
     time = product["time"].values
-    edges = _edges(time)
+    edges = _time_edges(time)
     for panel, (symbol, law) in zip(panels, LAWS.items(), strict=True):
         for name in names:
             _draw_axis(panel, product.sel(axis=name), symbol, name, axis_style(product, name))
             hidden = product["observable"].sel(axis=name, term=symbol).values == _NOT
             if hidden.any():
-                first, last = _runs(hidden)
+                first, last = _find_runs(hidden)
                 shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(names))
-        _scale(panel, product, symbol, names)
+        _set_scale(panel, product, symbol, names)
         panel.set_ylabel(f"{symbol} [{law.label}]")
         panel.set_title(law.name, loc="left", fontsize="medium", pad=3, y=1.0)
         panel.grid(alpha=0.3)
     figure.legend(
-        handles=_key(product, names),
+        handles=_legend_handles(product, names),
         loc="lower center",
         ncols=len(names) + 3,
         fontsize="small",
@@ -133,7 +133,7 @@ def _draw_axis(
     limits.set_gid(f"upper {symbol} {name}")
 
 
-def _scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> None:
+def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> None:
     """Log scale where the numbers span more than a decade, else linear from zero."""
     chosen = product.sel(axis=names)
     state = chosen["observable"].sel(term=symbol).values
@@ -161,7 +161,7 @@ def _scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> N
         )
 
 
-def _key(product: xr.Dataset, names: list[str]) -> list[Any]:
+def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -197,14 +197,14 @@ def _key(product: xr.Dataset, names: list[str]) -> list[Any]:
     return keys
 
 
-def _edges(time: NDArray[Any]) -> NDArray[Any]:
+def _time_edges(time: NDArray[Any]) -> NDArray[Any]:
     stamps = time.astype("datetime64[ns]").astype(np.int64)
     half = int(np.median(np.diff(stamps)) // 2) if stamps.size > 1 else 5 * 10**8
     inner = stamps[:-1] + np.diff(stamps) // 2
     return np.concatenate([[stamps[0] - half], inner, [stamps[-1] + half]]).astype("datetime64[ns]")
 
 
-def _runs(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def _find_runs(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """First index of each run of True, and the index after its last."""
     steps = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
     return np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)

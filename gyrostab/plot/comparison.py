@@ -111,25 +111,25 @@ def plot_comparison(
         else f"{seconds:g} s"
     )
     if moments:
-        _curves(
+        _draw_curves(
             panels[0, 0], logs, pair, [duration_seconds(moment, "moment") for moment in moments]
         )
         panels[0, 0].set_title(f"Allan deviation, windows of {name}")
     else:
-        _ratio(panels[0, 0], logs, pair)
+        _draw_ratio(panels[0, 0], logs, pair)
         panels[0, 0].set_title(f"σ with / σ without, windows of {name}")
-    _means(panels[0, 1], logs, pair, difference=difference)
+    _draw_means(panels[0, 1], logs, pair, difference=difference)
     if driver:
-        _channel(panels[0, 1], with_it, driver)
-    _spectrum(panels[1, 0], logs)
-    (_coherency if coherency else _correlation)(panels[1, 1], logs)
+        _draw_channel(panels[0, 1], with_it, driver)
+    _draw_spectra(panels[1, 0], logs)
+    (_draw_coherency if coherency else _draw_allan_correlation)(panels[1, 1], logs)
     for panel in panels.flat:
         panel.title.set_size("medium")
         panel.grid(visible=True, lw=0.3, alpha=0.6)
     return figure
 
 
-def _since(log: xr.Dataset, times: Any) -> tuple[Any, str]:
+def _time_since_start(log: xr.Dataset, times: Any) -> tuple[Any, str]:
     """Times since the start of the log, and their unit: hours for long logs, else minutes."""
     hour = np.timedelta64(int(HOUR) * 10**9, "ns")
     start, end = log["time"].values[[0, -1]]
@@ -137,8 +137,8 @@ def _since(log: xr.Dataset, times: Any) -> tuple[Any, str]:
     return (np.asarray(times) - start) / unit, word
 
 
-def _curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> None:
-    centres, word = _since(logs[0], pair[0]["time"].values)
+def _draw_curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> None:
+    centres, word = _time_since_start(logs[0], pair[0]["time"].values)
     tau = pair[0]["tau"].values
     panel.loglog(
         tau,
@@ -155,10 +155,10 @@ def _curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> None:
     panel.set(xlabel="averaging time [s]", ylabel="[deg/h]")
 
 
-def _ratio(panel: Axes, logs: Any, pair: Any) -> None:
+def _draw_ratio(panel: Axes, logs: Any, pair: Any) -> None:
     from matplotlib.colors import LogNorm
 
-    centres, word = _since(logs[0], pair[0]["time"].values)
+    centres, word = _time_since_start(logs[0], pair[0]["time"].values)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(pair[1]["avar"].values / pair[0]["avar"].values)
     size = np.abs(np.log(ratio[np.isfinite(ratio) & (ratio > 0)]))
@@ -182,13 +182,13 @@ def _ratio(panel: Axes, logs: Any, pair: Any) -> None:
     bar.set_ticks([1 / tick, 1, tick], labels=[f"1/{tick:g}", "1", f"{tick:g}"])
 
 
-def _means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
+def _draw_means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
     first = pair[0]["window_mean"] if difference else 0.0
-    centres, word = _since(logs[0], pair[0]["time"].values)
+    centres, word = _time_since_start(logs[0], pair[0]["time"].values)
     for product, style, label in zip(pair, _STYLES, ("without", "with"), strict=True):
         panel.plot(centres, product["window_mean"] - first, **style, label=label)
     gaps = [
-        _since(logs[0], logs[0][edge].values)[0]
+        _time_since_start(logs[0], logs[0][edge].values)[0]
         for edge in ("gap_start", "gap_end")
         if logs[0].sizes.get("gap")
     ]
@@ -212,11 +212,11 @@ def _means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
     panel.legend(fontsize="x-small", frameon=False)
 
 
-def _channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
+def _draw_channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
     """Dot a channel behind the window means, on a scale of its own."""
     twin = panel.twinx()
     stamps, low, high = thin(log[driver], columns=400)
-    times, _ = _since(log, stamps)
+    times, _ = _time_since_start(log, stamps)
     if np.nanquantile(high - low, 0.8) <= 0.05 * (np.nanmax(high) - np.nanmin(low)):
         twin.plot(times, (low + high) / 2, ":", color=COLOURS[1], lw=1.2)
     else:  # faster than the columns of the figure
@@ -227,7 +227,7 @@ def _channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
     panel.set(zorder=twin.get_zorder() + 1, facecolor="none")
 
 
-def _filled(log: xr.Dataset) -> tuple[Array, Array]:
+def _interpolate_gaps(log: xr.Dataset) -> tuple[Array, Array]:
     """The first two axes, straight across the gaps: for spectra."""
     rows = log["rate"].transpose("axis", "time").values[:2].astype(float)
     for row in rows:
@@ -236,7 +236,7 @@ def _filled(log: xr.Dataset) -> tuple[Array, Array]:
     return rows[0], rows[1]
 
 
-def _spectrum(panel: Axes, logs: Any) -> None:
+def _draw_spectra(panel: Axes, logs: Any) -> None:
     from scipy.signal import welch
 
     for log, style in zip(logs, _STYLES, strict=True):
@@ -245,17 +245,17 @@ def _spectrum(panel: Axes, logs: Any) -> None:
             "nperseg": max(8, log.sizes["time"] // 10),
             "detrend": "linear",
         }
-        f, power = welch(_filled(log)[0], **how)
+        f, power = welch(_interpolate_gaps(log)[0], **how)
         panel.loglog(f[1:], power[1:], **style | {"lw": style["lw"] * 0.8})
     label_log_axis(panel.yaxis, *panel.get_ylim())
     panel.set(title="Power spectrum", xlabel="frequency [Hz]", ylabel="[(deg/h)²/Hz]")
 
 
-def _names(log: xr.Dataset) -> str:
+def _join_axis_names(log: xr.Dataset) -> str:
     return " and ".join(str(name) for name in log["axis"].values[:2])
 
 
-def _coherency(panel: Axes, logs: Any) -> None:
+def _draw_coherency(panel: Axes, logs: Any) -> None:
     from scipy.signal import csd, welch
 
     for log, style, quadrature in zip(logs, _STYLES, (GREY, COLOURS[1]), strict=True):
@@ -264,16 +264,18 @@ def _coherency(panel: Axes, logs: Any) -> None:
             "nperseg": max(8, log.sizes["time"] // 30),
             "detrend": "linear",
         }
-        x, y = _filled(log)
+        x, y = _interpolate_gaps(log)
         f, cross = csd(x, y, **how)
         ratio = cross / np.sqrt(welch(x, **how)[1] * welch(y, **how)[1])
         panel.semilogx(f[1:], ratio.imag[1:], "--", color=quadrature, lw=0.9, label="in quadrature")
         panel.semilogx(f[1:], ratio.real[1:], **style | {"lw": style["lw"] * 0.8}, label="in phase")
     panel.legend(handles=panel.get_lines()[:1:-1], fontsize="x-small", frameon=False)
-    panel.set(title=f"Coherency of {_names(logs[0])}", xlabel="frequency [Hz]", ylim=(-1.1, 1.1))
+    panel.set(
+        title=f"Coherency of {_join_axis_names(logs[0])}", xlabel="frequency [Hz]", ylim=(-1.1, 1.1)
+    )
 
 
-def _correlation(panel: Axes, logs: Any) -> None:
+def _draw_allan_correlation(panel: Axes, logs: Any) -> None:
     from gyrostab.allan.davar import davar
 
     for log, style in zip(logs, _STYLES, strict=True):
@@ -292,7 +294,7 @@ def _correlation(panel: Axes, logs: Any) -> None:
             chance = 2.0 / np.sqrt(whole["edf"].values[0])
             panel.fill_between(whole["tau"].values, -chance, chance, color=GREY, alpha=0.15, lw=0)
     panel.set(
-        title=f"Allan correlation of {_names(logs[0])}",
+        title=f"Allan correlation of {_join_axis_names(logs[0])}",
         xlabel="averaging time [s]",
         ylim=(-1.1, 1.1),
     )

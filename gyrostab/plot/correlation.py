@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.correlate.judge import VERDICTS, chance
+from gyrostab.correlate.judge import VERDICTS, format_p_value
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import COLOURS, axis_names, literal_text, new_figure, unit_label
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_correlation"]
 
 _UP, _DOWN = COLOURS[1], COLOURS[0]
-_MOST = 3000
+_MAX_POINTS = 3000
 
 
 @literal_text
@@ -66,7 +66,7 @@ def plot_correlation(
     panels = figure.subplots(len(variables), len(names), sharex="col", squeeze=False)
     for row, variable in zip(panels, variables, strict=True):
         for panel, name in zip(row, names, strict=True):
-            _draw(panel, result.sel(axis=name), variable, driver)
+            _draw_panel(panel, result.sel(axis=name), variable, driver)
             panel.grid(alpha=0.3)
         units = (
             f"[{LAWS[variable].label}]"
@@ -88,7 +88,7 @@ def plot_correlation(
     for panel in panels[-1]:
         panel.set_xlabel(label)
     figure.legend(
-        handles=_key(driver, float(result.attrs.get("interval_level", 0.95))),
+        handles=_legend_handles(driver, float(result.attrs.get("interval_level", 0.95))),
         loc="outside lower center",
         ncols=3,
         fontsize="small",
@@ -97,15 +97,15 @@ def plot_correlation(
     return figure
 
 
-def _draw(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
+def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
     cell = part.sel(variable=variable, driver=driver)
     lag = float(np.nan_to_num(cell["coupling_lag"]))
-    x, rising = _shifted(part[driver], lag)
+    x, rising = _shift_driver(part[driver], lag)
     y = part[variable].values
     good = np.isfinite(x) & np.isfinite(y)
     if variable in LAWS and "observable" in part:
         good &= part["observable"].sel(term=variable).values == OBSERVABLE.index("observed")
-    every = max(1, int(good.sum()) // _MOST)
+    every = max(1, int(good.sum()) // _MAX_POINTS)
     styles: list[tuple[Any, dict[str, Any]]] = [
         (rising, {"marker": "^", "color": _UP}),
         (~rising, {"marker": "v", "color": _DOWN, "markerfacecolor": "none"}),
@@ -122,7 +122,7 @@ def _draw(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
             **style,
         )
     verdict = VERDICTS[int(cell["coupling_verdict"])]
-    panel.set_title(_heading(verdict, lag, float(cell["p_value_adjusted"])), fontsize="small")
+    panel.set_title(_verdict_text(verdict, lag, float(cell["p_value_adjusted"])), fontsize="small")
     if not good.any():
         panel.text(
             0.5,
@@ -151,17 +151,17 @@ def _draw(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> None:
     panel.set_ylim(y[good].min() - 0.1 * span, y[good].max() + 0.1 * span)
 
 
-def _heading(verdict: str, lag: float, p: float) -> str:
+def _verdict_text(verdict: str, lag: float, p: float) -> str:
     """What is said above a panel; a p-value only where it is one of the whole story."""
     late = f", {lag:.3g} s late" if lag else ""
     if verdict == "cannot_tell":
         return "cannot tell"
     if verdict == "not_told_apart":
         return f"not told apart from another cause{late}"
-    return f"{verdict.replace('_', ' ')}{late}, p {'' if p < 1e-4 else '= '}{chance(p)}"
+    return f"{verdict.replace('_', ' ')}{late}, p {'' if p < 1e-4 else '= '}{format_p_value(p)}"
 
 
-def _shifted(driver: xr.DataArray, lag: float) -> tuple[Any, Any]:
+def _shift_driver(driver: xr.DataArray, lag: float) -> tuple[Any, Any]:
     """The driver one lag earlier at every window, and whether it rises there; NaN before the record and in holes."""
     seconds = (driver["time"].values - driver["time"].values[0]) / np.timedelta64(1, "s")
     values = driver.values.astype(np.float64)
@@ -174,7 +174,7 @@ def _shifted(driver: xr.DataArray, lag: float) -> tuple[Any, Any]:
     return moved, slope > 0
 
 
-def _key(driver: str, level: float) -> list[Any]:
+def _legend_handles(driver: str, level: float) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

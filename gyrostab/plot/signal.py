@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_signal", "thin"]
 
-_BLOCK = 2**22  # samples read at a time: 32 MiB
+_BLOCK_SAMPLES = 2**22  # samples read at a time: 32 MiB
 
 
 @literal_text
@@ -85,10 +85,12 @@ def plot_signal(
     ratios = [1.2] * len(axes) + [1.0] * len(shown)
     panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
     for panel, axis_name in zip(panels, axes, strict=False):
-        _trace(panel, log[name].sel(axis=axis_name), axis_style(log, axis_name)["color"], columns)
+        _draw_trace(
+            panel, log[name].sel(axis=axis_name), axis_style(log, axis_name)["color"], columns
+        )
         panel.set_ylabel(f"{axis_name} {unit_label(log[name].attrs.get('units'))}")
     for panel, channel in zip(panels[len(axes) :], shown, strict=True):
-        _trace(panel, log[channel], "#333333", columns)
+        _draw_trace(panel, log[channel], "#333333", columns)
         panel.set_ylabel(
             f"{channel.replace('_', ' ')}\n{unit_label(log[channel].attrs.get('units'))}".rstrip()
         )
@@ -127,7 +129,7 @@ def thin(
     (dim,) = values.dims
     size = values.size
     width = -(-size // columns) if size > 2 * columns else 1
-    per_block = max(1, _BLOCK // width) * width
+    per_block = max(1, _BLOCK_SAMPLES // width) * width
     low, high = [], []
     for start in range(0, size, per_block):
         block = np.asarray(values[start : start + per_block].values, dtype=np.float64)
@@ -138,7 +140,7 @@ def thin(
     return times, np.concatenate(low), np.concatenate(high)
 
 
-def _trace(panel: Axes, values: xr.DataArray, colour: str, columns: int) -> None:
+def _draw_trace(panel: Axes, values: xr.DataArray, colour: str, columns: int) -> None:
     times, low, high = thin(values, columns=columns)
     if np.array_equal(low, high, equal_nan=True):
         lone = times.size < 60 or not np.any(np.isfinite(low[1:]) & np.isfinite(low[:-1]))
@@ -151,7 +153,7 @@ def _trace(panel: Axes, values: xr.DataArray, colour: str, columns: int) -> None
 
 
 def _shade_gaps(panels: list[Axes], log: xr.Dataset, columns: int) -> None:
-    starts, ends = _gaps(log, columns)
+    starts, ends = _find_gaps(log, columns)
     if not starts.size:
         return
     for panel in panels:
@@ -159,7 +161,7 @@ def _shade_gaps(panels: list[Axes], log: xr.Dataset, columns: int) -> None:
     panels[0].legend(loc="upper right", fontsize="small", framealpha=0.9)
 
 
-def _gaps(log: xr.Dataset, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:
+def _find_gaps(log: xr.Dataset, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Start and end of the gaps: from the table when the log has one, else where a whole column is missing on all axes."""
     if "gap_start" in log.variables and "gap_end" in log.variables:
         return log["gap_start"].values, log["gap_end"].values

@@ -70,11 +70,11 @@ def plot_davar(
     figure = new_figure(10.0, 1.3 + 2.7 * len(names), stacked=True)
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     time, tau = product["time"].values, product["tau"].values
-    cells, merged = _columns(product, names, columns)
+    cells, merged = _merge_windows(product, names, columns)
     time_edges, tau_edges = _time_edges(time, merged, product.attrs.get("step_s")), log_edges(tau)
     if relative:
-        cells = [(_over_median(deviation), weighted) for deviation, weighted in cells]
-    norm = LogNorm(*_limits([deviation for deviation, _ in cells], relative=relative))
+        cells = [(_divide_by_median(deviation), weighted) for deviation, weighted in cells]
+    norm = LogNorm(*_colour_limits([deviation for deviation, _ in cells], relative=relative))
     for panel, name, (deviation, weighted) in zip(panels, names, cells, strict=True):
         panel.set_facecolor("#d0d0d0")
         panel.patch.set_hatch("////")
@@ -104,7 +104,7 @@ def plot_davar(
             )
         )
     if any(weighted.any() for _, weighted in cells):
-        handles.append(_dot_key())
+        handles.append(_dot_handle())
     if handles:
         figure.legend(handles=handles, loc="lower left", ncols=2, fontsize="small", frameon=False)
     text = ", ".join(
@@ -154,7 +154,7 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
         raise OptionError(
             "a surface needs at least two windows and two averaging times; draw this product with plot_adev"
         )
-    ((deviation, _),), merged = _columns(product, [name], columns)
+    ((deviation, _),), merged = _merge_windows(product, [name], columns)
     time = product["time"].values
     seconds = (time[::merged] - time[0]) / np.timedelta64(1, "s")
     size, unit = unit_of_time(seconds[-1])
@@ -193,7 +193,7 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
     return figure
 
 
-def _columns(
+def _merge_windows(
     product: xr.Dataset, names: list[str], columns: int
 ) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], int]:
     """Allan deviation (time, tau) and the mark of weighted cells for each axis, and how many windows one column holds."""
@@ -215,14 +215,14 @@ def _columns(
     return cells, merged
 
 
-def _over_median(deviation: NDArray[Any]) -> NDArray[Any]:
+def _divide_by_median(deviation: NDArray[Any]) -> NDArray[Any]:
     out = np.full_like(deviation, np.nan)
     known = np.isfinite(deviation).any(axis=0)
     out[:, known] = deviation[:, known] / np.nanmedian(deviation[:, known], axis=0)
     return out
 
 
-def _limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float, float]:
+def _colour_limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float, float]:
     finite = np.concatenate([value[np.isfinite(value) & (value > 0)] for value in values])
     if not finite.size:
         return (0.5, 2.0)
@@ -289,7 +289,7 @@ def _mark_weighted(
         dots.set_gid("weighted")
 
 
-def _dot_key() -> Any:
+def _dot_handle() -> Any:
     from matplotlib.lines import Line2D
 
     style = {

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["write_report"]
 
-_LONGEST_GAPS = 20
-_GAIN = 1.5  # a variation of N over the record that is worth a sentence
+_MAX_GAPS_LISTED = 20
+_MIN_CHANGE_RATIO = 1.5  # a variation of N over the record that is worth a sentence
 
 
 def write_report(
@@ -64,37 +64,39 @@ def write_report(
 
     terms = summarise_terms(product)
     axes = dict.fromkeys(term.axis for term in terms)
-    table = [(axis, _coefficients([term for term in terms if term.axis == axis])) for axis in axes]
-    gaps = None if log is None or "gap_start" not in log.variables else _gaps(log)
+    table = [
+        (axis, _coefficient_rows([term for term in terms if term.axis == axis])) for axis in axes
+    ]
+    gaps = None if log is None or "gap_start" not in log.variables else _list_gaps(log)
     with new_output(path, overwrite=overwrite) as temporary:
         text = page_text(
             "product.html.jinja",
             title="Gyro stability report",
-            summary=_summary(product),
-            findings=_findings(product, table),
-            facts=_facts(product),
+            summary=_summarise_record(product),
+            findings=_describe_findings(product, table),
+            facts=_list_facts(product),
             table=table,
-            figures=_figures(product, log),
+            figures=_make_figures(product, log),
             gaps=gaps,
-            gap_summary=_gap_summary(log, gaps) if log is not None and gaps else "",
-            notes=_lines(product.attrs.get("notes")),
-            history=_lines(product.attrs.get("history")),
+            gap_summary=_summarise_gaps(log, gaps) if log is not None and gaps else "",
+            notes=_note_lines(product.attrs.get("notes")),
+            history=_note_lines(product.attrs.get("history")),
         )
         temporary.write_text(text, encoding="utf-8")
     return Path(path)
 
 
-def _lines(value: Any) -> list[str]:
+def _note_lines(value: Any) -> list[str]:
     if value is None:
         return []
     return value.splitlines() if isinstance(value, str) else [str(line) for line in value]
 
 
-def _stamp(time: Any) -> str:
+def _stamp_text(time: Any) -> str:
     return str(np.datetime_as_string(np.datetime64(time, "ns"), unit="s")).replace("T", " ")
 
 
-def _span(product: xr.Dataset) -> tuple[Any, Any]:
+def _record_span(product: xr.Dataset) -> tuple[Any, Any]:
     """Return the first and last moment of the record that any window covers."""
     if "time_bounds" in product.variables:
         bounds = product["time_bounds"].values
@@ -103,42 +105,44 @@ def _span(product: xr.Dataset) -> tuple[Any, Any]:
     return product["time"].values[0] - half, product["time"].values[-1] + half
 
 
-def _number(value: float) -> str:
+def _number_text(value: float) -> str:
     return "–" if not np.isfinite(value) else f"{value:.3g}"
 
 
-def _share(share: float) -> str:
+def _share_text(share: float) -> str:
     if 0.0 < share < 0.01:
         return "< 1 %"
     return "> 99 %" if 0.99 < share < 1.0 else f"{100.0 * share:.0f} %"
 
 
-def _missing(product: xr.Dataset) -> dict[str, float]:
+def _missing_shares(product: xr.Dataset) -> dict[str, float]:
     coverage = product["window_coverage"]
     return {
         str(name): 1.0 - float(coverage.sel(axis=name).mean()) for name in product["axis"].values
     }
 
 
-def _files(product: xr.Dataset) -> list[str]:
+def _file_names(product: xr.Dataset) -> list[str]:
     return [Path(name).name for name in texts(product, "source_files")]
 
 
-def _summary(product: xr.Dataset) -> str:
-    start, end = _span(product)
+def _summarise_record(product: xr.Dataset) -> str:
+    start, end = _record_span(product)
     axes = [str(name) for name in product["axis"].values]
-    files = _files(product)
+    files = _file_names(product)
     origin = f" from {len(files)} file{'s' if len(files) != 1 else ''}" if files else ""
     rate = product.attrs.get("sampling_rate_hz")
     speed = f" at {float(rate):g} samples a second" if rate is not None else ""
     length = duration(float((end - start) / np.timedelta64(1, "s")))
     return (
         f"{len(axes)} gyro {'axes' if len(axes) != 1 else 'axis'} ({', '.join(axes)}){speed}{origin}, "
-        f"{length} from {_stamp(start)} to {_stamp(end)} UTC, looked at in {product.sizes['time']} windows."
+        f"{length} from {_stamp_text(start)} to {_stamp_text(end)} UTC, looked at in {product.sizes['time']} windows."
     )
 
 
-def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]) -> list[str]:
+def _describe_findings(
+    product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]
+) -> list[str]:
     from gyrostab.allan.summary import describe_record
 
     lines = []
@@ -153,12 +157,12 @@ def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]
             if seen
             else f"Axis {axis}: no coefficient is observed in any window."
         )
-        lines.append(text + _change(product.sel(axis=axis)))
-    missing = {axis: share for axis, share in _missing(product).items() if share > 0.0}
+        lines.append(text + _describe_change(product.sel(axis=axis)))
+    missing = {axis: share for axis, share in _missing_shares(product).items() if share > 0.0}
     if missing:
         lines.append(
             "Missing samples, mean over the windows: "
-            + ", ".join(f"axis {axis} {_share(share)}" for axis, share in missing.items())
+            + ", ".join(f"axis {axis} {_share_text(share)}" for axis, share in missing.items())
             + "."
         )
     else:
@@ -166,30 +170,32 @@ def _findings(product: xr.Dataset, table: list[tuple[str, list[dict[str, Any]]]]
     return [*lines, *describe_record(product)]
 
 
-def _change(part: xr.Dataset) -> str:
+def _describe_change(part: xr.Dataset) -> str:
     """Say in a sentence how far angle random walk varies over the record, and when it is highest."""
     seen = part["observable"].sel(term="N").values == OBSERVABLE.index("observed")
     values = part["N"].values[seen]
     if values.size < 5:
         return ""
     low, high = np.quantile(values, [0.05, 0.95])
-    if low <= 0.0 or high < _GAIN * low:
+    if low <= 0.0 or high < _MIN_CHANGE_RATIO * low:
         return ""
-    when = _stamp(part["time"].values[seen][np.argmax(values)])
-    return f" Angle random walk varies from {_number(low)} to {_number(high)} deg/sqrt(h) and is highest around {when}."
+    when = _stamp_text(part["time"].values[seen][np.argmax(values)])
+    return f" Angle random walk varies from {_number_text(low)} to {_number_text(high)} deg/sqrt(h) and is highest around {when}."
 
 
-def _facts(product: xr.Dataset) -> list[tuple[str, str]]:
+def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
     attrs = product.attrs
-    start, end = _span(product)
+    start, end = _record_span(product)
     tau = product["tau"].values
     facts = [
-        ("Files", ", ".join(_files(product)) or "not recorded"),
-        ("Span (UTC)", f"{_stamp(start)} to {_stamp(end)}"),
+        ("Files", ", ".join(_file_names(product)) or "not recorded"),
+        ("Span (UTC)", f"{_stamp_text(start)} to {_stamp_text(end)}"),
         ("Axes", ", ".join(str(name) for name in product["axis"].values)),
         (
             "Missing samples",
-            ", ".join(f"{axis}: {_share(share)}" for axis, share in _missing(product).items()),
+            ", ".join(
+                f"{axis}: {_share_text(share)}" for axis, share in _missing_shares(product).items()
+            ),
         ),
         (
             "Averaging times",
@@ -215,11 +221,11 @@ def _facts(product: xr.Dataset) -> list[tuple[str, str]]:
         for name, label in plain.items()
         if name in attrs
     ]
-    shares = [f"{label}: {_share(share)}" for label, share in _estimators(product)]
+    shares = [f"{label}: {_share_text(share)}" for label, share in _estimator_shares(product)]
     return [*facts, ("Cells of the surface", ", ".join(shares))]
 
 
-def _estimators(product: xr.Dataset) -> list[tuple[str, float]]:
+def _estimator_shares(product: xr.Dataset) -> list[tuple[str, float]]:
     labels = ("no estimate", "from complete clusters", "from incomplete (weighted) clusters")
     counts = np.bincount(
         np.asarray(product["estimator"].values, dtype=np.int64).ravel(), minlength=len(labels)
@@ -227,37 +233,37 @@ def _estimators(product: xr.Dataset) -> list[tuple[str, float]]:
     return [(label, float(counts[number] / counts.sum())) for number, label in enumerate(labels)]
 
 
-def _coefficients(terms: list[TermSummary]) -> list[dict[str, Any]]:
+def _coefficient_rows(terms: list[TermSummary]) -> list[dict[str, Any]]:
     return [
         {
             "symbol": term.symbol,
             "name": LAWS[term.symbol].name,
             "unit": term.unit,
-            "median": _number(term.median),
-            "range": f"{_number(term.low)} to {_number(term.high)}"
+            "median": _number_text(term.median),
+            "range": f"{_number_text(term.low)} to {_number_text(term.high)}"
             if np.isfinite(term.median)
             else "–",
-            "observed": _share(term.observed_share),
-            "rare": f" (observed in {_share(term.observed_share)} of the windows only)"
+            "observed": _share_text(term.observed_share),
+            "rare": f" (observed in {_share_text(term.observed_share)} of the windows only)"
             if term.observed_share < 0.5
             else "",
-            "limited": _share(term.limited_share),
-            "limit": f"< {_number(term.limit)}" if np.isfinite(term.limit) else "–",
+            "limited": _share_text(term.limited_share),
+            "limit": f"< {_number_text(term.limit)}" if np.isfinite(term.limit) else "–",
         }
         for term in terms
     ]
 
 
-def _gaps(log: xr.Dataset) -> list[dict[str, Any]]:
+def _list_gaps(log: xr.Dataset) -> list[dict[str, Any]]:
     """Describe the longest gaps in order of time."""
     samples = np.asarray(log["gap_samples"].values)
-    chosen = np.sort(np.argsort(-samples, kind="stable")[:_LONGEST_GAPS])
+    chosen = np.sort(np.argsort(-samples, kind="stable")[:_MAX_GAPS_LISTED])
     causes = str(log["gap_cause"].attrs.get("flag_meanings", " ".join(GAP_CAUSES))).split()
     rate = float(log.attrs["sampling_rate_hz"])
     return [
         {
-            "start": _stamp(log["gap_start"].values[i]),
-            "end": _stamp(log["gap_end"].values[i]),
+            "start": _stamp_text(log["gap_start"].values[i]),
+            "end": _stamp_text(log["gap_end"].values[i]),
             "length": duration(float(samples[i]) / rate),
             "samples": f"{int(samples[i]):,}".replace(",", " "),
             "cause": causes[int(log["gap_cause"].values[i])].replace("_", " "),
@@ -266,7 +272,7 @@ def _gaps(log: xr.Dataset) -> list[dict[str, Any]]:
     ]
 
 
-def _gap_summary(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
+def _summarise_gaps(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
     total = log.sizes["gap"]
     missing = duration(
         float(np.sum(log["gap_samples"].values)) / float(log.attrs["sampling_rate_hz"])
@@ -275,21 +281,23 @@ def _gap_summary(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
     return f"{total} gap{'s' if total != 1 else ''}, {missing} in all.{shown}"
 
 
-def _figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]]:
+def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]]:
     from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
 
     figures = []
     if log is not None:
-        figures.append(embedded(plot_signal(log), "Signal as recorded", _READ["signal"]))
+        figures.append(embedded(plot_signal(log), "Signal as recorded", _CAPTIONS["signal"]))
     figures.append(
-        embedded(plot_coefficients(product), "Noise coefficients over time", _READ["coefficients"])
+        embedded(
+            plot_coefficients(product), "Noise coefficients over time", _CAPTIONS["coefficients"]
+        )
     )
-    figures.append(embedded(plot_davar(product), "Dynamic Allan deviation", _READ["davar"]))
+    figures.append(embedded(plot_davar(product), "Dynamic Allan deviation", _CAPTIONS["davar"]))
     figures.append(
         embedded(
             plot_davar(product, relative=True),
             "Change of the dynamic Allan deviation",
-            _READ["change"],
+            _CAPTIONS["change"],
         )
     )
     for name in product["axis"].values:
@@ -297,7 +305,7 @@ def _figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]
             embedded(
                 plot_adev(product, str(name)),
                 f"Allan deviation of one window, axis {name}",
-                _READ["adev"],
+                _CAPTIONS["adev"],
             )
         )
     if min(product.sizes["time"], product.sizes["tau"]) < 2:
@@ -307,14 +315,14 @@ def _figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]
         embedded(
             plot_davar_3d(product, axis=first),
             f"Dynamic Allan deviation as a surface, axis {first}",
-            _READ["davar_3d"],
+            _CAPTIONS["davar_3d"],
         )
     )
     return figures
 
 
 #: How to read each figure.
-_READ = {
+_CAPTIONS = {
     "signal": (
         "Each panel shows one gyro axis or channel against time; a long record is drawn from its lowest to its highest sample, so "
         "spikes stay visible. Grey marks gaps. Look for spikes, steps and drift, and whether they come together with temperature or "

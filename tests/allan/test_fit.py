@@ -256,9 +256,11 @@ def test_errors_widen_with_the_misfit_and_only_then():
     spoiled = surface.assign(avar=surface.avar * (1 + 0.2 * (np.arange(surface.sizes["tau"]) % 2)))
     for cells, fits in ((surface, True), (spoiled, False)):
         product = fit_noise(cells, terms="N", observed_only=False)
-        flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in fit._inputs(cells)[0]]
+        flat = [
+            np.ascontiguousarray(cell[0], dtype=np.float64) for cell in fit._fit_inputs(cells)[0]
+        ]
         ks = np.round(cells.tau.values * RATE).astype(np.int64)
-        tables = fit._tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2000)
+        tables = fit._cached_tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2000)
         result, misfit, _ = fit_windows(
             *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 2
         )
@@ -396,10 +398,10 @@ def test_fast_fit_is_the_plain_fit(law, share, block):
         quantization(rng, 12, 3000, Q=law.get("Q", 0.0), rate=RATE)
         + law.get("R", 0.0) * np.arange(3000) / RATE / 3600
     )
-    cells, ks, rate, window = fit._inputs(windows_of(lose(rng, x, share, block), taus=21))
+    cells, ks, rate, window = fit._fit_inputs(windows_of(lose(rng, x, share, block), taus=21))
     flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells]
     flat[0][3, 5] = np.nan
-    tables = fit._tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
+    tables = fit._cached_tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
     result, misfit, _ = fit_windows(
         *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, 31
     )
@@ -421,8 +423,8 @@ def test_fast_fit_is_the_plain_fit(law, share, block):
 
 def cells_of(x, **options):
     """Arguments of `fit_windows` for independent windows, and the tables of `gyrostab.allan.fit`."""
-    cells, ks, rate, window = fit._inputs(windows_of(x, **options))
-    return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._tables(
+    cells, ks, rate, window = fit._fit_inputs(windows_of(x, **options))
+    return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._cached_tables(
         tuple(ks.tolist()), (0,) * ks.size, rate, window
     )
 

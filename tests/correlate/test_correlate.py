@@ -18,11 +18,11 @@ from gyrostab.cli import main
 from gyrostab.correlate.judge import VERDICTS
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.kernels.regression.coupling import (
-    averages,
-    beside,
+    block_averages,
     calibrated,
     decompose,
     fit_lags,
+    project_out,
     slope_interval,
     uncalibrated,
 )
@@ -74,7 +74,7 @@ def test_ramps_are_fitted_apart():
 def test_white_law_is_ordinary_least_squares():
     rng = np.random.default_rng(3)
     y, x = rng.normal(size=(40, 1)), rng.normal(size=(40, 1))
-    fit = fit_lags(beside(decompose([np.eye(40)], np.zeros(1)), np.ones((40, 1))), y, x)
+    fit = fit_lags(project_out(decompose([np.eye(40)], np.zeros(1)), np.ones((40, 1))), y, x)
     design = np.concatenate([np.ones((40, 1)), x], axis=1)
     solved, rest, *_ = np.linalg.lstsq(design, y, rcond=None)
     assert fit.slope[0, 0, 0] == pytest.approx(solved[1, 0])
@@ -90,7 +90,9 @@ def test_overlap_of_windows_is_counted():
     rng = np.random.default_rng(4)
     cells = rng.normal(size=(20000, 14))
     windows = 0.5 * (cells[:, 1:] + cells[:, :-1])[:, :12]
-    mean, _, white = averages(np.repeat(np.arange(3), 4), np.arange(12) * 30.0, 60.0, np.ones(12))
+    mean, _, white = block_averages(
+        np.repeat(np.arange(3), 4), np.arange(12) * 30.0, 60.0, np.ones(12)
+    )
     blocks = windows @ mean.toarray().T
     np.testing.assert_allclose(
         np.cov(blocks.T) * 2, white, atol=0.02

@@ -21,38 +21,41 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.integrate import TILE, integrate_tile, thin_pyramid
-from gyrostab.kernels.allan.vectors import IN_A_ROW, TOGETHER, split_sums
+from gyrostab.kernels.allan.vectors import CONSECUTIVE_LAGS, MAX_LAGS, split_sums
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-__all__ = ["full_counts", "grouped_blocks", "groups", "held_points", "windows_from_blocks"]
+__all__ = ["full_counts", "group_factors", "grouped_blocks", "held_points", "windows_from_blocks"]
 
 # Points that a group of averaging factors goes through before the next one does: so few that they
 # stay in the second-level cache, so many
 # that the processor can foresee where the loops of short blocks end.
-_STRETCH = 65536
+_STRETCH_POINTS = 65536
 
 
-def groups(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
+def group_factors(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
     """First averaging factor of each group that goes through the angle together, and the end.
 
-    The factors of a group have one shift; there are `TOGETHER` of them at most, or `IN_A_ROW` that
+    The factors of a group have one shift; there are `MAX_LAGS` of them at most, or `CONSECUTIVE_LAGS` that
     follow each other.
     """
     starts = np.flatnonzero(np.diff(shifts)) + 1
     lags = ks >> shifts
     first: list[int] = []
     for at, end in zip([0, *starts], [*starts, shifts.size], strict=True):
-        while at + IN_A_ROW <= end and lags[at + IN_A_ROW - 1] - lags[at] == IN_A_ROW - 1:
+        while (
+            at + CONSECUTIVE_LAGS <= end
+            and lags[at + CONSECUTIVE_LAGS - 1] - lags[at] == CONSECUTIVE_LAGS - 1
+        ):
             first.append(at)
-            at += IN_A_ROW
-        first.extend(range(at, end, TOGETHER))
-        if (end - at) % TOGETHER == 1 and end - at > TOGETHER:
+            at += CONSECUTIVE_LAGS
+        first.extend(range(at, end, MAX_LAGS))
+        if (end - at) % MAX_LAGS == 1 and end - at > MAX_LAGS:
             first[-1] -= 1  # two and a few rather than one alone
     return np.array([*first, shifts.size])
 
 
 @njit(**INNER)
-def _limit(  # type: ignore[no-untyped-def]
+def _limit_terms(  # type: ignore[no-untyped-def]
     i,
     count,
     first,
@@ -89,7 +92,7 @@ def _add_stretch(  # type: ignore[no-untyped-def]
     flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups, head_lengths, whole, n_windows,
     near, splits, sizes, out,
 ):  # fmt: skip
-    """Add what the blocks from `begin` to `end` have behind `tile` samples, `_STRETCH` of each at most; `near`: the first runs in reach."""
+    """Add what the blocks from `begin` to `end` have behind `tile` samples, `_STRETCH_POINTS` of each at most; `near`: the first runs in reach."""
     heads, tails = out[0].reshape(-1), out[1].reshape(-1)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
     for g in range(groups.size - 1):
@@ -98,14 +101,14 @@ def _add_stretch(  # type: ignore[no-untyped-def]
         shift = shifts[i]
         for block in range(begin, end):
             low = block * step + tile
-            high = min(low + _STRETCH, (block + 1) * step)
+            high = min(low + _STRETCH_POINTS, (block + 1) * step)
             while near[g] < stops.size and stops[near[g]] - 2 * ks[i] <= low:
                 near[g] += 1
             for r in range(near[g], stops.size):
                 if starts[r] >= high:
                     break
                 first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
-                if _limit(
+                if _limit_terms(
                     i,
                     count,
                     first,
@@ -156,7 +159,7 @@ def _move_to_front(flat, capacity, levels, by, held):  # type: ignore[no-untyped
 def held_points(n_points: int, step: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> int:
     """Points of the angle that `grouped_blocks` needs room for: what its terms reach twice over, and no more than there are."""
     whole = 1 << int(shifts.max(initial=0))
-    wanted = 4 * int(ks[-1]) + 2 * max(step, _STRETCH) + TILE + whole
+    wanted = 4 * int(ks[-1]) + 2 * max(step, _STRETCH_POINTS) + TILE + whole
     return -(-min(wanted, n_points) // whole) * whole
 
 
@@ -195,8 +198,8 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
     n_blocks = out.shape[1]
     near, ends = np.zeros(groups.size, np.int64), stops - 1
     lags = ks >> shifts
-    splits, sizes = np.empty(IN_A_ROW, np.int64), np.empty(IN_A_ROW, np.int64)
-    levels, together = shifts[-1], max(1, _STRETCH // step)
+    splits, sizes = np.empty(CONSECUTIVE_LAGS, np.int64), np.empty(CONSECUTIVE_LAGS, np.int64)
+    levels, together = shifts[-1], max(1, _STRETCH_POINTS // step)
     base = done = run = np.int64(0)
     total = largest = 0.0
     if x.size > 0:
@@ -205,9 +208,9 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
     for begin in range(0, n_blocks, together):
         end = min(begin + together, n_blocks)
         out[:, begin:end] = 0.0
-        for tile in range(0, step, _STRETCH):
+        for tile in range(0, step, _STRETCH_POINTS):
             first = begin * step + tile
-            needed = min((end - 1) * step + min(tile + _STRETCH, step) + 2 * ks[-1], x.size)
+            needed = min((end - 1) * step + min(tile + _STRETCH_POINTS, step) + 2 * ks[-1], x.size)
             while done < needed:
                 b = min(done + TILE, x.size)
                 if b + 1 - base > capacity:
@@ -228,7 +231,7 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _slide(heads, tails, length, first, stop, out):  # type: ignore[no-untyped-def]
+def _sum_windows(heads, tails, length, first, stop, out):  # type: ignore[no-untyped-def]
     """Windows of `length` whole blocks and one head, columns `first` to `stop`: per group of `length` windows two running sums."""
     n = out.shape[0]
     suffix = np.empty((length, stop - first))
@@ -258,7 +261,7 @@ def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-de
         while stop < whole.size and whole[stop] == whole[first]:
             stop += 1
         if whole[first] > 0:
-            _slide(heads, tails, whole[first], first, stop, out)
+            _sum_windows(heads, tails, whole[first], first, stop, out)
         else:
             for j in range(out.shape[0]):
                 for i in range(first, stop):

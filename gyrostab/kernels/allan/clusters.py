@@ -50,17 +50,17 @@ def cluster_strides(
 
 
 @intrinsic
-def _ones(typing_context, word):  # type: ignore[no-untyped-def]
+def _count_ones(typing_context, word):  # type: ignore[no-untyped-def]
     """Number of bits of a word that are set."""
     return word(word), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
 @njit(**INNER)
-def _places(word):  # type: ignore[no-untyped-def]
+def _sum_places(word):  # type: ignore[no-untyped-def]
     """Sum of the places (0 to 63) of the bits of a word that are set."""
     total = np.int64(0)
     for i in range(_BITS.size):
-        total += _ones(word & _BITS[i]) << i
+        total += _count_ones(word & _BITS[i]) << i
     return total
 
 
@@ -68,7 +68,7 @@ def _places(word):  # type: ignore[no-untyped-def]
 def _places_before(mask, row, low):  # type: ignore[no-untyped-def]
     """Sum of the numbers of the samples that are present before a sample: those in the rows before its own, and in its row below `low`."""
     word = mask[row, 0] & low
-    return mask[row, 4] + (np.int64(row) << 6) * _ones(word) + _places(word)
+    return mask[row, 4] + (np.int64(row) << 6) * _count_ones(word) + _sum_places(word)
 
 
 @njit(**INNER)
@@ -94,17 +94,17 @@ def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
             mask[row, 0] |= word
         mask[first, 1] |= one << (starts[r] & 63)
     for row in range(1, mask.shape[0]):
-        mask[row, 2] = mask[row - 1, 2] + _ones(mask[row - 1, 0])
-        mask[row, 3] = mask[row - 1, 3] + _ones(mask[row - 1, 1])
+        mask[row, 2] = mask[row - 1, 2] + _count_ones(mask[row - 1, 0])
+        mask[row, 3] = mask[row - 1, 3] + _count_ones(mask[row - 1, 1])
         mask[row, 4] = _places_before(mask, row - 1, np.int64(-1))
     return mask
 
 
 @njit(**INNER)
-def _before(mask, m):  # type: ignore[no-untyped-def]
+def _count_before(mask, m):  # type: ignore[no-untyped-def]
     """Number of samples present before m."""
     row = np.uint64(m >> 6)
-    return mask[row, 2] + _ones(mask[row, 0] & ((np.int64(1) << (m & 63)) - 1))
+    return mask[row, 2] + _count_ones(mask[row, 0] & ((np.int64(1) << (m & 63)) - 1))
 
 
 @njit(**INNER)
@@ -135,9 +135,9 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
             (one << ((m + k) & 63)) - one,
             (one << ((m + 2 * k) & 63)) - one,
         )
-        middle = mask[row1, 2] + _ones(mask[row1, 0] & low1)
-        n1 = middle - mask[row0, 2] - _ones(mask[row0, 0] & low0)
-        n2 = mask[row2, 2] + _ones(mask[row2, 0] & low2) - middle
+        middle = mask[row1, 2] + _count_ones(mask[row1, 0] & low1)
+        n1 = middle - mask[row0, 2] - _count_ones(mask[row0, 0] & low0)
+        n2 = mask[row2, 2] + _count_ones(mask[row2, 0] & low2) - middle
         if 2 * n1 < k or 2 * n2 < k:
             continue
         f1, f2 = float(n1), float(n2)
@@ -155,13 +155,13 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
             )
         apart = behind * f1 - before * f2  # and that of their centres
         # a run that a cluster cuts counts in both
-        runs = mask[row1, 3] + _ones(mask[row1, 1] & low1)
+        runs = mask[row1, 3] + _count_ones(mask[row1, 1] & low1)
         cut0, cut1 = (
             mask[row0, 0] & ~mask[row0, 1] & (low0 + one) != 0,
             mask[row1, 0] & ~mask[row1, 1] & (low1 + one) != 0,
         )
-        r1 = runs - mask[row0, 3] - _ones(mask[row0, 1] & low0) + cut0
-        r2 = mask[row2, 3] + _ones(mask[row2, 1] & low2) - runs + cut1
+        r1 = runs - mask[row0, 3] - _count_ones(mask[row0, 1] & low0) + cut0
+        r2 = mask[row2, 3] + _count_ones(mask[row2, 1] & low2) - runs + cut1
         inverse = 1.0 / (f1 * f2)
         squares += d * d * inverse
         ramp += apart * apart * inverse
@@ -233,7 +233,7 @@ def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: 
 
 
 @njit(**INNER)
-def _look(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
+def _fill_grid(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
     """Fill the columns of `places` for m on a grid from `begin` on.
 
     Rows: present samples before m, m + k and m + 2k, those of the two clusters, and the reciprocal
@@ -242,7 +242,7 @@ def _look(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
     for i in range(places.shape[1]):
         m = begin + i * grid
         for side in range(3):
-            places[side, i] = _before(mask, m + side * k)
+            places[side, i] = _count_before(mask, m + side * k)
         places[3, i] = places[1, i] - places[0, i]
         places[4, i] = places[2, i] - places[1, i]
         used = 2 * places[3, i] >= k and 2 * places[4, i] >= k
@@ -250,7 +250,7 @@ def _look(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST, **INNER)
-def _overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
+def _sum_overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
     """Sum over the terms ``first <= j < stop`` of weight times squared covariance with term i, less than k before them.
 
     Of the means of clusters of n1 and n2 samples, and p1 and p2 of the other term, those share
@@ -272,7 +272,7 @@ def _overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST, **INNER)
-def _touching(places, i, first, stop):  # type: ignore[no-untyped-def]
+def _sum_touching(places, i, first, stop):  # type: ignore[no-untyped-def]
     """The same for terms between k and 2k behind term i, whose first cluster meets only the second of that."""
     a2, n1 = places[2, i], places[3, i]
     b0, p2, inverse = places[0, first:stop], places[4, first:stop], places[5, first:stop]
@@ -302,7 +302,7 @@ def _add_section(places, lags, close, many, sums):  # type: ignore[no-untyped-de
         near = min(i + close, stop)
         sums[0] += own
         sums[1] += own * own + 2.0 * places[5, i] * (
-            _overlapping(places, i, i + 1, near) + _touching(places, i, near, stop)
+            _sum_overlapping(places, i, i + 1, near) + _sum_touching(places, i, near, stop)
         )
 
 
@@ -323,7 +323,7 @@ def _pair_sums(mask, begin, end, grid, k, sums):  # type: ignore[no-untyped-def]
     for section in range(sections):
         one = int((section + section * _GOLDEN % 1.0) / sections * (total - many))
         part = places[:, : min(total - one, places.shape[1])]
-        _look(mask, begin + one * grid, grid, k, part)
+        _fill_grid(mask, begin + one * grid, grid, k, part)
         _add_section(part, lags, close, many, sums)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.allan.vectors import LANES, TOGETHER
+from gyrostab.kernels.allan.vectors import LANES, MAX_LAGS
 from gyrostab.kernels.compiled import INNER, KERNEL
 
 __all__ = [
@@ -54,7 +54,7 @@ def first_present(x: NDArray[np.generic]) -> float:
 
 
 @njit(fastmath=_FAST, **INNER)
-def _sum(x, base):  # type: ignore[no-untyped-def]
+def _sum_samples(x, base):  # type: ignore[no-untyped-def]
     total = 0.0
     for i in range(x.size):
         total += x[i] - base
@@ -68,7 +68,7 @@ def _sum_present(x, base):  # type: ignore[no-untyped-def]
     count = 0
     for a in range(0, x.size, _LOOK):
         part = x[a : a + _LOOK]
-        one = _sum(part, base)
+        one = _sum_samples(part, base)
         if np.isfinite(one):
             total += one
             count += part.size
@@ -95,7 +95,7 @@ def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def
 
 
 @njit(**INNER)
-def _edges(x, step, known, starts, stops):  # type: ignore[no-untyped-def]
+def _find_runs(x, step, known, starts, stops):  # type: ignore[no-untyped-def]
     """Number of runs of finite samples; the first of them, as many as there is room for, to `starts` and `stops`."""
     run = 0
     inside = False
@@ -145,10 +145,10 @@ def present_runs(x, step, known):  # type: ignore[no-untyped-def]
         at.
     """
     runs = np.empty((2, x.size // 256 + 16), np.int64)
-    count = _edges(x, step, known, runs[0], runs[1])
+    count = _find_runs(x, step, known, runs[0], runs[1])
     if count > runs.shape[1]:
         runs = np.empty((2, count), np.int64)
-        _edges(x, step, known, runs[0], runs[1])
+        _find_runs(x, step, known, runs[0], runs[1])
     return runs[0, :count], runs[1, :count]
 
 
@@ -172,7 +172,7 @@ def _integrate_run(x, offset, total, theta):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _largest(theta):  # type: ignore[no-untyped-def]
+def _find_largest(theta):  # type: ignore[no-untyped-def]
     """Largest magnitude; doubles without their sign are ordered as the integers of the same bits, which compare faster."""
     bits = theta.view(np.int64)
     largest = np.zeros(1, np.int64)
@@ -213,7 +213,7 @@ def integrate_tile(x, offset, starts, stops, a, b, total, run, theta):  # type: 
             end = min(starts[run], b) if run < starts.size else b
             theta[m + 1 - a : end + 1 - a] = total
         m = end
-    return total, _largest(theta[1 : b + 1 - a]), run
+    return total, _find_largest(theta[1 : b + 1 - a]), run
 
 
 @njit(**KERNEL)
@@ -277,7 +277,7 @@ def pyramid_places(
     """
     apart = 0
     for i in range(ks.size):
-        apart = max(apart, ks[i] - ks[max(0, i - TOGETHER + 1)])
+        apart = max(apart, ks[i] - ks[max(0, i - MAX_LAGS + 1)])
     begin = np.zeros(shifts.size, np.int64)
     place = 0
     size = n_points

@@ -65,7 +65,7 @@ def valid_intervals(starts, stops, k, angle):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST, **INNER)
-def _energy(theta, a, b, k):  # type: ignore[no-untyped-def]
+def _sum_squares(theta, a, b, k):  # type: ignore[no-untyped-def]
     """Sum of squared second differences over ``a <= m < b``."""
     # Three slices: with theta[m + k] the signed index costs a wraparound test that blocks
     # vectorisation.
@@ -89,7 +89,7 @@ def _differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST, **INNER)
-def _square(values):  # type: ignore[no-untyped-def]
+def _square_sum(values):  # type: ignore[no-untyped-def]
     """Sum of squares."""
     total = 0.0
     for i in range(values.size):
@@ -99,18 +99,18 @@ def _square(values):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _energy_two(high, low, a, b, k):  # type: ignore[no-untyped-def]
-    """`_energy` for an angle held as two doubles."""
+    """`_sum_squares` for an angle held as two doubles."""
     buffer = np.empty(min(b - a, 2048))
     total = 0.0
     for begin in range(a, b, 2048):
         part = buffer[: min(2048, b - begin)]
         _differences_two(high, low, begin, begin + part.size, k, part)
-        total += _square(part)
+        total += _square_sum(part)
     return total
 
 
 @njit(**INNER)
-def _part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: ignore[no-untyped-def]
+def _add_part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: ignore[no-untyped-def]
     """Add the valid terms in ``a <= m < b`` to `sums` and `counts`; interval number `near` is the first that ends after a."""
     up = (1 << shift) - 1
     for v in range(near, begin.size):
@@ -123,7 +123,7 @@ def _part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: i
             if low.size > 0:
                 sums[0] += _energy_two(high, low, first, last, k >> shift)
             else:
-                sums[0] += _energy(high, first, last, k >> shift)
+                sums[0] += _sum_squares(high, first, last, k >> shift)
 
 
 @njit(**KERNEL)
@@ -144,7 +144,7 @@ def single_blocks(  # type: ignore[no-untyped-def]
             b = a + head_lengths[i]
             while near < end.size and end[near] <= a:
                 near += 1
-            _part(
+            _add_part(
                 theta,
                 rest,
                 begin,
@@ -158,7 +158,7 @@ def single_blocks(  # type: ignore[no-untyped-def]
                 head_counts[block, i : i + 1],
             )
             if whole[i] > 0 and block < last:
-                _part(
+                _add_part(
                     theta,
                     rest,
                     begin,

@@ -17,7 +17,7 @@ __all__ = ["strict_gap_factors", "white_pair_sum"]
 
 
 @njit(**INNER)
-def _moment(n, slope, a, b):  # type: ignore[no-untyped-def]
+def _weighted_moment(n, slope, a, b):  # type: ignore[no-untyped-def]
     """``sum((n - l) (1 - slope l)^2 for l in a..b)`` in closed form."""
     if b < a:
         return 0.0
@@ -34,8 +34,8 @@ def white_pair_sum(n, k):  # type: ignore[no-untyped-def]
     """``sum_ij rho(i - j)^2`` over n consecutive second differences of averaging factor k, for angle random walk."""
     if n < 1:
         return 0.0
-    near = _moment(float(n), 1.5 / k, np.int64(1), min(n - 1, k))
-    far = _moment(float(n), 0.5 / k, k + 1, min(n - 1, 2 * k - 1))
+    near = _weighted_moment(float(n), 1.5 / k, np.int64(1), min(n - 1, k))
+    far = _weighted_moment(float(n), 0.5 / k, k + 1, min(n - 1, 2 * k - 1))
     return n + 2.0 * (near + far)
 
 

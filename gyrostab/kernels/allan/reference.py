@@ -85,7 +85,7 @@ def direct_sums(
 
 
 @njit(**INNER)
-def _difference(theta, present, missing, m, k):  # type: ignore[no-untyped-def]
+def _second_difference(theta, present, missing, m, k):  # type: ignore[no-untyped-def]
     """Second difference at m, zero where a point is missing (Eq. 21-22), and whether it is there."""
     if present[m] and present[m + k] and present[m + 2 * k] and missing[m] == missing[m + 2 * k]:
         return theta[m + 2 * k] - 2.0 * theta[m + k] + theta[m], 1
@@ -108,13 +108,13 @@ def recursive_sums(theta, present, missing, window_points, step, n_windows, ks):
         total = 0.0
         count = 0
         for m in range(length):  # the starting value, Eq. 20
-            d, here = _difference(theta, present, missing, m, k)
+            d, here = _second_difference(theta, present, missing, m, k)
             total += d * d
             count += here
         sums[0, i], counts[0, i] = total, count
         for n in range((n_windows - 1) * step):
-            new, new_here = _difference(theta, present, missing, n + length, k)
-            old, old_here = _difference(theta, present, missing, n, k)
+            new, new_here = _second_difference(theta, present, missing, n + length, k)
+            old, old_here = _second_difference(theta, present, missing, n, k)
             total += new * new - old * old
             count += new_here - old_here
             if (n + 1) % step == 0:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.blocks import (
     full_counts,
+    group_factors,
     grouped_blocks,
-    groups,
     held_points,
     windows_from_blocks,
 )
@@ -91,7 +91,7 @@ class Unit(NamedTuple):
 
 
 @njit(**KERNEL)
-def _fill(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[no-untyped-def]
+def _fill_cells(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[no-untyped-def]
     """Cells from sums of squares; `counts` is empty where nothing is missing. No term leaves no sum, and 0 / 0 is NaN."""
     scale = 2.0 * (ks * interval) * (ks * interval)
     for j in range(sums.shape[0]):
@@ -204,7 +204,7 @@ def _rate_blocks(
     points = held_points(x.size + 1, unit.step, ks, shifts)
     places, size = pyramid_places(points, ks, shifts)
     flat = space.array("angle", size)
-    runs, order = (starts, stops + 1), (ks, shifts, groups(ks, shifts))
+    runs, order = (starts, stops + 1), (ks, shifts, group_factors(ks, shifts))
     largest = grouped_blocks(
         x, offset, flat, points, places, *runs, unit.step, *order, *cut, blocks
     )
@@ -254,13 +254,13 @@ def _angle_blocks(
             flat, flat[:0], places, starts, stops, unit.angle, unit.step, ks, shifts, *cut
         )[: len(blocks)]
     else:
-        order = (ks, shifts, groups(ks, shifts))
+        order = (ks, shifts, group_factors(ks, shifts))
         grouped_blocks(
             np.empty(0), 0.0, flat, x.size, places, starts, stops, unit.step, *order, *cut, blocks
         )
 
 
-def _native(x: NDArray[np.generic]) -> NDArray[np.generic]:
+def _to_native(x: NDArray[np.generic]) -> NDArray[np.generic]:
     return np.ascontiguousarray(x if x.dtype in _NATIVE else x.astype(np.float64))
 
 
@@ -289,10 +289,10 @@ def surface_unit(
         As `window_means`.
     """
     counts_only = np.issubdtype(x.dtype, np.integer)
-    x, space = _native(x), space or Workspace()
+    x, space = _to_native(x), space or Workspace()
     n_windows = _number_of_windows(x, unit)
     cells = space.array("cells", len(CELL_FIELDS), n_windows, unit.ks.size)
-    means, mean, known = _means(x, unit, n_windows)
+    means, mean, known = _average_windows(x, unit, n_windows)
     present = int(known.sum())
     if present == 0:
         cells[:] = 0.0
@@ -309,7 +309,9 @@ def surface_unit(
     )  # integers less an integer: every sum is exact
     sums, counts = _strict_sums(x, unit, _Present(starts, stops, offset), n_windows, gaps, space)
     full = full_counts(unit.window, unit.step, n_windows, unit.ks, unit.shifts)
-    _fill(sums, counts, full, unit.zero_fill, unit.ks, unit.interval if unit.angle else 1.0, cells)
+    _fill_cells(
+        sums, counts, full, unit.zero_fill, unit.ks, unit.interval if unit.angle else 1.0, cells
+    )
     if gaps:
         _share_gaps(
             starts,
@@ -344,7 +346,9 @@ def _number_of_windows(x: NDArray[np.generic], unit: Unit) -> int:
     return int((x.size - unit.window - (1 if unit.angle else 0)) // unit.step + 1)
 
 
-def _means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> tuple[Floats, float, Floats]:
+def _average_windows(
+    x: NDArray[np.generic], unit: Unit, n_windows: int
+) -> tuple[Floats, float, Floats]:
     """Means and coverage of the windows, mean of the stretch, number of samples present in each of its blocks (of angles: in all of it)."""
     if unit.angle:
         return _angle_means(x, unit, n_windows), np.nan, np.array([float(np.isfinite(x).sum())])
@@ -385,5 +389,5 @@ def window_means(x: NDArray[np.generic], unit: Unit) -> Floats:
         Mean [unit of the rate; for angles: of angle per second], NaN where nothing is present;
         share of samples present.
     """
-    x = _native(x)
-    return _means(x, unit, _number_of_windows(x, unit))[0]
+    x = _to_native(x)
+    return _average_windows(x, unit, _number_of_windows(x, unit))[0]

@@ -21,34 +21,36 @@ from numba.extending import intrinsic
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["IN_A_ROW", "LANES", "TOGETHER", "split_sums"]
+__all__ = ["CONSECUTIVE_LAGS", "LANES", "MAX_LAGS", "split_sums"]
 
 #: Elements of a vector.
 LANES = 8
 #: Most lags in one pass, and most of lags that follow each other.
-TOGETHER, IN_A_ROW = 4, 8
+MAX_LAGS, CONSECUTIVE_LAGS = 4, 8
 
 _INDEX = ir.IntType(64)
 _SHORT = ir.IntType(32)
 _DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
 _INDICES = ir.VectorType(_INDEX, LANES)
 # Vectors per turn of the loop: with few lags additions would wait for each other.
-_STEPS = {1: 4, 2: 2, 3: 1, 4: 1}
+_VECTORS_PER_TURN = {1: 4, 2: 2, 3: 1, 4: 1}
 _FAST = ("reassoc", "contract", "nsz")
 
 
-def _places(places: list[int]) -> ir.Constant:
+def _shuffle_mask(places: list[int]) -> ir.Constant:
     return ir.Constant(ir.VectorType(_SHORT, len(places)), places)
 
 
-def _splat(builder: Any, value: Any) -> Any:
+def _spread_value(builder: Any, value: Any) -> Any:
     empty = ir.Constant(_INDICES, ir.Undefined)
     return builder.shuffle_vector(
-        builder.insert_element(empty, value, ir.Constant(_SHORT, 0)), empty, _places([0] * LANES)
+        builder.insert_element(empty, value, ir.Constant(_SHORT, 0)),
+        empty,
+        _shuffle_mask([0] * LANES),
     )
 
 
-def _extreme(builder: Any, values: list[Any], sign: str) -> Any:
+def _select_extreme(builder: Any, values: list[Any], sign: str) -> Any:
     found = values[0]
     for value in values[1:]:
         found = builder.select(builder.icmp_signed(sign, value, found), value, found)
@@ -56,7 +58,7 @@ def _extreme(builder: Any, values: list[Any], sign: str) -> Any:
 
 
 @contextmanager
-def _while(builder: Any, goes_on: Callable[[], Any]) -> Iterator[None]:
+def _while_loop(builder: Any, goes_on: Callable[[], Any]) -> Iterator[None]:
     test, body, after = (builder.append_basic_block() for _ in range(3))
     builder.branch(test)
     builder.position_at_end(test)
@@ -67,13 +69,13 @@ def _while(builder: Any, goes_on: Callable[[], Any]) -> Iterator[None]:
     builder.position_at_end(after)
 
 
-def _vector(builder: Any, theta: Any, index: Any) -> Any:
+def _load_vector(builder: Any, theta: Any, index: Any) -> Any:
     return builder.load(
         builder.bitcast(builder.gep(theta, [index]), _DOUBLES.as_pointer()), align=8
     )
 
 
-def _second(builder: Any, first: Any, middle: Any, last: Any) -> Any:
+def _second_difference(builder: Any, first: Any, middle: Any, last: Any) -> Any:
     minus_two = ir.Constant(_DOUBLES, [-2.0] * LANES)
     return builder.fadd(
         builder.fadd(builder.fmul(middle, minus_two, flags=_FAST), last, flags=_FAST),
@@ -82,24 +84,24 @@ def _second(builder: Any, first: Any, middle: Any, last: Any) -> Any:
     )
 
 
-def _differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
+def _second_differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
     """Second differences of each lag at ``at ... at + LANES - 1``."""
-    first = _vector(builder, theta, at)
+    first = _load_vector(builder, theta, at)
     found = []
     for lag in lags:
-        middle = _vector(builder, theta, builder.add(at, lag))
-        last = _vector(builder, theta, builder.add(at, builder.add(lag, lag)))
-        found.append(_second(builder, first, middle, last))
+        middle = _load_vector(builder, theta, builder.add(at, lag))
+        last = _load_vector(builder, theta, builder.add(at, builder.add(lag, lag)))
+        found.append(_second_difference(builder, first, middle, last))
     return found
 
 
-def _differences_in_a_row(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
-    """The same of lags that follow each other, `IN_A_ROW` at most."""
+def _consecutive_differences(builder: Any, theta: Any, at: Any, lags: list[Any]) -> list[Any]:
+    """The same of lags that follow each other, `CONSECUTIVE_LAGS` at most."""
     last_needed = len(lags) + LANES - 2
 
     def vectors(index: Any, reach: int) -> list[Any]:
         return [
-            _vector(builder, theta, builder.add(index, ir.Constant(_INDEX, by)))
+            _load_vector(builder, theta, builder.add(index, ir.Constant(_INDEX, by)))
             for by in range(0, reach + 1, LANES)
         ]
 
@@ -107,17 +109,18 @@ def _differences_in_a_row(builder: Any, theta: Any, at: Any, lags: list[Any]) ->
         place, by = divmod(by, LANES)
         return (
             builder.shuffle_vector(
-                found[place], found[place + 1], _places(list(range(by, by + LANES)))
+                found[place], found[place + 1], _shuffle_mask(list(range(by, by + LANES)))
             )
             if by
             else found[place]
         )
 
-    first = _vector(builder, theta, at)
+    first = _load_vector(builder, theta, at)
     middles = vectors(builder.add(at, lags[0]), last_needed)
     lasts = vectors(builder.add(at, builder.add(lags[0], lags[0])), last_needed + len(lags) - 1)
     return [
-        _second(builder, first, taken(middles, i), taken(lasts, 2 * i)) for i in range(len(lags))
+        _second_difference(builder, first, taken(middles, i), taken(lasts, 2 * i))
+        for i in range(len(lags))
     ]
 
 
@@ -127,17 +130,17 @@ def _add_square(builder: Any, place: Any, value: Any, where: Any = None) -> None
     builder.store(after if where is None else builder.select(where, after, before), place)
 
 
-def _halves(builder: Any, first: Any, second: Any, width: int) -> Any:
+def _add_halves(builder: Any, first: Any, second: Any, width: int) -> Any:
     """Two vectors as one: in each group of `width` elements the halves are added, those of the two vectors side by side."""
     low = [at for at in range(2 * LANES) if at % width < width // 2]
     left, right = (
-        builder.shuffle_vector(first, second, _places([at + by for at in low]))
+        builder.shuffle_vector(first, second, _shuffle_mask([at + by for at in low]))
         for by in (0, width // 2)
     )
     return builder.fadd(left, right)
 
 
-def _totals(builder: Any, sums: list[list[Any]]) -> Any:
+def _sum_vectors(builder: Any, sums: list[list[Any]]) -> Any:
     """Sums of all elements of eight vectors as one vector, halves first; each vector is given in parts."""
     vectors = []
     for parts in sums:
@@ -148,29 +151,29 @@ def _totals(builder: Any, sums: list[list[Any]]) -> Any:
     width = LANES
     while len(vectors) > 1:
         vectors = [
-            _halves(builder, vectors[at], vectors[at + 1], width)
+            _add_halves(builder, vectors[at], vectors[at + 1], width)
             for at in range(0, len(vectors), 2)
         ]
         width //= 2
     return vectors[0]
 
 
-def _all_totals(builder: Any, heads: list[list[Any]], tails: list[list[Any]]) -> list[Any]:
+def _sum_heads_and_tails(builder: Any, heads: list[list[Any]], tails: list[list[Any]]) -> list[Any]:
     """Sums of all elements of each vector, as one vector for the heads and one for the tails."""
     count = len(heads)
     if 2 * count > LANES:
-        return [_totals(builder, sums) for sums in (heads, tails)]
+        return [_sum_vectors(builder, sums) for sums in (heads, tails)]
     both = heads + tails
-    found = _totals(
+    found = _sum_vectors(
         builder, [both[place % len(both)] for place in range(LANES)]
     )  # what is left over is filled with any
     return [
-        builder.shuffle_vector(found, found, _places(list(range(begin, begin + count))))
+        builder.shuffle_vector(found, found, _shuffle_mask(list(range(begin, begin + count))))
         for begin in (0, count)
     ]
 
 
-def _loop(
+def _emit_loop(
     builder: Any,
     theta: Any,
     lags: list[Any],
@@ -180,8 +183,8 @@ def _loop(
     in_a_row: bool,
 ) -> list[Any]:
     """Vector with the sum of every lag over ``m < split``, and that over ``split <= m < size``."""
-    steps = 1 if in_a_row else _STEPS[len(lags)]
-    differences = _differences_in_a_row if in_a_row else _differences
+    steps = 1 if in_a_row else _VECTORS_PER_TURN[len(lags)]
+    differences = _consecutive_differences if in_a_row else _second_differences
     nothing = ir.Constant(_DOUBLES, [0.0] * LANES)
     heads, tails = (
         [[cgutils.alloca_once(builder, _DOUBLES) for _ in range(steps)] for _ in lags]
@@ -191,17 +194,25 @@ def _loop(
         builder.store(nothing, place)
     position = cgutils.alloca_once(builder, _INDEX)
     builder.store(ir.Constant(_INDEX, 0), position)
-    first_split, last_split = _extreme(builder, splits, "<"), _extreme(builder, splits, ">")
-    first_size, last_size = _extreme(builder, sizes, "<"), _extreme(builder, sizes, ">")
+    first_split, last_split = (
+        _select_extreme(builder, splits, "<"),
+        _select_extreme(builder, splits, ">"),
+    )
+    first_size, last_size = (
+        _select_extreme(builder, sizes, "<"),
+        _select_extreme(builder, sizes, ">"),
+    )
     wide_splits, wide_sizes = (
-        [_splat(builder, value) for value in values] for values in (splits, sizes)
+        [_spread_value(builder, value) for value in values] for values in (splits, sizes)
     )
 
     def advanced(by: int) -> Any:
         return builder.add(builder.load(position), ir.Constant(_INDEX, by))
 
     def whole_vectors(limit: Any, sums: list[list[Any]]) -> None:
-        with _while(builder, lambda: builder.icmp_signed("<=", advanced(steps * LANES), limit)):
+        with _while_loop(
+            builder, lambda: builder.icmp_signed("<=", advanced(steps * LANES), limit)
+        ):
             for step in range(steps):
                 for lag, value in enumerate(
                     differences(builder, theta, advanced(step * LANES), lags)
@@ -209,13 +220,15 @@ def _loop(
                     _add_square(builder, sums[lag][step], value)
             builder.store(advanced(steps * LANES), position)
 
-    with _while(builder, lambda: builder.icmp_signed("<", builder.load(position), last_size)):
+    with _while_loop(builder, lambda: builder.icmp_signed("<", builder.load(position), last_size)):
         whole_vectors(first_split, heads)
         with builder.if_then(builder.icmp_signed(">=", builder.load(position), last_split)):
             whole_vectors(first_size, tails)
         with builder.if_then(builder.icmp_signed("<", builder.load(position), last_size)):
             at = builder.load(position)
-            index = builder.add(_splat(builder, at), ir.Constant(_INDICES, list(range(LANES))))
+            index = builder.add(
+                _spread_value(builder, at), ir.Constant(_INDICES, list(range(LANES)))
+            )
             for lag, value in enumerate(differences(builder, theta, at, lags)):
                 before = builder.icmp_signed("<", index, wide_splits[lag])
                 inside = builder.icmp_signed("<", index, wide_sizes[lag])
@@ -224,10 +237,10 @@ def _loop(
                     builder, tails[lag][0], value, where=builder.and_(inside, builder.not_(before))
                 )
             builder.store(advanced(LANES), position)
-    return _all_totals(builder, heads, tails)
+    return _sum_heads_and_tails(builder, heads, tails)
 
 
-def _of_lags(count: int, *, in_a_row: bool = False) -> Any:
+def _intrinsic_of_lags(count: int, *, in_a_row: bool = False) -> Any:
     """The loop for `count` lags as a function for compiled code, arguments as `split_sums`."""
 
     def sums(typing_context, theta, first, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
@@ -245,7 +258,7 @@ def _of_lags(count: int, *, in_a_row: bool = False) -> Any:
             ]
             some = ir.VectorType(ir.DoubleType(), count).as_pointer()
             for total, start in zip(
-                _loop(builder, theta, *values, in_a_row=in_a_row), starts[4:], strict=True
+                _emit_loop(builder, theta, *values, in_a_row=in_a_row), starts[4:], strict=True
             ):
                 row = builder.bitcast(builder.gep(start, [args[8]]), some)
                 builder.store(builder.fadd(builder.load(row, align=8), total), row, align=8)
@@ -258,8 +271,10 @@ def _of_lags(count: int, *, in_a_row: bool = False) -> Any:
     return intrinsic(sums)
 
 
-_one, _two, _three, _four = (_of_lags(count) for count in range(1, TOGETHER + 1))
-_eight_in_a_row, _four_in_a_row = (_of_lags(count, in_a_row=True) for count in (IN_A_ROW, TOGETHER))
+_one, _two, _three, _four = (_intrinsic_of_lags(count) for count in range(1, MAX_LAGS + 1))
+_eight_in_a_row, _four_in_a_row = (
+    _intrinsic_of_lags(count, in_a_row=True) for count in (CONSECUTIVE_LAGS, MAX_LAGS)
+)
 
 
 @njit(**KERNEL)
@@ -274,7 +289,7 @@ def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place
     first : int
         Index of m = 0.
     count : int
-        Number of lags: 1 to `TOGETHER`, or `IN_A_ROW`.
+        Number of lags: 1 to `MAX_LAGS`, or `CONSECUTIVE_LAGS`.
     lags, at : int64 (n_lags,), int
         Averaging factors, rising, used from number `at` on.
     splits, sizes : int64 (count,)

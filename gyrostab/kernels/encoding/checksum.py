@@ -36,20 +36,20 @@ def fletcher32(data: NDArray[np.uint8]) -> int:
     '0x4ff029c7'
     """
     even = data.size // 2
-    total, sums, some = _sums(data[: 2 * even].view("<u2"))
+    total, sums, some = _add_words(data[: 2 * even].view("<u2"))
     if data.size % 2:
         last = int(data[-1])
         total, sums, some = total + last, sums + total + last, some | last
-    return _half(sums, some) << 16 | _half(total, some)
+    return _half_sum(sums, some) << 16 | _half_sum(total, some)
 
 
-def _half(amount: int, some: int) -> int:
+def _half_sum(amount: int, some: int) -> int:
     """A sum of words whose bytes are swapped; of anything but zeros it is never 0 but 65535, for it is folded, not divided."""
     return int(amount) * 256 % 65535 or (65535 if some else 0)
 
 
 @njit(**KERNEL)
-def _sums(words):  # type: ignore[no-untyped-def]
+def _add_words(words):  # type: ignore[no-untyped-def]
     """Sum of the words and sum of the sums after each, modulo 65535 (where swapping the bytes is times 256); whether any is not 0."""
     total, sums, some = np.int64(0), np.int64(0), np.int64(0)
     for begin in range(0, words.size, 256):

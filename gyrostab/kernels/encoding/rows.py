@@ -59,7 +59,7 @@ _FIRST_PAIRS, _FIRST_SCALE, _SECOND_SCALE = (
 _LONGEST_NS = np.uint64(2**63 - 1)
 
 
-def _fives() -> NDArray[np.uint64]:
+def _powers_of_five() -> NDArray[np.uint64]:
     """The leading 128 bits of the powers of five from `_LEAST` to `_MOST`, in two words each."""
     words = []
     for power in range(_LEAST, _MOST + 1):
@@ -74,11 +74,11 @@ def _fives() -> NDArray[np.uint64]:
     return np.array(words, dtype=np.uint64)
 
 
-_FIVES = _fives()
+_FIVES = _powers_of_five()
 
 
 @intrinsic
-def _byte(typing, text, at):  # type: ignore[no-untyped-def]
+def _load_byte(typing, text, at):  # type: ignore[no-untyped-def]
     """The byte at an address: arrays are counted whenever they are handed on, which would cost more than the reading."""
 
     def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -88,7 +88,7 @@ def _byte(typing, text, at):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def _eight(typing, text, at):  # type: ignore[no-untyped-def]
+def _load_eight(typing, text, at):  # type: ignore[no-untyped-def]
     """Eight bytes from an address on; the first is the lowest."""
 
     def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -110,7 +110,7 @@ def _zeros_behind(typing, word):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _product(a, b):  # type: ignore[no-untyped-def]
+def _multiply_words(a, b):  # type: ignore[no-untyped-def]
     """High and low word of the product of two words."""
     half = np.uint64(32)
     a0, a1, b0, b1 = a & _HALF, a >> half, b & _HALF, b >> half
@@ -121,7 +121,7 @@ def _product(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _rounded(mantissa, power):  # type: ignore[no-untyped-def]
+def _nearest_double(mantissa, power):  # type: ignore[no-untyped-def]
     """The double nearest to ``mantissa * 10**power``, and whether it was found (Lemire, Software: Practice and Experience 51, 2021)."""
     if mantissa == np.uint64(0):
         return 0.0, True
@@ -133,9 +133,9 @@ def _rounded(mantissa, power):  # type: ignore[no-untyped-def]
     while not mantissa >> np.uint64(63):
         mantissa <<= np.uint64(1)
         shifted += 1
-    high, low = _product(mantissa, _FIVES[power - _LEAST, 0])
+    high, low = _multiply_words(mantissa, _FIVES[power - _LEAST, 0])
     if high & np.uint64(0x1FF) == np.uint64(0x1FF):
-        more, _ = _product(mantissa, _FIVES[power - _LEAST, 1])
+        more, _ = _multiply_words(mantissa, _FIVES[power - _LEAST, 1])
         low += more
         if more > low:
             high += np.uint64(1)
@@ -157,13 +157,13 @@ def _rounded(mantissa, power):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
+def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
     """Go on with a whole number: its value, and where it ends.
 
     Eight bytes at a time, as a loop over digits ends where the processor does not expect it.
     """
     while at + 8 <= size:
-        bare = _eight(text, at) ^ _ZEROS
+        bare = _load_eight(text, at) ^ _ZEROS
         other = ((bare + _TO_TEN) | bare) & _TOPS
         count = _zeros_behind(other) >> np.uint64(3)
         if count == np.uint64(0):
@@ -177,7 +177,7 @@ def _digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
         if count < np.uint64(8):
             return mantissa, at
     while True:
-        digit = np.uint8(_byte(text, at) - np.uint8(_ZERO))
+        digit = np.uint8(_load_byte(text, at) - np.uint8(_ZERO))
         if digit > 9:
             return mantissa, at
         mantissa = mantissa * np.uint64(10) + np.uint64(digit)
@@ -185,23 +185,23 @@ def _digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _decimal(text, at, size, point):  # type: ignore[no-untyped-def]
+def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
     """Sign, digits, decimals and end of a number without exponent; the end is negative where there is none, or a long one."""
-    negative = _byte(text, at) == _MINUS
-    at += np.int64(negative) | np.int64(_byte(text, at) == _PLUS)
+    negative = _load_byte(text, at) == _MINUS
+    at += np.int64(negative) | np.int64(_load_byte(text, at) == _PLUS)
     first = at
-    mantissa, at = _digits(text, at, size, np.uint64(0))
+    mantissa, at = _read_digits(text, at, size, np.uint64(0))
     count, decimals = at - first, np.int64(0)
-    if _byte(text, at) == point:
+    if _load_byte(text, at) == point:
         after = at + 1
-        mantissa, at = _digits(text, after, size, mantissa)
+        mantissa, at = _read_digits(text, after, size, mantissa)
         decimals = at - after
         count += decimals
     if count > _DIGITS:
         while (
-            _byte(text, first) == _ZERO or _byte(text, first) == point
+            _load_byte(text, first) == _ZERO or _load_byte(text, first) == point
         ):  # zeros in front do not count
-            count -= _byte(text, first) == _ZERO
+            count -= _load_byte(text, first) == _ZERO
             first += 1
     return (
         negative,
@@ -212,34 +212,34 @@ def _decimal(text, at, size, point):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _number(text, at, size, point):  # type: ignore[no-untyped-def]
+def _read_number(text, at, size, point):  # type: ignore[no-untyped-def]
     """Value of a number, and its end; the end is negative where there is none."""
-    negative, mantissa, decimals, end = _decimal(text, at, size, point)
+    negative, mantissa, decimals, end = _read_decimal(text, at, size, point)
     if end < 0:
-        here = at + (_byte(text, at) == _MINUS)
+        here = at + (_load_byte(text, at) == _MINUS)
         if (
-            _byte(text, here) | 32 == _SMALL_N
-            and _byte(text, here + 1) | 32 == _SMALL_A
-            and _byte(text, here + 2) | 32 == _SMALL_N
+            _load_byte(text, here) | 32 == _SMALL_N
+            and _load_byte(text, here + 1) | 32 == _SMALL_A
+            and _load_byte(text, here + 2) | 32 == _SMALL_N
         ):
             return np.nan, here + 3
         return 0.0, end
     power = -decimals
-    if _byte(text, end) | 32 == _SMALL_E:
-        down = _byte(text, end + 1) == _MINUS
-        first = end + 1 + (down or _byte(text, end + 1) == _PLUS)
-        exponent, end = _digits(text, first, size, np.uint64(0))
+    if _load_byte(text, end) | 32 == _SMALL_E:
+        down = _load_byte(text, end + 1) == _MINUS
+        first = end + 1 + (down or _load_byte(text, end + 1) == _PLUS)
+        exponent, end = _read_digits(text, first, size, np.uint64(0))
         if not 0 < end - first < 4:
             return 0.0, np.int64(-1)
         power += -np.int64(exponent) if down else np.int64(exponent)
-    value, found = _rounded(mantissa, power)
+    value, found = _nearest_double(mantissa, power)
     return -value if negative else value, end if found else np.int64(-1)
 
 
 @njit(**INNER)
 def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-def]
     """A number of time as a whole number of ``10**-digits``, half to even, and its end."""
-    negative, mantissa, decimals, end = _decimal(text, at, size, point)
+    negative, mantissa, decimals, end = _read_decimal(text, at, size, point)
     if end < 0 or (digits == 0 and decimals > 0) or decimals - digits > 18:
         return np.int64(0), np.int64(-1)
     if decimals <= digits:
@@ -256,17 +256,17 @@ def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-de
 
 
 @njit(**INNER)
-def _two(text, at):  # type: ignore[no-untyped-def]
+def _read_pair(text, at):  # type: ignore[no-untyped-def]
     """A number of two digits, or one above 99."""
     tens, ones = (
-        np.uint8(_byte(text, at) - np.uint8(_ZERO)),
-        np.uint8(_byte(text, at + 1) - np.uint8(_ZERO)),
+        np.uint8(_load_byte(text, at) - np.uint8(_ZERO)),
+        np.uint8(_load_byte(text, at + 1) - np.uint8(_ZERO)),
     )
     return np.int64(10 * tens + ones) if tens < 10 and ones < 10 else np.int64(1000)
 
 
 @njit(**INNER)
-def _days(year, month, day):  # type: ignore[no-untyped-def]
+def _days_since_1970(year, month, day):  # type: ignore[no-untyped-def]
     """Days since 1970-01-01 (years begin in March)."""
     year -= month <= 2
     age = year - 1600
@@ -275,23 +275,23 @@ def _days(year, month, day):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _iso(text, at, size):  # type: ignore[no-untyped-def]
+def _read_iso_stamp(text, at, size):  # type: ignore[no-untyped-def]
     """Nanoseconds since 1970 of ``2026-01-02T03:04:05.678Z`` (or a blank for the T, no Z), and its end."""
     none = (np.int64(0), np.int64(-1))
     if at + 19 >= size:
         return none
-    year = 100 * _two(text, at) + _two(text, at + 2)
+    year = 100 * _read_pair(text, at) + _read_pair(text, at + 2)
     month, day, hour, minute, second = (
-        _two(text, at + 5), _two(text, at + 8), _two(text, at + 11), _two(text, at + 14), _two(text, at + 17),
+        _read_pair(text, at + 5), _read_pair(text, at + 8), _read_pair(text, at + 11), _read_pair(text, at + 14), _read_pair(text, at + 17),
     )  # fmt: skip
     if (
-        _byte(text, at + 4) != _MINUS
-        or _byte(text, at + 7) != _MINUS
-        or _byte(text, at + 13) != _COLON
-        or _byte(text, at + 16) != _COLON
+        _load_byte(text, at + 4) != _MINUS
+        or _load_byte(text, at + 7) != _MINUS
+        or _load_byte(text, at + 13) != _COLON
+        or _load_byte(text, at + 16) != _COLON
     ):
         return none
-    if (_byte(text, at + 10) != _T and _byte(text, at + 10) != _BLANK) or not (
+    if (_load_byte(text, at + 10) != _T and _load_byte(text, at + 10) != _BLANK) or not (
         1700 <= year < 2200 and 1 <= month <= 12 and day >= 1
     ):
         return none
@@ -301,22 +301,22 @@ def _iso(text, at, size):  # type: ignore[no-untyped-def]
     if day > last or hour > 23 or minute > 59 or second > 59:
         return none
     end, part = at + 19, np.uint64(0)
-    if _byte(text, end) == _POINT:
-        part, stop = _digits(text, end + 1, size, np.uint64(0))
+    if _load_byte(text, end) == _POINT:
+        part, stop = _read_digits(text, end + 1, size, np.uint64(0))
         length = stop - end - 1
         if not 0 < length <= 9:
             return none
         part *= _WHOLE_TENS[9 - length]
         end = stop
-    if _byte(text, end) == _Z:
+    if _load_byte(text, end) == _Z:
         end += 1
-    seconds = ((_days(year, month, day) * 24 + hour) * 60 + minute) * 60 + second
+    seconds = ((_days_since_1970(year, month, day) * 24 + hour) * 60 + minute) * 60 + second
     return seconds * 1_000_000_000 + np.int64(part), end
 
 
 @njit(**INNER)
 def _past_blanks(text, at, separator):  # type: ignore[no-untyped-def]
-    while _byte(text, at) == _BLANK or (_byte(text, at) == _TAB and separator != _TAB):
+    while _load_byte(text, at) == _BLANK or (_load_byte(text, at) == _TAB and separator != _TAB):
         at += 1
     return at
 
@@ -326,44 +326,58 @@ def _cell_end(text, at, separator, last):  # type: ignore[no-untyped-def]
     """Where the next cell, or line, begins after a cell that ends at `at`; negative where the row does not go on as it should."""
     at = _past_blanks(text, at, separator)
     if last:
-        at += _byte(text, at) == _RETURN
-        return at + 1 if _byte(text, at) == _LINE else np.int64(-1)
+        at += _load_byte(text, at) == _RETURN
+        return at + 1 if _load_byte(text, at) == _LINE else np.int64(-1)
     if separator == BLANKS:  # one was passed, or there is another cell's text here
-        return at if _byte(text, at) != _LINE and _byte(text, at) != _RETURN else np.int64(-1)
-    return at + 1 if _byte(text, at) == separator else np.int64(-1)
+        return (
+            at
+            if _load_byte(text, at) != _LINE and _load_byte(text, at) != _RETURN
+            else np.int64(-1)
+        )
+    return at + 1 if _load_byte(text, at) == separator else np.int64(-1)
 
 
 @njit(**INNER)
-def _skipped(text, at, separator):  # type: ignore[no-untyped-def]
+def _skip_cell(text, at, separator):  # type: ignore[no-untyped-def]
     """The end of a cell that is not wanted; negative where quotes or comments make it unsure."""
     while (
-        _byte(text, at) != _LINE
-        and _byte(text, at) != separator
-        and not (separator == BLANKS and _byte(text, at) == _TAB)
+        _load_byte(text, at) != _LINE
+        and _load_byte(text, at) != separator
+        and not (separator == BLANKS and _load_byte(text, at) == _TAB)
     ):
-        if _byte(text, at) == _QUOTE or _byte(text, at) == _HASH:
+        if _load_byte(text, at) == _QUOTE or _load_byte(text, at) == _HASH:
             return np.int64(-1)
         at += 1
-    return at - 1 if at and _byte(text, at) == _LINE and _byte(text, at - 1) == _RETURN else at
+    return (
+        at - 1
+        if at and _load_byte(text, at) == _LINE and _load_byte(text, at - 1) == _RETURN
+        else at
+    )
 
 
 @njit(**INNER)
 def _is_void(text, at, separator):  # type: ignore[no-untyped-def]
-    return _byte(text, at) == separator or _byte(text, at) == _LINE or _byte(text, at) == _RETURN
+    return (
+        _load_byte(text, at) == separator
+        or _load_byte(text, at) == _LINE
+        or _load_byte(text, at) == _RETURN
+    )
 
 
 @njit(**INNER)
-def _cell(text, at, size, role, separator, point, digits):  # type: ignore[no-untyped-def]
+def _read_cell(text, at, size, role, separator, point, digits):  # type: ignore[no-untyped-def]
     """Number, stamp and end of a cell; the end is negative where it is not plain."""
     if role == SKIPPED:
-        return 0.0, np.int64(0), _skipped(text, at, separator)
+        return 0.0, np.int64(0), _skip_cell(text, at, separator)
     if _is_void(text, at, separator):
         return np.nan, np.int64(_NAT), at
     if role == NUMBER:
-        value, end = _number(text, at, size, point)
+        value, end = _read_number(text, at, size, point)
         return value, np.int64(0), end
     stamp, end = (
-        _iso(text, at, size) if role == ISO else _count_of_time(text, at, size, point, digits)
+        _read_iso_stamp(text, at, size)
+        if role == ISO
+        else _count_of_time(text, at, size, point, digits)
     )
     return 0.0, stamp, end
 
@@ -373,11 +387,11 @@ def _next_row(text, at, size):  # type: ignore[no-untyped-def]
     """Where the next line begins that is neither blank nor a comment."""
     while at < size:
         here = _past_blanks(text, at, np.int64(_TAB))
-        if _byte(text, here) == _HASH or _byte(text, here) == _PERCENT:
-            while _byte(text, here) != _LINE:
+        if _load_byte(text, here) == _HASH or _load_byte(text, here) == _PERCENT:
+            while _load_byte(text, here) != _LINE:
                 here += 1
-        here += _byte(text, here) == _RETURN
-        if _byte(text, here) != _LINE:
+        here += _load_byte(text, here) == _RETURN
+        if _load_byte(text, here) != _LINE:
             break
         at = here + 1
     return at
@@ -393,7 +407,7 @@ def _read_rows(lines, start, roles, separator, point, digits, values, stamps):  
         for column in range(width):
             at = _past_blanks(text, at, separator)
             first, role = at, roles[column]
-            value, stamp, at = _cell(text, at, size, role, separator, point, digits)
+            value, stamp, at = _read_cell(text, at, size, role, separator, point, digits)
             if role == NUMBER:
                 values[number, row] = value
                 number += 1

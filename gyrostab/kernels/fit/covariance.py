@@ -31,12 +31,12 @@ __all__ = ["STOCHASTIC", "diagonal_products", "product_tables"]
 STOCHASTIC = 4
 
 #: Lags are taken in steps of this share of the shorter factor.
-_FINE = 32
-_FLICKER = 1.0 / (2.0 * math.pi)
+_LAG_STEPS = 32
+_FLICKER_FACTOR = 1.0 / (2.0 * math.pi)
 
 
 @njit(**INNER)
-def _smooth(lag, k1, k2, logarithm, out):  # type: ignore[no-untyped-def]
+def _smooth_covariance(lag, k1, k2, logarithm, out):  # type: ignore[no-untyped-def]
     """Covariance of d_k1[m] and d_k2[m + lag] over 2 k1 k2, for the terms N, B and K (entries 1..3 of `out`)."""
     white = 0.0
     flicker = 0.0
@@ -51,12 +51,12 @@ def _smooth(lag, k1, k2, logarithm, out):  # type: ignore[no-untyped-def]
             walk += weight * square * t
     scale = 1.0 / (2.0 * k1 * k2)
     out[1] = -0.5 * white * scale
-    out[2] = _FLICKER * flicker * scale
+    out[2] = _FLICKER_FACTOR * flicker * scale
     out[3] = walk / 12.0 * scale
 
 
 @njit(**INNER)
-def _quantization(lag, k1, k2):  # type: ignore[no-untyped-def]
+def _quantization_covariance(lag, k1, k2):  # type: ignore[no-untyped-def]
     """The same for white angle noise: nonzero only where points of both second differences coincide."""
     total = 0.0
     for i in range(3):
@@ -67,7 +67,7 @@ def _quantization(lag, k1, k2):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _weight(lag, n1, n2):  # type: ignore[no-untyped-def]
+def _count_pairs(lag, n1, n2):  # type: ignore[no-untyped-def]
     """Number of pairs of terms with this lag."""
     return max(0, min(n1, n2 - lag) - max(0, -lag))
 
@@ -77,14 +77,14 @@ def _add_smooth(window, k1, k2, logarithm, products, means):  # type: ignore[no-
     """Add the pairs of the terms N, B and K, whose covariances are smooth in the lag on the scale of the shorter factor."""
     n1, n2 = window - 2 * k1 + 1, window - 2 * k2 + 1
     r = np.zeros(STOCHASTIC)
-    step = max(1, min(k1, k2) // _FINE)
+    step = max(1, min(k1, k2) // _LAG_STEPS)
     centre = k1 - k2
     reach = min(2 * (k1 + k2), window)
     for lag in range(centre - (reach // step) * step, centre + reach + 1, step):
-        weight = _weight(lag, n1, n2) * step
+        weight = _count_pairs(lag, n1, n2) * step
         if weight == 0:
             continue
-        _smooth(lag, k1, k2, logarithm, r)
+        _smooth_covariance(lag, k1, k2, logarithm, r)
         for a in range(1, STOCHASTIC):
             means[a] += weight * r[a]
             for b in range(1, STOCHASTIC):
@@ -101,11 +101,11 @@ def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type
         seen = False
         for q in range(p):
             seen = seen or lag == (q // 3) * k1 - (q % 3) * k2
-        weight = _weight(lag, n1, n2) * thin
+        weight = _count_pairs(lag, n1, n2) * thin
         if seen or weight == 0:
             continue
-        _smooth(lag, k1, k2, logarithm, r)
-        r[0] = _quantization(lag, k1, k2)
+        _smooth_covariance(lag, k1, k2, logarithm, r)
+        r[0] = _quantization_covariance(lag, k1, k2)
         means[0] += weight * r[0]
         products[0, 0] += weight * r[0] * r[0]
         for b in range(1, STOCHASTIC):
@@ -114,7 +114,7 @@ def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type
 
 
 @njit(**INNER)
-def _differences(k, logarithm, out):  # type: ignore[no-untyped-def]
+def _difference_covariances(k, logarithm, out):  # type: ignore[no-untyped-def]
     """Second differences at distance k of the three autocovariances, at every whole lag; lag 0 is in the middle of `out`."""
     middle = out.shape[1] // 2
     for lag in range(middle + 1):
@@ -129,13 +129,13 @@ def _differences(k, logarithm, out):  # type: ignore[no-untyped-def]
             flicker += weight * square * logarithm[t]
             walk += weight * square * t
         out[0, middle + lag] = out[0, middle - lag] = -0.5 * white
-        out[1, middle + lag] = out[1, middle - lag] = _FLICKER * flicker
+        out[1, middle + lag] = out[1, middle - lag] = _FLICKER_FACTOR * flicker
         out[2, middle + lag] = out[2, middle - lag] = walk / 12.0
 
 
 @njit(fastmath=REORDER, **INNER)
 def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no-untyped-def]
-    """What `_add_smooth` adds where it takes every lag, from `_differences` of k1 <= k2.
+    """What `_add_smooth` adds where it takes every lag, from `_difference_covariances` of k1 <= k2.
 
     Covariances and numbers of pairs are even about the lag k1 - k2, so half of the lags are enough.
     """
@@ -189,7 +189,7 @@ def _sum_pairs(window, k1, k2, thin, logarithm, differences, products, means):  
 
 
 @njit(**KERNEL)
-def _tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
+def _fill_tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     n_tau = ks.size
     products = np.zeros((STOCHASTIC, STOCHASTIC, n_tau, n_tau))
     means = np.zeros((STOCHASTIC, n_tau, n_tau))
@@ -198,8 +198,8 @@ def _tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     widest = 2 * ks[-1] + min(4 * ks[-1], window) + 1
     differences = np.empty((3, 2 * widest + 1))
     for i in range(n_tau):
-        if ks[i] < 2 * _FINE:
-            _differences(ks[i], logarithm, differences)
+        if ks[i] < 2 * _LAG_STEPS:
+            _difference_covariances(ks[i], logarithm, differences)
         else:
             differences = np.empty((3, 0))
         for j in range(i, n_tau):
@@ -243,12 +243,12 @@ def product_tables(
         ``D[a]``, such that a rate that grows by rho per sample adds ``rho^2 sum_a s[a] D[a]``.
     """
     factors = np.asarray(ks, dtype=np.float64)
-    products, means = _tables(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
+    products, means = _fill_tables(window, np.asarray(ks), np.asarray(shifts), _log_lags(window))
     return np.asarray(2.0 * products), np.asarray(2.0 * factors[:, None] * factors[None, :] * means)
 
 
 @njit(**KERNEL)
-def _diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
+def _fill_diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
     products = np.zeros((STOCHASTIC, STOCHASTIC, ks.size))
     means = np.zeros((STOCHASTIC, ks.size))
     one = np.empty((STOCHASTIC, STOCHASTIC))
@@ -266,13 +266,13 @@ def diagonal_products(
     window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Diagonals of `product_tables`, shape (4, 4, n_tau), and of its second part, shape (4, n_tau), without the rest."""
-    products, means = _diagonals(window, np.asarray(ks), np.asarray(shifts), _logarithms(window))
+    products, means = _fill_diagonals(window, np.asarray(ks), np.asarray(shifts), _log_lags(window))
     return np.asarray(2.0 * products), np.asarray(
         2.0 * np.asarray(ks, dtype=np.float64) ** 2 * means
     )
 
 
-def _logarithms(window: int) -> NDArray[np.float64]:
+def _log_lags(window: int) -> NDArray[np.float64]:
     """``ln t`` for every lag that can occur, 0 at t = 0."""
     t = np.arange(5 * window + 2, dtype=np.float64)
     t[0] = 1.0

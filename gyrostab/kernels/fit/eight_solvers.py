@@ -175,7 +175,7 @@ def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untype
 
 
 @njit(**INNER)
-def _optimal(scaled, right, allowed, terms, solution, ok):  # type: ignore[no-untyped-def]
+def _is_optimal(scaled, right, allowed, terms, solution, ok):  # type: ignore[no-untyped-def]
     """`ok` where the solution for `terms` is above zero and no other allowed term would improve it (Karush-Kuhn-Tucker), else zero."""
     some = ok * 0.0
     for i in range(_TERMS):
@@ -237,7 +237,7 @@ def solve_nonnegative_eights(normal, right, allowed, terms, squares, room):  # t
     for i in range(_TERMS):
         put(scaled_right, i, take(right, i) * take(scale, i))
     found = solve_terms(scaled, scaled_right, terms, solution, work)
-    done = _optimal(scaled, scaled_right, allowed, terms, solution, found)
+    done = _is_optimal(scaled, scaled_right, allowed, terms, solution, found)
     put(tried, 0, done)
     everywhere = True
     for place in range(PLACES):

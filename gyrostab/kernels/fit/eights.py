@@ -53,7 +53,7 @@ class _EightModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 @lower_cast(types.Float, _EightType)
-def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
+def _spread_number(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
     """A plain number beside eights stands for eight of it."""
     wide = context.cast(builder, value, source, types.float64)
     first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), wide, ir.Constant(_SHORT, 0))
@@ -62,7 +62,7 @@ def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) ->
     )
 
 
-def _operator(symbol: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
+def _register_operator(symbol: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
     """Teach the compiler one operator between eights, or between eights and a plain number."""
 
     class Typing(AbstractTemplate):  # type: ignore[misc]
@@ -82,13 +82,13 @@ def _operator(symbol: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
     lower_builtin(symbol, _EightType, _EightType)(lower)
 
 
-_operator(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=_FUSE))
-_operator(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=_FUSE))
-_operator(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=_FUSE))
-_operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
+_register_operator(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=_FUSE))
+_register_operator(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=_FUSE))
+_register_operator(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=_FUSE))
+_register_operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
 
 
-def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+def _element_address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     """Where the eights number `index` of a C-contiguous (n, 8) array stand."""
     data = context.make_array(kind)(context, builder, array).data
     return builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [index])
@@ -110,7 +110,7 @@ def take(typing_context: Any, array: Any, index: Any) -> Any:
         return None
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_address(context, builder, sig.args[0], *args), align=8)
+        return builder.load(_element_address(context, builder, sig.args[0], *args), align=8)
 
     return _EIGHT(array, types.intp), emit
 
@@ -122,7 +122,7 @@ def put(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
         return None
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _address(context, builder, sig.args[0], *args[:2]), align=8)
+        builder.store(args[2], _element_address(context, builder, sig.args[0], *args[:2]), align=8)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, _EIGHT), emit

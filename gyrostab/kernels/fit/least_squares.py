@@ -96,7 +96,7 @@ def _make_room(size):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _quick(cells, weight, allowed, normal, right, fit, scratch):  # type: ignore[no-untyped-def]
+def _fit_diagonal(cells, weight, allowed, normal, right, fit, scratch):  # type: ignore[no-untyped-def]
     """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise.
 
     No noise falls faster than quantization noise does. A cell that lies below the fall from a
@@ -117,7 +117,7 @@ def _quick(cells, weight, allowed, normal, right, fit, scratch):  # type: ignore
         expected = level * first
         w = where_above(y, 0.0, weight[i] / (take(inverse, i) * expected * expected), 0.0)
         _add_equation(system, WIDTH * i, w, normal, right)
-    _mirror(normal)
+    _mirror_triangle(normal)
     solve_nonnegative_eights(normal, right, allowed, terms, fit.squares, scratch)
 
 
@@ -133,7 +133,7 @@ def _add_equation(system, at, w, normal, right):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _mirror(normal):  # type: ignore[no-untyped-def]
+def _mirror_triangle(normal):  # type: ignore[no-untyped-def]
     """Fill in what is below the diagonal of normal equations."""
     for a in range(5):
         for b in range(a):
@@ -189,7 +189,7 @@ def identify_noise(  # type: ignore[no-untyped-def]
             cells,
             np.empty(PLACES, np.int64),
         )
-        _quick(cells, weight, np.int64(31), normal, right, fit, scratch)
+        _fit_diagonal(cells, weight, np.int64(31), normal, right, fit, scratch)
         for w in range(start, min(start + PLACES, n_windows)):
             for a in range(5):
                 squares[a] = fit.squares[a, w - start]
@@ -275,11 +275,11 @@ def _normal_equations(whole, n, normal, right):  # type: ignore[no-untyped-def]
     one = take(whole, 0) * 0.0 + 1.0
     for i in range(n):
         _add_equation(whole, (n + WIDTH) * i + n, one, normal, right)
-    _mirror(normal)
+    _mirror_triangle(normal)
 
 
 @njit(**INNER)
-def _refit(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
+def _refit_windows(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
     """Refit until the covariance is that of the fitted noise. A fit that has arrived keeps its numbers, and its matrices are made anew."""
     squares, terms, basis, state, trial, tried = (
         fit.squares,
@@ -307,12 +307,12 @@ def _refit(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
             old, step = take(basis, a), take(squares, a) - take(basis, a)
             moved = where_above(where_above(step, 0.0, step, 0.0 - step), 1e-4 * old, moves, moved)
         put(state, 0, where_above(take(state, 1), 0.5, 0.0, moved))
-        if not _somewhere(state, np.int64(0)):
+        if not _has_positive(state, np.int64(0)):
             break
 
 
 @njit(**INNER)
-def _somewhere(rows, row):  # type: ignore[no-untyped-def]
+def _has_positive(rows, row):  # type: ignore[no-untyped-def]
     """Whether one of the eight numbers of a row is above zero."""
     found = False
     for place in range(PLACES):
@@ -321,7 +321,7 @@ def _somewhere(rows, row):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _estimate(a, allowed, squares, terms, normal, right, scratch, row, found):  # type: ignore[no-untyped-def]
+def _estimate_term(a, allowed, squares, terms, normal, right, scratch, row, found):  # type: ignore[no-untyped-def]
     """Estimate of one term, free of sign beside the chosen ones; its weights on the right-hand sides to `row`.
 
     Everything is NaN, and the separation zero, where the term cannot be told from the chosen ones.
@@ -363,7 +363,7 @@ def _estimate(a, allowed, squares, terms, normal, right, scratch, row, found):  
 
 
 @njit(**INNER)
-def _without(a, squares, facts, trial):  # type: ignore[no-untyped-def]
+def _remove_term(a, squares, facts, trial):  # type: ignore[no-untyped-def]
     """The noise if term `a` were not there and the neighbour most like it had made the same Allan variance instead.
 
     A ramp or a flicker floor is claimed only against a random walk that would reach as high at the
@@ -378,7 +378,7 @@ def _without(a, squares, facts, trial):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _growth(a, apart, cells, fit, room, tables, found):  # type: ignore[no-untyped-def]
+def _variance_growth(a, apart, cells, fit, room, tables, found):  # type: ignore[no-untyped-def]
     """Variance of the estimate of term `a` as a polynomial in its square, to rows 3, 4 and 5 of `found`."""
     seen, inverse, units, roots, weights = (
         cells.seen,
@@ -388,10 +388,10 @@ def _growth(a, apart, cells, fit, room, tables, found):  # type: ignore[no-untyp
         room.weights,
     )
     trial, parts = room.scratch[:5], room.scratch[5:8]
-    _without(a, fit.squares, cells.facts, trial)
+    _remove_term(a, fit.squares, cells.facts, trial)
     root_squares(trial, seen, units, roots)
     variance_parts(roots, a, units, inverse, tables, weights, parts)
-    if a < 2 and _somewhere(cells.facts, np.int64(5)):
+    if a < 2 and _has_positive(cells.facts, np.int64(5)):
         _joint_growth(a, trial, cells, room, tables, parts)
     for part in range(3):
         put(found, 5 * (3 + part) + a, where_above(apart, 0.5, take(parts, part), np.nan))
@@ -423,7 +423,7 @@ def _joint_growth(a, trial, cells, room, tables, parts):  # type: ignore[no-unty
 
 
 @njit(**INNER)
-def _judge(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore[no-untyped-def]
+def _judge_terms(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore[no-untyped-def]
     """Estimates of all terms with their errors, separations and growing variances to `found`; chi-square."""
     whole, weights, squares = room.whole, room.weights, fit.squares
     n = cells.inverse.shape[0]
@@ -440,7 +440,7 @@ def _judge(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore
     for a in range(5):
         if not allowed >> a & 1:
             continue
-        apart = _estimate(
+        apart = _estimate_term(
             a, allowed, squares, fit.terms, room.normal, room.right, room.scratch, row, found
         )
         for i in range(n):  # estimator as weights on the cells
@@ -448,7 +448,7 @@ def _judge(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore
             for b in range(1, 5):
                 weight = weight + take(row, b) * take(whole, width * i + n + b)
             put(weights, i, weight)
-        _growth(a, apart, cells, fit, room, tables, found)
+        _variance_growth(a, apart, cells, fit, room, tables, found)
 
 
 @njit(**KERNEL)
@@ -511,9 +511,9 @@ def fit_windows(  # type: ignore[no-untyped-def]
             start, avar, white, quantization, ramp, gap_factor, columns, to_samples, cells, valid
         )
         root_units(cells.seen, room.units)
-        _quick(cells, weight, allowed, room.normal, room.right, fit, room.scratch)
-        _refit(allowed, cells, fit, room, tables)
-        _judge(allowed, cells, fit, room, tables, found, row, chi2)
+        _fit_diagonal(cells, weight, allowed, room.normal, room.right, fit, room.scratch)
+        _refit_windows(allowed, cells, fit, room, tables)
+        _judge_terms(allowed, cells, fit, room, tables, found, row, chi2)
         for w in range(start, min(start + PLACES, n_windows)):
             place = w - start
             misfit[w, 1] = 0.0

@@ -11,7 +11,7 @@ __all__ = ["cell_limits", "interpolate_quantile"]
 
 
 @njit(**INNER)
-def _quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
+def _chi_square_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
     """Quantile of chi-square over its degrees of freedom, by Lagrange's cubic through four nodes of ``nu ln q``."""
     if not freedom > 0.0:
         return 0.0
@@ -45,12 +45,12 @@ def interpolate_quantile(freedom, start, step, curve):  # type: ignore[no-untype
     out = np.empty(freedom.shape)
     flat, values = freedom.ravel(), out.reshape(-1)
     for i in range(flat.size):
-        values[i] = _quantile(flat[i], start, step, curve)
+        values[i] = _chi_square_quantile(flat[i], start, step, curve)
     return out
 
 
 @njit(**INNER)
-def _see(columns, white, quantization, ramp, squares, seen):  # type: ignore[no-untyped-def]
+def _predict_cell(columns, white, quantization, ramp, squares, seen):  # type: ignore[no-untyped-def]
     """Allan variance of one cell under the fitted model; per squared coefficient, seen through the gaps, to `seen`."""
     model = 0.0
     for a in range(5):
@@ -66,8 +66,8 @@ def _see(columns, white, quantization, ramp, squares, seen):  # type: ignore[no-
 def _cell_quantile(a, whole, own_dof, share, dof, most, start, step, curve):  # type: ignore[no-untyped-def]
     """Quantile of a cell in which term `a` is alone; `whole` where nothing is missing. That of a ramp has the cell's degrees of freedom."""
     if a == 4:
-        return _quantile(min(own_dof, most, dof), start, step, curve)
-    return whole if share == 1.0 else _quantile(min(own_dof, most), start, step, curve)
+        return _chi_square_quantile(min(own_dof, most, dof), start, step, curve)
+    return whole if share == 1.0 else _chi_square_quantile(min(own_dof, most), start, step, curve)
 
 
 @njit(**KERNEL)
@@ -124,7 +124,7 @@ def cell_limits(  # type: ignore[no-untyped-def]
     whole, seen, lowest = np.empty((n_tau, 5)), np.empty(5), np.empty(5)
     for i in range(n_tau):
         for a in range(5):
-            whole[i, a] = _quantile(min(own_dof[a, i], most), start, step, curve)
+            whole[i, a] = _chi_square_quantile(min(own_dof[a, i], most), start, step, curve)
     for w in range(n_windows):
         lowest[:] = np.inf
         last = n_tau - 1
@@ -133,7 +133,9 @@ def cell_limits(  # type: ignore[no-untyped-def]
         for i in range(n_tau):
             if not np.isfinite(avar[w, i]):
                 continue
-            model = _see(columns[i], white[w, i], quantization[w, i], ramp[w, i], squares[w], seen)
+            model = _predict_cell(
+                columns[i], white[w, i], quantization[w, i], ramp[w, i], squares[w], seen
+            )
             share = factor[w, i]
             for a in range(5):
                 if ks[i] * span[a] < ks[last]:

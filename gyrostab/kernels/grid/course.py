@@ -38,7 +38,7 @@ _PERSIST_ROWS = 16
 
 
 @njit(**INNER)
-def _keep(table, n, level, phase, cost, parent):  # type: ignore[no-untyped-def]
+def _keep_hypothesis(table, n, level, phase, cost, parent):  # type: ignore[no-untyped-def]
     """Add a hypothesis to the first `n` of a table, each level once; returns how many there are then.
 
     The one with the fewest losses stays whatever it costs: while rows are late, all others are
@@ -80,7 +80,7 @@ def _stamp_nats(off, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _prune(table, n):  # type: ignore[no-untyped-def]
+def _prune_hypotheses(table, n):  # type: ignore[no-untyped-def]
     """Drop the hypotheses that the best one could still become at less cost; returns how many remain."""
     best = np.int64(0)
     for h in range(n):
@@ -98,7 +98,7 @@ def _prune(table, n):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _extend(new, kept, old, h, position, following, sigma, gain, hold, most):  # type: ignore[no-untyped-def]
+def _extend_hypothesis(new, kept, old, h, position, following, sigma, gain, hold, most):  # type: ignore[no-untyped-def]
     """Add to a table what hypothesis h becomes with a row that lies at `position`, and the next at `following`; the new length."""
     level, phase, cost = old[h, 0], old[h, 1], old[h, 2]
     weight = 0.5 / sigma**2
@@ -108,33 +108,33 @@ def _extend(new, kept, old, h, position, following, sigma, gain, hold, most):  #
         level, phase = level - 1.0, phase + 1.0
     off = position - level - phase
     step = gain * off if weight * off * off < _OUTLIER_NATS else 0.0
-    kept = _keep(new, kept, level, phase + step, cost + _stamp_nats(off, weight), h)
+    kept = _keep_hypothesis(new, kept, level, phase + step, cost + _stamp_nats(off, weight), h)
     low, far = np.rint(off - _REACH_SIGMA * sigma), min(np.rint(off + _REACH_SIGMA * sigma), most)
     while far >= low:  # a loss whose end this row may be, or a row too many
         if far > 0.0 or (far < 0.0 and far == np.rint(off)):
             rest = off - far
             dear = cost + _switch_nats(far) + _stamp_nats(rest, weight)
-            kept = _keep(new, kept, level + far, phase + gain * rest, dear, h)
+            kept = _keep_hypothesis(new, kept, level + far, phase + gain * rest, dear, h)
         far -= 1.0
     ahead = np.rint(following - level - phase)
     if (
         1.0 <= ahead <= most and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5
     ):  # a loss of which the next row shows the end
         dear = cost + _switch_nats(ahead) + _stamp_nats(off - ahead, weight)
-        kept = _keep(new, kept, level + ahead, phase, dear, h)
+        kept = _keep_hypothesis(new, kept, level + ahead, phase, dear, h)
     return kept
 
 
 @njit(**INNER)
-def _seed(table, level, phase, first, most):  # type: ignore[no-untyped-def]
+def _seed_hypotheses(table, level, phase, first, most):  # type: ignore[no-untyped-def]
     """Begin with a hypothesis; where the first row of a piece is at `first`, samples may be lost between the first rows."""
     table[0, 0], table[0, 1], table[0, 2] = level, phase, 0.0
     size = np.int64(1)
     if not np.isnan(first):
         for lost in range(1, 1 + _EARLY_LOSSES):
-            size = _keep(table, size, level - lost, phase, 0.0, np.int64(0))
+            size = _keep_hypothesis(table, size, level - lost, phase, 0.0, np.int64(0))
         if np.rint(first - phase) <= most:
-            size = _keep(
+            size = _keep_hypothesis(
                 table, size, np.rint(first - phase), phase, _LOSS_NATS, np.int64(0)
             )  # or many, just after the first
     return size
@@ -196,7 +196,7 @@ def trace(  # type: ignore[no-untyped-def]
     parents = np.empty((n, _MOST), dtype=np.int8)
     table = np.empty((n, _MOST, 2))
     first = (stamps[0] - stamp0) / period - (count[0] - count0) if seen == 0 and n > 0 else np.nan
-    size = _seed(old, level0, phase0, first, most)
+    size = _seed_hypotheses(old, level0, phase0, first, most)
     for i in range(n):
         position = (stamps[i] - stamp0) / period - (count[i] - count0)
         after = min(i + 1, n - 1)
@@ -204,8 +204,10 @@ def trace(  # type: ignore[no-untyped-def]
         follows = max(gain, 1.0 / (max(seen, _FIRST_ROWS) + i + 1.0))
         kept = np.int64(0)
         for h in range(size):
-            kept = _extend(new, kept, old, h, position, following, sigma, follows, hold, most)
-        size = _prune(new, kept) if kept > 1 else kept
+            kept = _extend_hypothesis(
+                new, kept, old, h, position, following, sigma, follows, hold, most
+            )
+        size = _prune_hypotheses(new, kept) if kept > 1 else kept
         for h in range(size):
             table[i, h, 0], table[i, h, 1], parents[i, h] = new[h, 0], new[h, 1], np.int8(new[h, 3])
         old, new = new, old

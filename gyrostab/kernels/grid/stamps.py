@@ -219,7 +219,7 @@ def look(cells, present):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _fits(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
+def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
     """Whether the next readable stamps after row j lie where unbroken counting puts them, after `expected`."""
     found = 0
     zero = state[_GRID0] - state[_PHASE] * _UNIT
@@ -236,7 +236,7 @@ def _fits(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _persists(stamps, j, n, latest):  # type: ignore[no-untyped-def]
+def _stays_behind(stamps, j, n, latest):  # type: ignore[no-untyped-def]
     """Whether the stamps after row j stay behind the latest one, so that the clock was set back."""
     found = 0
     for m in range(j + 1, min(n, j + 1 + LOOK)):
@@ -251,7 +251,7 @@ def _persists(stamps, j, n, latest):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _origin(stamps, j, period):  # type: ignore[no-untyped-def]
+def _estimate_origin(stamps, j, period):  # type: ignore[no-untyped-def]
     """Stamp [ns] that sample j should have had, as the stamps after it tell: its own jitter must not shift all others."""
     total, found = 0.0, 0
     for m in range(j, min(len(stamps), j + 32)):
@@ -265,7 +265,7 @@ def _origin(stamps, j, period):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _occupy(ring, head, sample):  # type: ignore[no-untyped-def]
+def _occupy_sample(ring, head, sample):  # type: ignore[no-untyped-def]
     """Mark `sample`, past the head, as taken and all between as free."""
     for g in range(max(head + 1, sample - len(ring) + 1), sample):
         ring[g % len(ring)] = False
@@ -280,7 +280,7 @@ def _is_free(ring, state, target):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _settle(row, position, state, ring):  # type: ignore[no-untyped-def]
+def _settle_rows(row, position, state, ring):  # type: ignore[no-untyped-def]
     """Place the rows without a stamp that come just before `row`, if it leaves exactly their room."""
     pending = state[_PENDING]
     state[_PENDING] = 0
@@ -290,21 +290,21 @@ def _settle(row, position, state, ring):  # type: ignore[no-untyped-def]
         and abs(position - (state[_HEAD] + 1 + pending)) <= 0.5
     ):
         for sample in range(state[_HEAD] + 1, state[_HEAD] + 1 + pending):
-            _occupy(ring, sample - 1, sample)
+            _occupy_sample(ring, sample - 1, sample)
         state[_RUN_LENGTH] += pending
         state[_ROW] += pending
         state[_HEAD] += pending
 
 
 @njit(**INNER)
-def _ahead(stamps, j, position, period, max_gap, state):  # type: ignore[no-untyped-def]
+def _judge_ahead(stamps, j, position, period, max_gap, state):  # type: ignore[no-untyped-def]
     """Judge row j, whose stamp is later than the next sample: verdict and sample."""
     expected = state[_HEAD] + 1
     soon = position - expected < 1.5
     # a late stamp stands apart from the one after it; of a doubled row, which follows a missing
     # one, both are the same
     apart = j + 1 < len(stamps) and stamps[j + 1] > stamps[j] + 0.05 * period
-    if (apart or not soon) and _fits(stamps, j, expected, period, state):
+    if (apart or not soon) and _fits_counting(stamps, j, expected, period, state):
         return _BY_COUNT, expected
     if (stamps[j] - state[_LATEST]) / period > max_gap:
         return STEP, expected + 1
@@ -312,11 +312,11 @@ def _ahead(stamps, j, position, period, max_gap, state):  # type: ignore[no-unty
 
 
 @njit(**INNER)
-def _behind(stamps, j, position, period, state, ring):  # type: ignore[no-untyped-def]
+def _judge_behind(stamps, j, position, period, state, ring):  # type: ignore[no-untyped-def]
     """Judge row j, whose stamp is earlier than the next sample: verdict and sample."""
     expected = state[_HEAD] + 1
     target = np.int64(np.rint(position))
-    if _persists(stamps, j, len(stamps), state[_LATEST]):
+    if _stays_behind(stamps, j, len(stamps), state[_LATEST]):
         elapsed = state[_LATEST] - state[_STAMP0]
         begins_again = (
             stamps[j] <= state[FIRST] + 0.1 * elapsed or 2 * (state[_LATEST] - stamps[j]) > elapsed
@@ -325,20 +325,20 @@ def _behind(stamps, j, position, period, state, ring):  # type: ignore[no-untype
     if _is_free(ring, state, target):
         return OUT_OF_ORDER, target
     stray = position - expected < -2.5
-    if stray and _fits(stamps, j, expected, period, state):
+    if stray and _fits_counting(stamps, j, expected, period, state):
         return _BY_COUNT, expected
     return DUPLICATE if target >= state[_HEAD] else OUT_OF_ORDER, max(target, state[_GRID0])
 
 
 @njit(**INNER)
-def _judge(stamps, j, position, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
+def _judge_row(stamps, j, position, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
     """Judge row j, whose stamp lies at `position` on the grid: verdict and sample."""
     expected = state[_HEAD] + 1
     phase = state[_PHASE] * _UNIT
     if position - expected > 0.5:
-        return _ahead(stamps, j, position, period, max_gap, state)
+        return _judge_ahead(stamps, j, position, period, max_gap, state)
     if position - expected < -0.5:
-        return _behind(stamps, j, position, period, state, ring)
+        return _judge_behind(stamps, j, position, period, state, ring)
     if phase > hold:  # the clock has come to lie nearer to the sample after
         state[_PHASE] -= int(1 / _UNIT)
         return _ON_TIME, expected + 1
@@ -356,7 +356,7 @@ def _add_run(runs, n, sample, row, length):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _note(events, n, cause, sample, row, before, stamp):  # type: ignore[no-untyped-def]
+def _note_event(events, n, cause, sample, row, before, stamp):  # type: ignore[no-untyped-def]
     events[n, 0], events[n, 1], events[n, 2], events[n, 3], events[n, 4] = (
         cause,
         sample,
@@ -368,7 +368,7 @@ def _note(events, n, cause, sample, row, before, stamp):  # type: ignore[no-unty
 
 
 @njit(**INNER)
-def _even(rows, stamps, j, n, period, expected, row, stamp0):  # type: ignore[no-untyped-def]
+def _skip_even_rows(rows, stamps, j, n, period, expected, row, stamp0):  # type: ignore[no-untyped-def]
     """The first row from j on that is not the one after the last, or whose stamp is not exactly `expected` samples after `stamp0`.
 
     No row waits here for what the ones before did to the phase, which they leave at zero.
@@ -391,7 +391,7 @@ def _on_time(rows, stamps, j, n, period, hold, state, ring):  # type: ignore[no-
     if not state[STARTED] or state[_PENDING]:
         return j
     if phase == 0:
-        j = _even(rows, stamps, j, n, period, head + 1 - grid0, row, stamp0)
+        j = _skip_even_rows(rows, stamps, j, n, period, head + 1 - grid0, row, stamp0)
         for g in range(max(begin, j - len(ring)), j):
             ring[(head + 1 + g - begin) & (len(ring) - 1)] = True
         if j > begin:
@@ -410,7 +410,7 @@ def _on_time(rows, stamps, j, n, period, hold, state, ring):  # type: ignore[no-
 
 
 @njit(**KERNEL)
-def _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  # type: ignore[no-untyped-def]
+def _place_rows(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  # type: ignore[no-untyped-def]
     """`place` into `runs` and `events`; returns how many there are of each."""
     n_runs, n_events = np.int64(0), np.int64(0)
     j = np.int64(-1)
@@ -426,17 +426,17 @@ def _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  
         if not state[STARTED]:
             state[STARTED] = 1
             state[FIRST] = state[_LATEST] = stamp
-            state[_STAMP0] = _origin(stamps, j, period)
+            state[_STAMP0] = _estimate_origin(stamps, j, period)
             state[_ROW] = state[_RUN_ROW] = row
             state[_RUN_LENGTH] = 1
             ring[0] = True
             continue
         position = state[_GRID0] - state[_PHASE] * _UNIT + (stamp - state[_STAMP0]) / period
-        _settle(row, position, state, ring)
+        _settle_rows(row, position, state, ring)
         head = state[_HEAD]
-        verdict, target = _judge(stamps, j, position, period, hold, max_gap, state, ring)
+        verdict, target = _judge_row(stamps, j, position, period, hold, max_gap, state, ring)
         if verdict > _BY_COUNT:
-            n_events = _note(
+            n_events = _note_event(
                 events,
                 n_events,
                 verdict,
@@ -448,7 +448,7 @@ def _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  
         if verdict >= STEP:
             state[_GRID0], state[_STAMP0], state[_LATEST], state[_PHASE] = (
                 target,
-                _origin(stamps, j, period),
+                _estimate_origin(stamps, j, period),
                 stamp,
                 0,
             )
@@ -463,7 +463,7 @@ def _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  
         else:
             n_runs = _add_run(runs, n_runs, state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH])
             state[_RUN_GRID], state[_RUN_ROW], state[_RUN_LENGTH] = target, row, 1
-        _occupy(ring, head, target)
+        _occupy_sample(ring, head, target)
         state[_HEAD], state[_ROW] = target, row
         if verdict != _BY_COUNT:
             state[_LATEST] = max(state[_LATEST], stamp)
@@ -514,5 +514,7 @@ def place(
         np.empty((2 * n + 2, 3), dtype=np.int64),
         np.empty((2 * n + 2, 5), dtype=np.int64),
     )
-    n_runs, n_events = _place(rows, stamps, n, period, hold, max_gap, state, ring, runs, events)
+    n_runs, n_events = _place_rows(
+        rows, stamps, n, period, hold, max_gap, state, ring, runs, events
+    )
     return runs[:n_runs].copy(), events[:n_events].copy()

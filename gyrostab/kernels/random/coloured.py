@@ -60,7 +60,7 @@ class _Section(NamedTuple):
     velocity: bool
 
 
-def _chain(sections: Sequence[_Section]) -> tuple[Array, Array, Array]:
+def _chain_sections(sections: Sequence[_Section]) -> tuple[Array, Array, Array]:
     """State matrix, input of white noise and output of sections in series; two states for each, both of the same size."""
     size = 2 * len(sections)
     a, b = np.zeros((size, size)), np.zeros(size)
@@ -80,14 +80,14 @@ def _chain(sections: Sequence[_Section]) -> tuple[Array, Array, Array]:
     return a, b, drive
 
 
-def _factor(covariance: Array) -> Array:
+def _factor_covariance(covariance: Array) -> Array:
     """A lower triangle whose square is the covariance, which may be singular."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.ascontiguousarray(np.asarray(np.linalg.qr(root.T, mode="r")).T)
 
 
-def _reading(a: Array, covariance: Array, c: Array, rate: float, *, average: bool) -> Reading:
+def _make_reading(a: Array, covariance: Array, c: Array, rate: float, *, average: bool) -> Reading:
     """Sample a stationary process with state matrix `a` [s-1] and the output `c` at `rate` [Hz]."""
     size = c.size
     step = expm(a / rate)
@@ -102,7 +102,10 @@ def _reading(a: Array, covariance: Array, c: Array, rate: float, *, average: boo
         total[:size, size] = total[size, :size] = crossed
         total[size, size] = c @ twice @ covariance @ c - read @ covariance @ read
     return Reading(
-        np.ascontiguousarray(step), np.ascontiguousarray(read), _factor(total), _factor(covariance)
+        np.ascontiguousarray(step),
+        np.ascontiguousarray(read),
+        _factor_covariance(total),
+        _factor_covariance(covariance),
     )
 
 
@@ -121,8 +124,8 @@ def oscillator(frequency: float, quality: float, rate: float, *, average: bool =
         Mean over each sample instead of the value at its beginning.
     """
     omega = 2.0 * math.pi * frequency
-    a, _, _ = _chain([_Section(omega, omega / quality, True)])
-    return _reading(a, np.eye(2), np.array([0.0, 1.0]), rate, average=average)
+    a, _, _ = _chain_sections([_Section(omega, omega / quality, True)])
+    return _make_reading(a, np.eye(2), np.array([0.0, 1.0]), rate, average=average)
 
 
 def _band_sections(low: float, high: float) -> list[_Section]:
@@ -166,10 +169,10 @@ def band(
     if resonance:
         omega = 2.0 * math.pi * resonance
         sections.append(_Section(omega, omega / quality, False))
-    a, b, c = _chain(sections)
+    a, b, c = _chain_sections(sections)
     covariance = solve_continuous_lyapunov(a, -np.outer(b, b))
     power = covariance[size - 1, size - 1]  # of the band before the mount
-    return _reading(a, covariance / power, c, rate, average=average)
+    return _make_reading(a, covariance / power, c, rate, average=average)
 
 
 def rest(reading: Reading, normal: Array) -> Array:

@@ -113,7 +113,7 @@ def ornstein_uhlenbeck(
     return total, x
 
 
-def _moments(samples: Array) -> tuple[Array, Array, Array]:
+def _mean_moments(samples: Array) -> tuple[Array, Array, Array]:
     """Decay over a sample, weight of both ends in its mean, and variance of the rest of the mean, for correlation times [samples]."""
     a = 1.0 / samples
     decay = -np.expm1(-a)
@@ -150,7 +150,7 @@ def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> 
     >>> means.round(4), round(position, 4)  # (1 - 1/e) e^-n and e^-3
     (array([0.6321, 0.2325, 0.0855]), 0.0498)
     """
-    decay, weight, rest = _moments(np.array([float(samples)]))
+    decay, weight, rest = _mean_moments(np.array([float(samples)]))
     total, last = ornstein_uhlenbeck(
         normal, decay, weight, math.sqrt(rest[0]), np.array([position])
     )
@@ -194,7 +194,7 @@ def flicker_means(
     means : ndarray, shape (n,)
     position : ndarray, shape (m,)
     """
-    decay, weight, rest = _moments(times * rate)
+    decay, weight, rest = _mean_moments(times * rate)
     variance = math.log(RATIO) / math.pi  # of each process
     inner = rest.sum()
     if endless:  # sum of 2 T over the correlation times that would follow; together they are white

@@ -13,16 +13,16 @@ from scipy.special import stdtr, stdtrit
 __all__ = [
     "LagFit",
     "Laws",
-    "averages",
-    "beside",
+    "block_averages",
     "calibrated",
-    "chances",
     "decompose",
     "fit_lags",
     "mixture",
     "noise_laws",
     "null_weights",
     "p_values",
+    "project_out",
+    "simulate_p_values",
     "slope_interval",
     "uncalibrated",
     "weights",
@@ -60,7 +60,7 @@ class LagFit(NamedTuple):
     freedom: int
 
 
-def averages(
+def block_averages(
     block: NDArray[np.int64], time: Array, length: float, share: Array
 ) -> tuple[Any, Array, Array]:
     """Average windows into blocks, and say how the white noise of the blocks is correlated.
@@ -121,7 +121,7 @@ def noise_laws(centre: Array, white: Array) -> Laws:
     Returns
     -------
     Laws
-        With no nuisance yet (see `beside`).
+        With no nuisance yet (see `project_out`).
     """
     record = float(np.ptp(centre)) or 1.0
     distance = np.abs(centre[:, None] - centre[None, :]) / record
@@ -149,7 +149,7 @@ def decompose(family: list[Array], prior: Array) -> Laws:
     return Laws(factor, whiten, log_det, np.asarray(prior), n - 1)
 
 
-def beside(laws: Laws, nuisance: Array) -> Laws:
+def project_out(laws: Laws, nuisance: Array) -> Laws:
     """Noise laws beside nuisance columns (n, p): what is whitened is freed from them, and they count in the likelihood."""
     q, r = np.linalg.qr(laws.whiten @ nuisance)
     free = laws.whiten - q @ (np.swapaxes(q, 1, 2) @ laws.whiten)
@@ -169,7 +169,7 @@ def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
     Parameters
     ----------
     laws : Laws
-        Of `beside`.
+        Of `project_out`.
     series, driver : float64 (n, n_series), (n, n_lags)
         Columns.
 
@@ -220,13 +220,15 @@ def p_values(fit: LagFit) -> Array:
     return np.asarray(2.0 * stdtr(fit.freedom, -np.abs(mean / spread)))
 
 
-def chances(laws: Laws, driver: Array, weight: Array, draws: int = 300, seed: int = 20) -> Array:
+def simulate_p_values(
+    laws: Laws, driver: Array, weight: Array, draws: int = 300, seed: int = 20
+) -> Array:
     """P-values by (draw, lag) of noise that has nothing to do with the driver, and follows the laws by their weights.
 
     Parameters
     ----------
     laws : Laws
-        Of `beside`.
+        Of `project_out`.
     driver : float64 (n, n_lags)
         Columns.
     weight : float64 (n_laws,)

@@ -22,7 +22,9 @@ _NEGLIGIBLE = 40.0
 
 
 @njit(**KERNEL)
-def _terms(base: Array, rotated: Array, constant: Array, share: Array) -> tuple[Array, Array]:
+def _mixture_terms(
+    base: Array, rotated: Array, constant: Array, share: Array
+) -> tuple[Array, Array]:
     """Logarithm of every term of the mixture less the largest of its design and record, (design, record, width x grid), and that one."""
     designs, records, grid, p = rotated.shape
     kinds = constant.shape[1]
@@ -75,7 +77,7 @@ def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Arra
     )  # (design, width, p, grid)
     share = 0.5 * widths[:, None, None] / spread
     constant = -np.log(widths.size) - 0.5 * np.log(spread).sum(axis=2)
-    terms, best = _terms(base, rotated, constant, share)
+    terms, best = _mixture_terms(base, rotated, constant, share)
     return np.asarray(
         best + np.log(np.exp(terms, out=terms).sum(axis=2))
     )  # numpy takes many exponentials at once

@@ -67,7 +67,7 @@ def _solve_subset(normal, right, subset, solution, work, members):  # type: igno
 
 
 @njit(**INNER)
-def _optimal(normal, right, allowed, subset, solution):  # type: ignore[no-untyped-def]
+def _is_optimal(normal, right, allowed, subset, solution):  # type: ignore[no-untyped-def]
     """Whether the solution for `subset` is not negative, and no other allowed term would improve it (Karush-Kuhn-Tucker)."""
     for i in range(right.size):
         if subset >> i & 1:
@@ -116,7 +116,7 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
     if (
         guess
         and _solve_subset(scaled, scaled_right, guess, trial, work, members)
-        and _optimal(scaled, scaled_right, allowed, guess, trial)
+        and _is_optimal(scaled, scaled_right, allowed, guess, trial)
     ):
         for i in range(n):
             solution[i] = trial[i] * scale[i]

@@ -55,7 +55,7 @@ def flicker_states(step: float, span: float) -> tuple[Array, Array, float]:
 
 
 @njit(**INNER)
-def _moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared):  # type: ignore[no-untyped-def]
+def _block_moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared):  # type: ignore[no-untyped-def]
     """Variance of the mean over a block of `step` seconds when the states at its start are known.
 
     Fills in how each state goes on, its weight in the mean, the variance of what is new at the end,
@@ -78,7 +78,7 @@ def _moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared):  # t
 
 
 @njit(**INNER)
-def _advance(covariance, decay, drive):  # type: ignore[no-untyped-def]
+def _advance_states(covariance, decay, drive):  # type: ignore[no-untyped-def]
     m = decay.size
     for i in range(m):
         for j in range(m):
@@ -87,7 +87,7 @@ def _advance(covariance, decay, drive):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _project(covariance, weight, first, gain):  # type: ignore[no-untyped-def]
+def _project_covariance(covariance, weight, first, gain):  # type: ignore[no-untyped-def]
     """Covariances of the states with the mean to `gain`; returns the mean's variance. Both over the states from `first` on."""
     total = 0.0
     for j in range(first, weight.size):
@@ -99,14 +99,14 @@ def _project(covariance, weight, first, gain):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _subtract(covariance, gain, F):  # type: ignore[no-untyped-def]
+def _subtract_gain(covariance, gain, F):  # type: ignore[no-untyped-def]
     for j in range(gain.size):
         for k in range(gain.size):
             covariance[j, k] -= gain[j] * gain[k] * F
 
 
 @njit(fastmath={"contract"}, **INNER)
-def _innovations(row, state, weight, decay, gain, scale, out):  # type: ignore[no-untyped-def]
+def _scale_innovations(row, state, weight, decay, gain, scale, out):  # type: ignore[no-untyped-def]
     """Scaled innovations of all columns to `out`; the states of all columns to the next block."""
     for c in range(row.size):
         out[c] = row[c] - state[0, c]
@@ -172,19 +172,19 @@ def whiten(
     for i in range(n):
         if step_seconds[i] != last or K2[i] != walked:
             last, walked = step_seconds[i], K2[i]
-            rest = _moments(last, walked, ou_variance, ou_time, decay, weight, drive, shared)
+            rest = _block_moments(last, walked, ou_variance, ou_time, decay, weight, drive, shared)
         if not present[i]:
             for j in range(m):
                 for c in range(width):
                     state[j, c] *= decay[j]
-            _advance(covariance, decay, drive)
+            _advance_states(covariance, decay, drive)
             continue
         F = (
-            variance[i] + rest + _project(covariance, weight, 0 if known else 1, gain)
+            variance[i] + rest + _project_covariance(covariance, weight, 0 if known else 1, gain)
         )  # of the innovation; the level counts once known
         if not known:  # the level becomes what the mean says, with the error of all the rest
             known = True
-            _advance(covariance, decay, drive)
+            _advance_states(covariance, decay, drive)
             covariance[0, 0] = F + drive[0] - 2.0 * shared[0]
             for j in range(1, m):
                 covariance[0, j] = covariance[j, 0] = -gain[j] * decay[j] - shared[j]
@@ -192,8 +192,8 @@ def whiten(
             continue
         for j in range(m):
             gain[j] = (decay[j] * gain[j] + shared[j]) / F
-        _innovations(columns[i], state, weight, decay, gain, 1.0 / np.sqrt(F), out[i])
-        _advance(covariance, decay, drive)
-        _subtract(covariance, gain, F)
+        _scale_innovations(columns[i], state, weight, decay, gain, 1.0 / np.sqrt(F), out[i])
+        _advance_states(covariance, decay, drive)
+        _subtract_gain(covariance, gain, F)
         total += np.log(F)
     return out, total

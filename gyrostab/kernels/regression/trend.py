@@ -12,7 +12,7 @@ __all__ = ["window_trend"]
 
 
 @njit(fastmath=REORDER, **INNER)
-def _sums(values, seconds, origin, start):  # type: ignore[no-untyped-def]
+def _sum_finite(values, seconds, origin, start):  # type: ignore[no-untyped-def]
     """Number of finite values, and the sums of them and of their times beyond an origin."""
     count, total, elapsed = 0.0, 0.0, 0.0
     for i in range(values.size):
@@ -24,7 +24,7 @@ def _sums(values, seconds, origin, start):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=REORDER, **INNER)
-def _products(values, seconds, mean, centre):  # type: ignore[no-untyped-def]
+def _sum_products(values, seconds, mean, centre):  # type: ignore[no-untyped-def]
     """Sums over finite values of their deviation from the mean times that of their times, and of the square of the latter."""
     covariance, variance = 0.0, 0.0
     for i in range(values.size):
@@ -66,9 +66,9 @@ def window_trend(values, seconds, first, last):  # type: ignore[no-untyped-def]
             seconds[begin],
         )  # near the mean, so that the sums lose no digits
         here, there = values[begin:end], seconds[begin:end]
-        count, total, elapsed = _sums(here, there, origin, start)
+        count, total, elapsed = _sum_finite(here, there, origin, start)
         out[0, j] = mean = origin + total / count
-        covariance, variance = _products(here, there, mean, start + elapsed / count)
+        covariance, variance = _sum_products(here, there, mean, start + elapsed / count)
         if variance > 0.0:
             out[1, j] = covariance / variance
     return out

@@ -56,7 +56,7 @@ def sample_covariance(size: int, rate: float) -> Array:
     return out
 
 
-def _spectra(frequency: Array, rate: float) -> Array:
+def _plain_spectra(frequency: Array, rate: float) -> Array:
     """Plain two-sided densities of the four terms, shape (4, frequency)."""
     bend = np.sin(math.pi * frequency / rate)
     return np.stack(
@@ -114,7 +114,7 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
         seen = np.roll(taper, 2 * k) - taper[2 * k] * box / size
         found[:, number] = density @ (seen.real**2 + seen.imag**2) / (2 * size)
     found /= found[1]
-    ratio = found / _spectra(places * rate / size, rate)
+    ratio = found / _plain_spectra(places * rate / size, rate)
     wanted = np.arange(1, ordinates + 1)
     between = np.stack([np.interp(np.log(wanted), np.log(places), row) for row in ratio])
-    return np.asarray(between * _spectra(wanted * rate / size, rate))
+    return np.asarray(between * _plain_spectra(wanted * rate / size, rate))

@@ -34,7 +34,7 @@ _ERROR = 1.17  # of the deviation from the median of one number
 
 
 @njit(**INNER)
-def _bin(value):  # type: ignore[no-untyped-def]
+def _bin_index(value):  # type: ignore[no-untyped-def]
     if value == 0.0:
         return np.int64(0)
     return np.int64(min(max(4.0 * math.log2(value) + 128.0, 1.0), 255.0))
@@ -65,7 +65,7 @@ def _median_eight(row, i):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _insert(values, count, value):  # type: ignore[no-untyped-def]
+def _insert_sorted(values, count, value):  # type: ignore[no-untyped-def]
     """Put a value among the first `count`, which are sorted."""
     at = count
     while at > 0 and values[at - 1] > value:
@@ -84,8 +84,8 @@ def _median_pairs(row, i, near):  # type: ignore[no-untyped-def]
         one, other = row[i - apart], row[i + apart]
         if one != one or other != other:
             continue
-        _insert(near, count, one)
-        _insert(near, count + 1, other)
+        _insert_sorted(near, count, one)
+        _insert_sorted(near, count + 1, other)
         count += 2
     if count == 0:
         return np.nan, 0
@@ -154,17 +154,17 @@ def departures(x, out, histogram):  # type: ignore[no-untyped-def]
                 away = (row[i] - middle) * share[pairs]
             out[b, i] = away
             if away == away:
-                histogram[b, _bin(abs(away))] += np.uint32(1)
+                histogram[b, _bin_index(abs(away))] += np.uint32(1)
 
 
 @njit(**INNER)
-def _level(away, low, high, room):  # type: ignore[no-untyped-def]
+def _noise_level(away, low, high, room):  # type: ignore[no-untyped-def]
     """Deviation of the departures from `low` to before `high`, less an error of it; 0 where too few samples tell."""
     count = 0
     for j in range(max(low, 0), min(high, away.size)):
         value = abs(away[j])
         if value > 0.0:
-            _insert(room, count, value)
+            _insert_sorted(room, count, value)
             count += 1
     if count < _WINDOWS[0]:
         return 0.0
@@ -172,20 +172,20 @@ def _level(away, low, high, room):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _loudest(away, i, room):  # type: ignore[no-untyped-def]
+def _largest_noise_level(away, i, room):  # type: ignore[no-untyped-def]
     """How loud the noise right before or right after a sample is at least."""
     found = 0.0
     for window in _WINDOWS:
         found = max(
             found,
-            _level(away, i - 1 - window, i - 1, room),
-            _level(away, i + 2, i + 2 + window, room),
+            _noise_level(away, i - 1 - window, i - 1, room),
+            _noise_level(away, i + 2, i + 2 + window, room),
         )
     return found
 
 
 @njit(**INNER)
-def _stands_out(row, away, i, limit):  # type: ignore[no-untyped-def]
+def _is_outlier(row, away, i, limit):  # type: ignore[no-untyped-def]
     """Whether a sample is far beyond each of the two beside it, on the same side, and none within two samples jumps out half as far."""
     side = 1.0 if away[i] > 0.0 else -1.0
     least = _ALONE * abs(away[i])
@@ -234,7 +234,7 @@ def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
         beyond = 0
         for i in range(x.shape[1]):
             if deviation[b] > 0.0 and abs(away[b, i]) > limit * deviation[b]:
-                place[beyond], loud[beyond] = i, _loudest(away[b], i, room)
+                place[beyond], loud[beyond] = i, _largest_noise_level(away[b], i, room)
                 beyond += 1
         for k in range(beyond):
             i = place[k]
@@ -242,7 +242,7 @@ def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
             for other in range(max(k - _NEAR, 0), min(k + _NEAR + 1, beyond)):
                 if abs(place[other] - i) <= _NEAR:
                     level_here = max(level_here, loud[other])
-            if abs(away[b, i]) > limit * level_here and _stands_out(
+            if abs(away[b, i]) > limit * level_here and _is_outlier(
                 x[b], away[b], i, limit * deviation[b]
             ):
                 block[found], size[found], level[found] = b, abs(away[b, i]), level_here

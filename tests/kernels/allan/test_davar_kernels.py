@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gyrostab.kernels.allan.integrate import integrate, present_runs, pyramid_places, thin_pyramid
 from gyrostab.kernels.allan.surface import Unit, surface_unit
-from gyrostab.kernels.allan.vectors import IN_A_ROW, LANES, split_sums
+from gyrostab.kernels.allan.vectors import CONSECUTIVE_LAGS, LANES, split_sums
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.time.durations import thin
 
@@ -19,7 +19,7 @@ class TestKernels:
     def test_sums_of_several_lags_in_one_pass(self, seed, count, in_a_row, longest):
         rng = np.random.default_rng(seed)
         if in_a_row:
-            count = IN_A_ROW if count > 2 else 4
+            count = CONSECUTIVE_LAGS if count > 2 else 4
         sizes, first, place = (
             rng.integers(0, longest, count),
             int(rng.integers(0, 9)),
