@@ -61,8 +61,9 @@ class NoiseLaw:
     symbol, name : str
         Letter and name of IEEE Std 952.
     seconds_factor : float
-        Factor from the squared coefficient to (deg/h)^2 and seconds: density of white noise [degree2
-        hour-2 Hz-1] for N, variance for B, growth of the variance [degree2 hour-2 s-1] for K.
+        Factor from the squared coefficient to (deg/h)^2 and seconds: density of white noise
+        [degree2 hour-2 Hz-1] for N, variance for B, growth of the variance [degree2 hour-2 s-1]
+        for K.
     avar_factor : float
         Numerical factor of the law, such as 1/3 for K.
     power : int

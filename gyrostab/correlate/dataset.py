@@ -1,4 +1,4 @@
-"""The result as a dataset whose every unit stands on its variable."""
+"""The correlation as a dataset with units on every variable."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gyrostab.noise import TERMS
 
 __all__ = ["assemble", "join"]
 
-# variable -> (key of the entry, long name, units)
+# Key of the entry, long name and units of each variable.
 _STATISTICS = {
     "coupling_lag": ("lag", "time by which the variable follows the driver", "s"),
     "correlation": ("correlation", "correlation of the block means at that lag", "1"),
@@ -34,7 +34,7 @@ _STATISTICS = {
         "p-value adjusted for the search over lags, axes, variables and drivers",
         "1",
     ),
-    "effective_samples": ("effective", "independent samples that the windows are worth", "1"),
+    "effective_samples": ("effective", "effective number of independent samples", "1"),
 }
 _SLOPES = {"": "slope", "_stderr": "stderr", "_low": "low", "_high": "high"}
 _SLOPES |= {f"_{name}": name for name in ("rising", "rising_stderr", "falling", "falling_stderr")}
@@ -49,7 +49,7 @@ def assemble(
     level: float,
     longest: float,
 ) -> xr.Dataset:
-    """Put the entries by (axis, variable, driver) into one dataset, beside the series they were found in."""
+    """Build the dataset of entries by (axis, variable, driver), with the series they describe."""
     shape = (product.sizes["axis"], len(names), len(found))
     dims = ("axis", "variable", "driver")
 
@@ -83,14 +83,15 @@ def assemble(
     made["coupling_verdict"] = (
         dims,
         table("verdict", np.int8),
-        {"long_name": "what the record tells of the coupling", **flags},
+        {"long_name": "what the record shows about the coupling", **flags},
     )
     made["coupling_limits"] = (dims, *_limit_flags(shape, entries))
     for v, name in enumerate(names):
         for d, driver in enumerate(found):
             units = slope_units(str(product[name].attrs.get("units", "1")), driver.units)
             for suffix, key in _SLOPES.items():
-                label = f"sensitivity of {name.replace('_', ' ')} to {driver.label}{_slope_label(key, level)}"
+                series = name.replace("_", " ")
+                label = f"sensitivity of {series} to {driver.label}{_slope_label(key, level)}"
                 made[f"{name}_per_{driver.name}{suffix}"] = (
                     "axis",
                     table(key)[:, v, d],
@@ -99,12 +100,12 @@ def assemble(
     made["statement"] = (
         dims,
         table("statement", object).astype(str),
-        {"long_name": "the finding in one sentence"},
+        {"long_name": "result in one sentence"},
     )
     result = result.assign(made)
     labels = {
         "variable": (names, "variable of the product"),
-        "driver": ([driver.name for driver in found], "what may drive the variable"),
+        "driver": ([driver.name for driver in found], "channel that may drive the variable"),
     }
     result = result.assign_coords(
         {
@@ -124,7 +125,7 @@ def assemble(
 def _limit_flags(
     shape: tuple[int, ...], entries: Mapping[tuple[int, int, int], Mapping[str, Any]]
 ) -> tuple[Any, dict[str, Any]]:
-    """One bit for each thing that limits a verdict, and the attributes that say which."""
+    """Set one bit for each limit of a verdict, with the attributes that name the bits."""
     masks = {name: np.int8(1 << bit) for bit, name in enumerate(LIMITS)}
     bits = np.zeros(shape, np.int8)
     for place, entry in entries.items():
@@ -152,7 +153,7 @@ def _slope_label(key: str, level: float) -> str:
 
 
 def join(product: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
-    """The product with the correlation beside it, for one file; what both hold is the product's."""
+    """Merge product and correlation; a variable that both hold is that of the product."""
     new = [name for name in result.data_vars if name not in product.variables]
     return product.merge(result[new], compat="no_conflicts").assign_attrs(
         interval_level=result.attrs["interval_level"], longest_lag_s=result.attrs["longest_lag_s"]

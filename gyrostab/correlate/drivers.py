@@ -1,4 +1,4 @@
-"""The channel that may drive the gyro: aligned to the windows by averaging inside each, shifted by every lag, and its rate of change."""
+"""Align a channel that may drive the gyro, and its rate of change, with the windows at each lag."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Driver", "align_drivers", "other_channels", "slope_units"]
 
 Array = NDArray[np.float64]
 
-# a hole is bridged when it is no longer than this many spacings of the channel, or than a window
+# A gap is bridged if it is at most as long as a window or this many sample spacings of the channel.
 _MAX_GAP_SPACINGS = 3.0
 
 # Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS
@@ -43,50 +43,51 @@ class Driver:
 def align_drivers(
     product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.int64], step: float
 ) -> list[Driver]:
-    """Channel and its rate of change, averaged inside the windows, for every lag.
+    """Average a channel and its rate of change over the windows, for every lag.
 
     Parameters
     ----------
     product : xarray.Dataset
         Product with ``time`` and ``time_bounds``.
     channel : str or DataArray
-        Channel of the product, or one on a time of its own.
+        Channel of the product, or a channel with a separate time coordinate.
     lags : int64 (n_lags,)
-        Lags [steps]; the channel is taken that much earlier than the gyro.
+        Lags by which the gyro follows the channel [steps].
     step : float
         Step of the windows [s].
 
     Returns
     -------
     list of Driver
-        Two; NaN where the channel is not known. Holes as long as a window or three spacings of the
-        channel are bridged, nothing is extrapolated.
+        The channel and its rate of change; NaN where they are unknown. Gaps up to one window or
+        three spacings of the channel are interpolated; nothing is extrapolated.
     """
     if isinstance(channel, str):
         if channel not in product.data_vars or product[channel].dims != ("time",):
-            there = ", ".join(_channel_names(product)) or "none"
+            available = ", ".join(_channel_names(product)) or "none"
             raise OptionError(
-                f"the product has no channel {channel!r}; it has {there}; give another, or a file with --channel"
+                f"the product has no channel {channel!r}; it has {available}; give another, or a "
+                "file with --channel"
             )
         name, units = channel, str(product[channel].attrs.get("units", "1"))
-        both = _align_product_channel(product, channel, lags, step)
+        mean, rate = _align_product_channel(product, channel, lags, step)
     else:
         name, units = _name_channel(channel, product), str(channel.attrs.get("units", "1"))
-        both = _align_file_channel(channel, product, lags, step)
+        mean, rate = _align_file_channel(channel, product, lags, step)
     label = name.replace("_", " ")
     return [
-        Driver(name, label, units, both[0]),
+        Driver(name, label, units, mean),
         Driver(
             f"{name}_rate",
             f"rate of change of {label}",
             _multiply_units(_difference_unit(units), {"hour": -1}),
-            both[1],
+            rate,
         ),
     ]
 
 
 def other_channels(product: xr.Dataset, driver: str) -> list[str]:
-    """Channels of the product beside the driver and what is derived from it."""
+    """List the channels of the product except the driver and its rate of change."""
     bare = driver.removesuffix("_of_file")
     return [name for name in _channel_names(product) if name not in (driver, bare, f"{bare}_rate")]
 
@@ -115,13 +116,13 @@ def _grid_positions(product: xr.Dataset, step: float) -> NDArray[np.int64]:
 def _shift_by_lags(
     whole: Array, before: int, place: NDArray[np.int64], lags: NDArray[np.int64]
 ) -> Array:
-    """Values that lie each lag earlier, of a row on the grid of windows that begins `before` steps ahead of the first window."""
+    """Take the values one lag earlier, for each lag; `whole` begins `before` steps early."""
     at = place[None, :] - lags[:, None] + before
     return np.where(at >= 0, whole[np.maximum(at, 0)], np.nan)
 
 
 def _bridge_gaps(whole: Array, most: float) -> Array:
-    """Draw a line across holes of at most so many windows; longer ones and the ends stay as they are."""
+    """Interpolate over gaps of at most `most` windows, in place; nothing is extrapolated."""
     known = np.flatnonzero(np.isfinite(whole))
     wide = np.diff(known)
     for hole in np.flatnonzero((wide > 1) & (wide - 1 <= most)):
@@ -131,7 +132,7 @@ def _bridge_gaps(whole: Array, most: float) -> Array:
 
 
 def _window_length_ns(product: xr.Dataset) -> int:
-    """Length of a window [ns]."""
+    """Find the length of a window [ns]."""
     bounds = _to_nanoseconds(product["time_bounds"].values)
     return int(np.median(bounds[:, 1] - bounds[:, 0]))
 
@@ -161,7 +162,7 @@ def _align_product_channel(
 
 
 def _difference_means(mean: Array, step: float) -> Array:
-    """Rate of change [1/hour] of a row of window means, from its neighbours."""
+    """Differentiate a row of window means [per hour] by central differences."""
     slope = np.full(mean.size, np.nan)
     slope[1:-1] = (mean[2:] - mean[:-2]) / (2.0 * step / HOUR)
     return slope
@@ -170,10 +171,9 @@ def _difference_means(mean: Array, step: float) -> Array:
 def _align_file_channel(
     channel: xr.DataArray, product: xr.Dataset, lags: NDArray[np.int64], step: float
 ) -> list[Array]:
-    """Mean and slope of a channel on its own time inside the windows, from the longest lag before the first window on.
+    """Average and differentiate a channel with a separate time coordinate over the windows.
 
-    A channel with fewer than two values in a window is interpolated to the middle of the windows
-    instead.
+    A channel with fewer than two values per window is interpolated to the window centres instead.
     """
     values, stamps = _check_channel(channel, product)
     place, before = _grid_positions(product, step), int(lags[-1])
@@ -200,7 +200,7 @@ def _align_file_channel(
 def _interpolate_values(
     values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], longest: float
 ) -> Array:
-    """A line from each value to the next, NaN before the first, after the last and where two are too far apart."""
+    """Interpolate between values that are at most `longest` apart; NaN elsewhere."""
     after = np.clip(np.searchsorted(stamps, at), 1, max(stamps.size - 1, 1))
     if stamps.size < 2:
         return np.full(at.size, np.nan)
@@ -213,27 +213,27 @@ def _interpolate_values(
 def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray[np.int64]]:
     if channel.ndim != 1 or channel.dtype.kind not in "iuf":
         raise SchemaError(
-            f"channel {channel.name!r} must be numbers along one dimension of time; it has dimensions {channel.dims}"
+            f"channel {channel.name!r} must hold numbers along one dimension, time; it has "
+            f"dimensions {channel.dims}"
         )
     dim = channel.dims[0]
     if dim not in channel.coords or channel[dim].dtype.kind != "M":
-        raise SchemaError(
-            f"channel {channel.name!r} has no coordinate {dim!r} of dates; give it one"
-        )
+        raise SchemaError(f"channel {channel.name!r} has no datetime coordinate {dim!r}; add one")
     good = np.isfinite(channel.values) & ~np.isnat(channel[dim].values)
     stamps = _to_nanoseconds(channel[dim].values[good])
     order = np.argsort(stamps, kind="stable")
     stamps, values = stamps[order], channel.values[good][order].astype(np.float64)
     bounds = _to_nanoseconds(product["time_bounds"].values)
     if not stamps.size or stamps[-1] < bounds[0, 0] or stamps[0] >= bounds[-1, 1]:
-        said = (
+        extent = (
             "holds no value"
             if not stamps.size
             else f"spans {_stamp_text(stamps[0])} to {_stamp_text(stamps[-1])}"
         )
         raise TimeError(
-            f"channel {channel.name!r} {said}, the product {_stamp_text(bounds[0, 0])} to {_stamp_text(bounds[-1, 1])}: they do not overlap; "
-            "check the file, or the zero of its time with --epoch"
+            f"channel {channel.name!r} {extent}, the product {_stamp_text(bounds[0, 0])} to "
+            f"{_stamp_text(bounds[-1, 1])}: they do not overlap; check the file, or the zero of "
+            "its time with --epoch"
         )
     return values, stamps
 
@@ -252,7 +252,7 @@ def _unit_powers(units: str) -> dict[str, int]:
 
 
 def _difference_unit(units: str) -> str:
-    """Unit of a difference: kelvin for degrees Celsius."""
+    """Give the unit of a difference: kelvin for degrees Celsius."""
     return " ".join(_DIFFERENCE_UNITS.get(word, word) for word in units.split())
 
 
@@ -265,7 +265,7 @@ def _multiply_units(units: str, more: dict[str, int]) -> str:
 
 
 def slope_units(units: str, driver: str) -> str:
-    """Unit of a sensitivity, spelled for UDUNITS.
+    """Give the unit of a sensitivity, spelled for UDUNITS.
 
     Examples
     --------

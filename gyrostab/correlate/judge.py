@@ -1,4 +1,4 @@
-"""What a record can tell of a coupling, in flags and in one sentence."""
+"""What a record shows about a coupling, as flags and in one sentence."""
 
 from __future__ import annotations
 
@@ -21,22 +21,40 @@ Array = NDArray[np.float64]
 #: Flag values of ``coupling_verdict``.
 VERDICTS = ("cannot_tell", "none_seen", "not_told_apart", "coupled")
 
-#: Bit -> name of ``coupling_limits``, and how a sentence says it.
+#: Names of the bits of ``coupling_limits``, and the wording of each in a sentence.
 LIMITS = {
     "constant": "{driver} is constant",
     "too_few": "there are too few independent windows",
-    "clusters": "{driver} only differs between stretches that a gap parts",
+    "clusters": "{driver} differs only between segments separated by a gap",
     "one_moment": "{driver} changes at one moment only",
-    "no_reversal": "{driver} never turns, so a drift or slow noise looks the same",
-    "no_plateau": "{driver} never rests, so a lasting effect and one of its rate of change look alike",
-    "other_channel": "another channel explains it as well",
+    "no_reversal": "{driver} never reverses, so a drift or slow noise looks the same",
+    "no_plateau": "{driver} is never constant, so its effect and that of its rate of change "
+    "look alike",
+    "other_channel": "another channel explains it equally well",
 }
 _MIN_BLOCKS = 12
-_MIN_RANGE = {"degree_Celsius": 0.02}  # a smaller range of the channel counts as none
+_MIN_RANGE = {"degree_Celsius": 0.02}  # a channel with a smaller range counts as constant
 
 
 def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: bool) -> set[str]:
-    """Say why a driver may not tell, from its block means `x` in the stretches `pieces` between long gaps."""
+    """List what limits a verdict on a driver.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_blocks,)
+        Block means of the driver.
+    pieces : ndarray of int, shape (n_blocks,)
+        Number of the segment between long gaps that holds each block.
+    units : str
+        Units of the driver.
+    derived : bool
+        The driver is the rate of change of a channel.
+
+    Returns
+    -------
+    set of str
+        Keys of `LIMITS`.
+    """
     found = set()
     span = float(np.ptp(x)) if x.size else 0.0
     if x.size < _MIN_BLOCKS:
@@ -61,12 +79,12 @@ def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: b
 
 
 def readable_units(units: str) -> str:
-    """Spell a unit of UDUNITS as people write it.
+    """Spell a UDUNITS unit in the customary way.
 
     Examples
     --------
-    >>> plain_units("degree hour-1 K-1"), plain_units("degree K-1"), plain_units("K-1"), plain_units("m s-2")
-    ('deg/h/K', 'deg/K', '1/K', 'm/s^2')
+    >>> [readable_units(text) for text in ("degree hour-1 K-1", "degree K-1", "K-1", "m s-2")]
+    ['deg/h/K', 'deg/K', '1/K', 'm/s^2']
     """
     above, below = [], ""
     for word in units.split():
@@ -83,18 +101,18 @@ def readable_units(units: str) -> str:
 
 
 def format_p_value(p: float) -> str:
-    """Write a p-value; beyond the reach of the simulation only that it is small.
+    """Format a p-value; the simulation does not resolve values below 0.0001.
 
     Examples
     --------
-    >>> chance(0.0312), chance(3e-9)
+    >>> format_p_value(0.0312), format_p_value(3e-9)
     ('0.031', '<0.0001')
     """
     return "<0.0001" if p < 1e-4 else f"{p:.2g}"
 
 
 def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
-    """One sentence of plain words about an entry."""
+    """Describe the coupling of a series with a driver in one sentence."""
     reasons = [LIMITS[name].format(driver=driver) for name in LIMITS if name in entry["limits"]]
     verdict = VERDICTS[entry["verdict"]]
     if verdict == "cannot_tell":
@@ -103,7 +121,8 @@ def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
             for name in ("constant", "too_few", "clusters", "one_moment")
             if name in entry["limits"]
         ]
-        return f"The record cannot tell whether {series} follows {driver}: {'; '.join(hard) or 'no window holds both'}."
+        reason = "; ".join(hard) or "no window holds both"
+        return f"The record cannot show whether {series} follows {driver}: {reason}."
     units = readable_units(entry["units"])
     between = f"{entry['low']:.3g} to {entry['high']:.3g}"
     number = f"{entry['slope']:.3g} ({between}) {units}"
@@ -112,19 +131,23 @@ def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
     odds = f"p {'' if entry['p_adjusted'] < 1e-4 else '= '}{format_p_value(entry['p_adjusted'])}"
     if verdict == "none_seen":
         apart = not entry["low"] <= 0.0 <= entry["high"]
-        note = (
-            "; at that lag alone it would stand out, in the whole search it does not"
-            if apart
-            else ""
-        )
+        note = "; it is significant at that lag alone, but not in the whole search" if apart else ""
         tail = f" ({'; '.join(reasons)})" if reasons else ""
-        return f"No coupling of {series} with {driver} is seen: {number}{late}, {odds} for the whole search{note}{tail}."
+        return (
+            f"No coupling of {series} with {driver} is seen: {number}{late}, {odds} for the whole "
+            f"search{note}{tail}."
+        )
     if verdict == "not_told_apart" and entry["p_adjusted"] >= 0.05:
         late = f" {entry['lag_white']:.3g} s later" if entry["lag_white"] else ""
         return (
-            f"{start} and {driver} change together{late}, by about {entry['slope_white']:.3g} {units}, but "
-            f"{LIMITS['no_reversal'].format(driver=driver)}. Allowing for that, the sensitivity is anything from {between} {units}."
+            f"{start} and {driver} change together{late}, by about {entry['slope_white']:.3g} "
+            f"{units}, but {LIMITS['no_reversal'].format(driver=driver)}. Allowing for that, the "
+            f"sensitivity may be anywhere from {between} {units}."
         )
     if verdict == "not_told_apart":
-        return f"{start} goes with {driver}{late}, {number}, {odds} for the whole search, but {'; '.join(reasons)}."
-    return f"{start} follows {driver}{late}: {number}, {odds} for the whole search{' (' + '; '.join(reasons) + ')' if reasons else ''}."
+        return (
+            f"{start} varies with {driver}{late}, {number}, {odds} for the whole search, but "
+            f"{'; '.join(reasons)}."
+        )
+    tail = f" ({'; '.join(reasons)})" if reasons else ""
+    return f"{start} follows {driver}{late}: {number}, {odds} for the whole search{tail}."

@@ -1,4 +1,4 @@
-"""The result as a table for the terminal."""
+"""The correlation as a table for the terminal."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ __all__ = ["correlation_rows", "format_correlation"]
 
 
 def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
-    """Write every entry as a row of a table.
+    """List every coupling as a row of a table.
 
     Parameters
     ----------
     result : xarray.Dataset
-        Of `gyrostab.correlate`.
+        Result of `gyrostab.correlate`.
 
     Returns
     -------
     list of dict
-        Heading -> text, the same headings in every row; ``-`` where the record cannot tell.
+        Text by heading, the same headings in every row; ``-`` where the record gives no number.
     """
     rows = []
     for a, axis in enumerate(result["axis"].values):
@@ -61,12 +61,12 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
 
 
 def format_correlation(result: xr.Dataset) -> str:
-    """Write the entries as a table, and a sentence on each that is coupled or not told apart.
+    """Format the result as a table, with a sentence on each coupling that is or may be there.
 
     Parameters
     ----------
     result : xarray.Dataset
-        Of `gyrostab.correlate`.
+        Result of `gyrostab.correlate`.
 
     Returns
     -------
@@ -77,13 +77,13 @@ def format_correlation(result: xr.Dataset) -> str:
     table = [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
     verdicts = result["coupling_verdict"].values.ravel()
     sentences = result["statement"].values.ravel()
-    said = [
+    statements = [
         str(sentences[place])
         for place in np.flatnonzero(verdicts >= VERDICTS.index("not_told_apart"))
     ]
     cannot = np.flatnonzero(verdicts == VERDICTS.index("cannot_tell"))
     if cannot.size:
-        said.append(
+        statements.append(
             str(sentences[cannot[0]])
             + (f" ({cannot.size - 1} more like it)" if cannot.size > 1 else "")
         )
@@ -92,5 +92,8 @@ def format_correlation(result: xr.Dataset) -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in table
     ]
-    note = "Lag, sensitivity and interval are those of the lag that fits best; p adjusted is for the whole search."
-    return "\n".join([*lines, note, "", *(said or ["No coupling is seen."])])
+    note = (
+        "Lag, sensitivity and interval are those of the best-fitting lag; "
+        "p adjusted is for the whole search."
+    )
+    return "\n".join([*lines, note, "", *(statements or ["No coupling is seen."])])

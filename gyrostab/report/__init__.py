@@ -1,4 +1,4 @@
-"""Pages that people read: of a product, and of a diagnosis, each one HTML file that needs nothing beside it."""
+"""Self-contained HTML reports of a product and of a diagnosis."""
 
 from gyrostab.report.diagnosis import write_diagnosis_report as write_diagnosis_report
 from gyrostab.report.product import write_report as write_report

@@ -1,4 +1,4 @@
-"""Fill in a template of this folder, as one HTML file."""
+"""Fill in an HTML template of this package."""
 
 from __future__ import annotations
 
@@ -10,16 +10,21 @@ __all__ = ["page_text"]
 
 
 def page_text(template: str, *, title: str, **content: Any) -> str:
-    """Text of a page that says when and by which version it was made.
+    """Render a template, with the time and the version that made the page.
 
     Parameters
     ----------
     template : str
         Name of the template, which extends ``frame.html.jinja``.
     title : str
-        Title and heading.
+        Title and heading of the page.
     **content
-        What the template asks for.
+        Variables of the template.
+
+    Returns
+    -------
+    str
+        HTML.
     """
     import jinja2
 

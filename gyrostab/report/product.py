@@ -1,4 +1,4 @@
-"""One self-contained HTML page of a product: summary in plain words, coefficients, figures, gaps, notes."""
+"""One self-contained HTML page of a product: summary, coefficients, figures, gaps and notes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["write_report"]
 
 _MAX_GAPS_LISTED = 20
-_MIN_CHANGE_RATIO = 1.5  # a variation of N over the record that is worth a sentence
+_MIN_CHANGE_RATIO = 1.5  # of the 95 % to the 5 % quantile of N, below which no sentence is written
 
 
 def write_report(
@@ -32,16 +32,16 @@ def write_report(
     log: xr.Dataset | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write a report on a product as one HTML file that needs nothing beside it.
+    """Write a report on a product as one self-contained HTML file.
 
     Parameters
     ----------
     product : xarray.Dataset
         What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens.
     path : path-like
-        The file to make.
+        File to write.
     log : xarray.Dataset, optional
-        The log that the product was made of, to show the signal and the gaps too.
+        Log from which the product was computed; adds the signal and the gaps to the report.
     overwrite : bool
         Replace an existing file.
 
@@ -53,9 +53,9 @@ def write_report(
     Raises
     ------
     SchemaError
-        When it is no product, or the log is no log.
+        If `product` is not a product or `log` is not a log.
     OutputError
-        When the file exists, or cannot be written.
+        If the file exists or cannot be written.
     """
     check_product(product)
     if log is not None:
@@ -97,7 +97,7 @@ def _stamp_text(time: Any) -> str:
 
 
 def _record_span(product: xr.Dataset) -> tuple[Any, Any]:
-    """Return the first and last moment of the record that any window covers."""
+    """Find the first and last time that any window covers."""
     if "time_bounds" in product.variables:
         bounds = product["time_bounds"].values
         return bounds.min(), bounds.max()
@@ -132,11 +132,12 @@ def _summarise_record(product: xr.Dataset) -> str:
     files = _file_names(product)
     origin = f" from {len(files)} file{'s' if len(files) != 1 else ''}" if files else ""
     rate = product.attrs.get("sampling_rate_hz")
-    speed = f" at {float(rate):g} samples a second" if rate is not None else ""
+    speed = f" at {float(rate):g} Hz" if rate is not None else ""
+    axis_text = f"{len(axes)} gyro {'axes' if len(axes) != 1 else 'axis'} ({', '.join(axes)})"
     length = duration(float((end - start) / np.timedelta64(1, "s")))
     return (
-        f"{len(axes)} gyro {'axes' if len(axes) != 1 else 'axis'} ({', '.join(axes)}){speed}{origin}, "
-        f"{length} from {_stamp_text(start)} to {_stamp_text(end)} UTC, looked at in {product.sizes['time']} windows."
+        f"{axis_text}{speed}{origin}, {length} from {_stamp_text(start)} to {_stamp_text(end)} UTC, "
+        f"analysed in {product.sizes['time']} windows."
     )
 
 
@@ -153,7 +154,7 @@ def _describe_findings(
             if row["median"] != "–"
         ]
         text = (
-            f"Axis {axis}: {', '.join(seen)}; medians."
+            f"Axis {axis}, medians: {', '.join(seen)}."
             if seen
             else f"Axis {axis}: no coefficient is observed in any window."
         )
@@ -171,7 +172,7 @@ def _describe_findings(
 
 
 def _describe_change(part: xr.Dataset) -> str:
-    """Say in a sentence how far angle random walk varies over the record, and when it is highest."""
+    """Say in one sentence how much N varies over the record, and when it is highest."""
     seen = part["observable"].sel(term="N").values == OBSERVABLE.index("observed")
     values = part["N"].values[seen]
     if values.size < 5:
@@ -180,7 +181,10 @@ def _describe_change(part: xr.Dataset) -> str:
     if low <= 0.0 or high < _MIN_CHANGE_RATIO * low:
         return ""
     when = _stamp_text(part["time"].values[seen][np.argmax(values)])
-    return f" Angle random walk varies from {_number_text(low)} to {_number_text(high)} deg/sqrt(h) and is highest around {when}."
+    return (
+        f" Angle random walk varies from {_number_text(low)} to {_number_text(high)} deg/sqrt(h) "
+        f"and is highest around {when}."
+    )
 
 
 def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
@@ -255,7 +259,7 @@ def _coefficient_rows(terms: list[TermSummary]) -> list[dict[str, Any]]:
 
 
 def _list_gaps(log: xr.Dataset) -> list[dict[str, Any]]:
-    """Describe the longest gaps in order of time."""
+    """List the longest gaps in order of time."""
     samples = np.asarray(log["gap_samples"].values)
     chosen = np.sort(np.argsort(-samples, kind="stable")[:_MAX_GAPS_LISTED])
     causes = str(log["gap_cause"].attrs.get("flag_meanings", " ".join(GAP_CAUSES))).split()
@@ -277,8 +281,8 @@ def _summarise_gaps(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
     missing = duration(
         float(np.sum(log["gap_samples"].values)) / float(log.attrs["sampling_rate_hz"])
     )
-    shown = f" The {len(gaps)} longest are listed." if total > len(gaps) else ""
-    return f"{total} gap{'s' if total != 1 else ''}, {missing} in all.{shown}"
+    shown = f" The table lists the {len(gaps)} longest." if total > len(gaps) else ""
+    return f"{total} gap{'s' if total != 1 else ''}, {missing} in total.{shown}"
 
 
 def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str, str]]:
@@ -324,34 +328,40 @@ def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str,
 #: How to read each figure.
 _CAPTIONS = {
     "signal": (
-        "Each panel shows one gyro axis or channel against time; a long record is drawn from its lowest to its highest sample, so "
-        "spikes stay visible. Grey marks gaps. Look for spikes, steps and drift, and whether they come together with temperature or "
+        "Each panel shows one gyro axis or channel over time. Each column of a long record is "
+        "drawn from its lowest to its highest sample, so spikes stay visible. Gaps are grey. Look "
+        "for spikes, steps and drift, and whether they coincide with changes of temperature or "
         "vibration."
     ),
     "coefficients": (
-        "A level line means that the gyro's noise does not change. N is the short-term noise that averaging reduces, B the floor that "
-        "averaging cannot beat, K and R the slow drift, Q the resolution of the output. Bars or bands are standard errors; a triangle "
-        "says that the true value lies below it (with 95 % confidence); grey says that these windows cannot tell."
+        "A level line means that the noise of the gyro does not change. N is the short-term noise "
+        "that averaging reduces, B the floor that averaging cannot reduce further, K and R the "
+        "slow drift, Q the resolution of the output. Bars or bands are standard errors. A triangle "
+        "is a 95 % upper limit of the true value. In grey windows the coefficient is not "
+        "observable."
     ),
     "davar": (
-        "Colour is the Allan deviation: how much the rate, averaged over the time on the vertical axis, differs from one average to "
-        "the next. A stable gyro gives horizontal stripes. Stripes that change colour at short averaging times mean more or less "
-        "noise; at long ones, more or less drift. Hatched cells have no estimate; dotted cells rest on incomplete averages beside "
-        "gaps."
+        "Colour is the Allan deviation: how much the rate, averaged over the time on the vertical "
+        "axis, differs from one average to the next. A stable gyro gives horizontal stripes; a "
+        "stripe that changes colour at short averaging times means more or less noise; at long "
+        "averaging times, more or less drift. Hatched cells have no estimate; dotted cells are "
+        "estimated from incomplete averages near gaps."
     ),
     "change": (
-        "The same, divided by what is usual for each averaging time: white is usual, orange is noisier, purple is quieter. Single "
-        "coloured cells at long averaging times are mostly chance, since a window holds few long averages; whole columns or patches "
-        "seldom are."
+        "The Allan deviation divided by its median over time at each averaging time: white is the "
+        "median, orange is noisier, purple is quieter. Single coloured cells at long averaging "
+        "times are mostly chance, because a window holds few long averages; whole columns or "
+        "patches are rarely chance."
     ),
     "adev": (
-        "Points are the Allan deviation of one window near the middle of the record; at each point the band holds the true value with "
-        "95 % confidence. Broken lines are the fitted noise terms that are observed, each with its own slope; the others are named with "
-        "their upper limit. The black line is the sum of all five: where it leaves the band again and again, the five terms do not "
-        "describe this gyro."
+        "Points are the Allan deviation of one window near the middle of the record; at each point "
+        "the band holds the true value with 95 % confidence. Dashed lines are the observed noise "
+        "terms, each with its own slope; the legend gives upper limits for the others. The black "
+        "line is the sum of all five terms: where it leaves the band repeatedly, the five terms do "
+        "not describe this gyro."
     ),
     "davar_3d": (
-        "The surface of the first axis; height and colour are the Allan deviation. A furrow or ridge across the surface is an event in "
-        "time; holes are gaps."
+        "The dynamic Allan deviation of the first axis; height and colour are the Allan deviation. "
+        "A ridge or furrow across all averaging times is an event in time; holes are gaps."
     ),
 }

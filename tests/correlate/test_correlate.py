@@ -1,4 +1,4 @@
-"""Coupling with a channel: what is there is found, what is not is not, and the intervals hold."""
+"""Coupling with a channel: detection, false alarms, coverage of the intervals, and messages."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def verdict(found: xr.Dataset, **where: str) -> str:
     return VERDICTS[int(found["coupling_verdict"].sel(**where))]
 
 
-def test_slope_and_lag_are_found_and_quiet_axes_are_not_accused():
+def test_slope_and_lag_are_found_and_other_axes_show_no_coupling():
     found = gyrostab.correlate(coupled.product(slope=0.3, lag=4, noises="white"), max_lag="5min")
     place = {"axis": "x", "variable": "window_mean", "driver": "temperature"}
     assert verdict(found, **place) == "coupled"
@@ -49,7 +49,7 @@ def test_slope_and_lag_are_found_and_quiet_axes_are_not_accused():
     assert "follows temperature" in str(found["statement"].sel(place).values)
 
 
-def test_rate_of_change_is_found():
+def test_coupling_with_the_rate_of_change_is_found():
     found = gyrostab.correlate(
         coupled.product(pace=0.05, noises="white"), variables="window_mean", max_lag=0
     )
@@ -60,7 +60,7 @@ def test_rate_of_change_is_found():
     assert low < 0.05 < high
 
 
-def test_ramps_are_fitted_apart():
+def test_rising_and_falling_slopes_are_fitted_separately():
     found = gyrostab.correlate(
         coupled.product(slope=0.3, noises="white", windows=240), variables="window_mean", max_lag=0
     )
@@ -71,7 +71,7 @@ def test_ramps_are_fitted_apart():
         assert abs(slope - 0.3) < 4 * error < 0.2
 
 
-def test_white_law_is_ordinary_least_squares():
+def test_fit_under_white_noise_is_ordinary_least_squares():
     rng = np.random.default_rng(3)
     y, x = rng.normal(size=(40, 1)), rng.normal(size=(40, 1))
     fit = fit_lags(project_out(decompose([np.eye(40)], np.zeros(1)), np.ones((40, 1))), y, x)
@@ -85,8 +85,8 @@ def test_white_law_is_ordinary_least_squares():
     )
 
 
-def test_overlap_of_windows_is_counted():
-    """Against the variance of block means of windows that are cut from white noise."""
+def test_overlap_of_windows_enters_the_covariance():
+    """Compare with the covariance of block means of windows cut from white noise."""
     rng = np.random.default_rng(4)
     cells = rng.normal(size=(20000, 14))
     windows = 0.5 * (cells[:, 1:] + cells[:, :-1])[:, :12]
@@ -99,7 +99,7 @@ def test_overlap_of_windows_is_counted():
     )  # a full window of two cells has variance 1/2
 
 
-def test_a_share_of_simulated_noise_and_its_p_value_belong_together():
+def test_calibration_of_p_values_is_inverted_exactly():
     chance = np.random.default_rng(6).uniform(size=2000) ** 2  # P(p <= x) = sqrt(x)
     for p in (1e-6, 1e-3, 0.05, 0.3, 0.9):
         assert calibrated(p, chance) == pytest.approx(np.sqrt(p), rel=1.0 if p < 1e-4 else 0.3)
@@ -110,7 +110,7 @@ def test_a_share_of_simulated_noise_and_its_p_value_belong_together():
     ("noises", "heat", "gap"),
     [("white", "sine", True), ("flicker", "sine", False), ("walk", "ramps", True)],
 )
-def test_intervals_hold_and_agree_with_the_p_values(noises, heat, gap):
+def test_intervals_have_their_coverage_and_agree_with_the_p_values(noises, heat, gap):
     hold = []
     for seed in range(8):
         product = coupled.product(
@@ -139,23 +139,23 @@ def test_intervals_hold_and_agree_with_the_p_values(noises, heat, gap):
 
 
 @pytest.mark.parametrize(("noises", "heat"), [("flicker", "sine"), ("slow", "walk")])
-def test_nothing_is_invented(noises, heat):
-    claims = 0
+def test_false_alarms_are_rare(noises, heat):
+    false_alarms = 0
     for seed in range(8):
         product = coupled.product(
             seed=50_000 + seed, noises=noises, heat=heat, windows=80, terms=False
         )
-        claims += bool(
+        false_alarms += bool(
             (
                 gyrostab.correlate(product, max_lag="8min")["coupling_verdict"]
                 == VERDICTS.index("coupled")
             ).any()
         )
-    assert claims <= 2  # of 8 at the rate of 5 %: more happens once in 170
+    assert false_alarms <= 2  # of 8 at a rate of 5 %; more happen once in 170
 
 
-def test_the_search_is_paid_for():
-    """The p-value for the whole search against that of the chosen lag: 12 lags of a driver without memory are worth many tests."""
+def test_adjusted_p_value_accounts_for_the_search_over_lags():
+    """With a driver without memory, 12 lags count as many tests."""
     product = coupled.product(noises="white", terms=False, axes="x")
     rng = np.random.default_rng(7)
     product["temperature"] = product["temperature"].copy(
@@ -170,7 +170,7 @@ def test_the_search_is_paid_for():
     )  # two drivers, Holm
 
 
-def test_autocorrelated_samples_count_less():
+def test_autocorrelation_lowers_the_effective_samples():
     many = gyrostab.correlate(coupled.product(noises="white", terms=False), max_lag=0)[
         "effective_samples"
     ].sel(driver="temperature")
@@ -183,7 +183,7 @@ def test_autocorrelated_samples_count_less():
     assert float(few.median()) < 20
 
 
-def test_a_record_that_cannot_tell_says_why():
+def test_statement_gives_the_reason_why_a_record_cannot_tell():
     flat = gyrostab.correlate(coupled.product(heat="flat"), variables="window_mean")
     assert (flat["coupling_verdict"] == VERDICTS.index("cannot_tell")).all()
     assert "temperature is constant" in str(flat["statement"].values[0, 0, 0])
@@ -193,10 +193,10 @@ def test_a_record_that_cannot_tell_says_why():
         coupled.product(heat="rise", slope=1.0, noises="white"), variables="window_mean", max_lag=0
     )
     assert verdict(rise, axis="x", variable="window_mean", driver="temperature") == "not_told_apart"
-    assert "never turns" in str(rise["statement"].values[0, 0, 0])
+    assert "never reverses" in str(rise["statement"].values[0, 0, 0])
 
 
-def test_two_clusters_across_a_gap_are_no_slope():
+def test_two_clusters_across_a_gap_give_no_slope():
     product = coupled.product(windows=160, noises="white", gap=False)
     late = np.arange(160) >= 80
     rng = np.random.default_rng(5)
@@ -209,7 +209,7 @@ def test_two_clusters_across_a_gap_are_no_slope():
     assert set(found["coupling_verdict"].sel(driver="temperature").values.ravel()) == {
         VERDICTS.index("cannot_tell")
     }
-    assert "a gap parts" in str(found["statement"].values[0, 0, 0])
+    assert "separated by a gap" in str(found["statement"].values[0, 0, 0])
 
 
 def test_channel_of_a_file_is_averaged_and_never_extrapolated(tmp_path):
@@ -232,7 +232,7 @@ def test_channel_of_a_file_is_averaged_and_never_extrapolated(tmp_path):
         gyrostab.correlate(product, channel=probe.assign_coords(t=stamps - np.timedelta64(9, "D")))
 
 
-def hours(values, product, every):
+def probe_channel(values, product, every):
     stamps = product["time_bounds"].values[0, 0] + (
         np.arange(values.size) * int(every * 1e9)
     ).astype("timedelta64[ns]")
@@ -241,7 +241,7 @@ def hours(values, product, every):
     )
 
 
-def test_short_holes_of_a_channel_are_bridged_and_long_ones_are_not():
+def test_short_gaps_of_a_channel_are_interpolated_and_long_ones_are_not():
     product = coupled.product(noises="white", gap=False, terms=False)
     seconds = np.arange(3630.0)
     course = 20 + 5 * np.sin(seconds / 300)
@@ -249,7 +249,7 @@ def test_short_holes_of_a_channel_are_bridged_and_long_ones_are_not():
     holed[600:655] = np.nan  # less than a window of 60 s
     holed[2000:2300] = np.nan  # five windows, a twelfth of the record
     seen = gyrostab.correlate(
-        product, channel=hours(holed, product, 1.0), variables="window_mean", max_lag=0
+        product, channel=probe_channel(holed, product, 1.0), variables="window_mean", max_lag=0
     )["probe"].values
     whole = np.array([course[30 * i : 30 * i + 60].mean() for i in range(120)])
     inside = np.flatnonzero((np.arange(120) * 30 >= 1990) & (np.arange(120) * 30 + 60 <= 2310))
@@ -263,7 +263,10 @@ def test_a_slow_channel_is_interpolated_between_its_values_only():
     product = coupled.product(noises="white", gap=False, terms=False)
     at = np.arange(0.0, 3300.0, 150.0)
     seen = gyrostab.correlate(
-        product, channel=hours(20 + at / 100, product, 150.0), variables="window_mean", max_lag=0
+        product,
+        channel=probe_channel(20 + at / 100, product, 150.0),
+        variables="window_mean",
+        max_lag=0,
     )["probe"].values
     middle = np.arange(120) * 30 + 30.0
     known = middle <= at[-1]
@@ -271,7 +274,7 @@ def test_a_slow_channel_is_interpolated_between_its_values_only():
     assert np.isnan(seen[~known]).all()
 
 
-def test_command_refuses_options_that_it_has_no_use_for(stored, capsys):
+def test_command_refuses_options_that_it_does_not_use(stored, capsys):
     assert main(["correlate", str(stored), "--rate", "100"]) == 2
     assert "--rate" in capsys.readouterr().err
     assert main(["correlate", str(stored), "--map", "T=temperature"]) == 2
@@ -389,12 +392,12 @@ def test_real_recordings(recordings, name, read, window, step, following, quiet)
             "coupled",
             "not_told_apart",
         )
-        said = str(
+        statement = str(
             whole["statement"].sel(variable="window_mean", axis=axis, driver="temperature").values
         )
-        assert "temperature never turns" in said
+        assert "temperature never reverses" in statement
         assert (
-            "change together" in said
+            "change together" in statement
             or float(whole["p_value"].sel(variable="window_mean", axis=axis, driver="temperature"))
             < 0.05
         )
@@ -405,14 +408,14 @@ def test_real_recordings(recordings, name, read, window, step, following, quiet)
         }
 
 
-def test_a_term_seen_in_scattered_windows_only_is_no_ground_for_a_verdict():
-    """Each window a stretch of its own leaves nothing to tell a slope from."""
+def test_term_observed_in_scattered_windows_only_gives_no_verdict():
+    """Where each window is a separate segment, no slope can be estimated."""
     product = synthetic.product()
     found = gyrostab.correlate(product)
     assert np.isfinite(found["p_value"].sel(variable="window_mean")).any()
     seen = product["observable"].sel(axis="x", term="Q").values == 2
     assert 12 < seen.sum() < 20
-    assert not (seen[1:] & seen[:-1]).any()  # enough windows, but none beside another
+    assert not (seen[1:] & seen[:-1]).any()  # enough windows, but no two next to each other
     assert (
         VERDICTS[int(found["coupling_verdict"].sel(axis="x", variable="Q").values[0])]
         == "cannot_tell"

@@ -1,4 +1,4 @@
-"""The report stands alone and says the right numbers."""
+"""The report of a product: a self-contained page with the right numbers."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def page(tmp_path_factory) -> _Page:
     return read(write_report(open_product(product), folder / "report.html", log=open_log(log)))
 
 
-def test_the_page_needs_nothing_beside_it(page):
+def test_page_is_self_contained(page):
     assert all(link.startswith("data:image/png;base64,") for link in page.links)
     assert (
         len(page.images) == 8
@@ -69,7 +69,7 @@ def test_the_page_needs_nothing_beside_it(page):
         assert base64.b64decode(image.split(",")[1]).startswith(b"\x89PNG")
 
 
-def test_the_coefficient_table_holds_medians_ranges_and_shares(page):
+def test_coefficient_table_holds_medians_ranges_and_shares(page):
     product = synthetic.product()
     rows = [row for row in page.rows if len(row) == 8 and ", " in row[1]]
     assert len(rows) == 15
@@ -94,27 +94,28 @@ def test_the_coefficient_table_holds_medians_ranges_and_shares(page):
     )
 
 
-def test_the_summary_is_in_plain_words(page):
+def test_summary_names_axes_span_and_change(page):
     text = re.sub(r"\s+", " ", page.text)
-    assert "3 gyro axes (x, y, z) at 300 samples a second from 2 files" in text
+    assert "3 gyro axes (x, y, z) at 300 Hz from 2 files" in text
     assert "2026-09-21 14:13:20" in text
-    assert "looked at in 40 windows" in text
+    assert "analysed in 40 windows" in text
     n = synthetic.product().N.sel(axis="y")
-    said = re.search(
-        r"Axis y:.*?Angle random walk varies from (\S+) to (\S+) deg/sqrt\(h\) and is highest around (\S+ \S+)\.",
+    change = re.search(
+        r"Axis y, medians:.*?Angle random walk varies from (\S+) to (\S+) deg/sqrt\(h\) "
+        r"and is highest around (\S+ \S+)\.",
         text,
     )
-    assert said is not None
-    assert [float(said[1]), float(said[2])] == pytest.approx(
+    assert change is not None
+    assert [float(change[1]), float(change[2])] == pytest.approx(
         n.quantile([0.05, 0.95]).values, rel=0.01
     )
-    assert said[3] == str(n.time[n.argmax("time")].values)[:19].replace("T", " ")
+    assert change[3] == str(n.time[n.argmax("time")].values)[:19].replace("T", " ")
     assert "urad (observed in 45 % of the windows only)" in text
     assert "R = " not in text
     assert "axis x 14 %" in text  # 4 of 40 windows hold nothing, 5 hold 70 %: 1 - 34.5 / 40 = 14 %
 
 
-def test_facts_gaps_and_notes(page):
+def test_page_lists_facts_gaps_and_notes(page):
     facts = {row[0]: row[1] for row in page.rows if len(row) == 2}
     assert facts["Files"] == "bore_run_4a.csv, bore_run_4b.csv"
     assert facts["Window"] == "6 s"
@@ -125,7 +126,7 @@ def test_facts_gaps_and_notes(page):
     assert "2 rows could not be read, µ" in page.text
 
 
-def test_words_of_the_user_are_not_markup(tmp_path):
+def test_text_of_the_user_is_escaped(tmp_path):
     product = synthetic.product(windows=6, axes="x")
     product.attrs["notes"] = ["<script>alert(1)</script> & more"]
     path = write_report(product, tmp_path / "report.html")
@@ -136,13 +137,13 @@ def test_words_of_the_user_are_not_markup(tmp_path):
     assert len(page.images) == 5
 
 
-def test_one_window_without_any_estimate_still_makes_a_page(tmp_path):
+def test_one_window_without_an_estimate_makes_a_page(tmp_path):
     page = read(write_report(synthetic.product(axes="x").isel(time=[20]), tmp_path / "report.html"))
     assert "Axis x: no coefficient is observed in any window." in page.text
     assert len(page.images) == 4  # no surface of a single window
 
 
-def test_existing_report_and_wrong_input(tmp_path):
+def test_existing_report_and_wrong_input_are_refused(tmp_path):
     path = tmp_path / "report.html"
     path.write_text("old")
     with pytest.raises(OutputError, match="exists already; give --overwrite"):

@@ -21,8 +21,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.integrate import TILE, integrate_tile, thin_pyramid
-from gyrostab.kernels.allan.vectors import CONSECUTIVE_LAGS, MAX_LAGS, split_sums
+from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, MAX_LAGS
 from gyrostab.kernels.compiled import INNER, KERNEL
+
+try:
+    from gyrostab.kernels.allan.vectors import split_sums
+except ImportError:  # without llvmlite, or where numba has moved what the vectors are built with
+    from gyrostab.kernels.allan.plain_sums import split_sums
 
 __all__ = ["full_counts", "group_factors", "grouped_blocks", "held_points", "windows_from_blocks"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.allan.vectors import LANES, MAX_LAGS
+from gyrostab.kernels.allan.plain_sums import LANES, MAX_LAGS
 from gyrostab.kernels.compiled import INNER, KERNEL
 
 __all__ = [

@@ -19,14 +19,10 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, LANES, MAX_LAGS
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["CONSECUTIVE_LAGS", "LANES", "MAX_LAGS", "split_sums"]
-
-#: Elements of a vector.
-LANES = 8
-#: Most lags in one pass, and most of lags that follow each other.
-MAX_LAGS, CONSECUTIVE_LAGS = 4, 8
+__all__ = ["split_sums"]
 
 _INDEX = ir.IntType(64)
 _SHORT = ir.IntType(32)

@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.kernels.allan.integrate import integrate, present_runs, pyramid_places, thin_pyramid
+from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, LANES
 from gyrostab.kernels.allan.surface import Unit, surface_unit
-from gyrostab.kernels.allan.vectors import CONSECUTIVE_LAGS, LANES, split_sums
+from gyrostab.kernels.allan.vectors import split_sums
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.time.durations import thin
 

@@ -1,0 +1,37 @@
+"""The inner loop of the Allan variance in plain numba: the same sums as `vectors`, one lag at a time.
+
+Used where the vectors of `gyrostab.kernels.allan.vectors` cannot be built, and in tests, as their
+reference implementation.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from gyrostab.kernels.compiled import KERNEL
+
+__all__ = ["CONSECUTIVE_LAGS", "LANES", "MAX_LAGS", "split_sums"]
+
+#: Elements of a vector.
+LANES = 8
+#: Most lags in one pass, and most of lags that follow each other.
+MAX_LAGS, CONSECUTIVE_LAGS = 4, 8
+
+
+@njit(fastmath={"reassoc", "contract", "nsz"}, **KERNEL)
+def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
+    """Add squared second differences in two parts; see `gyrostab.kernels.allan.vectors.split_sums`."""
+    for q in range(count):
+        k, split, size = lags[at + q], splits[q], sizes[q]
+        early = theta[first : first + size]
+        middle = theta[first + k : first + k + size]
+        late = theta[first + 2 * k : first + 2 * k + size]
+        head = tail = 0.0
+        for m in range(split):
+            difference = late[m] - 2.0 * middle[m] + early[m]
+            head += difference * difference
+        for m in range(split, size):
+            difference = late[m] - 2.0 * middle[m] + early[m]
+            tail += difference * difference
+        heads[place + q] += head
+        tails[place + q] += tail
