@@ -1,29 +1,36 @@
-"""Simulate the log of a three-axis fiber-optic gyro on a shaker and write ``mwd_sample.csv.gz`` and ``README.md`` beside this file.
+"""Simulate the log of a three-axis fiber-optic gyro on a shaker; write it and its README.
 
-The timeline is that of the vibration experiment in section 8 of Wang et al., Sensors 16 (2016): 930
-s, still until 330 s, vibrating until 630 s, still again, data lost from 432 s to 450 s, at about 65
-degC, 13.39 g rms with its power at 700-800 Hz. The sampling rate here is 100 Hz. Time t is in
-seconds from the first row. Each axis reads
+The files are ``mwd_sample.csv.gz`` and ``README.md`` in this folder. The timeline is that of the
+vibration experiment in section 8 of Wang et al., Sensors 16 (2016): 930 s, still until 330 s,
+vibrating until 630 s, still again, data lost from 432 s to 450 s, at about 65 degC, 13.39 g rms
+with its power at 700-800 Hz. The sampling rate here is 100 Hz. Time t is in seconds from the first
+row. With dt = 0.01 s, each axis reads
 
-    rate(t) = earth + a_T (T(t) - 60 degC) + k_2 g(t)^2 + b(t) + w(t) + (theta(t) - theta(t - dt)) / dt,    dt = 0.01 s
+    rate(t) = earth + a_T (T(t) - 60 degC) + k_2 g(t)^2 + b(t) + w(t)
+              + (theta(t) - theta(t - dt)) / dt
 
-- ``earth``: earth rate, 15.041 deg/h, in a tool that hangs plumb at 40 degrees north with toolface azimuth 30 degrees.
-- ``a_T``: temperature sensitivity left after compensation, up to 3e-3 deg/h/degC for a gyro of the 0.03 deg/h class (estimate).
-- ``k_2 g^2``: vibration rectification. Published sinusoidal tests at 30 Hz and 6 g gave 0.0118 to 0.0445 deg/h, that is
-  0.7e-3 to 2.5e-3 deg/h/g^2 if 6 g is the amplitude; g is the rms acceleration. It is a step of the
-  mean, not a random walk.
-- ``b``: bias instability (flicker, two-sided PSD B^2 / (2 pi f)) plus rate random walk (white steps), at one level throughout.
-- ``w``: white rate noise, N, raised by a factor under vibration (intensity and polarisation noise of the shaken fiber; in stepped
-  vibration tests of a three-axis gyro by Li et al., Chin. J. Lasers 40 (2013) 0908004, N rose four
-  times on average, ten at most).
-- ``theta``: angle noise. Still, it is the rounding of the angle increments (Q). Under vibration the housing also *turns* to and fro in the
-  band 700-800 Hz. The logger integrates the rate over each interval, so it samples the angle; a
-  flat band of 100 Hz sampled at 100 Hz folds to a white sequence, which no Allan variance can tell
-  from quantization noise of Q = the angle's rms value.
+- ``earth``: earth rate, 15.041 deg/h, in a tool that hangs plumb at 40 degrees north with toolface
+  azimuth 30 degrees.
+- ``a_T``: temperature sensitivity that remains after compensation, up to 3e-3 deg/h/degC for a gyro
+  of the 0.03 deg/h class (estimate).
+- ``k_2 g^2``: vibration rectification. Published sinusoidal tests at 30 Hz and 6 g gave 0.0118 to
+  0.0445 deg/h, that is 0.7e-3 to 2.5e-3 deg/h/g^2 if 6 g is the amplitude; g is the rms
+  acceleration. It is a step of the mean, not a random walk.
+- ``b``: bias instability (flicker, two-sided PSD B^2 / (2 pi f)) plus rate random walk (white
+  steps), at one level throughout.
+- ``w``: white rate noise, N, raised by a factor under vibration (intensity and polarisation noise
+  of the shaken fiber; in stepped vibration tests of a three-axis gyro by Li et al., Chin. J. Lasers
+  40 (2013) 0908004, N rose four times on average, ten times at most).
+- ``theta``: angle noise. At rest it is the rounding of the angle increments (Q). Under vibration
+  the housing also *rotates* back and forth in the band 700-800 Hz. The logger integrates the rate
+  over each interval, which means that it samples the angle; a flat band of 100 Hz sampled at 100 Hz
+  folds to a white sequence, which no Allan variance can distinguish from quantization noise with
+  Q = the rms angle.
 
-So under vibration N and Q rise for two different reasons, B and K do not rise, and the mean steps.
+Under vibration N and Q therefore rise for two different reasons, B and K do not rise, and the mean
+steps.
 
-Then the logger and the telemetry spoil the log: absent rows, unreadable words, duplicated rows,
+Then the logger and the telemetry damage the log: missing rows, unreadable cells, duplicated rows,
 rows out of order, flipped bits.
 """
 
@@ -112,7 +119,10 @@ def earth_rate() -> dict[str, float]:
 def shaped(
     rng: np.random.Generator, size: int, rate: float, psd: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Gaussian noise of `size` samples at `rate` [Hz] with the two-sided density `psd` at ``rfftfreq(size, 1 / rate)``."""
+    """Draw `size` samples of Gaussian noise at `rate` [Hz].
+
+    `psd` is the two-sided density at ``rfftfreq(size, 1 / rate)``.
+    """
     parts = rng.standard_normal((2, psd.size))
     spectrum = (parts[0] + 1j * parts[1]) * np.sqrt(psd * rate * size / 2.0)
     spectrum[0] = 0.0
@@ -120,7 +130,7 @@ def shaped(
 
 
 def flicker(rng: np.random.Generator, size: int, coefficient: float) -> NDArray[np.float64]:
-    """Flicker noise [deg/h]; drawn twice as long and halved, so that the end does not join the beginning."""
+    """Draw flicker noise [deg/h], twice as long and halved, so that it is not periodic."""
     frequency = np.fft.rfftfreq(2 * size, 1.0 / RATE)
     psd = np.zeros(frequency.size)
     psd[1:] = coefficient**2 / (2.0 * np.pi * frequency[1:])
@@ -128,7 +138,10 @@ def flicker(rng: np.random.Generator, size: int, coefficient: float) -> NDArray[
 
 
 def angular_vibration(rng: np.random.Generator, size: int, rms: float) -> NDArray[np.float64]:
-    """Angle [same unit as `rms`] at the ends of the sampling intervals, of a motion with a flat band of 700-800 Hz."""
+    """Draw the angle of a motion with a flat band of 700-800 Hz at the ends of sampling intervals.
+
+    The unit is that of `rms`.
+    """
     fine = 20  # 2 kHz
     frequency = np.fft.rfftfreq(size * fine, 1.0 / (RATE * fine))
     psd = np.where(
@@ -225,8 +238,10 @@ def header() -> list[str]:
     """Comment lines and the header row."""
     return [
         "# SIMULATED log of a three-axis fiber-optic gyro on a shaker; no measurement.",
-        f"# Written by data/make_mwd_sample.py, seed {SEED}; the true noise coefficients stand in data/README.md.",
-        f"# Still to {VIBRATING[0]:g} s, vibrating to {VIBRATING[1]:g} s, still to {DURATION:g} s; data lost {LOST[0]:g}-{LOST[1]:g} s.",
+        f"# Written by data/make_mwd_sample.py, seed {SEED}; "
+        "the true noise coefficients stand in data/README.md.",
+        f"# Still to {VIBRATING[0]:g} s, vibrating to {VIBRATING[1]:g} s, still to {DURATION:g} s; "
+        f"data lost {LOST[0]:g}-{LOST[1]:g} s.",
         "time,gyro_x [deg/h],gyro_y [deg/h],gyro_z [deg/h],temperature [degC],vibration [g]",
     ]
 
@@ -234,7 +249,8 @@ def header() -> list[str]:
 def truth_table() -> str:
     """Markdown table of the true coefficients, still and under vibration."""
     lines = [
-        "| axis | state | Q [urad] | N [deg/sqrt(h)] | B [deg/h] | K [deg/h^1.5] | mean [deg/h] at 60 degC |",
+        "| axis | state | Q [urad] | N [deg/sqrt(h)] | B [deg/h] | K [deg/h^1.5] "
+        "| mean [deg/h] at 60 degC |",
         "|---|---|---|---|---|---|---|",
     ]
     for axis in AXES:
@@ -244,48 +260,56 @@ def truth_table() -> str:
             q = np.hypot(truth["Q"], truth["theta"] if shaken else 0.0)
             n = truth["N"] * (truth["N_factor"] if shaken else 1.0)
             lines.append(
-                f"| {axis} | {state} | {q:.3f} | {n:.4f} | {truth['B']:g} | {truth['K']:g} | {earth + truth['k_2'] * g**2:.3f} |"
+                f"| {axis} | {state} | {q:.3f} | {n:.4f} | {truth['B']:g} | {truth['K']:g} "
+                f"| {earth + truth['k_2'] * g**2:.3f} |"
             )
     return "\n".join(lines)
 
 
 def readme(rows: int) -> str:
-    """Text of the README that describes the log and its truth."""
+    """Return the README, which describes the log and its ground truth."""
     steps = ", ".join(
         f"{axis} {TRUTH[axis]['k_2'] * (G_VIBRATING**2 - G_STILL**2):.2f}" for axis in AXES
     )
     slopes = ", ".join(f"{axis} {TRUTH[axis]['a_T']:g}" for axis in AXES)
-    dropouts = ", ".join(f"{start:g} s ({length:g} s)" for start, length in DROPOUTS)
+    places = [f"{start:g} s ({length:g} s)" for start, length in DROPOUTS]
+    dropouts = ", ".join(places[:4]) + ",\n  " + ", ".join(places[4:])
     return f"""# The shipped log
 
-`mwd_sample.csv.gz` is **simulated**: three gyro axes of a fiber-optic gyro of the 0.03 deg/h class on a shaker, {RATE} Hz, {DURATION} s,
-{rows} rows. `make_mwd_sample.py` (seed {SEED}) writes it and this page; what it assumes, with figures and sources, stands at its head.
+`mwd_sample.csv.gz` is **simulated**: three axes of a fiber-optic gyro of the 0.03 deg/h class on a
+shaker, {RATE} Hz, {DURATION} s, {rows} rows. `make_mwd_sample.py` (seed {SEED}) writes it and this
+page; the docstring of the script states every assumption, with figures and sources.
 
     python data/make_mwd_sample.py
 
 ## What is in it
 
-- `time` is ISO 8601 with milliseconds, which is exact at {RATE} Hz and needs no epoch to be told beside the file.
+- `time` is ISO 8601 with milliseconds, which is exact at {RATE} Hz and needs no separate epoch.
 - `gyro_x`, `gyro_y`, `gyro_z` in deg/h, least significant digit {LSB:g} deg/h.
-- `temperature` and `vibration` (rms acceleration) are slow sensors: each is filled in once a second, in different rows.
-- Still until {VIBRATING[0]:g} s, vibrating ({G_VIBRATING:g} g rms, 700-800 Hz) until {VIBRATING[1]:g} s, still to the end.
+- `temperature` and `vibration` (rms acceleration) are slow sensors: each has a value once a second,
+  in different rows.
+- Still until {VIBRATING[0]:g} s, vibrating ({G_VIBRATING:g} g rms, 700-800 Hz) until
+  {VIBRATING[1]:g} s, still to the end.
 
 ## What is true
 
 {truth_table()}
 
-R is zero. The vibration raises the mean by {steps} deg/h (rectification), a step that an Allan variance shows as
-an apparent K in windows across 330 s and 630 s and nowhere else. Q rises because the tool turns to and fro at 700-800 Hz, which folds to
-white angle noise at {RATE} Hz.
-The temperature rises from 58 to 66 degC and moves the means by {slopes} deg/h per degC. B and K lie below what windows of a
-minute can show: expect upper limits.
+R is zero. The vibration raises the mean by {steps} deg/h (rectification), a
+step that an Allan variance shows as an apparent K in windows across 330 s and 630 s and nowhere
+else. Q rises because the tool rotates back and forth at 700-800 Hz, which folds to white angle
+noise at {RATE} Hz. The temperature rises from 58 to 66 degC and shifts the means by
+{slopes} deg/h per degC. B and K are below what windows of a minute can
+show: expect upper limits.
 
-## What is wrong with it, on purpose
+## Deliberate damage
 
-- no rows from {LOST[0]:g} s to {LOST[1]:g} s (telemetry), nor at {dropouts};
+- no rows from {LOST[0]:g} s to {LOST[1]:g} s (telemetry), nor at
+  {dropouts};
 - 60 rows with `****`, `ERR` or an empty cell in place of one gyro axis or all three;
 - 2 rows sent twice, 3 rows four places late;
-- {SPIKES[1]} words of axis y with a flipped bit (82 to 655 deg/h) within 0.4 s from {SPIKES[0]:g} s.
+- {SPIKES[1]} values of axis y with a flipped bit (82 to 655 deg/h) within 0.4 s
+  from {SPIKES[0]:g} s.
 """
 
 

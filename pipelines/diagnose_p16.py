@@ -1,4 +1,4 @@
-"""Diagnose the vibration experiment of P16, simulated with what it is, against the five noise terms; write table and figure of the page."""
+"""Diagnose the simulated vibration experiment of P16; write table and figure of the page."""
 
 import re
 import sys
@@ -13,7 +13,7 @@ from gyrostab.plot.style import save_png
 
 
 def published(log, plan):
-    """Fit the five terms as the paper does, and give the median of each over the still and the shaken windows of every axis."""
+    """Fit the five terms as the paper does; return their medians over still and shaken windows."""
     product = gyrostab.fit_noise(gyrostab.davar(log, **plan["davar"]), method="adev")
     seconds = (product["time"] - log["time"][0]) / np.timedelta64(1, "s")
     parts = {

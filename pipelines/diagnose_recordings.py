@@ -1,4 +1,4 @@
-"""Diagnose the recordings of diagnose_recordings.toml, all or those named on the command line, and print a table of what is named."""
+"""Diagnose the recordings of diagnose_recordings.toml, all or those named; print a table."""
 
 import os
 import sys
@@ -25,17 +25,18 @@ def log_of(name, start=0.0, end=np.inf):
 
 
 def row(name, found):
-    """One row of the table: verdict, and each effect with its axes and what it gains."""
+    """Return one row of the table: verdict, and each effect with its axes and evidence."""
     named = [
         f"{one['name']} ({', '.join(one['axes'])}): {one['held_out_gain']['nats']:.0f}"
         for one in found.effects
     ]
-    held = found.content["held_out"]
-    return f"| {name} | {found.verdict} | {'; '.join(named)} | {held['coverage95_before']:.0%} | {held['coverage95_after']:.0%} |"
+    coverage = [found.content["held_out"][f"coverage95_{when}"] for when in ("before", "after")]
+    shares = " | ".join(f"{share:.0%}" for share in coverage)
+    return f"| {name} | {found.verdict} | {'; '.join(named)} | {shares} |"
 
 
 def halves(name, *, nulls=400):
-    """Fit a simulation to the first half, without and with the effects, and compare its Allan variance with that of the second half."""
+    """Compare the Allan variance of the second half with simulations fitted to the first half."""
     whole = log_of(name)
     seconds = whole.sizes["time"] / whole.attrs["sampling_rate_hz"]
     first, second = log_of(name, end=seconds / 2), log_of(name, start=seconds / 2)

@@ -1,4 +1,4 @@
-"""Draw what every physical effect does to a log, with and without it, and put the figures and the table of effects into docs/physics/.
+"""Draw a log with and without each physical effect; write figures and table of docs/physics/.
 
 Each effect has its experiment in effect_figures.toml; ``python pipelines/effect_figures.py shupe
 warm_up`` makes some of them.
@@ -25,7 +25,7 @@ DEFAULTS, OPTIONS = (
 )
 
 
-def twins(name):
+def simulate_pair(name):
     """Simulate the experiment of an effect without and with it, from the same seed."""
     entry = PLAN[name]
     model = read_model(
@@ -42,7 +42,12 @@ def draw(name, folder):
     """Make the figure of one effect as a small PNG."""
     options = {key: PLAN[name][key] for key in OPTIONS if key in PLAN[name]}
     folder.mkdir(parents=True, exist_ok=True)
-    save_png(plot_comparison(*twins(name), **options), folder / f"{name}.png", dpi=120, colours=256)
+    save_png(
+        plot_comparison(*simulate_pair(name), **options),
+        folder / f"{name}.png",
+        dpi=120,
+        colours=256,
+    )
     return folder / f"{name}.png"
 
 
@@ -66,8 +71,8 @@ def illustrate(page):
                     + "\n\n<!-- figure -->\n<!-- end of figure -->\n"
                     + "\n" * (number + 1 < len(parts))
                 )
-            image = f"![{effects()[name].short}](../figures/effects/{name}.png)\n\n{PLAN[name]['caption']}\n"
-            parts[number] = between(part, "figure", image)
+            image = f"![{effects()[name].short}](../figures/effects/{name}.png)"
+            parts[number] = between(part, "figure", f"{image}\n\n{PLAN[name]['caption']}\n")
     page.write_text("".join(parts), encoding="utf-8")
 
 
@@ -90,7 +95,14 @@ def rows(pages):
             page.name for page in pages if f"\n## {name}\n" in page.read_text(encoding="utf-8")
         )
         drivers = ", ".join(f"`{channel}`" for channel in kind.channels) or "–"
-        yield f"| [{name}]({home}#{name}) | {kind.short} | {drivers} | {kind.stage} | {'; '.join(amounts(kind))} |\n"
+        cells = (
+            f"[{name}]({home}#{name})",
+            kind.short,
+            drivers,
+            kind.stage,
+            "; ".join(amounts(kind)),
+        )
+        yield f"| {' | '.join(cells)} |\n"
 
 
 if __name__ == "__main__":
@@ -100,7 +112,8 @@ if __name__ == "__main__":
     sections = [page for page in index.parent.glob("*.md") if page != index]
     for section in sections:
         illustrate(section)
-    head = "| effect | what it does | driver | stage | parameters and typical sizes |\n|---|---|---|---|---|\n"
+    columns = "| effect | what it does | driver | stage | parameters and typical sizes |"
+    head = f"{columns}\n|---|---|---|---|---|\n"
     index.write_text(
         between(index.read_text(encoding="utf-8"), "effects", head + "".join(rows(sections))),
         encoding="utf-8",

@@ -1,4 +1,4 @@
-"""Simulate the experiments of the three papers, all or those named, and put their tables and figures beside ours in docs/seeds.md."""
+"""Simulate the papers' experiments, all or those named; write docs/seeds.md and its figures."""
 
 import re
 import sys
@@ -40,7 +40,7 @@ def analyse(log, run):
 
 
 def number(wanted, products):
-    """Find one number of the table: of which run, variable, axis, averaging time, stretch of time; and over its windows."""
+    """Find one number of the table by run, variable, axis, averaging time and time."""
     product = products[wanted["run"]].sel(tau=wanted.get("tau", 1.0), method="nearest")
     product = product.sel(axis=wanted["axis"]) if "axis" in wanted else product.isel(axis=0)
     begin, end = (
@@ -72,7 +72,7 @@ def lines(head, rows):
 
 
 def experiment(name, figures):
-    """Run one experiment, draw its figures, and write its table with the numbers of the paper beside ours."""
+    """Run one experiment, draw its figures, and return its table with the numbers of the paper."""
     entry = PLAN["experiment"][name]
     logs = {run: simulate(name, options) for run, options in entry["run"].items()}
     products = {run: analyse(logs[run], options) for run, options in entry["run"].items()}

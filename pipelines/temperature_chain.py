@@ -1,4 +1,4 @@
-"""Take a product and the temperature that another team measured, and write what follows it as NetCDF with a figure."""
+"""Correlate a product with a temperature from another file; write NetCDF and a figure."""
 
 import sys
 import tomllib
@@ -8,7 +8,7 @@ import gyrostab
 
 
 def chain(plan, folder):
-    """Correlate one product with one channel of another file, as the plan says; paths start at the plan's folder."""
+    """Correlate a product with a channel of another file; paths are relative to the plan."""
     product = gyrostab.open_product(folder / plan["product"])
     channel = gyrostab.read_channel(
         folder / plan["channel"]["file"], plan["channel"]["name"], **plan["channel"].get("read", {})
@@ -20,13 +20,13 @@ def chain(plan, folder):
 
 
 def sentences(found):
-    """List what is said of every axis, variable and driver that is coupled, or may be."""
+    """List the statements about every axis, variable and driver that is or may be coupled."""
     meanings = found["coupling_verdict"].attrs["flag_meanings"].split()
     said = found["statement"].where(
         found["coupling_verdict"] >= meanings.index("not_told_apart"), ""
     )
     return [str(sentence) for sentence in said.values.ravel() if sentence] or [
-        "Nothing is seen to follow it."
+        "No dependence is seen."
     ]
 
 
