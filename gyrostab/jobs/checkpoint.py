@@ -188,7 +188,8 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
     for name, described in first["variables"].items():
         dims, attrs = tuple(described["dims"]), _decode_attributes(described["attrs"])
         if "time" not in dims:
-            data = _map_variable(blocks[0], name)
+            # a copy: Windows does not remove a file that is mapped
+            data = np.array(_map_variable(blocks[0], name))
         elif small:
             data = np.concatenate(
                 [

@@ -18,7 +18,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ import numpy as np
 from gyrostab.errors import OutputError, ResumeError
 from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, replace_file
 from gyrostab.store.output.content import read_json
+from gyrostab.store.system import lock_file, read_at, write_at
 
 __all__ = [
     "begin_job",
@@ -48,6 +48,7 @@ __all__ = [
 ]
 
 _SCHEMA = "gyrostab.job/1"
+_REMOVES_OPEN_FILES = os.name != "nt"
 _JOB_FILE = re.compile(r"lock|job\.json|log\.zarr|log\.sha256|windows-\d{10}\.block")
 _STORE_CHECKSUM_FILE = "log.sha256"
 _MAX_DIFFERENCES = 4  # differences that a message lists
@@ -220,14 +221,24 @@ def lock_job(folder: Path) -> Iterator[None]:
     ResumeError
         When another process works in it.
     """
-    if find_spec("fcntl") is None:  # no such locks on this system
-        folder.mkdir(exist_ok=True)
+    handle = _open_lock(folder)
+    try:
+        os.ftruncate(handle, 0)
+        owner = f"process {os.getpid()} on {platform.node()}\n"
+        write_at(handle, owner.encode("ascii", "replace"), 0)
         yield
-        return
-    handle = None
-    while handle is None:
+    finally:
+        os.close(handle)
+        if not _REMOVES_OPEN_FILES:
+            _remove_lock(folder)
+
+
+def _open_lock(folder: Path) -> int:
+    """Open and lock the lock file of a job folder."""
+    while True:
         folder.mkdir(exist_ok=True)
-        with contextlib.suppress(FileNotFoundError):  # removed by the one who held it, just now
+        # the process that held the lock may remove it at any moment
+        with contextlib.suppress(FileNotFoundError):
             handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
             try:
                 _take_lock(handle, folder)
@@ -235,30 +246,26 @@ def lock_job(folder: Path) -> Iterator[None]:
                     raise FileNotFoundError
             except BaseException:
                 os.close(handle)
-                handle = None
                 raise
-    try:
-        os.ftruncate(handle, 0)
-        os.pwrite(
-            handle, f"process {os.getpid()} on {platform.node()}\n".encode("ascii", "replace"), 0
-        )
-        yield
-    finally:
-        os.close(handle)
+            return handle
 
 
 def _take_lock(handle: int, folder: Path) -> None:
-    import fcntl
-
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        who = os.pread(handle, 100, 0).decode("ascii", "replace").strip() or "another process"
+    if not lock_file(handle):
+        text = memoryview(bytearray(100))
+        count = read_at(handle, text, 0)
+        owner = bytes(text[:count]).decode("ascii", "replace").strip() or "another process"
         raise ResumeError(
-            f"{folder.name}: {who} is making this product now; wait for it, or stop it first"
-        ) from None
-    except OSError:  # a file system without locks
-        return
+            f"{folder.name}: {owner} is making this product now; wait for it, or stop it first"
+        )
+
+
+def _remove_lock(folder: Path) -> None:
+    """Remove a lock that `remove_job` could not: Windows does not remove a file that is open."""
+    if _list_names(folder) == ["lock"]:
+        with contextlib.suppress(OSError):  # another process has opened it
+            (folder / "lock").unlink()
+            folder.rmdir()
 
 
 def read_job(folder: Path) -> dict[str, Any] | None:
@@ -352,6 +359,6 @@ def remove_job(folder: Path, *, output: Path) -> None:
     """Remove a job folder, and what a killed run left of its output under other names."""
     clear_job(folder)
     remove_leftovers(output)
-    (folder / "lock").unlink(missing_ok=True)
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):  # Windows does not remove a file that is open
+        (folder / "lock").unlink(missing_ok=True)
         folder.rmdir()

@@ -134,23 +134,24 @@ def _start_processes(count: int) -> Any:
         count,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=_begin_process,
-        initargs=(os.getpid(),),
     )
 
 
-def _begin_process(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and end with it, even if it is killed."""
+def _begin_process() -> None:
+    """Ignore Ctrl-C, which the parent handles, and end when the parent ends or is killed."""
+    import multiprocessing
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
 
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
+    def end_with_parent() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
-    warnings.showwarning = lambda message, *_: (
-        None
-    )  # the parent opens the same files and says the same
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    # the parent opens the same files and shows the same warnings
+    warnings.showwarning = lambda message, *_: None
 
 
 class _ResultWithWarnings(NamedTuple):

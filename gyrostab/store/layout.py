@@ -87,7 +87,7 @@ def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:
     if not path.is_dir():
         return not any(encoding.get(filters) for filters in ("szip", "bzip2", "blosc"))
     try:
-        return bool(json.loads((path / name / ".zarray").read_text())["order"] == "C")
+        return bool(json.loads((path / name / ".zarray").read_bytes())["order"] == "C")
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -319,7 +319,7 @@ def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray
 def _read_zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
     """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk."""
     try:
-        layout = json.loads((folder / ".zarray").read_text())
+        layout = json.loads((folder / ".zarray").read_bytes())
         return _ZarrLayout(
             np.dtype(layout["dtype"]),
             find_zarr_codecs(layout),

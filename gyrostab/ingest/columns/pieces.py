@@ -1,13 +1,12 @@
 """Columns of 8-byte values in pieces, packed where that loses nothing, in memory or in an unlinked temporary file.
 
-Files are read back with `os.preadv`, not mapped: pages of a mapped file would count as memory of
+Files are read back with `gyrostab.store.system.read_at`, not mapped: pages of a mapped file would count as memory of
 this process, more and more of them as a long log is gone through, and every map holds a file handle
 of its own, of which hundreds of files would need thousands.
 """
 
 from __future__ import annotations
 
-import os
 import tempfile
 import threading
 from bisect import bisect_right
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
+from gyrostab.store.system import read_at, write_at
 
 __all__ = [
     "DecimalPiece",
@@ -45,7 +45,7 @@ class Spool:
             with self._lock:
                 if self.file is None:
                     self.file = tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)  # noqa: SIM115
-                _write_all(self.file, values.data.cast("B"))
+                _write_all(self.handle, values.data.cast("B"), self.end)
                 begin, self.end = self.end, self.end + values.nbytes
                 return begin
         except OSError as error:
@@ -70,9 +70,10 @@ class Spool:
         return self.file.fileno()
 
 
-def _write_all(file: IO[bytes], view: memoryview) -> None:
+def _write_all(handle: int, view: memoryview, begin: int) -> None:
     while view.nbytes:
-        view = view[file.write(view) :]
+        count = write_at(handle, view, begin)
+        view, begin = view[count:], begin + count
 
 
 @dataclass(frozen=True)
@@ -89,14 +90,14 @@ class _SpooledArray:
         wide, done = self.dtype.itemsize, 0
         view = out.data.cast("B")
         while done < view.nbytes:
-            got = os.preadv(self.spool.handle, [view[done:]], self.begin + wide * first + done)
+            got = read_at(self.spool.handle, view[done:], self.begin + wide * first + done)
             if got < 1:
                 raise OSError("the temporary file of a long log is shorter than it was")
             done += got
 
     def write(self, number: int, value: int) -> None:
         """Change one value."""
-        os.pwrite(
+        write_at(
             self.spool.handle,
             np.array(value, self.dtype).tobytes(),
             self.begin + self.dtype.itemsize * number,

@@ -229,7 +229,7 @@ def _content_kind(path: Path) -> str:
     """What it says that gyrostab wrote it as: log, surface or product; what is damaged as a whole, or another's, says nothing."""
     try:
         if path.is_dir():
-            return str(json.loads((path / ".zattrs").read_text()).get("gyrostab_content", ""))
+            return str(json.loads((path / ".zattrs").read_bytes()).get("gyrostab_content", ""))
         return read_attribute(path, "gyrostab_content")
     except Exception:  # whatever the libraries raise on damaged bytes
         return ""

@@ -200,7 +200,7 @@ def _find_foreign(said: str, target: Path, find_foreign: FindForeign) -> str | N
 
 def _check_inputs(said: str, target: Path, inputs: Sequence[Path], advice: str) -> None:
     """Compare by identity, which links and other spellings of a path do not change."""
-    own, place = _find_status(target), os.path.realpath(target)
+    own, place = _find_status(target), _find_real_path(target)
     folder = own is not None and stat.S_ISDIR(own.st_mode)
     for item in inputs:
         found = _find_status(item)
@@ -208,17 +208,22 @@ def _check_inputs(said: str, target: Path, inputs: Sequence[Path], advice: str) 
             continue
         if own is not None and os.path.samestat(own, found):
             raise OptionError(f"{said} is also an input and would be destroyed; {advice}")
-        if folder and os.path.realpath(item).startswith(os.path.join(place, "")):
+        if folder and _find_real_path(item).startswith(os.path.join(place, "")):
             raise OptionError(
                 f"{said} is a folder around the input {str(item)!r}, which would be destroyed; {advice}"
             )
         inside = stat.S_ISDIR(found.st_mode) and place.startswith(
-            os.path.join(os.path.realpath(item), "")
+            os.path.join(_find_real_path(item), "")
         )
         if inside and is_store(item):
             raise OptionError(
                 f"{said} lies inside the input {str(item)!r}, which would be changed; {advice}"
             )
+
+
+def _find_real_path(path: Path) -> str:
+    """Resolve links; on Windows, also ignore the case of letters."""
+    return os.path.normcase(os.path.realpath(path))
 
 
 def _find_status(path: Path) -> os.stat_result | None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import glob
 import os
 import re
 import secrets
 import shutil
-import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator
@@ -20,6 +18,7 @@ from gyrostab.errors import GyrostabError, OutputError
 from gyrostab.store.output.check import check_folder, check_target
 from gyrostab.store.output.content import FindForeign
 from gyrostab.store.output.inputs import check_unchanged
+from gyrostab.store.system import exchange_paths, rename_new, sync_path
 
 __all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "replace_file"]
 
@@ -97,7 +96,7 @@ def new_output(
             _replace_folder(temporary, target, find_foreign)
         elif overwrite and find_foreign is None:
             os.replace(temporary, target)
-            _sync_path(target.parent)
+            sync_path(target.parent)
         else:
             _rename_new(temporary, target)
 
@@ -111,7 +110,7 @@ def replace_file(path: Path) -> Iterator[Path]:
         yield temporary
         _sync_tree(temporary)
         os.replace(temporary, path)
-        _sync_path(path.parent)
+        sync_path(path.parent)
 
 
 @contextlib.contextmanager
@@ -234,11 +233,11 @@ def remove_leftovers(output: Path) -> None:
 
 def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) -> None:
     """Let a complete folder and an older one change places, and remove the older one."""
-    if _rename_with_flag(temporary, target, _EXCHANGE):
+    if exchange_paths(temporary, target):
         if (
             find_foreign(temporary) is not None
         ):  # someone has put something there since it was looked through
-            _rename_with_flag(temporary, target, _EXCHANGE)
+            exchange_paths(temporary, target)
             raise OutputError(
                 f"{target}: has changed while the new one was written, so it is not replaced; give another name with -o"
             )
@@ -251,7 +250,7 @@ def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) ->
             aside.rename(target)
             raise
         temporary = aside
-    _sync_path(target.parent)
+    sync_path(target.parent)
     _remove_tree(temporary)
     if temporary.exists():
         warnings.warn(
@@ -262,57 +261,22 @@ def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) ->
 def _rename_new(source: Path, target: Path) -> None:
     """Rename a file or folder unless something has the name already, in one step where the system can."""
     try:
-        if not _rename_with_flag(source, target, _NO_REPLACE):
-            if os.path.lexists(target):
-                raise FileExistsError
-            os.rename(source, target)
+        rename_new(source, target)
     except FileExistsError:
         raise OutputError(
             f"output {str(target)!r} exists already: another process has made it meanwhile; give --overwrite (overwrite=True) to replace it"
         ) from None
-    _sync_path(target.parent)
-
-
-# linux/fs.h; both flags are of Linux 3.15
-_NO_REPLACE, _EXCHANGE = 1, 2
-_AT_FDCWD = -100
-_UNSUPPORTED_ERRNOS = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
-
-
-def _rename_with_flag(source: Path, target: Path, flag: int) -> bool:
-    """Rename with a flag of ``renameat2``; False where the system or the file system has no such call."""
-    call = (
-        getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-        if sys.platform == "linux"
-        else None
-    )
-    if call is None:
-        return False
-    if call(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
-        return True
-    number = ctypes.get_errno()
-    if number in _UNSUPPORTED_ERRNOS:
-        return False
-    raise OSError(number, os.strerror(number), str(target))
+    sync_path(target.parent)
 
 
 def _sync_tree(path: Path) -> None:
     """Bring a file, or a folder with all that is in it, to the disk."""
     for folder, _, names in os.walk(path):
         for name in names:
-            _sync_path(Path(folder, name))
-        _sync_path(Path(folder))
+            sync_path(Path(folder, name))
+        sync_path(Path(folder))
     if not path.is_dir():
-        _sync_path(path)
-
-
-def _sync_path(path: Path) -> None:
-    """Ask the system to bring a file (or the entries of a directory) to the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        sync_path(path)
 
 
 def _remove_until_gone(path: Path) -> None:
@@ -334,10 +298,13 @@ def _remove_tree(path: Path) -> None:
             path.unlink()
 
 
+_SHARING_VIOLATION = 32  # of Windows
 _DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def _describe_reason(error: Exception, path: Path) -> str:
+    if getattr(error, "winerror", None) == _SHARING_VIOLATION:
+        return "it is open in another program; close it there"
     if isinstance(error, PermissionError):
         return f"no permission to write in {path.parent}; choose another directory"
     number = (error.errno or 0) if isinstance(error, OSError) else 0

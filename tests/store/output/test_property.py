@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 from gyrostab import davar, fit_noise, open_log, to_netcdf, to_zarr
 from gyrostab.io.datasets import open_dataset
 from gyrostab.store.output import is_leftover
-from gyrostab.store.output import write as writing
 from tests.support.command_line import call, write_log
 
 #: Calls that change the disk.
@@ -136,7 +135,7 @@ def calls_of_the_disk(act: Callable[[int], None], folder: Path) -> Iterator[None
     with pytest.MonkeyPatch.context() as patch:
         for name in CALLS:
             patch.setattr(os, name, wrap(getattr(os, name)))
-        patch.setattr(writing, "_rename_with_flag", wrap(writing._rename_with_flag))
+        patch.setattr(system, "rename_with_flag", wrap(system.rename_with_flag))
         yield
 
 

@@ -481,7 +481,7 @@ def test_what_another_process_has_made_meanwhile_is_not_replaced(tmp_path, suffi
 def test_a_folder_is_replaced_in_one_step_or_put_back(tmp_path, monkeypatch, renameat2):
     log = make_log(np.zeros((1, 10)), rate=1.0, unit="deg/h")
     if not renameat2:
-        monkeypatch.setattr("gyrostab.store.output.write._rename_with_flag", lambda *_: False)
+        monkeypatch.setattr("gyrostab.store.system.rename_with_flag", lambda *_: False)
     path = to_zarr(log, tmp_path / "log.zarr")
     to_zarr(log.isel(time=slice(0, 5)), path, overwrite=True)
     assert open_log(path).sizes["time"] == 5
