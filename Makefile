@@ -10,7 +10,7 @@ N      ?= 100000
 SEED   ?= 1
 JOBS   ?= $(shell nproc 2>/dev/null || echo 2)
 
-.PHONY: demo test test-full fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
+.PHONY: demo test test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
@@ -36,6 +36,15 @@ test: $(VENV)/.installed-test  ## install, and run the tests
 
 test-full: $(VENV)/.installed-test  ## all tests, including those that take a minute or more
 	$(BIN)/python -m pytest -n auto --dist loadgroup -m "slow or not slow"
+
+$(VENV)-minimum/.installed: pyproject.toml tests/support/minimum_versions.py
+	test -x $(VENV)-minimum/bin/python || $(PYTHON) -m venv $(VENV)-minimum
+	$(PYTHON) -m tests.support.minimum_versions > $(VENV)-minimum/constraints.txt
+	$(VENV)-minimum/bin/pip install --quiet --disable-pip-version-check --prefer-binary -c $(VENV)-minimum/constraints.txt -e ".[test]"
+	touch $@
+
+test-minimum: $(VENV)-minimum/.installed  ## the tests with the lowest versions of the dependencies that pyproject.toml allows
+	$(VENV)-minimum/bin/python -m pytest -n auto --dist loadgroup
 
 fuzz: $(VENV)/.installed-test  ## try damaged inputs and write docs/fuzzing.md (N=100000 SEED=1 JOBS=2); can be stopped and repeated
 	$(BIN)/python -W ignore -m tests.fuzz --count $(N) --seed $(SEED) --jobs $(JOBS) --output docs/fuzzing.md
@@ -72,4 +81,4 @@ clean-kernels:  ## delete the compiled kernels
 	find gyrostab -name '*.nb[ic]' -delete
 
 clean: clean-kernels  ## delete what the targets made
-	rm -rf $(VENV) $(OUT)
+	rm -rf $(VENV) $(VENV)-minimum $(OUT)

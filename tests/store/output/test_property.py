@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from gyrostab import davar, fit_noise, open_log, to_netcdf, to_zarr
 from gyrostab.io.datasets import open_dataset
+from gyrostab.store import system
 from gyrostab.store.output import is_leftover
 from tests.support.command_line import call, write_log
 
