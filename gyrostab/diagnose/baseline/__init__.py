@@ -1,1 +1,1 @@
-"""The stationary noise that a record is compared with."""
+"""The baseline: the stationary noise that a recording is compared with."""

@@ -1,8 +1,7 @@
-"""The stationary noise that a record is compared with: calibrated on its quiet time.
+"""Calibration of the stationary noise that a record is compared with, on its quiescent time.
 
-Band powers of the quiet blocks give Q, N and what they can of B and K; the block means give the
-slow part of B and K. The posterior is kept as draws, so that null records carry the error of the
-calibration.
+Band powers of the quiescent blocks give Q, N and part of B and K; block means give the slow part of
+B and K. The posterior is kept as draws, so that null records include the calibration error.
 """
 
 from __future__ import annotations
@@ -21,23 +20,27 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     noise_powers,
     white_variance,
 )
-from gyrostab.diagnose.baseline.known_effects import evenness, expect_known_effects
+from gyrostab.diagnose.baseline.known_effects import expect_known_effects, independent_line_share
 from gyrostab.diagnose.baseline.noise_level import quiescent_level, scale_noise
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
+    average_blocks,
     fit_squares,
     floor_square,
     noise_posterior,
-    scales,
-    summed,
+    visible_coefficients,
 )
 from gyrostab.diagnose.baseline.quiescent import (
     find_quiescent_blocks,
     find_quiescent_spans,
-    loudness,
+    noise_level_excess,
 )
-from gyrostab.diagnose.baseline.simulated import odd_band, shown_by, with_shown
+from gyrostab.diagnose.baseline.simulated import (
+    add_extra_statistics,
+    measure_extra_statistics,
+    worst_band,
+)
 from gyrostab.diagnose.baseline.wandering import with_wandering
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.errors import OptionError, SchemaError
@@ -54,35 +57,38 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-#: Draws from the posterior of the noise of an axis.
+#: Number of draws from the posterior of the noise of an axis; limits memory.
 DRAWS = 512
-#: Values of K and B that the noise may have instead, as multiples of the calibrated ones.
+#: Values of K and B on the coarse grid, as multiples of the calibrated ones. Design choice.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
-_LOW_SHAPE = 20.0  # of the lowest bands, which say how noisy the mean of a block is
-_EXCESS = 4.0  # standard deviations from which on a block is noisier
-_LEAST_BANDS = 6  # that five noise terms are fitted to, whatever the form of a simulated spectrum
-_POWER = "degree2 hour-2 Hz-1"
+_MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a block mean
+_MIN_EXCESS_SIGMA = 4.0  # from which a block is noisier; design choice
+_MIN_BANDS = 6  # that the noise terms are fitted to, with any spectral shape
+_POWER_UNIT = "degree2 hour-2 Hz-1"
 
 
-def _noisier(power: Array, shape: Array, spectrum: Array) -> Array:
-    """Factor by which the white variance of each block mean exceeds the expected one, from the lowest bands; inputs (block, band)."""
+def _mean_noise_excess(power: Array, shape: Array, spectrum: Array) -> Array:
+    """Return the excess factor of the white variance of each mean, from the lowest bands.
+
+    Inputs (block, band).
+    """
     count = np.nan_to_num(shape).sum(axis=0) / max(1, int(np.isfinite(shape).all(axis=1).sum()))
-    low = max(2, int(np.searchsorted(np.cumsum(count), _LOW_SHAPE)) + 1)
-    level, deviation = loudness(power[:, :low] / spectrum[:, :low] - 1.0, shape[:, :low])
-    return np.asarray(np.where(deviation > _EXCESS, level, 1.0))
+    low = max(2, int(np.searchsorted(np.cumsum(count), _MIN_LOW_SHAPE)) + 1)
+    level, deviation = noise_level_excess(power[:, :low] / spectrum[:, :low] - 1.0, shape[:, :low])
+    return np.asarray(np.where(deviation > _MIN_EXCESS_SIGMA, level, 1.0))
 
 
 def grid_values(term: str, centre: float, scale: float) -> Array:
-    """Values of K or B that the noise may have, from none to far above both the calibrated one and what is just seen."""
+    """Return values of K or B, from 0 to far above the calibrated and the just visible ones."""
     return np.array(
         [factor * (max(centre, scale) if factor > 1.0 else centre) for factor in _FACTORS[term]]
     )
 
 
-def _grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Array, Array]:
-    """K and B of the coarse grid, and log of the posterior around every point."""
+def _coarse_grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Array, Array]:
+    """Return K and B of the coarse grid, and the log posterior around every point."""
     centres = np.sqrt(np.median(posterior.slow, axis=0))
-    least = scales(density, span)
+    least = visible_coefficients(density, span)
     K, B = (
         grid_values("K", float(centres[1]), least[0]),
         grid_values("B", float(centres[0]), least[1]),
@@ -93,48 +99,53 @@ def _grid(posterior: Posterior, density: float, span: float) -> tuple[Array, Arr
         place.append(np.searchsorted(np.concatenate([[coarse[1] / np.sqrt(3.0)], between]), fine))
     mass = np.full((K.size, B.size), 1e-12)
     np.add.at(mass, tuple(place), posterior.weight)
-    many = [component.ravel() for component in np.meshgrid(K, B, indexing="ij")]
-    return many[0], many[1], np.log(mass.ravel() / mass.sum())
+    grid = [values.ravel() for values in np.meshgrid(K, B, indexing="ij")]
+    return grid[0], grid[1], np.log(mass.ravel() / mass.sum())
 
 
 def calibrate_noise(blocks: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
-    """Calibrate the noise of every axis on quiet blocks.
+    """Calibrate the noise of every axis on quiescent blocks.
 
     Parameters
     ----------
     blocks : xarray.Dataset
         From `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
-        What is known to be quiet: seconds since the start, or ISO times. Without it blocks with
-        little vibration, steady temperature, no rotation, not soon after a restart, and not louder
+        Known quiescent time: seconds since the start, or ISO times. By default blocks with little
+        vibration, steady temperature, no rotation, some time after a restart, and no more noise
         than most.
 
     Returns
     -------
     xarray.Dataset
-        - ``coefficient``, ``stderr`` (axis, term) [units of the noise table]; a ramp is an effect, so R is 0, with the error that it has.
-        - ``quiet(axis, block)``: what it was calibrated on.
-        - ``spectrum(axis, block, band)``: expected power [degree2 hour-2 Hz-1]; its terms in ``columns(axis, block, band, noise)``,
-          ``square`` and ``square_stderr`` (axis, noise).
-        - ``common(axis, block)``, ``shape_alone(axis, block, band)``: scatter of the powers of a block, together and apart.
+        - ``coefficient``, ``stderr`` (axis, term) [units of the noise table]; a ramp is an effect,
+          so that R is 0, with its error.
+        - ``quiet(axis, block)``: the calibration blocks.
+        - ``spectrum(axis, block, band)``: expected power [degree2 hour-2 Hz-1]; its terms in
+          ``columns(axis, block, band, noise)``, ``square`` and ``square_stderr`` (axis, noise).
+        - ``common(axis, block)``, ``shape_alone(axis, block, band)``: scatter of the powers of a
+          block, common to all and separate.
         - ``known_mean``, ``mean_variance`` (axis, block) [degree hour-1, degree2 hour-2].
-        - ``grid_K``, ``grid_B``, ``grid_prior``, ``grid_calibrated`` (axis, grid): possible noise of the means, log weights.
-        - ``posterior(axis, draw, noise)``, ``posterior_slow(axis, draw, slow)``: draws of the squares in powers and in means.
+        - ``grid_K``, ``grid_B``, ``grid_prior``, ``grid_calibrated`` (axis, grid): possible noise
+          of the means, log weights.
+        - ``posterior(axis, draw, noise)``, ``posterior_slow(axis, draw, slow)``: draws of the
+          squares in powers and in means.
 
     Raises
     ------
     OptionError
-        When `quiet` holds fewer than 100 samples in whole blocks.
+        If `quiet` holds fewer than 100 samples in whole blocks.
     SchemaError
-        When an axis has no spectra to calibrate on.
+        If an axis has no spectra to calibrate on.
 
     Examples
     --------
     >>> from gyrostab.diagnose.reduce.block_statistics import reduce_log
     >>> from gyrostab.simulate import simulate
-    >>> log = simulate({"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=3)
-    >>> baseline = calibrate(reduce_log(log))
-    >>> error = (baseline.coefficient - 0.003).sel(axis="x", term="N") / baseline.stderr.sel(axis="x", term="N")
+    >>> model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003}}
+    >>> baseline = calibrate_noise(reduce_log(simulate(model, duration="1h", rate=10.0, seed=3)))
+    >>> N = baseline.sel(axis="x", term="N")
+    >>> error = (N.coefficient - 0.003) / N.stderr
     >>> bool(abs(error) < 4.0), baseline.attrs["source"]
     (True, 'calibrated')
     """
@@ -144,11 +155,11 @@ def calibrate_noise(blocks: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
         "calibrated_on": find_quiescent_spans(blocks, chosen),
         "quiet_by": reason,
     }
-    return assemble_baseline(blocks, _posteriors(blocks, chosen), quiet=chosen, attrs=attrs)
+    return assemble_baseline(blocks, _calibrate_axes(blocks, chosen), quiet=chosen, attrs=attrs)
 
 
-def _posteriors(blocks: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior]:
-    """Noise of every axis from the chosen blocks (axis, block)."""
+def _calibrate_axes(blocks: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior]:
+    """Compute the noise of every axis from the chosen blocks (axis, block)."""
     columns = noise_powers(blocks)
     common, rest = common_variance(blocks)
     power, shape = (
@@ -157,20 +168,21 @@ def _posteriors(blocks: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior
     )
     mean = blocks["mean"].transpose("axis", "block").values
     step = float(blocks.attrs["block_s"])
-    found = []
+    posteriors = []
     for row, axis in enumerate(blocks["axis"].values):
         use = chosen[row]
-        fit = summed(power[row][use], shape[row][use], columns[row][use])
+        fit = average_blocks(power[row][use], shape[row][use], columns[row][use])
         if fit.power.size < 4:
             raise SchemaError(
-                f"axis {axis}: the quiet blocks hold spectra in {fit.power.size} bands, too few to calibrate on; "
+                f"axis {axis}: the quiet blocks hold spectra in {fit.power.size} bands, "
+                "too few to calibrate on; "
                 "name other quiet time, or diagnose a part of the record with fewer gaps"
             )
-        fit = _with_common(fit, shape[row][use], rest[row][use], common[row][use])
+        fit = _reduce_weights(fit, shape[row][use], rest[row][use], common[row][use])
         square = np.maximum(fit_squares(fit)[0], [0.0, floor_square(fit), 0.0, 0.0])
         variance = white_variance(blocks, np.tile(square, (len(mean), 1)))[row]
         present = use & np.isfinite(mean[row])
-        found.append(
+        posteriors.append(
             noise_posterior(
                 fit,
                 mean[row],
@@ -181,42 +193,42 @@ def _posteriors(blocks: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior
                 rng=np.random.default_rng(row),
             )
         )
-    return found
+    return posteriors
 
 
-def _with_common(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
-    """Fit whose weights are less by what the common part of the bands takes from them together."""
-    each = np.nansum(rest, axis=1)
-    known = (each / (1.0 + common * each)).sum()
+def _reduce_weights(fit: Fit, shape: Array, rest: Array, common: Array) -> Fit:
+    """Reduce the weights of a fit by the common variance of the bands."""
+    block_weight = np.nansum(rest, axis=1)
+    known = (block_weight / (1.0 + common * block_weight)).sum()
     return fit._replace(weight=fit.weight * min(1.0, float(known / max(np.nansum(shape), 1e-300))))
 
 
 def assemble_baseline(
     blocks: xr.Dataset,
-    found: list[Posterior],
+    posteriors: list[Posterior],
     *,
     quiet: NDArray[np.bool_],
     attrs: Mapping[str, Any],
     known_mean: Array | None = None,
     spectrum: Array | None = None,
 ) -> xr.Dataset:
-    """Put the noise of all axes into the Dataset that `calibrate_noise` describes.
+    """Assemble the noise of all axes as the Dataset described in `calibrate_noise`.
 
     Parameters
     ----------
     blocks : xarray.Dataset
-    found : list of Posterior
+    posteriors : list of Posterior
         One for each axis.
     quiet : ndarray of bool, shape (axis, block)
     attrs : mapping
-        ``source``, ``calibrated_on`` and what else there is to say.
+        ``source``, ``calibrated_on`` and other attributes.
     known_mean : ndarray, shape (axis, block), optional
-        Effects that are taken as known [degree hour-1].
+        Known means of effects [degree hour-1].
     spectrum : ndarray, shape (axis, block, band), optional
-        Expected power with effects; that of the noise without it.
+        Expected power including effects; that of the noise by default.
     """
     columns = noise_powers(blocks)
-    square = np.stack([one.square for one in found])
+    square = np.stack([one.square for one in posteriors])
     noise = np.einsum("abfn,an->abf", columns, square)
     expected = noise if spectrum is None else spectrum
     power, shape = (
@@ -232,28 +244,32 @@ def assemble_baseline(
     )
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
     variance = white * np.stack(
-        [_noisier(*components) for components in zip(power, shape, expected, strict=True)]
+        [_mean_noise_excess(*arrays) for arrays in zip(power, shape, expected, strict=True)]
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
     grids = [
-        _grid(one, max(one.square[1], least) * HOUR, span)
-        for one, least in zip(found, floor, strict=True)
+        _coarse_grid(one, max(one.square[1], least) * HOUR, span)
+        for one, least in zip(posteriors, floor, strict=True)
     ]
-    draws = np.stack([one.draws for one in found])
+    draws = np.stack([one.draws for one in posteriors])
     common, rest = common_variance(blocks)
-    value, error = _coefficients(found)
+    value, error = _mean_coefficients(posteriors)
     value[:, 4], error[:, 4] = 0.0, _ramp_error(blocks, white, value, quiet)
     plane, cube = ("axis", "block"), ("axis", "block", "band")
-    told = ", ".join(f"{term} in {LAWS[term].label}" for term in TERMS)
+    units = ", ".join(f"{term} in {LAWS[term].label}" for term in TERMS)
     variables: dict[str, Any] = {
-        "coefficient": (("axis", "term"), value, {"long_name": "noise coefficient", "units": told}),
+        "coefficient": (
+            ("axis", "term"),
+            value,
+            {"long_name": "noise coefficient", "units": units},
+        ),
         "stderr": (
             ("axis", "term"),
             error,
-            {"long_name": "standard error of the coefficient", "units": told},
+            {"long_name": "standard error of the coefficient", "units": units},
         ),
         "quiet": (plane, quiet, {"long_name": "block is calibrated on", "units": "1"}),
-        "spectrum": (cube, expected, {"long_name": "expected power", "units": _POWER}),
+        "spectrum": (cube, expected, {"long_name": "expected power", "units": _POWER_UNIT}),
         "known_mean": (
             plane,
             np.zeros(quiet.shape) if known_mean is None else known_mean,
@@ -276,40 +292,43 @@ def assemble_baseline(
             cube,
             rest,
             {
-                "long_name": "shape of the gamma distribution of a power beside the common part",
+                "long_name": "shape of the gamma distribution of a power without the common part",
                 "units": "1",
             },
         ),
         "columns": (
             (*cube, "noise"),
             columns,
-            {"long_name": "expected power per squared coefficient", "units": _POWER},
+            {"long_name": "expected power per squared coefficient", "units": _POWER_UNIT},
         ),
         "square": (
             ("axis", "noise"),
             square,
-            {"long_name": "squared coefficient that fits the powers", "units": f"square of {told}"},
+            {
+                "long_name": "squared coefficient that fits the powers",
+                "units": f"square of {units}",
+            },
         ),
         "square_stderr": (
             ("axis", "noise"),
-            np.stack([one.error for one in found]),
-            {"units": f"square of {told}"},
+            np.stack([one.error for one in posteriors]),
+            {"units": f"square of {units}"},
         ),
         "posterior": (
             ("axis", "draw", "noise"),
             draws,
-            {"long_name": "draws of the squares in powers", "units": f"square of {told}"},
+            {"long_name": "draws of the squares in powers", "units": f"square of {units}"},
         ),
         "posterior_slow": (
             ("axis", "draw", "slow"),
-            np.stack([one.slow for one in found]),
-            {"units": f"square of {told}"},
+            np.stack([one.slow for one in posteriors]),
+            {"units": f"square of {units}"},
         ),
         "grid_K": (("axis", "grid"), np.stack([grid[0] for grid in grids]), {"units": "deg/h^1.5"}),
         "grid_B": (("axis", "grid"), np.stack([grid[1] for grid in grids]), {"units": "deg/h"}),
         "grid_prior": (
             ("axis", "grid"),
-            np.full((len(found), grids[0][0].size), -np.log(grids[0][0].size)),
+            np.full((len(posteriors), grids[0][0].size), -np.log(grids[0][0].size)),
             {"units": "1"},
         ),
         "grid_calibrated": (
@@ -323,27 +342,29 @@ def assemble_baseline(
         for name in ("axis", "time", "begin", "end", "frequency", "band_low", "band_high")
         if name in blocks
     }
-    joined = [
-        str(axis) for axis, one in zip(blocks["axis"].values, found, strict=True) if not one.joined
+    not_joined = [
+        str(axis)
+        for axis, one in zip(blocks["axis"].values, posteriors, strict=True)
+        if not one.joined
     ]
     return xr.Dataset(
         variables,
         coords={**coordinates, "term": list(TERMS), "noise": list(NOISE), "slow": ["B", "K"]},
-        attrs={**attrs, "slow_noise_apart": joined},
+        attrs={**attrs, "slow_noise_apart": not_joined},
     )
 
 
-def _coefficients(found: list[Posterior]) -> tuple[Array, Array]:
-    """Values and errors (axis, term), R left to the caller; B and K are those of the block means."""
-    value, error = np.zeros((len(found), 5)), np.zeros((len(found), 5))
-    for row, one in enumerate(found):
+def _mean_coefficients(posteriors: list[Posterior]) -> tuple[Array, Array]:
+    """Return values and errors (axis, term), without R; B and K are those of the block means."""
+    value, error = np.zeros((len(posteriors), 5)), np.zeros((len(posteriors), 5))
+    for row, one in enumerate(posteriors):
         roots = np.sqrt(np.concatenate([one.draws[:, :2], one.slow], axis=1))
         value[row, :4], error[row, :4] = roots.mean(axis=0), roots.std(axis=0)
     return value, error
 
 
 def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[np.bool_]) -> Array:
-    """Error that a ramp would have in the quiet means [deg/h^2]."""
+    """Return the error of a ramp fitted to the quiescent means [deg/h^2]."""
     hours = (blocks["begin"].values + blocks["end"].values)[:, None] / (2.0 * HOUR)
     present = quiet & np.isfinite(blocks["mean"].transpose("axis", "block").values)
     error = np.zeros(len(white))
@@ -367,51 +388,54 @@ def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) ->
     model : path, mapping or Model
         As `gyrostab.simulate` takes it.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
-        Quiet stretches of the recording. One factor for each axis then fits the noise of the model
-        to them; its noise terms keep their proportions, and its effects their sizes. Without it the
-        noise is taken as it is.
+        Quiescent time of the recording. One factor for each axis then fits the noise of the model
+        to it; the noise terms keep their proportions, and the effects their sizes. By default the
+        noise is taken unchanged.
 
     Returns
     -------
     xarray.Dataset
-        As `calibrate_noise` has it; the noise has the error of that factor, or none. With
-        ``cross(pair, block, band)``, the expected cross-spectrum, where axes share an effect of the
-        model. ``attrs["left_out"]`` names the effects that show elsewhere too (in distributions,
-        transfers, orders of the rotation, random wander): that part of them is not in it.
+        As from `calibrate_noise`; the noise has the error of that factor, or none. If axes share an
+        effect of the model, with ``cross(pair, block, band)``, the expected cross-spectrum.
+        ``attrs["left_out"]`` lists the effects that also show elsewhere (in distributions,
+        transfers, rotation orders, random wander): that part of them is not included.
 
     Raises
     ------
     OptionError, FormatError
-        When the model makes no sense, or has no noise.
+        If the model is invalid, or has no noise.
     SchemaError
-        When the recording lacks the channel of an effect.
+        If the recording lacks the channel of an effect.
     """
-    made = model if isinstance(model, Model) else read_model(model)
+    parsed = model if isinstance(model, Model) else read_model(model)
     axes = [str(axis) for axis in blocks["axis"].values]
-    found = []
+    posteriors = []
     for axis in axes:
-        coefficients = made.coefficients(axis)
+        coefficients = parsed.coefficients(axis)
         square = np.array([coefficients[term] ** 2 for term in NOISE])
         if not square.any():
             raise OptionError(
-                f"{made.source}: axis {axis} has no noise to compare a recording with; give N in [noise] or [noise.{axis}]"
+                f"{parsed.source}: axis {axis} has no noise to compare a recording with; "
+                f"give N in [noise] or [noise.{axis}]"
             )
         draws = np.tile(square, (DRAWS, 1))
         K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
-        found.append(Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True))
+        posteriors.append(
+            Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True)
+        )
     chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
-    attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": made.source}
+    attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}
     if quiet is not None:
         chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet)
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
-        found = _levelled(blocks, made, found, chosen)
-    known = expect_known_effects(blocks, made, np.stack([one.square for one in found]))
+        posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
+    known = expect_known_effects(blocks, parsed, np.stack([one.square for one in posteriors]))
     attrs["left_out"] = known.left_out
     hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
-    ramp = np.array([made.coefficients(axis)["R"] for axis in axes])
+    ramp = np.array([parsed.coefficients(axis)["R"] for axis in axes])
     out = assemble_baseline(
         blocks,
-        found,
+        posteriors,
         quiet=chosen,
         attrs=attrs,
         known_mean=known.mean + ramp[:, None] * hours,
@@ -422,64 +446,64 @@ def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) ->
         out["cross"] = (
             ("pair", "block", "band"),
             known.cross,
-            {"long_name": "expected cross-spectrum", "units": _POWER},
+            {"long_name": "expected cross-spectrum", "units": _POWER_UNIT},
         )
     for name, values in known.lines.items():
         last = "band" if name == "line_spectrum" else "line"
         out[name] = (
             ("axis", last),
             values,
-            {"long_name": "expected power of lines", "units": _POWER},
+            {"long_name": "expected power of lines", "units": _POWER_UNIT},
         )
     if known.lines:
-        noise = np.stack([line_columns(blocks) @ one.square for one in found])
-        out["shape_alone"] *= evenness(noise + known.lines["peaks"], blocks)[:, None]
+        noise = np.stack([line_columns(blocks) @ one.square for one in posteriors])
+        out["shape_alone"] *= independent_line_share(noise + known.lines["peaks"], blocks)[:, None]
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if quiet is None else ["R"]}] = 0.0
     return out
 
 
-def _levelled(
-    blocks: xr.Dataset, model: Model, found: list[Posterior], quiet: NDArray[np.bool_]
+def _scale_to_quiescent(
+    blocks: xr.Dataset, model: Model, posteriors: list[Posterior], quiet: NDArray[np.bool_]
 ) -> list[Posterior]:
-    """Scale the noise of a model to the quiet blocks (axis, block) of the recording, beside its effects."""
-    square = np.stack([one.square for one in found])
+    """Scale the noise of a model to the quiescent blocks (axis, block), given its effects."""
+    square = np.stack([one.square for one in posteriors])
     whole, added = (
-        expect_known_effects(blocks, model, component).spectrum
-        for component in (square, 0.0 * square)
+        expect_known_effects(blocks, model, values).spectrum for values in (square, 0.0 * square)
     )
-    return _scaled(found, *quiescent_level(blocks, whole - added, added, quiet))
+    return _scale_axes(posteriors, *quiescent_level(blocks, whole - added, added, quiet))
 
 
-def _scaled(found: list[Posterior], factor: Array, error: Array) -> list[Posterior]:
-    every = zip(found, factor.tolist(), error.tolist(), strict=True)
+def _scale_axes(posteriors: list[Posterior], factor: Array, error: Array) -> list[Posterior]:
+    """Scale the noise of all axes, with the errors of the factors."""
+    scalings = zip(posteriors, factor.tolist(), error.tolist(), strict=True)
     return [
-        scale_noise(one, by, doubt, np.random.default_rng(row))
-        for row, (one, by, doubt) in enumerate(every)
+        scale_noise(one, by, relative_error, np.random.default_rng(row))
+        for row, (one, by, relative_error) in enumerate(scalings)
     ]
 
 
 def baseline_from_simulation(
     blocks: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None
 ) -> xr.Dataset:
-    """Take the noise of a simulated log with the error of calibrating it, and its level over time where that changes.
+    """Take the noise of a simulated log with its calibration error, and its level over time.
 
-    What it shows all the time beside the five noise terms is taken as measured: the form of its
-    spectrum, what axes share, steady lines. What a simulation does to the means over time cannot be
-    told from its random walk, so it is not taken as known; `baseline_from_model` takes it.
+    Its stationary statistics other than the five noise terms are taken as measured: the shape of
+    its spectrum, coherency of axes, steady lines. What a simulation does to the means over time is
+    indistinguishable from its random walk and therefore not known; `baseline_from_model` knows it.
 
     Parameters
     ----------
     blocks, simulated : xarray.Dataset
         Recording and simulation, from `reduce_log`.
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
-        Quiet stretches of the recording: one factor for each axis fits the noise of the simulation
-        to them.
+        Quiescent time of the recording: one factor for each axis fits the noise of the simulation
+        to it.
 
     Raises
     ------
     SchemaError
-        When the two differ in axes, sampling rate or length.
+        If the two differ in axes, sampling rate or length.
     """
     for name, wanted, got in (
         (
@@ -496,16 +520,21 @@ def baseline_from_simulation(
     ):
         if wanted != got:
             raise SchemaError(
-                f"simulation: {name} {got}, but {wanted} in the recording; simulate with --like RECORDING"
+                f"simulation: {name} {got}, but {wanted} in the recording; "
+                "simulate with --like RECORDING"
             )
     chosen, reason = find_quiescent_blocks(simulated)
-    found, level, odd = _explained(simulated, chosen)
+    posteriors, level, unexplained = _calibrate_simulation(simulated, chosen)
     plain = (
-        np.einsum("abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in found]))
+        np.einsum(
+            "abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in posteriors])
+        )
         * level[..., None]
     )
-    shown = shown_by(simulated, plain, odd)
-    noise = np.einsum("abfn,an->abf", noise_powers(blocks), np.stack([one.square for one in found]))
+    shown = measure_extra_statistics(simulated, plain, unexplained)
+    noise = np.einsum(
+        "abfn,an->abf", noise_powers(blocks), np.stack([one.square for one in posteriors])
+    )
     attrs = {
         "source": "simulation",
         "calibrated_on": find_quiescent_spans(simulated, chosen),
@@ -516,42 +545,49 @@ def baseline_from_simulation(
         chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet)
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
-        found, spectrum = _scaled(found, factor, error), spectrum * factor[:, None, None]
-    return with_shown(
-        assemble_baseline(blocks, found, quiet=chosen, attrs=attrs, spectrum=spectrum),
+        posteriors, spectrum = (
+            _scale_axes(posteriors, factor, error),
+            spectrum * factor[:, None, None],
+        )
+    return add_extra_statistics(
+        assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum),
         shown,
         blocks,
     )
 
 
-def _explained(
+def _calibrate_simulation(
     simulated: xr.Dataset, chosen: NDArray[np.bool_]
 ) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:
-    """Noise of every axis from the bands that it explains, its level over time (axis, block), and the other bands (axis, band)."""
+    """Calibrate a simulation on the bands that the noise terms explain.
+
+    Returns the noise of every axis, its level over time (axis, block), and the unexplained bands
+    (axis, band).
+    """
     columns = noise_powers(simulated)
-    odd = np.zeros((simulated.sizes["axis"], simulated.sizes["band"]), np.bool_)
+    unexplained = np.zeros((simulated.sizes["axis"], simulated.sizes["band"]), np.bool_)
     while True:
-        there = simulated.assign(
-            power=simulated["power"].where(~xr.DataArray(odd, dims=("axis", "band")))
+        explained = simulated.assign(
+            power=simulated["power"].where(~xr.DataArray(unexplained, dims=("axis", "band")))
         )
-        found = _posteriors(there, chosen)
-        plain = np.einsum("abfn,an->abf", columns, np.stack([one.square for one in found]))
-        level = _level(there, plain)
-        more = odd_band(there, plain * level[..., None]) & (
-            odd.sum(axis=1, keepdims=True) < odd.shape[1] - _LEAST_BANDS
+        posteriors = _calibrate_axes(explained, chosen)
+        plain = np.einsum("abfn,an->abf", columns, np.stack([one.square for one in posteriors]))
+        level = _level_over_time(explained, plain)
+        newly_unexplained = worst_band(explained, plain * level[..., None]) & (
+            unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - _MIN_BANDS
         )
-        if not more.any():
-            return found, level, odd
-        odd |= more
+        if not newly_unexplained.any():
+            return posteriors, level, unexplained
+        unexplained |= newly_unexplained
 
 
-def _level(simulated: xr.Dataset, plain: Array) -> Array:
-    """Power of every block over that of the noise terms (axis, block, band), (axis, block); 1 where chance may do as much."""
+def _level_over_time(simulated: xr.Dataset, plain: Array) -> Array:
+    """Return the noise level of every block (axis, block); 1 if not significant."""
     power, shape = (
         simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape")
     )
     level = np.ones(plain.shape[:2])
     for row in range(len(plain)):
-        risen, deviation = loudness(power[row] / plain[row] - 1.0, shape[row])
-        level[row] = np.where(deviation > _EXCESS, risen, 1.0)
+        risen, deviation = noise_level_excess(power[row] / plain[row] - 1.0, shape[row])
+        level[row] = np.where(deviation > _MIN_EXCESS_SIGMA, risen, 1.0)
     return level

@@ -1,4 +1,4 @@
-"""What a stationary noise is expected to show in the block statistics of a record, with its taper, blocks and gaps."""
+"""Expected block statistics of stationary noise, given taper, blocks and gaps of a record."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-#: Random terms, in the order of the dimension `noise`.
+#: Random noise terms, in the order of the dimension `noise`.
 NOISE = ("Q", "N", "B", "K")
 
 
 def line_columns(blocks: xr.Dataset) -> Array:
-    """Expected power of every ordinate of a full block for unit squares of Q, N, B, K.
+    """Return the expected power of every line of a full block for unit squares of Q, N, B, K.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def line_columns(blocks: xr.Dataset) -> Array:
 
 
 def band_columns(blocks: xr.Dataset) -> Array:
-    """Expected band powers of a full block for unit squares of Q, N, B, K.
+    """Return the expected band powers of a full block for unit squares of Q, N, B, K.
 
     Returns
     -------
@@ -56,13 +56,13 @@ def band_columns(blocks: xr.Dataset) -> Array:
 
 
 def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
-    """Expected band powers for unit squares of Q, N, B, K, as the gaps of each block let them be seen.
+    """Return the expected band powers for unit squares of Q, N, B, K, with the gaps of each block.
 
     Parameters
     ----------
     blocks : xarray.Dataset
     response : ndarray, shape (band,), optional
-        Factor that a filter has put on the noise before samples were lost.
+        Power response of a filter before samples were lost.
 
     Returns
     -------
@@ -74,13 +74,15 @@ def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
 
 
 def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
-    """Relative variance that all band powers of a block have in common through random gaps, and the shape of what is left.
+    """Return the relative variance common to all bands of a block, and the remaining shape.
+
+    Random gaps cause the common variance.
 
     Returns
     -------
     common : ndarray, shape (axis, block)
     shape : ndarray, shape (axis, block, band)
-        Of the gamma distribution of each power when the common factor is known.
+        Of the gamma distribution of each power, given the common factor.
     """
     shape = blocks["shape"].transpose("axis", "block", "band").values
     near = blocks["neighbours"].transpose("axis", "block").values
@@ -98,12 +100,16 @@ def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
 
 
 def white_variance(blocks: xr.Dataset, square: Array) -> Array:
-    """Variance of block means by Q and N, shape (axis, block) [degree2 hour-2], for squares of shape (axis, 4)."""
+    """Return the variance of block means due to Q and N (axis, block) [degree2 hour-2].
+
+    The squares have the shape (axis, 4).
+    """
     samples = blocks["samples"].transpose("axis", "block").values.astype(np.float64)
     near = blocks["neighbours"].transpose("axis", "block").values
     rate, count = float(blocks.attrs["sampling_rate_hz"]), np.maximum(samples, 1.0)
     apart = 1.0 - np.where(np.isfinite(near), near, samples / float(blocks.attrs["block_samples"]))
-    runs = np.maximum(apart, 0.0) * count + 1.0  # each leaves a rounding of the angle at either end
+    # Each run of samples leaves a rounding of the angle at either end.
+    runs = np.maximum(apart, 0.0) * count + 1.0
     return np.asarray(
         LAWS["N"].seconds_factor * rate * square[:, 1:2] / count
         + 2.0 * LAWS["Q"].seconds_factor * rate**2 * square[:, :1] * runs / count**2

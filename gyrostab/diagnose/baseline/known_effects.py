@@ -1,4 +1,4 @@
-"""What the effects of a model make of a record, as far as they are known beforehand: means, band powers, cross-spectra, lines."""
+"""Known effects of a model in a record: means, band powers, cross-spectra, lines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns
-from gyrostab.diagnose.baseline.wandering import Wandering, told_in_full, wandering
+from gyrostab.diagnose.baseline.wandering import (
+    Wandering,
+    add_up_wandering,
+    is_described_by_variance,
+)
 from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES, expected_lines
 from gyrostab.diagnose.predict.candidates import make_windows
 from gyrostab.diagnose.predict.filter_response import band_response, frequencies_in_bands
@@ -30,34 +34,29 @@ from gyrostab.simulate.model import Model
 
 __all__ = [
     "KnownEffects",
-    "evenness",
     "expect_known_effects",
     "expect_known_motion",
     "find_drivers",
+    "independent_line_share",
     "remove_known_lines",
     "remove_known_motion",
 ]
 
 Array = NDArray[np.float64]
-_REACH, _BETWEEN = (
-    100,
-    4,
-)  # ordinates on either side that a line leaks into; places of it between one and the next, on either side
-# of the power of a known line: twice the share of its amplitude by which a form may be wrong, and
-# more
-_SIZE_ERROR = 0.1
-_INSIDE_PEAK = 1000  # places within a step of a density
-_IN_ALL = "lattice"  # what is odd about every sample
-_MOVES, _USUAL = (
-    5.0,
-    0.5,
-)  # of the noise of a mean, its square, that counts as moving; share of the blocks that may be left out
-_CHANCE = 5.0  # standard deviations
-_SLIGHT = 0.1  # of the noise, below which what leaks from a line is taken off as it is
+_LEAK_LINES = 100  # on either side, that a line leaks into; limits time
+_PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum
+#: Relative error of the power of a known line: more than twice that of its amplitude (4 %).
+_LINE_POWER_ERROR = 0.1
+_PEAK_POINTS = 1000  # within a step of a density
+_EVERYWHERE = "lattice"  # the anomaly of every sample
+_MIN_MOTION_RATIO = 5.0  # of a squared step of the mean over its noise, for motion; design choice
+_MAX_MOVING_SHARE = 0.5  # of the blocks that may be left out; design choice
+_MIN_LINE_SIGMA = 5.0  # by which a line exceeds the known one; design choice
+_MIN_LEAK_RATIO = 0.1  # of the noise; smaller leakage is subtracted as expected; design choice
 
 
 class KnownEffects(NamedTuple):
-    """Effects of a model in the statistics of a record.
+    """Known effects of a model in the statistics of a record.
 
     Attributes
     ----------
@@ -66,15 +65,15 @@ class KnownEffects(NamedTuple):
     spectrum : ndarray, shape (axis, block, band)
         Expected power of noise and effects [degree2 hour-2 Hz-1].
     cross : ndarray of complex, shape (pair, block, band), or None
-        Expected cross-spectrum [degree2 hour-2 Hz-1]; None where the axes share nothing.
+        Expected cross-spectrum [degree2 hour-2 Hz-1]; None if the axes have nothing in common.
     lines : dict of str to ndarray
-        At full resolution (axis, line): steady ``lines``, the most that each ordinate may have of
-        them (``lines_most``), and ``peaks`` of some width. And ``line_spectrum`` (axis, band): what
-        they have in the bands, at their own place [degree2 hour-2 Hz-1]. Empty without any.
+        At full resolution (axis, line): steady ``lines``, their largest possible power at each
+        frequency (``lines_most``), and broad ``peaks``. And ``line_spectrum`` (axis, band): their
+        power in the bands, without leakage [degree2 hour-2 Hz-1]. Empty without lines.
     wandering : Wandering
-        What they do to the means at random.
+        Random processes in the means.
     left_out : list of str
-        Effects that show elsewhere too.
+        Effects that also show elsewhere.
     """
 
     mean: Array
@@ -86,7 +85,7 @@ class KnownEffects(NamedTuple):
 
 
 def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> KnownEffects:
-    """What the effects of a model make of the record.
+    """Predict the known effects of a model in the record.
 
     Parameters
     ----------
@@ -98,24 +97,28 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     Raises
     ------
     SchemaError
-        When the recording lacks the channel of an effect.
+        If the recording lacks the channel of an effect.
     """
-    acting = [_acting(effect, blocks) for effect in map(_simulated(model), model.effects)]
-    shown = [
-        one for one in acting if not _leaves_odd_samples(one)
-    ]  # the blocks with odd samples are found, and left out
-    powers = [power for one in shown for power in _powers(one, blocks)]
-    response = _response(shown, blocks)
+    acting = [
+        _act_on_record(effect, blocks)
+        for effect in map(_effect_of_instrument(model), model.effects)
+    ]
+    # Blocks with anomalous samples are found and left out.
+    described = [one for one in acting if not _has_anomalous_samples(one)]
+    powers = [power for one in described for power in _added_powers(one, blocks)]
+    response = _filter_response(described, blocks)
     noise = np.einsum(
-        "fn,abn->abf", band_columns(blocks), np.maximum(_levels(shown, square, blocks), 0.0)
+        "fn,abn->abf",
+        band_columns(blocks),
+        np.maximum(_expected_squares(described, square, blocks), 0.0),
     )
     added = np.zeros(noise.shape)
     for power in powers:
-        added += power.own
+        added += power.on_axes
     narrow = [
-        (one.acting.effect, one.acting.rows, one.own)
+        (one.acting.effect, one.acting.rows, one.on_axes)
         for one in powers
-        if one.acting.seen.line is not None and one.factor.any()
+        if one.acting.prediction.line is not None and one.factor.any()
     ]
     sizes = {
         "bands": blocks.sizes["band"],
@@ -123,41 +126,45 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         "axes": blocks.sizes["axis"],
     }
     return KnownEffects(
-        mean=_means(shown, blocks),
+        mean=_expected_means(described, blocks),
         spectrum=spread_by_gaps((noise + added) * response, blocks),
-        cross=_cross(powers, response, blocks),
+        cross=_shared_cross(powers, response, blocks),
         lines=_known_lines(blocks, narrow, response[:, 0])
         if narrow and "line_power" in blocks
         else {},
-        wandering=wandering([(_wander_squares(one, blocks), one.seen) for one in shown], **sizes),
+        wandering=add_up_wandering(
+            [(_process_squares(one, blocks), one.prediction) for one in described], **sizes
+        ),
         left_out=[
-            one.effect.name for one in acting if _leaves_odd_samples(one) or _shows_elsewhere(one)
+            one.effect.name
+            for one in acting
+            if _has_anomalous_samples(one) or _shows_elsewhere(one)
         ],
     )
 
 
-class _Acting(NamedTuple):
+class _ActingEffect(NamedTuple):
     """An effect of a model on a record.
 
     Attributes
     ----------
     effect : Effect
-    rows : list of int
+        Axes that it acts on, by index.
         Axes that it acts on.
-    axes : tuple of str
+        The names of these axes.
         Their names.
-    seen : Prediction
-        What it does there.
+    prediction : Prediction
+        Its prediction.
     """
 
     effect: Effect
     rows: list[int]
     axes: tuple[str, ...]
-    seen: Prediction
+    prediction: Prediction
 
 
-class _Power(NamedTuple):
-    """Power that an effect adds.
+class _AddedPower(NamedTuple):
+    """Power added by an effect.
 
     Attributes
     ----------
@@ -167,117 +174,129 @@ class _Power(NamedTuple):
         For a factor of 1 [degree2 hour-2 Hz-1 per squared unit].
     """
 
-    acting: _Acting
+    acting: _ActingEffect
     factor: NDArray[np.complex128]
     density: Array
 
     @property
-    def own(self) -> Array:
-        """On each axis, (axis, block, band) [degree2 hour-2 Hz-1]."""
+    def on_axes(self) -> Array:
+        """Power on each axis, (axis, block, band) [degree2 hour-2 Hz-1]."""
         return np.asarray(np.abs(self.factor[:, None, None]) ** 2 * self.density)
 
 
-def _acting(effect: Effect, blocks: xr.Dataset) -> _Acting:
+def _act_on_record(effect: Effect, blocks: xr.Dataset) -> _ActingEffect:
+    """Predict an effect on the axes that it acts on."""
     axes = [str(axis) for axis in blocks["axis"].values]
     rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
-    own = tuple(axes[row] for row in rows)
-    return _Acting(effect, rows, own, _explained(effect, blocks, own))
+    axis_names = tuple(axes[row] for row in rows)
+    return _ActingEffect(effect, rows, axis_names, _predict_effect(effect, blocks, axis_names))
 
 
-def _leaves_odd_samples(one: _Acting) -> bool:
-    return bool({*one.seen.marks} - {_IN_ALL})
+def _has_anomalous_samples(one: _ActingEffect) -> bool:
+    """Return whether an effect changes sample counts other than by a quantization grid."""
+    return bool({*one.prediction.marks} - {_EVERYWHERE})
 
 
-def _shows_elsewhere(one: _Acting) -> bool:
-    """Whether means, powers and cross-spectra do not hold all that an effect does."""
-    seen = one.seen
+def _shows_elsewhere(one: _ActingEffect) -> bool:
+    """Return whether an effect also shows outside means, powers and cross-spectra."""
+    prediction = one.prediction
     elsewhere = (
-        seen.marks or not told_in_full(seen) or seen.transfer or seen.order or seen.phase_locked
+        prediction.marks
+        or not is_described_by_variance(prediction)
+        or prediction.transfer
+        or prediction.order
+        or prediction.phase_locked
     )
     return bool(
-        elsewhere or not (seen.mean or seen.level or seen.spectrum or seen.response is not None)
+        elsewhere
+        or not (
+            prediction.mean
+            or prediction.level
+            or prediction.spectrum
+            or prediction.response is not None
+        )
     )
 
 
-def _means(acting: Sequence[_Acting], blocks: xr.Dataset) -> Array:
-    """Rates that effects add, (axis, block) [degree hour-1]."""
+def _expected_means(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
+    """Return the rates that effects add, (axis, block) [degree hour-1]."""
     mean = np.zeros((blocks.sizes["axis"], blocks.sizes["block"]))
     for one in acting:
-        for name, values in one.seen.mean.items():
-            mean[one.rows] += _sizes(one.effect, name, one.axes)[:, None] * values
+        for name, values in one.prediction.mean.items():
+            mean[one.rows] += _sizes_by_axis(one.effect, name, one.axes)[:, None] * values
     return mean
 
 
-def _levels(acting: Sequence[_Acting], square: Array, blocks: xr.Dataset) -> Array:
-    """Squared noise coefficients with what effects add to them, (axis, block, noise)."""
+def _expected_squares(acting: Sequence[_ActingEffect], square: Array, blocks: xr.Dataset) -> Array:
+    """Return squared noise coefficients including effects, (axis, block, noise)."""
     level = np.repeat(square[:, None], blocks.sizes["block"], axis=1)
     for one in acting:
-        for (term, name), values in one.seen.level.items():
-            own = square[one.rows, None, NOISE.index(term)]
+        for (term, name), values in one.prediction.level.items():
+            axis_square = square[one.rows, None, NOISE.index(term)]
             level[one.rows, :, NOISE.index(term)] += (
-                own * _sizes(one.effect, name, one.axes)[:, None] * values
+                axis_square * _sizes_by_axis(one.effect, name, one.axes)[:, None] * values
             )
     return level
 
 
-def _powers(one: _Acting, blocks: xr.Dataset) -> list[_Power]:
-    """Power that an effect adds, one for each of its spectra."""
+def _added_powers(one: _ActingEffect, blocks: xr.Dataset) -> list[_AddedPower]:
+    """Return the powers that an effect adds, one for each of its spectra."""
     out, bands = [], blocks.sizes["band"]
-    for name, values in one.seen.spectrum.items():
+    for name, values in one.prediction.spectrum.items():
         factor = np.zeros(blocks.sizes["axis"], np.complex128)
-        factor[one.rows] = _factors(one.effect, name, one.axes)
+        factor[one.rows] = _complex_factors(one.effect, name, one.axes)
         density = np.zeros((factor.size, blocks.sizes["block"], bands))
-        peak = _peak(one.effect, name, blocks, one.axes)
+        peak = _resonance_density(one.effect, name, blocks, one.axes)
         density[one.rows] = (
             values.reshape(*values.shape[:-1], bands, -1).mean(axis=-1)
             if peak is None
-            else _over_bands(peak, blocks)
+            else _average_in_bands(peak, blocks)
         )
-        out.append(_Power(one, factor, density))
+        out.append(_AddedPower(one, factor, density))
     return out
 
 
-def _response(acting: Sequence[_Acting], blocks: xr.Dataset) -> Array:
-    """Share of the power that filters let pass, (axis, 1, band)."""
+def _filter_response(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
+    """Return the power response of filters, (axis, 1, band)."""
     response = np.ones((blocks.sizes["axis"], 1, blocks.sizes["band"]))
     for one in acting:
-        if one.seen.response is not None:
+        if one.prediction.response is not None:
             response[one.rows] *= band_response(one.effect, blocks)
     return response
 
 
-def _cross(
-    powers: Sequence[_Power], response: Array, blocks: xr.Dataset
+def _shared_cross(
+    powers: Sequence[_AddedPower], response: Array, blocks: xr.Dataset
 ) -> NDArray[np.complex128] | None:
-    """Cross-spectrum of what the axes share, behind a filter (axis, 1, band), as `Known.cross` has it."""
+    """Return the cross-spectrum of coherent effects after a filter (axis, 1, band)."""
     if "cross" not in blocks:
         return None
     axes = [str(axis) for axis in blocks["axis"].values]
     pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(blocks)]
     shared = np.zeros((len(pairs), blocks.sizes["block"], blocks.sizes["band"]), np.complex128)
-    for power in (power for power in powers if power.acting.seen.coherent):
+    for power in (power for power in powers if power.acting.prediction.coherent):
         for number, (one, other) in enumerate(pairs):
-            both = power.factor[one] * np.conj(power.factor[other])
-            shared[number] += both * np.sqrt(power.density[one] * power.density[other])
+            factor_product = power.factor[one] * np.conj(power.factor[other])
+            shared[number] += factor_product * np.sqrt(power.density[one] * power.density[other])
     for number, (one, other) in enumerate(pairs):
         shared[number] *= np.sqrt(response[one] * response[other])
     return spread_by_gaps(shared, blocks, "pair") if shared.any() else None
 
 
-def _wander_squares(one: _Acting, blocks: xr.Dataset) -> dict[str, Array]:
-    """Squared sizes of what an effect does to the means at random, (axis,) each."""
+def _process_squares(one: _ActingEffect, blocks: xr.Dataset) -> dict[str, Array]:
+    """Return squared sizes of random processes in the means, (axis,) each."""
     squares = {}
-    for name in one.seen.wander:
+    for name in one.prediction.wander:
         squares[name] = np.zeros(blocks.sizes["axis"])
-        squares[name][one.rows] = _sizes(one.effect, name, one.axes) ** 2
+        squares[name][one.rows] = _sizes_by_axis(one.effect, name, one.axes) ** 2
     return squares
 
 
 def expect_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]:
-    """Blocks in which what is known of an axis moves far above its noise, (axis, block); none on an axis where that is the usual thing.
+    """Find the blocks in which a known mean moves far above its noise, (axis, block).
 
-    The mean of such a block is known, and what moves inside it is not: its spectrum would be
-    compared with that of noise.
+    None on an axis where most blocks move. The mean of such a block is known, but not the motion
+    within it, whose spectrum would be compared with that of noise.
 
     Parameters
     ----------
@@ -286,12 +305,12 @@ def expect_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.
     step = np.abs(np.diff(baseline["known_mean"].transpose("axis", "block").values, axis=1))
     moved = np.maximum(np.pad(step, ((0, 0), (0, 1))), np.pad(step, ((0, 0), (1, 0))))
     noise = baseline["spectrum"].transpose("axis", "block", "band").values[..., 0]
-    moving = moved**2 * float(blocks.attrs["block_s"]) > _MOVES * noise
-    return np.asarray(moving & (moving.mean(axis=1, keepdims=True) <= _USUAL))
+    moving = moved**2 * float(blocks.attrs["block_s"]) > _MIN_MOTION_RATIO * noise
+    return np.asarray(moving & (moving.mean(axis=1, keepdims=True) <= _MAX_MOVING_SHARE))
 
 
 def remove_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
-    """The record without what blocks say of their inside where what is known of an axis moves: powers, kurtosis, and what axes share there.
+    """Drop powers, kurtosis and cross-spectra of blocks in which a known mean moves.
 
     Parameters
     ----------
@@ -310,111 +329,134 @@ def remove_known_motion(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 def _known_lines(
     blocks: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array
 ) -> dict[str, Array]:
-    """Lines of effects (with their axes, and their power in the bands), behind a filter (axis, band), as `Known.lines` has them."""
+    """Return lines of effects after a filter (axis, band), as in `KnownEffects.lines`.
+
+    The effects come with their axes and their power in the bands.
+    """
     axes = [str(axis) for axis in blocks["axis"].values]
     frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
     passed = np.stack([np.interp(np.log(frequency), np.log(bands), one) for one in response])
-    steady, most, broad = (np.zeros(passed.shape) for _ in range(3))
-    near, own = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
-    leak = _leak(int(blocks.attrs["block_samples"]))
+    steady, largest, broad = (np.zeros(passed.shape) for _ in range(3))
+    near, band_power = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
+    leak = _line_leakage(int(blocks.attrs["block_samples"]))
     for effect, rows, density in narrow:
         chosen = tuple(axes[row] for row in rows)
-        seen = _explained(effect, blocks, chosen, frequency)
-        own += (near * density).mean(axis=1) * response
-        for name, values in seen.spectrum.items():
-            size = np.abs(_factors(effect, name, chosen)[:, None]) ** 2 * values.mean(axis=-2)
-            places = 0 if seen.line is None else seen.line.size // blocks.sizes["block"]
+        prediction = _predict_effect(effect, blocks, chosen, frequency)
+        band_power += (near * density).mean(axis=1) * response
+        for name, values in prediction.spectrum.items():
+            size = np.abs(_complex_factors(effect, name, chosen)[:, None]) ** 2 * values.mean(
+                axis=-2
+            )
+            places = 0 if prediction.line is None else prediction.line.size // blocks.sizes["block"]
             alone = np.count_nonzero(values, axis=-1).max() <= places
-            peak = _peak(effect, name, blocks, chosen)
+            peak = _resonance_density(effect, name, blocks, chosen)
             if peak is not None:
                 broad[rows] += (
-                    np.abs(_factors(effect, name, chosen)[:, None]) ** 2 * peak * passed[rows]
+                    np.abs(_complex_factors(effect, name, chosen)[:, None]) ** 2
+                    * peak
+                    * passed[rows]
                 )
                 continue
             own_leak = leak[1]
-            if alone and places == 1 and seen.line is not None and np.ptp(seen.line) == 0.0:
+            if (
+                alone
+                and places == 1
+                and prediction.line is not None
+                and np.ptp(prediction.line) == 0.0
+            ):
                 apart = (
-                    float(seen.line.flat[0])
+                    float(prediction.line.flat[0])
                     - frequency[int(np.argmax(values.reshape(-1, frequency.size)[0]))]
                 )
-                own_leak = _leak(
+                own_leak = _line_leakage(
                     int(blocks.attrs["block_samples"]), apart * float(blocks.attrs["block_s"])
                 )[0]
             for row, one in zip(rows, size * passed[rows], strict=True):
                 (steady if alone else broad)[row] += np.convolve(
                     one, own_leak if alone else leak[0], "same"
                 )
-                most[row] += np.convolve(one, leak[2], "same") if alone else 0.0
-    return {"lines": steady, "lines_most": most, "peaks": broad, "line_spectrum": own}
+                largest[row] += np.convolve(one, leak[2], "same") if alone else 0.0
+    return {"lines": steady, "lines_most": largest, "peaks": broad, "line_spectrum": band_power}
 
 
-def _peak(effect: Effect, name: str, blocks: xr.Dataset, axes: tuple[str, ...]) -> Array | None:
-    """Density of a resonance per squared unit as the taper shows it, (line,): its peak may be narrower than the taper's own width.
+def _resonance_density(
+    effect: Effect, name: str, blocks: xr.Dataset, axes: tuple[str, ...]
+) -> Array | None:
+    """Return the tapered density of a resonance per squared unit, (line,); None without resonance.
 
-    None of an effect that has none.
+    Its peak may be narrower than the width of the taper.
     """
     if not math.isfinite(getattr(effect, "quality", math.inf)) or "line_frequency" not in blocks:
         return None
     frequency, finer, size = (
         blocks["line_frequency"].values,
-        2 * _BETWEEN,
+        2 * _PLACES_BETWEEN,
         int(blocks.attrs["block_samples"]),
     )
     fine = frequency[0] / finer * np.arange(1, finer * frequency.size + 1)
-    seen = _explained(effect, blocks, axes, fine)
-    density = seen.spectrum[name].reshape(-1, fine.size)[0].copy()
-    centre = fine.size if seen.line is None else int(np.argmin(np.abs(fine - seen.line.flat[0])))
-    inside = (np.arange(_INSIDE_PEAK) + 0.5) / _INSIDE_PEAK - 0.5
-    for place in range(
-        max(centre - 1, 0), min(centre + 2, fine.size)
-    ):  # where the peak may be narrower than the steps of the density
-        there = fine[place] + (fine[1] - fine[0]) * inside
+    prediction = _predict_effect(effect, blocks, axes, fine)
+    density = prediction.spectrum[name].reshape(-1, fine.size)[0].copy()
+    centre = (
+        fine.size
+        if prediction.line is None
+        else int(np.argmin(np.abs(fine - prediction.line.flat[0])))
+    )
+    inside = (np.arange(_PEAK_POINTS) + 0.5) / _PEAK_POINTS - 0.5
+    # The peak may be narrower than the steps of the density.
+    for place in range(max(centre - 1, 0), min(centre + 2, fine.size)):
+        frequencies = fine[place] + (fine[1] - fine[0]) * inside
         density[place] = (
-            _explained(effect, blocks, axes, there)
+            _predict_effect(effect, blocks, axes, frequencies)
             .spectrum[name]
             .reshape(-1, inside.size)[0]
             .mean()
         )
     window = np.abs(np.fft.fft(taper(size), size * finer)) ** 2
-    reach = min(_REACH, frequency.size // 2) * finer
+    reach = min(_LEAK_LINES, frequency.size // 2) * finer
     window = np.concatenate([window[-reach:], window[: reach + 1]])
-    shown = np.convolve(
+    tapered = np.convolve(
         np.concatenate([density[::-1], density[:1], density]), window / window.sum(), "same"
     )
-    return np.asarray(shown[fine.size + finer :: finer])
+    return np.asarray(tapered[fine.size + finer :: finer])
 
 
-def _over_bands(density: Array, blocks: xr.Dataset) -> Array:
-    """Mean of every band of a density of all ordinates."""
+def _average_in_bands(density: Array, blocks: xr.Dataset) -> Array:
+    """Average a density over the lines of every band."""
     edges = band_edges(int(blocks.attrs["block_samples"])) - 1
     return np.asarray(np.add.reduceat(density, edges[:-1]) / np.diff(edges))
 
 
-def evenness(density: Array, blocks: xr.Dataset) -> Array:
-    """Share of the ordinates of a band (axis, band) that scatter by themselves where one of them is louder than others (axis, line)."""
+def independent_line_share(density: Array, blocks: xr.Dataset) -> Array:
+    """Return the equivalent share of independent lines of a band (axis, band).
+
+    It is below 1 if the density (axis, line) is dominated by some lines.
+    """
     return np.stack(
-        [_over_bands(one, blocks) ** 2 / _over_bands(one**2, blocks) for one in density]
+        [_average_in_bands(one, blocks) ** 2 / _average_in_bands(one**2, blocks) for one in density]
     )
 
 
-def _leak(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
-    """Share of a line in the ordinates about it, so far `apart` from the middle one; the mean over such places, and the most at any."""
+def _line_leakage(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
+    """Return the share of a line in the lines around it: at an offset, on average, at most.
+
+    The offset `apart` from the middle line is in lines.
+    """
     weights = taper(size)
-    reach = min(_REACH, ordinates(size) // 2)
-    finer = 2 * _BETWEEN
+    reach = min(_LEAK_LINES, ordinates(size) // 2)
+    finer = 2 * _PLACES_BETWEEN
     turned = weights * np.exp(2j * np.pi * apart * np.arange(size) / size)
     padded = np.abs(np.fft.fft(turned, size * finer)) ** 2 / (size * (weights**2).sum())
     place = np.arange(-reach, reach + 1) * finer
-    inside = padded[place[:, None] + np.arange(-_BETWEEN, _BETWEEN + 1)]
-    ends = np.array([0.5, *[1.0] * (2 * _BETWEEN - 1), 0.5])
-    return inside[:, _BETWEEN], np.average(inside, axis=1, weights=ends), inside.max(axis=1)
+    inside = padded[place[:, None] + np.arange(-_PLACES_BETWEEN, _PLACES_BETWEEN + 1)]
+    ends = np.array([0.5, *[1.0] * (2 * _PLACES_BETWEEN - 1), 0.5])
+    return inside[:, _PLACES_BETWEEN], np.average(inside, axis=1, weights=ends), inside.max(axis=1)
 
 
 def remove_known_lines(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
-    """The record with its line spectrum freed of the steady lines that the baseline knows.
+    """Subtract the known steady lines from the line spectrum.
 
-    A line is left as it is above what is known of it where it is stronger than the form of an
-    effect may be wrong and the noise beside it may do.
+    The excess over a known line stays if it exceeds the model error of an effect and the scatter of
+    the noise.
 
     Parameters
     ----------
@@ -427,24 +469,27 @@ def remove_known_lines(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         blocks["line_weight"].transpose("axis", "part"),
     )
     noise = expected_lines(baseline, blocks["line_frequency"].values)[:, None]
-    known, most = (baseline[name].values[:, None] for name in ("lines", "lines_most"))
+    known, largest = (baseline[name].values[:, None] for name in ("lines", "lines_most"))
     with np.errstate(divide="ignore", invalid="ignore"):
-        scatter = np.sqrt((noise**2 + 2.0 * noise * most) / weight.values[..., None])
+        scatter = np.sqrt((noise**2 + 2.0 * noise * largest) / weight.values[..., None])
     above = power.values - noise - known
-    stands = power.values - noise - most > _SIZE_ERROR * most + _CHANCE * scatter
-    beside = np.pad(stands, ((0, 0), (0, 0), (LEAK_LINES, LEAK_LINES)))
-    stands = np.lib.stride_tricks.sliding_window_view(beside, 2 * LEAK_LINES + 1, axis=-1).any(
-        axis=-1
-    )  # with what it leaks into
-    freed = noise + np.where(stands | (most < _SLIGHT * noise), above, 0.0)
+    exceeds = (
+        power.values - noise - largest > _LINE_POWER_ERROR * largest + _MIN_LINE_SIGMA * scatter
+    )
+    padded_lines = np.pad(exceeds, ((0, 0), (0, 0), (LEAK_LINES, LEAK_LINES)))
+    # With the lines that it leaks into.
+    exceeds = np.lib.stride_tricks.sliding_window_view(
+        padded_lines, 2 * LEAK_LINES + 1, axis=-1
+    ).any(axis=-1)
+    freed = noise + np.where(exceeds | (largest < _MIN_LEAK_RATIO * noise), above, 0.0)
     freed = np.where(known > 0.0, np.maximum(freed, 0.0), power.values)
     return blocks.assign(
         line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))
     )
 
 
-def _simulated(model: Model) -> Callable[[Effect], Effect]:
-    """Effects as the model simulates them: a filter works at the rate of the model's instrument."""
+def _effect_of_instrument(model: Model) -> Callable[[Effect], Effect]:
+    """Return the filter of effects at the rate of the model's instrument."""
     instrument = float(model.log.get("oversampling", 1))
     return lambda effect: (
         replace(effect, instrument=instrument) if isinstance(effect, LoggerFilter) else effect
@@ -452,14 +497,14 @@ def _simulated(model: Model) -> Callable[[Effect], Effect]:
 
 
 def find_drivers(effect: Effect) -> dict[str, str]:
-    """Channel of the effect -> its name in the log."""
+    """Return the names in the log of an effect's channels."""
     return {role: effect.channel_names()[role] for role in effect.needs()}
 
 
-def _explained(
+def _predict_effect(
     effect: Effect, blocks: xr.Dataset, axes: tuple[str, ...], frequency: Array | None = None
 ) -> Prediction:
-    """What an effect predicts for the record on some of its axes; spectra at many frequencies in each band, since a peak may be narrow."""
+    """Predict an effect on some axes, with many frequencies in each band for narrow peaks."""
     drivers = find_drivers(effect)
     present = [
         str(name).removeprefix("channel_")
@@ -478,8 +523,8 @@ def _explained(
     )
 
 
-def _sizes(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
-    """A parameter for each axis."""
+def _sizes_by_axis(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
+    """Return a parameter for each axis."""
     known = {one.name: one for one in effect.parameters()}
     return (
         effect.each(name, axes)
@@ -488,12 +533,12 @@ def _sizes(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
     )
 
 
-def _factors(effect: Effect, name: str, axes: tuple[str, ...]) -> NDArray[np.complex128]:
-    """Factor that each axis has of a spectrum: its size, the share of its direction, the phase of a steady line."""
+def _complex_factors(effect: Effect, name: str, axes: tuple[str, ...]) -> NDArray[np.complex128]:
+    """Return the complex factor of a spectrum for each axis: size, direction, phase."""
     known = {one.name: one for one in effect.parameters()}
-    factor = _sizes(effect, name, axes).astype(np.complex128)
+    factor = _sizes_by_axis(effect, name, axes).astype(np.complex128)
     if "direction" in known:
-        factor *= _sizes(effect, "direction", axes)
+        factor *= _sizes_by_axis(effect, "direction", axes)
     if "phase" in known and known["phase"].many:
-        factor *= np.exp(1j * np.radians(_sizes(effect, "phase", axes)))
+        factor *= np.exp(1j * np.radians(_sizes_by_axis(effect, "phase", axes)))
     return factor

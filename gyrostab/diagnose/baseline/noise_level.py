@@ -1,4 +1,4 @@
-"""The noise level of a simulation, calibrated on quiet stretches of the recording."""
+"""Calibration of the noise level of a simulation on quiescent blocks of the recording."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ __all__ = ["quiescent_level", "scale_noise"]
 
 Array = NDArray[np.float64]
 _ROUNDS = 20  # of Fisher scoring, which converges quadratically
-_LEAST = 0.1  # of the factor before, below which no round takes it: the power of noise is positive
+_MIN_FACTOR_RATIO = 0.1  # of the factor before: no round may reach zero
 
 
 def quiescent_level(
     blocks: xr.Dataset, noise: Array, added: Array, quiet: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Measure how loud the noise of the quiet blocks is against that of a simulation.
+    """Measure the noise level of the quiescent blocks relative to that of a simulation.
 
     Parameters
     ----------
     blocks : xarray.Dataset
         Recording, from `reduce_log`.
     noise, added : ndarray, shape (axis, block, band)
-        Expected power of the noise, and what effects of the simulation add to it.
+        Expected power of the noise, and power that effects of the simulation add.
     quiet : ndarray of bool, shape (axis, block)
         Blocks to calibrate on.
 
     Returns
     -------
     factor : ndarray, shape (axis,)
-        Factor of `noise` of largest gamma likelihood.
+        Factor of `noise` with the largest gamma likelihood.
     error : ndarray, shape (axis,)
-        Its standard error, as a share of it.
+        Its standard error, relative to it.
 
     Raises
     ------
     SchemaError
-        When an axis has no spectrum in its quiet blocks.
+        If an axis has no spectrum in its quiescent blocks.
     """
     power, shape = (
         blocks[name].transpose("axis", "block", "band").values for name in ("power", "shape")
     )
     common, alone = common_variance(blocks)
-    found = []
+    factors = []
     for row, axis in enumerate(blocks["axis"].values):
         good = np.isfinite(power[row]) & np.isfinite(shape[row]) & quiet[row][:, None]
         good &= noise[row] > 0.0
@@ -58,22 +58,27 @@ def quiescent_level(
                 f"axis {axis}: the quiet blocks hold no spectrum to calibrate the simulation on; "
                 "name other quiet time, or leave --quiet out to take the simulation as it is"
             )
-        own = np.where(good, alone[row], 0.0).sum(axis=1)
-        less = 1.0 / (1.0 + np.where(quiet[row], common[row], 0.0) * own)  # see `common_variance`
-        weight = (shape[row] * np.broadcast_to(less[:, None], good.shape))[good]
-        found.append(_fit_factor(power[row][good], noise[row][good], added[row][good], weight))
-    return np.array([one for one, _ in found]), np.array([error for _, error in found])
+        separate_shape = np.where(good, alone[row], 0.0).sum(axis=1)
+        reduction = 1.0 / (
+            1.0 + np.where(quiet[row], common[row], 0.0) * separate_shape
+        )  # see `common_variance`
+        weight = (shape[row] * np.broadcast_to(reduction[:, None], good.shape))[good]
+        factors.append(_fit_factor(power[row][good], noise[row][good], added[row][good], weight))
+    return np.array([one for one, _ in factors]), np.array([error for _, error in factors])
 
 
 def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:
-    """Fit ``factor * noise + added`` to powers of gamma laws, by Fisher scoring; the second number is its relative error."""
+    """Fit ``factor * noise + added`` to gamma-distributed powers; return also the relative error.
+
+    By Fisher scoring.
+    """
     factor = float((weight * power / (noise + added)).sum() / weight.sum())
     information = 0.0
     for _ in range(_ROUNDS):
         expected = factor * noise + added
         information = float((weight * (noise / expected) ** 2).sum())
-        moved = float((weight * noise * (power - expected) / expected**2).sum()) / information
-        factor = max(factor + moved, _LEAST * factor)
+        change = float((weight * noise * (power - expected) / expected**2).sum()) / information
+        factor = max(factor + change, _MIN_FACTOR_RATIO * factor)
     return factor, 1.0 / (factor * math.sqrt(information))
 
 
@@ -89,9 +94,9 @@ def scale_noise(
     factor : float
         Factor of its power.
     error : float
-        Standard error of `factor`, as a share of it.
+        Standard error of `factor`, relative to it.
     rng : numpy.random.Generator
-        Random numbers of the draws.
+        Generator of the draws.
     """
     scatter = rng.gamma(error**-2, error**2, (len(noise.draws), 1))
     return noise._replace(

@@ -1,4 +1,4 @@
-"""Posterior of the noise of one axis: Q and N from band powers, B and K from band powers and block means."""
+"""Posterior of the noise of one axis: Q, N from band powers, B, K from these and block means."""
 
 from __future__ import annotations
 
@@ -15,57 +15,62 @@ from gyrostab.noise import HOUR
 __all__ = [
     "Fit",
     "Posterior",
-    "expected_of",
+    "average_blocks",
+    "expected_powers",
     "fit_squares",
     "floor_square",
     "noise_posterior",
-    "scales",
-    "summed",
+    "visible_coefficients",
 ]
 
 Array = NDArray[np.float64]
-_DISAGREE = 8.0  # nats by which spectrum and means may differ about B and K
-_LEAST = 0.05  # of the expected powers, below which no size of an effect takes them
-_AT_ONCE = 64  # points of the grid
-_SHORTEST, _EVEN = 1e-3, 1e-12  # steps towards the best fit; and what rounding does to a likelihood
-_WIDE = 1e-9  # precision of what effects do to the means, against that of one of them
+_MAX_DISAGREEMENT_NATS = 8.0  # of spectrum and means about B and K; design choice
+_MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice
+_POINTS_AT_ONCE = 64  # points of the grid; limits memory
+_MIN_STEP = 1e-3  # shortest step towards the best fit
+_ROUNDING_SHARE = 1e-12  # rounding error of a log likelihood
+_PRIOR_PRECISION = 1e-9  # of effects in the means, over that of one mean; nearly free
 
 
 class Fit(NamedTuple):
-    """Band powers as a sum of noise terms and of effects.
+    """Band powers as a sum of noise terms and effects.
 
     Attributes
     ----------
     power, weight : ndarray, shape (cell,)
-        Powers, averaged over blocks, and the shapes of their gamma laws.
+        Powers, averaged over blocks, and the shapes of their gamma distributions.
     columns : ndarray, shape (cell, 4)
-        Of the noise terms.
+        Power of the noise terms per squared coefficient.
     known : ndarray, shape (cell,), optional
-        Power of effects that is known.
-    beside : ndarray, shape (cell, column), optional
-        Power of effects per unit of sizes that are free.
+        Known power of effects.
+    free_columns : ndarray, shape (cell, column), optional
+        Power of effects per unit of free sizes.
     precision : ndarray, shape (column,), optional
-        Of normal priors of these sizes about 0.
+        Precisions of normal priors of these sizes about 0.
     start : ndarray, shape (cell,), optional
-        Expected powers to begin from; white noise by default.
+        Expected powers to start from; white noise by default.
     """
 
     power: Array
     columns: Array
     weight: Array
     known: Array | None = None
-    beside: Array | None = None
+    free_columns: Array | None = None
     precision: Array | None = None
     start: Array | None = None
 
     def rest(self) -> Array:
-        """Powers less what is known."""
+        """Return the powers minus the known ones."""
         return self.power if self.known is None else self.power - self.known
 
     def free(self) -> tuple[Array, Array]:
-        """Columns and precisions of the sizes that are free."""
-        beside = np.empty((self.power.size, 0)) if self.beside is None else self.beside
-        return beside, np.zeros(beside.shape[1]) if self.precision is None else self.precision
+        """Return columns and precisions of the free sizes."""
+        free_columns = (
+            np.empty((self.power.size, 0)) if self.free_columns is None else self.free_columns
+        )
+        return free_columns, np.zeros(
+            free_columns.shape[1]
+        ) if self.precision is None else self.precision
 
 
 class Posterior(NamedTuple):
@@ -73,17 +78,17 @@ class Posterior(NamedTuple):
 
     Attributes
     ----------
-    square, error : ndarray, shape (4,)
         Squares of Q, N, B, K that fit the band powers best, and their errors [squared units of the
         noise table].
     K, B, weight : ndarray, shape (cell,)
-        Fine grid of K and B, and its share of the posterior.
+    K, B, weight : ndarray, shape (cell,)
+        Fine grid of K and B, and its posterior probabilities.
     draws : ndarray, shape (draw, 4)
         Squares of Q, N, B, K in the band powers.
     slow : ndarray, shape (draw, 2)
         Squares of B and K in the block means; the same as in `draws` when `joined`.
     joined : bool
-        Band powers and means agree about B and K.
+        Whether band powers and means agree about B and K.
     """
 
     square: Array
@@ -96,37 +101,41 @@ class Posterior(NamedTuple):
     joined: bool
 
 
-def summed(power: Array, shape: Array, columns: Array) -> Fit:
-    """Average over blocks: power and shape (block, band), columns (block, band, term)."""
+def average_blocks(power: Array, shape: Array, columns: Array) -> Fit:
+    """Average over blocks; power and shape (block, band), columns (block, band, term)."""
     use = np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)
     total = use.sum(axis=0)
-    some = total > 0.0
-    safe = np.where(some, total, 1.0)
+    has_data = total > 0.0
+    safe = np.where(has_data, total, 1.0)
     mean = (use * np.nan_to_num(power)).sum(axis=0) / safe
-    seen = np.einsum("ij,ijk->jk", use, columns) / safe[:, None]
-    return Fit(mean[some], seen[some], total[some])
+    mean_columns = np.einsum("ij,ijk->jk", use, columns) / safe[:, None]
+    return Fit(mean[has_data], mean_columns[has_data], total[has_data])
 
 
 def fit_squares(fit: Fit) -> tuple[Array, Array]:
-    """Non-negative squares of largest gamma likelihood (Whittle), and their Fisher information when the effects are free beside them.
+    """Fit non-negative squares by gamma likelihood (Whittle); return also their information.
+
+    The Fisher information is that with the effects free.
 
     Examples
     --------
-    >>> columns = np.stack([np.arange(1.0, 9.0) ** 2, np.ones(8), 1.0 / np.arange(1.0, 9.0), np.arange(1.0, 9.0) ** -2], axis=1)
-    >>> fit_squares(Fit(columns @ [0.1, 2.0, 0.0, 3.0], columns, np.full(8, 100.0)))[0].round(6)
+    >>> f = np.arange(1.0, 9.0)
+    >>> columns = np.stack([f**2, np.ones(8), 1.0 / f, f**-2], axis=1)
+    >>> fit = Fit(columns @ [0.1, 2.0, 0.0, 3.0], columns, np.full(8, 100.0))
+    >>> fit_squares(fit)[0].round(6)
     array([0.1, 2. , 0. , 3. ])
     """
-    square, normal, _ = _fitted(fit)
+    square, normal, _ = _fit_likelihood(fit)
     return square, normal
 
 
-def expected_of(fit: Fit) -> Array:
-    """Expected powers where the likelihood is largest."""
-    return _fitted(fit)[2]
+def expected_powers(fit: Fit) -> Array:
+    """Return the expected powers at the largest likelihood."""
+    return _fit_likelihood(fit)[2]
 
 
-def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
-    """Squares, their information, and the expected powers."""
+def _fit_likelihood(fit: Fit) -> tuple[Array, Array, Array]:
+    """Return squares, their information, and the expected powers."""
     width = fit.columns.shape[1]
     square, normal = np.zeros(width), np.zeros((width, width))
     square[1] = max(
@@ -135,30 +144,29 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
     spectrum = np.asarray(
         fit.columns @ square if fit.start is None else fit.start, dtype=np.float64
     )
-    beside, precision = fit.free()
-    alone = (
-        not beside.shape[1] and fit.known is None and fit.start is None
-    )  # else the likelihood is not that of these powers only
+    free_columns, precision = fit.free()
+    # Otherwise the likelihood is not that of these powers alone.
+    alone = not free_columns.shape[1] and fit.known is None and fit.start is None
     for _ in range(50):
         weight = fit.weight / spectrum**2
-        normal, right, to_noise, to_right = _without(
-            beside, precision, fit.columns, fit.rest(), weight
+        normal, right, to_noise, to_right = _eliminate_free_sizes(
+            free_columns, precision, fit.columns, fit.rest(), weight
         )
-        found = np.empty(width)
-        solve_nonnegative(normal, right, (1 << width) - 1, found, 0)
-        after = np.asarray(fit.columns @ np.maximum(found, 0.0), dtype=np.float64)
-        if beside.shape[1] or fit.known is not None:
+        solution = np.empty(width)
+        solve_nonnegative(normal, right, (1 << width) - 1, solution, 0)
+        after = np.asarray(fit.columns @ np.maximum(solution, 0.0), dtype=np.float64)
+        if free_columns.shape[1] or fit.known is not None:
             after = (
                 after
                 + (fit.power - fit.rest())
-                + beside @ (to_right - to_noise @ np.maximum(found, 0.0))
+                + free_columns @ (to_right - to_noise @ np.maximum(solution, 0.0))
             )
-            after = np.asarray(np.maximum(after, _LEAST * spectrum))
+            after = np.asarray(np.maximum(after, _MIN_POWER_RATIO * spectrum))
         if not (after > 0.0).all():
             break
-        component = _step(fit, spectrum, after) if alone else 1.0
-        square = square + component * (np.maximum(found, 0.0) - square)
-        after = spectrum + component * (after - spectrum)
+        fraction = _choose_step(fit, spectrum, after) if alone else 1.0
+        square = square + fraction * (np.maximum(solution, 0.0) - square)
+        after = spectrum + fraction * (after - spectrum)
         change = np.abs(after / spectrum - 1.0).max()
         spectrum = after
         if change < 1e-9:
@@ -166,50 +174,56 @@ def _fitted(fit: Fit) -> tuple[Array, Array, Array]:
     return square, np.asarray(normal, dtype=np.float64), spectrum
 
 
-def _step(fit: Fit, spectrum: Array, after: Array) -> float:
-    """How far to go towards the next spectrum: all the way, or half as far until that is likelier; scoring goes too far where none fits."""
+def _choose_step(fit: Fit, spectrum: Array, after: Array) -> float:
+    """Return the step towards the next spectrum, halved until the likelihood does not fall."""
     least = _log_likelihood(fit, spectrum)
-    component = 1.0
-    while component > _SHORTEST and _log_likelihood(
-        fit, spectrum + component * (after - spectrum)
-    ) < least - _EVEN * abs(least):
-        component *= 0.5
-    return component
+    fraction = 1.0
+    while fraction > _MIN_STEP and _log_likelihood(
+        fit, spectrum + fraction * (after - spectrum)
+    ) < least - _ROUNDING_SHARE * abs(least):
+        fraction *= 0.5
+    return fraction
 
 
 def _log_likelihood(fit: Fit, spectrum: Array) -> float:
+    """Return the gamma log likelihood of a spectrum."""
     return -float((fit.weight * (np.log(spectrum) + fit.power / spectrum)).sum())
 
 
-def _without(
-    beside: Array, precision: Array, columns: Array, power: Array, weight: Array
+def _eliminate_free_sizes(
+    free_columns: Array, precision: Array, columns: Array, power: Array, weight: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Normal equations of `columns` with the sizes of `beside` solved for; and what these are, ``to_right - to_noise @ squares``."""
+    """Eliminate free sizes from the normal equations of `columns`.
+
+    The sizes are ``to_right - to_noise @ squares``.
+    """
     weighted = columns.T * weight
     normal, right = weighted @ columns, weighted @ power
-    if not beside.shape[1]:
+    if not free_columns.shape[1]:
         return normal, right, np.empty((0, columns.shape[1])), np.empty(0)
-    inner = (beside.T * weight) @ beside + np.diag(precision)
+    inner = (free_columns.T * weight) @ free_columns + np.diag(precision)
     inner += 1e-9 * np.diag(np.maximum(np.diagonal(inner), 1e-300))
-    crossed = weighted @ beside
+    crossed = weighted @ free_columns
     to_noise = np.asarray(np.linalg.solve(inner, crossed.T), dtype=np.float64)
-    to_right = np.asarray(np.linalg.solve(inner, (beside.T * weight) @ power), dtype=np.float64)
+    to_right = np.asarray(
+        np.linalg.solve(inner, (free_columns.T * weight) @ power), dtype=np.float64
+    )
     return normal - crossed @ to_noise, right - crossed @ to_right, to_noise, to_right
 
 
 def floor_square(fit: Fit) -> float:
-    """Square of N below which it is not followed: white noise hides in the least of the powers."""
+    """Return the smallest resolved N^2: white noise hides in the smallest power."""
     return 1e-3 * max(float(np.min(fit.power)), np.finfo(float).tiny) / HOUR
 
 
-def scales(density: float, span: float) -> tuple[float, float]:
-    """K and B that the means of a record just show, beside white noise of this density [degree2 hour-2 Hz-1]."""
+def visible_coefficients(density: float, span: float) -> tuple[float, float]:
+    """Return K and B that the means just show in white noise of a density [degree2 hour-2 Hz-1]."""
     return float(np.sqrt(HOUR * 3.0 * density) / span), float(np.sqrt(density / span / 0.44))
 
 
 def _fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
-    """Values of K and B from what cannot be seen in the means to what hides all white noise."""
-    K, B = scales(density, span)
+    """Return values of K and B, from invisible in the means to far above white noise."""
+    K, B = visible_coefficients(density, span)
     top = 300.0 * span / step
     return (
         np.geomspace(0.1 * K, 0.1 * K * top, round(6.0 * np.log10(top))),
@@ -217,54 +231,60 @@ def _fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
     )
 
 
-def _by_powers(fit: Fit, spectrum: Array, K: Array, B: Array) -> tuple[Array, Array, Array]:
-    """Log likelihood of the powers for every K, B (point,) with the best of the rest; Q and N, unbounded (point, 2); their information."""
-    beside, precision = fit.free()
+def _likelihood_of_powers(
+    fit: Fit, spectrum: Array, K: Array, B: Array
+) -> tuple[Array, Array, Array]:
+    """Compute the log likelihood of the powers for every K and B.
+
+    Returns also the best Q and N, unbounded (point, 2), and their information.
+    """
+    free_columns, precision = fit.free()
     weight = fit.weight / spectrum**2
-    near = np.concatenate([fit.columns[:, :2], beside], axis=1)
+    fast_columns = np.concatenate([fit.columns[:, :2], free_columns], axis=1)
     known = fit.power - fit.rest()
-    normal = _normal(near, weight, precision)
-    without = _normal(near[:, 1:], weight, precision)
-    components = [
-        _chunk(
+    normal = _normal_matrix(fast_columns, weight, precision)
+    without = _normal_matrix(fast_columns[:, 1:], weight, precision)
+    chunks = [
+        _likelihood_of_points(
             fit,
             np.outer(b**2, fit.columns[:, 2]) + np.outer(k**2, fit.columns[:, 3]),
-            near,
+            fast_columns,
             (normal, without),
             (weight, known, spectrum),
         )
         for b, k in zip(
-            np.array_split(B, -(-B.size // _AT_ONCE)),
-            np.array_split(K, -(-K.size // _AT_ONCE)),
+            np.array_split(B, -(-B.size // _POINTS_AT_ONCE)),
+            np.array_split(K, -(-K.size // _POINTS_AT_ONCE)),
             strict=True,
         )
     ]
-    inverse = np.linalg.inv(normal)[:2, :2] if beside.shape[1] else None
+    inverse = np.linalg.inv(normal)[:2, :2] if free_columns.shape[1] else None
     return (
-        np.concatenate([one[0] for one in components]),
-        np.concatenate([one[1] for one in components]),
+        np.concatenate([one[0] for one in chunks]),
+        np.concatenate([one[1] for one in chunks]),
         normal if inverse is None else np.linalg.inv(inverse),
     )
 
 
-def _normal(near: Array, weight: Array, precision: Array) -> Array:
-    normal = near.T @ (weight[:, None] * near)
+def _normal_matrix(fast_columns: Array, weight: Array, precision: Array) -> Array:
+    """Return the normal matrix of Q, N and free sizes."""
+    normal = fast_columns.T @ (weight[:, None] * fast_columns)
     if precision.size:
-        normal = normal + np.diag([*np.zeros(near.shape[1] - precision.size), *precision])
+        normal = normal + np.diag([*np.zeros(fast_columns.shape[1] - precision.size), *precision])
         normal += 1e-9 * np.diag(np.diagonal(normal))
     return normal
 
 
-def _chunk(
+def _likelihood_of_points(
     fit: Fit,
     slow: Array,
-    near: Array,
+    fast_columns: Array,
     normals: tuple[Array, Array],
-    frame: tuple[Array, Array, Array],
+    setup: tuple[Array, Array, Array],
 ) -> tuple[Array, Array]:
-    """Some points of the grid, `slow` (point, cell) the powers of B and K."""
-    weight, known, spectrum = frame
-    right = (weight * (fit.rest() - slow)) @ near
+    """Compute some points of the grid; `slow` (point, cell) is the power of B and K."""
+    weight, known, spectrum = setup
+    right = (weight * (fit.rest() - slow)) @ fast_columns
     best = np.linalg.solve(normals[0], right.T).T
     alone = np.linalg.solve(normals[1], right[:, 1:].T).T
     alone[:, 0] = np.maximum(alone[:, 0], 1e-12 * float(spectrum.max()) / HOUR)
@@ -272,16 +292,16 @@ def _chunk(
     used = np.where(
         inside[:, None], best, np.concatenate([np.zeros((len(best), 1)), alone], axis=1)
     )
-    expected = used @ near.T + slow + known
-    if near.shape[1] > 2 or fit.known is not None:
-        expected = np.maximum(expected, _LEAST * spectrum)
+    expected = used @ fast_columns.T + slow + known
+    if fast_columns.shape[1] > 2 or fit.known is not None:
+        expected = np.maximum(expected, _MIN_POWER_RATIO * spectrum)
     return np.asarray(
         -(fit.weight * (np.log(expected) + fit.power / expected)).sum(axis=1)
     ), np.asarray(best[:, :2])
 
 
 def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Array:
-    """Draws of the squares of Q and N about `mean` (draw, 2), that of Q above 0."""
+    """Draw squares of Q and N about `mean` (draw, 2), Q^2 not negative."""
     sd = float(np.sqrt(covariance[0, 0]))
     low = np.minimum(-mean[:, 0] / sd, 30.0)
     Q = np.maximum(mean[:, 0] - sd * ndtri(rng.random(len(mean)) * ndtr(-low)), 0.0)
@@ -303,28 +323,28 @@ def noise_posterior(
     rng: np.random.Generator,
     effects: Array | None = None,
 ) -> Posterior:
-    """Posterior of Q, N, B, K.
+    """Compute the posterior of Q, N, B, K.
 
     Parameters
     ----------
     fit : Fit
-        Band powers of the quiet blocks; columns in the order Q, N, B, K.
+        Band powers of the quiescent blocks; columns in the order Q, N, B, K.
     mean, variance : ndarray, shape (block,)
         Block means [degree hour-1] and their white variance.
     present : ndarray of bool, shape (block,)
-        Quiet blocks with a mean.
+        Quiescent blocks with a mean.
     step : float
         Length of a block [s].
     draws : int
-        Draws from the posterior.
+        Number of draws from the posterior.
     rng : numpy.random.Generator
     effects : ndarray, shape (block, column), optional
-        What effects do to the means, of any size.
+        Designs of effects in the means, of any size.
     """
-    square, information, spectrum = _fitted(fit)
+    square, information, spectrum = _fit_likelihood(fit)
     density = HOUR * max(float(square[1]), floor_square(fit))
     coarse_K, coarse_B = _fine_grid(density, mean.size * step, step)
-    K, B = (component.ravel() for component in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
+    K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
     values = np.where(present, mean, 0.0)[:, None]
     columns = (
         np.empty((mean.size, 0))
@@ -337,11 +357,13 @@ def noise_posterior(
     products = marginalise(
         products,
         columns.shape[1],
-        _WIDE * np.eye(columns.shape[1]) / np.maximum(variance[present].min(initial=1.0), 1e-300),
+        _PRIOR_PRECISION
+        * np.eye(columns.shape[1])
+        / np.maximum(variance[present].min(initial=1.0), 1e-300),
     )
     slow = -0.5 * (products.square[:, 0] + products.log_determinant)
-    fast, best, normal = _by_powers(fit, spectrum, K, B)
-    joined = bool(slow.max() + fast.max() - (slow + fast).max() < _DISAGREE)
+    fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
+    joined = bool(slow.max() + fast.max() - (slow + fast).max() < _MAX_DISAGREEMENT_NATS)
     log = slow + fast if joined else slow
     weight = np.exp(log - log.max())
     weight /= weight.sum()
@@ -354,8 +376,8 @@ def noise_posterior(
     error = np.sqrt(np.diag(covariance))
     if joined:
         spread = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-        together = np.concatenate([_draw_near(best[cell], spread, rng), slow_draws], axis=1)
+        squares = np.concatenate([_draw_near(best[cell], spread, rng), slow_draws], axis=1)
     else:
-        together = np.maximum(square + error * rng.standard_normal((draws, 4)), 0.0)
-    together[:, 1] = np.maximum(together[:, 1], 0.01 * square[1])
-    return Posterior(square, error, K, B, weight, together, slow_draws, joined)
+        squares = np.maximum(square + error * rng.standard_normal((draws, 4)), 0.0)
+    squares[:, 1] = np.maximum(squares[:, 1], 0.01 * square[1])
+    return Posterior(square, error, K, B, weight, squares, slow_draws, joined)

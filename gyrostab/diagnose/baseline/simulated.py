@@ -1,4 +1,4 @@
-"""What a simulated log shows beside the five noise terms: the form of its spectrum, what its axes share, its steady lines."""
+"""What a simulated log has in addition to five noise terms: spectral shape, coherency, lines."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from gyrostab.diagnose.evidence.spectral_lines import (
 )
 from gyrostab.diagnose.predict.linear_model import band_widths, pair_rows, unspread_share
 
-__all__ = ["Shown", "odd_band", "shown_by", "with_shown"]
+__all__ = ["ExtraStatistics", "add_extra_statistics", "measure_extra_statistics", "worst_band"]
 
 Array = NDArray[np.float64]
-_POWER = "degree2 hour-2 Hz-1"
-_SURE = 4.0  # standard deviations beyond which a band is known to differ from the noise terms
-_CHANCE = 1e-4  # with which two axes that share nothing are taken to share what they show
-_LINE = 12.0  # nats from which on a line is known
-_MOST_LINES = 100  # that are looked for on an axis
-_SMOOTH = 5  # lines over which a peak is smoothed
+_POWER_UNIT = "degree2 hour-2 Hz-1"
+_MIN_BAND_SIGMA = 4.0  # by which a band differs from the noise terms; design choice
+_COHERENCY_P_VALUE = 1e-4  # below which axes have something in common; design choice
+_MIN_LINE_NATS = 12.0  # evidence of a known line; design choice
+_MAX_LINES = 100  # on an axis; limits time
+_SMOOTHING_LINES = 5  # over which a peak is smoothed; design choice
 
 
-class Shown(NamedTuple):
-    """What the simulation shows all the time beside its noise terms.
+class ExtraStatistics(NamedTuple):
+    """Stationary statistics of a simulation in addition to its noise terms.
 
     Attributes
     ----------
     form : ndarray, shape (axis, band)
-        Its powers over those of the noise terms; 1 on axes where they agree.
+        Its powers over those of the noise terms; 1 on axes that agree.
     form_shape : ndarray, shape (axis, band)
-        Shape of the gamma distribution of `form`; infinite where it is 1.
+        Shape of the gamma distribution of `form`; infinite if it is 1.
     coherency : ndarray of complex, shape (pair, band)
-        Of the axes; 0 where chance may do as much.
+        Coherency of the axes; 0 if not significant.
     coherency_error : ndarray, shape (pair, band)
-        Standard deviation of its real and of its imaginary part; 0 where it is 0.
+        Standard deviation of its real and imaginary parts; 0 if it is 0.
     lines, peaks : ndarray, shape (axis, line)
-        Power of steady lines, and of what else the noise terms do not have near the odd bands
+        Power of steady lines, and other power missing in the noise terms near unexplained bands
         [degree2 hour-2 Hz-1].
     """
 
@@ -53,23 +53,29 @@ class Shown(NamedTuple):
     peaks: Array
 
 
-def odd_band(simulated: xr.Dataset, expected: Array) -> NDArray[np.bool_]:
-    """The band of each axis in which a simulation differs most from its noise terms, (axis, band); none where that may be chance.
+def worst_band(simulated: xr.Dataset, expected: Array) -> NDArray[np.bool_]:
+    """Find the band of each axis that differs most from the noise terms, if significantly.
 
     Parameters
     ----------
     simulated : xarray.Dataset
-        From `reduce_log`; bands whose powers are missing are passed over.
+        From `reduce_log`; bands without powers are skipped.
     expected : ndarray, shape (axis, block, band)
         Power of its noise terms, with their level over time.
+
+    Returns
+    -------
+    ndarray of bool, shape (axis, band)
     """
-    form, known = _form(simulated, expected)
+    form, known = _spectral_form(simulated, expected)
     off = np.abs(form - 1.0) * np.sqrt(known)
-    return np.asarray((off > _SURE) & (off == off.max(axis=1, keepdims=True)))
+    return np.asarray((off > _MIN_BAND_SIGMA) & (off == off.max(axis=1, keepdims=True)))
 
 
-def shown_by(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> Shown:
-    """Measure what a simulation shows beside its noise terms.
+def measure_extra_statistics(
+    simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_]
+) -> ExtraStatistics:
+    """Measure what a simulation has in addition to its noise terms.
 
     Parameters
     ----------
@@ -77,26 +83,29 @@ def shown_by(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> 
         From `reduce_log`.
     expected : ndarray, shape (axis, block, band)
         Power of its noise terms, with their level over time.
-    odd : ndarray of bool, shape (axis, band)
+    unexplained : ndarray of bool, shape (axis, band)
         Bands that the noise terms do not explain.
     """
-    form, known = _form(simulated, expected)
-    measured = odd.any(axis=1, keepdims=True)  # what makes a band odd reaches into others
+    form, known = _spectral_form(simulated, expected)
+    # An unexplained band reaches into others.
+    measured = unexplained.any(axis=1, keepdims=True)
     form, form_shape = np.where(measured, form, 1.0), np.where(measured, known, np.inf)
-    coherency, error = _coherency(simulated, expected * form[:, None])
-    return Shown(form, form_shape, coherency, error, *_lines(simulated, expected, odd))
+    coherency, error = _measure_coherency(simulated, expected * form[:, None])
+    return ExtraStatistics(
+        form, form_shape, coherency, error, *_measure_lines(simulated, expected, unexplained)
+    )
 
 
-def _form(simulated: xr.Dataset, expected: Array) -> tuple[Array, Array]:
-    """Powers over those expected, (axis, band), and the shape of their gamma distribution."""
+def _spectral_form(simulated: xr.Dataset, expected: Array) -> tuple[Array, Array]:
+    """Return powers over expected powers, (axis, band), and the shape of their distribution."""
     power, shape = (
         simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape")
     )
-    return _mean(power / expected, shape)
+    return _weighted_mean(power / expected, shape)
 
 
-def _mean(values: NDArray[Any], shape: Array) -> tuple[NDArray[Any], Array]:
-    """Mean over the blocks, and the sum of the shapes."""
+def _weighted_mean(values: NDArray[Any], shape: Array) -> tuple[NDArray[Any], Array]:
+    """Return the mean over the blocks, and the sum of the shapes."""
     good = np.isfinite(values) & np.isfinite(shape) & (shape > 0.0)
     weight = np.where(good, shape, 0.0)
     total = weight.sum(axis=1)
@@ -105,7 +114,10 @@ def _mean(values: NDArray[Any], shape: Array) -> tuple[NDArray[Any], Array]:
     ), total
 
 
-def _coherency(simulated: xr.Dataset, expected: Array) -> tuple[NDArray[np.complex128], Array]:
+def _measure_coherency(
+    simulated: xr.Dataset, expected: Array
+) -> tuple[NDArray[np.complex128], Array]:
+    """Return the coherency of the axes and its error, 0 if not significant."""
     from scipy.stats import chi2
 
     if "cross" not in simulated:
@@ -116,22 +128,26 @@ def _coherency(simulated: xr.Dataset, expected: Array) -> tuple[NDArray[np.compl
         for name in ("cross", "cross_shape")
     )
     pairs = [(axes.index(one), axes.index(other)) for one, other in pair_rows(simulated)]
-    both = (
+    geometric_mean = (
         np.stack([np.sqrt(expected[one] * expected[other]) for one, other in pairs])
         if pairs
         else np.empty(cross.shape)
     )
-    found, known = _mean(cross / both, shape)
+    found, known = _weighted_mean(cross / geometric_mean, shape)
     total = 2.0 * (np.abs(found) ** 2 * known).sum(axis=1, keepdims=True)
-    there = (known > 0.0) & (
-        chi2.sf(total, 2.0 * (known > 0.0).sum(axis=1, keepdims=True)) < _CHANCE
+    significant = (known > 0.0) & (
+        chi2.sf(total, 2.0 * (known > 0.0).sum(axis=1, keepdims=True)) < _COHERENCY_P_VALUE
     )
     with np.errstate(divide="ignore"):
-        return np.where(there, found, 0.0), np.where(there, 1.0 / np.sqrt(2.0 * known), 0.0)
+        return np.where(significant, found, 0.0), np.where(
+            significant, 1.0 / np.sqrt(2.0 * known), 0.0
+        )
 
 
-def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Power of the lines that stand out, with what they leak into; and what else there is near the odd bands, (axis, line)."""
+def _measure_lines(
+    simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Return the power of significant lines, with leakage, and of peaks near unexplained bands."""
     power, weight = (
         simulated["line_power"].transpose("axis", "part", "line").values,
         simulated["line_weight"].values,
@@ -145,14 +161,14 @@ def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tu
     )
     evidence_nats = line_evidence(power[None], weight, slope)[0]
     lines, peaks = np.zeros(evidence_nats.shape), np.zeros(evidence_nats.shape)
-    inside, near = _inside(simulated), odd.copy()
-    near[:, 1:] |= odd[:, :-1]
-    near[:, :-1] |= odd[:, 1:]
+    inside, near = _lines_in_bands(simulated), unexplained.copy()
+    near[:, 1:] |= unexplained[:, :-1]
+    near[:, :-1] |= unexplained[:, 1:]
     for row, axis in enumerate(simulated["axis"].values):
         known = np.zeros(evidence_nats.shape[1], np.bool_)
-        for _ in range(_MOST_LINES):
+        for _ in range(_MAX_LINES):
             place = int(np.argmax(np.where(known, -np.inf, evidence_nats[row])))
-            if known[place] or not evidence_nats[row, place] > _LINE:
+            if known[place] or not evidence_nats[row, place] > _MIN_LINE_NATS:
                 break
             known |= line_skirt(simulated, str(axis), place)
         good = (weight[row] > 0.0) & np.isfinite(power[row]).all(axis=1)
@@ -162,14 +178,16 @@ def _lines(simulated: xr.Dataset, expected: Array, odd: NDArray[np.bool_]) -> tu
         level = np.where(known, local_level(mean[None])[0], mean)
         lines[row] = np.maximum(mean - level, 0.0)
         smooth = np.convolve(
-            np.pad(level, _SMOOTH // 2, mode="edge"), np.full(_SMOOTH, 1.0 / _SMOOTH), "valid"
+            np.pad(level, _SMOOTHING_LINES // 2, mode="edge"),
+            np.full(_SMOOTHING_LINES, 1.0 / _SMOOTHING_LINES),
+            "valid",
         )
         peaks[row] = np.where(inside[near[row]].any(axis=0), smooth - slope[row], 0.0)
     return lines, peaks
 
 
-def _inside(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Whether a line lies in a band, (band, line)."""
+def _lines_in_bands(blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Return whether a line is in a band, (band, line)."""
     frequency = blocks["line_frequency"].values
     return np.asarray(
         (frequency >= blocks["band_low"].values[:, None])
@@ -177,24 +195,27 @@ def _inside(blocks: xr.Dataset) -> NDArray[np.bool_]:
     )
 
 
-def with_shown(baseline: xr.Dataset, shown: Shown, blocks: xr.Dataset) -> xr.Dataset:
-    """The baseline, whose spectrum has the form already, with what null records and views ask of the rest.
+def add_extra_statistics(
+    baseline: xr.Dataset, extra: ExtraStatistics, blocks: xr.Dataset
+) -> xr.Dataset:
+    """Add what null records and statistics need of a simulation to the baseline.
 
-    Added are ``form_shape(axis, band)``; where axes share something ``cross(pair, block, band)``
-    and ``cross_error(pair, band)``, the latter over the root of the powers of both; and where there
-    are lines what `without_known_lines` reads.
+    The spectrum of the baseline includes the form already. Added are ``form_shape(axis, band)``; if
+    axes have something in common, ``cross(pair, block, band)`` and ``cross_error(pair, band)``, the
+    latter over the root of the powers of both; and with lines the variables that
+    `remove_known_lines` reads.
     """
     out = baseline.assign(
         form_shape=(
             ("axis", "band"),
-            shown.form_shape,
-            {"long_name": "shape of what the form is known by", "units": "1"},
+            extra.form_shape,
+            {"long_name": "shape of the gamma distribution of the form", "units": "1"},
         )
     )
-    if shown.coherency.any():
+    if extra.coherency.any():
         axes = [str(axis) for axis in blocks["axis"].values]
         spectrum = baseline["spectrum"].transpose("axis", "block", "band").values
-        both = np.stack(
+        geometric_mean = np.stack(
             [
                 np.sqrt(spectrum[axes.index(one)] * spectrum[axes.index(other)])
                 for one, other in pair_rows(blocks)
@@ -202,31 +223,31 @@ def with_shown(baseline: xr.Dataset, shown: Shown, blocks: xr.Dataset) -> xr.Dat
         )
         out["cross"] = (
             ("pair", "block", "band"),
-            shown.coherency[:, None] * both,
-            {"long_name": "cross-spectrum", "units": _POWER},
+            extra.coherency[:, None] * geometric_mean,
+            {"long_name": "cross-spectrum", "units": _POWER_UNIT},
         )
         out["cross_error"] = (
             ("pair", "band"),
-            shown.coherency_error,
+            extra.coherency_error,
             {"long_name": "error of the coherency", "units": "1"},
         )
-    if shown.lines.any() or shown.peaks.any():
-        own = (
-            (shown.lines + shown.peaks)
-            @ _inside(blocks).T
+    if extra.lines.any() or extra.peaks.any():
+        line_power = (
+            (extra.lines + extra.peaks)
+            @ _lines_in_bands(blocks).T
             * blocks["line_frequency"].values[0]
             / band_widths(blocks)
         )
-        attrs = {"long_name": "power of lines", "units": _POWER}
+        attrs = {"long_name": "power of lines", "units": _POWER_UNIT}
         out["line_spectrum"] = (
             ("axis", "band"),
-            own * unspread_share(blocks).mean(axis=1)[:, None],
+            line_power * unspread_share(blocks).mean(axis=1)[:, None],
             attrs,
         )
         for name, values in (
-            ("lines", shown.lines),
-            ("lines_most", shown.lines),
-            ("peaks", shown.peaks),
+            ("lines", extra.lines),
+            ("lines_most", extra.lines),
+            ("peaks", extra.peaks),
         ):
             out[name] = (("axis", "line"), values, attrs)
     return out

@@ -1,4 +1,4 @@
-"""What effects of a model do to the means at random: biases that wander and come back, and walks."""
+"""Random effects of a model on the means: exponentially correlated biases, and random walks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.physics.prediction import Prediction
 
-__all__ = ["Wandering", "told_in_full", "wandering", "with_wandering"]
+__all__ = ["Wandering", "add_up_wandering", "is_described_by_variance", "with_wandering"]
 
 Array = NDArray[np.float64]
 
@@ -22,13 +22,13 @@ class Wandering(NamedTuple):
     Attributes
     ----------
     square : ndarray, shape (axis, process)
-        Variances of what comes back [degree2 hour-2].
+        Variances of exponentially correlated biases [degree2 hour-2].
     time : ndarray, shape (process,)
-        Its correlation times [s].
+        Their correlation times [s].
     walk : ndarray, shape (axis, block)
-        Growth of the variance of what does not [degree2 hour-2 s-1].
+        Growth of the variance of random walks [degree2 hour-2 s-1].
     power : ndarray, shape (axis, block)
-        What all of it has in the lowest band [degree2 hour-2 Hz-1].
+        Power of all of them in the lowest band [degree2 hour-2 Hz-1].
     """
 
     square: Array
@@ -37,36 +37,40 @@ class Wandering(NamedTuple):
     power: Array
 
 
-def told_in_full(seen: Prediction) -> bool:
-    """Whether what an effect does to the means at random is told by its variance: with a memory that does not change, and not in steps."""
-    return not seen.levels and all(_steady(*one) for one in seen.wander.values())
+def is_described_by_variance(seen: Prediction) -> bool:
+    """Return whether the variance fully describes what an effect does to the means at random.
+
+    It does for a constant correlation time without steps.
+    """
+    return not seen.levels and all(_is_steady(*one) for one in seen.wander.values())
 
 
-def _steady(time: float, variance: Array) -> bool:
+def _is_steady(time: float, variance: Array) -> bool:
+    """Return whether a process has a constant variance, or is a walk."""
     return bool(np.isinf(time) or np.ptp(variance) == 0.0)
 
 
-def wandering(
+def add_up_wandering(
     effects: Sequence[tuple[Mapping[str, Array], Prediction]],
     *,
     bands: int,
     block_count: int,
     axes: int,
 ) -> Wandering:
-    """Random means of several effects.
+    """Add up the random means of several effects.
 
     Parameters
     ----------
     effects : sequence of (mapping of str to ndarray of shape (axis,), Prediction)
-        Squared sizes by parameter, 0 on axes without the effect, and what it predicts; its spectra
-        at as many frequencies in each band.
-    bands, blocks, axes : int
+        Squared sizes by parameter, 0 on axes without the effect, and its prediction; spectra at
+        equally many frequencies in each band.
+    bands, block_count, axes : int
     """
     square, time = [], []
     walk, power = np.zeros((axes, block_count)), np.zeros((axes, block_count))
     for sizes, seen in effects:
         for name, (memory, variance) in seen.wander.items():
-            if seen.levels or not _steady(memory, variance):
+            if seen.levels or not _is_steady(memory, variance):
                 continue
             if np.isinf(memory):
                 walk += sizes[name][:, None] * variance
@@ -82,7 +86,9 @@ def wandering(
 
 
 def with_wandering(baseline: xr.Dataset, known: Wandering, spectrum: Array) -> xr.Dataset:
-    """A baseline whose means wander: what does so makes no white noise of the means, whatever it adds to the lowest band.
+    """Add random processes of the means to a baseline.
+
+    They are not white noise of the means, whatever they add to the lowest band.
 
     Parameters
     ----------

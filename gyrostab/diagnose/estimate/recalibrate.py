@@ -408,7 +408,7 @@ def _fit(
         flat[1],
         weight[some],
         known=flat[2],
-        beside=beside,
+        free_columns=beside,
         precision=precision,
         start=flat[3],
     )

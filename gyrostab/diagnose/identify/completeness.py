@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.posterior import scales
+from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.identify.identification import Identification
@@ -81,7 +81,7 @@ def variance_fluctuation(state: State, axis: str) -> float:
         return 0.0
     step = float(state.blocks.attrs["block_s"])
     usual = float(np.median(variance[present]))
-    least = scales(usual * step, present.sum() * step)
+    least = visible_coefficients(usual * step, present.sum() * step)
     K, B = (
         component.ravel()
         for component in np.meshgrid(

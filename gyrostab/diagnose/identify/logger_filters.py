@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
-from gyrostab.diagnose.baseline.posterior import Fit, expected_of
+from gyrostab.diagnose.baseline.posterior import Fit, expected_powers
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.filter_response import band_response, is_filter
@@ -215,12 +215,12 @@ def _fit(axis: str, state: State) -> tuple[Fit, Array]:
         mean(power),
         seen @ band_columns(blocks),
         total * share,
-        beside=free,
+        free_columns=free,
         start=mean(state.weight[row]),
     ), seen
 
 
 def _likelihood(fit: Fit) -> float:
     """Largest log likelihood of the powers, over the noise."""
-    expected = expected_of(fit)
+    expected = expected_powers(fit)
     return float(-(fit.weight * (np.log(expected) + fit.power / expected)).sum())

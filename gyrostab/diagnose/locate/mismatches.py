@@ -13,7 +13,7 @@ from gyrostab.diagnose.locate.regions import merge_regions, merge_wandering_regi
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores, standardise
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.mean import region_mean
-from gyrostab.diagnose.statistics.variance_stability import levelled
+from gyrostab.diagnose.statistics.variance_stability import scale_to_expected
 from gyrostab.errors import OptionError
 
 __all__ = ["FIELDS", "locate_mismatches", "louder"]
@@ -101,7 +101,9 @@ def locate_mismatches(
             continue
         find = _mean_boxes if name == "mean" else _boxes
         seen = (
-            levelled(blocks, baseline, louder(regions)) if name == "variance_stability" else blocks
+            scale_to_expected(blocks, baseline, louder(regions))
+            if name == "variance_stability"
+            else blocks
         )
         regions += find(name, score, seen, baseline, null, level)
     return _table(merge_regions(regions)[:_TOLD], blocks, null, level)

@@ -13,7 +13,7 @@ _LIKE = 0.5  # share of the time of both that two boxes have in common when they
 # the shorter
 _NEAR = 0.25
 _LINE = 0.02  # share of the frequency by which one line may wander
-_KINDS = ("slow", "restless", "glide")
+_KINDS = ("slow", "variance", "drifting")
 _STEPS = 3  # boxes of one mean, beyond which it is said to wander
 
 

@@ -1,1 +1,1 @@
-"""Null records: block statistics as noise alone would have made them, and the scores that they reach."""
+"""Null records: block statistics of noise alone, and their scores."""

@@ -1,4 +1,4 @@
-"""Odd samples of null records: how many outliers, repeats, zeros and extremes each block has by chance."""
+"""Sample counts of null records: outliers, repeats, zeros and extremes by chance."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from gyrostab.diagnose.reduce.outliers import (
 )
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 
-__all__ = ["COARSE", "null_counts"]
+__all__ = ["COARSE_STEP_SIGMA", "null_counts"]
 
 Array = NDArray[np.float64]
-_TURNS = 20  # of an iteration that halves its error
-COARSE = 1.5  # standard deviations: a lattice step from which on the values are few levels
+_ITERATIONS = 20  # of an iteration that halves its error
+#: Standard deviations in a quantization step from which the values have few levels. Design choice.
+COARSE_STEP_SIGMA = 1.5
 
 
 def null_counts(
     blocks: xr.Dataset, sd: Array, count: int, rng: np.random.Generator
 ) -> dict[str, NDArray[np.int64]]:
-    """Outliers, repeats, extremes and zeros as Gaussian noise on the lattice has them.
+    """Draw outliers, repeats, extremes and zeros of Gaussian noise on the quantization grid.
 
     Parameters
     ----------
     blocks : xarray.Dataset
-        The recording, whose blocks, gaps and lattices are taken.
+        The recording, for its blocks, gaps and quantization grids.
     sd : ndarray, shape (axis, 2)
-        Standard deviation of a sample, and of the difference of two neighbours [degree hour-1].
+        Standard deviations of a sample and of a difference of neighbours [degree hour-1].
     count : int
-        Records.
+        Number of records.
     rng : numpy.random.Generator
 
     Returns
@@ -42,18 +43,18 @@ def null_counts(
     """
     samples = blocks["samples"].transpose("axis", "block").values.astype(np.int64)
     adjacent = blocks["adjacent"].transpose("axis", "block").values.astype(np.int64)
-    mean = _filled(blocks["mean"].transpose("axis", "block").values)
+    mean = _interpolate_means(blocks["mean"].transpose("axis", "block").values)
     repeat, zero = np.zeros(samples.shape), np.zeros(samples.shape)
-    cut = truncated_axes(blocks)
+    truncated = truncated_axes(blocks)
     for axis, step in enumerate(blocks["lattice"].values):
         if step > 0.0:
-            repeat[axis], zero[axis] = _lattice_chances(
-                mean[axis], float(step), sd[axis], cut=bool(cut[axis])
+            repeat[axis], zero[axis] = _grid_probabilities(
+                mean[axis], float(step), sd[axis], truncated=bool(truncated[axis])
             )
         if not blocks["zeros"].values[axis].any():
             zero[axis] = 0.0
-        own = zero[axis] ** 2 / (2.0 if cut[axis] else 1.0)  # of two cells in one
-        repeat[axis] = np.maximum(repeat[axis] - own, 0.0)
+        both_zero = zero[axis] ** 2 / (2.0 if truncated[axis] else 1.0)  # the bin holds two steps
+        repeat[axis] = np.maximum(repeat[axis] - both_zero, 0.0)
     size = (count, *samples.shape)
     zeros = rng.binomial(samples, np.broadcast_to(zero, size))
     filled = _filled_zeros(blocks, zeros, samples, rng)
@@ -70,7 +71,7 @@ def null_counts(
         "zeros": zeros,
         "stuck": zeros - filled,
         "filled": filled,
-        "extremes": _extremes(blocks, sd, samples, count, rng),
+        "extremes": _draw_extremes(blocks, sd, samples, count, rng),
     }
 
 
@@ -80,22 +81,22 @@ def _filled_zeros(
     samples: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Of so many zeros (record, axis, block) those that look like samples filled with zeros, where chance alone brings zeros together."""
+    """Return the zeros (record, axis, block) that look filled because they coincide by chance."""
     subset = blocks["axes_at_once"].transpose("subset", "axis").values.astype(bool)
     number = blocks["at_once"].transpose("subset", "block").values.astype(np.int64)
     share = zeros / np.maximum(samples, 1)
     if len(samples) == 1:
-        together = rng.binomial(zeros, 1.0 - (1.0 - share) ** 2)  # a zero has another one beside it
+        coinciding = rng.binomial(zeros, 1.0 - (1.0 - share) ** 2)  # zeros next to another one
     elif not zeros.any():
-        together = np.zeros_like(zeros)
+        coinciding = np.zeros_like(zeros)
     else:
         at_once = rng.binomial(number, probability_all_zero(share, subset))
-        together = np.minimum(np.einsum("sa,rsb->rab", subset.astype(np.int64), at_once), zeros)
-    return zeros_beyond_chance(together, zeros, samples, subset, number)
+        coinciding = np.minimum(np.einsum("sa,rsb->rab", subset.astype(np.int64), at_once), zeros)
+    return zeros_beyond_chance(coinciding, zeros, samples, subset, number)
 
 
-def _filled(mean: Array) -> Array:
-    """Means with those of blocks of few samples on straight lines between their neighbours; 0 where an axis has none."""
+def _interpolate_means(mean: Array) -> Array:
+    """Interpolate missing means; 0 on an axis without any."""
     out, block = np.zeros_like(mean), np.arange(mean.shape[1])
     for row, values in enumerate(mean):
         good = np.isfinite(values)
@@ -104,12 +105,12 @@ def _filled(mean: Array) -> Array:
     return out
 
 
-def _lattice_chances(
-    mean: Array, step: float, sd: Array, *, cut: bool = False
+def _grid_probabilities(
+    mean: Array, step: float, sd: Array, *, truncated: bool = False
 ) -> tuple[Array, Array]:
-    """Chance in each block that a sample equals the one before (the cell of 0 as the others), and that it is 0; `cut` off towards zero."""
+    """Return the probabilities of a repeat (in any bin) and of a zero, by block."""
     inner = float(np.sqrt(max(sd[0] ** 2 - step**2 / 12.0, (0.05 * step) ** 2)))
-    centre = (_before_cut(mean, step, inner) if cut else mean)[:, None]
+    centre = (_before_truncation(mean, step, inner) if truncated else mean)[:, None]
     reach = int(np.ceil(6.0 * inner / step)) + 1
 
     def chance(level: Array) -> Array:
@@ -118,25 +119,27 @@ def _lattice_chances(
             - ndtr((level - step / 2.0 - centre) / inner)
         )
 
-    zero = chance(np.array([-0.5, 0.5]) * step).sum(axis=1) if cut else chance(np.zeros(1))[:, 0]
-    if step < COARSE * inner:
+    zero = (
+        chance(np.array([-0.5, 0.5]) * step).sum(axis=1) if truncated else chance(np.zeros(1))[:, 0]
+    )
+    if step < COARSE_STEP_SIGMA * inner:
         return np.full(mean.size, min(step / (np.sqrt(2.0 * np.pi) * float(sd[1])), 1.0)), zero
     levels = (np.round(centre / step) + np.arange(-reach, reach + 1)) * step
     return np.asarray((chance(levels) ** 2).sum(axis=1)), zero
 
 
-def _before_cut(mean: Array, step: float, scatter: float) -> Array:
-    """Means of normal numbers that have these once they are cut off towards zero: by half a step on average, those on either side."""
+def _before_truncation(mean: Array, step: float, scatter: float) -> Array:
+    """Return means before truncation, which shifts them by up to half a step towards zero."""
     out = mean
-    for _ in range(_TURNS):
+    for _ in range(_ITERATIONS):
         out = mean + step * (ndtr(out / scatter) - 0.5)
     return out
 
 
-def _extremes(
+def _draw_extremes(
     blocks: xr.Dataset, sd: Array, samples: NDArray[np.int64], count: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """The smallest and the largest value, each in the blocks where it falls: once, but for a lattice that is not fine."""
+    """Draw the blocks of the smallest and largest value; each is repeated on a coarse grid."""
     out = np.zeros((count, *samples.shape), np.int64)
     for axis, step in enumerate(blocks["lattice"].values):
         total = int(samples[axis].sum())
@@ -147,8 +150,8 @@ def _extremes(
         ratio = float(step) / float(sd[axis, 0])
         if ratio > 1e-3:
             edges = np.arange(8.0, 0.0, -ratio)[:, None, None] + ratio * rng.random((count, 2))
-            found = rng.poisson(total * (ndtr(ratio - edges) - ndtr(-edges)))
-            first = np.argmax(found > 0, axis=0)
-            many = np.maximum(np.take_along_axis(found, first[None], axis=0)[0], 1)
+            in_bins = rng.poisson(total * (ndtr(ratio - edges) - ndtr(-edges)))
+            first = np.argmax(in_bins > 0, axis=0)
+            many = np.maximum(np.take_along_axis(in_bins, first[None], axis=0)[0], 1)
         out[:, axis] = rng.multinomial(many.sum(axis=1), share)
     return out

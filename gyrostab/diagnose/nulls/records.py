@@ -1,8 +1,8 @@
-"""Records as noise alone would have made them, drawn as block statistics: same gaps, same channels, same blocks.
+"""Null records: block statistics of noise alone, with the recording's gaps, channels and blocks.
 
-Every statistic is drawn from the law that it has in Gaussian noise with coefficients from the
-posterior of the calibration. So hundreds of records cost seconds, and the error of the calibration
-is in them.
+Every statistic is drawn from its distribution in Gaussian noise, with coefficients from the
+calibration posterior. Hundreds of records therefore take seconds, and include the calibration
+error.
 """
 
 from __future__ import annotations
@@ -16,8 +16,13 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import line_columns, white_variance
 from gyrostab.diagnose.evidence.wandering import expected_processes
-from gyrostab.diagnose.nulls.counts import COARSE, null_counts
-from gyrostab.diagnose.nulls.shared_noise import Shared, shared_by, shared_spectra, shared_white
+from gyrostab.diagnose.nulls.counts import COARSE_STEP_SIGMA, null_counts
+from gyrostab.diagnose.nulls.shared_noise import (
+    SharedNoise,
+    draw_shared_spectra,
+    draw_shared_white,
+    find_shared_noise,
+)
 from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
 from gyrostab.kernels.random.stochastic import (
     brownian_means,
@@ -31,29 +36,28 @@ from gyrostab.noise import HOUR
 __all__ = ["null_records"]
 
 Array = NDArray[np.float64]
-_CHUNK = 25
-_POOL = 10**6  # samples made one by one
-_NEXT = 4  # bands above that share scatter with one
-_SLIGHT = 0.003  # correlation of two bands that makes no difference
-_COMMON = 0.9  # of the scatter of a band that it may share with others
+_RECORDS_PER_CHUNK = 25  # limits memory
+_KURTOSIS_SAMPLES = 10**6  # simulated sample by sample; limits time
+_MAX_BANDS_APART = 4  # of bands that the taper correlates
+_MIN_BAND_CORRELATION = 0.003  # smaller ones are neglected
+_MAX_COMMON_SHARE = 0.9  # of the scatter of a band that may be common with others
 
 
-class _Frame(NamedTuple):
-    """What all null records share, as arrays (axis, block, ...)."""
+class _NullSetup(NamedTuple):
+    """Quantities common to all null records, as arrays (axis, block, ...)."""
 
     blocks: xr.Dataset
     baseline: xr.Dataset
     shape: Array
-    ties: list[
-        Array
-    ]  # shape of the gamma part that each band shares with the next, and with the one after
+    # Shapes of the gamma parts that each band has in common with the first, second, ... above it.
+    ties: list[Array]
     columns: Array
     effects: Array  # expected power over that of the noise alone
-    sd: Array  # of a sample and of the difference of two neighbours, by axis
-    # excess kurtosis of a block beyond that of white Gaussian noise, and its scatter over that
-    # one's, by axis
+    sd: Array  # standard deviations of a sample and of a difference of neighbours, by axis
+    # Excess kurtosis of a block beyond that of white Gaussian noise, and its scatter over that of
+    # white Gaussian noise, by axis.
     tails: Array
-    shared: Shared | None  # what axes have in common
+    shared: SharedNoise | None  # noise common to axes
 
 
 def null_records(
@@ -62,51 +66,56 @@ def null_records(
     *,
     count: int = 400,
     rng: np.random.Generator,
-    chunk: int = _CHUNK,
+    chunk: int = _RECORDS_PER_CHUNK,
 ) -> Iterator[xr.Dataset]:
-    """Draw reduced records that hold nothing but the noise of the baseline (and the effects that it knows).
+    """Draw block statistics with nothing but the noise (and known effects) of the baseline.
 
     Parameters
     ----------
     blocks : xarray.Dataset
-        The recording, whose blocks, gaps and channels are taken.
+        The recording, for its blocks, gaps and channels.
     baseline : xarray.Dataset
-        From `calibrate`, `from_model` or `from_simulation`.
+        From `calibrate_noise`, `baseline_from_model` or `baseline_from_simulation`.
     count : int
-        Records.
+        Number of records.
     rng : numpy.random.Generator
-        The same state gives the same records for the same `chunk`.
+        Generator; the same state gives the same records for the same `chunk`.
     chunk : int
-        Records drawn at a time.
+        Number of records drawn at a time.
 
     Yields
     ------
     xarray.Dataset
-        As `blocks`, with a leading dimension ``record`` where it is random.
+        As `blocks`, with a leading dimension ``record`` for random variables.
 
     Examples
     --------
-    >>> from gyrostab.diagnose.baseline.calibrate import calibrate
+    >>> from gyrostab.diagnose.baseline.calibrate import calibrate_noise
     >>> from gyrostab.diagnose.reduce.block_statistics import reduce_log
     >>> from gyrostab.simulate import simulate
     >>> blocks = reduce_log(simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0))
-    >>> nulls = list(null_records(blocks, calibrate(blocks), count=40, rng=np.random.default_rng(1)))
+    >>> baseline, rng = calibrate_noise(blocks), np.random.default_rng(1)
+    >>> nulls = list(null_records(blocks, baseline, count=40, rng=rng))
     >>> [one.sizes["record"] for one in nulls], nulls[0]["power"].dims
     ([25, 15], ('record', 'axis', 'block', 'band'))
     """
-    frame = _frame(blocks, baseline, rng)
+    setup = _prepare_nulls(blocks, baseline, rng)
     for first in range(0, count, chunk):
-        yield _draw(frame, min(chunk, count - first), rng)
+        yield _draw_records(setup, min(chunk, count - first), rng)
 
 
-def _ordered(data: xr.Dataset, name: str, *dims: str) -> Array:
+def _values_in_order(data: xr.Dataset, name: str, *dims: str) -> Array:
+    """Return a variable with its dimensions in this order."""
     return np.asarray(data[name].transpose(*dims).values)
 
 
-def _frame(blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) -> _Frame:
-    columns = _ordered(baseline, "columns", "axis", "block", "band", "noise")
+def _prepare_nulls(
+    blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator
+) -> _NullSetup:
+    """Compute the quantities common to all null records."""
+    columns = _values_in_order(baseline, "columns", "axis", "block", "band", "noise")
     noise = np.einsum("abfn,an->abf", columns, baseline["square"].values)
-    effects = _ordered(baseline, "spectrum", "axis", "block", "band") / noise
+    effects = _values_in_order(baseline, "spectrum", "axis", "block", "band") / noise
     lines = line_columns(blocks)
     sd = []
     for square in baseline["square"].values:
@@ -115,13 +124,13 @@ def _frame(blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) -
             [
                 np.sqrt(level)
                 for level in (
-                    _variance(blocks, density),
-                    2.0 * _variance(blocks, density, difference=True),
+                    _sample_variance(blocks, density),
+                    2.0 * _sample_variance(blocks, density, difference=True),
                 )
             ]
         )
     peaks = (
-        _ordered(baseline, "peaks", "axis", "line")
+        _values_in_order(baseline, "peaks", "axis", "line")
         if "peaks" in baseline
         else np.zeros((len(sd), len(lines)))
     )
@@ -129,13 +138,13 @@ def _frame(blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) -
         np.column_stack([lines * square, peak])
         for square, peak in zip(baseline["square"].values, peaks, strict=True)
     ]
-    tails = np.array([_tails(blocks, one, rng) for one in density])
-    shape = _ordered(blocks, "shape", "axis", "block", "band")
-    ties = _ties(
-        _ordered(baseline, "shape_alone", "axis", "block", "band"),
+    tails = np.array([_kurtosis_excess(blocks, one, rng) for one in density])
+    shape = _values_in_order(blocks, "shape", "axis", "block", "band")
+    ties = _common_shapes(
+        _values_in_order(baseline, "shape_alone", "axis", "block", "band"),
         int(blocks.attrs["block_samples"]),
     )
-    return _Frame(
+    return _NullSetup(
         blocks,
         baseline,
         shape,
@@ -144,57 +153,67 @@ def _frame(blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator) -
         effects,
         np.array(sd),
         tails,
-        shared_by(blocks, baseline),
+        find_shared_noise(blocks, baseline),
     )
 
 
-def _ties(shape: Array, size: int) -> list[Array]:
-    """Shapes (axis, block, band) of what each band has in common with the first, second, ... band above it, as the taper makes it.
+def _common_shapes(shape: Array, size: int) -> list[Array]:
+    """Return the shapes (axis, block, band) of the gamma parts common to neighbouring bands.
 
-    What is next to nothing, which the high bands have with those further above, is left out.
+    The taper causes them. Negligible ones, of high bands and those far above, are left out.
     """
     covariance = band_covariance(size)
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 0.0)
     ties = []
-    for apart in range(1, min(_NEXT, safe.shape[-1] - 1) + 1):
+    for apart in range(1, min(_MAX_BANDS_APART, safe.shape[-1] - 1) + 1):
         tie = safe[..., :-apart] * safe[..., apart:] * np.diagonal(covariance, apart)
         correlation = np.sqrt(np.diagonal(covariance, apart) * tie)
-        told = np.flatnonzero(
-            (correlation > _SLIGHT).reshape(-1, correlation.shape[-1]).any(axis=0)
+        correlated = np.flatnonzero(
+            (correlation > _MIN_BAND_CORRELATION).reshape(-1, correlation.shape[-1]).any(axis=0)
         )
-        ties.append(tie[..., : told.max(initial=-1) + 1])
+        ties.append(tie[..., : correlated.max(initial=-1) + 1])
     total = np.zeros_like(safe)
-    for low, high, tie in _between(total, ties):
+    for low, high, tie in _pairs_of_bands(total, ties):
         low += tie
         high += tie
-    least = np.divide(_COMMON * safe, total, out=np.ones_like(safe), where=total > _COMMON * safe)
-    return [tie * np.minimum(low, high) for low, high, tie in _between(least, ties)]
+    least = np.divide(
+        _MAX_COMMON_SHARE * safe,
+        total,
+        out=np.ones_like(safe),
+        where=total > _MAX_COMMON_SHARE * safe,
+    )
+    return [tie * np.minimum(low, high) for low, high, tie in _pairs_of_bands(least, ties)]
 
 
-def _between(values: Array, ties: list[Array]) -> Iterator[tuple[Array, Array, Array]]:
-    """Views of the lower and the upper band of each tie, the tie beside them."""
+def _pairs_of_bands(values: Array, ties: list[Array]) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield the lower and the upper band of each tie as array slices, with the tie."""
     for apart, tie in enumerate(ties, start=1):
         yield values[..., : tie.shape[-1]], values[..., apart : apart + tie.shape[-1]], tie
 
 
-def _tails(blocks: xr.Dataset, density: Array, rng: np.random.Generator) -> tuple[float, float]:
-    """Kurtosis of full blocks of noise (line, term): memory widens its scatter, a resonance swings, the rounding of an angle has edges."""
+def _kurtosis_excess(
+    blocks: xr.Dataset, density: Array, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Simulate the kurtosis of full blocks of noise (line, term); return mean and scatter excess.
+
+    Correlation widens its scatter; a resonance and the rounding of an angle change its mean.
+    """
     size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
     shaped = np.zeros(size // 2 + 1)
     shaped[1 : len(density) + 1] = density[:, 1:].sum(axis=1)
-    many = int(np.clip(_POOL // size, 200, 2000))
-    normal = rng.standard_normal((many, shaped.size, 2)) @ np.array([1.0, 1j])
+    record_count = int(np.clip(_KURTOSIS_SAMPLES // size, 200, 2000))
+    normal = rng.standard_normal((record_count, shaped.size, 2)) @ np.array([1.0, 1j])
     values = np.fft.irfft(normal * np.sqrt(shaped * rate * size / 2.0), n=size, axis=1)
     rounding = np.sqrt(12.0 * density[:, 0].mean() * rate / 2.0)
-    values += np.diff(rounding * rng.random((many, size + 1)), axis=1)
+    values += np.diff(rounding * rng.random((record_count, size + 1)), axis=1)
     values -= values.mean(axis=1, keepdims=True)
     kurtosis = (values**4).mean(axis=1) / (values**2).mean(axis=1) ** 2 - 3.0
     mean, variance, _ = _kurtosis_moments(np.array(float(size)))
     return float(kurtosis.mean() - mean), float(kurtosis.std() / np.sqrt(variance))
 
 
-def _variance(blocks: xr.Dataset, density: Array, *, difference: bool = False) -> float:
-    """Variance of a sample, or half of that of the difference of neighbours, from the density of every ordinate."""
+def _sample_variance(blocks: xr.Dataset, density: Array, *, difference: bool = False) -> float:
+    """Return the variance of a sample, or half that of a difference, from the line density."""
     rate = float(blocks.attrs["sampling_rate_hz"])
     factor = (
         1.0 - np.cos(2.0 * np.pi * blocks["line_frequency"].values / rate) if difference else 1.0
@@ -202,8 +221,9 @@ def _variance(blocks: xr.Dataset, density: Array, *, difference: bool = False) -
     return float((density * factor).mean() * rate)
 
 
-def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
-    blocks, baseline = frame.blocks, frame.baseline
+def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr.Dataset:
+    """Draw some null records."""
+    blocks, baseline = setup.blocks, setup.baseline
     axes, draws = blocks.sizes["axis"], baseline.sizes["draw"]
     chosen = rng.integers(0, draws, (count, axes))
     squares = np.stack(
@@ -212,83 +232,92 @@ def _draw(frame: _Frame, count: int, rng: np.random.Generator) -> xr.Dataset:
     slow = np.stack(
         [baseline["posterior_slow"].values[axis, chosen[:, axis]] for axis in range(axes)], axis=1
     )
-    expected = np.einsum("abfn,ran->rabf", frame.columns, squares) * frame.effects
+    expected = np.einsum("abfn,ran->rabf", setup.columns, squares) * setup.effects
     if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
-        form = _ordered(baseline, "form_shape", "axis", "band")
-        expected *= _gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
-    if frame.shared is None:
-        shape_alone = _ordered(baseline, "shape_alone", "axis", "block", "band")
-        power, between = _tied(shape_alone, frame.ties, expected, rng), np.empty(0, np.complex128)
+        form = _values_in_order(baseline, "form_shape", "axis", "band")
+        expected *= _draw_gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
+    if setup.shared is None:
+        shape_alone = _values_in_order(baseline, "shape_alone", "axis", "block", "band")
+        power, between = (
+            _draw_correlated_gamma(shape_alone, setup.ties, expected, rng),
+            np.empty(0, np.complex128),
+        )
     else:
-        power, between = shared_spectra(frame.shared, count, rng)
+        power, between = draw_shared_spectra(setup.shared, count, rng)
         power *= expected
         if "cross_error" in baseline:
-            error = _ordered(baseline, "cross_error", "pair", "band")
+            error = _values_in_order(baseline, "cross_error", "pair", "band")
             between += (
                 error * (rng.standard_normal((count, *error.shape, 2)) @ np.array([1.0, 1j]))
             )[:, :, None]
     common = baseline["common"].values
-    swell = _gamma(
+    swell = _draw_gamma(
         np.where(common > 0.0, 1.0 / np.where(common > 0.0, common, 1.0), np.inf),
         np.ones(power.shape[:3]),
         rng,
     )[..., None]
     power *= swell
-    power[..., np.isnan(_ordered(blocks, "power", "axis", "block", "band"))] = np.nan
-    found: dict[str, Any] = {
-        "mean": (("axis", "block"), _means(frame, squares, slow, rng)),
+    power[..., np.isnan(_values_in_order(blocks, "power", "axis", "block", "band"))] = np.nan
+    variables: dict[str, Any] = {
+        "mean": (("axis", "block"), _draw_means(setup, squares, slow, rng)),
         "power": (("axis", "block", "band"), power),
-        "line_power": (("axis", "part", "line"), _lines(frame, squares, rng)),
-        "kurtosis": (("axis", "block"), _kurtosis(frame, count, rng)),
+        "line_power": (("axis", "part", "line"), _draw_lines(setup, squares, rng)),
+        "kurtosis": (("axis", "block"), _draw_kurtosis(setup, count, rng)),
         "cross": (
             ("pair", "block", "band"),
-            _cross(frame, power, rng)
-            if frame.shared is None
-            else _crossed(frame, expected * swell, between),
+            _draw_independent_cross(setup, power, rng)
+            if setup.shared is None
+            else _scale_shared_cross(setup, expected * swell, between),
         ),
     }
-    found |= {
+    variables |= {
         name: (("axis", "block"), values)
-        for name, values in null_counts(blocks, frame.sd, count, rng).items()
+        for name, values in null_counts(blocks, setup.sd, count, rng).items()
     }
     if "witness_cross" in blocks:
-        found["witness_cross"] = (("axis", "witness", "block", "band"), _witness(frame, power, rng))
+        variables["witness_cross"] = (
+            ("axis", "witness", "block", "band"),
+            _draw_channel_cross(setup, power, rng),
+        )
     if "order" in blocks:
-        found["order"] = (("axis", "block", "harmonic"), _orders(frame, expected, rng))
+        variables["order"] = (("axis", "block", "harmonic"), _draw_orders(setup, expected, rng))
     if "profile" in blocks:
-        found["profile"] = (("axis", "block", "phase"), _profiles(frame, count, rng))
+        variables["profile"] = (("axis", "block", "phase"), _draw_profiles(setup, count, rng))
     return blocks.assign(
         {
             name: (("record", *dims), values, blocks[name].attrs)
-            for name, (dims, values) in found.items()
+            for name, (dims, values) in variables.items()
         }
     )
 
 
-def _gamma(shape: Array, mean: Array, rng: np.random.Generator) -> Array:
+def _draw_gamma(shape: Array, mean: Array, rng: np.random.Generator) -> Array:
+    """Draw gamma variables with these shapes and means."""
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
     drawn = rng.standard_gamma(np.broadcast_to(safe, mean.shape)) / safe
     return np.asarray(np.where(np.isinf(shape), 1.0, drawn) * mean)
 
 
-def _tied(shape: Array, ties: list[Array], mean: Array, rng: np.random.Generator) -> Array:
-    """As `_gamma`, where bands have gamma parts in common: parts of one scale add up to what their shapes add up to."""
+def _draw_correlated_gamma(
+    shape: Array, ties: list[Array], mean: Array, rng: np.random.Generator
+) -> Array:
+    """Draw gamma variables with common parts, whose shapes add up at equal scale."""
     safe = np.where(np.isfinite(shape) & (shape > 0.0), shape, 1.0)
     alone = safe.copy()
-    for low, high, tie in _between(alone, ties):
+    for low, high, tie in _pairs_of_bands(alone, ties):
         low -= tie
         high -= tie
     drawn = rng.standard_gamma(np.broadcast_to(alone, mean.shape))
-    for low, high, tie in _between(drawn, ties):
-        both = rng.standard_gamma(np.broadcast_to(tie, (len(mean), *tie.shape)))
-        low += both
-        high += both
+    for low, high, tie in _pairs_of_bands(drawn, ties):
+        common_part = rng.standard_gamma(np.broadcast_to(tie, (len(mean), *tie.shape)))
+        low += common_part
+        high += common_part
     return np.asarray(drawn / safe * mean)
 
 
-def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator) -> Array:
-    """Block means: white noise, random walk, flicker and what else is known to wander, as means over the blocks."""
-    blocks, baseline = frame.blocks, frame.baseline
+def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.Generator) -> Array:
+    """Draw block means: white noise, random walk, flicker and known random processes."""
+    blocks, baseline = setup.blocks, setup.baseline
     n, step = blocks.sizes["block"], float(blocks.attrs["block_s"])
     each = np.stack(
         [white_variance(blocks, np.tile(unit, (len(slow[0]), 1))) for unit in np.eye(4)[:2]],
@@ -296,17 +325,18 @@ def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator)
     )
     usual = np.einsum("abn,an->ab", each, baseline["square"].values[:, :2])
     drawn = np.einsum("abn,ran->rab", each, squares[..., :2])
+    # An axis may have neither.
     level = np.divide(
         drawn, usual, out=np.ones_like(drawn), where=np.broadcast_to(usual > 0.0, drawn.shape)
-    )  # an axis may have neither
-    white = np.sqrt(_ordered(baseline, "mean_variance", "axis", "block") * level)
+    )
+    white = np.sqrt(_values_in_order(baseline, "mean_variance", "axis", "block") * level)
     times = flicker_times(1.0 / step, low=1.0 / (2.0 * np.pi * 8.0 * n * step))
     drawn = (
         rng.standard_normal(white.shape)
-        if frame.shared is None
-        else shared_white(frame.shared, len(white), rng)
+        if setup.shared is None
+        else draw_shared_white(setup.shared, len(white), rng)
     )
-    total = _ordered(baseline, "known_mean", "axis", "block") + white * drawn
+    total = _values_in_order(baseline, "known_mean", "axis", "block") + white * drawn
     for place in np.ndindex(*white.shape[:2]):
         B2, K2 = slow[place]
         flicker, _ = flicker_means(
@@ -324,49 +354,50 @@ def _means(frame: _Frame, squares: Array, slow: Array, rng: np.random.Generator)
                 rng.standard_normal((n, 2)), memory / step, float(rng.standard_normal())
             )
             total[place] += np.sqrt(square) * wander
-    total[..., np.isnan(_ordered(blocks, "mean", "axis", "block"))] = np.nan
+    total[..., np.isnan(_values_in_order(blocks, "mean", "axis", "block"))] = np.nan
     return np.asarray(total)
 
 
-def _lines(frame: _Frame, squares: Array, rng: np.random.Generator) -> Array:
-    """Mean periodograms of the parts of the record."""
-    blocks = frame.blocks
-    weight = _ordered(blocks, "line_weight", "axis", "part")
-    components, n = weight.shape[1], blocks.sizes["block"]
+def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> Array:
+    """Draw the mean periodograms of the parts of the record."""
+    blocks = setup.blocks
+    weight = _values_in_order(blocks, "line_weight", "axis", "part")
+    part_count, n = weight.shape[1], blocks.sizes["block"]
     columns = line_columns(blocks)
-    part_of = np.arange(n) * components // n
-    near = _ordered(blocks, "neighbours", "axis", "block")
+    part_of = np.arange(n) * part_count // n
+    near = _values_in_order(blocks, "neighbours", "axis", "block")
     frequency, bands = np.log(blocks["line_frequency"].values), np.log(blocks["frequency"].values)
     plain = squares @ columns.T
     flat = plain.mean(axis=-1, keepdims=True)
-    out = np.full((*plain.shape[:2], components, plain.shape[2]), np.nan)
-    for axis, component in np.ndindex(*weight.shape):
-        chosen = (part_of == component) & np.isfinite(near[axis])
-        if not (chosen.any() and weight[axis, component] > 0.0):
+    out = np.full((*plain.shape[:2], part_count, plain.shape[2]), np.nan)
+    for axis, part in np.ndindex(*weight.shape):
+        chosen = (part_of == part) & np.isfinite(near[axis])
+        if not (chosen.any() and weight[axis, part] > 0.0):
             continue
         share = near[axis, chosen].mean()
-        over = frame.effects[axis, chosen].mean(axis=0)
-        if "line_spectrum" in frame.baseline:
-            noise = (frame.columns[axis, chosen] @ frame.baseline["square"].values[axis]).mean(
+        over = setup.effects[axis, chosen].mean(axis=0)
+        if "line_spectrum" in setup.baseline:
+            noise = (setup.columns[axis, chosen] @ setup.baseline["square"].values[axis]).mean(
                 axis=0
             )
             over = np.maximum(
-                over - frame.baseline["line_spectrum"].values[axis] / noise, 0.01 * over
+                over - setup.baseline["line_spectrum"].values[axis] / noise, 0.01 * over
             )
         effects = np.interp(frequency, bands, over)
-        out[:, axis, component] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
-        if "peaks" in frame.baseline:
-            out[:, axis, component] += frame.baseline["peaks"].values[axis]
+        out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
+        if "peaks" in setup.baseline:
+            out[:, axis, part] += setup.baseline["peaks"].values[axis]
     return (
-        _leaked(
-            _gamma(weight[..., None], np.ones(out.shape), rng), int(blocks.attrs["block_samples"])
+        _correlate_lines(
+            _draw_gamma(weight[..., None], np.ones(out.shape), rng),
+            int(blocks.attrs["block_samples"]),
         )
         * out
     )
 
 
-def _leaked(drawn: Array, size: int) -> Array:
-    """Lines (..., line) of mean 1 as the taper lets them leak: their correlation is that of the squared taper's spectrum."""
+def _correlate_lines(drawn: Array, size: int) -> Array:
+    """Correlate lines (..., line) of mean 1 as the taper does, by the squared taper's spectrum."""
     lines = drawn.shape[-1]
     correlation = np.abs(np.fft.fft(taper(size) ** 2)) ** 2
     lag = np.minimum(np.arange(lines), lines - np.arange(lines))
@@ -375,60 +406,67 @@ def _leaked(drawn: Array, size: int) -> Array:
     return np.asarray(np.maximum(leaked, drawn.min(axis=-1, keepdims=True)))
 
 
-def _coherency(
+def _draw_coherency(
     shape: Array, size: tuple[int, ...], rng: np.random.Generator
 ) -> NDArray[np.complex128]:
-    """Sample coherency of signals that have nothing in common, from so many complex ordinates."""
+    """Draw the sample coherency of independent signals, from `shape` complex frequencies."""
     rest = np.maximum(np.where(np.isfinite(shape), shape, 1.0) - 1.0, 0.0)
     with np.errstate(divide="ignore", over="ignore"):
-        squared = np.where(
-            rest > 0.0, 1.0 - rng.random(size) ** (1.0 / rest), 1.0
-        )  # Beta(1, n - 1)
+        # Beta(1, n - 1)
+        squared = np.where(rest > 0.0, 1.0 - rng.random(size) ** (1.0 / rest), 1.0)
     return np.asarray(np.sqrt(squared) * np.exp(2j * np.pi * rng.random(size)))
 
 
-def _cross(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[np.complex128]:
-    names = [str(axis) for axis in frame.blocks["axis"].values]
-    one = [names.index(str(name)) for name in frame.blocks["first"].values]
-    other = [names.index(str(name)) for name in frame.blocks["second"].values]
-    size = np.sqrt(power[:, one] * power[:, other])
-    shape = np.minimum(frame.shape[one], frame.shape[other])
-    if "cross_shape" in frame.blocks:
-        shape = _ordered(frame.blocks, "cross_shape", "pair", "block", "band")
-    cross = size * _coherency(shape, size.shape, rng)
-    cross[..., np.isnan(_ordered(frame.blocks, "cross", "pair", "block", "band"))] = np.nan
-    return np.asarray(cross)
-
-
-def _crossed(
-    frame: _Frame, level: Array, between: NDArray[np.complex128]
+def _draw_independent_cross(
+    setup: _NullSetup, power: Array, rng: np.random.Generator
 ) -> NDArray[np.complex128]:
-    """Cross-spectra of axes that share something, from those over the levels of both."""
-    assert frame.shared is not None
-    one, other = ([pair[side] for pair in frame.shared.pairs] for side in (0, 1))
+    """Draw cross-spectra of axes without anything in common."""
+    names = [str(axis) for axis in setup.blocks["axis"].values]
+    one = [names.index(str(name)) for name in setup.blocks["first"].values]
+    other = [names.index(str(name)) for name in setup.blocks["second"].values]
+    size = np.sqrt(power[:, one] * power[:, other])
+    shape = np.minimum(setup.shape[one], setup.shape[other])
+    if "cross_shape" in setup.blocks:
+        shape = _values_in_order(setup.blocks, "cross_shape", "pair", "block", "band")
+    cross = size * _draw_coherency(shape, size.shape, rng)
+    cross[..., np.isnan(_values_in_order(setup.blocks, "cross", "pair", "block", "band"))] = np.nan
+    return np.asarray(cross)
+
+
+def _scale_shared_cross(
+    setup: _NullSetup, level: Array, between: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Return cross-spectra of axes with common noise, from those over the levels of both."""
+    assert setup.shared is not None
+    one, other = ([pair[side] for pair in setup.shared.pairs] for side in (0, 1))
     cross = between * np.sqrt(level[:, one] * level[:, other])
-    cross[..., np.isnan(_ordered(frame.blocks, "cross", "pair", "block", "band"))] = np.nan
+    cross[..., np.isnan(_values_in_order(setup.blocks, "cross", "pair", "block", "band"))] = np.nan
     return np.asarray(cross)
 
 
-def _witness(frame: _Frame, power: Array, rng: np.random.Generator) -> NDArray[np.complex128]:
-    found = _ordered(frame.blocks, "witness_cross", "axis", "witness", "block", "band")
-    beside = _ordered(frame.blocks, "witness_power", "witness", "block", "band")
-    size = np.sqrt(power[:, :, None] * beside)
-    cross = size * _coherency(frame.shape[:, None], size.shape, rng)
-    cross[..., np.isnan(found)] = np.nan
+def _draw_channel_cross(
+    setup: _NullSetup, power: Array, rng: np.random.Generator
+) -> NDArray[np.complex128]:
+    """Draw cross-spectra of axes with reference channels."""
+    recorded = _values_in_order(setup.blocks, "witness_cross", "axis", "witness", "block", "band")
+    channel_power = _values_in_order(setup.blocks, "witness_power", "witness", "block", "band")
+    size = np.sqrt(power[:, :, None] * channel_power)
+    cross = size * _draw_coherency(setup.shape[:, None], size.shape, rng)
+    cross[..., np.isnan(recorded)] = np.nan
     return np.asarray(cross)
 
 
-def _orders(frame: _Frame, expected: Array, rng: np.random.Generator) -> NDArray[np.complex128]:
-    """Amplitudes at multiples of the rotation: Gaussian with the density at that frequency, or with that beside it where that is more."""
-    blocks = frame.blocks
-    found = _ordered(blocks, "order", "axis", "block", "harmonic")
+def _draw_orders(
+    setup: _NullSetup, expected: Array, rng: np.random.Generator
+) -> NDArray[np.complex128]:
+    """Draw Gaussian amplitudes at the rotation orders, with the density near that frequency."""
+    blocks = setup.blocks
+    recorded = _values_in_order(blocks, "order", "axis", "block", "harmonic")
     rate = float(blocks.attrs["sampling_rate_hz"])
-    samples = np.maximum(_ordered(blocks, "samples", "axis", "block"), 1)
+    samples = np.maximum(_values_in_order(blocks, "samples", "axis", "block"), 1)
     turning = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values)) / 360.0
     bands = np.log(blocks["frequency"].values)
-    density = np.empty((len(expected), *found.shape))
+    density = np.empty((len(expected), *recorded.shape))
     for place, harmonic in enumerate(blocks["harmonic"].values):
         folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
         at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
@@ -441,24 +479,30 @@ def _orders(frame: _Frame, expected: Array, rng: np.random.Generator) -> NDArray
     out = np.asarray(
         np.sqrt(2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]) * noise
     )
-    out[..., np.isnan(found)] = np.nan
+    out[..., np.isnan(recorded)] = np.nan
     return out
 
 
-def _profiles(frame: _Frame, count: int, rng: np.random.Generator) -> Array:
-    found = _ordered(frame.blocks, "profile", "axis", "block", "phase")
-    samples = _ordered(frame.blocks, "profile_samples", "axis", "block", "phase").astype(np.float64)
+def _draw_profiles(setup: _NullSetup, count: int, rng: np.random.Generator) -> Array:
+    """Draw ramp profiles."""
+    recorded = _values_in_order(setup.blocks, "profile", "axis", "block", "phase")
+    samples = _values_in_order(setup.blocks, "profile_samples", "axis", "block", "phase").astype(
+        np.float64
+    )
     safe = np.maximum(samples, 1.0)
-    noise = rng.standard_normal((count, *found.shape)) * frame.sd[:, :1, None] / np.sqrt(safe)
+    noise = rng.standard_normal((count, *recorded.shape)) * setup.sd[:, :1, None] / np.sqrt(safe)
     noise -= (noise * samples).sum(axis=-1, keepdims=True) / np.maximum(samples.sum(axis=-1), 1.0)[
         ..., None
     ]
-    noise[..., np.isnan(found)] = np.nan
+    noise[..., np.isnan(recorded)] = np.nan
     return np.asarray(noise)
 
 
 def _kurtosis_moments(n: Array) -> tuple[Array, Array, Array]:
-    """Mean and variance of the excess kurtosis of n Gaussian samples, and the degrees of freedom of its law (Anscombe and Glynn)."""
+    """Return mean, variance, degrees of freedom of the kurtosis of n samples (Anscombe, Glynn).
+
+    Excess kurtosis of Gaussian samples; Biometrika 70 (1983), doi:10.1093/biomet/70.1.227.
+    """
     mean = -6.0 / (n + 1.0)
     variance = 24.0 * n * (n - 2.0) * (n - 3.0) / ((n + 1.0) ** 2 * (n + 3.0) * (n + 5.0))
     skew = (
@@ -470,11 +514,11 @@ def _kurtosis_moments(n: Array) -> tuple[Array, Array, Array]:
     return mean, variance, 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
 
 
-def _with_tails(score: Array, n: Array) -> Array:
-    """Normal scores with the tails that the kurtosis of n samples has beyond Anscombe and Glynn's law.
+def _widen_tails(score: Array, n: Array) -> Array:
+    """Add the tails that the kurtosis of n samples has beyond the law of Anscombe and Glynn.
 
-    Half a million simulated blocks each of 100 to 2000 samples have them: 3.37 standard deviations
-    below, where the law says 3.09, for blocks of 200.
+    From half a million simulated blocks each of 100 to 2000 samples: once in a thousand blocks of
+    200 samples it is 3.37 standard deviations below the mean, by the law 3.09.
     """
     return np.asarray(
         score
@@ -483,23 +527,25 @@ def _with_tails(score: Array, n: Array) -> Array:
     )
 
 
-def _kurtosis(frame: _Frame, count: int, rng: np.random.Generator) -> Array:
-    """Excess kurtosis as the noise has it, or that of other blocks where the values are few levels."""
-    blocks = frame.blocks
-    found = _ordered(blocks, "kurtosis", "axis", "block")
-    samples = np.maximum(_ordered(blocks, "samples", "axis", "block").astype(np.float64), 20.0)
+def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> Array:
+    """Draw the excess kurtosis of the noise; with few levels, that of other blocks."""
+    blocks = setup.blocks
+    recorded = _values_in_order(blocks, "kurtosis", "axis", "block")
+    samples = np.maximum(
+        _values_in_order(blocks, "samples", "axis", "block").astype(np.float64), 20.0
+    )
     mean, variance, a = _kurtosis_moments(samples)
     root = (
         1.0
         - 2.0 / (9.0 * a)
-        - _with_tails(rng.standard_normal((count, *found.shape)), samples)
+        - _widen_tails(rng.standard_normal((count, *recorded.shape)), samples)
         * np.sqrt(2.0 / (9.0 * a))
     )
     score = ((1.0 - 2.0 / a) / np.maximum(root, 0.1) ** 3 - 1.0) / np.sqrt(2.0 / (a - 4.0))
-    out = mean + frame.tails[:, :1] + np.sqrt(variance) * frame.tails[:, 1:] * score
+    out = mean + setup.tails[:, :1] + np.sqrt(variance) * setup.tails[:, 1:] * score
     for axis, step in enumerate(blocks["lattice"].values):
-        good = found[axis][np.isfinite(found[axis])]
-        if step > COARSE * frame.sd[axis, 0] and good.size:
+        good = recorded[axis][np.isfinite(recorded[axis])]
+        if step > COARSE_STEP_SIGMA * setup.sd[axis, 0] and good.size:
             out[:, axis] = rng.choice(good, out[:, axis].shape)
-    out[..., np.isnan(found)] = np.nan
+    out[..., np.isnan(recorded)] = np.nan
     return np.asarray(out)

@@ -1,4 +1,4 @@
-"""What the scores of every view do in null records: moments of each cell, and the law of the largest of all."""
+"""Distributions of scores in null records: moments of each cell, and that of the largest of all."""
 
 from __future__ import annotations
 
@@ -12,26 +12,22 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.errors import OptionError
 
-__all__ = ["NullScores", "StatisticNull", "Tail", "null_scores", "standardise"]
+__all__ = ["MaximumDistribution", "NullScores", "StatisticNull", "null_scores", "standardise"]
 
 Array = NDArray[np.float64]
-_BELOW = (
-    1.4  # standard deviations below the largest of independent cells, from which on scores are kept
-)
-_AT_ONCE = 1_000_000  # band powers of the null records that are scored at once
-_FIRST = 20  # null records that tell what a standard deviation is
-_POOL = 100.0  # null records that the mean over like windows counts for
-_SHARE = 0.25  # of the null records, the largest, to which the tail is fitted
-_STEEPEST = (
-    0.7  # scale of the tail of half a squared normal score, at least: that of a single cell is 1
-)
-_LEAST = 40
-_LEAST_P = 1e-9  # a tail from hundreds of records says nothing of rarer things
+_KEPT_BELOW_SIGMA = 1.4  # below the largest of independent cells, from which scores are kept
+_POWERS_AT_ONCE = 1_000_000  # band powers of null records scored at once; limits memory
+_FIRST_RECORDS = 20  # null records for the first estimate of a standard deviation
+_POOLED_RECORDS = 100.0  # weight of the mean variance over equal windows; design choice
+_TAIL_SHARE = 0.25  # of the null records, the largest, to which the tail is fitted
+_MIN_TAIL_SCALE = 0.7  # of half a squared score; that of a single normal cell is 1
+_MIN_RECORDS = 40  # design choice
+_MIN_P_VALUE = 1e-9  # a tail from hundreds of records is unreliable beyond
 
 
 @dataclass(frozen=True)
-class Tail:
-    """Law of the largest value of a record: the sample, and an exponential tail fitted to its upper quarter."""
+class MaximumDistribution:
+    """Distribution of the largest value of a record: sample, and exponential tail above 3/4."""
 
     sample: Array
     start: float
@@ -39,7 +35,7 @@ class Tail:
     share: float
 
     def surprise(self, value: Array | float) -> Array:
-        """``-log`` of the probability that the largest of a null record is `value` or more."""
+        """Return ``-log`` of the probability that a null record's largest is at least `value`."""
         value = np.asarray(value, dtype=float)
         rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (
             self.sample.size + 1.0
@@ -50,7 +46,7 @@ class Tail:
         )
 
     def level(self, p: float) -> float:
-        """Value that the largest of a null record reaches with probability `p`."""
+        """Return the value that the largest of a null record reaches with probability `p`."""
         return (
             float(self.start + self.scale * np.log(self.share / p))
             if p < self.share
@@ -60,51 +56,51 @@ class Tail:
 
 @dataclass(frozen=True)
 class StatisticNull:
-    """One view in the null records: moments of each cell, and the tail of half the square of the largest standardised score."""
+    """One statistic in null records: moments of cells, tail of half the squared largest score."""
 
     mean: Array
     spread: Array
-    tail: Tail
+    tail: MaximumDistribution
 
 
 @dataclass(frozen=True)
 class NullScores:
-    """All views in the null records.
+    """All statistics in null records.
 
     Attributes
     ----------
-    statistics : mapping of str to ViewNull
+    statistics : mapping of str to StatisticNull
         By the names of `gyrostab.diagnose.statistics.STATISTICS`.
     family : Tail
-        Of the largest ``-log p`` over the views, p that of each view's largest score.
+        Of the largest ``-log p`` over the statistics, with p of each one's largest score.
     records : int
-        Null records.
+        Number of null records.
     """
 
     statistics: Mapping[str, StatisticNull]
-    family: Tail
+    family: MaximumDistribution
     records: int
 
     def p_value(self, statistic: str, z: Array | float) -> Array:
-        """Probability that a null record has so large a standardised score in any view, as this one has in this view."""
+        """Return the probability that a null record is as extreme in any statistic as `z` here."""
         own = self.statistics[statistic].tail.surprise(np.square(z) / 2.0)
-        return np.asarray(np.clip(np.exp(-self.family.surprise(own)), _LEAST_P, 1.0))
+        return np.asarray(np.clip(np.exp(-self.family.surprise(own)), _MIN_P_VALUE, 1.0))
 
     def critical(self, statistic: str, level: float) -> float:
-        """Standardised score of a view at which the p-value is `level`."""
+        """Return the standardised score of a statistic at which the p-value is `level`."""
         t = self.statistics[statistic].tail.level(float(np.exp(-self.family.level(level))))
         return float(np.sqrt(2.0 * max(t, 0.0)))
 
 
 def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores:
-    """Gather the scores of null records, chunk by chunk; of each only what lies far out is kept.
+    """Collect the scores of null records chunk by chunk, keeping only extreme scores.
 
     Parameters
     ----------
     baseline : xarray.Dataset
-        What the simulation expects.
+        Expectation of the scores.
     nulls : iterable of xarray.Dataset
-        Null records, some with a leading dimension ``record`` at a time.
+        Null records in chunks with a leading dimension ``record``.
 
     Returns
     -------
@@ -113,64 +109,72 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
     Raises
     ------
     OptionError
-        When there are too few to tell.
+        If there are too few records.
     """
-    gathered: dict[str, _Gathered] = {}
+    gathered: dict[str, _ScoreSums] = {}
     records = 0
     for chunk in nulls:
         records += chunk.sizes["record"]
-        size = max(1, _AT_ONCE * chunk.sizes["record"] // chunk["power"].size)
+        size = max(1, _POWERS_AT_ONCE * chunk.sizes["record"] // chunk["power"].size)
         for first in range(0, chunk.sizes["record"], size):
-            component = chunk.isel(record=slice(first, first + size))
+            part = chunk.isel(record=slice(first, first + size))
             for name, score in STATISTICS.items():
-                found = score(component, baseline)
-                if found is not None:
+                scores = score(part, baseline)
+                if scores is not None:
                     if name not in gathered:
-                        gathered[name] = _Gathered(found)
-                    gathered[name].add(found)
-    if records < _LEAST:
+                        gathered[name] = _ScoreSums(scores)
+                    gathered[name].add(scores)
+    if records < _MIN_RECORDS:
         raise OptionError(
-            f"{records} null records are too few to tell how often noise alone does as much; give nulls=400"
+            f"{records} null records are too few to tell how often noise alone does as much; "
+            "give nulls=400"
         )
     statistics = {}
     largest = {}
     for name, statistic in gathered.items():
         mean, spread, z = statistic.finish()
         half = z**2 / 2.0
-        statistics[name] = StatisticNull(mean, spread, _tail(half))
+        statistics[name] = StatisticNull(mean, spread, _fit_maximum(half))
         largest[name] = statistics[name].tail.surprise(half)
-    return NullScores(statistics, _tail(np.max(list(largest.values()), axis=0)), records)
+    return NullScores(statistics, _fit_maximum(np.max(list(largest.values()), axis=0)), records)
 
 
 def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:
-    """Scores in standard deviations of the null records, below zero where one-sided."""
+    """Return scores in standard deviations of the null records, at least 0 if one-sided."""
     z = (scores["z"].values - null.mean) / null.spread
     return np.asarray(np.maximum(z, 0.0) if scores.attrs["one_sided"] else z)
 
 
-def _tail(largest: Array) -> Tail:
+def _fit_maximum(largest: Array) -> MaximumDistribution:
+    """Fit the distribution of the largest values."""
     sample = np.sort(largest)
-    start = float(np.quantile(sample, 1.0 - _SHARE))
+    start = float(np.quantile(sample, 1.0 - _TAIL_SHARE))
     above = sample[sample > start] - start
     share = max(above.size, 1) / (sample.size + 1.0)
-    return Tail(sample, start, max(float(above.mean()) if above.size else 0.0, _STEEPEST), share)
+    return MaximumDistribution(
+        sample, start, max(float(above.mean()) if above.size else 0.0, _MIN_TAIL_SCALE), share
+    )
 
 
-class _Gathered:
-    """Running sums of one view over the null records, and their scores far out."""
+class _ScoreSums:
+    """Running sums of one statistic over the null records, and its extreme scores."""
 
     def __init__(self, scores: xr.Dataset) -> None:
         self.shape = scores["z"].shape[1:]
         self.sums = np.zeros((3, int(np.prod(self.shape))))
-        self.far: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
+        self.extremes: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
         self.waiting: list[Array] = []
         self.records = 0
         self.one_sided = bool(scores.attrs["one_sided"])
         self.floor = np.broadcast_to(scores["floor"].values, self.shape).ravel()
         self.length = scores["stop"].values - scores["first"].values
-        self.kept = np.sqrt(2.0 * np.log(max(np.isfinite(scores["z"].values[0]).sum(), 2))) - _BELOW
+        self.kept = (
+            np.sqrt(2.0 * np.log(max(np.isfinite(scores["z"].values[0]).sum(), 2)))
+            - _KEPT_BELOW_SIGMA
+        )
 
     def add(self, scores: xr.Dataset) -> None:
+        """Add the scores of some null records."""
         z = scores["z"].values.reshape(scores.sizes["record"], -1)
         known = np.isfinite(z)
         filled = np.where(known, z, 0.0)
@@ -178,53 +182,61 @@ class _Gathered:
             [known.sum(axis=0), filled.sum(axis=0), np.square(filled).sum(axis=0)]
         )
         self.waiting.append(z)
-        if self.records + sum(len(component) for component in self.waiting) >= _FIRST:
-            self._keep()
+        if self.records + sum(len(part) for part in self.waiting) >= _FIRST_RECORDS:
+            self._keep_extremes()
 
-    def _keep(self) -> None:
-        """Keep what lies far out by the moments so far; they are good enough to leave out the rest."""
-        mean, spread = _moments(self.sums, self._like(), self.floor)
+    def _keep_extremes(self) -> None:
+        """Keep extreme scores by the moments so far, which suffice to drop the rest."""
+        mean, spread = _pooled_moments(self.sums, self._pool_variance(), self.floor)
         for z in self.waiting:
             with np.errstate(invalid="ignore"):
-                away = (z - mean) / spread
-                record, cell = np.nonzero((away if self.one_sided else np.abs(away)) > self.kept)
-            self.far.append((record + self.records, cell, z[record, cell]))
+                deviation = (z - mean) / spread
+                record, cell = np.nonzero(
+                    (deviation if self.one_sided else np.abs(deviation)) > self.kept
+                )
+            self.extremes.append((record + self.records, cell, z[record, cell]))
             self.records += len(z)
         self.waiting = []
 
-    def _like(self) -> Array:
-        """Variance of each cell, averaged over the windows of the same length."""
-        count, first, second = (component.reshape(self.shape) for component in self.sums)
+    def _pool_variance(self) -> Array:
+        """Return the variance of each cell, averaged over windows of equal length."""
+        count, first, second = (part.reshape(self.shape) for part in self.sums)
         with np.errstate(invalid="ignore", divide="ignore"):
             variance = np.maximum(second / count - (first / count) ** 2, 0.0)
-        like = np.empty(self.shape)
+        pooled_variance = np.empty(self.shape)
         for length in np.unique(self.length):
-            of = self.length == length
-            there = count[:, of] > 1
-            total = np.where(there, variance[:, of], 0.0).sum(axis=1, keepdims=True)
-            like[:, of] = total / np.maximum(there.sum(axis=1, keepdims=True), 1)
-        return like.ravel()
+            same_length = self.length == length
+            known = count[:, same_length] > 1
+            total = np.where(known, variance[:, same_length], 0.0).sum(axis=1, keepdims=True)
+            pooled_variance[:, same_length] = total / np.maximum(
+                known.sum(axis=1, keepdims=True), 1
+            )
+        return pooled_variance.ravel()
 
     def finish(self) -> tuple[Array, Array, Array]:
-        """Mean and spread of every cell, and the largest standardised score of each record, judged by the other records."""
-        self._keep()
-        like = self._like()
-        mean, spread = _moments(self.sums, like, self.floor)
-        record, cell, z = (np.concatenate(component) for component in zip(*self.far, strict=True))
+        """Return mean and spread of every cell, and the largest scores by the other records."""
+        self._keep_extremes()
+        pooled_variance = self._pool_variance()
+        mean, spread = _pooled_moments(self.sums, pooled_variance, self.floor)
+        record, cell, z = (np.concatenate(part) for part in zip(*self.extremes, strict=True))
         others = self.sums[:, cell] - np.stack([np.ones(z.size), z, z**2])
-        own_mean, own_spread = _moments(others, like[cell], self.floor[cell])
-        away = (z - own_mean) / own_spread
+        own_mean, own_spread = _pooled_moments(others, pooled_variance[cell], self.floor[cell])
+        deviation = (z - own_mean) / own_spread
         largest = np.full(self.records, self.kept)
-        np.maximum.at(largest, record, np.nan_to_num(away if self.one_sided else np.abs(away)))
+        np.maximum.at(
+            largest, record, np.nan_to_num(deviation if self.one_sided else np.abs(deviation))
+        )
         return mean.reshape(self.shape), spread.reshape(self.shape), largest
 
 
-def _moments(sums: Array, like: Array, floor: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation from running sums; the variance is drawn towards `like`."""
+def _pooled_moments(sums: Array, pooled_variance: Array, floor: Array) -> tuple[Array, Array]:
+    """Return mean and standard deviation from running sums, with shrunk variance."""
     count, first, second = sums
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = first / count
-        variance = (np.maximum(second - count * mean**2, 0.0) + _POOL * like) / (count + _POOL)
+        variance = (
+            np.maximum(second - count * mean**2, 0.0) + _POOLED_RECORDS * pooled_variance
+        ) / (count + _POOLED_RECORDS)
     known = count > 1
     return np.where(known, mean, np.nan), np.where(
         known, np.maximum(np.sqrt(variance), floor), np.nan

@@ -334,7 +334,7 @@ def _can_show(component: Component, region: Mapping[str, Any], blocks: xr.Datase
             abs(region["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine
         )
     tau = _BUMP / mine  # where the Allan variance of a sine is largest
-    return str(region["what"]).startswith(("avar", "level", "restless")) and bool(
+    return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
         region["tau_min_s"] / _WIDE <= tau <= region["tau_max_s"] * _WIDE
     )
 

@@ -17,7 +17,7 @@ from gyrostab.diagnose.predict.condition import Component, drop_changed_tails, m
 from gyrostab.diagnose.predict.filter_response import is_filter
 from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.statistics import STATISTICS
-from gyrostab.diagnose.statistics.variance_stability import levelled
+from gyrostab.diagnose.statistics.variance_stability import scale_to_expected
 
 __all__ = ["Scores", "left_of", "needed", "statistic_scores"]
 
@@ -73,7 +73,7 @@ def statistic_scores(
     )
     special = {
         "sample_counts": turns_left_out,
-        "variance_stability": levelled(seen, after, louder(regions)),
+        "variance_stability": scale_to_expected(seen, after, louder(regions)),
     }
     if still is not None:
         special |= dict.fromkeys(

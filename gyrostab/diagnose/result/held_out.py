@@ -14,7 +14,7 @@ from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, values_of
+from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score, values_in_order
 from gyrostab.errors import OptionError
 from gyrostab.noise import NORMAL_95
 
@@ -209,9 +209,12 @@ def _variance(
     evidence_nats: float,
 ) -> float:
     """Variance of a gain: that of the powers from the scatter of their cells about `after`; a normal law has twice its gain."""
-    power, shape = (values_of(blocks, name, "axis", "block", "band") for name in ("power", "shape"))
+    power, shape = (
+        values_in_order(blocks, name, "axis", "block", "band") for name in ("power", "shape")
+    )
     one, other = (
-        values_of(baseline, "spectrum", "axis", "block", "band") for baseline in (after, before)
+        values_in_order(baseline, "spectrum", "axis", "block", "band")
+        for baseline in (after, before)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.square(shape * (1.0 / one - 1.0 / other) * (power - one))[:, held]
@@ -221,8 +224,10 @@ def _variance(
 
 def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     """Log-likelihood of the band powers of every block, by gamma laws."""
-    power, shape = (values_of(blocks, name, "axis", "block", "band") for name in ("power", "shape"))
-    spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
+    power, shape = (
+        values_in_order(blocks, name, "axis", "block", "band") for name in ("power", "shape")
+    )
+    spectrum = values_in_order(baseline, "spectrum", "axis", "block", "band")
     there = np.isfinite(power) & np.isfinite(shape) & (spectrum > 0)
     safe = np.where(there, spectrum, 1.0)
     return np.asarray(np.where(there, -shape * (np.log(safe) + power / safe), 0.0).sum(axis=(0, 2)))
@@ -237,14 +242,16 @@ def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     left = [axes.index(str(axis)) for axis in blocks["first"].values]
     right = [axes.index(str(axis)) for axis in blocks["second"].values]
     power, shape = (
-        np.moveaxis(values_of(blocks, name, "axis", "block", "band"), 0, -1)
+        np.moveaxis(values_in_order(blocks, name, "axis", "block", "band"), 0, -1)
         for name in ("power", "shape")
     )
-    spectrum = np.moveaxis(values_of(baseline, "spectrum", "axis", "block", "band"), 0, -1)
+    spectrum = np.moveaxis(values_in_order(baseline, "spectrum", "axis", "block", "band"), 0, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         both = np.sqrt(spectrum[..., left] * spectrum[..., right])
-        seen = np.moveaxis(values_of(blocks, "cross", "pair", "block", "band"), 0, -1) / both
-        model = np.moveaxis(values_of(baseline, "cross", "pair", "block", "band"), 0, -1) / both
+        seen = np.moveaxis(values_in_order(blocks, "cross", "pair", "block", "band"), 0, -1) / both
+        model = (
+            np.moveaxis(values_in_order(baseline, "cross", "pair", "block", "band"), 0, -1) / both
+        )
         flat = power / spectrum
     there = (
         np.isfinite(seen).all(axis=-1)
@@ -269,10 +276,10 @@ def _mean_evidence(
 ) -> float:
     """Log-likelihood of the block means that are used, with a free constant, averaged over the calibrated random walk and flicker."""
     residual = (
-        values_of(blocks, "mean", "axis", "block")[axis]
-        - values_of(baseline, "known_mean", "axis", "block")[axis]
+        values_in_order(blocks, "mean", "axis", "block")[axis]
+        - values_in_order(baseline, "known_mean", "axis", "block")[axis]
     )
-    variance = values_of(baseline, "mean_variance", "axis", "block")[axis]
+    variance = values_in_order(baseline, "mean_variance", "axis", "block")[axis]
     present = used & np.isfinite(residual) & np.isfinite(variance) & (variance > 0)
     if "grid_K" in baseline:
         walk, flicker = baseline["grid_K"].values[axis], baseline["grid_B"].values[axis]

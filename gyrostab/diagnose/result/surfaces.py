@@ -10,7 +10,7 @@ from scipy.special import gammaincinv
 
 from gyrostab.diagnose.statistics.mean import window_means
 from gyrostab.diagnose.statistics.power import allan_surface
-from gyrostab.diagnose.statistics.scores import Array, Windows, over_windows, values_of
+from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows, values_in_order
 
 __all__ = ["CASES", "make_surfaces"]
 
@@ -49,7 +49,7 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
         [],
     )
     high.append(low[0])
-    mean, error = [_averaged(blocks, values_of(blocks, "mean", "axis", "block"), windows)], []
+    mean, error = [_averaged(blocks, values_in_order(blocks, "mean", "axis", "block"), windows)], []
     error.append(np.full(mean[0].shape, np.nan))
     for baseline in (before, after):
         noise = allan_surface(blocks, baseline, windows)
@@ -77,8 +77,8 @@ def _windows(block_count: int) -> Windows:
 def _known(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Allan variance of the known mean, which the noise is without."""
     means = np.where(
-        np.isfinite(values_of(blocks, "mean", "axis", "block")),
-        values_of(baseline, "known_mean", "axis", "block"),
+        np.isfinite(values_in_order(blocks, "mean", "axis", "block")),
+        values_in_order(baseline, "known_mean", "axis", "block"),
         np.nan,
     )
     alone = blocks.assign(mean=(("axis", "block"), means))
@@ -93,12 +93,14 @@ def _known(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
 def _averaged(blocks: xr.Dataset, values: Array, windows: Windows) -> Array:
     """Mean over windows, weighted with the samples present where the recording has a mean."""
     weight = np.where(
-        np.isfinite(values_of(blocks, "mean", "axis", "block")),
-        values_of(blocks, "samples", "axis", "block"),
+        np.isfinite(values_in_order(blocks, "mean", "axis", "block")),
+        values_in_order(blocks, "samples", "axis", "block"),
         0.0,
     )
-    sums = over_windows((np.where(weight > 0, values, 0.0) * weight)[..., None], windows)[..., 0]
-    total = over_windows(weight[..., None], windows)[..., 0]
+    sums = sum_over_windows((np.where(weight > 0, values, 0.0) * weight)[..., None], windows)[
+        ..., 0
+    ]
+    total = sum_over_windows(weight[..., None], windows)[..., 0]
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.where(total > 0, sums / total, np.nan))
 
@@ -106,11 +108,11 @@ def _averaged(blocks: xr.Dataset, values: Array, windows: Windows) -> Array:
 def _predicted(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     """Mean of the effects, and the constant that the recording has beside them."""
     known, mean = (
-        values_of(baseline, "known_mean", "axis", "block"),
-        values_of(blocks, "mean", "axis", "block"),
+        values_in_order(baseline, "known_mean", "axis", "block"),
+        values_in_order(blocks, "mean", "axis", "block"),
     )
     weight = np.where(
-        np.isfinite(mean), 1.0 / values_of(baseline, "mean_variance", "axis", "block"), 0.0
+        np.isfinite(mean), 1.0 / values_in_order(baseline, "mean_variance", "axis", "block"), 0.0
     )
     weight = np.where(np.isfinite(weight), weight, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -240,7 +240,7 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
     sure = chance(region["p_value"])
     begin = axes[0].upper() + axes[1:]
     one, estimate = len(region["axes"]) == 1, region.get("estimate", np.nan)
-    if region["view"] == "davar" and str(region.get("what", "")).startswith("restless"):
+    if region["view"] == "davar" and str(region.get("what", "")).startswith("variance"):
         pace = length_text(float(str(region["what"]).split()[1]))
         size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
         return (
@@ -272,7 +272,7 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
         )
     if region["view"] == "spectrum" and what == "ramp phase":
         return f"The rate of {axes} has a part of {estimate:.3g} deg/h rms that follows the phase of the feedback ramp {when} ({sure})."
-    if region["view"] == "spectrum" and what.startswith("glide"):
+    if region["view"] == "spectrum" and what.startswith("drifting"):
         begins, ends = what.split()[1:]
         return f"The spectrum of {axes} has a line that moves {when}, from about {begins} Hz to about {ends} Hz ({sure})."
     if region["view"] == "spectrum":

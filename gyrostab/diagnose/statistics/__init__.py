@@ -1,8 +1,8 @@
-"""Statistics in which a recording and a simulation are compared: near-normal scores of windows.
+"""Statistics that compare a recording with a simulation: near-normal scores of windows of blocks.
 
-A statistic is a file with a function ``score(blocks, baseline)`` that gives a Dataset of
-`scores.statistic_dataset`, or None when the recording has nothing that it uses. The table here is
-the only other place that names it.
+A statistic is a module with a function ``score(blocks, baseline)``, which returns a Dataset from
+`scores.statistic_dataset`, or None if the recording lacks its data. Only the table below names the
+statistics.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gyrostab.diagnose.statistics import (
 
 __all__ = ["STATISTICS"]
 
-#: Statistics by name. The attribute ``view`` of what they give is the name in diagnosis.json.
+#: Statistics by name. The attribute ``view`` of their result is the name in diagnosis.json.
 STATISTICS: dict[str, Callable[[xr.Dataset, xr.Dataset], xr.Dataset | None]] = {
     "power": power.score,
     "mean": mean.score,

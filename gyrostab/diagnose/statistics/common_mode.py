@@ -1,4 +1,4 @@
-"""Slow motion that axes share: waveforms that each axis by itself takes for its own random walk."""
+"""Score of slow motion common to axes, which each axis alone could have as its own random walk."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
-    over_windows,
     statistic_dataset,
-    values_of,
+    sum_over_windows,
+    values_in_order,
     window_set,
 )
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
@@ -28,61 +28,62 @@ __all__ = ["LENGTHS", "SPANS", "score"]
 LENGTHS = (60,)
 #: Blocks over which the increments are averaged.
 SPANS = (1, 2, 4, 8, 16, 32, 64)
-_FEWEST = 8.0  # independent averages; with fewer a correlation is no number to judge by
-_OVERLAP = (
-    1.5  # independent averages that overlapping ones are worth, for each that lies beside the next
-)
-_SINGULAR = -27.0  # logarithm of a determinant that is as good as zero
-_PROBES, _SEED = (
-    64,
-    20,
-)  # series of white noise that tell what a known covariance makes of the increments
+_MIN_AVERAGES = 8.0  # independent averages, for a meaningful correlation; design choice
+#: Independent averages per non-overlapping one, if they overlap.
+_OVERLAP_FACTOR = 1.5
+_MIN_LOG_DETERMINANT = -27.0  # that of a singular matrix, up to rounding
+#: Probe series of white noise, which measure the response of the increments to a known covariance.
+_PROBE_COUNT, _PROBE_SEED = 64, 20
 
 
 def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    """Score the correlation of what is new in the block means of every pair of axes, against axes that wander independently.
+    """Score the correlation of the increments of block means between axes, over 1 to 64 blocks.
 
-    The block means of each axis are whitened by its noise: what is left of each is what the ones
-    before do not foretell, the increment of a random walk or the mean of white noise. The noise of
-    the sensors is new on every axis by itself, however much of it there is; hence the correlation
-    is scored, which no error of the calibration changes. The increments are averaged over several
-    blocks, since what the axes share may be slow.
+    The block means of each axis are whitened by its noise: the increment is the part that the means
+    before do not predict, that is the increment of a random walk or the mean of white noise. The
+    noise of different axes is independent, whatever its size. The score is therefore the
+    correlation, which no calibration error changes. The increments are averaged over several
+    blocks, because the common motion may be slow.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects; white noise that the axes share
-        by its ``cross`` is taken off.
+        Recording or null records, and the expectation of the simulation; common white noise by its
+        ``cross`` is subtracted.
 
     Returns
     -------
     xarray.Dataset or None
-        None with one axis, or where the record is too short. A row for each pair, whose ``ratio``
-        and ``estimate`` are the correlation. Three axes or more have a row of all together, by the
-        determinant of their correlations; its ``estimate`` is the root of the mean square of them.
+        None with one axis, or for too short a record. A row for each pair, whose ``ratio`` and
+        ``estimate`` are the correlation. Three axes or more have a row of all together, by the
+        determinant of their correlations; its ``estimate`` is the root of their mean square.
     """
     axes = [str(axis) for axis in blocks["axis"].values]
     block_count = blocks.sizes["block"]
-    spans = [span for span in SPANS if _OVERLAP * block_count / span >= _FEWEST]
+    spans = [span for span in SPANS if _OVERLAP_FACTOR * block_count / span >= _MIN_AVERAGES]
     if len(axes) < 2 or not spans:
         return None
     windows = window_set(block_count, LENGTHS)
-    residual = values_of(blocks, "mean", "axis", "block") - values_of(
+    residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
         baseline, "known_mean", "axis", "block"
     )
-    there = np.isfinite(residual).reshape(-1, *residual.shape[-2:]).all(axis=0)
-    new = _increments(residual, there, blocks, baseline)
+    present = np.isfinite(residual).reshape(-1, *residual.shape[-2:]).all(axis=0)
+    increments = _whiten_means(residual, present, blocks, baseline)
     pairs = list(combinations(range(len(axes)), 2))
-    shared = _shared(there, pairs, blocks, baseline) if "cross" in baseline else None
-    found = [_correlations(new, there, pairs, windows, span, shared) for span in spans]
+    shared = _shared_increments(present, pairs, blocks, baseline) if "cross" in baseline else None
+    correlations = [
+        _correlate_pairs(increments, present, pairs, windows, span, shared) for span in spans
+    ]
     r, count = (
-        np.stack([one for one, _ in found], axis=-1),
-        np.stack([one for _, one in found], axis=-1),
+        np.stack([first for first, _ in correlations], axis=-1),
+        np.stack([first for _, first in correlations], axis=-1),
     )
     z = correlation_score(r, np.broadcast_to(count, r.shape))
     rows = [f"{axes[a]} {axes[b]}" for a, b in pairs]
     if len(rows) > 1:
-        z = np.concatenate([z, _together(r, count, pairs, len(axes))[..., None, :, :]], axis=-3)
+        z = np.concatenate(
+            [z, _score_all_axes(r, count, pairs, len(axes))[..., None, :, :]], axis=-3
+        )
         r = np.concatenate([r, np.sqrt((r**2).mean(axis=-3, keepdims=True))], axis=-3)
         rows = [*rows, " ".join(axes)]
     block = float(blocks.attrs["block_s"])
@@ -102,10 +103,10 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     )
 
 
-def _increments(
-    residual: Array, there: NDArray[np.bool_], blocks: xr.Dataset, baseline: xr.Dataset
+def _whiten_means(
+    residual: Array, available: NDArray[np.bool_], blocks: xr.Dataset, baseline: xr.Dataset
 ) -> Array:
-    """Whitened block means by (record), axis, block; zero where there is none."""
+    """Whiten block means by (record), axis, block; zero where missing."""
     terms = [str(term) for term in baseline["term"].values]
     white = baseline["mean_variance"].transpose("axis", "block").values
     begin, end, block = (
@@ -114,90 +115,106 @@ def _increments(
         float(blocks.attrs["block_s"]),
     )
     share, times, faster = flicker_states(block, float(end[-1] - begin[0]))
-    new = np.empty_like(residual)
+    increments = np.empty_like(residual)
     for axis in range(residual.shape[-2]):
         b, k = (
             float(np.nan_to_num(baseline["coefficient"].values[axis, terms.index(term)]))
             for term in ("B", "K")
         )
-        present = there[axis] & np.isfinite(white[axis]) & (white[axis] > 0)
+        present = available[axis] & np.isfinite(white[axis]) & (white[axis] > 0)
         variance = np.where(present, white[axis] + b**2 * faster, 1.0)
         series = residual[..., axis, :].reshape(-1, residual.shape[-1])
         columns = np.ascontiguousarray(np.where(present, series, 0.0).T)
         known = expected_processes(baseline, axis)
         states = np.append(b**2 * share, known.square), np.append(times, known.time)
-        made, _ = whiten(columns, variance, end - begin, present, k**2 / HOUR + known.walk, *states)
-        new[..., axis, :] = made.T.reshape(new[..., axis, :].shape)
-    return new
+        whitened, _ = whiten(
+            columns, variance, end - begin, present, k**2 / HOUR + known.walk, *states
+        )
+        increments[..., axis, :] = whitened.T.reshape(increments[..., axis, :].shape)
+    return increments
 
 
-def _shared(
-    there: NDArray[np.bool_],
+def _shared_increments(
+    present: NDArray[np.bool_],
     pairs: list[tuple[int, int]],
     blocks: xr.Dataset,
     baseline: xr.Dataset,
 ) -> tuple[Array, Array]:
-    """Increments of one white noise on all axes by probe, axis, block, and the part of it that each pair is known to share."""
-    series = np.random.default_rng(_SEED).standard_normal((_PROBES, 1, there.shape[1]))
+    """Return the increments of one white noise on all axes, and the share common to each pair.
+
+    The increments are by probe, axis, block.
+    """
+    series = np.random.default_rng(_PROBE_SEED).standard_normal((_PROBE_COUNT, 1, present.shape[1]))
     series = series * np.sqrt(
         np.nan_to_num(baseline["mean_variance"].transpose("axis", "block").values)
     )
     spectrum = baseline["spectrum"].transpose("axis", "block", "band").values[..., 0]
     cross = baseline["cross"].transpose("pair", "block", "band").values[..., 0].real
-    one, other = ([pair[side] for pair in pairs] for side in (0, 1))
+    first, second = ([pair[side] for pair in pairs] for side in (0, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = cross / np.sqrt(spectrum[one] * spectrum[other])
-    return _increments(series, there, blocks, baseline), np.nan_to_num(np.nanmean(share, axis=-1))
+        share = cross / np.sqrt(spectrum[first] * spectrum[second])
+    return _whiten_means(series, present, blocks, baseline), np.nan_to_num(
+        np.nanmean(share, axis=-1)
+    )
 
 
-def _correlations(
-    new: Array,
-    there: NDArray[np.bool_],
+def _correlate_pairs(
+    increments: Array,
+    present: NDArray[np.bool_],
     pairs: list[tuple[int, int]],
     windows: Windows,
     span: int,
     shared: tuple[Array, Array] | None,
 ) -> tuple[Array, Array]:
-    """Correlation of each pair by (record), pair, window, of averages over so many blocks, and the independent averages in each."""
-    one, other = ([pair[side] for pair in pairs] for side in (0, 1))
+    """Correlate pairs by (record), pair, window, averaged over `span` blocks; count averages."""
+    first, second = ([pair[side] for pair in pairs] for side in (0, 1))
 
     def over(values: Array) -> Array:
-        return np.asarray(over_windows(values[..., None], windows)[..., 0])
+        return np.asarray(sum_over_windows(values[..., None], windows)[..., 0])
 
     def products(values: Array) -> Array:
-        return over(values[..., one, :] * values[..., other, :])
+        return over(values[..., first, :] * values[..., second, :])
 
-    summed = _moving(new, span)
-    square, product = over(summed**2), products(summed)
+    averages = _moving_sum(increments, span)
+    square, product = over(averages**2), products(averages)
     if shared is not None:
-        product = product - shared[1][:, None] * products(_moving(shared[0], span)).mean(axis=0)
+        product = product - shared[1][:, None] * products(_moving_sum(shared[0], span)).mean(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        r = np.clip(product / np.sqrt(square[..., one, :] * square[..., other, :]), -1.0, 1.0)
-    count = over((there[one] & there[other]).astype(float)) * (_OVERLAP / span if span > 1 else 1.0)
-    remembered = _memory(summed, one, other)[..., None] * (_OVERLAP / span if span > 1 else 1.0)
-    return np.where(count >= _FEWEST, r, np.nan), count / np.maximum(remembered, 1.0)
+        r = np.clip(product / np.sqrt(square[..., first, :] * square[..., second, :]), -1.0, 1.0)
+    count = over((present[first] & present[second]).astype(float)) * (
+        _OVERLAP_FACTOR / span if span > 1 else 1.0
+    )
+    memory = _blocks_per_value(averages, first, second)[..., None] * (
+        _OVERLAP_FACTOR / span if span > 1 else 1.0
+    )
+    return np.where(count >= _MIN_AVERAGES, r, np.nan), count / np.maximum(memory, 1.0)
 
 
-def _memory(summed: Array, one: list[int], other: list[int]) -> Array:
-    """Blocks that an independent value takes in each pair: the sum of the products of their autocorrelations (Bartlett 1935)."""
-    n = summed.shape[-1]
-    power = np.abs(np.fft.rfft(summed, 2 * n, axis=-1)) ** 2
-    own = np.fft.irfft(power, 2 * n, axis=-1)[..., : n // 4]
+def _blocks_per_value(averages: Array, first: list[int], second: list[int]) -> Array:
+    """Return the blocks per independent value of each pair (Bartlett 1935).
+
+    It is the sum of the products of their autocorrelations.
+    """
+    n = averages.shape[-1]
+    power = np.abs(np.fft.rfft(averages, 2 * n, axis=-1)) ** 2
+    autocorrelation = np.fft.irfft(power, 2 * n, axis=-1)[..., : n // 4]
     with np.errstate(divide="ignore", invalid="ignore"):
-        own = np.nan_to_num(own / own[..., :1])
-    return np.asarray(2.0 * (own[..., one, :] * own[..., other, :]).sum(axis=-1) - 1.0)
+        autocorrelation = np.nan_to_num(autocorrelation / autocorrelation[..., :1])
+    return np.asarray(
+        2.0 * (autocorrelation[..., first, :] * autocorrelation[..., second, :]).sum(axis=-1) - 1.0
+    )
 
 
-def _moving(values: Array, span: int) -> Array:
-    """Sums over so many blocks about each."""
+def _moving_sum(values: Array, span: int) -> Array:
+    """Return sums over `span` blocks around each."""
     total = np.pad(np.cumsum(values, axis=-1), [(0, 0)] * (values.ndim - 1) + [(1, 0)])
     place = np.arange(values.shape[-1])
     low, high = np.maximum(place - span // 2, 0), np.minimum(place - span // 2 + span, place.size)
     return np.asarray(total[..., high] - total[..., low])
 
 
-def _together(r: Array, count: Array, pairs: list[tuple[int, int]], axes: int) -> Array:
-    """Score of all correlations by (record), window, span: likelihood ratio against independent axes (Bartlett 1954)."""
+def _score_all_axes(r: Array, count: Array, pairs: list[tuple[int, int]], axes: int) -> Array:
+    """Score all correlations by (record), window, span, jointly (Bartlett 1954)."""
     matrix = np.broadcast_to(np.eye(axes), (*r.shape[:-3], *r.shape[-2:], axes, axes)).copy()
     for place, (a, b) in enumerate(pairs):
         matrix[..., a, b] = matrix[..., b, a] = r[..., place, :, :]
@@ -205,5 +222,9 @@ def _together(r: Array, count: Array, pairs: list[tuple[int, int]], axes: int) -
     sign, logarithm = np.linalg.slogdet(np.where(known[..., None, None], matrix, np.eye(axes)))
     samples = np.maximum(count.min(axis=-3) - (2.0 * axes + 5.0) / 6.0, 1.0)
     freedom = len(pairs)
-    value = -samples * np.where(sign > 0, np.maximum(logarithm, _SINGULAR), _SINGULAR) / freedom
+    value = (
+        -samples
+        * np.where(sign > 0, np.maximum(logarithm, _MIN_LOG_DETERMINANT), _MIN_LOG_DETERMINANT)
+        / freedom
+    )
     return np.where(known, cube_root_score(value, np.full(value.shape, freedom / 2.0)), np.nan)

@@ -1,4 +1,4 @@
-"""What two axes share, of which the Allan variance of one axis shows nothing."""
+"""Score of the coherency between axes, which the Allan variance of one axis does not show."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
-    over_windows,
     statistic_dataset,
-    values_of,
+    sum_over_windows,
+    values_in_order,
     window_set,
 )
 
@@ -22,23 +22,23 @@ Complex = NDArray[np.complex128]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (5, 15, 45)
-_FEWEST = 8.0  # complex ordinates; with fewer a coherency is no number to judge by
+_MIN_FREQUENCIES = 8.0  # complex frequencies, for a meaningful coherency; design choice
 
 
 def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    """Score the coherency of every pair of axes, in bands and over all bands, against independent axes.
+    """Score the coherency of every pair of axes, in bands and in total, against independent axes.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects: the bands are weighed by its
-        spectrum, and a ``cross`` (pair, block, band) that the axes share by it is taken off.
+        Recording or null records, and the expectation of the simulation: its spectrum weights the
+        bands, and its ``cross`` (pair, block, band) is subtracted.
 
     Returns
     -------
     xarray.Dataset or None
-        None with one axis. Columns ``in phase`` and ``in quadrature``; ``ratio`` is the coherency,
-        and ``estimate`` too. Three axes or more have a row of all pairs together, over all bands in
+        None with one axis. Columns ``in phase`` and ``in quadrature``; ``ratio`` and ``estimate``
+        are the coherency. Three axes or more have a row of all pairs together, over all bands in
         phase.
     """
     if "cross" not in blocks or blocks.sizes.get("pair", 0) == 0:
@@ -47,23 +47,25 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     left = [axes.index(str(axis)) for axis in blocks["first"].values]
     right = [axes.index(str(axis)) for axis in blocks["second"].values]
     windows = window_set(blocks.sizes["block"], LENGTHS)
-    coherency, count = _coherency(blocks, baseline, left, right, windows)
-    components = [coherency.real, coherency.imag]
-    r = np.concatenate(components, axis=-1)
+    coherency, count = _pair_coherency(blocks, baseline, left, right, windows)
+    parts = [coherency.real, coherency.imag]
+    r = np.concatenate(parts, axis=-1)
     z = correlation_score(r, np.concatenate([2.0 * count] * 2, axis=-1))
     rows = [f"{axes[a]} {axes[b]}" for a, b in zip(left, right, strict=True)]
     bands = blocks.sizes["band"]
     if len(rows) > 1:
         z, r = (
             np.concatenate(
-                [component, np.full((*component.shape[:-3], 1, *component.shape[-2:]), np.nan)],
+                [part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)],
                 axis=-3,
             )
-            for component in (z, r)
+            for part in (z, r)
         )
         broad = z[..., :-1, :, bands]
-        together = (broad**2).mean(axis=-2)
-        z[..., -1, :, bands] = cube_root_score(together, np.full(together.shape, len(rows) / 2.0))
+        mean_square = (broad**2).mean(axis=-2)
+        z[..., -1, :, bands] = cube_root_score(
+            mean_square, np.full(mean_square.shape, len(rows) / 2.0)
+        )
         r[..., -1, :, bands] = np.sqrt((r[..., :-1, :, bands] ** 2).mean(axis=-2))
         rows = [*rows, " ".join(axes)]
     low, high = blocks["band_low"].values, blocks["band_high"].values
@@ -89,48 +91,48 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
     )
 
 
-def _coherency(
+def _pair_coherency(
     blocks: xr.Dataset, baseline: xr.Dataset, left: list[int], right: list[int], windows: Windows
 ) -> tuple[Complex, Array]:
-    """Coherency of each pair by (record), pair, window, band and over all bands last, and the complex ordinates in each.
+    """Compute the coherency and the number of complex frequencies by (record), pair, window, band.
 
-    Where both axes are loud in a few blocks only, these have all the weight: so many blocks of
-    equal power would scatter as much.
+    The last band is that of all bands together. If both axes are noisy in only a few blocks, these
+    dominate: the number is that of equal blocks with the same scatter.
     """
-    cross = values_of(blocks, "cross", "pair", "block", "band")
+    cross = values_in_order(blocks, "cross", "pair", "block", "band")
     if "cross" in baseline:
-        cross = cross - values_of(baseline, "cross", "pair", "block", "band")
+        cross = cross - values_in_order(baseline, "cross", "pair", "block", "band")
     power, shape = (
-        values_of(blocks, "power", "axis", "block", "band"),
-        values_of(blocks, "shape", "axis", "block", "band"),
+        values_in_order(blocks, "power", "axis", "block", "band"),
+        values_in_order(blocks, "shape", "axis", "block", "band"),
     )
-    spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
+    spectrum = values_in_order(baseline, "spectrum", "axis", "block", "band")
     with np.errstate(divide="ignore", invalid="ignore"):
         flat = power / spectrum
         cross = cross / np.sqrt(spectrum[left] * spectrum[right])
         weight = np.minimum(shape[..., left, :, :], shape[..., right, :, :])
-    there = (
+    present = (
         np.isfinite(cross)
         & np.isfinite(flat[..., left, :, :])
         & np.isfinite(flat[..., right, :, :])
         & (weight > 0)
     )
-    weight = np.where(there, weight, 0.0)
+    weight = np.where(present, weight, 0.0)
 
     def summed(values: Complex) -> Complex:
-        found = over_windows(np.where(there, values, 0.0) * weight, windows)
-        return np.concatenate([found, found.sum(axis=-1, keepdims=True)], axis=-1)
+        sums = sum_over_windows(np.where(present, values, 0.0) * weight, windows)
+        return np.concatenate([sums, sums.sum(axis=-1, keepdims=True)], axis=-1)
 
     one, other = flat[..., left, :, :], flat[..., right, :, :]
     product = summed(one).real * summed(other).real
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = summed(cross) / np.sqrt(product)
+        sums = summed(cross) / np.sqrt(product)
         count = np.fmin(summed(np.ones_like(one)).real, product / summed(one * other).real)
-    return np.where(count >= _FEWEST, found, complex(np.nan, np.nan)), count
+    return np.where(count >= _MIN_FREQUENCIES, sums, complex(np.nan, np.nan)), count
 
 
 def correlation_score(r: Array, samples: Array) -> Array:
-    """Normal score of a correlation of so many independent samples of known mean (Wallace 1959).
+    """Return the normal score of a correlation of independent samples of known mean (Wallace 1959).
 
     Examples
     --------

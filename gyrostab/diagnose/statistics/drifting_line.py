@@ -1,4 +1,4 @@
-"""Lines that move through the spectrum: at each frequency too short to stand out, but along their way."""
+"""Score of drifting lines, too short at each frequency to be significant, along their paths."""
 
 from __future__ import annotations
 
@@ -16,72 +16,68 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     exponential_score,
     statistic_dataset,
-    values_of,
+    values_in_order,
 )
 
 __all__ = ["score"]
 
-_STRETCHES = 8  # of the spectrum, in which a way begins and ends
-_FEWEST = 6  # parts of the record that a way must lead through
-_LEAST = 4  # lines that a line must move: less is no motion
-_BENDS = (
-    -0.7,
-    0.0,
-    0.7,
-)  # of a way, as a share of its length: it hastens, keeps its speed, or slows
-_CELL, _PART = (
-    4.0,
-    3.0,
-)  # standard deviations that one line of one part, and one part, count for: a moving line is everywhere
-_MOST = 250  # lines; more are averaged in groups
-_INDEPENDENT = 0.2  # of the ways that are looked at
-_USUAL = 20.0  # ways that do as much, beyond which a score is as low as any
-_BUMP = 0.371  # averaging time times frequency where the Allan variance of a sine is largest
+_SPECTRUM_SECTIONS = 8  # in which paths begin and end; design choice
+_MIN_PARTS = 6  # of the record, that a path must cover; design choice
+_MIN_MOVED_LINES = 4  # of a drifting line; design choice
+_BENDS = (-0.7, 0.0, 0.7)  # of a path, as a share of its length: accelerating, steady, slowing
+#: Largest contribution of a line of one part, and of a part: a drifting line is in all parts.
+_MAX_CELL_SIGMA, _MAX_PART_SIGMA = 4.0, 3.0
+_MAX_LINES = 250  # more are averaged in groups; limits time
+_INDEPENDENT_SHARE = 0.2  # of the paths that are tried; estimate
+_MAX_EXPECTED_PATHS = 20.0  # that noise has; beyond, a score is as low as any
+_ADEV_PEAK_PRODUCT = (
+    0.371  # tau times frequency at which the Allan variance of a sine peaks; derived
+)
 
 
 def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    r"""Score the lines of the spectrum along ways: each part of the record at another frequency.
+    r"""Score the lines of the spectrum along paths: each part of the record at another frequency.
 
     A line of power :math:`E` over the density of the noise in every block, moving over L lines
-    while B blocks pass, is in each line of each of P parts for B / L blocks only. There it raises
-    the mean of B / P blocks by E P / L, which scatters by
-    :math:`\sqrt{P / B}`; the L cells of its way together stand out by :math:`E \sqrt{P B / L}` standard deviations. The ways begin
-    anywhere, lead over 4 lines or more in either direction, and hasten or slow by up to a half of
-    their mean speed; the largest of those that lead from one eighth of the spectrum to another
-    gives the score of that column.
+    while B blocks pass, is in each line of each of P parts for only B / L blocks. There it raises
+    the mean of B / P blocks by E P / L, which scatters by :math:`\sqrt{P / B}`; the L cells of its
+    path together exceed noise by :math:`E \sqrt{P B / L}` standard deviations. Paths begin
+    anywhere, cover 4 lines or more in either direction, and accelerate or slow down by up to a half
+    of their mean speed. The largest sum from one eighth of the spectrum to another is the score of
+    that column.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects.
+        Recording or null records, and the expectation of the simulation.
 
     Returns
     -------
     xarray.Dataset or None
         None without lines, or with spectra of fewer than 6 parts of the record. ``ratio`` is the
-        power along the way over that of the noise. Several axes have a row of all together.
+        power along the path over that of the noise. Several axes have a row of all together.
 
     Notes
     -----
-    Every line is seen relative to the lines around it in its part and to its own mean over the
-    parts, and counts for little by itself: a line that stands still, or a part of the record that
-    is louder, is no motion.
+    Every line is relative to the lines around it in its part and to its own mean over the parts,
+    and its contribution is limited: neither a steady line nor a noisier part of the record is a
+    drifting line.
     """
     if "line_power" not in blocks:
         return None
     power, weight = (
-        values_of(blocks, "line_power", "axis", "part", "line"),
-        values_of(blocks, "line_weight", "axis", "part"),
+        values_in_order(blocks, "line_power", "axis", "part", "line"),
+        values_in_order(blocks, "line_weight", "axis", "part"),
     )
-    there = np.isfinite(power).reshape(-1, *power.shape[-3:]).all(axis=(0, 3)) & (weight > 0)
-    components = np.flatnonzero(there.all(axis=0))
+    present = np.isfinite(power).reshape(-1, *power.shape[-3:]).all(axis=(0, 3)) & (weight > 0)
+    parts = np.flatnonzero(present.all(axis=0))
     lines = power.shape[-1]
-    if components.size < _FEWEST or lines < 2 * _STRETCHES:
+    if parts.size < _MIN_PARTS or lines < 2 * _SPECTRUM_SECTIONS:
         return None
-    cells = _cells(
-        power[..., components, :],
-        weight[:, components, None],
-        _expected(blocks, baseline)[:, components],
+    cells = _score_cells(
+        power[..., parts, :],
+        weight[:, parts, None],
+        _expected_spectrum(blocks, baseline)[:, parts],
     )
     axes = [str(axis) for axis in blocks["axis"].values]
     if len(axes) > 1:
@@ -91,110 +87,122 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
             ),
             [*axes, " ".join(axes)],
         )
-    cells = cells / np.maximum(
-        cells.std(axis=(-2, -1), keepdims=True), 1.0
-    )  # axes with noise in common add up to more
-    edges = np.stack([components, components + 1]) - components[0]
-    largest, ways = _largest(cells, edges / edges.max())
+    # Axes with common noise add up to more.
+    cells = cells / np.maximum(cells.std(axis=(-2, -1), keepdims=True), 1.0)
+    edges = np.stack([parts, parts + 1]) - parts[0]
+    largest, path_count = _largest_path_sums(cells, edges / edges.max())
     with np.errstate(divide="ignore", invalid="ignore"):
-        more = np.exp(
-            np.log(_INDEPENDENT * ways) + log_ndtr(-largest)
-        )  # ways of noise that would do as much
+        # Expected number of paths of noise with this score.
+        expected_count = np.exp(np.log(_INDEPENDENT_SHARE * path_count) + log_ndtr(-largest))
         z = np.where(
-            ways > 0, exponential_score(-np.log(-np.expm1(-np.minimum(more, _USUAL)))), np.nan
+            path_count > 0,
+            exponential_score(-np.log(-np.expm1(-np.minimum(expected_count, _MAX_EXPECTED_PATHS)))),
+            np.nan,
         )
     block_count = -(-np.arange(power.shape[-2] + 1) * blocks.sizes["block"] // power.shape[-2])
     return statistic_dataset(
         "spectrum",
         blocks,
         rows=axes,
-        windows=Windows(block_count[components[:1]], block_count[components[-1:] + 1]),
-        columns=_columns(blocks["line_frequency"].values),
+        windows=Windows(block_count[parts[:1]], block_count[parts[-1:] + 1]),
+        columns=_path_columns(blocks["line_frequency"].values),
         z=z[..., None, :],
-        ratio=np.where(ways > 0, largest, np.nan)[..., None, :],
+        ratio=np.where(path_count > 0, largest, np.nan)[..., None, :],
         one_sided=True,
     )
 
 
-def _expected(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
-    """Spectrum of the baseline at the lines by axis, part, line."""
-    components, block_count = blocks.sizes["part"], blocks.sizes["block"]
-    of = np.arange(block_count) * components // block_count
+def _expected_spectrum(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
+    """Return the spectrum of the baseline at the lines by axis, part, line."""
+    parts, block_count = blocks.sizes["part"], blocks.sizes["block"]
+    part_of_block = np.arange(block_count) * parts // block_count
     lines = blocks["line_frequency"].values
     return np.stack(
         [
-            expected_lines(baseline.isel(block=of == component), lines)
-            for component in range(components)
+            expected_lines(baseline.isel(block=part_of_block == part), lines)
+            for part in range(parts)
         ],
         axis=1,
     )
 
 
-def _cells(power: Array, weight: Array, expected: Array) -> Array:
-    """Near-normal score of every line of every part beside the lines around it and beside its own mean; some lines together where many."""
+def _score_cells(power: Array, weight: Array, expected: Array) -> Array:
+    """Score every line of every part relative to its surroundings and its mean over the parts.
+
+    Many lines are averaged in groups.
+    """
     flat = power / expected
     flat = flat / local_level(flat)
     flat = flat / ((flat * weight).sum(axis=-2, keepdims=True) / weight.sum(axis=-2, keepdims=True))
-    cells = np.clip(cube_root_score(flat, weight), -_CELL, _CELL)
-    wide = -(-cells.shape[-1] // _MOST)
-    lines = cells.shape[-1] // wide
+    cells = np.clip(cube_root_score(flat, weight), -_MAX_CELL_SIGMA, _MAX_CELL_SIGMA)
+    group = -(-cells.shape[-1] // _MAX_LINES)
+    lines = cells.shape[-1] // group
     return np.asarray(
-        cells[..., : lines * wide].reshape(*cells.shape[:-1], lines, wide).sum(axis=-1)
-        / np.sqrt(wide)
+        cells[..., : lines * group].reshape(*cells.shape[:-1], lines, group).sum(axis=-1)
+        / np.sqrt(group)
     )
 
 
-def _moves(lines: int) -> Iterator[tuple[int, float]]:
-    """Lines by which a way leads on, and its bend."""
-    move = _LEAST
+def _path_shapes(lines: int) -> Iterator[tuple[int, float]]:
+    """Yield the lines that a path moves by, and its bend."""
+    move = _MIN_MOVED_LINES
     while move < lines:
         yield from ((sign * move, bend) for sign in (1, -1) for bend in _BENDS)
-        move += max(1, move // _STRETCHES)
+        move += max(1, move // _SPECTRUM_SECTIONS)
 
 
-def _largest(cells: Array, edges: Array) -> tuple[Array, Array]:
-    """Largest sum along a way from each stretch to each by (record), row, column [standard deviations], and the ways looked at.
+def _largest_path_sums(cells: Array, edges: Array) -> tuple[Array, Array]:
+    """Find the largest sum along paths between sections by (record), row, column; count paths.
 
-    `cells` are (record), row, part, line, `edges` (2, part) the begin and end of each part, 0 to 1.
+    `cells` are (record), row, part, line [standard deviations], `edges` (2, part) the begin and end
+    of each part, 0 to 1.
     """
-    lines, components = cells.shape[-1], cells.shape[-2]
+    lines, parts = cells.shape[-1], cells.shape[-2]
     total = np.concatenate([np.zeros((*cells.shape[:-1], 1)), np.cumsum(cells, axis=-1)], axis=-1)
-    largest = np.full((*cells.shape[:-2], _STRETCHES**2), -np.inf)
-    ways = np.zeros(_STRETCHES**2)
-    for move, bend in _moves(lines):
-        at = np.rint(move * (edges + bend * edges * (1.0 - edges))).astype(np.int64)
-        low, high = at.min(axis=0), at.max(axis=0) + 1
+    largest = np.full((*cells.shape[:-2], _SPECTRUM_SECTIONS**2), -np.inf)
+    path_count = np.zeros(_SPECTRUM_SECTIONS**2)
+    for move, bend in _path_shapes(lines):
+        shift = np.rint(move * (edges + bend * edges * (1.0 - edges))).astype(np.int64)
+        low, high = shift.min(axis=0), shift.max(axis=0) + 1
         begin, end, step = (
             max(0, -move),
             lines - max(0, move),
-            max(1, abs(move) // (2 * components)),
+            max(1, abs(move) // (2 * parts)),
         )
         start = np.arange(begin, end, step)
-        along = np.zeros((*cells.shape[:-2], start.size))
-        for component in range(components):
+        sums = np.zeros((*cells.shape[:-2], start.size))
+        for part in range(parts):
             upper, lower = (
-                slice(begin + edge, end + edge, step) for edge in (high[component], low[component])
+                slice(begin + edge, end + edge, step) for edge in (high[part], low[part])
             )
-            inside = total[..., component, upper] - total[..., component, lower]
-            along += np.minimum(inside / np.sqrt(high[component] - low[component]), _PART)
-        column = start * _STRETCHES // lines * _STRETCHES + (start + move) * _STRETCHES // lines
+            inside = total[..., part, upper] - total[..., part, lower]
+            sums += np.minimum(inside / np.sqrt(high[part] - low[part]), _MAX_PART_SIGMA)
+        column = (
+            start * _SPECTRUM_SECTIONS // lines * _SPECTRUM_SECTIONS
+            + (start + move) * _SPECTRUM_SECTIONS // lines
+        )
         first = np.flatnonzero(np.diff(column, prepend=-1))
-        best = np.maximum.reduceat(along / np.sqrt(components), first, axis=-1)
+        best = np.maximum.reduceat(sums / np.sqrt(parts), first, axis=-1)
         largest[..., column[first]] = np.maximum(largest[..., column[first]], best)
-        np.add.at(ways, column, 1.0)
-    return largest, ways
+        np.add.at(path_count, column, 1.0)
+    return largest, path_count
 
 
-def _columns(frequency: Array) -> dict[str, Any]:
-    """From the middle of one stretch of the spectrum to that of another, and the averaging times between."""
-    edges = np.linspace(frequency[0], frequency[-1], _STRETCHES + 1)
+def _path_columns(frequency: Array) -> dict[str, Any]:
+    """Return columns from the middle of one section to another, and averaging times between."""
+    edges = np.linspace(frequency[0], frequency[-1], _SPECTRUM_SECTIONS + 1)
     middle = (edges[1:] + edges[:-1]) / 2.0
-    one, other = (
-        component.ravel()
-        for component in np.meshgrid(np.arange(_STRETCHES), np.arange(_STRETCHES), indexing="ij")
+    begin_section, end_section = (
+        part.ravel()
+        for part in np.meshgrid(
+            np.arange(_SPECTRUM_SECTIONS), np.arange(_SPECTRUM_SECTIONS), indexing="ij"
+        )
     )
     return {
-        "what": [f"glide {middle[a]:.3g} {middle[b]:.3g}" for a, b in zip(one, other, strict=True)],
-        "tau_min_s": _BUMP / edges[np.maximum(one, other) + 1],
-        "tau_max_s": _BUMP / edges[np.minimum(one, other)],
+        "what": [
+            f"drifting {middle[a]:.3g} {middle[b]:.3g}"
+            for a, b in zip(begin_section, end_section, strict=True)
+        ],
+        "tau_min_s": _ADEV_PEAK_PRODUCT / edges[np.maximum(begin_section, end_section) + 1],
+        "tau_max_s": _ADEV_PEAK_PRODUCT / edges[np.minimum(begin_section, end_section)],
     }

@@ -1,4 +1,4 @@
-"""The window means, to which the Allan variance is blind, against those of the simulation."""
+"""Score of the window means, which the Allan variance does not show, against the simulation."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_p
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
-    over_windows,
     statistic_dataset,
-    values_of,
+    sum_over_windows,
+    values_in_order,
     window_set,
 )
 from gyrostab.kernels.regression.boxcars import (
@@ -28,8 +28,8 @@ from gyrostab.noise import HOUR
 __all__ = [
     "LENGTHS",
     "MeanNoise",
+    "apply_precision",
     "mean_noise",
-    "precision",
     "region_mean",
     "score",
     "window_means",
@@ -40,7 +40,7 @@ LENGTHS = (1, 5, 15, 45)
 
 
 class MeanNoise(NamedTuple):
-    """Covariance of the block means of one axis, in the form that the filters need."""
+    """Covariance of the block means of one axis, as the filters need it."""
 
     present: Array
     innovation: Array
@@ -50,16 +50,16 @@ class MeanNoise(NamedTuple):
 
 
 def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
-    """Score the mean of windows of four lengths against the rest of the record, with the noise of the simulation.
+    """Score the mean of windows of four lengths against the rest of the record.
 
-    The score is that of a constant which is added inside the window alone, by generalised least
-    squares beside a constant of the record: where the noise is white it is the window's mean less
-    that of the rest, over its standard deviation; where it wanders, the neighbours count for more.
+    The score is that of a constant added only in the window, by generalised least squares with the
+    noise of the simulation and a constant of the record. For white noise it is the window's mean
+    minus that of the rest, over its standard deviation; for slow noise, neighbours count more.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects.
+        Recording or null records, and the expectation of the simulation.
 
     Returns
     -------
@@ -89,21 +89,21 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 
 
 def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:
-    """Matched filter of every window and its information: their ratio is the constant that stands in the window alone.
+    """Compute matched filter and information of every window; their ratio is the constant in it.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
         As for `score`.
     windows : Windows
-        Not the whole record, which says nothing beside its own constant.
+        Windows other than the whole record, whose constant is free.
 
     Returns
     -------
     amount, information : ndarray ((record,) axis, window), (axis, window)
-        [degree-1 hour], [degree-2 hour2]; NaN where too little of the window is there.
+        [degree-1 hour], [degree-2 hour2]; NaN if too little of the window is present.
     """
-    residual = values_of(blocks, "mean", "axis", "block") - values_of(
+    residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
         baseline, "known_mean", "axis", "block"
     )
     amount = np.full((*residual.shape[:-1], windows.first.size), np.nan)
@@ -111,38 +111,42 @@ def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> 
     for axis in range(residual.shape[-2]):
         present = np.isfinite(residual[..., axis, :]).reshape(-1, residual.shape[-1]).any(axis=0)
         noise = mean_noise(blocks, baseline, axis, present)
-        amount[..., axis, :], information[axis] = _matched(residual[..., axis, :], noise, windows)
+        amount[..., axis, :], information[axis] = _matched_filter(
+            residual[..., axis, :], noise, windows
+        )
     return amount, information
 
 
-def _matched(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array, Array]:
-    """Filter output and information of each window, both free from a constant."""
-    weighted = precision(residual, noise)
-    one = precision(np.ones(residual.shape[-1]), noise)
+def _matched_filter(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array, Array]:
+    """Return filter output and information of each window, both independent of a constant."""
+    weighted = apply_precision(residual, noise)
+    one = apply_precision(np.ones(residual.shape[-1]), noise)
     total = one.sum()
     weighted = weighted - one * (weighted.sum(axis=-1, keepdims=True) / total)
     own = np.empty(windows.first.size)
     boxcar_information(
         windows.first, windows.stop, noise.innovation, noise.gain, noise.decay, noise.remaining, own
     )
-    across = over_windows(one[:, None], windows)[:, 0]
-    count = over_windows(noise.present[:, None], windows)[:, 0]
+    across = sum_over_windows(one[:, None], windows)[:, 0]
+    count = sum_over_windows(noise.present[:, None], windows)[:, 0]
     information = own - across**2 / total
     enough = (count >= 0.25 * windows.length) & (information > 1e-3 * own)
-    return over_windows(weighted[..., None], windows)[..., 0], np.where(enough, information, np.nan)
+    return sum_over_windows(weighted[..., None], windows)[..., 0], np.where(
+        enough, information, np.nan
+    )
 
 
 def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Array) -> MeanNoise:
-    """Covariance of the block means of an axis: white, random walk and flicker of the baseline, and what else it knows to wander.
+    """Return the covariance of the block means of an axis, with all known random processes.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
         As for `score`.
     axis : int
-        Number of the axis.
+        Index of the axis.
     present : ndarray of bool (block,)
-        Blocks whose mean is used.
+        Blocks with a mean.
     """
     terms = [str(term) for term in baseline["term"].values]
     b, k = (
@@ -171,8 +175,8 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, present: Arr
     return MeanNoise(present.astype(float), innovation, gain, decay, remaining)
 
 
-def precision(series: Array, noise: MeanNoise) -> Array:
-    """Inverse covariance times each series (..., block); zero at missing blocks."""
+def apply_precision(series: Array, noise: MeanNoise) -> Array:
+    """Multiply each series (..., block) by the inverse covariance; zero at missing blocks."""
     rows = np.ascontiguousarray(series.reshape(-1, series.shape[-1]), dtype=np.float64)
     out = np.empty_like(rows)
     precision_times(rows, noise.innovation, noise.gain, noise.decay, out)
@@ -180,13 +184,16 @@ def precision(series: Array, noise: MeanNoise) -> Array:
 
 
 def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:
-    """Constant that stands in some blocks of a recording alone, by generalised least squares beside one of the record [degree hour-1]."""
+    """Return the constant added only in some blocks of a recording [degree hour-1].
+
+    By generalised least squares with a constant of the record.
+    """
     residual = (
-        values_of(blocks, "mean", "axis", "block")[axis]
-        - values_of(baseline, "known_mean", "axis", "block")[axis]
+        values_in_order(blocks, "mean", "axis", "block")[axis]
+        - values_in_order(baseline, "known_mean", "axis", "block")[axis]
     )
     noise = mean_noise(blocks, baseline, axis, np.isfinite(residual))
-    rows = precision(np.stack([np.ones(residual.size), inside.astype(float)]), noise)
+    rows = apply_precision(np.stack([np.ones(residual.size), inside.astype(float)]), noise)
     columns = np.stack([np.ones(residual.size), inside.astype(float)])
     solved = np.linalg.lstsq(rows @ columns.T, rows @ np.nan_to_num(residual), rcond=None)[0]
     return float(solved[1])

@@ -1,4 +1,4 @@
-"""The dynamic Allan variance of the reduced recording against that of the simulation."""
+"""Score of the dynamic Allan variance of the block statistics against that of the simulation."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
-    over_windows,
     statistic_dataset,
-    values_of,
+    sum_over_windows,
+    values_in_order,
     window_set,
 )
 from gyrostab.noise import LAWS
 
-__all__ = ["LENGTHS", "allan_surface", "score", "transfer"]
+__all__ = ["LENGTHS", "allan_surface", "allan_transfer", "score"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
-_FINE = 256  # points of the integral of the transfer function in one band
+_INTEGRATION_POINTS = 256  # of the transfer function in one band, at least
 
 
-def transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
-    """Allan variance per unit of two-sided density in each band.
+def allan_transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
+    """Return the Allan variance per unit of two-sided density in each band.
 
     Parameters
     ----------
@@ -45,11 +45,12 @@ def transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
 
     Examples
     --------
-    >>> weights = transfer(np.array([0.0, 1.0]), np.array([1.0, 50.0]), np.array([0.01, 0.1]), 100.0)
-    >>> (weights.sum(axis=1) * 0.2**2).round(4)              # white noise of 0.2 (deg/h)/sqrt(Hz): N^2 / tau
+    >>> low, high, tau = np.array([0.0, 1.0]), np.array([1.0, 50.0]), np.array([0.01, 0.1])
+    >>> weights = allan_transfer(low, high, tau, 100.0)
+    >>> (weights.sum(axis=1) * 0.2**2).round(4)  # white noise of 0.2 (deg/h)/sqrt(Hz): N^2 / tau
     array([4. , 0.4])
     """
-    points = max(_FINE, round(8 * float(np.max((high - low)[:, None] * tau))))
+    points = max(_INTEGRATION_POINTS, round(8 * float(np.max((high - low)[:, None] * tau))))
     share = (np.arange(points) + 0.5) / points
     out = np.empty((tau.size, low.size))
     for band in range(low.size):
@@ -65,14 +66,14 @@ def transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
 def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Score the Allan variance in windows of three lengths and of the whole record.
 
-    Inside a block it is taken from the powers of the bands, at octaves of the sampling interval up
-    to a quarter of a block; the column ``level`` weighs all bands alike, as the likelihood does.
-    From a block on it is taken from the block means.
+    Within blocks it is computed from the band powers, at octaves of the sampling interval up to a
+    quarter of a block; the column ``level`` weights all bands equally, as the likelihood does. From
+    a block on it is computed from the block means.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects.
+        Recording or null records, and the expectation of the simulation.
 
     Returns
     -------
@@ -95,14 +96,16 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 def allan_surface(
     blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows | None = None
 ) -> dict[str, Any]:
-    """Observed and expected Allan variance [degree2 hour-2] by (record), axis, window, tau, and the shape of their gamma law.
+    """Compute observed and expected Allan variances, and the shape of their gamma distribution.
+
+    By (record), axis, window, tau [degree2 hour-2].
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        As for `score`; the known mean is taken off before.
+        As for `score`; the known mean is subtracted.
     windows : Windows, optional
-        Those of `score` by default.
+        By default those of `score`.
 
     Returns
     -------
@@ -110,42 +113,50 @@ def allan_surface(
         ``observed``, ``expected``, ``shape``; ``windows``; ``columns`` as for `statistic_dataset`.
     """
     windows = window_set(blocks.sizes["block"], LENGTHS) if windows is None else windows
-    components = [_inside(blocks, baseline, windows), _beyond(blocks, baseline, windows)]
+    surfaces = [
+        _surface_within_blocks(blocks, baseline, windows),
+        _surface_of_means(blocks, baseline, windows),
+    ]
     joined: dict[str, Any] = {"windows": windows}
     for name in ("observed", "expected", "shape"):
-        joined[name] = np.concatenate([component[name] for component in components], axis=-1)
+        joined[name] = np.concatenate([surface[name] for surface in surfaces], axis=-1)
     joined["columns"] = {
-        name: np.concatenate([component["columns"][name] for component in components])
-        for name in components[0]["columns"]
+        name: np.concatenate([surface["columns"][name] for surface in surfaces])
+        for name in surfaces[0]["columns"]
     }
     return joined
 
 
-def _inside(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
+def _surface_within_blocks(
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
+) -> dict[str, Any]:
+    """Compute the surface within blocks, from band powers."""
     rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
     power, shape = (
-        values_of(blocks, "power", "axis", "block", "band"),
-        values_of(blocks, "shape", "axis", "block", "band"),
+        values_in_order(blocks, "power", "axis", "block", "band"),
+        values_in_order(blocks, "shape", "axis", "block", "band"),
     )
-    spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
+    spectrum = values_in_order(baseline, "spectrum", "axis", "block", "band")
     k = 2 ** np.arange(max(1, int(np.log2(block * rate / 4.0)) + 1))
-    weights = transfer(blocks["band_low"].values, blocks["band_high"].values, k / rate, rate).T
-    there = np.isfinite(power) & np.isfinite(spectrum) & (shape > 0)
+    weights = allan_transfer(
+        blocks["band_low"].values, blocks["band_high"].values, k / rate, rate
+    ).T
+    present = np.isfinite(power) & np.isfinite(spectrum) & (shape > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(there, 1.0 / shape, 0.0)
-        relative = np.where(there, power / spectrum * shape, 0.0).sum(axis=-1, keepdims=True)
-    power, spectrum, each = (
-        np.where(there, power, 0.0),
-        np.where(there, spectrum, 0.0),
-        np.where(there, shape, 0.0),
+        inverse = np.where(present, 1.0 / shape, 0.0)
+        relative = np.where(present, power / spectrum * shape, 0.0).sum(axis=-1, keepdims=True)
+    power, spectrum, used_shape = (
+        np.where(present, power, 0.0),
+        np.where(present, spectrum, 0.0),
+        np.where(present, shape, 0.0),
     )
-    total = each.sum(axis=-1, keepdims=True)
-    observed = over_windows(np.concatenate([power @ weights, relative], axis=-1), windows)
-    expected = over_windows(np.concatenate([spectrum @ weights, total], axis=-1), windows)
-    variance = over_windows(
+    total = used_shape.sum(axis=-1, keepdims=True)
+    observed = sum_over_windows(np.concatenate([power @ weights, relative], axis=-1), windows)
+    expected = sum_over_windows(np.concatenate([spectrum @ weights, total], axis=-1), windows)
+    variance = sum_over_windows(
         np.concatenate([(spectrum**2 * inverse) @ weights**2, total], axis=-1), windows
     )
-    count = over_windows(there.any(axis=-1, keepdims=True).astype(float), windows)
+    count = sum_over_windows(present.any(axis=-1, keepdims=True).astype(float), windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         gamma = np.where(count >= 0.25 * windows.length[:, None], expected**2 / variance, np.nan)
         return {
@@ -160,38 +171,41 @@ def _inside(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[
         }
 
 
-def _beyond(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
-    """Averaging times of whole blocks: second differences of the block means, all that overlap."""
+def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
+    """Compute the surface at whole blocks, from all overlapping differences of block means."""
     block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
-    means = values_of(blocks, "mean", "axis", "block") - values_of(
+    means = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
         baseline, "known_mean", "axis", "block"
     )
-    white = values_of(baseline, "mean_variance", "axis", "block")
+    white = values_in_order(baseline, "mean_variance", "axis", "block")
     sizes = [k for k in (1, 2, 4, 8, 16, 32) if 4 * k <= block_count]
-    components: dict[str, list[Array]] = {"observed": [], "expected": [], "shape": []}
+    surfaces: dict[str, list[Array]] = {"observed": [], "expected": [], "shape": []}
     for k in sizes:
-        d2 = _differences(means, k) ** 2 / 2.0
-        expected = _pair_variance(white, k) / 2.0 + _slow(blocks, baseline, k * block)[:, None]
-        there = np.isfinite(d2) & np.isfinite(expected)
+        d2 = _mean_differences(means, k) ** 2 / 2.0
+        expected = (
+            _pair_variance(white, k) / 2.0
+            + _slow_allan_variance(blocks, baseline, k * block)[:, None]
+        )
+        present = np.isfinite(d2) & np.isfinite(expected)
         pairs = Windows(windows.first, np.maximum(windows.stop - 2 * k + 1, windows.first))
-        count = over_windows(there[..., None].astype(float), pairs)[..., 0]
+        count = sum_over_windows(present[..., None].astype(float), pairs)[..., 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             fits = (count >= 0.5 * pairs.length) & (pairs.length > 0) & (windows.length >= 4 * k)
-            components["observed"].append(
-                over_windows(np.where(there, d2, 0.0)[..., None], pairs)[..., 0] / count
+            surfaces["observed"].append(
+                sum_over_windows(np.where(present, d2, 0.0)[..., None], pairs)[..., 0] / count
             )
-            components["expected"].append(
-                over_windows(np.where(there, expected, 0.0)[..., None], pairs)[..., 0] / count
+            surfaces["expected"].append(
+                sum_over_windows(np.where(present, expected, 0.0)[..., None], pairs)[..., 0] / count
             )
-            table = _shape(np.arange(int(count.max(initial=0)) + 1), k)
-            components["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
+            table = _gamma_shape(np.arange(int(count.max(initial=0)) + 1), k)
+            surfaces["shape"].append(np.where(fits, table[count.astype(np.int64)], np.nan))
     if not sizes:
         nothing = np.empty((*means.shape[:-1], windows.first.size, 0))
-        joined: dict[str, Any] = dict.fromkeys(components, nothing)
+        joined: dict[str, Any] = dict.fromkeys(surfaces, nothing)
     else:
         joined = {
             name: np.stack(np.broadcast_arrays(*values), axis=-1)
-            for name, values in components.items()
+            for name, values in surfaces.items()
         }
     tau = np.array(sizes, dtype=float) * block
     joined["columns"] = {
@@ -202,8 +216,11 @@ def _beyond(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[
     return joined
 
 
-def _differences(means: Array, k: int) -> Array:
-    """Mean of k blocks less that of the k before, all starts; NaN where one is missing. As long as the record."""
+def _mean_differences(means: Array, k: int) -> Array:
+    """Return the mean of k blocks minus that of the k before; NaN if incomplete.
+
+    As long as the record.
+    """
     total = np.concatenate(
         [
             np.zeros((*means.shape[:-1], 1)),
@@ -216,10 +233,11 @@ def _differences(means: Array, k: int) -> Array:
     )
     difference = (total[..., 2 * k :] - 2.0 * total[..., k:-k] + total[..., : -2 * k]) / k
     difference[lost[..., 2 * k :] > lost[..., : -2 * k]] = np.nan
-    return _padded(difference, means.shape[-1])
+    return _pad_end(difference, means.shape[-1])
 
 
 def _pair_variance(white: Array, k: int) -> Array:
+    """Return the white variance of the differences of means of k blocks."""
     total = np.concatenate(
         [
             np.zeros((*white.shape[:-1], 1)),
@@ -227,17 +245,20 @@ def _pair_variance(white: Array, k: int) -> Array:
         ],
         axis=-1,
     )
-    return _padded((total[..., 2 * k :] - total[..., : -2 * k]) / k**2, white.shape[-1])
+    return _pad_end((total[..., 2 * k :] - total[..., : -2 * k]) / k**2, white.shape[-1])
 
 
-def _padded(values: Array, size: int) -> Array:
+def _pad_end(values: Array, size: int) -> Array:
+    """Append NaN up to the size of the record."""
     rest = np.full((*values.shape[:-1], size - values.shape[-1]), np.nan)
     return np.concatenate([values, rest], axis=-1)
 
 
-def _slow(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
-    """Allan variance of the slow terms by axis [degree2 hour-2]; a ramp is in the known mean."""
-    coefficient = values_of(baseline.transpose(..., "axis", "term"), "coefficient", "axis", "term")
+def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
+    """Return the Allan variance of B and K by axis [degree2 hour-2], without a ramp."""
+    coefficient = values_in_order(
+        baseline.transpose(..., "axis", "term"), "coefficient", "axis", "term"
+    )
     total = np.zeros(blocks.sizes["axis"])
     for place, term in enumerate(baseline["term"].values):
         if str(term) in ("B", "K"):
@@ -245,8 +266,8 @@ def _slow(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
     return np.asarray(total)
 
 
-def _shape(count: Any, k: int) -> Array:
-    """Shape of the gamma law of the mean of `count` overlapping terms in white noise."""
+def _gamma_shape(count: Any, k: int) -> Array:
+    """Return the gamma shape of the mean of `count` overlapping terms in white noise."""
     region = np.concatenate([-np.ones(k), np.ones(k)])
     r2 = (np.correlate(region, region, mode="full")[2 * k - 1 :] / (2 * k)) ** 2
     lag = np.arange(r2.size)

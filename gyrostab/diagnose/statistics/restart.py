@@ -1,28 +1,28 @@
-"""What happens after a restart, all restarts laid on top of each other."""
+"""Score of the transients after restarts, with all restarts superposed."""
 
 from __future__ import annotations
 
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.statistics.mean import MeanNoise, mean_noise, precision
-from gyrostab.diagnose.statistics.scores import Array, Windows, statistic_dataset, values_of
+from gyrostab.diagnose.statistics.mean import MeanNoise, apply_precision, mean_noise
+from gyrostab.diagnose.statistics.scores import Array, Windows, statistic_dataset, values_in_order
 
 __all__ = ["score"]
 
-_TIMES = (2, 6, 18)  # blocks in which a transient falls to 1/e
-_BESIDE = 15  # blocks before and after a restart that are compared
+_DECAY_BLOCKS = (2, 6, 18)  # in which a transient falls to 1/e; design choice
+_SIDE_BLOCKS = 15  # before and after a restart, that are compared; design choice
 
 
 def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    """Score transients that begin at every restart alike, and a jump of the mean at each.
+    """Score transients that begin equally at every restart, and a jump of the mean at each.
 
-    Both are free from a constant of the record, and have the noise of the simulation.
+    Both are independent of a constant of the record, and have the noise of the simulation.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects.
+        Recording or null records, and the expectation of the simulation.
 
     Returns
     -------
@@ -30,64 +30,67 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         None without restarts. ``estimate`` is the transient at the restart, or the jump [degree
         hour-1].
     """
-    at = restart_blocks(blocks)
-    if at.size == 0:
+    restarts = restart_blocks(blocks)
+    if restarts.size == 0:
         return None
     block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
-    designs, windows = _designs(at, block_count)
-    residual = values_of(blocks, "mean", "axis", "block") - values_of(
+    designs, windows = _restart_designs(restarts, block_count)
+    residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
         baseline, "known_mean", "axis", "block"
     )
     z, estimate = (np.full((*residual.shape[:-1], len(designs)), np.nan) for _ in range(2))
     for axis in range(blocks.sizes["axis"]):
         present = np.isfinite(residual[..., axis, :]).reshape(-1, block_count).any(axis=0)
         noise = mean_noise(blocks, baseline, axis, present)
-        amount, information = _matched(residual[..., axis, :], designs, noise)
+        amount, information = _matched_filter(residual[..., axis, :], designs, noise)
         with np.errstate(divide="ignore", invalid="ignore"):
             z[..., axis, :] = amount / np.sqrt(information)
             estimate[..., axis, :] = amount / information
-    # a window has one column only that it speaks of
-    what = [f"transient of {k} blocks" for k in _TIMES] + ["jump"]
-    column = np.concatenate([np.arange(len(_TIMES)), np.full(at.size, len(_TIMES))])
-    spread = np.full((*z.shape, len(what)), np.nan)
-    size = spread.copy()
-    spread[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = (
+    # Each window has only one column.
+    what = [f"transient of {k} blocks" for k in _DECAY_BLOCKS] + ["jump"]
+    column = np.concatenate(
+        [np.arange(len(_DECAY_BLOCKS)), np.full(restarts.size, len(_DECAY_BLOCKS))]
+    )
+    scores = np.full((*z.shape, len(what)), np.nan)
+    size = scores.copy()
+    scores[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = (
         z,
         estimate,
     )
-    tau = np.array([*_TIMES, _BESIDE], dtype=float) * block
+    tau = np.array([*_DECAY_BLOCKS, _SIDE_BLOCKS], dtype=float) * block
     return statistic_dataset(
         "restart",
         blocks,
         windows=windows,
         columns={"what": what, "tau_min_s": block, "tau_max_s": tau},
-        z=spread,
-        ratio=np.abs(spread),
+        z=scores,
+        ratio=np.abs(scores),
         estimate=size,
         units="degree hour-1",
     )
 
 
 def restart_blocks(blocks: xr.Dataset) -> np.ndarray:
-    """First whole block after each restart that has blocks on both sides."""
+    """Return the first whole block after each restart with blocks on both sides."""
     if "restart_end" not in blocks:
         return np.empty(0, np.int64)
-    found = np.searchsorted(blocks["begin"].values, blocks["restart_end"].values - 1e-9)
-    return np.unique(found[(found > 0) & (found < blocks.sizes["block"])])
+    first_blocks = np.searchsorted(blocks["begin"].values, blocks["restart_end"].values - 1e-9)
+    return np.unique(first_blocks[(first_blocks > 0) & (first_blocks < blocks.sizes["block"])])
 
 
-def _designs(at: np.ndarray, block_count: int) -> tuple[Array, Windows]:
-    since = np.full(block_count, np.inf)
-    for start in at:
-        since[start:] = np.arange(block_count - start)
-    rows = [np.exp(-since / k) for k in _TIMES]
+def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Array, Windows]:
+    """Return the designs of all transients and jumps, and their windows."""
+    age = np.full(block_count, np.inf)
+    for start in restarts:
+        age[start:] = np.arange(block_count - start)
+    rows = [np.exp(-age / k) for k in _DECAY_BLOCKS]
     first, stop = (
-        [int(at[0])] * len(_TIMES),
-        [int(min(at[-1] + 2 * k, block_count)) for k in _TIMES],
+        [int(restarts[0])] * len(_DECAY_BLOCKS),
+        [int(min(restarts[-1] + 2 * k, block_count)) for k in _DECAY_BLOCKS],
     )
-    for start in at:
+    for start in restarts:
         row = np.zeros(block_count)
-        low, high = max(start - _BESIDE, 0), min(start + _BESIDE, block_count)
+        low, high = max(start - _SIDE_BLOCKS, 0), min(start + _SIDE_BLOCKS, block_count)
         row[low:start], row[start:high] = -0.5, 0.5
         rows.append(row)
         first.append(int(start))
@@ -95,8 +98,12 @@ def _designs(at: np.ndarray, block_count: int) -> tuple[Array, Windows]:
     return np.array(rows), Windows(np.array(first, dtype=np.int64), np.array(stop, dtype=np.int64))
 
 
-def _matched(residual: Array, designs: Array, noise: MeanNoise) -> tuple[Array, Array]:
-    weighted, one = precision(designs, noise), precision(np.ones((1, designs.shape[-1])), noise)[0]
+def _matched_filter(residual: Array, designs: Array, noise: MeanNoise) -> tuple[Array, Array]:
+    """Return filter output and information of each design, both independent of a constant."""
+    weighted, one = (
+        apply_precision(designs, noise),
+        apply_precision(np.ones((1, designs.shape[-1])), noise)[0],
+    )
     weighted = weighted - np.outer(weighted.sum(axis=-1) / one.sum(), one)
     information = (weighted * designs).sum(axis=-1)
     return np.nan_to_num(residual) @ weighted.T, np.where(information > 0, information, np.nan)

@@ -1,4 +1,4 @@
-"""Samples that Gaussian noise does not have: outliers, repeats, clipped or empty values, heavy or missing tails."""
+"""Score of sample counts unlike Gaussian noise: outliers, repeats, clipping, zeros, tails."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import xarray as xr
 from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, excess_extremes, has_coarse_grid
 from gyrostab.diagnose.statistics.scores import (
     Array,
-    over_windows,
     statistic_dataset,
-    values_of,
+    sum_over_windows,
+    values_in_order,
     window_set,
 )
 
@@ -18,26 +18,23 @@ __all__ = ["COUNTS", "LENGTHS", "score"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
-#: What is counted.
+#: Counts of samples.
 COUNTS = ("outliers", "repeats", "extremes", "zeros")
-_MOST = (
-    4.0  # that the kurtosis of one block may stand out: a single outlier is for the counts to judge
-)
-#: Least scatter of the scores: where null records never count one, a single one is no mismatch.
-_FLOOR = (0.35, 0.35, 0.35, 0.35, 0.2)
+_MAX_BLOCK_SIGMA = 4.0  # of the kurtosis of one block: the counts judge single outliers
+#: Least scatter of the scores: if null records never have one, a single one is not a mismatch.
+_MIN_SCATTER = (0.35, 0.35, 0.35, 0.35, 0.2)
 
 
 def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Score counts and kurtosis in windows of three lengths and of the whole record.
 
-    The counts are made to scatter alike by Anscombe's root; what is to be expected of them the null
-    records say, so that only differences between records of one kind mean something. On a coarse
-    lattice most of them are those of the lattice, and are left out.
+    Anscombe's root makes the scatter of the counts equal; null records define their expectation.
+    With a coarse quantization grid, counts that the grid alone changes are left out.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        Recording or null records; nothing of the baseline is used.
+        Recording or null records; the baseline is not used.
 
     Returns
     -------
@@ -46,30 +43,35 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         the count, or the mean kurtosis.
     """
     windows = window_set(blocks.sizes["block"], LENGTHS)
-    samples = values_of(blocks, "samples", "axis", "block").astype(float)
-    each = {
-        name: np.nan_to_num(values_of(blocks, name, "axis", "block").astype(float))
+    samples = values_in_order(blocks, "samples", "axis", "block").astype(float)
+    counts_by_block = {
+        name: np.nan_to_num(values_in_order(blocks, name, "axis", "block").astype(float))
         for name in COUNTS
     }
-    each["extremes"] = excess_extremes(each["extremes"])
-    counts = over_windows(np.stack([each[name] for name in COUNTS], axis=-1), windows)
-    heavy, used = kurtosis_score(values_of(blocks, "kurtosis", "axis", "block"), samples)
-    usual = np.median(
-        heavy, axis=-1, keepdims=True
-    )  # rounding has no tails, so that the noise itself may be away from 0
-    heavy = np.where(used > 0, usual + np.clip(heavy - usual, -_MOST, _MOST), 0.0)
-    n = over_windows(used[..., None], windows)
+    counts_by_block["extremes"] = excess_extremes(counts_by_block["extremes"])
+    counts = sum_over_windows(
+        np.stack([counts_by_block[name] for name in COUNTS], axis=-1), windows
+    )
+    tail_score, used = kurtosis_score(values_in_order(blocks, "kurtosis", "axis", "block"), samples)
+    # Rounding has no tails, so that the noise itself may differ from 0.
+    usual = np.median(tail_score, axis=-1, keepdims=True)
+    tail_score = np.where(
+        used > 0, usual + np.clip(tail_score - usual, -_MAX_BLOCK_SIGMA, _MAX_BLOCK_SIGMA), 0.0
+    )
+    n = sum_over_windows(used[..., None], windows)
     with np.errstate(divide="ignore", invalid="ignore"):
-        tails = np.where(n > 0, over_windows(heavy[..., None], windows) / np.sqrt(n), np.nan)
-        excess = np.where(
-            used > 0, np.nan_to_num(values_of(blocks, "kurtosis", "axis", "block")), 0.0
+        tails = np.where(
+            n > 0, sum_over_windows(tail_score[..., None], windows) / np.sqrt(n), np.nan
         )
-        mean = over_windows(excess[..., None], windows) / n
+        excess = np.where(
+            used > 0, np.nan_to_num(values_in_order(blocks, "kurtosis", "axis", "block")), 0.0
+        )
+        mean = sum_over_windows(excess[..., None], windows) / n
     rate = float(blocks.attrs["sampling_rate_hz"])
     number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
     z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
-    of_lattice = np.array([name in GRID_COUNTS for name in (*COUNTS, "kurtosis")])
-    z = np.where(has_coarse_grid(blocks)[:, None, None] & of_lattice, np.nan, z)
+    is_grid_count = np.array([name in GRID_COUNTS for name in (*COUNTS, "kurtosis")])
+    z = np.where(has_coarse_grid(blocks)[:, None, None] & is_grid_count, np.nan, z)
     return statistic_dataset(
         "distribution",
         blocks,
@@ -78,7 +80,7 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
             "what": [*COUNTS, "kurtosis"],
             "tau_min_s": 1.0 / rate,
             "tau_max_s": 1.0 / rate,
-            "floor": _FLOOR,
+            "floor": _MIN_SCATTER,
         },
         z=z,
         ratio=number,
@@ -87,7 +89,9 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
 
 
 def kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
-    """Normal score of the excess kurtosis of so many Gaussian samples (Anscombe and Glynn 1983), and 1 where there is one.
+    """Return the normal score of the excess kurtosis of Gaussian samples, and 1 where known.
+
+    Anscombe and Glynn (1983), doi:10.1093/biomet/70.1.227.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What the views share: windows of blocks, sums over them, near-normal scores, and the Dataset of a view."""
+"""Common parts of the statistics: windows of blocks, sums, near-normal scores, and the dataset."""
 
 from __future__ import annotations
 
@@ -15,52 +15,58 @@ __all__ = [
     "Windows",
     "cube_root_score",
     "exponential_score",
-    "over_windows",
     "statistic_dataset",
-    "values_of",
+    "sum_over_windows",
+    "values_in_order",
     "window_set",
 ]
 
 Array = NDArray[np.float64]
-#: A window moves by this share of its length, in records up to so many blocks, and in longer ones.
-_STEP, _LONG, _LONG_STEP = 0.2, 1000, 0.4
+_WINDOW_STEP = 0.2  # of the length of a window, from one to the next; design choice
+_MAX_DENSE_BLOCKS = 1000  # of a record with this step; limits time
+_LONG_WINDOW_STEP = 0.4  # the same for longer records
 
 
 class Windows(NamedTuple):
-    """Windows of whole blocks: the first block of each, and the first behind it."""
+    """Windows of whole blocks: first block of each, and the first one after it."""
 
     first: NDArray[np.int64]
     stop: NDArray[np.int64]
 
     @property
     def length(self) -> NDArray[np.int64]:
-        """Blocks of each window."""
+        """Number of blocks of each window."""
         return self.stop - self.first
 
 
 def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) -> Windows:
-    """Windows of several lengths over a record, a fifth of their length apart (two fifths in long records).
+    """Return windows of several lengths, a fifth of their length apart (two fifths if long).
 
     Parameters
     ----------
     block_count : int
-        Blocks of the record.
+        Number of blocks of the record.
     lengths : sequence of int
-        Lengths [blocks]; those above half of the record are left out.
+        Lengths [blocks]; those above half of the record are skipped.
     whole : bool
-        Add the record as one window.
+        Whether to add the record as one window.
 
     Examples
     --------
-    >>> found = window_set(10, (1, 5))
-    >>> found.length.tolist()
+    >>> dataset = window_set(10, (1, 5))
+    >>> dataset.length.tolist()
     [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 5, 5, 5, 5, 5, 5, 10]
     """
     first, length = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for wanted in lengths:
         if wanted > max(block_count // 2, 1):
             continue
-        step = max(1, round(wanted * (_STEP if block_count <= _LONG else _LONG_STEP)))
+        step = max(
+            1,
+            round(
+                wanted * (_WINDOW_STEP if block_count <= _MAX_DENSE_BLOCKS else _LONG_WINDOW_STEP)
+            ),
+        )
         start = np.arange(0, block_count - wanted + 1, step)
         if start[-1] != block_count - wanted:
             start = np.append(start, block_count - wanted)
@@ -73,12 +79,12 @@ def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) 
     return Windows(begin, begin + np.concatenate(length))
 
 
-def over_windows(values: Any, windows: Windows) -> Any:
-    """Sums over each window; the blocks are the last dimension but one, missing values must be zero.
+def sum_over_windows(values: Any, windows: Windows) -> Any:
+    """Sum over each window; blocks are the second last dimension, missing values must be zero.
 
     Examples
     --------
-    >>> over_windows(np.ones((4, 1)), window_set(4, (2,), whole=False))[:, 0]
+    >>> sum_over_windows(np.ones((4, 1)), window_set(4, (2,), whole=False))[:, 0]
     array([2., 2., 2.])
     """
     total = np.zeros(
@@ -89,20 +95,22 @@ def over_windows(values: Any, windows: Windows) -> Any:
 
 
 def cube_root_score(ratio: Array, shape: Array) -> Array:
-    """Near-normal score of a gamma-distributed ratio of mean 1 (Wilson and Hilferty 1931); NaN where `shape` is not positive.
+    """Return the near-normal score of a gamma-distributed ratio of mean 1; NaN for shape <= 0.
+
+    Wilson and Hilferty (1931), doi:10.1073/pnas.17.12.684.
 
     Examples
     --------
-    >>> float(cube_root_score(np.array(1.0 + 2.0 / 100.0), np.array(1e4)).round(2))  # two standard deviations above
+    >>> float(cube_root_score(np.array(1.02), np.array(1e4)).round(2))  # two standard deviations
     1.99
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        third = 1.0 / (9.0 * shape)
-        return np.asarray((np.cbrt(np.maximum(ratio, 0.0)) - (1.0 - third)) / np.sqrt(third))
+        variance = 1.0 / (9.0 * shape)
+        return np.asarray((np.cbrt(np.maximum(ratio, 0.0)) - (1.0 - variance)) / np.sqrt(variance))
 
 
 def exponential_score(value: Array) -> Array:
-    """Normal score of a value that is exponentially distributed with mean 1.
+    """Return the normal score of an exponentially distributed value of mean 1.
 
     Examples
     --------
@@ -112,8 +120,8 @@ def exponential_score(value: Array) -> Array:
     return np.asarray(-ndtri_exp(-value))
 
 
-def values_of(blocks: xr.Dataset, name: str, *dims: str) -> Any:
-    """Values of a variable, `dims` last; a leading dimension of records stays in front."""
+def values_in_order(blocks: xr.Dataset, name: str, *dims: str) -> Any:
+    """Return the values of a variable with `dims` last; a dimension of records stays first."""
     return blocks[name].transpose(..., *dims).values
 
 
@@ -130,30 +138,29 @@ def statistic_dataset(
     units: str = "1",
     one_sided: bool = False,
 ) -> xr.Dataset:
-    """The cells of a view, all views alike.
+    """Assemble the dataset of a statistic, which is the same for all.
 
     Parameters
     ----------
     name : str
-        View, one of the contract's.
+        Statistic, as named in diagnosis.json.
     blocks : xarray.Dataset
-        Of `gyrostab.diagnose.reduce.block_statistics.reduce_log`; gives the edges of the windows.
+        From `gyrostab.diagnose.reduce.block_statistics.reduce_log`; defines the window edges.
     windows : Windows
-        The windows.
+        Windows of blocks.
     columns : dict
         ``what`` (str), ``tau_min_s``, ``tau_max_s`` [s] and ``frequency`` [Hz] of each column, and
-        ``floor``, the smallest standard deviation that null records may give to a score.
+        ``floor``, the smallest standard deviation that null records may give a score.
     z, ratio : ndarray (..., row, window, tau)
         Near-normal score; observed over expected.
     rows : sequence of str, optional
-        Axes of each row, those of one row parted by a blank; by default a row is an axis of the
-        record.
+        Axes of each row, separated by blanks; by default a row is an axis of the record.
     estimate : ndarray, optional
-        The mismatch as a number of `units`.
+        Size of the mismatch, in `units`.
     units : str
-        Of the estimate.
+        Unit of the estimate.
     one_sided : bool
-        Only what lies above the expected is a mismatch.
+        Whether only an excess is a mismatch.
 
     Returns
     -------
@@ -164,7 +171,7 @@ def statistic_dataset(
     begin, end = blocks["begin"].values, blocks["end"].values
     size = z.shape[-1]
     label = {key: np.broadcast_to(np.asarray(value), size) for key, value in columns.items()}
-    found = xr.Dataset(
+    dataset = xr.Dataset(
         {
             "z": (
                 dims,
@@ -194,5 +201,5 @@ def statistic_dataset(
         attrs={"view": name, "one_sided": int(one_sided)},
     )
     if estimate is not None:
-        found["estimate"] = (dims, np.broadcast_to(estimate, z.shape), {"units": units})
-    return found
+        dataset["estimate"] = (dims, np.broadcast_to(estimate, z.shape), {"units": units})
+    return dataset

@@ -1,4 +1,4 @@
-"""Noise whose strength goes up and down: powers that scatter more than their degrees of freedom allow."""
+"""Score of variance fluctuation: powers that scatter more than their degrees of freedom allow."""
 
 from __future__ import annotations
 
@@ -13,72 +13,77 @@ from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
     cube_root_score,
-    over_windows,
     statistic_dataset,
-    values_of,
+    sum_over_windows,
+    values_in_order,
     window_set,
 )
 
-__all__ = ["LENGTHS", "SPANS", "levelled", "scatter_moments", "score"]
+__all__ = ["LENGTHS", "SPANS", "scale_to_expected", "scatter_moments", "score"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (20, 80)
 #: Blocks whose powers are averaged before their scatter is judged.
 SPANS = (1, 2, 4, 8, 16, 32, 64)
-_FEWEST = 6  # averages; with fewer a scatter is no number to judge by
-_GROUPS = 4  # of neighbouring bands
-_LOW = 3.5  # ordinates: below, a mean that moves inside of a block is seen rather than noise
-# standard deviations that one average counts for: a single loud block is for the Allan variance to
-# judge
-_MOST = 4.0
+_MIN_AVERAGES = 6  # for a meaningful scatter; design choice
+_BAND_GROUPS = 4  # of neighbouring bands; design choice
+_MIN_FREQUENCY_LINES = 3.5  # lower bands show a mean that moves within blocks rather than noise
+#: Largest deviation that one average contributes: the Allan variance judges single noisy blocks.
+_MAX_AVERAGE_SIGMA = 4.0
 
 
 def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    r"""Score the scatter of the band powers in time about their own mean, whatever that is, against what steady noise has.
+    r"""Score the scatter of the band powers over time about their own mean, against steady noise.
 
     The powers of a block over the expected ones, averaged over bands and over 1, 2, 4 ... blocks,
-    are the levels :math:`y_j`. In steady noise each is gamma-distributed with a shape :math:`w_j`
-    that is known, and the statistic of a window of J of them is
+    are the levels :math:`y_j`. In steady noise each is gamma-distributed with a known shape
+    :math:`w_j`, and the statistic of a window of J of them is
 
-    .. math:: Q = \sum_j w_j (y_j - \bar y)^2 / \bar y^2, \qquad \bar y = \sum_j w_j y_j / \sum_j w_j,
+    .. math::
+
+        Q = \sum_j w_j (y_j - \bar y)^2 / \bar y^2, \quad
+        \bar y = \sum_j w_j y_j / \sum_j w_j,
 
     about :math:`J - 1`, with a variance of :math:`2 (J - 1) + 6 \sum_j 1 / w_j` or a little less
-    (`scatter_moments` has both exactly). Noise whose log power swings by v rms from one average to
-    the next raises Q by :math:`v^2 \sum_j w_j`. So it stands out by z standard deviations where
-    :math:`v^2 = z \sqrt{2 (J - 1)} / \sum_j w_j`: white noise in 100 blocks of 200 samples (w = 93
-    each) by five where v = 9 %. Averages over k blocks have a variance that is less by the root of
-    k, and lose what goes faster than some 3 k.
+    (`scatter_moments` has both exactly). Noise whose log power varies by v rms from one average to
+    the next raises Q by :math:`v^2 \sum_j w_j`. It is therefore z standard deviations above steady
+    noise if :math:`v^2 = z \sqrt{2 (J - 1)} / \sum_j w_j`: for white noise in 100 blocks of 200
+    samples (w = 93 each) five, if v = 9 %. Averages over k blocks have a variance smaller by the
+    root of k, and lose variations faster than some 3 k blocks.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        Recording or null records, and what the simulation expects: the levels are relative to its
-        spectrum.
+        Recording or null records, and the expectation of the simulation, whose spectrum is the
+        reference of the levels.
 
     Returns
     -------
     xarray.Dataset or None
-        None where the record is too short. A column for each span and each band, each quarter of
-        the bands, all bands, and each band against its own mean. ``ratio`` is the scatter over that
-        of steady noise, ``estimate`` how far the power swings, rms over mean. Several axes have a
-        row of all together: the mean of their levels, for what makes noise swell is often common to
-        them.
+        None for too short a record. A column for each span and each band, each quarter of the
+        bands, all bands, and each band against its own mean. ``ratio`` is the scatter over that of
+        steady noise, ``estimate`` the variation of the power, rms over mean. Several axes have a
+        row of all together, the mean of their levels, because axes often fluctuate together.
 
     Notes
     -----
-    Of the lowest bands a moving mean takes hold; they are left out.
+    The lowest bands are left out, because a moving mean shows in them.
     """
     block_count, block = blocks.sizes["block"], float(blocks.attrs["block_s"])
-    spans = [span for span in SPANS if block_count // span >= _FEWEST]
+    spans = [span for span in SPANS if block_count // span >= _MIN_AVERAGES]
     low, high = (blocks[name].values for name in ("band_low", "band_high"))
-    used = low * block >= _LOW
+    used = low * block >= _MIN_FREQUENCY_LINES
     if not spans or not used.any():
         return None
-    members = _members(int(used.sum()))
-    level, weight, rows = _levels(blocks, baseline, used, members)
+    members = _band_groups(int(used.sum()))
+    level, weight, rows = _relative_levels(blocks, baseline, used, members)
     windows = window_set(block_count, LENGTHS)
-    found = [_scatter(level, weight, windows, span, single=int(used.sum())) for span in spans]
-    z, ratio, swing = (np.concatenate([one[place] for one in found], axis=-1) for place in range(3))
+    scatter = [
+        _score_scatter(level, weight, windows, span, single=int(used.sum())) for span in spans
+    ]
+    z, ratio, variation = (
+        np.concatenate([one[place] for one in scatter], axis=-1) for place in range(3)
+    )
     f_low = np.append([low[used][one].min() for one in members], low[used][0])
     f_high = np.append([high[used][one].max() for one in members], high[used][-1])
     return statistic_dataset(
@@ -87,29 +92,29 @@ def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         rows=rows,
         windows=windows,
         columns={
-            "what": np.repeat([f"restless {span * block:g} s" for span in spans], f_low.size),
+            "what": np.repeat([f"variance {span * block:g} s" for span in spans], f_low.size),
             "tau_min_s": np.tile(0.5 / f_high, len(spans)),
             "tau_max_s": np.tile(0.5 / f_low, len(spans)),
         },
         z=z,
         ratio=ratio,
-        estimate=swing,
+        estimate=variation,
         one_sided=True,
     )
 
 
-def levelled(
+def scale_to_expected(
     blocks: xr.Dataset, baseline: xr.Dataset, spans: Sequence[tuple[Sequence[str], float, float]]
 ) -> xr.Dataset:
-    """The recording with the powers of some stretches brought to the expected mean: their levels are told already.
+    """Scale the powers in some intervals to the expected mean, when their levels are known.
 
-    The first and the last two blocks of a stretch are so each by itself, for the level may have
-    changed within them.
+    The first two and the last two blocks of an interval are scaled separately, because the level
+    may change within them.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-        A recording, and what the simulation expects.
+        A recording, and the expectation of the simulation.
     spans : sequence of (axes, begin, end)
         Names of axes, and times [s since the start].
     """
@@ -140,15 +145,15 @@ def levelled(
 
 
 def scatter_moments(count: Array, total: Array, inverse: Array) -> tuple[Array, Array]:
-    """Mean and variance of the scatter of gamma-distributed levels about their own mean, relative to it.
+    """Return mean and variance of the scatter of gamma-distributed levels relative to their mean.
 
-    Exact where the levels have one scale: their mean is then independent of their ratios (Lukacs
-    1955), so that the moments of Q are those of the sum of squares over those of the mean.
+    Exact for levels of one scale: their mean is then independent of their ratios (Lukacs 1955), so
+    that the moments of Q are those of the sum of squares over those of the mean.
 
     Parameters
     ----------
     count, total, inverse : ndarray
-        Number of levels, sum of their shapes, and sum of the inverses of these.
+        Number of levels, sum of their shapes, and sum of the inverse shapes.
 
     Examples
     --------
@@ -165,109 +170,114 @@ def scatter_moments(count: Array, total: Array, inverse: Array) -> tuple[Array, 
         ) - mean**2
 
 
-def _members(bands: int) -> list[NDArray[np.int64]]:
-    """Bands of each column: one, a quarter of them, all."""
-    each = [np.array([band]) for band in range(bands)]
+def _band_groups(bands: int) -> list[NDArray[np.int64]]:
+    """Return the bands of each column: one, a quarter of them, all."""
+    used_shape = [np.array([band]) for band in range(bands)]
     return [
-        *each,
-        *(
-            component
-            for component in np.array_split(np.arange(bands), _GROUPS)
-            if component.size > 1
-        ),
+        *used_shape,
+        *(group for group in np.array_split(np.arange(bands), _BAND_GROUPS) if group.size > 1),
         np.arange(bands),
     ]
 
 
-def _levels(
+def _relative_levels(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
     used: NDArray[np.bool_],
     members: list[NDArray[np.int64]],
 ) -> tuple[Array, Array, list[str]]:
-    """Level over that of the record and its shape by (record), row, block, group of bands; and the axes of each row."""
+    """Return the level over that of the record, its shape, and the axes of each row.
+
+    By (record), row, block, group of bands.
+    """
     power, spectrum = (
-        values_of(blocks, "power", "axis", "block", "band"),
-        values_of(baseline, "spectrum", "axis", "block", "band"),
+        values_in_order(blocks, "power", "axis", "block", "band"),
+        values_in_order(baseline, "spectrum", "axis", "block", "band"),
     )
-    shape = values_of(blocks, "shape", "axis", "block", "band")[..., used]
+    shape = values_in_order(blocks, "shape", "axis", "block", "band")[..., used]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = (power / spectrum)[..., used]
-        there = np.isfinite(ratio) & (shape > 0)
-        each = np.where(there, shape, 0.0)
-        ratio = ratio * _tamed(np.where(there, ratio, 0.0), each)
-        weight = np.stack([each[..., one].sum(axis=-1) for one in members], axis=-1)
+        present = np.isfinite(ratio) & (shape > 0)
+        used_shape = np.where(present, shape, 0.0)
+        ratio = ratio * _limit_noisy_blocks(np.where(present, ratio, 0.0), used_shape)
+        weight = np.stack([used_shape[..., one].sum(axis=-1) for one in members], axis=-1)
         total = np.stack(
-            [np.where(there, ratio * each, 0.0)[..., one].sum(axis=-1) for one in members], axis=-1
+            [np.where(present, ratio * used_shape, 0.0)[..., one].sum(axis=-1) for one in members],
+            axis=-1,
         )
         level = total / weight
-        level = level / _middle(level, weight)
+        level = level / _robust_mean(level, weight)
     axes = [str(axis) for axis in blocks["axis"].values]
     level = np.nan_to_num(level)
     if len(axes) == 1:
         return level, weight, axes
-    together = weight.sum(axis=-3, keepdims=True)
+    joint_weight = weight.sum(axis=-3, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.nan_to_num((level * weight).sum(axis=-3, keepdims=True) / together)
-    together = together / _alike(blocks, used, members, weight)
+        mean = np.nan_to_num((level * weight).sum(axis=-3, keepdims=True) / joint_weight)
+    joint_weight = joint_weight / _coherence_factor(blocks, used, members, weight)
     return (
         np.concatenate([level, mean], axis=-3),
-        np.concatenate([weight, together], axis=-3),
+        np.concatenate([weight, joint_weight], axis=-3),
         [*axes, " ".join(axes)],
     )
 
 
-def _tamed(ratio: Array, shape: Array) -> Array:
-    """Factor by (record), axis, block, 1 that brings a loud block down to what one may count for, in all its bands alike."""
+def _limit_noisy_blocks(ratio: Array, shape: Array) -> Array:
+    """Return the factor (record), axis, block, 1 that limits a noisy block, equal in all bands."""
     weight = shape.sum(axis=-1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = (ratio * shape).sum(axis=-1, keepdims=True) / weight
         return np.asarray(
             np.nan_to_num(
-                np.minimum(_middle(level, weight) * (1.0 + _MOST / np.sqrt(weight)) / level, 1.0),
+                np.minimum(
+                    _robust_mean(level, weight)
+                    * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(weight))
+                    / level,
+                    1.0,
+                ),
                 nan=1.0,
             )
         )
 
 
-def _alike(
+def _coherence_factor(
     blocks: xr.Dataset, used: NDArray[np.bool_], members: list[NDArray[np.int64]], weight: Array
 ) -> Array:
-    """Factor on the variance of the mean over the axes by (record), 1, 1, group: powers of axes scatter alike where these are coherent."""
+    """Return the variance factor (record), 1, 1, group of the mean over coherent axes."""
     if "cross" not in blocks:
         return np.ones(1)
     axes = [str(axis) for axis in blocks["axis"].values]
     one, other = (
         [axes.index(str(axis)) for axis in blocks[name].values] for name in ("first", "second")
     )
-    power = np.nan_to_num(values_of(blocks, "power", "axis", "block", "band")[..., used])
-    cross = np.nan_to_num(values_of(blocks, "cross", "pair", "block", "band")[..., used])
+    power = np.nan_to_num(values_in_order(blocks, "power", "axis", "block", "band")[..., used])
+    cross = np.nan_to_num(values_in_order(blocks, "cross", "pair", "block", "band")[..., used])
     with np.errstate(divide="ignore", invalid="ignore"):
         squared = np.abs(cross.sum(axis=-2)) ** 2 / (
             power[..., one, :, :].sum(axis=-2) * power[..., other, :, :].sum(axis=-2)
         )
     squared = np.minimum(np.nan_to_num(squared), 1.0)
-    mean = np.stack([squared[..., component].mean(axis=-1) for component in members], axis=-1)
+    mean = np.stack([squared[..., values].mean(axis=-1) for values in members], axis=-1)
     share = weight.sum(axis=-2)
     pairs = 2.0 * (np.sqrt(share[..., one, :] * share[..., other, :]) * mean).sum(axis=-2)
     return np.asarray(1.0 + np.nan_to_num(pairs / share.sum(axis=-2)))[..., None, None, :]
 
 
-def _middle(level: Array, weight: Array) -> Array:
-    """Mean of each course of levels as its median has it, which a few loud blocks do not move."""
-    there = weight > 0
-    usual = np.where(there, weight, 0.0).sum(axis=-2, keepdims=True) / np.maximum(
-        there.sum(axis=-2, keepdims=True), 1
+def _robust_mean(level: Array, weight: Array) -> Array:
+    """Return the mean of each series of levels, from its median, robust against noisy blocks."""
+    present = weight > 0
+    usual = np.where(present, weight, 0.0).sum(axis=-2, keepdims=True) / np.maximum(
+        present.sum(axis=-2, keepdims=True), 1
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(
-            _median(np.where(there, level, np.nan))
+            _median_over_blocks(np.where(present, level, np.nan))
             / (1.0 - 1.0 / (9.0 * np.maximum(usual, 0.5))) ** 3
         )
 
 
-def _median(values: Array) -> Array:
-    """Median over the last dimension but one, of what is there."""
+def _median_over_blocks(values: Array) -> Array:
+    """Return the median over the second last dimension, ignoring NaN."""
     ordered = np.sort(values, axis=-2)
     count = np.isfinite(ordered).sum(axis=-2, keepdims=True)
     low, high = (
@@ -277,10 +287,13 @@ def _median(values: Array) -> Array:
     return np.asarray((low + high) / 2.0)
 
 
-def _scatter(
+def _score_scatter(
     level: Array, weight: Array, windows: Windows, span: int, *, single: int
 ) -> tuple[Array, Array, Array]:
-    """Score, ratio and swing by (record), row, window, column for averages over `span` blocks; the bands alone come first."""
+    """Return score, ratio and variation by (record), row, window, column, for `span` blocks.
+
+    The single bands come first.
+    """
     count = level.shape[-2] // span
     shape = np.broadcast_to(weight, level.shape)[..., : count * span, :].reshape(
         *level.shape[:-2], count, span, -1
@@ -288,31 +301,40 @@ def _scatter(
     total = shape.sum(axis=-2)
     with np.errstate(divide="ignore", invalid="ignore"):
         average = (level[..., : count * span, :].reshape(shape.shape) * shape).sum(axis=-2) / total
-        middle = _middle(average, total)
-        average = np.clip(average, None, middle * (1.0 + _MOST / np.sqrt(total)))
-        there = total > 0
-        inverse = np.where(there, 1.0 / total, 0.0)
-    average = np.where(there, average, 0.0)
-    begin = np.minimum(
-        -(-windows.first // span), count
-    )  # what is left of the record behind the last average has none
+        middle = _robust_mean(average, total)
+        average = np.clip(average, None, middle * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(total)))
+        present = total > 0
+        inverse = np.where(present, 1.0 / total, 0.0)
+    average = np.where(present, average, 0.0)
+    # An incomplete average at the end of the record does not count.
+    begin = np.minimum(-(-windows.first // span), count)
     inside = Windows(begin, np.maximum(windows.stop // span, begin))
-    first, square = over_windows(total * average, inside), over_windows(total * average**2, inside)
-    number, weights = over_windows(there.astype(float), inside), over_windows(total, inside)
+    first, square = (
+        sum_over_windows(total * average, inside),
+        sum_over_windows(total * average**2, inside),
+    )
+    number, weights = (
+        sum_over_windows(present.astype(float), inside),
+        sum_over_windows(total, inside),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = (square - first**2 / weights) / (first / weights) ** 2
-    mean, variance = scatter_moments(number, weights, over_windows(inverse, inside))
-    enough = (number >= _FEWEST) & (weights > 0)
-    components = [
-        np.where(enough, np.nan_to_num(component), 0.0)[..., :single].sum(axis=-1, keepdims=True)
-        for component in (found, mean, variance, weights)
+        scatter = (square - first**2 / weights) / (first / weights) ** 2
+    mean, variance = scatter_moments(number, weights, sum_over_windows(inverse, inside))
+    enough = (number >= _MIN_AVERAGES) & (weights > 0)
+    single_sums = [
+        np.where(enough, np.nan_to_num(values), 0.0)[..., :single].sum(axis=-1, keepdims=True)
+        for values in (scatter, mean, variance, weights)
     ]
-    found, mean, variance, weights = (
+    scatter, mean, variance, weights = (
         np.concatenate(pair, axis=-1)
-        for pair in zip((found, mean, variance, weights), components, strict=True)
+        for pair in zip((scatter, mean, variance, weights), single_sums, strict=True)
     )
     enough = np.concatenate([enough, enough[..., :single].any(axis=-1, keepdims=True)], axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(enough, found / mean, np.nan)
-        swing = np.sqrt(np.maximum(found - mean, 0.0) / weights)
-        return np.where(enough, cube_root_score(ratio, mean**2 / variance), np.nan), ratio, swing
+        ratio = np.where(enough, scatter / mean, np.nan)
+        variation = np.sqrt(np.maximum(scatter - mean, 0.0) / weights)
+        return (
+            np.where(enough, cube_root_score(ratio, mean**2 / variance), np.nan),
+            ratio,
+            variation,
+        )

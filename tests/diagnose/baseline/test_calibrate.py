@@ -89,7 +89,7 @@ def test_expected_powers_are_those_of_simulated_noise(term, size):
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
-def test_coefficients_lie_within_their_errors(lost):
+def test_coefficients_are_within_their_errors(lost):
     noise = {"Q": 0.5, "N": 0.003, "B": 0.004, "K": 0.1}
     axes = tuple("abcdefghijkl")
     baseline = calibrate_noise(reduce_log(log(noise, axes=axes, duration="2h", lost=lost, seed=3)))
@@ -113,7 +113,7 @@ def test_white_variance_is_that_of_block_means():
     assert ratio == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / expected.size))
 
 
-def test_powers_of_a_block_scatter_together_as_told():
+def test_common_variance_of_a_block_is_as_expected():
     blocks = reduce_log(log({"N": 0.003}, axes=tuple("abcdefgh"), duration="2h", lost=0.4))
     common, rest = common_variance(blocks)
     residual = (blocks["power"] / noise_powers(blocks)[..., 1] / 9e-6 - 1.0).values
@@ -125,7 +125,7 @@ def test_powers_of_a_block_scatter_together_as_told():
     assert np.abs(whole).max() < 1e-9
 
 
-def test_shaken_turning_and_warming_blocks_are_not_quiet():
+def test_blocks_with_vibration_rotation_or_heating_are_not_quiescent():
     warm = {
         "profile": "ramps",
         "channel": "temperature",
@@ -142,7 +142,7 @@ def test_shaken_turning_and_warming_blocks_are_not_quiet():
     assert "temperature" in reason
 
 
-def test_a_loud_stretch_without_a_channel_is_not_calibrated_on():
+def test_noisy_blocks_are_not_calibrated_on_without_channels():
     effect = {"name": "vibration_noise", "white": 0.0006, "driver": "vibration"}
     loud = reduce_log(log(effects=[effect], environment=[SHAKEN], rate=100.0)).drop_vars(
         "channel_vibration"
@@ -165,7 +165,7 @@ def test_a_loud_stretch_without_a_channel_is_not_calibrated_on():
     )
 
 
-def test_quiet_time_is_taken_as_named_and_checked():
+def test_given_quiet_time_is_used_and_checked():
     blocks = reduce_log(log(rate=10.0))
     begin, end = blocks["begin"].values, blocks["end"].values
     for quiet in ((0.0, 1200.0), ("1970-01-01T00:00:00Z", "1970-01-01T00:20:00Z"), end <= 1200.0):
@@ -183,7 +183,7 @@ def test_quiet_time_is_taken_as_named_and_checked():
         calibrate_noise(blocks, quiet=("soon", "later"))
 
 
-def test_the_grid_holds_calibrated_and_far_redder_noise():
+def test_the_grid_contains_calibrated_and_much_slower_noise():
     baseline = calibrate_noise(reduce_log(log({"N": 0.003, "K": 0.3})))
     K, weight = baseline["grid_K"].values[0], np.exp(baseline["grid_calibrated"].values[0])
     assert weight.sum() == pytest.approx(1.0)
@@ -193,7 +193,7 @@ def test_the_grid_holds_calibrated_and_far_redder_noise():
     assert np.exp(baseline["grid_prior"].values[0]).sum() == pytest.approx(1.0)
 
 
-def test_a_model_is_taken_with_its_effects():
+def test_baseline_from_a_model_includes_its_effects():
     effects = [
         {"name": "vibration_noise", "white": 0.001, "axes": ["x"]},
         {"name": "temperature_bias", "sensitivity": 0.01, "axes": ["y"]},
@@ -240,7 +240,7 @@ def test_a_model_is_taken_with_its_effects():
         baseline_from_model(blocks, {"noise": {"z": {"N": 1.0}}})
 
 
-def test_a_ramp_of_a_model_is_expected_once():
+def test_a_ramp_of_a_model_counts_once():
     noise = {"N": 0.003, "R": 2.0}
     blocks = reduce_log(log(noise))
     surface = allan_surface(blocks, baseline_from_model(blocks, {"noise": noise}))
@@ -248,7 +248,7 @@ def test_a_ramp_of_a_model_is_expected_once():
     assert np.nanmax(np.abs(score[0, -1])) < 4.0  # the record as one window
 
 
-def test_a_filter_of_a_model_is_seen_through_random_gaps():
+def test_a_filter_of_a_model_is_expected_with_random_gaps():
     model = {
         "noise": {"N": 0.003},
         "effect": [{"name": "logger_filter", "cutoff": 1.5, "order": 2, "instrument": 1}],
@@ -260,7 +260,7 @@ def test_a_filter_of_a_model_is_seen_through_random_gaps():
     assert float(np.abs((ratio - 1.0) / error).max()) < 4.5
 
 
-def test_a_simulation_is_calibrated_and_keeps_its_level():
+def test_baseline_from_a_simulation_keeps_its_level():
     effect = {"name": "vibration_noise", "white": 0.002}
     recording = reduce_log(log(effects=[effect], environment=[SHAKEN], seed=1))
     simulated = reduce_log(log(effects=[effect], environment=[SHAKEN], seed=2))
@@ -275,14 +275,14 @@ def test_a_simulation_is_calibrated_and_keeps_its_level():
         baseline_from_simulation(recording, reduce_log(log(rate=20.0)))
 
 
-def test_an_axis_without_spectra_is_named():
+def test_error_names_an_axis_without_spectra():
     blocks = reduce_log(log(axes=("x", "y")))
     blocks["power"].loc[{"axis": "y"}] = np.nan
     with pytest.raises(SchemaError, match="axis y"):
         calibrate_noise(blocks)
 
 
-def test_noise_is_fitted_where_the_likelihood_is_largest_also_where_no_sum_of_terms_fits():
+def test_fit_maximises_the_likelihood_even_without_a_good_fit():
     from scipy.optimize import minimize
 
     f = np.array(

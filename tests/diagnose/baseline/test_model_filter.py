@@ -43,7 +43,7 @@ def test_a_model_expects_its_own_filter(filtering):
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_what_is_named_of_a_fast_instrument_simulates_as_it_was():
+def test_a_named_filter_of_a_fast_instrument_simulates_the_recording():
     log = simulate(
         made(cutoff=6.0, order=4.0, oversampling=16), duration="30min", rate=10.0, seed=5
     ).compute()

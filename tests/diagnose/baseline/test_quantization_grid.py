@@ -41,7 +41,7 @@ def on_lattice(
 
 @pytest.mark.parametrize("steps", [0.85, 1.5, 4.0])
 @pytest.mark.parametrize("mean", [3.0, 0.05])
-def test_steps_are_told_apart(steps: float, mean: float) -> None:
+def test_rounded_rates_and_angles_are_distinguished(steps: float, mean: float) -> None:
     for kind, expected in (("rate", True), ("angle", False)):
         blocks = on_lattice(kind, steps, mean=mean)
         np.testing.assert_allclose(blocks["lattice"], steps * SCATTER, rtol=1e-6)
@@ -49,13 +49,13 @@ def test_steps_are_told_apart(steps: float, mean: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ["rate", "angle"])
-def test_fine_steps_are_nobodys(kind: str) -> None:
+def test_fine_steps_are_undecided(kind: str) -> None:
     blocks = on_lattice(kind, 0.3)
     assert (blocks["lattice"] > 0).all()
     assert not rounded_rates(blocks, calibrate_noise(blocks)).any()
 
 
-def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
+def test_a_filtered_angle_counter_is_not_a_rounded_rate() -> None:
     rng = np.random.default_rng(4)
     rates = 3.0 + SCATTER * rng.standard_normal((2, 18_001))
     step = 0.85 * SCATTER
@@ -68,7 +68,7 @@ def test_a_filter_before_the_counter_does_not_make_it_one_of_rates() -> None:
     assert not rounded_rates(blocks, calibrate_noise(blocks)).any()
 
 
-def test_axes_tell_together_what_one_tells_not() -> None:
+def test_axes_together_decide_what_one_axis_cannot() -> None:
     blocks = on_lattice("rate", 0.7)
     baseline = calibrate_noise(blocks)
     alone = [
@@ -79,13 +79,13 @@ def test_axes_tell_together_what_one_tells_not() -> None:
     assert rounded_rates(blocks, baseline).all()
 
 
-def test_without_a_lattice_nothing_was_rounded() -> None:
+def test_without_a_grid_no_rate_is_rounded() -> None:
     blocks = on_lattice("rate", 2.0)
     plain = blocks.assign(lattice=blocks["lattice"] * 0.0)
     assert not rounded_rates(plain, calibrate_noise(blocks)).any()
 
 
-def test_a_model_does_not_say_what_the_record_is() -> None:
+def test_the_decision_does_not_depend_on_the_model() -> None:
     model = {"noise": {"N": 0.003, "Q": 0.1}, "log": {"axes": ["x", "y"]}}
     for kind, expected in (("rate", True), ("angle", False)):
         blocks = on_lattice(kind, 2.0)
@@ -94,7 +94,7 @@ def test_a_model_does_not_say_what_the_record_is() -> None:
 
 @pytest.mark.parametrize("mean", [0.0, 0.13, 0.5])
 @pytest.mark.parametrize("scatter", [0.1, 0.4, 1.0])
-def test_the_share_of_a_counter_is_that_of_its_errors(mean: float, scatter: float) -> None:
+def test_angle_share_is_that_of_simulated_counters(mean: float, scatter: float) -> None:
     steps = mean + scatter * np.random.default_rng(1).standard_normal(400_000)
     angle = np.cumsum(steps)
     errors = np.diff(np.rint(angle + 0.37) - angle)
@@ -129,7 +129,7 @@ def cut_record(
 
 
 @pytest.mark.parametrize("step", [0.05, 0.18, 0.5])
-def test_a_rate_that_is_cut_off_towards_zero_is_told_by_the_cell_of_zero(step: float) -> None:
+def test_the_zero_bin_shows_a_truncated_rate(step: float) -> None:
     for how, cut in ((np.trunc, True), (np.rint, False), (np.floor, False)):
         blocks = cut_record(how, step=step)
         assert (truncated_axes(blocks) == cut).all()
@@ -140,7 +140,7 @@ def test_a_rate_that_is_cut_off_towards_zero_is_told_by_the_cell_of_zero(step: f
 
 
 @pytest.mark.parametrize("zone", [1.0, 2.0])
-def test_what_sticks_at_zero_is_missing_beside_it(zone: float) -> None:
+def test_samples_stuck_at_zero_are_missing_in_neighbouring_bins(zone: float) -> None:
     blocks = cut_record(np.rint, zone=zone)
     width = blocks["bin_width"].sel(axis="x", bin="next")
     assert abs(float(width) - max(1.5 - zone, 0.0)) < 0.1
@@ -152,9 +152,7 @@ def test_what_sticks_at_zero_is_missing_beside_it(zone: float) -> None:
     ("how", "zone", "names"),
     [(np.trunc, 0.0, ["rate_quantization"]), (np.rint, 1.0, ["dead_zone"]), (np.rint, 0.0, [])],
 )
-def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(
-    how, zone: float, names: list[str]
-) -> None:
+def test_truncation_and_dead_zone_are_distinguished(how, zone: float, names: list[str]) -> None:
     blocks = cut_record(how, zone=zone, size=15_000)
     baseline, records = nulls(blocks, 40)
     found = name_effects(blocks, baseline, records)
@@ -166,7 +164,7 @@ def test_a_cut_rate_is_no_dead_zone_and_a_dead_zone_no_cut_rate(
         }
 
 
-def test_where_the_cells_do_not_tell_both_names_stand() -> None:
+def test_both_names_are_given_if_the_bins_do_not_decide() -> None:
     """Three standard deviations away a cell holds three of 15 000 samples: nothing tells whether that of zero is twice as wide."""
     blocks = cut_record(np.rint, step=0.04, mean=(-3.0, 2.8), zone=0.0, size=15_000)
     assert possibly_truncated_axes(blocks).all()

@@ -24,7 +24,7 @@ def value_of(baseline, term, axis="x"):
 
 
 @pytest.mark.parametrize("block_count", [1, 2, 4, 15])
-def test_a_short_quiet_stretch_calibrates_with_a_note_on_its_precision(block_count):
+def test_a_short_quiet_time_calibrates_with_a_warning(block_count):
     blocks = reduce_log(log({"N": 0.003}, duration="30min"))
     step = blocks.attrs["block_s"]
     with pytest.warns(
@@ -47,7 +47,7 @@ def test_the_error_of_a_short_calibration_covers_the_truth():
     assert np.abs(pulls).max() < 4.0
 
 
-def test_a_model_gives_the_proportions_and_quiet_time_the_level():
+def test_quiet_time_scales_the_noise_of_a_model():
     """Noise of the model 20 % too low: one factor brings it to that of the recording, effects keep their size."""
     recording = log(effects=[SHAKE_NOISE], environment=[SHAKEN])
     blocks = reduce_log(recording)
@@ -78,7 +78,7 @@ def test_a_model_gives_the_proportions_and_quiet_time_the_level():
     )
 
 
-def test_quiet_time_calibrates_beside_an_effect_that_acts_in_it():
+def test_quiet_time_calibrates_with_an_active_effect():
     """Vibration all the time: its noise is the model's, and is not taken for a higher level."""
     shaken = {"profile": "vibration", "points": [[0, 6.0], [3600, 6.0]]}
     blocks = reduce_log(log(effects=[SHAKE_NOISE], environment=[shaken]))
@@ -106,7 +106,7 @@ def test_a_simulated_log_is_scaled_to_quiet_time():
     ]
 
 
-def test_a_simulation_and_quiet_time_go_together():
+def test_a_simulation_and_quiet_time_can_be_combined():
     recording = log({"N": 0.003}, duration="15min")
     found = gyrostab.diagnose(
         recording, simulation={"noise": {"N": 0.002}}, quiet=(0.0, 200.0), nulls=100

@@ -42,7 +42,7 @@ def lossy(log: xr.Dataset, share: float) -> xr.Dataset:
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.2])
-def test_null_records_share_what_the_model_says(lost):
+def test_null_records_have_the_common_noise_of_the_model(lost):
     size = 0.0025
     records = [reduce_log(lossy(log_of(seed, size, minutes=60), lost)) for seed in range(1, 5)]
     baseline = baseline_from_model(records[0], {"noise": NOISE, "effect": [shared(size)]})
@@ -117,14 +117,14 @@ def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_what_the_model_shares_is_no_mismatch(seed):
+def test_common_noise_of_the_model_is_not_a_mismatch(seed):
     found = gyrostab.diagnose(
         log_of(seed, 0.0015), simulation={"noise": NOISE, "effect": [shared(0.0015)]}, nulls=100
     )
     assert found.verdict == "no mismatch", found.content["mismatches"]
 
 
-def test_what_is_shared_beyond_the_model_is_named_with_its_size():
+def test_common_noise_beyond_the_model_is_named_with_its_size():
     found = gyrostab.diagnose(
         log_of(3, 0.0015, 0.0012),
         simulation={"noise": NOISE, "effect": [shared(0.0015)]},
@@ -137,7 +137,7 @@ def test_what_is_shared_beyond_the_model_is_named_with_its_size():
         )
 
 
-def test_what_a_model_lacks_is_named_and_in_the_powers_thereafter():
+def test_an_effect_missing_in_the_model_is_named_and_explains_the_powers():
     found = gyrostab.diagnose(log_of(4, 0.0015), simulation={"noise": NOISE}, nulls=100)
     assert [effect["name"] for effect in found.effects] == ["shared_source"]
     assert found.verdict == "explained", found.content["mismatches"]
@@ -149,7 +149,7 @@ def test_what_a_model_lacks_is_named_and_in_the_powers_thereafter():
     assert abs(held["misfit_after"] - 1.0) < 0.5 * abs(held["misfit_before"] - 1.0)
 
 
-def test_a_low_pass_of_what_two_axes_share_leaves_no_filter_and_nothing_unknown():
+def test_low_pass_common_noise_is_not_a_filter():
     slow = {"name": "shared_source", "N": [0.0, 0.004, 0.004], "bandwidth": 0.8}
     model = {"noise": NOISE, "effect": [slow], "log": {"axes": ["x", "y", "z"]}}
     found = gyrostab.diagnose(

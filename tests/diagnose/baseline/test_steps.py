@@ -43,7 +43,7 @@ def jumped():
     return _log([JUMP], 2)
 
 
-def test_a_jump_within_a_block_explains_the_power_that_it_has_there_and_at_the_lowest_lines(jumped):
+def test_a_jump_within_a_block_explains_its_power(jumped):
     found = _diagnosed(jumped)
     assert found.verdict == "explained"
     assert [effect["name"] for effect in found.effects] == ["bias_jump"]
@@ -55,7 +55,7 @@ def test_a_jump_within_a_block_explains_the_power_that_it_has_there_and_at_the_l
     }
 
 
-def test_what_is_loud_in_other_blocks_is_not_the_jump(jumped):
+def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
     seconds = np.arange(jumped.sizes["time"]) / 10.0
     rate = jumped["rate"].transpose("axis", "time").values.copy()
     rate[:, (seconds >= 1200) & (seconds < 1300)] *= 1.4
@@ -73,14 +73,14 @@ def test_what_is_loud_in_other_blocks_is_not_the_jump(jumped):
     assert any(begin < 1300 and end > 1200 for begin, end in spans)
 
 
-def test_hops_between_two_levels_leave_no_line_against_their_own_model():
+def test_a_telegraph_leaves_no_line_against_its_own_model():
     hops = {"name": "telegraph", "step": [1.0], "low": 200.0, "high": 200.0}
     found = _diagnosed(_log([hops], 7), [hops])
     assert (found.verdict, found.content["mismatches"]) == ("no mismatch", [])
     assert {one["name"] for one in found.content["baseline"]["expected"]} == {"telegraph"}
 
 
-def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
+def test_a_part_of_moving_blocks_has_no_lines(jumped):
     """The core reads the log again for its lines; what is loud in blocks that are left out does not matter then."""
     task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
     blocks = reduce_log(jumped)
@@ -98,7 +98,7 @@ def test_a_part_of_which_all_blocks_move_has_no_lines(jumped):
     assert still_lines(task, blocks, baseline) is blocks
 
 
-def test_the_inside_of_blocks_is_left_out_where_what_is_known_moves_and_nowhere_else():
+def test_only_blocks_with_known_motion_are_left_out():
     blocks = record([])
     baseline, _ = nulls(blocks, 4)
     step = np.zeros((3, blocks.sizes["block"]))

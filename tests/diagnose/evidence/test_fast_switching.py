@@ -69,7 +69,9 @@ def found_in(course: np.ndarray, rng: np.random.Generator) -> SwitchingEvidence:
 @pytest.mark.parametrize(
     ("low", "high", "step"), [(4.0, 4.0, 2.0), (30.0, 3.0, 2.0), (8.0, 8.0, 0.5), (20.0, 3.0, 40.0)]
 )
-def test_finds_hops_within_blocks_and_their_numbers(low: float, high: float, step: float) -> None:
+def test_finds_switching_within_blocks_and_its_parameters(
+    low: float, high: float, step: float
+) -> None:
     rng = np.random.default_rng(1)
     course = course_of(rng, low, high, BLOCKS * STEP, PIECES / STEP)
     found = found_in(step * course, rng)
@@ -80,7 +82,7 @@ def test_finds_hops_within_blocks_and_their_numbers(low: float, high: float, ste
     assert slope == pytest.approx(step, rel=0.1)
 
 
-def test_noise_of_the_same_second_order_does_not_hop() -> None:
+def test_noise_with_the_same_spectrum_does_not_switch() -> None:
     """Gauss-Markov noise of the variance and correlation time of the biases above, and noise that is louder than expected."""
     rng = np.random.default_rng(2)
     for time, size in [
@@ -101,7 +103,7 @@ def test_noise_of_the_same_second_order_does_not_hop() -> None:
         assert found_in(bias, rng).evidence_nats < 3.0
 
 
-def test_waves_and_bumps_of_any_height_do_not_hop_between_two_levels() -> None:
+def test_waves_and_steps_of_any_height_are_not_two_levels() -> None:
     rng = np.random.default_rng(3)
     time = (np.arange(BLOCKS * PIECES) + 0.5) * STEP / PIECES
     for period in (8.0, 20.0, 45.0):
@@ -109,7 +111,7 @@ def test_waves_and_bumps_of_any_height_do_not_hop_between_two_levels() -> None:
             assert found_in(size * np.sin(2.0 * np.pi * time / period), rng).evidence_nats < 3.0
 
 
-def test_three_levels_are_not_two() -> None:
+def test_three_levels_in_turn_are_not_two_levels() -> None:
     rng = np.random.default_rng(4)
     for dwell in (4.0, 20.0):
         first, second = (
@@ -119,7 +121,7 @@ def test_three_levels_are_not_two() -> None:
 
 
 @pytest.mark.parametrize("dwell", [2.0, 4.0, 10.0])
-def test_a_bias_that_hops_among_three_levels_at_random_is_not_two(dwell: float) -> None:
+def test_three_random_levels_are_not_two_levels(dwell: float) -> None:
     """Two levels follow it too, hopping fast; but pieces in a row are then as long on the upper one."""
     rng, fine = np.random.default_rng(1), 20
     course = np.empty(BLOCKS * PIECES * fine)
@@ -131,7 +133,7 @@ def test_a_bias_that_hops_among_three_levels_at_random_is_not_two(dwell: float) 
     assert found_in(4.0 * course.reshape(-1, fine).mean(axis=1), rng).evidence_nats == -np.inf
 
 
-def test_powers_within_blocks_are_those_of_the_samples() -> None:
+def test_switching_powers_match_those_of_the_samples() -> None:
     rng = np.random.default_rng(5)
     course = course_of(rng, 15.0, 6.0, 1200.0, 10.0)
     log = make_log(course[None], rate=10.0, unit="deg/h")
@@ -148,7 +150,9 @@ def test_powers_within_blocks_are_those_of_the_samples() -> None:
 
 
 @pytest.mark.parametrize(("low", "high", "deviations"), [(30.0, 3.0, 12.0), (4.0, 4.0, 3.0)])
-def test_a_diagnosis_names_it_with_its_numbers(low: float, high: float, deviations: float) -> None:
+def test_diagnosis_names_the_telegraph_with_its_parameters(
+    low: float, high: float, deviations: float
+) -> None:
     rng = np.random.default_rng(6)
     course = course_of(rng, low, high, 1800.0, 5.0)
     log = make_log(

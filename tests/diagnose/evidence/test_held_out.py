@@ -236,7 +236,7 @@ def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(tier):
                 assert factors[number, place, record] == pytest.approx(expected, abs=1e-6)
 
 
-def test_gain_is_what_the_folds_lose_at_the_best_length():
+def test_evidence_is_the_loss_without_the_folds_at_the_best_length():
     rng = np.random.default_rng(0)
     factors = rng.standard_normal((1 + 3 * FOLDS, 3, 5))
     gains = held_out_evidence(factors, [0, 0, 1])
@@ -251,7 +251,7 @@ def test_gain_is_what_the_folds_lose_at_the_best_length():
     )
 
 
-def test_what_is_there_gains_and_what_is_not_does_not():
+def test_only_a_present_effect_has_evidence():
     n = 180
     data, baseline = mean_case(n, records=40, missing=0.3)
     step = (np.arange(n) >= 90).astype(float)
@@ -276,7 +276,7 @@ def test_what_is_there_gains_and_what_is_not_does_not():
     assert float(quiet.quantile(0.9)) < 3.0
 
 
-def test_designs_that_are_constant_or_empty_gain_nothing():
+def test_constant_or_empty_designs_have_no_evidence():
     n = 60
     data, baseline = mean_case(n, records=3)
     absent = np.zeros(n)
@@ -323,7 +323,7 @@ def test_folds_are_interleaved_and_scale_with_the_record():
         fold_blocks(xr.Dataset(coords=frame(3)))
 
 
-def test_wrong_designs_and_tiers_are_named():
+def test_wrong_designs_and_tiers_are_refused():
     data, baseline = mean_case(30, records=1)
     with pytest.raises(OptionError, match=r"shape \(29,\)"):
         mean_evidence(data, baseline, {"short": [np.ones(29)]}, axis="x")
@@ -331,7 +331,7 @@ def test_wrong_designs_and_tiers_are_named():
         mean_evidence(data, baseline, {"one": [np.ones(30)]}, axis="x", tier="hard")
 
 
-def test_many_records_take_seconds():
+def test_evidence_of_many_records_takes_seconds():
     n = 180
     data, baseline = mean_case(n, records=400)
     power, level = power_case(n, 16, records=400)
@@ -344,7 +344,7 @@ def test_many_records_take_seconds():
     assert time.process_time() - begin < 10.0
 
 
-def test_a_spectrum_that_falls_is_no_quantization_of_negative_power():
+def test_a_falling_spectrum_is_not_negative_quantization_noise():
     """A mean of two neighbours takes ``4 a (1 - a) sin^2(pi f / fs)`` off, the form of Q: but the square of Q ends at zero."""
     raw = np.random.default_rng(12).standard_normal((1, 20_001))
     blocks = reduce_log(make_log(0.9 * raw[:, 1:] + 0.1 * raw[:, :-1], rate=10.0, unit="deg/h"))
@@ -363,7 +363,7 @@ def test_a_spectrum_that_falls_is_no_quantization_of_negative_power():
 
 
 @pytest.mark.parametrize(("share", "least", "most"), [(0.0, -np.inf, 2.0), (0.06, 10.0, np.inf)])
-def test_a_weak_filter_gains_more_than_noise_reaches(share, least, most):
+def test_evidence_of_a_weak_filter_exceeds_that_of_noise(share, least, most):
     """Six per cent of every sample come late: the spectrum falls by a quarter towards its end."""
     raw = np.random.default_rng(12).standard_normal((2, 15_001))
     blocks = reduce_log(

@@ -12,7 +12,7 @@ from gyrostab.diagnose.evidence.products import (
 )
 
 
-def test_products_of_columns_that_never_meet_are_not_needed():
+def test_evidence_does_not_need_products_of_unrelated_columns():
     rng = np.random.default_rng(8)
     values, columns = rng.standard_normal((60, 3)), rng.standard_normal((60, 7))
     frame_of = {

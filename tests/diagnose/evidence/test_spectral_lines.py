@@ -36,20 +36,20 @@ def spectra(density: np.ndarray, *, records: int = 20, seed: int = 1) -> np.ndar
     return np.random.default_rng(seed).gamma(22.0, 1.0 / 22.0, shape) * density
 
 
-def test_slopes_and_humps_are_no_lines() -> None:
+def test_slopes_and_humps_are_not_lines() -> None:
     place = np.arange(1.0, 601.0)
     for density in (place**-2.0, place**2.0, 1.0 + 50.0 * np.exp(-(((place - 90.0) / 15.0) ** 2))):
         evidence_nats = line_evidence(spectra(density[None]), WEIGHT)
         assert evidence_nats.max(axis=-1).max() < 8.0  # of 12 000 lines
 
 
-def test_what_comes_and_goes_is_no_steady_line() -> None:
+def test_an_intermittent_line_is_not_steady() -> None:
     once = np.ones((8, 400))
     once[3, 200] = 40.0
     assert line_evidence(spectra(once), WEIGHT)[..., 200].max() < 0.0
 
 
-def test_a_line_under_a_level_that_changes_is_found_by_its_own_power() -> None:
+def test_a_steady_line_is_found_under_a_changing_noise_level() -> None:
     level = np.array([1, 1, 1, 50, 50, 1, 1, 1.0])[:, None] * np.ones(400)
     level[:, 200] += 2.0
     found = line_evidence(spectra(level), WEIGHT)[:, 0]
@@ -71,7 +71,7 @@ def sines(
 
 
 @pytest.mark.parametrize("wander", [0.0, 30.0])
-def test_the_skirt_holds_the_line_and_no_other(wander: float) -> None:
+def test_the_skirt_contains_only_its_line(wander: float) -> None:
     blocks = sines({1.0: 3.0, 3.1: 1.0}, wander=wander)
     lines = blocks["line_frequency"].values
     place = int(np.abs(lines - 1.0).argmin())
@@ -90,7 +90,7 @@ def lines() -> tuple[Identification, ...]:
     return name_effects(blocks, baseline, records).identified
 
 
-def test_each_line_is_a_claim_of_its_own(lines: tuple[Identification, ...]) -> None:
+def test_each_line_is_a_separate_identification(lines: tuple[Identification, ...]) -> None:
     assert [identification.effect for identification in lines] == ["spectral_line"] * 3
     assert all(identification.axes == ("x",) for identification in lines)
     assert all(
@@ -104,7 +104,7 @@ def test_each_line_is_a_claim_of_its_own(lines: tuple[Identification, ...]) -> N
     )  # three may be a comb
 
 
-def test_a_line_changes_no_gain_of_the_means() -> None:
+def test_a_line_does_not_change_the_evidence_of_means() -> None:
     blocks = sines({0.7: 0.4}, size=9_000, axes=1)
     state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
     candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
@@ -137,7 +137,7 @@ def identification(one: Component) -> Identification:
     return Identification(one.candidate.effect, (), one.row, (one,), one.evidence_nats, 7.0)
 
 
-def test_a_line_counts_for_the_plainest_name_only() -> None:
+def test_a_line_counts_only_for_the_simplest_effect() -> None:
     found = {
         "spectral_line": [component("spectral_line", "line", 50.0)],
         "supply_bias(supply)": [
@@ -152,7 +152,7 @@ def test_a_line_counts_for_the_plainest_name_only() -> None:
     assert "real_motion" not in kept
 
 
-def test_claims_of_one_effect_become_one_but_for_lines_of_other_frequencies() -> None:
+def test_identifications_of_one_effect_merge_except_lines_of_other_frequencies() -> None:
     first = identification(component("spectral_line", "line", 50.0, 3))
     assert (
         len(
@@ -175,7 +175,7 @@ def test_claims_of_one_effect_become_one_but_for_lines_of_other_frequencies() ->
     )
 
 
-def test_a_steady_line_leaves_no_error_of_its_form() -> None:
+def test_a_steady_line_has_no_model_error() -> None:
     chosen = [
         identification(component("spectral_line", "line", 900.0, 3)),
         identification(component("shupe", "mean", 400.0)),
@@ -186,7 +186,7 @@ def test_a_steady_line_leaves_no_error_of_its_form() -> None:
     )
 
 
-def test_the_spectrum_of_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
+def test_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
     driven = replace(
         identification(component("vibration_noise", "power", 200.0)), driver=("vibration",)
     )
@@ -202,7 +202,7 @@ def test_the_spectrum_of_driven_noise_may_leave_a_filter_but_no_other_noise() ->
 
 
 @pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])
-def test_a_spectrum_is_straightened_by_as_much_as_its_filter_takes(weight: float) -> None:
+def test_a_filter_is_undone_at_its_estimated_size(weight: float) -> None:
     """Weights of 1 - a and a take 4 a (1 - a) of what a mean of two takes; a line stays in, and no slope is left that looks like one."""
     rng = np.random.default_rng(8)
     raw = rng.standard_normal(60_001) + 0.15 * np.sin(2.0 * np.pi * 4.0 * np.arange(60_001) / 10.0)

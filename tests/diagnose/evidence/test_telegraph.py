@@ -74,7 +74,7 @@ def white(rng: np.random.Generator, records: int) -> np.ndarray:
     return np.sqrt(WHITE) * rng.standard_normal((records, BLOCKS))
 
 
-def test_finds_hops_and_their_numbers() -> None:
+def test_finds_switches_and_their_parameters() -> None:
     rng = np.random.default_rng(1)
     course = np.stack([hops(rng, 120.0, 240.0) for _ in range(20)])
     evidence_nats, found = telegraph_evidence(*frame(0.6 * course + white(rng, 20)), axis="x")
@@ -88,7 +88,7 @@ def test_finds_hops_and_their_numbers() -> None:
     )
 
 
-def test_finds_hops_beside_a_walk_of_several_steps() -> None:
+def test_finds_switches_in_a_random_walk() -> None:
     rng = np.random.default_rng(2)
     walk = np.cumsum(0.07 * rng.standard_normal((20, BLOCKS)), axis=1)
     course = np.stack([hops(rng, 150.0, 150.0) for _ in range(20)])
@@ -99,7 +99,7 @@ def test_finds_hops_beside_a_walk_of_several_steps() -> None:
     assert np.median(found.step[evidence_nats > 10.0]) == pytest.approx(1.5, rel=0.1)
 
 
-def test_is_a_lower_bound_of_a_bayes_factor() -> None:
+def test_evidence_is_a_lower_bound_of_a_bayes_factor() -> None:
     """Over records of the noise that the baseline allows, the mean Bayes factor is one."""
     rng = np.random.default_rng(3)
     K = rng.choice(WALKS, 300) * np.sqrt(STEP / 3600.0)
@@ -112,7 +112,7 @@ def test_is_a_lower_bound_of_a_bayes_factor() -> None:
 
 @pytest.mark.parametrize("size", [0.3, 1.0])
 @pytest.mark.parametrize("time", [20.0, 60.0, 200.0])
-def test_a_bias_on_a_spring_is_no_bias_of_two_levels(time: float, size: float) -> None:
+def test_a_gauss_markov_bias_is_not_two_levels(time: float, size: float) -> None:
     rng = np.random.default_rng(4)
     keep = np.exp(-1.0 / time)
     fine = lfilter(
@@ -124,7 +124,7 @@ def test_a_bias_on_a_spring_is_no_bias_of_two_levels(time: float, size: float) -
     assert evidence_nats.max() < 3.0
 
 
-def test_one_jump_and_back_are_no_two_levels() -> None:
+def test_one_jump_and_its_return_are_not_two_levels() -> None:
     mean = np.zeros((1, BLOCKS)) + np.repeat([0.0, 2.0, 0.0], [30, 40, 30])
     evidence_nats, found = telegraph_evidence(
         *frame(mean + white(np.random.default_rng(5), 1)), axis="x"
@@ -134,7 +134,7 @@ def test_one_jump_and_back_are_no_two_levels() -> None:
     assert evidence_nats[0] == -np.inf
 
 
-def test_what_is_given_is_not_found_again_and_blocks_may_be_missing() -> None:
+def test_given_columns_are_not_found_again_and_blocks_may_be_missing() -> None:
     rng = np.random.default_rng(6)
     course = hops(rng, 150.0, 150.0)
     ramp = np.linspace(0.0, 20.0, BLOCKS)
@@ -147,7 +147,7 @@ def test_what_is_given_is_not_found_again_and_blocks_may_be_missing() -> None:
     assert again[0] < 1.0
 
 
-def test_the_other_sign_is_the_same_bias() -> None:
+def test_the_sign_of_the_bias_does_not_matter() -> None:
     rng = np.random.default_rng(7)
     values = (hops(rng, 100.0, 300.0) + white(rng, 1)[0])[:, None]
     variance, all_there, constant = (
@@ -179,7 +179,7 @@ def state_of(mean: np.ndarray) -> State:
     )
 
 
-def test_a_bias_of_three_levels_is_not_possible() -> None:
+def test_a_telegraph_of_three_levels_is_not_physical() -> None:
     rng = np.random.default_rng(8)
     first, second = hops(rng, 150.0, 150.0), hops(rng, 200.0, 200.0)
     two = state_of(first + white(rng, 1)[0])
@@ -188,7 +188,7 @@ def test_a_bias_of_three_levels_is_not_possible() -> None:
     assert not is_physical([component(more, first)], more)
 
 
-def test_sizes_are_those_of_the_course() -> None:
+def test_sizes_match_those_of_the_course() -> None:
     rng = np.random.default_rng(9)
     course = hops(rng, 100.0, 200.0)
     state = state_of(0.5 * course + white(rng, 1)[0])
@@ -233,7 +233,7 @@ FOLLOWS, HOPS_FIRST = (
         ("the same", 60.0, "y", HOPS_FIRST),
     ],
 )
-def test_what_follows_a_channel_that_may_hop_comes_first(
+def test_an_effect_of_a_switching_channel_comes_first(
     kind: str, evidence_nats: float, axis: str, expected: list[str]
 ) -> None:
     rng = np.random.default_rng(10)
@@ -260,7 +260,7 @@ REAL, HOP = 41, -1  # blocks: a jump of another size than the hops; and the last
     [(0.0, (0, HOP), ()), (3.0, (REAL,), (REAL,)), (3.0, (REAL, HOP), (REAL,))],
     ids=["none", "one", "one of two"],
 )
-def test_jumps_that_are_hops_themselves_are_none(
+def test_switches_are_not_also_jumps(
     size: float, places: tuple[int, ...], kept: tuple[int, ...]
 ) -> None:
     """The first hop and the last one were taken for jumps before the hops were named; a jump that is four times as large is one."""
@@ -332,14 +332,14 @@ def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) ->
     return name_effects(blocks, *nulls(blocks, 40))
 
 
-def test_the_search_asks_hops_whether_jumps_named_before_are_theirs(one_thread) -> None:
+def test_search_withdraws_jumps_that_are_switches(one_thread) -> None:
     """The supply that scatters holds the hops back; so the last of them is a jump first, and the search ends without it."""
     identifications = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
     assert [identification.effect for identification in identifications.identified] == ["telegraph"]
     assert identifications.verdict == "explained"
 
 
-def test_the_search_names_the_channel_that_switches_before_the_hops(one_thread) -> None:
+def test_search_names_a_switching_channel_before_a_telegraph(one_thread) -> None:
     """Two levels bring more than a supply that is known with a scatter, and still it is the cause."""
     identifications = switched([45, 14, 3, 12, 3, 10, 3, 5], 1, step=0.6, scatter=0.3)
     assert [identification.effect for identification in identifications.identified] == [
@@ -357,7 +357,7 @@ def found():
     return diagnose(simulate(model, duration="30min", rate=5.0, seed=11), nulls=100, seed=1)
 
 
-def test_a_diagnosis_names_it_with_its_numbers(found) -> None:
+def test_diagnosis_names_the_telegraph_with_its_parameters(found) -> None:
     assert [(one["name"], one["axes"]) for one in found.effects] == [("telegraph", ["y"])]
     numbers = found.effects[0]["parameters"]
     assert abs(numbers["step"]["value"] - 0.4) < 3.0 * numbers["step"]["stderr"]
@@ -367,7 +367,7 @@ def test_a_diagnosis_names_it_with_its_numbers(found) -> None:
     assert found.content["held_out"]["log_likelihood_gain"] > 10.0
 
 
-def test_the_model_hops_and_its_noise_does_not(found) -> None:
+def test_switching_is_in_the_model_but_not_in_its_noise(found) -> None:
     effect = next(one for one in found.model["effect"] if one["name"] == "telegraph")
     assert float(np.atleast_1d(effect["step"])[0]) == pytest.approx(0.4, rel=0.15)
     assert found.model["noise"]["y"]["K"] < 0.3  # with the hops for noise it is above 1

@@ -71,7 +71,7 @@ def close(one: xr.DataArray, other: xr.DataArray, *, rel: float) -> None:
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
-def test_statistics_are_those_of_raw_logs(lost):
+def test_statistics_match_those_of_raw_logs(lost):
     found, nulls = both(lost)
     for name in ("power", "mean", "cross", "line_power", "kurtosis"):
         np.testing.assert_array_equal(
@@ -109,7 +109,7 @@ def test_statistics_are_those_of_raw_logs(lost):
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
-def test_neighbouring_bands_scatter_together_as_in_raw_logs(lost):
+def test_covariance_of_neighbouring_bands_matches_raw_logs(lost):
     shares = []
     for records in both(lost):
         left = (
@@ -124,7 +124,7 @@ def test_neighbouring_bands_scatter_together_as_in_raw_logs(lost):
     assert beside[0] > 0.01
 
 
-def test_lowest_bands_scatter_with_the_third_above_as_the_taper_says():
+def test_covariance_of_the_lowest_bands_is_that_of_the_taper():
     record = reduce_log(
         simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute()
     )
@@ -141,7 +141,7 @@ def test_lowest_bands_scatter_with_the_third_above_as_the_taper_says():
     assert np.corrcoef(left)[0, 3] == pytest.approx(share, abs=4.0 / np.sqrt(left.shape[1]))
 
 
-def test_rare_kurtoses_are_as_rare_as_in_samples():
+def test_tails_of_the_kurtosis_match_samples():
     record = reduce_log(
         simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute()
     )
@@ -158,7 +158,7 @@ def test_rare_kurtoses_are_as_rare_as_in_samples():
         )
 
 
-def test_lattices_give_repeats_zeros_and_extremes():
+def test_quantization_causes_repeats_zeros_and_extremes():
     record = raw(1, 0.0, lattice=0.5)
     nulls = joined(
         list(null_records(record, calibrate_noise(record), count=50, rng=np.random.default_rng(1)))
@@ -171,7 +171,7 @@ def test_lattices_give_repeats_zeros_and_extremes():
     assert int(extremes.max()) > 2
 
 
-def test_blocks_of_few_samples_may_repeat_them_too():
+def test_blocks_with_few_samples_may_have_repeats():
     log = simulate(
         {"log": {"axes": ["x"]}, "noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=4
     ).compute()
@@ -198,7 +198,7 @@ def test_blocks_of_few_samples_may_repeat_them_too():
     )
 
 
-def test_orders_profiles_and_witnesses_have_the_scatter_of_noise():
+def test_orders_profiles_and_reference_channels_have_the_scatter_of_noise():
     rng = np.random.default_rng(2)
     seconds = np.arange(36_000) / 10.0
 
@@ -263,7 +263,7 @@ def candidates(record: xr.Dataset) -> tuple[dict, dict]:
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
-def test_largest_gains_of_raw_logs_are_those_of_their_own_null_records(lost):
+def test_largest_evidence_of_raw_logs_matches_null_records(lost):
     """The whole way: the rank of each raw record among null records of its own calibration is uniform."""
     count, records = 29, 16
     ranks = {"mean": [], "power": []}

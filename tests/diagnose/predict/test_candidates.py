@@ -46,7 +46,7 @@ def found(rich):
     return effect_candidates(rich, COEFFICIENT)
 
 
-def test_every_effect_is_tried_or_a_reason_is_given(found):
+def test_every_effect_is_tried_or_has_a_reason(found):
     candidates, reasons = found
     tried = {one.effect for one in candidates}
     assert tried.isdisjoint(reasons)
@@ -72,11 +72,11 @@ def test_every_effect_is_tried_or_a_reason_is_given(found):
         ("gauss_markov", {"power", "wander"}),
     ],
 )
-def test_effects_show_where_their_physics_says(found, effect, statistics):
+def test_effects_show_in_the_expected_statistics(found, effect, statistics):
     assert {one.statistic for one in found[0] if one.effect == effect} == statistics
 
 
-def test_without_a_channel_the_reason_names_it(plain):
+def test_reason_names_the_missing_channel(plain):
     _, reasons = effect_candidates(plain.drop_vars(["channel_vibration"]), COEFFICIENT)
     assert "vibration" in reasons["vibration_noise"]
     assert "ramp" in reasons["feedback_reset"]
@@ -86,7 +86,7 @@ def test_without_a_channel_the_reason_names_it(plain):
     ("told", "tried"),
     [([120.0, 160.0], (120.0, 160.0)), (None, (700.0, 800.0)), ("wide", (700.0, 800.0))],
 )
-def test_vibration_folds_from_the_band_that_its_channel_tells(told, tried):
+def test_vibration_aliases_from_the_band_of_its_channel(told, tried):
     shaking = np.random.default_rng(2).uniform(0.0, 5.0, 60_000)
     log = make_log(
         np.random.default_rng(1).standard_normal((1, 60_000)),
@@ -104,7 +104,7 @@ def test_vibration_folds_from_the_band_that_its_channel_tells(told, tried):
     assert {(one.values["low"], one.values["high"]) for one in variants} == {tried}
 
 
-def test_a_channel_that_stands_still_excites_nothing(plain):
+def test_a_constant_channel_has_no_effect(plain):
     still = plain.assign(
         {name: plain[name] * 0.0 + 20.0 for name in ("channel_temperature", "fine_temperature")}
     )
@@ -113,7 +113,7 @@ def test_a_channel_that_stands_still_excites_nothing(plain):
     assert reasons["shupe"] == "not identifiable: temperature does not change"
 
 
-def test_no_axis_is_explained_by_its_own_reading(plain, found):
+def test_an_axis_does_not_explain_itself(plain, found):
     turning = 500.0 * np.sin(np.linspace(0.0, 6.0, plain.sizes["block"]))
     moving = plain.assign(mean=plain["mean"] + turning)
     leak = next(
@@ -131,7 +131,7 @@ def test_no_axis_is_explained_by_its_own_reading(plain, found):
     ]
 
 
-def test_axes_at_rest_cannot_leak(plain, found):
+def test_axes_at_rest_do_not_leak(plain, found):
     assert not [one for one in found[0] if one.effect == "misalignment" and one.statistic == "mean"]
     course = xr.DataArray(np.linspace(0.0, 500.0, plain.sizes["block"]), dims="block")
     turning = plain.assign(mean=plain["mean"] + course.where(plain["axis"] == "z", 0.0))
@@ -143,7 +143,7 @@ def test_axes_at_rest_cannot_leak(plain, found):
     assert [variant.columns for variant in leak.variants] == [("z",)]
 
 
-def test_mean_designs_are_what_the_simulator_adds(plain):
+def test_mean_designs_match_the_simulator(plain):
     candidates, _ = effect_candidates(plain, COEFFICIENT)
     table = {"name": "vibration_rectification", "sensitivity": 0.01}
     added = (record([table])["mean"] - record([])["mean"]).values
@@ -169,7 +169,7 @@ def test_earth_rate_is_in_quadrature_between_the_cross_axes(rich):
     assert np.abs(z).max() < 0.02 * np.abs(x).min()
 
 
-def test_laws_of_the_terms(plain):
+def test_densities_of_the_noise_terms(plain):
     frequency = np.array([0.01, 0.1, 1.0])
     np.testing.assert_allclose(sampled_psd("N", frequency, 100.0), 3600.0)
     np.testing.assert_allclose(
@@ -194,7 +194,7 @@ def test_gaps_mix_a_density_with_its_mean(plain):
     )
 
 
-def test_channels_with_holes_are_bridged(plain):
+def test_gaps_in_channels_are_interpolated(plain):
     values = plain["channel_temperature"].values.copy()
     values[10:14] = np.nan
     seen = make_windows(
@@ -205,7 +205,7 @@ def test_channels_with_holes_are_bridged(plain):
     )
 
 
-def test_splines_add_to_one():
+def test_hat_functions_add_to_one():
     np.testing.assert_allclose(
         hat_functions(np.arange(50.0), np.arange(1.0, 51.0)).sum(axis=0), 1.0
     )
@@ -216,7 +216,7 @@ def test_splines_add_to_one():
 
 
 @pytest.mark.parametrize("common", [0.0, 0.05])
-def test_cells_of_powers_are_scored_as_powers(plain, common):
+def test_linear_model_of_powers_gives_the_evidence_of_powers(plain, common):
     baseline = calibrate_noise(plain)
     baseline = baseline.assign(common=baseline["common"] + common)
     folds = fold_blocks(plain)
@@ -235,7 +235,7 @@ def test_cells_of_powers_are_scored_as_powers(plain, common):
 
 
 @pytest.mark.parametrize("statistic", ["cross", "order"])
-def test_noise_has_the_variance_that_the_weights_say(rich, statistic):
+def test_simulated_noise_has_the_variance_of_the_weights(rich, statistic):
     baseline = calibrate_noise(rich)
     candidates = [
         one
@@ -252,7 +252,7 @@ def test_noise_has_the_variance_that_the_weights_say(rich, statistic):
     assert not some.values[cells.weight == 0].any()
 
 
-def test_a_filter_is_a_candidate_only_as_a_change_of_shape(found):
+def test_a_filter_is_a_candidate_only_if_it_changes_the_shape(found):
     one = next(one for one in found[0] if one.effect == "logger_filter")
     assert all(variant.columns == () for variant in one.variants)
     assert all(
@@ -265,7 +265,7 @@ def test_a_filter_is_a_candidate_only_as_a_change_of_shape(found):
     )
 
 
-def test_simulated_wander_has_the_variance_of_the_face():
+def test_simulated_wander_has_the_predicted_variance():
     kind = effects()["gauss_markov"]
     effect = kind(rms=0.1, correlation_time=50.0)
     log = simulate(
@@ -280,7 +280,7 @@ def test_simulated_wander_has_the_variance_of_the_face():
     assert 0.01 * variance[0] == pytest.approx(float(np.var(log["rate"].values)), rel=0.3)
 
 
-def test_generics_have_the_axes_of_the_record(plain):
+def test_nuisance_alternatives_have_the_axes_of_the_record(plain):
     assert {one.statistic for one in nuisance_alternatives(plain)} == {
         "mean",
         "power",

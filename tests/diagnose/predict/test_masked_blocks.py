@@ -47,7 +47,7 @@ def lost(found: xr.DataArray, before: xr.DataArray) -> set[tuple[str, int]]:
     return {(names[row], int(block)) for row, block in np.argwhere(gone.values)}
 
 
-def test_what_two_axes_share_is_left_out_where_either_of_them_is(blocks: xr.Dataset) -> None:
+def test_cross_spectrum_is_left_out_with_either_axis(blocks: xr.Dataset) -> None:
     left_out = np.zeros((3, BLOCKS), np.bool_)
     left_out[0, 3] = left_out[1, 7] = left_out[2, 7] = True
     assert list(zip(blocks["first"].values, blocks["second"].values, strict=True)) == PAIRS
@@ -57,7 +57,7 @@ def test_what_two_axes_share_is_left_out_where_either_of_them_is(blocks: xr.Data
     assert cross_without(blocks, np.zeros((3, BLOCKS), np.bool_)).identical(blocks["cross"])
 
 
-def test_blocks_of_named_spikes_are_left_out_of_means_powers_and_what_axes_share(
+def test_blocks_with_named_spikes_are_left_out_of_all_statistics(
     blocks: xr.Dataset,
 ) -> None:
     on_y, on_both = (
@@ -78,7 +78,7 @@ def test_blocks_of_named_spikes_are_left_out_of_means_powers_and_what_axes_share
     assert mask_anomalous_blocks(blocks, [spikes("x")]) is blocks  # it has none
 
 
-def test_they_are_left_out_for_the_effects_that_are_sought_next(blocks: xr.Dataset) -> None:
+def test_blocks_with_spikes_are_left_out_in_the_next_search(blocks: xr.Dataset) -> None:
     state = initial_state(blocks, baseline(block_count=BLOCKS))
     found = condition_on_component(state, spikes("y")).blocks
     for name in ("mean", "power"):

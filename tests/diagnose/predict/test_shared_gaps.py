@@ -26,7 +26,7 @@ def log():
 
 
 @pytest.mark.parametrize("rows", [1, 2])
-def test_random_gaps_do_not_make_a_shared_band_smaller(log, rows):
+def test_random_gaps_do_not_bias_a_shared_band(log, rows):
     lost = np.random.default_rng(3).random((rows, log.sizes["time"])) < 0.4
     there = xr.DataArray(np.broadcast_to(~lost, (2, lost.shape[1])), dims=("axis", "time"))
     rate = log["rate"].transpose("axis", "time")

@@ -36,7 +36,7 @@ def _jumps(blocks):
     )
 
 
-def test_a_restart_weighs_as_much_as_all_other_times(restarted):
+def test_a_restart_is_as_probable_as_all_other_times(restarted):
     variants = _jumps(restarted).variants
     weight = np.array([one.weight for one in variants])
     known = np.array([one.values["at"] == _BACK for one in variants])
@@ -45,7 +45,7 @@ def test_a_restart_weighs_as_much_as_all_other_times(restarted):
     assert weight[~known].sum() == pytest.approx((~known).sum())
 
 
-def test_each_time_weighs_as_much_as_the_time_that_it_stands_for():
+def test_each_time_has_the_probability_of_its_interval():
     variants = sorted(_jumps(record([])).variants, key=lambda one: one.values["at"])
     at, weight = (
         np.array(several)
@@ -58,7 +58,7 @@ def test_each_time_weighs_as_much_as_the_time_that_it_stands_for():
 
 
 @pytest.mark.parametrize("at", [1_337.0, 1_350.0, 1_359.0])
-def test_a_large_jump_is_found_at_any_time_of_a_long_record(at):
+def test_a_large_jump_is_found_anywhere_in_a_long_record(at):
     block_count = 2_000
     windows = 20.0 * np.arange(block_count)
     means = np.random.default_rng(2).standard_normal(block_count) + 30.0 * np.clip(
@@ -71,7 +71,7 @@ def test_a_large_jump_is_found_at_any_time_of_a_long_record(at):
     assert np.abs(tried - at).min() <= 5.0
 
 
-def test_two_restarts_share_their_weight(restarted):
+def test_two_restarts_share_their_probability(restarted):
     twice = restarted.drop_vars(["restart_begin", "restart_end"])
     twice = twice.assign(
         restart_begin=("restart", [900.0, _BACK]), restart_end=("restart", [905.0, _BACK + 7.0])
@@ -83,7 +83,7 @@ def test_two_restarts_share_their_weight(restarted):
     assert weight[known].sum() == pytest.approx(weight[~known].sum())
 
 
-def test_a_jump_where_power_came_back_needs_less_to_be_seen(restarted):
+def test_a_jump_at_a_restart_needs_less_evidence(restarted):
     middle = (restarted["begin"] + restarted["end"]) / 2.0
     moved = restarted.assign(mean=restarted["mean"] + 0.08 * (middle > _BACK))
     state = initial_state(moved, calibrate_noise(moved))

@@ -66,7 +66,7 @@ def test_samples_without_a_value_near_them_are_missing():
     assert np.flatnonzero(lost).tolist() == list(range(1000, 1500))
 
 
-def test_a_faster_channel_has_its_means():
+def test_a_faster_channel_is_averaged():
     seconds = (np.arange(4 * SIZE) - 1.5) / (4 * RATE)  # four values about each sample
     values = np.random.default_rng(1).standard_normal(seconds.size)
     aligned = align_channels(with_channel(log_of(), "accel_x", seconds, values, "g"))
@@ -74,7 +74,7 @@ def test_a_faster_channel_has_its_means():
     assert "mean of its values at 400 Hz" in aligned.notes[0]
 
 
-def test_a_slower_channel_lies_on_straight_lines_but_not_across_gaps():
+def test_a_slower_channel_is_interpolated_but_not_across_gaps():
     seconds = np.delete(np.arange(0.0, 30.0, 0.03), slice(100, 110))
     aligned = align_channels(with_channel(log_of(), "accel_x", seconds, 2.0 * seconds, "g"))
     at = np.arange(SIZE) / RATE
@@ -102,7 +102,7 @@ def test_slow_channels_and_vibration_keep_their_stamps(name: str, period: float)
 
 
 @pytest.mark.parametrize("period", [0.001, 0.01, 0.03])
-def test_channels_that_turn_with_the_tool_keep_their_stamps_beside_its_rotation(period: float):
+def test_rotating_channels_keep_their_stamps_with_a_rotation_rate(period: float):
     """Gravity is then a wave at the rotation, coherent with any line there; a toolface wraps and has no mean."""
     seconds = np.arange(0.0, 30.0, period)
     accel = with_channel(log_of(), "accel_x", seconds, np.sin(2 * np.pi * seconds), "g")
@@ -117,7 +117,7 @@ def test_channels_that_turn_with_the_tool_keep_their_stamps_beside_its_rotation(
     assert align_channels(ground).log["seismometer_z"].dims == ("time",)
 
 
-def test_a_fast_toolface_is_not_called_too_slow():
+def test_a_fast_toolface_is_not_reported_as_slow():
     seconds = np.arange(0.0, 600.0, 0.01)
     blocks, _, _ = candidates_of(
         with_channel(log_of(60_000), "toolface", seconds, np.mod(70.0 * seconds, 360.0), "degree")
@@ -136,7 +136,7 @@ def test_a_fast_toolface_is_not_called_too_slow():
         ("mode", np.arange(0.0, 30.0, 1.0), "text, not numbers"),
     ],
 )
-def test_a_channel_of_no_use_is_left_out_with_the_reason(name: str, seconds: Any, reason: str):
+def test_a_useless_channel_is_left_out_with_a_reason(name: str, seconds: Any, reason: str):
     values = np.full(len(seconds), "idle") if name == "mode" else np.mod(seconds, 1.0)
     aligned = align_channels(with_channel(log_of(), name, seconds, values))
     assert list(aligned.unused) == [name]
@@ -152,7 +152,7 @@ def test_a_channel_of_no_use_is_left_out_with_the_reason(name: str, seconds: Any
     lost=st.sets(st.integers(0, 400), max_size=60),
     grid=st.booleans(),
 )
-def test_pieces_of_a_lazy_log_give_what_the_whole_gives(
+def test_a_lazy_log_gives_the_same_as_a_log_in_memory(
     ratio: float, skew: float, chunk: int, lost: set[int], grid: bool
 ):
     log = log_of(400)
@@ -175,7 +175,7 @@ def test_pieces_of_a_lazy_log_give_what_the_whole_gives(
     np.testing.assert_allclose(pieces.values, whole.values, rtol=1e-9, atol=1e-9)
 
 
-def test_a_lazy_channel_is_read_in_parts():
+def test_a_lazy_channel_is_read_chunk_by_chunk():
     """Laying it out reads nothing; a chunk of the log then needs the values about it, and no more."""
     size, read = 100_000, []
 
@@ -214,7 +214,7 @@ def candidates_of(log: xr.Dataset) -> tuple[xr.Dataset, list[Any], dict[str, str
     return blocks, *effect_candidates(blocks, calibrate_noise(blocks)["coefficient"])
 
 
-def test_a_ramp_of_another_file_reaches_the_search():
+def test_a_ramp_from_another_file_is_used():
     blocks, found, reasons = candidates_of(kicked(1 / 3))
     assert "feedback_reset" not in reasons
     assert {one.statistic for one in found if one.effect == "feedback_reset"} >= {"phase_locked"}
@@ -225,7 +225,7 @@ def test_a_ramp_of_another_file_reaches_the_search():
     )
 
 
-def test_the_reason_of_an_effect_names_the_channel_that_is_not_used():
+def test_reason_of_an_effect_names_the_unused_channel():
     log = kicked(0.0)
     slow = with_channel(
         log.drop_vars(["ramp", "time_ramp"]), "ramp", np.arange(0.0, 600.0, 0.5), np.zeros(1200)
@@ -263,7 +263,7 @@ def test_the_reason_of_an_effect_names_the_channel_that_is_not_used():
         ),
     ],
 )
-def test_every_channel_that_is_not_used_is_named(name: str, unit: str, values: Any, reason: str):
+def test_every_unused_channel_is_listed(name: str, unit: str, values: Any, reason: str):
     log = with_channel(log_of(60_000), name, np.arange(600.0), values, unit)
     blocks, found, reasons = candidates_of(log)
     (one,) = unused_channels(
@@ -275,7 +275,7 @@ def test_every_channel_that_is_not_used_is_named(name: str, unit: str, values: A
         assert reason in reasons["temperature_bias"]
 
 
-def test_a_seismometer_on_its_own_stamps_is_compared_sample_by_sample():
+def test_a_seismometer_with_its_own_stamps_is_compared_sample_by_sample():
     log = log_of(60_000)
     ground = np.random.default_rng(4).standard_normal(60_000)
     log["rate"] = log["rate"] + ground
@@ -289,7 +289,7 @@ def test_a_seismometer_on_its_own_stamps_is_compared_sample_by_sample():
     assert unused_channels(blocks, {"seismometer_z"}) == []
 
 
-def test_the_diagnosis_says_which_channels_it_used(recwarn: pytest.WarningsRecorder):
+def test_diagnosis_lists_the_channels_it_used(recwarn: pytest.WarningsRecorder):
     log = with_channel(kicked(1 / 3, size=30_000), "humidity", np.arange(300.0), np.arange(300.0))
     with pytest.warns(
         UserWarning, match=r"channel ramp: its stamps are 3\.33 ms after those of the gyro"
@@ -300,7 +300,7 @@ def test_the_diagnosis_says_which_channels_it_used(recwarn: pytest.WarningsRecor
     assert "- channel humidity is not used: no effect follows" in str(found)
 
 
-def test_one_file_a_channel_is_diagnosed_like_one_file_for_all(recordings: Callable[[str], Path]):
+def test_separate_files_are_diagnosed_like_one_file(recordings: Callable[[str], Path]):
     """The real ramp of a fibre-optic gyro, in a file of its own."""
     path, ramp = (
         recordings("fog-blueseis-ramp/FOG.mseed"),

@@ -54,7 +54,7 @@ def with_gaps(
     lost=st.floats(0.0, 0.6),
     offset=st.floats(-1e5, 1e5),
 )
-def test_powers_are_the_sums_of_their_definition(seed: int, size: int, lost: float, offset: float):
+def test_powers_match_their_definition(seed: int, size: int, lost: float, offset: float):
     rng = np.random.default_rng(seed)
     x = rng.standard_normal((2, 24 * size)) + offset
     x[rng.random(x.shape) < lost] = np.nan
@@ -91,7 +91,7 @@ def test_powers_are_the_sums_of_their_definition(seed: int, size: int, lost: flo
 
 
 @pytest.mark.parametrize("gaps", ["none", "random", "stretches"])
-def test_white_noise_has_its_density_and_the_gamma_distribution_of_the_shape(gaps: str):
+def test_powers_of_white_noise_are_gamma_distributed(gaps: str):
     rng = np.random.default_rng(4)
     x = with_gaps(3.0 * rng.standard_normal(3000 * 400), gaps, rng)
     blocks = reduce_log(log_of(x), block="400samples")
@@ -111,7 +111,7 @@ def test_white_noise_has_its_density_and_the_gamma_distribution_of_the_shape(gap
         )
 
 
-def test_bands_share_scatter_as_the_taper_says():
+def test_covariance_of_bands_is_that_of_the_taper():
     size, block_count = 50, 40_000
     x = np.random.default_rng(4).standard_normal((block_count, size))
     spectrum = np.fft.rfft((x - x.mean(axis=1, keepdims=True)) * taper(size), axis=1)[
@@ -125,7 +125,7 @@ def test_bands_share_scatter_as_the_taper_says():
     assert np.abs(found / scatter).max() > 6.0  # there is something to see
 
 
-def test_whole_blocks_lose_little_to_the_taper():
+def test_full_blocks_lose_little_to_the_taper():
     blocks = reduce_log(
         log_of(np.random.default_rng(0).standard_normal(40_000)), block="1000samples"
     )
@@ -138,7 +138,7 @@ def test_whole_blocks_lose_little_to_the_taper():
 @pytest.mark.parametrize(
     ("noise", "tolerance"), [({"Q": 5.0}, 0.05), ({"N": 0.003, "K": 5.0}, 0.12)]
 )
-def test_densities_through_random_gaps_are_mixed_by_the_share_of_neighbours(
+def test_random_gaps_mix_densities_by_the_share_of_neighbours(
     noise: dict[str, float], tolerance: float
 ):
     log = simulate(
@@ -166,7 +166,7 @@ def test_densities_through_random_gaps_are_mixed_by_the_share_of_neighbours(
     assert found[4:] == pytest.approx(wanted[4:], rel=tolerance)
 
 
-def test_a_sine_lands_in_its_band_and_on_its_line():
+def test_a_sine_is_in_its_band_and_line():
     seconds = np.arange(60_000) / RATE
     blocks = reduce_log(log_of(2.0 * np.sin(2 * np.pi * 13.0 * seconds)), block="10s")
     power, width = blocks.power.values[0], (blocks.band_high - blocks.band_low).values
@@ -190,7 +190,7 @@ def test_line_spectra_average_the_blocks_of_an_eighth():
 
 
 @pytest.mark.parametrize("gaps", ["none", "random"])
-def test_what_axes_and_channels_share_is_in_their_cross_spectra(gaps: str):
+def test_cross_spectra_contain_common_signals(gaps: str):
     rng = np.random.default_rng(7)
     shared, own = rng.standard_normal(200_000), rng.standard_normal((3, 200_000))
     x = own + np.array([[0.5], [-0.4], [0.0]]) * shared
@@ -221,7 +221,7 @@ def test_what_axes_and_channels_share_is_in_their_cross_spectra(gaps: str):
 # what is locked, and counts
 
 
-def test_orders_are_the_amplitudes_that_turn_with_the_tool():
+def test_orders_are_the_amplitudes_at_the_tool_rotation():
     rng, size = np.random.default_rng(2), 120_000
     seconds = np.arange(size) / RATE
     speed = 90.0 + 40.0 * np.sin(2 * np.pi * seconds / 300.0)  # deg/s
@@ -239,7 +239,7 @@ def test_orders_are_the_amplitudes_that_turn_with_the_tool():
     assert np.abs(order[:, 1].mean()) < 0.15
 
 
-def test_orders_follow_a_rotation_sensor_with_its_own_slower_time_and_are_silent_at_rest():
+def test_orders_use_a_slower_rotation_sensor_and_are_missing_at_rest():
     model = {
         "noise": {"N": 1e-4},
         "log": {"axes": ["x", "y"]},
@@ -279,7 +279,7 @@ def test_a_profile_shows_the_error_by_phase_of_the_ramp():
 # channels and spans
 
 
-def test_channels_are_averaged_over_blocks_whatever_their_own_time():
+def test_channels_with_any_stamps_are_averaged_over_blocks():
     model = {
         "noise": {"N": 0.01},
         "log": {"axes": ["x"]},
@@ -313,7 +313,7 @@ def test_channels_are_averaged_over_blocks_whatever_their_own_time():
 
 
 @pytest.mark.parametrize("own", [True, False], ids=["on stamps of its own", "with the rate"])
-def test_temperatures_keep_their_course_inside_of_blocks_and_lose_their_noise(own):
+def test_temperatures_are_smoothed_within_blocks(own):
     rng = np.random.default_rng(4)
     log = log_of(rng.standard_normal(180_000))
     t = np.arange(180_000) / RATE
@@ -342,7 +342,7 @@ def test_temperatures_keep_their_course_inside_of_blocks_and_lose_their_noise(ow
     )  # a supply as well, but for its corners
 
 
-def test_a_channel_that_falls_silent_is_missing_there():
+def test_a_channel_is_missing_in_its_long_gaps():
     log = log_of(np.random.default_rng(0).standard_normal(60_000))
     stamps = log.time.values[::100]
     keep = np.r_[0:200, 400:600]
@@ -371,7 +371,7 @@ def test_long_gaps_and_restarts_are_listed_in_seconds():
     assert blocks.attrs["missing_share"] == pytest.approx((50 + 300 + 1000 + 1050) / 60_000)
 
 
-def test_restarts_that_the_log_tells_are_taken():
+def test_restarts_listed_in_the_log_are_used():
     model = {
         "noise": {"N": 0.01},
         "log": {"axes": ["x"]},
@@ -385,7 +385,7 @@ def test_restarts_that_the_log_tells_are_taken():
 
 @settings(max_examples=10, deadline=None)
 @given(chunk=st.integers(300, 9000), seed=st.integers(0, 100))
-def test_chunks_change_nothing(chunk: int, seed: int):
+def test_statistics_do_not_depend_on_chunks(chunk: int, seed: int):
     rng = np.random.default_rng(seed)
     x = rng.standard_normal((2, 20_000))
     x[:, rng.random(20_000) < 0.1] = np.nan
@@ -401,7 +401,7 @@ def test_chunks_change_nothing(chunk: int, seed: int):
             assert whole[name].identical(cut[name]), name
 
 
-def test_an_angle_log_is_that_of_its_rates():
+def test_an_angle_log_gives_the_statistics_of_its_rates():
     rates = np.random.default_rng(5).standard_normal((1, 30_000)) + 10.0
     angle = np.concatenate([[[0.0]], np.cumsum(rates, axis=1) / 3600.0 / RATE], axis=1)
     log = make_log(angle, rate=RATE, unit="deg", kind="angle")
@@ -414,7 +414,7 @@ def test_an_angle_log_is_that_of_its_rates():
 # manners
 
 
-def test_blocks_suit_the_length_of_the_record():
+def test_block_length_depends_on_the_record():
     assert block_samples(24 * 3600 * 400, 400.0) == 8000
     days = block_samples(200 * 3600 * 400, 400.0)
     assert 200 * 3600 * 400 / days == pytest.approx(6000, rel=0.05)
@@ -422,7 +422,7 @@ def test_blocks_suit_the_length_of_the_record():
     assert block_samples(360_000, 99.3) in range(1900, 1987)
 
 
-def test_a_record_that_is_too_short_is_told_how_long_it_must_be():
+def test_error_for_a_short_record_states_the_minimum():
     with pytest.raises(OptionError, match=r"record of 20 s .* too short .* 24 s at least"):
         reduce_log(log_of(np.zeros(2000)))
     with pytest.raises(OptionError, match="give a shorter block"):
@@ -431,7 +431,7 @@ def test_a_record_that_is_too_short_is_told_how_long_it_must_be():
         reduce_log(log_of(np.zeros(20_000)), block="0.1s")
 
 
-def test_a_single_name_of_a_file_stays_whole():
+def test_a_single_file_name_is_one_entry():
     log = log_of(np.random.default_rng(1).standard_normal(24 * 100)).assign_attrs(
         source_files="run7.csv", notes="after a repair"
     )
@@ -442,7 +442,7 @@ def test_a_single_name_of_a_file_stays_whole():
     )
 
 
-def test_what_is_no_log_is_refused():
+def test_an_invalid_log_is_refused():
     with pytest.raises(SchemaError):
         reduce_log(xr.Dataset())
 

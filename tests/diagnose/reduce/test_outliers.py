@@ -44,7 +44,7 @@ def spiked(rng: np.random.Generator, size: float, number: int) -> np.ndarray:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), lost=st.sampled_from([0.0, 0.2, 0.4]))
-def test_a_departure_is_from_the_median_of_the_pairs_about_a_sample(seed: int, lost: float):
+def test_departures_are_from_the_median_of_surrounding_pairs(seed: int, lost: float):
     rng = np.random.default_rng(seed)
     x = rng.standard_normal((2, 60))
     x[rng.random(x.shape) < lost] = np.nan
@@ -70,7 +70,7 @@ def test_a_departure_is_from_the_median_of_the_pairs_about_a_sample(seed: int, l
     assert histogram.sum() == np.isfinite(away).sum()
 
 
-def test_white_noise_departs_by_as_much_from_few_samples_as_from_many():
+def test_departures_of_white_noise_do_not_depend_on_gaps():
     rng = np.random.default_rng(1)
     for lost in (0.0, 0.3, 0.6):
         x = rng.standard_normal((200, 1000))
@@ -80,7 +80,7 @@ def test_white_noise_departs_by_as_much_from_few_samples_as_from_many():
         assert np.nanstd(away) == pytest.approx(np.sqrt(1.168), rel=0.02)
 
 
-def test_a_slope_departs_nowhere_and_a_spike_only_where_it_is():
+def test_departures_ignore_slopes_and_show_spikes():
     x = np.tile(3.0 * np.arange(100.0), (2, 1))
     x[1, [0, 50, 99]] += 1000.0
     away = np.empty_like(x)
@@ -95,19 +95,19 @@ def test_a_slope_departs_nowhere_and_a_spike_only_where_it_is():
 # counts
 
 
-def test_gaussian_noise_has_no_more_than_chance():
+def test_gaussian_noise_has_the_expected_false_outliers():
     assert total(
         lambda rng: rng.standard_normal(SIZE), 40
     ) <= 40 * EXPECTED_FALSE_OUTLIERS + 3.0 * np.sqrt(40 * EXPECTED_FALSE_OUTLIERS)
 
 
 @pytest.mark.parametrize(("size", "least"), [(5.0, 0.2), (6.0, 0.5), (8.0, 0.9)])
-def test_spikes_are_seen_from_five_deviations_on(size, least):
+def test_spikes_are_detected_from_five_deviations(size, least):
     seen = total(lambda rng: spiked(rng, size, 15), 10)
     assert least * 150 <= seen <= 150
 
 
-def test_one_that_is_far_counts_three_times_wherever_in_a_block():
+def test_a_large_outlier_counts_three_times_anywhere_in_a_block():
     for place in (0, 1, 90, 179):
         x = np.random.default_rng(2).standard_normal(SIZE)
         x[20 * BLOCK + place] += 30.0
@@ -148,12 +148,12 @@ LIVELY = {
 
 
 @pytest.mark.parametrize("kind", LIVELY)
-def test_lively_noise_has_hardly_any(kind):
+def test_nonstationary_noise_has_few_false_outliers(kind):
     assert total(LIVELY[kind], 12) <= 4  # in six hours
 
 
 @pytest.mark.parametrize(("samples", "louder"), [(20, 3.0), (20, 10.0), (50, 5.0)])
-def test_bursts_of_noise_are_no_spikes(samples, louder):
+def test_bursts_of_noise_are_not_spikes(samples, louder):
     def make(rng):
         loud = np.ones(SIZE)
         for first in rng.integers(0, SIZE - samples, 15):
@@ -167,7 +167,7 @@ def test_bursts_of_noise_are_no_spikes(samples, louder):
     assert total(make, 8) < max(12, 0.02 * sum(jumping))
 
 
-def test_bit_errors_that_come_close_together_are_no_noise():
+def test_bit_errors_in_bursts_are_not_noise():
     x = np.random.default_rng(3).standard_normal(SIZE)
     x[40 * BLOCK + 30 : 40 * BLOCK + 72 : 3] += 2.0 ** np.random.default_rng(4).integers(4, 8, 14)
     number, _ = counted(x)

@@ -19,7 +19,7 @@ def log_of(values: np.ndarray) -> xr.Dataset:
     return make_log(np.atleast_2d(values), rate=RATE, unit="deg/h")
 
 
-def test_marks_are_counted_where_they_are():
+def test_anomalous_samples_are_counted_in_their_blocks():
     rng = np.random.default_rng(9)
     x = rng.standard_normal(60 * 1000)
     clean = reduce_log(log_of(x), block="10s")
@@ -47,7 +47,7 @@ def test_marks_are_counted_where_they_are():
     assert int(clipped.repeats.sum()) == 0  # at the ends
 
 
-def test_zeros_of_one_axis_are_stuck_and_those_of_all_are_filled():
+def test_zeros_of_one_axis_are_stuck_and_common_zeros_are_filled():
     rng = np.random.default_rng(10)
     x = rng.standard_normal((3, 60 * 1000))
     x[1, np.abs(x[1]) < 0.02] = 0.0
@@ -95,7 +95,7 @@ def test_held_samples_do_not_make_outliers_of_the_others():
     offset=st.floats(-5e4, 5e4),
     single=st.booleans(),
 )
-def test_the_lattice_is_found_whatever_its_offset(
+def test_the_quantization_step_is_found_with_any_offset(
     seed: int, step: float, offset: float, single: bool
 ):
     noise = np.random.default_rng(seed).standard_normal(8000)
@@ -107,7 +107,7 @@ def test_the_lattice_is_found_whatever_its_offset(
     assert quantization_step(smooth) == 0.0
 
 
-def test_the_lattice_shows_where_spikes_off_it_are_as_common_as_its_rare_levels():
+def test_the_quantization_step_is_found_among_spikes():
     rng = np.random.default_rng(9)
     values = np.round(rng.standard_normal(4000) / 0.1) * 0.1
     off = np.concatenate([values[:12] + 7.03, np.full(8, 6.777)])

@@ -73,7 +73,7 @@ def _with(found, shares):
 
 @pytest.mark.parametrize(("told", "true"), [(0.0, 0.0), (0.1, 0.1), (1.0, 0.02), (0.02, 1.0)])
 @pytest.mark.parametrize("missing", [0, 40])
-def test_axes_that_wander_by_themselves_have_normal_scores(told, true, missing):
+def test_independent_axes_have_normal_scores(told, true, missing):
     found = _means(baseline(walk=true), 60, 3)
     found["mean"][:, 1, 30 : 30 + missing] = np.nan
     z = common.score(found, baseline(walk=told))["z"].values
@@ -85,7 +85,7 @@ def test_axes_that_wander_by_themselves_have_normal_scores(told, true, missing):
 
 
 @pytest.mark.parametrize("shares", [(1.0, 0.8, -0.9), (-0.5, 1.0, 0.7)])
-def test_a_waveform_on_all_axes_is_found_where_no_axis_shows_it(base, null, shares):
+def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares):
     found = _with(_quiet(30, 5), shares)
     z = np.abs(
         np.nan_to_num(standardise(common.score(found, base), null.statistics["common_mode"]))
@@ -100,7 +100,7 @@ def test_a_waveform_on_all_axes_is_found_where_no_axis_shows_it(base, null, shar
     st.lists(st.sampled_from([-1.0, 1.0]), min_size=3, max_size=3),
 )
 @settings(max_examples=15, deadline=None)
-def test_sizes_say_nothing_and_signs_only_signs(sizes, signs):
+def test_scores_do_not_depend_on_sizes_of_axes(sizes, signs):
     noise, found = baseline(walk=WALK), _quiet(1, 9).isel(record=0)
     scaled = found.assign(mean=found["mean"] * xr.DataArray(np.multiply(sizes, signs), dims="axis"))
     before, after = (common.score(one, noise)["estimate"].values for one in (found, scaled))
@@ -110,7 +110,7 @@ def test_sizes_say_nothing_and_signs_only_signs(sizes, signs):
     np.testing.assert_allclose(after, before * turned, atol=1e-9)
 
 
-def test_the_score_of_all_axes_is_that_of_their_determinant():
+def test_score_of_all_axes_is_that_of_the_determinant():
     noise = baseline()
     found = _means(noise, 500, 12)
     scores = common.score(found, noise)
@@ -126,7 +126,7 @@ def test_the_score_of_all_axes_is_that_of_their_determinant():
     )
 
 
-def test_white_noise_that_is_known_to_be_shared_is_taken_off():
+def test_known_common_white_noise_is_subtracted():
     noise = baseline()
     found = _means(noise, 40, 8)
     rng, share = np.random.default_rng(2), 0.4
@@ -143,7 +143,7 @@ def test_white_noise_that_is_known_to_be_shared_is_taken_off():
     assert abs(after.mean()) < 0.04
 
 
-def test_what_the_baseline_knows_of_the_means_is_taken_off(base):
+def test_known_means_are_subtracted(base):
     shares = np.array([1.0, 0.8, -0.9])
     found = _with(_quiet(20, 5), shares)
     known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _waveform()))
@@ -154,7 +154,7 @@ def test_what_the_baseline_knows_of_the_means_is_taken_off(base):
     assert after < 1.2 < 2.5 < before
 
 
-def test_one_axis_or_a_short_record_has_nothing_to_compare():
+def test_one_axis_or_a_short_record_has_no_score():
     alone = baseline(axes="x")
     assert common.score(records(alone, 2, np.random.default_rng(1)), alone) is None
     found = _means(baseline(), 2, 1)
@@ -173,7 +173,7 @@ def _claim(statistic: str, axes: str):
     return SimpleNamespace(effect="cause", axes=tuple(axes), components=components)
 
 
-def test_it_becomes_one_box_which_the_effect_explains_that_takes_it_away(base, null):
+def test_common_motion_is_one_region_explained_by_its_effect(base, null):
     shares = np.array([1.0, 0.8, -0.9])
     found = _with(records(baseline(walk=TRUE), 1, np.random.default_rng(5)), shares).isel(record=0)
     regions = locate_mismatches(found, base, null)
@@ -201,7 +201,7 @@ def test_it_becomes_one_box_which_the_effect_explains_that_takes_it_away(base, n
     assert told("wander", "x", base) == []
 
 
-def test_it_stays_apart_from_what_axes_share_inside_blocks():
+def test_common_motion_is_separate_from_common_noise_within_blocks():
     slow = {
         "view": "cross_axis",
         "axes": "x y z",

@@ -21,7 +21,7 @@ from gyrostab.diagnose.statistics import spectral_line as spectrum
 from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     exponential_score,
-    over_windows,
+    sum_over_windows,
     window_set,
 )
 from gyrostab.ingest.make_log import make_log
@@ -59,7 +59,7 @@ def _dense(variance, present, walk, ou, decay):
     return dense[np.ix_(present, present)]
 
 
-def test_boxcar_kernels_are_the_dense_algebra():
+def test_boxcar_kernels_match_dense_algebra():
     rng = np.random.default_rng(5)
     n, p = 60, 3
     variance, walk, ou = (
@@ -92,10 +92,10 @@ def test_boxcar_kernels_are_the_dense_algebra():
 
 @given(st.integers(1, 80), st.lists(st.integers(1, 30), min_size=1, max_size=4, unique=True))
 @settings(max_examples=50, deadline=None)
-def test_window_sums_are_sums_over_windows(block_count, lengths):
+def test_sums_over_windows_match_their_definition(block_count, lengths):
     windows = window_set(block_count, lengths)
     values = np.random.default_rng(block_count).normal(size=(2, block_count, 3))
-    found = over_windows(values, windows)
+    found = sum_over_windows(values, windows)
     for k, (first, stop) in enumerate(zip(windows.first, windows.stop, strict=True)):
         assert 0 <= first < stop <= block_count
         np.testing.assert_allclose(found[:, k], values[:, first:stop].sum(axis=1), atol=1e-12)
@@ -106,7 +106,7 @@ def test_transfer_reproduces_the_laws_of_the_allan_variance():
     edges = np.geomspace(1e-5, RATE / 2, 4000)
     middle = np.sqrt(edges[1:] * edges[:-1])
     tau = np.array([0.01, 0.02, 0.16, 1.28])
-    weights = davar.transfer(edges[:-1], edges[1:], tau, RATE)
+    weights = davar.allan_transfer(edges[:-1], edges[1:], tau, RATE)
     white = weights @ np.full(middle.size, LEVEL)
     np.testing.assert_allclose(white, LAWS["N"].avar(tau, 0.003), rtol=2e-4)
     walk = weights @ (0.02**2 / 3600.0 / (2 * np.pi * middle) ** 2)
@@ -145,7 +145,7 @@ def _limits(make, limit, statistic, name, base, null):
     return shares
 
 
-def test_raised_noise_is_seen_from_the_closed_form_on(base, null):
+def test_detection_limit_of_raised_noise(base, null):
     def burst(found, epsilon):
         found["power"][:, 0, EVENT] *= 1.0 + epsilon
 
@@ -155,7 +155,7 @@ def test_raised_noise_is_seen_from_the_closed_form_on(base, null):
     assert below < 0.5 < above
 
 
-def test_a_mean_step_is_seen_from_the_closed_form_on(base, null):
+def test_detection_limit_of_a_mean_step(base, null):
     def step(found, height):
         found["mean"][:, 0, EVENT] += height
 
@@ -166,7 +166,7 @@ def test_a_mean_step_is_seen_from_the_closed_form_on(base, null):
     assert below < 0.5 < above
 
 
-def test_shared_noise_is_seen_from_the_closed_form_on(base, null):
+def test_detection_limit_of_shared_noise(base, null):
     def shared(found, rho):
         power, pairs = found["power"].values, ((0, 1), (0, 2), (1, 2))
         for place, (a, b) in enumerate(pairs):
@@ -178,7 +178,7 @@ def test_shared_noise_is_seen_from_the_closed_form_on(base, null):
     assert below < 0.5 < above
 
 
-def test_a_line_is_seen_from_the_closed_form_on(base, null):
+def test_detection_limit_of_a_line(base, null):
     def line(found, amplitude):
         signal, rng = amplitude**2 / 4.0 * 0.926 * BLOCK_S, np.random.default_rng(2)
         sine = np.sqrt(signal) * np.exp(2j * np.pi * rng.random((60, 8, 23)))
@@ -194,7 +194,7 @@ def test_a_line_is_seen_from_the_closed_form_on(base, null):
     assert below < 0.5 < above
 
 
-def test_davar_is_blind_to_a_step_between_its_windows_and_the_mean_is_not(base, null):
+def test_the_mean_shows_a_step_between_windows_that_davar_does_not(base, null):
     found = records(base, 40, np.random.default_rng(4))
     found["mean"][:, 0, 60:120] += 0.06
     assert _detected(mean.score(found, base), null, "mean") > 0.9
@@ -219,7 +219,7 @@ def test_a_step_raises_the_allan_variance_by_the_closed_form():
             assert surface["observed"][0, whole, column] == pytest.approx(expected, rel=0.05)
 
 
-def test_mean_estimates_the_step(base):
+def test_the_mean_estimates_the_step(base):
     found = records(base, 1, np.random.default_rng(8)).isel(record=0)
     found["mean"][2, 60:105] += 0.5
     scores = mean.score(found, base)
@@ -231,7 +231,7 @@ def test_mean_estimates_the_step(base):
     assert mean.region_mean(found, base, 2, inside) == pytest.approx(0.5, abs=0.03)
 
 
-def test_a_line_has_its_amplitude():
+def test_a_line_estimates_its_amplitude():
     from gyrostab.diagnose.reduce.block_statistics import reduce_log
     from gyrostab.ingest.make_log import make_log
 
@@ -248,7 +248,7 @@ def test_a_line_has_its_amplitude():
     assert float(scores["estimate"][0, -1, best]) == pytest.approx(0.3, rel=0.1)
 
 
-def test_what_is_locked_to_rotation_and_ramp_is_seen(base):
+def test_phase_locked_rates_are_detected(base):
     rng = np.random.default_rng(9)
     found = records(base, 1, rng).isel(record=0)
     assert locked.score(found, base) is None
@@ -279,7 +279,7 @@ def test_what_is_locked_to_rotation_and_ramp_is_seen(base):
     assert (scores["z"].values[:, 0, -1, 1] > 5.0).mean() > 0.95
 
 
-def test_transients_and_jumps_after_restarts_are_seen(base):
+def test_transients_and_jumps_after_restarts_are_detected(base):
     found = records(base, 60, np.random.default_rng(10))
     assert restart.score(found, base) is None
     found["restart_begin"] = ("restart", np.array([1000.0, 2400.0]))
@@ -303,7 +303,7 @@ def test_transients_and_jumps_after_restarts_are_seen(base):
     assert int(scores["first"][-1]) == 121
 
 
-def test_counts_and_tails(base):
+def test_sample_counts_and_tails_are_detected(base):
     found = records(base, 2, np.random.default_rng(12))
     found["outliers"][:] = 0
     found["outliers"][1, 0, 40:43] = 2
@@ -336,7 +336,7 @@ def test_exponential_score_is_exact(value):
     assert stats.norm.logsf(z) == pytest.approx(-value, rel=1e-6)
 
 
-def test_a_correlation_score_is_that_of_student():
+def test_correlation_score_matches_student():
     r, n = np.array([0.3, 0.6]), 20.0
     t = r * np.sqrt((n - 1) / (1 - r**2))
     np.testing.assert_allclose(
@@ -353,7 +353,7 @@ def test_one_axis_has_no_pairs():
 
 
 @pytest.mark.parametrize("loud", [(6_050, 12_000), (6_050, 6_540)])
-def test_noise_that_is_loud_for_a_while_is_neither_shared_nor_a_line(loud):
+def test_a_noise_burst_is_neither_shared_nor_a_line(loud):
     largest: dict[str, list[float]] = {"cross_spectrum": [], "spectral_line": []}
     for seed in range(8):
         noise = np.random.default_rng(seed).standard_normal((2, 12_000))

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.locate.regions import merge_regions
-from gyrostab.diagnose.nulls.records import _leaked
+from gyrostab.diagnose.nulls.records import _correlate_lines
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.text import mismatch_statement
 from gyrostab.diagnose.statistics import drifting_line as gliding
 from gyrostab.diagnose.statistics import spectral_line as spectrum
-from gyrostab.diagnose.statistics import variance_stability as restless
+from gyrostab.diagnose.statistics import variance_stability
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import taper
 from tests.support.reduced_records import baseline, chunks, records
@@ -49,13 +49,13 @@ def _largest(statistic, found, base, null, row=slice(None)):
 
 @given(st.integers(4, 30), st.integers(0, 10**6))
 @settings(max_examples=12, deadline=None)
-def test_moments_of_the_scatter_are_those_of_drawn_levels(count, seed):
+def test_moments_of_the_scatter_match_simulated_levels(count, seed):
     rng = np.random.default_rng(seed)
     shape = rng.uniform(1.0, 40.0, count)
     drawn = rng.gamma(shape, size=(40_000, count)) / shape * rng.uniform(0.1, 10.0)
     mean = (drawn * shape).sum(axis=1, keepdims=True) / shape.sum()
     scatter = (shape * (drawn - mean) ** 2).sum(axis=1) / mean[:, 0] ** 2
-    wanted, variance = restless.scatter_moments(
+    wanted, variance = variance_stability.scatter_moments(
         np.array(float(count)), shape.sum(), (1.0 / shape).sum()
     )
     assert scatter.mean() == pytest.approx(wanted, abs=5.0 * np.sqrt(variance / scatter.size))
@@ -64,14 +64,14 @@ def test_moments_of_the_scatter_are_those_of_drawn_levels(count, seed):
 
 
 def test_scores_of_steady_noise_are_normal(base):
-    z = restless.score(_some(base, 60, 3), base)["z"].values
+    z = variance_stability.score(_some(base, 60, 3), base)["z"].values
     z = z[np.isfinite(z)]
     assert abs(z.mean()) < 0.05
     assert z.std() == pytest.approx(1.0, abs=0.06)
     assert 0.4 < (z > 3.0).mean() / 0.00135 < 2.5
 
 
-def test_swelling_noise_is_seen_from_the_closed_form_on(base, null):
+def test_detection_limit_of_variance_fluctuation(base, null):
     shape = float(_some(base, 1, 1)["shape"].values[0, 0, 3:].sum())
     swell = np.sqrt(2.0) * np.sin(
         2.0 * np.pi * np.arange(BLOCKS) / 3.7
@@ -82,51 +82,55 @@ def test_swelling_noise_is_seen_from_the_closed_form_on(base, null):
     for factor in (0.75, 1.3):
         found = _some(base, 60, 17)
         found["power"][:, 0] *= np.exp(factor * limit * swell)[:, None]
-        shares.append((_largest(restless, found, base, null, row=0) > critical).mean())
+        shares.append((_largest(variance_stability, found, base, null, row=0) > critical).mean())
     assert shares[0] < 0.5 < shares[1]
 
 
-def test_what_swells_on_all_axes_is_seen_sooner_together(base, null):
+def test_common_variance_fluctuation_is_detected_jointly(base, null):
     found = _some(base, 30, 5)
     found["power"] *= np.exp(0.09 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 12.0))[:, None]
     together, alone = (
-        np.median(_largest(restless, found, base, null, row=row)) for row in (3, slice(0, 3))
+        np.median(_largest(variance_stability, found, base, null, row=row))
+        for row in (3, slice(0, 3))
     )
     assert together > null.critical("variance_stability", 0.01) > alone
 
 
 @given(st.floats(0.01, 100.0))
 @settings(max_examples=5, deadline=None)
-def test_how_loud_steady_noise_is_does_not_matter(factor):
+def test_scores_do_not_depend_on_the_noise_level(factor):
     base = baseline(**SMALL)
     found = _some(base, 1, 8)
     louder = found.copy(deep=True)
     louder["power"][:, 1] *= factor
-    kept = [restless.score(one, base)["z"].isel(row=[0, 1, 2]).values for one in (found, louder)]
+    kept = [
+        variance_stability.score(one, base)["z"].isel(row=[0, 1, 2]).values
+        for one in (found, louder)
+    ]
     np.testing.assert_allclose(*kept, atol=1e-6)
 
 
-def test_a_single_loud_block_is_not_restless(base, null):
+def test_a_single_noisy_block_is_not_variance_fluctuation(base, null):
     found = _some(base, 20, 6)
     found["power"][:, 0, 50] *= 30.0
     assert (
-        _largest(restless, found, base, null) > null.critical("variance_stability", 0.01)
+        _largest(variance_stability, found, base, null) > null.critical("variance_stability", 0.01)
     ).mean() <= 0.1
 
 
-def test_noise_that_axes_share_is_not_restless(base, null):
+def test_shared_noise_is_not_variance_fluctuation(base, null):
     found = _some(base, 20, 7)
     found["power"][:, 1] = found["power"][:, 0]
     found["power"][:, 2] = found["power"][:, 0]
     found["cross"][:] = found["power"][:, 0].values[:, None]
     critical = null.critical("variance_stability", 0.01)
-    assert (_largest(restless, found, base, null, row=3) > critical).mean() <= 0.1
+    assert (_largest(variance_stability, found, base, null, row=3) > critical).mean() <= 0.1
     assert (
-        _largest(restless, found.drop_vars("cross"), base, null, row=3) > critical
+        _largest(variance_stability, found.drop_vars("cross"), base, null, row=3) > critical
     ).mean() > 0.9  # were it not known
 
 
-def test_a_burst_that_has_its_box_is_not_told_again(base, null):
+def test_a_burst_with_a_region_is_not_reported_again(base, null):
     found = _some(base, 1, 9).isel(record=0)
     found["power"][0, 60:75] *= 1.7
     regions = locate_mismatches(found, base, null)
@@ -134,21 +138,21 @@ def test_a_burst_that_has_its_box_is_not_told_again(base, null):
     found["power"][1] *= np.exp(0.5 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 9.0))[:, None]
     regions = locate_mismatches(found, base, null)
     new = regions.sel(
-        mismatch=[str(what).startswith("restless") for what in regions["what"].values]
+        mismatch=[str(what).startswith("variance") for what in regions["what"].values]
     )
     assert "y" in {axis for axes in new["axes"].values for axis in str(axes).split()}
     assert float(new["end"].max() - new["begin"].min()) > 0.9 * BLOCKS * 20.0
 
 
-def test_levelled_powers_have_the_expected_mean(base):
+def test_scaled_powers_have_the_expected_mean(base):
     found = _some(base, 1, 10).isel(record=0)
     found["power"][0, 10:40] *= 5.0
-    flat = restless.levelled(found, base, [(["x"], 200.0, 800.0)])
+    flat = variance_stability.scale_to_expected(found, base, [(["x"], 200.0, 800.0)])
     ratio = flat["power"].values / base["spectrum"].values
     np.testing.assert_allclose(ratio[0, 10:40].mean(axis=0), 1.0)
     np.testing.assert_array_equal(flat["power"].values[1:], found["power"].values[1:])
     np.testing.assert_array_equal(flat["power"].values[0, 40:], found["power"].values[0, 40:])
-    assert restless.levelled(found, base, []) is found
+    assert variance_stability.scale_to_expected(found, base, []) is found
 
 
 def _moving_line(found, row, first, last, energy, bend=0.0):
@@ -170,7 +174,7 @@ def _moving_line(found, row, first, last, energy, bend=0.0):
 @pytest.mark.parametrize(
     ("first", "last", "bend"), [(20, 60, 0.0), (75, 30, 0.0), (10, 50, 0.6), (25, 90, -0.6)]
 )
-def test_a_moving_line_is_seen_where_none_of_its_lines_stands_out(base, null, first, last, bend):
+def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, bend):
     found = _some(base, 12, 12)
     energy = 9.0 * np.sqrt(
         abs(last - first) / (8.0 * BLOCKS)
@@ -191,7 +195,7 @@ def test_a_moving_line_is_seen_where_none_of_its_lines_stands_out(base, null, fi
     assert (_largest(spectrum, found, base, null) > single).mean() < 0.5
 
 
-def test_a_line_that_stands_and_a_hump_for_a_while_do_not_move(base, null):
+def test_a_steady_line_and_a_temporary_hump_do_not_drift(base, null):
     found = _some(base, 20, 13)
     found["line_power"][:, 0, :, 37] *= 50.0
     found["line_power"][:, 1, 3, 20:60] *= 3.0
@@ -201,20 +205,20 @@ def test_a_line_that_stands_and_a_hump_for_a_while_do_not_move(base, null):
     ).mean() <= 0.1
 
 
-def test_steady_noise_has_no_line_that_moves(base, null):
+def test_steady_noise_has_no_drifting_line(base, null):
     assert (
         _largest(gliding, _some(base, 100, 14), base, null) > null.critical("drifting_line", 0.01)
     ).mean() <= 0.03
     assert (
-        _largest(restless, _some(base, 100, 15), base, null)
+        _largest(variance_stability, _some(base, 100, 15), base, null)
         > null.critical("variance_stability", 0.01)
     ).mean() <= 0.03
 
 
-def test_short_records_are_left_alone(base):
+def test_short_records_have_no_score(base):
     few = {"rate": 10.0, "block_count": 5}
     assert (
-        restless.score(
+        variance_stability.score(
             records(baseline(**few), 2, np.random.default_rng(1), **few), baseline(**few)
         )
         is None
@@ -226,21 +230,21 @@ def test_short_records_are_left_alone(base):
 
 
 @pytest.mark.parametrize("block_count", [213, 218, 255])
-def test_windows_behind_the_last_average_have_no_score(block_count):
+def test_windows_after_the_last_average_have_no_score(block_count):
     small = {"rate": 10.0, "block_count": block_count}
-    found = restless.score(
+    found = variance_stability.score(
         records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small)
     )
     behind = (found["first"] > block_count // 32 * 32).values
     assert behind.any()
-    long = np.char.startswith(found["what"].values.astype(str), "restless 640 s")
+    long = np.char.startswith(found["what"].values.astype(str), "variance 640 s")
     assert long.any()
     assert np.isnan(found["z"].values[..., behind, :][..., long]).all()
     whole = (found["stop"] - found["first"] == block_count).values
     assert np.isfinite(found["z"].values[..., whole, :][..., long]).all()
 
 
-def test_a_part_without_samples_is_stepped_over(base, null):
+def test_a_part_without_samples_is_skipped(base, null):
     found = _some(base, 12, 16)
     _moving_line(found, 0, 20, 60, 7.0 * np.sqrt(40.0 / (8.0 * BLOCKS)))
     found["line_power"][:, :, 4], found["line_weight"][:, 4] = np.nan, 0.0
@@ -249,10 +253,10 @@ def test_a_part_without_samples_is_stepped_over(base, null):
     assert np.median(np.nanmax(z, axis=(1, 2, 3))) > 3.0
 
 
-def test_one_axis_has_no_row_of_all():
+def test_one_axis_has_no_joint_row():
     one = baseline(axes="x", **SMALL)
     found = records(one, 2, np.random.default_rng(1), **SMALL)
-    assert restless.score(found, one)["axes"].values.tolist() == ["x"]
+    assert variance_stability.score(found, one)["axes"].values.tolist() == ["x"]
     assert gliding.score(found, one)["axes"].values.tolist() == ["x"]
 
 
@@ -267,13 +271,13 @@ def test_a_level_and_its_scatter_are_two_mismatches():
         "tau_max_s": 0.1,
     }
     region |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
-    assert len(merge_regions([region, region | {"what": "restless 20 s"}])) == 2
+    assert len(merge_regions([region, region | {"what": "variance 20 s"}])) == 2
     assert (
         len(
             merge_regions(
                 [
-                    region | {"what": "restless 40 s"},
-                    region | {"what": "restless 20 s", "axes": "x y"},
+                    region | {"what": "variance 40 s"},
+                    region | {"what": "variance 20 s", "axes": "x y"},
                 ]
             )
         )
@@ -281,10 +285,10 @@ def test_a_level_and_its_scatter_are_two_mismatches():
     )
 
 
-def test_sentences_say_how_fast_and_where_to():
+def test_statements_give_time_scale_and_frequencies():
     region = {
         "view": "davar",
-        "what": "restless 40 s",
+        "what": "variance 40 s",
         "axes": ["x", "y"],
         "begin": 0.0,
         "end": 2000.0,
@@ -296,19 +300,19 @@ def test_sentences_say_how_fast_and_where_to():
     assert "axes x and y goes up and down over the whole record" in told
     assert "one stretch of 40 s to another" in told
     assert "8 % (rms)" in told
-    glide = region | {"view": "spectrum", "what": "glide 1.58 3.42", "axes": ["y"]}
+    glide = region | {"view": "spectrum", "what": "drifting 1.58 3.42", "axes": ["y"]}
     assert (
         "a line that moves over the whole record, from about 1.58 Hz to about 3.42 Hz"
         in mismatch_statement(glide, 2000.0)
     )
 
 
-def test_drawn_lines_leak_as_those_of_tapered_noise_do():
+def test_lines_of_null_records_leak_like_tapered_noise():
     rng, size = np.random.default_rng(2), 200
     lines = (
         np.abs(np.fft.rfft(rng.normal(size=(40_000, size)) * taper(size), axis=-1)[:, 1:100]) ** 2
     )
-    drawn = _leaked(rng.gamma(12.0, size=(40_000, 99)) / 12.0, size)
+    drawn = _correlate_lines(rng.gamma(12.0, size=(40_000, 99)) / 12.0, size)
     for wide in (4, 15, 40):  # lines that a way adds up
         spread = [one[:, 20 : 20 + wide].mean(axis=1).std() / one.mean() for one in (lines, drawn)]
         alone = [one[:, 20:60].std() / one.mean() for one in (lines, drawn)]
@@ -322,12 +326,12 @@ def test_drawn_lines_leak_as_those_of_tapered_noise_do():
     assert drawn.var() == pytest.approx(1.0 / 12.0, rel=0.02)
 
 
-def test_a_stretch_that_ends_within_a_block_leaves_nothing_restless():
+def test_an_interval_that_ends_within_a_block_leaves_no_fluctuation():
     noise = np.random.default_rng(5).standard_normal((2, 60_000))
     noise[:, 20_000:40_400] *= 6.0
     blocks = reduce_log(
         make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples"
     )
     base = calibrate_noise(blocks, quiet=np.arange(60) < 20)
-    told = restless.levelled(blocks, base, [(("x", "y"), 2_000.0, 4_100.0)])
-    assert float(np.nanmax(restless.score(told, base)["z"].values)) < 4.8
+    told = variance_stability.scale_to_expected(blocks, base, [(("x", "y"), 2_000.0, 4_100.0)])
+    assert float(np.nanmax(variance_stability.score(told, base)["z"].values)) < 4.8
