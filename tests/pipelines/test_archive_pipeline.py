@@ -78,7 +78,7 @@ def test_product_spans_the_days_and_finds_the_noise(archive):
         assert (night["observable"] == 0).all()
 
 
-def test_everything_else_is_there(archive):
+def test_all_other_outputs_exist(archive):
     folder, said = archive
     results = folder / "results"
     assert {path.name for path in results.iterdir()} == {
@@ -107,7 +107,7 @@ def test_a_damaged_file_is_left_out_and_named(archive):
         assert len(product.attrs["source_files"]) == 3
 
 
-def test_a_second_start_keeps_what_is_complete(archive):
+def test_second_start_keeps_complete_results(archive):
     folder, _ = archive
     results = [folder / "results" / name for name in ("log.nc", "product.nc")]
     before = [path.stat().st_mtime_ns for path in results]
@@ -119,7 +119,7 @@ def test_a_second_start_keeps_what_is_complete(archive):
     assert [path.stat().st_mtime_ns for path in results] == before
 
 
-def test_no_logs_is_said_plainly(tmp_path):
+def test_message_without_logs(tmp_path):
     for name in ("archive.py", "archive.toml"):
         shutil.copy(ROOT / "pipelines" / name, tmp_path)
     done = subprocess.run(

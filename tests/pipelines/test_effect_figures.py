@@ -1,4 +1,4 @@
-"""Every effect has a section with a figure and a row in the table; pipelines/effect_figures.py draws what the section says."""
+"""Every effect has a section, a figure and a table row, and the figure shows what they say."""
 
 from __future__ import annotations
 

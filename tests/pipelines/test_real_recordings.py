@@ -1,4 +1,4 @@
-"""Real recordings, from log to product: what is known of them from their sources is what comes out."""
+"""Real recordings, from log to product, compared with what their sources state."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Outcome = tuple[xr.Dataset, xr.Dataset, dict[str, float]]
 def there(
     recordings: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[str], dict[str, Any]]:
-    """Go to the directory of the recordings, where the paths of an entry hold; skip when its files are not there."""
+    """Return a function that enters the directory of the recordings; skip without the files."""
 
     def go(name: str) -> dict[str, Any]:
         entry: dict[str, Any] = ENTRIES[name]
@@ -53,7 +53,7 @@ def examine(
     kept: dict[str, Outcome],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[str], Outcome]:
-    """Log, product as read back from disk, and the numbers of the page; each recording is processed once."""
+    """Process each recording once: log, product read back from disk, numbers of the page."""
 
     def run(name: str) -> Outcome:
         entry = there(name)
@@ -122,7 +122,7 @@ def test_adis16405_is_stationary(examine):
     assert found["n_high"] < 1.07 * found["n_x"]
 
 
-def test_ring_laser_gyros_sway_on_and_off(examine):
+def test_ring_laser_gyros_sway_intermittently(examine):
     log, product, found = examine("rlg-static-30min")
     pieces = deviation(product, "y", 1.0, "deg/h")[
         ::6
@@ -171,7 +171,7 @@ def test_blueseis_angle_random_walk_from_one_second_on(examine):
     assert (whole["N_upper"] > white).all()
 
 
-def test_ch104_textbook(examine):
+def test_ch104_is_not_the_textbook_curve_below_10_s(examine):
     product, found = examine("mems-static-53min")[1:]
     assert found["at_1"] == pytest.approx(0.0077, rel=0.01)
     assert found["at_100"] == pytest.approx(6.9e-4, rel=0.1)
@@ -221,7 +221,7 @@ def test_the_command_of_the_page_makes_the_same_product(examine, there, tmp_path
     assert "bursts" in capsys.readouterr().err
 
 
-def test_rocket_that_waited(examine):
+def test_rocket_flight_with_a_pause(examine):
     log, product, found = examine("rocket-flight-temperature-launch-1")
     (gap,) = gyrostab.gap_table(log).itertuples()
     assert gap.seconds == pytest.approx(1068, abs=1)
@@ -233,7 +233,7 @@ def test_rocket_that_waited(examine):
     assert (found["t_before"], found["t_after"]) == pytest.approx((26.5, 32.6), abs=0.2)
 
 
-def test_rocket_that_did_not_wait(examine):
+def test_rocket_flight_without_a_pause(examine):
     log, _, found = examine("rocket-flight-temperature-launch-3")
     assert (log.sizes["gap"], found["holes"], log.sizes["time"]) == (0, 0, 7646)
     assert np.isfinite(log["rate"]).all()
@@ -262,7 +262,7 @@ def test_autopilot_with_dropouts(examine, recordings):
     assert shaken.max() - shaken.min() < 4 + 2 * 2 + 1  # 4 s of handling, seen by windows of 2 s
 
 
-def test_micro_air_vehicle_after_a_spreadsheet(examine):
+def test_stamps_rewritten_by_a_spreadsheet(examine):
     log, _, found = examine("mav-flight-adis16448")
     assert np.isfinite(log["rate"]).sum() == 3 * 36_820
     assert log.sizes["time"] == 36_820
@@ -309,7 +309,8 @@ def test_drill_string_without_a_gyro(examine, there, recordings):
     log, product, found = examine("drill-rig-stick-slip")
     message = SCRIPT.refusal(there("drill-rig-stick-slip"))
     assert re.search(
-        r"^drill_rig\.csv\.gz: no gyro column .*bit_speed, top_speed.*--map \"bit_speed=gyro_x\" --unit",
+        r"^drill_rig\.csv\.gz: no gyro column .*bit_speed, top_speed.*"
+        r"--map \"bit_speed=gyro_x\" --unit",
         message,
     )
     table = pd.read_csv(recordings("drill-rig-stick-slip/drill_rig.csv.gz"))
@@ -333,7 +334,7 @@ def test_one_recording_on_the_page(there, tmp_path):
     assert followed == ""  # temperature is compared on the static run
 
 
-def test_the_page_has_a_row_for_every_recording_and_no_path():
+def test_page_has_a_row_for_every_recording_and_no_path():
     page = (ROOT / "docs" / "real-recordings.md").read_text(encoding="utf-8")
     assert "make real-recordings" in page
     assert not re.search(r"(?<![\w.])/(work|home|tmp|usr|root)\b", page)

@@ -1,4 +1,4 @@
-"""The experiments of the three papers: the pipeline in a small form, the errata against closed forms, and the page that holds them."""
+"""The papers' experiments: a small run of the pipeline, the errata, and the page."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def slips():
     return ERRATA.errata()
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------
 # experiments
 
 
-def test_x1_has_the_windows_and_the_noise_of_its_law(plan, tmp_path):
+def test_x1_has_the_expected_windows_and_noise(plan, tmp_path):
     rows = cells(SCRIPT.experiment("x1", tmp_path))
     assert rows["windows"] == ["166", "166", "166", "166", "167"]
     noise = next(row for label, row in rows.items() if label.startswith("N "))
@@ -62,7 +62,7 @@ def test_x1_has_the_windows_and_the_noise_of_its_law(plan, tmp_path):
     assert np.array(noise[2:], dtype=float) == pytest.approx(1 / 600, rel=0.03)
 
 
-def test_x2_rises_in_a_straight_line(plan):
+def test_noise_of_x2_rises_linearly(plan):
     run = plan["x2"]["run"]["blocks"]
     made = SCRIPT.analyse(SCRIPT.simulate("x2", run), run)
     seconds = (made["time"] - made["time"][0]) / np.timedelta64(1, "s") + 10.0
@@ -71,7 +71,7 @@ def test_x2_rises_in_a_straight_line(plan):
     assert 6000 * slope == pytest.approx(10.0, rel=0.03)
 
 
-def test_the_canyon_is_the_share_of_what_is_lost(plan, tmp_path):
+def test_gap_bias_equals_the_share_of_lost_samples(plan, tmp_path):
     rows = cells(SCRIPT.experiment("x3", tmp_path))
     _, printed, counted = next(row for label, row in rows.items() if "195-205" in label)
     k = 10
@@ -81,7 +81,7 @@ def test_the_canyon_is_the_share_of_what_is_lost(plan, tmp_path):
     assert float(counted) == pytest.approx(math.sqrt(0.1), rel=0.2)
 
 
-def test_folded_vibration_is_white_noise_from_20_ms_on_and_everything_when_deviations_are_added(
+def test_folded_vibration_is_white_noise_from_20_ms_on(
     plan,
 ):
     made = {}
@@ -101,7 +101,7 @@ def test_folded_vibration_is_white_noise_from_20_ms_on_and_everything_when_devia
         assert float(median("sums", of, **{"from": 30})) > 5 * float(median("sums", of, to=30))
 
 
-def test_l13_vibration_has_the_coefficients_that_were_asked_for(plan, tmp_path):
+def test_l13_vibration_has_the_coefficients_of_the_plan(plan, tmp_path):
     rows = cells(SCRIPT.experiment("l13_vibration", tmp_path))
     titles = [column["title"] for column in plan["l13_vibration"]["columns"]]
     at = {title: number for number, title in enumerate(titles)}
@@ -113,7 +113,7 @@ def test_l13_vibration_has_the_coefficients_that_were_asked_for(plan, tmp_path):
     assert rows["R [deg/h²]"][at["max, ours"]].startswith("< ")
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------
 # errata
 
 TRUTHS = {
@@ -153,12 +153,12 @@ TRUTHS = {
 
 
 @pytest.mark.parametrize("quantity", TRUTHS)
-def test_a_slip_is_as_large_as_its_closed_form(quantity, slips):
+def test_erratum_has_the_size_of_its_closed_form(quantity, slips):
     slip = next(slip for slip in slips if slip.quantity == quantity)
     assert (slip.as_printed, slip.in_truth) == pytest.approx(TRUTHS[quantity], rel=0.05)
 
 
-def test_deviations_add_to_too_much_and_angles_do_not_cross_a_gap(slips):
+def test_added_deviations_are_too_large_and_angles_do_not_cross_a_gap(slips):
     added = next(slip for slip in slips if slip.where == "P15 Eq. 3")
     assert 1.5 < added.as_printed / added.in_truth < math.sqrt(5)
     crossed = next(slip for slip in slips if slip.where == "P16 Eq. 21, 22")
@@ -166,18 +166,18 @@ def test_deviations_add_to_too_much_and_angles_do_not_cross_a_gap(slips):
     assert crossed.in_truth == pytest.approx(1.0, abs=0.3)
 
 
-# -----------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------
 # page
 
 
-def test_the_page_holds_the_errata_of_now(slips):
+def test_page_holds_the_current_errata(slips):
     written = [line.strip("|").split("|")[-2:] for line in on_the_page("errata").splitlines()[2:]]
     assert np.array(written, dtype=float) == pytest.approx(
         np.array([slip[-2:] for slip in slips]), rel=2e-3, abs=1e-6
     )
 
 
-def test_the_page_has_every_experiment_and_figure():
+def test_page_has_every_experiment_and_figure():
     text = PAGE.read_text(encoding="utf-8")
     figures = {
         f"figures/seeds-{name}.png"
@@ -191,13 +191,13 @@ def test_the_page_has_every_experiment_and_figure():
         assert set(cells(on_the_page(name))) == set(entry["rows"])
 
 
-def test_a_table_replaces_what_stands_between_its_marks():
+def test_table_replaces_the_text_between_its_markers():
     page = "a\n<!-- x: begin -->\nold\n<!-- x: end -->\nb\n<!-- y: begin -->\n<!-- y: end -->\n"
     assert SCRIPT.fill(page, "x", r"| \1 |") == page.replace("old", r"| \1 |")
     assert "new" in SCRIPT.fill(page, "y", "new")
 
 
-def test_the_script_stays_short():
+def test_script_stays_short():
     assert (
         len((ROOT / "pipelines" / "seed_experiments.py").read_text(encoding="utf-8").splitlines())
         <= 110
