@@ -1,4 +1,4 @@
-"""What a recording is compared with and how, and what a comparison found."""
+"""The inputs of a diagnosis, and what the comparison of a recording with them found."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_lines
-from gyrostab.diagnose.identify.forward_search import Identifications
+from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.moving_axes import without_motion
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.progress import Stage
 from gyrostab.simulate.model import Model
 
-__all__ = ["Compared", "Task", "still_lines"]
+__all__ = ["Comparison", "Task", "lines_without_motion"]
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,15 @@ class Task:
     Attributes
     ----------
     log : xarray.Dataset
-        With the axes that are alive.
-    given : Model, xarray.Dataset or None
-        The simulation; None where the noise is to be calibrated.
+        The recording, with the axes that vary.
+    simulation : Model, xarray.Dataset or None
+        What the recording is compared with; None when the noise is calibrated on the recording.
     quiet, restart_gap, seed, nulls, level, progress
-        The options of `diagnose`; `level` is its `false_alarm_level`.
+        The options of `gyrostab.diagnose`; `level` is its `false_alarm_level`.
     """
 
     log: xr.Dataset
-    given: Model | xr.Dataset | None
+    simulation: Model | xr.Dataset | None
     quiet: Any
     restart_gap: Any
     seed: int
@@ -42,39 +42,42 @@ class Task:
     progress: Stage
 
 
-class Compared(NamedTuple):
-    """What a comparison found.
+class Comparison(NamedTuple):
+    """What the comparison of a recording with its baseline found.
 
     Attributes
     ----------
     blocks : xarray.Dataset
+        Block statistics of the recording.
     baseline : xarray.Dataset
-    found : xarray.Dataset
-        Places of mismatches.
-    identifications : Naming
+        What the simulation predicts for them.
+    mismatches : xarray.Dataset
+        From `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
+    identifications : Identifications
+        The effects that explain the differences.
     null : NullScores
+        Scores of the null records.
     """
 
     blocks: xr.Dataset
     baseline: xr.Dataset
-    found: xr.Dataset
+    mismatches: xr.Dataset
     identifications: Identifications
     null: NullScores
 
 
-def still_lines(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
-    """The record with the line spectra of the blocks in which nothing that is known moves; the log is read once more where something does.
+def lines_without_motion(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
+    """Return the blocks with line spectra from those in which no known effect moves the rate.
 
-    A step within a block has the spectrum of a step, and a part of the record has only one for all
-    its blocks.
+    A step within a block has a broad spectrum, and all blocks in a part of the record share one
+    line spectrum. The log is read again when a block has to be left out.
     """
-    there = np.isfinite(blocks["power"].transpose("axis", "block", "band").values).any(axis=-1)
+    has_data = np.isfinite(blocks["power"].transpose("axis", "block", "band").values).any(axis=-1)
     moving = expect_known_motion(blocks, known)
-    if not (moving & there).any():
+    if not (moving & has_data).any():
         return blocks
-    calm = without_motion(
-        task.log, blocks, moving | ~there, restart_gap=task.restart_gap, progress=task.progress
+    at_rest = without_motion(
+        task.log, blocks, moving | ~has_data, restart_gap=task.restart_gap, progress=task.progress
     )
-    return remove_known_lines(
-        blocks.assign({name: calm[name] for name in ("line_power", "line_weight")}), known
-    )
+    lines = {name: at_rest[name] for name in ("line_power", "line_weight")}
+    return remove_known_lines(blocks.assign(lines), known)

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: recording, simulation before and simulation after on the same axes, with the mismatches drawn."""
+"""Plot a diagnosis: the recording and both simulations side by side, with the mismatches."""
 
 from __future__ import annotations
 
@@ -31,16 +31,19 @@ Array = NDArray[np.float64]
 _TITLES = {"recording": "Recording", "before": "Simulation before", "after": "Simulation after"}
 _STYLES: dict[str, dict[str, Any]] = {
     "recording": {"color": "black", "lw": 0.0, "marker": "o", "ms": 3.0},
-    "before": {"color": COLOURS[1], "lw": 1.6, "ls": "--", "zorder": 3},  # seen where both are one
+    # dashed and on top, so that it shows where both coincide
+    "before": {"color": COLOURS[1], "lw": 1.6, "ls": "--", "zorder": 3},
     "after": {"color": COLOURS[0], "lw": 1.6, "zorder": 2.5},
 }
-_MOST_CHANNELS = 3
-_PALE = 0.3  # opacity of what chance does in 95 of 100
-_LEAST_WIDTH = 0.012  # of the panel, that a box is drawn
+MAX_CHANNELS = 3  # panels below the means
+INSIDE_BAND_OPACITY = 0.3  # of cells inside the 95 % band
+MIN_FRAME_SHARE = 0.012  # width of a frame, as a share of the panel
+SIGMA_95 = 1.96  # two-sided 95 % quantile of the normal law
+_RED = "#D00000"
 
 
-def _edges(begin: Array, end: Array) -> Array:
-    """Edges of windows that may overlap: halfway between their centres."""
+def _window_edges(begin: Array, end: Array) -> Array:
+    """Return the edges of windows that may overlap: halfway between their centres."""
     centre = (begin + end) / 2.0
     if centre.size == 1:
         return np.array([begin[0], end[0]])
@@ -48,56 +51,65 @@ def _edges(begin: Array, end: Array) -> Array:
     return np.concatenate([[begin[0]], inner, [end[-1]]])
 
 
-def _time_of(text: str, start: str) -> float:
+def _seconds_since(text: str, start: str) -> float:
     return float(
         (np.datetime64(text.removesuffix("Z"), "ns") - np.datetime64(start.removesuffix("Z"), "ns"))
         / np.timedelta64(1, "s")
     )
 
 
-def _boxes(
+def _frame_mismatches(
     panel: Axes, axis: str, content: Mapping[str, Any], size: float, *, taus: Array, faint: bool
 ) -> None:
-    """Frames around the mismatches of the axis that have averaging times."""
+    """Frame the mismatches of an axis that have averaging times."""
     from matplotlib.patches import Rectangle
 
     start = content["recording"]["start"]
     low_edge, high_edge = log_edges(taus)[[0, -1]]
     left, right = panel.get_xlim()
-    for box in content["mismatches"]:
+    for region in content["mismatches"]:
         if (
-            axis not in box["axes"]
-            or box["view"] not in ("davar", "cross_axis")
-            or not box["tau_min_s"]
+            axis not in region["axes"]
+            or region["view"] not in ("davar", "cross_axis")
+            or not region["tau_min_s"]
         ):
             continue
-        begin, end = _time_of(box["start"], start) / size, _time_of(box["end"], start) / size
-        least = _LEAST_WIDTH * (right - left)
+        begin, end = (
+            _seconds_since(region["start"], start) / size,
+            _seconds_since(region["end"], start) / size,
+        )
+        least = MIN_FRAME_SHARE * (right - left)
         if end - begin < least:
             begin, end = (begin + end - least) / 2.0, (begin + end + least) / 2.0
-        low, high = max(box["tau_min_s"] / 1.3, low_edge), min(box["tau_max_s"] * 1.3, high_edge)
+        low, high = (
+            max(region["tau_min_s"] / 1.3, low_edge),
+            min(region["tau_max_s"] * 1.3, high_edge),
+        )
         if high <= low:
             continue
         style = {
             "fill": False,
-            "edgecolor": "#D00000",
+            "edgecolor": _RED,
             "linewidth": 1.0 if faint else 2.0,
             "linestyle": ":" if faint else "-",
         }
         panel.add_patch(Rectangle((begin, low), end - begin, high - low, **style))  # type: ignore[arg-type]
         if not faint:
-            at = {
-                "xy": (begin, high),
-                "xytext": (2, -2),
-                "textcoords": "offset points",
-                "va": "top",
-                "ha": "left",
-            }
-            told = panel.annotate(str(box["id"]), **at, fontsize=9, color="white", weight="bold")  # type: ignore[arg-type]
-            told.set_bbox({"facecolor": "#D00000", "edgecolor": "none", "pad": 1.2})
+            panel.annotate(
+                str(region["id"]),
+                (begin, high),
+                (2, -2),
+                textcoords="offset points",
+                va="top",
+                ha="left",
+                fontsize=9,
+                color="white",
+                weight="bold",
+                bbox={"facecolor": _RED, "edgecolor": "none", "pad": 1.2},
+            )
 
 
-def _maps(
+def _draw_maps(
     surfaces: xr.Dataset,
     content: Mapping[str, Any],
     columns: Sequence[tuple[str, Array, Any]],
@@ -105,7 +117,10 @@ def _maps(
     cmap: str,
     label: str,
 ) -> Figure:
-    """One row of maps an axis; `columns` are titles, values by (axis, window, tau), and how opaque each is, None for all."""
+    """Draw one row of maps per axis.
+
+    `columns` are titles, values by (axis, window, tau), and the opacity of each cell, or None.
+    """
     from matplotlib.cm import ScalarMappable
 
     names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
@@ -123,20 +138,20 @@ def _maps(
     )
     panels = figure.subplots(len(names), len(columns), sharex=True, sharey=True, squeeze=False)
     for row, name in enumerate(names):
-        for column, (title, values, opaque) in enumerate(columns):
+        for column, (title, values, opacity) in enumerate(columns):
             panel = panels[row, column]
-            edges = _edges(begin, end) / size, log_edges(tau)
+            edges = _window_edges(begin, end) / size, log_edges(tau)
             missing = np.ma.masked_where(np.isfinite(values[row]), np.full(values[row].shape, 0.2))
             panel.pcolormesh(*edges, missing.T, cmap="Greys", vmin=0.0, vmax=1.0, rasterized=True)
             alpha = (
-                None if opaque is None else np.where(np.isfinite(values[row]), opaque[row], 0.0).T
+                None if opacity is None else np.where(np.isfinite(values[row]), opacity[row], 0.0).T
             )
             shown = np.ma.masked_invalid(values[row])
             panel.pcolormesh(*edges, shown.T, norm=norm, cmap=cmap, rasterized=True, alpha=alpha)
             panel.set_yscale("log")
             panel.set_xlim(begin[0] / size, end[-1] / size)
             panel.set_ylim(*log_edges(tau)[[0, -1]])
-            _boxes(panel, name, content, size, taus=tau, faint=column > 0)
+            _frame_mismatches(panel, name, content, size, taus=tau, faint=column > 0)
             if row == 0:
                 panel.set_title(title)
             if column == 0:
@@ -154,15 +169,15 @@ def _maps(
 
 @literal_text
 def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
-    """Draw the Allan deviation over time and averaging time: recording, simulation before, simulation after.
+    """Draw the Allan deviation over time and averaging time, of the recording and both simulations.
 
     Parameters
     ----------
     surfaces : xarray.Dataset
-        From `gyrostab.diagnose.result.surfaces`: ``avar(case, axis, window, tau)`` [degree2
-        hour-2].
+        From `gyrostab.diagnose.result.surfaces`: ``avar(case, axis, window, tau)``
+        [degree2 hour-2].
     content : mapping
-        Of the diagnosis; its mismatches are framed.
+        Contents of `diagnosis.json`; its mismatches are framed.
 
     Returns
     -------
@@ -177,12 +192,12 @@ def plot_surfaces(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     columns = [
         (_TITLES.get(name, name), deviation[place], None) for place, name in enumerate(cases)
     ]
-    return _maps(surfaces, content, columns, norm, "viridis", "Allan deviation [deg/h]")
+    return _draw_maps(surfaces, content, columns, norm, "viridis", "Allan deviation [deg/h]")
 
 
 @literal_text
 def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
-    """Draw the Allan deviation of the recording over that of the simulation, before and after."""
+    """Draw the Allan deviation of the recording over that of the simulations before and after."""
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import FixedLocator, NullFormatter
 
@@ -200,12 +215,12 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
             )
         columns.append(
             (
-                f"Recording over simulation, {'without' if name == 'before' else 'with'} the effects",
+                f"Recording over simulation {'without' if name == 'before' else 'with'} effects",
                 ratio,
-                np.where(usual, _PALE, 1.0),
+                np.where(usual, INSIDE_BAND_OPACITY, 1.0),
             )
         )
-    figure = _maps(
+    figure = _draw_maps(
         surfaces, content, columns, LogNorm(0.5, 2.0), "PuOr_r", "ratio of Allan deviations"
     )
     bar = figure.axes[-1]
@@ -217,7 +232,7 @@ def plot_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
 
 @literal_text
 def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
-    """Draw the mean rate over time with what the simulation says, and the channels beneath.
+    """Draw the mean rate over time with the simulations, and the channels below.
 
     Parameters
     ----------
@@ -225,10 +240,10 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
         ``mean``, ``mean_stderr`` (case, axis, window), ``block_mean(axis, block)`` [degree hour-1]
         and the ``channel_<name>(block)``.
     content : mapping
-        Of the diagnosis.
+        Contents of `diagnosis.json`.
     """
     names = [str(name) for name in surfaces["axis"].values]
-    channels = _channels(surfaces, content)
+    channels = _select_channels(surfaces, content)
     size, unit = unit_of_time(float(surfaces["end"].values[-1]))
     time = (surfaces["begin"].values + surfaces["end"].values) / (2.0 * size)
     block = (surfaces["block_begin"].values + surfaces["block_end"].values) / (2.0 * size)
@@ -256,8 +271,8 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
             panel.plot(time, mean, **_STYLES[case], label=f"{_TITLES[case].lower()}, 95 %")
             panel.fill_between(
                 time,
-                mean - NORMAL_95 * error,
-                mean + NORMAL_95 * error,
+                mean - SIGMA_95 * error,
+                mean + SIGMA_95 * error,
                 color=_STYLES[case]["color"],
                 alpha=0.18,
                 lw=0,
@@ -265,12 +280,11 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
         _mark_spans(panel, name, content, size)
         panel.set_ylabel(f"axis {name}\nmean rate [deg/h]")
         panel.margins(x=0)
-        _limit(panel, single)
+        _limit_to_middle(panel, single)
     for panel, channel in zip(panels[len(names) :], channels, strict=True):
         panel.plot(block, surfaces[f"channel_{channel}"].values, color=COLOURS[2], lw=1.2)
-        panel.set_ylabel(
-            f"{channel.replace('_', ' ')}\n{unit_label(surfaces[f'channel_{channel}'].attrs.get('units'))}"
-        )
+        unit_text = unit_label(surfaces[f"channel_{channel}"].attrs.get("units"))
+        panel.set_ylabel(f"{channel.replace('_', ' ')}\n{unit_text}")
     panels[-1].set_xlabel(f"time since the start [{unit}]")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(
@@ -279,48 +293,61 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _limit(panel: Axes, values: Array) -> None:
-    """Show the middle 99 % of the block means with some room, so that a single one does not flatten the rest."""
+def _limit_to_middle(panel: Axes, values: Array) -> None:
+    """Show the middle 99 % of the block means, so that an outlier does not flatten the rest."""
     good = values[np.isfinite(values)]
     if good.size > 20:
         low, high = np.quantile(good, [0.005, 0.995])
         panel.set_ylim(low - 0.25 * (high - low) - 1e-12, high + 0.25 * (high - low) + 1e-12)
 
 
-def _channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[str]:
-    """Channels to draw: those that named effects follow first."""
-    there = [
+def _select_channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[str]:
+    """Return the channels to draw: first those that named effects follow."""
+    available = [
         str(name).removeprefix("channel_")
         for name in surfaces.data_vars
         if str(name).startswith("channel_")
     ]
-    there = [name for name in there if np.isfinite(surfaces[f"channel_{name}"].values).any()]
+    available = [
+        name for name in available if np.isfinite(surfaces[f"channel_{name}"].values).any()
+    ]
     named = [
         name.strip()
         for effect in content["effects"]
         for name in str(effect["driver"] or "").split(",")
     ]
-    usual = [name for name in ("temperature", "vibration", "rotation_rate") if name in there]
-    first = [name for name in dict.fromkeys(named) if name in there]
-    return list(dict.fromkeys([*first, *usual]))[:_MOST_CHANNELS]
+    usual = [name for name in ("temperature", "vibration", "rotation_rate") if name in available]
+    first = [name for name in dict.fromkeys(named) if name in available]
+    return list(dict.fromkeys([*first, *usual]))[:MAX_CHANNELS]
 
 
 def _mark_spans(panel: Axes, axis: str, content: Mapping[str, Any], size: float) -> None:
     start = content["recording"]["start"]
-    for box in content["mismatches"]:
-        if axis in box["axes"] and box["view"] in ("mean", "restart"):
-            begin, end = _time_of(box["start"], start) / size, _time_of(box["end"], start) / size
-            panel.axvspan(begin, end, color="#D00000", alpha=0.05, lw=0)
-            panel.axvspan(begin, end, ymin=0.96, color="#D00000", lw=0)
+    for region in content["mismatches"]:
+        if axis in region["axes"] and region["view"] in ("mean", "restart"):
+            begin, end = (
+                _seconds_since(region["start"], start) / size,
+                _seconds_since(region["end"], start) / size,
+            )
+            panel.axvspan(begin, end, color=_RED, alpha=0.05, lw=0)
+            panel.axvspan(begin, end, ymin=0.96, color=_RED, lw=0)
             panel.annotate(
-                str(box["id"]), (begin, 1.0), (2, -2), xycoords=panel.get_xaxis_transform(), textcoords="offset points",
-                va="top", fontsize=9, color="white", weight="bold", bbox={"facecolor": "#D00000", "edgecolor": "none", "pad": 1.2},
-            )  # fmt: skip
+                str(region["id"]),
+                (begin, 1.0),
+                (2, -2),
+                xycoords=panel.get_xaxis_transform(),
+                textcoords="offset points",
+                va="top",
+                fontsize=9,
+                color="white",
+                weight="bold",
+                bbox={"facecolor": _RED, "edgecolor": "none", "pad": 1.2},
+            )
 
 
 @literal_text
 def plot_deviations(surfaces: xr.Dataset) -> Figure:
-    """Draw the Allan deviation of the whole record, one panel an axis."""
+    """Draw the Allan deviation of the whole record, one panel per axis."""
     names, tau = [str(name) for name in surfaces["axis"].values], surfaces["tau"].values
     figure = new_figure(min(4.2 * len(names), 12.0) if len(names) > 1 else 6.0, 3.8)
     panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
@@ -344,7 +371,7 @@ def plot_deviations(surfaces: xr.Dataset) -> Figure:
 
 @literal_text
 def plot_spectra(surfaces: xr.Dataset) -> Figure:
-    """Draw the power spectrum of the whole record, one panel an axis.
+    """Draw the power spectrum of the whole record, one panel per axis.
 
     Parameters
     ----------

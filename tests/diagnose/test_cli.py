@@ -11,10 +11,11 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.core import diagnose, parse_quiescent_span
+from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.inputs import parse_quiescent_span
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.result.attribution import _can_show, spans
+from gyrostab.diagnose.result.attribution import _can_show, join_blocks
 from gyrostab.diagnose.result.diagnosis import check_diagnosis
 from gyrostab.diagnose.result.tables import chance_of_gain
 from gyrostab.errors import OptionError, SchemaError
@@ -179,7 +180,7 @@ def test_an_axis_that_never_changes_is_left_out():
         found = diagnose(log, nulls=100, seed=1)
     assert found.verdict == "no mismatch"
     assert found.content["recording"]["axes"] == list(found.content["baseline"]["noise"]) == ["x"]
-    with pytest.raises(SchemaError, match="the same on axis y: there is no noise"):
+    with pytest.raises(SchemaError, match="the same on axis y: without noise"):
         diagnose(log.isel(axis=[1]), nulls=100)
 
 
@@ -207,15 +208,21 @@ def test_a_short_recording_is_told_how_long_it_must_be(
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda log: white(rate=20.0), "another sampling rate (20 Hz) than the recording (10 Hz)"),
+        (
+            lambda log: white(rate=20.0),
+            "the sampling rate of the simulated log is 20 Hz, that of the recording 10 Hz",
+        ),
         (
             lambda log: log.isel(time=slice(0, 5000)),
-            "another number of samples (5000) than the recording (6000)",
+            "the number of samples of the simulated log is 5000, that of the recording 6000",
         ),
-        (lambda log: white(axes=2), "another axes (x, y) than the recording (x)"),
+        (
+            lambda log: white(axes=2),
+            "the list of axes of the simulated log is x, y, that of the recording x",
+        ),
         (
             lambda log: make_log(log.rate.values, rate=10.0, unit="deg/h", start="2027-01-01"),
-            "another start (2027-01-01",
+            "the start of the simulated log is 2027-01-01",
         ),
     ],
 )
@@ -277,10 +284,10 @@ def test_times_of_an_effect_are_few_or_the_whole_record():
     begin = np.arange(200.0)
     there = np.zeros(200, bool)
     there[50:80] = there[82:90] = True
-    assert spans(there, begin, begin + 1.0) == [(50.0, 90.0)]
+    assert join_blocks(there, begin, begin + 1.0) == [(50.0, 90.0)]
     there[150:170] = True
-    assert spans(there, begin, begin + 1.0) == [(50.0, 90.0), (150.0, 170.0)]
-    assert spans(np.arange(200) % 12 < 3, begin, begin + 1.0) == [(0.0, 200.0)]
+    assert join_blocks(there, begin, begin + 1.0) == [(50.0, 90.0), (150.0, 170.0)]
+    assert join_blocks(np.arange(200) % 12 < 3, begin, begin + 1.0) == [(0.0, 200.0)]
 
 
 def test_a_line_explains_a_line_at_its_own_frequency_only():

@@ -22,15 +22,15 @@ def when(seconds: float) -> str:
 
 
 def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
-    """An hour at 100 Hz, louder by 1.8 in variance and shifted by 0.08 deg/h on the first axis for five minutes."""
+    """An hour at 100 Hz; for five minutes axis x has 1.8 times the variance and 0.08 deg/h more."""
     rng = np.random.default_rng(seed)
     tau = 0.01 * 2.0 ** np.arange(14)
     begin = np.arange(0.0, 3600.0, 100.0)
     end = begin + 100.0
-    loud = (begin >= 1500) & (begin < 1800)
+    noisy = (begin >= 1500) & (begin < 1800)
     plain = np.broadcast_to(model_avar(tau, NOISE), (len(axes), begin.size, tau.size))
     after = plain.copy()
-    after[0, loud] *= 1.8
+    after[0, noisy] *= 1.8
     edf = np.maximum(100.0 / tau, 2.0)
     recording = after * rng.chisquare(edf, after.shape) / edf
     z = np.minimum(1.96 * np.sqrt(2.0 / edf), 0.9)
@@ -38,7 +38,7 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
     shift = np.zeros((len(axes), block.size))
     shift[0, (block >= 1500) & (block < 1800)] = 0.08
     window_shift = np.zeros((len(axes), begin.size))
-    window_shift[0, loud] = 0.08
+    window_shift[0, noisy] = 0.08
     mean = np.stack(
         [
             window_shift + 0.018 * rng.standard_normal(window_shift.shape),

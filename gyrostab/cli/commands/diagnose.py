@@ -62,7 +62,7 @@ def diagnose(
         Seed of the null records.
     """
     from gyrostab.diagnose.core import diagnose as run_diagnosis
-    from gyrostab.diagnose.core import parse_quiescent_span
+    from gyrostab.diagnose.inputs import parse_quiescent_span
     from gyrostab.jobs.run import load_log
     from gyrostab.report.diagnosis_folder import find_foreign_file, write_diagnosis
     from gyrostab.store.output import check_output

@@ -1,1 +1,1 @@
-"""The named effects fitted together, and the noise once more with them in the model."""
+"""Fit the identified effects and the noise together, and limit the sizes of all others."""

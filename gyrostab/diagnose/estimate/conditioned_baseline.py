@@ -1,4 +1,4 @@
-"""The baseline with the named effects in it, fitted to some blocks or to all."""
+"""Put the identified effects into the baseline."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 
-__all__ = ["predicted"]
+__all__ = ["predict_baseline"]
 
 
-def predicted(
+def predict_baseline(
     identifications: Identifications,
     baseline: xr.Dataset,
     known: NDArray[np.bool_] | None = None,
     *,
     left_out: Sequence[Identification] = (),
 ) -> xr.Dataset:
-    """The baseline with the named effects in it, fitted to the blocks that may be used.
+    """Return the baseline with the identified effects in it, fitted to the blocks that may be used.
 
     Parameters
     ----------
-    identifications : Naming
+    identifications : Identifications
         The effects, with those that were expected; their nuisance parameters are kept.
     baseline : xarray.Dataset
-        That the naming started from.
+        The baseline that the identification started from.
     known : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
-    left_out : sequence of Claim, optional
-        Effects of the naming that are fitted with the others, and then taken out again; what a
-        low-pass stopped stays out.
+    left_out : sequence of Identification, optional
+        Effects that are fitted with the others and then taken out again. What a low-pass removed
+        stays removed.
 
     Returns
     -------
     xarray.Dataset
-        With ``spectrum`` and ``known_mean`` of the effects; for effects that axes share also
-        ``cross`` (pair, block, band).
+        With ``spectrum`` and ``known_mean`` of the effects, and ``cross`` (pair, block, band) of
+        noise in common.
     """
     blocks = identifications.state.blocks
     keep = (
@@ -63,24 +63,23 @@ def predicted(
     for name in ("mean", "power", "cross"):
         if name in seen:
             seen[name] = seen[name].where(xr.DataArray(keep, dims="block"))
-    state = initial_state(seen, baseline)
-    mine: dict[
-        tuple[str, str], list[bool]
-    ] = {}  # of each given column: it is of an effect that is left out
+    state = begin_state(seen, baseline)
+    # for each column in the model, whether it belongs to an effect that is left out
+    is_left_out: dict[tuple[str, str], list[bool]] = {}
     identified = (*identifications.expected, *identifications.identified)
     for identification in identified:
         state = condition_on(state, list(identification.components))
         for place, columns in state.given.items():
-            known_of = mine.setdefault(place, [])
+            known_of = is_left_out.setdefault(place, [])
             known_of += [any(identification is one for one in left_out)] * (
                 len(columns) - len(known_of)
             )
-    weight = _less(state, baseline, mine)
+    weight = _powers_without(state, baseline, is_left_out)
     state = replace(state, blocks=seen, masked=identifications.state.masked)
     mean = baseline["known_mean"].transpose("axis", "block").values.copy()
     for row, axis in enumerate(state.axes):
         columns = state.given.get(("mean", axis), [])
-        kept = ~np.array(mine.get(("mean", axis), []), np.bool_)
+        kept = ~np.array(is_left_out.get(("mean", axis), []), np.bool_)
         if kept.any():
             alone = replace(
                 state,
@@ -92,34 +91,34 @@ def predicted(
         spectrum=baseline["spectrum"].transpose("axis", "block", "band").copy(data=weight),
         known_mean=baseline["known_mean"].transpose("axis", "block").copy(data=mean),
     )
-    there = [
+    remaining = [
         identification
         for identification in identified
         if not any(identification is one for one in left_out)
     ]
     shared = [
         component
-        for identification in there
+        for identification in remaining
         for component in identification.components
         if component.candidate.statistic == "cross"
     ]
     if not shared:
         return after
-    expected = expected_cross(baseline)
-    cross = _shared(shared, state, identifications)
+    expected = known_cross(baseline)
+    cross = _cross_spectra(shared, state, identifications)
     return after.assign(
         cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
     )
 
 
-def _less(
-    state: State, baseline: xr.Dataset, mine: Mapping[tuple[str, str], Sequence[bool]]
+def _powers_without(
+    state: State, baseline: xr.Dataset, is_left_out: Mapping[tuple[str, str], Sequence[bool]]
 ) -> NDArray[np.float64]:
-    """Expected powers without some of the columns given to them."""
+    """Return the expected powers without some of the columns in the model."""
     weight = state.weight.copy()
     least = MIN_POWER_RATIO * baseline["spectrum"].transpose("axis", "block", "band").values
     for row, axis in enumerate(state.axes):
-        chosen = np.array(mine.get(("power", axis), []), np.bool_)
+        chosen = np.array(is_left_out.get(("power", axis), []), np.bool_)
         if chosen.any():
             weight[row] = np.maximum(
                 weight[row] - power_shares(state, axis)[chosen].sum(axis=0), least[row]
@@ -127,9 +126,10 @@ def _less(
     return weight
 
 
-def _shared(
+def _cross_spectra(
     components: Sequence[Component], state: State, identifications: Identifications
 ) -> NDArray[np.complex128]:
+    """Return the cross-spectra of noise that axes have in common."""
     shape = state.weight.shape[1:]
     pairs = pair_rows(state.blocks)
     total = np.zeros((len(pairs), *shape), np.complex128)

@@ -1,4 +1,4 @@
-"""What a simulation and a recording have in common, as the recording tells it: the start from which anything more is looked for."""
+"""Put the effects that simulation and recording have in common into the baseline."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.predict.condition import condition_on
@@ -21,25 +21,25 @@ __all__ = ["expected_baseline", "fit_expected", "without_expected"]
 def expected_baseline(
     identifications: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None
 ) -> xr.Dataset:
-    """The baseline with the effects that were expected, and no others, fitted to the blocks that are `known`.
+    """Return the baseline with the expected effects only, fitted to the `known` blocks.
 
     Parameters
     ----------
-    identifications : Naming
+    identifications : Identifications
     baseline : xarray.Dataset
-        That the naming started from.
+        The baseline that the identification started from.
     known : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
     """
     return (
-        predicted(replace(identifications, identified=(), unknown=()), baseline, known)
+        predict_baseline(replace(identifications, identified=(), unknown=()), baseline, known)
         if identifications.expected
         else baseline
     )
 
 
 def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
-    """The numbers that the recording gives to the effects that were expected, with all that was named in the model."""
+    """Fit the expected effects with all identified ones in the model."""
     return fit_identifications(
         replace(
             identifications,
@@ -53,12 +53,12 @@ def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list
 def without_expected(
     blocks: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Identification]
 ) -> xr.Dataset:
-    """The record without the blocks in which effects that were expected leave odd samples, or move the rate too fast for its spectrum.
+    """Drop the blocks in which expected effects leave anomalous samples or move the rate.
 
     Parameters
     ----------
     blocks, baseline : xarray.Dataset
-    expected : sequence of Claim
+    expected : sequence of Identification
     """
     if not expected:
         return blocks

@@ -1,4 +1,4 @@
-"""Lags, times and plays between the values of the grid and beyond its ends, where the record tells them better than the grid does."""
+"""Refine the grid of lags, time constants and dead bands where the likelihood changes fast."""
 
 from __future__ import annotations
 
@@ -17,27 +17,33 @@ from gyrostab.errors import OptionError
 from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
 
-__all__ = ["Point", "refined"]
-_SECONDS = {"s": 1.0, "h": HOUR}
-_SCALES, _INSTANT = (
-    (*_SECONDS, "degC"),
-    "at",
-)  # units of what has values between two others; but not an instant, whose grid is fine
-_LIKELY, _STEEP, _MOVED = (
-    6.0,
-    1.0,
-    1.0,
-)  # nats below the best; nats and standard errors from one value to the next
-_ROUNDS, _MOST = (
-    5,
-    40,
-)  # halvings of a step of the grid, and steps beyond it; points that are added between them at most
-_NONE = 100.0  # times smaller than the next value is as good as none
+__all__ = ["Point", "refine_grid"]
+_SECONDS = {"s": 1.0, "h": 3600.0}
+#: Units of parameters that have values between those of the grid.
+_SCALES = (*_SECONDS, "degC")
+_INSTANT = "at"  # a parameter in seconds whose grid is fine already
+# Tolerances of the quadrature over the grid.
+LIKELY_NATS = 6.0  # below the best, to which points count: a probability of 1 in 400
+STEEP_NATS = 1.0  # from one point to the next, that the quadrature tolerates
+MAX_STEP_SIGMA = 1.0  # change of a size from one point to the next, in its standard errors
+MAX_ROUNDS = 5  # halvings of a step of the grid, and steps beyond its end
+MAX_ADDED_POINTS = 40  # between the points of the grid
+MAX_RATIO = 100.0  # of two neighbours, above which the smaller one counts as zero
 
 
 @dataclass(frozen=True)
 class Point:
-    """A variant, its sizes, the share of a step of the grid that it stands for, and by how much it is `unlikely` beforehand [nats]."""
+    """A variant with its sizes and its weight in the average over the grid.
+
+    Attributes
+    ----------
+    variant : Variant
+    sizes : Mixture
+    share : float
+        Length of the part of the grid that it represents, in steps.
+    unlikely : float
+        Prior penalty [nats].
+    """
 
     variant: Variant
     sizes: Mixture
@@ -46,86 +52,86 @@ class Point:
 
     @property
     def evidence(self) -> float:
-        """Logarithm of its likelihood, but for a constant."""
+        """Return the log likelihood, up to a constant."""
         return float(np.logaddexp.reduce(self.sizes.log_weight)) - self.unlikely
 
     def weighed(self) -> Mixture:
-        """The sizes, weighted by all of this."""
+        """Return the sizes, weighted by likelihood, prior and share."""
         return replace(
             self.sizes, log_weight=self.sizes.log_weight - self.unlikely + math.log(self.share)
         )
 
 
-def _scaled(variant: Variant, sizes: Mixture) -> Point:
-    """A point whose sizes are as likely beforehand as those of others of as many standard errors.
+def _make_point(variant: Variant, sizes: Mixture) -> Point:
+    """Return a point with a prior that is uniform in size over standard error.
 
-    One number is another effect where a time is longer: were all numbers alike, slow forms would
-    be, which look like their beginning only.
+    The same size is another effect where a time constant is longer. With a prior uniform in size,
+    slow forms would be preferred, of which the record shows only the beginning.
     """
     mean = np.einsum("g,gij->ij", sizes.weights(), sizes.covariance)
     return Point(variant, sizes, unlikely=0.5 * float(np.linalg.slogdet(mean)[1]))
 
 
-def refined(component: Component, state: State, points: Sequence[Point]) -> list[Point]:
-    """Points with others between them, wherever the likelihood or the size of an effect on means changes much from one to the next.
+def refine_grid(component: Component, state: State, points: Sequence[Point]) -> list[Point]:
+    """Add points to a grid wherever likelihood or size of an effect on means change much.
 
-    The grid goes on where the likelihood still rises at its end. A step is halved about the best
-    point, and again while its ends are likely and differ, so that the likelihood is smooth from
-    point to point. What a step stands for is shared by the points in it.
+    The grid is extended where the likelihood still rises at its end. A step is halved about the
+    best point, and again while its ends are likely and differ, so that the likelihood is smooth
+    from point to point. Points within a step share its weight.
 
     Parameters
     ----------
-    component : Part
+    component : Component
     state : State
-        With all else that is named.
+        With all other effects in the model.
     points : sequence of Point
-        Of the grid.
+        Points of the grid.
     """
-    name = _scale(component, points)
+    name = _find_scale(component, points)
     if name is None:
         return list(points)
     found = [
-        _Placed(_scaled(one.variant, one.sizes), *place)
-        for one, place in zip(points, _places(points, name), strict=True)
+        PlacedPoint(_make_point(one.variant, one.sizes), *place)
+        for one, place in zip(points, _place_points(points, name), strict=True)
     ]
     for line in sorted({one.line for one in found}):
         members = sorted((one for one in found if one.line == line), key=lambda one: one.place)
         for down in (True, False) if len(members) > 1 else ():
-            found += _beyond(component, state, name, members, found, down)
-    for _ in range(_ROUNDS):
-        steps = _wide(found)[: max(_MOST - len(found) + len(points), 0)]
+            found += _extend_line(component, state, name, members, found, down)
+    for _ in range(MAX_ROUNDS):
+        steps = _steps_to_halve(found)[: max(MAX_ADDED_POINTS - len(found) + len(points), 0)]
         new = [
             made
             for one, other in steps
-            if (made := _middle(component, state, name, one, other)) is not None
+            if (made := _halve_step(component, state, name, one, other)) is not None
         ]
         if not new:
             break
         found += new
-    return _shared(found)
+    return _share_steps(found)
 
 
 @dataclass(frozen=True)
-class _Placed:
-    """A point with the line of the grid that it is on, and its place along that, in steps."""
+class PlacedPoint:
+    """A point with its line of the grid, and its place along that line in steps."""
 
     point: Point
     line: int
     place: float
 
 
-def _scale(component: Component, points: Sequence[Point]) -> str | None:
-    """The first parameter of the grid that is a scale and has several values."""
+def _find_scale(component: Component, points: Sequence[Point]) -> str | None:
+    """Return the first parameter of the grid that is a scale and has several values."""
     if component.candidate.statistic != "mean":
         return None
     for name in points[0].variant.values:
         values = {point.variant.values.get(name) for point in points}
-        if len(values) > 2 and _unit(component, name) in _SCALES and name != _INSTANT:
+        if len(values) > 2 and _unit_of(component, name) in _SCALES and name != _INSTANT:
             return name
     return None
 
 
-def _unit(component: Component, name: str) -> str:
+def _unit_of(component: Component, name: str) -> str:
     return next(
         (
             item.unit
@@ -136,8 +142,8 @@ def _unit(component: Component, name: str) -> str:
     )
 
 
-def _places(points: Sequence[Point], name: str) -> list[tuple[int, float]]:
-    """Line (of like other values) and place of every point."""
+def _place_points(points: Sequence[Point], name: str) -> list[tuple[int, float]]:
+    """Return line (of the same other values) and place of every point."""
     lines: dict[tuple[object, ...], list[int]] = {}
     for number, point in enumerate(points):
         lines.setdefault(
@@ -145,76 +151,81 @@ def _places(points: Sequence[Point], name: str) -> list[tuple[int, float]]:
         ).append(number)
     out: dict[int, tuple[int, float]] = {}
     for line, members in enumerate(lines.values()):
-        ordered = sorted(members, key=lambda number: _value(points[number], name))
+        ordered = sorted(members, key=lambda number: _value_at(points[number], name))
         out |= {number: (line, float(place)) for place, number in enumerate(ordered)}
     return [out[number] for number in range(len(points))]
 
 
-def _value(point: Point, name: str) -> float:
+def _value_at(point: Point, name: str) -> float:
     return float(point.variant.values[name])
 
 
-def _neighbours(found: Sequence[_Placed]) -> list[tuple[_Placed, _Placed]]:
+def _neighbour_pairs(found: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
     ordered = sorted(found, key=lambda one: (one.line, one.place))
     return [(one, other) for one, other in pairwise(ordered) if one.line == other.line]
 
 
-def _wide(found: Sequence[_Placed]) -> list[tuple[_Placed, _Placed]]:
-    """Steps to be halved, the likeliest first."""
+def _steps_to_halve(found: Sequence[PlacedPoint]) -> list[tuple[PlacedPoint, PlacedPoint]]:
+    """Return the steps to be halved, the likeliest first."""
     best = max(found, key=lambda one: one.point.evidence)
     top, first = best.point.evidence, not any(one.place % 1.0 for one in found)
     out = []
-    for one, other in _neighbours(found):
-        likely = max(one.point.evidence, other.point.evidence) > top - _LIKELY
+    for one, other in _neighbour_pairs(found):
+        likely = max(one.point.evidence, other.point.evidence) > top - LIKELY_NATS
         if (first and (best is one or best is other)) or (
-            likely and _differ(one.point, other.point)
+            likely and _are_different(one.point, other.point)
         ):
             out.append((one, other))
     return sorted(out, key=lambda pair: -max(one.point.evidence for one in pair))
 
 
-def _differ(one: Point, other: Point) -> bool:
-    if abs(one.evidence - other.evidence) > _STEEP:
+def _are_different(one: Point, other: Point) -> bool:
+    if abs(one.evidence - other.evidence) > STEEP_NATS:
         return True
     (mean, covariance), (after, _) = one.sizes.moments(), other.sizes.moments()
-    return bool((np.abs(mean - after) > _MOVED * np.sqrt(np.diagonal(covariance))).any())
+    return bool((np.abs(mean - after) > MAX_STEP_SIGMA * np.sqrt(np.diagonal(covariance))).any())
 
 
-def _middle(
-    component: Component, state: State, name: str, one: _Placed, other: _Placed
-) -> _Placed | None:
-    """The point in the middle of a step: of the logarithm, but from none on."""
-    low, high = sorted((_value(one.point, name), _value(other.point, name)))
-    value = math.sqrt(low * high) if low > high / _NONE else 0.5 * (low + high)
-    return _made(component, state, name, one, value, 0.5 * (one.place + other.place))
+def _halve_step(
+    component: Component, state: State, name: str, one: PlacedPoint, other: PlacedPoint
+) -> PlacedPoint | None:
+    """Return the point in the middle of a step, in the logarithm unless one end is near zero."""
+    low, high = sorted((_value_at(one.point, name), _value_at(other.point, name)))
+    value = math.sqrt(low * high) if low > high / MAX_RATIO else 0.5 * (low + high)
+    return _place_point(component, state, name, one, value, 0.5 * (one.place + other.place))
 
 
-def _beyond(
+def _extend_line(
     component: Component,
     state: State,
     name: str,
-    line: Sequence[_Placed],
-    found: Sequence[_Placed],
+    line: Sequence[PlacedPoint],
+    found: Sequence[PlacedPoint],
     down: bool,
-) -> list[_Placed]:
-    """Points beyond an end of a line, by steps like the last one, as long as the likelihood rises and is the largest but for `_LIKELY`.
+) -> list[PlacedPoint]:
+    """Return points beyond an end of a line, in steps like the last one.
 
-    A lag longer than the record is only another slope.
+    They continue while the likelihood rises and is within `LIKELY_NATS` of the largest. A lag
+    longer than the record is only another slope.
     """
     before, last = (line[1], line[0]) if down else (line[-2], line[-1])
-    ratio = _value(last.point, name) / max(_value(before.point, name), 1e-300)
-    top, out = max(one.point.evidence for one in found) - _LIKELY, list[_Placed]()
-    longest = float(state.blocks["end"].values[-1]) / _SECONDS.get(_unit(component, name), math.nan)
+    ratio = _value_at(last.point, name) / max(_value_at(before.point, name), 1e-300)
+    top, out = max(one.point.evidence for one in found) - LIKELY_NATS, list[PlacedPoint]()
+    longest = float(state.blocks["end"].values[-1]) / _SECONDS.get(
+        _unit_of(component, name), math.nan
+    )
     while (
-        len(out) < _ROUNDS
-        and 1.0 / _NONE < ratio < _NONE
-        and last.point.evidence > max(before.point.evidence + _STEEP, top)
+        len(out) < MAX_ROUNDS
+        and 1.0 / MAX_RATIO < ratio < MAX_RATIO
+        and last.point.evidence > max(before.point.evidence + STEEP_NATS, top)
     ):
-        value = ratio * _value(last.point, name)
+        value = ratio * _value_at(last.point, name)
         after = (
             None
             if value > longest
-            else _made(component, state, name, last, value, last.place + (-1.0 if down else 1.0))
+            else _place_point(
+                component, state, name, last, value, last.place + (-1.0 if down else 1.0)
+            )
         )
         if after is None:
             break
@@ -223,10 +234,10 @@ def _beyond(
     return out
 
 
-def _made(
-    component: Component, state: State, name: str, like: _Placed, value: float, place: float
-) -> _Placed | None:
-    """A point of another value on the same line; None where the effect cannot have it."""
+def _place_point(
+    component: Component, state: State, name: str, like: PlacedPoint, value: float, place: float
+) -> PlacedPoint | None:
+    """Return a point of another value on the same line, or None where the effect cannot have it."""
     wanted = replace(like.point.variant, values={**like.point.variant.values, name: value})
     try:
         variant = rebuild_variant(
@@ -236,11 +247,13 @@ def _made(
         return None
     if variant is None or variant.values.get(name) != value:
         return None
-    return _Placed(_scaled(variant, component_mixture(component, state, variant)), like.line, place)
+    return PlacedPoint(
+        _make_point(variant, component_mixture(component, state, variant)), like.line, place
+    )
 
 
-def _shared(found: Sequence[_Placed]) -> list[Point]:
-    """Points with the share of the steps that each stands for: half of those on its sides, and half of one beyond the ends."""
+def _share_steps(found: Sequence[PlacedPoint]) -> list[Point]:
+    """Return the points with their shares: half of both steps next to them, or half a step."""
     out = []
     for line in sorted({one.line for one in found}):
         ordered = sorted((one for one in found if one.line == line), key=lambda one: one.place)

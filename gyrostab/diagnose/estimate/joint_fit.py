@@ -1,4 +1,4 @@
-"""Fit all named effects together: values with honest errors, and the model with the effects in it."""
+"""Fit all identified effects together: sizes with errors, and the model with the effects in it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.nuisance import sizes_over
+from gyrostab.diagnose.estimate.nuisance import average_sizes
 from gyrostab.diagnose.estimate.shared_factors import estimate_shared_factors
 from gyrostab.diagnose.estimate.telegraph_sizes import estimate_telegraph
 from gyrostab.diagnose.identify.equivalents import prefer_plainer
-from gyrostab.diagnose.identify.forward_search import Identification, Identifications, Unidentified
-from gyrostab.diagnose.identify.logger_filters import filter_sizes
-from gyrostab.diagnose.identify.sample_sizes import line_size, sample_count_sizes
-from gyrostab.diagnose.predict.condition import Component, condition_on, is_reversed
+from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
+from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes
+from gyrostab.diagnose.identify.sample_sizes import estimate_from_counts, estimate_line
+from gyrostab.diagnose.predict.condition import Component, condition_on, mirrored
 from gyrostab.diagnose.predict.filter_response import is_filter
 from gyrostab.diagnose.predict.linear_model import State, harmonic_sets, initial_state
 from gyrostab.diagnose.predict.sizes import component_mixture
@@ -33,22 +33,22 @@ __all__ = ["FORM_ERROR", "Estimate", "Fitted", "fit_identifications"]
 
 Array = NDArray[np.float64]
 #: Error of the form of an effect, as a share of its size: no effect is exactly what its equation
-#: says.
+#: says. With forms wrong by the shares in docs/diagnosis.md, the intervals still hold the truth.
 FORM_ERROR = 0.04
+SIGMA_95 = 1.959964  # two-sided 95 % quantile of the normal law
 _ANGLE = "deg"
-_PLACE = "line", "frequency"  # where a line is has nothing to do with what makes it
-_EARTH = 15.041067  # deg/h
+_PLACE = "line", "frequency"  # where a line is does not depend on what makes it
+EARTH_RATE = 15.041067  # deg/h: 360 degrees in a sidereal day of 23.934470 h
+MIN_HARMONIC_SIGMA = 2.0  # standard errors of an amplitude, below which a harmonic is dropped
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A parameter.
+    """A parameter with its standard error and the ends of its 95 % interval.
 
     Attributes
     ----------
-    value, stderr : float
-    low, high : float
-        Ends of the 95 % interval.
+    value, stderr, low, high : float
     unit : str
     """
 
@@ -61,19 +61,18 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A named effect with its numbers, on one axis or on several at once.
+    """An effect with its sizes, on one axis or on several together.
 
     Attributes
     ----------
-    identification : Claim
+    identification : Identification
     axes : tuple of str
     parameters : mapping of str to Estimate
-        Of an effect with a number for each axis: name and axis, with a dot between, where there are
-        several axes.
+        Keys are ``name``, or ``name.axis`` for a size of each of several axes.
     effect : Effect or None
-        With these numbers, as a model takes it; None where they make no effect.
+        With these sizes, as a model takes it; None where they make no effect.
     note : str
-        What the numbers do not say.
+        What the sizes do not show.
     """
 
     identification: Identification
@@ -83,28 +82,28 @@ class Fitted:
     note: str = ""
 
     def say(self) -> str:
-        """Describe the effect with its numbers in one sentence; return an empty string where it has no numbers."""
+        """Describe the effect with its sizes in one sentence; empty without sizes."""
         if self.effect is None or not self.parameters:
             return ""
-        said = self.effect.say({name: one.stderr for name, one in self.parameters.items()})
-        return f"{said} {self.note}" if self.note else said
+        text = self.effect.say({name: one.stderr for name, one in self.parameters.items()})
+        return f"{text} {self.note}" if self.note else text
 
 
 def fit_identifications(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
-    """Fit all named effects, each with the others in the model.
+    """Fit all identified effects, each with the others in the model.
 
     Parameters
     ----------
-    identifications : Naming
+    identifications : Identifications
         From `gyrostab.diagnose.identify.forward_search.name_effects`.
     baseline : xarray.Dataset
-        That the naming started from.
+        The baseline that the identification started from.
 
     Returns
     -------
     list of Fitted
-        An entry for each axis of an effect with one number for all of its axes; one entry for all
-        axes where each has its own number.
+        One entry per axis of an effect with a single size for all of its axes; one entry for all
+        axes where each has its own size.
     """
     start = initial_state(identifications.state.blocks, baseline)
     found: list[Fitted] = []
@@ -121,11 +120,11 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
         state = replace(
             state, weight=identifications.state.weight, masked=identifications.state.masked
         )
-        found += _fit_claim(identification, state, identifications)
+        found += _fit_identification(identification, state, identifications)
     return found
 
 
-def _fit_claim(
+def _fit_identification(
     identification: Identification, state: State, identifications: Identifications
 ) -> list[Fitted]:
     statistics = {component.candidate.statistic for component in identification.components}
@@ -134,7 +133,7 @@ def _fit_claim(
     filtered = any(
         is_filter(component.candidate.statistic, component.variant)
         for component in identification.components
-    )  # one logger: its axes are filtered alike
+    )  # all axes pass the filter of the one logger
     together = (
         many
         or filtered
@@ -143,17 +142,17 @@ def _fit_claim(
     )
     if together:
         return [
-            _fitted(
+            _fit_components(
                 identification,
-                _axes(identification, components),
+                _axes_shown(identification, components),
                 components,
                 state,
                 identifications,
             )
-            for components in _by_harmonic(identification, state)
+            for components in _split_harmonics(identification, state)
         ]
     return [
-        _fitted(
+        _fit_components(
             identification,
             (axis,),
             [component for component in identification.components if axis in component.row],
@@ -164,8 +163,8 @@ def _fit_claim(
     ]
 
 
-def _axes(identification: Identification, components: Sequence[Component]) -> tuple[str, ...]:
-    """Axes of the claim on which the parts are."""
+def _axes_shown(identification: Identification, components: Sequence[Component]) -> tuple[str, ...]:
+    """Return the axes of the identification that the components are on."""
     return tuple(
         axis
         for axis in identification.axes
@@ -173,11 +172,11 @@ def _axes(identification: Identification, components: Sequence[Component]) -> tu
     )
 
 
-def _by_harmonic(identification: Identification, state: State) -> list[list[Component]]:
-    """Parts of a claim; those of several harmonics of the rotation, each of which has a size and a phase of its own, one by one.
+def _split_harmonics(identification: Identification, state: State) -> list[list[Component]]:
+    """Split the components of several harmonics of the rotation, each with its amplitude and phase.
 
-    A harmonic beside the strongest is left out where its amplitude is within two standard errors on
-    every axis.
+    Harmonics other than the strongest are dropped when their amplitude is within two standard
+    errors on every axis.
     """
     turning = [
         component
@@ -195,20 +194,20 @@ def _by_harmonic(identification: Identification, state: State) -> list[list[Comp
     clear = [
         max(
             size / error
-            for size, error, _ in (_amplitude(component, state) for component in components)
+            for size, error, _ in (_fit_amplitude(component, state) for component in components)
         )
         for components in alone
     ]
     kept = [
         components
         for components, times in zip(alone, clear, strict=True)
-        if times > 2.0 or times == max(clear)
+        if times > MIN_HARMONIC_SIGMA or times == max(clear)
     ]
     rest = [component for component in identification.components if component not in turning]
     return [[*kept[0], *rest], *kept[1:]]
 
 
-def _fitted(
+def _fit_components(
     identification: Identification,
     axes: tuple[str, ...],
     components: list[Component],
@@ -219,65 +218,71 @@ def _fitted(
     units = {item.name: item.unit for item in kind.parameters()}
     values: dict[str, Any] = {}
     estimates: dict[str, Estimate] = {}
-    by_view: dict[str, list[Component]] = {}
+    by_statistic: dict[str, list[Component]] = {}
     for component in components:
-        by_view.setdefault(component.candidate.statistic, []).append(component)
+        by_statistic.setdefault(component.candidate.statistic, []).append(component)
     statistic = max(
-        by_view, key=lambda name: sum(component.evidence_nats for component in by_view[name])
+        by_statistic,
+        key=lambda name: sum(component.evidence_nats for component in by_statistic[name]),
     )
-    plain = [prefer_plainer(component, state) for component in by_view[statistic]]
-    by_view[statistic] = [component for component, _ in plain]
-    filtered = is_filter(statistic, by_view[statistic][0].variant)
+    plain = [prefer_plainer(component, state) for component in by_statistic[statistic]]
+    by_statistic[statistic] = [component for component, _ in plain]
+    filtered = is_filter(statistic, by_statistic[statistic][0].variant)
     sizes: Mapping[str, tuple[float, ...]]
     if filtered:
-        sizes, values = filter_sizes(by_view[statistic], state)
+        sizes, values = fit_filter_sizes(by_statistic[statistic], state)
     else:
-        own = _SIZES.get(statistic, _linear)(by_view[statistic], axes, state, identifications)
-        sizes = {**_elsewhere(by_view, statistic, axes, state, identifications), **own}
+        own = _SIZES.get(statistic, _linear_sizes)(
+            by_statistic[statistic], axes, state, identifications
+        )
+        sizes = {
+            **_sizes_on_other_axes(by_statistic, statistic, axes, state, identifications),
+            **own,
+        }
     for name, (mean, sd, *ends) in sizes.items():
         unit = units.get(name.split(".")[0], "1")
-        if math.isfinite(mean) and not math.isnan(
-            sd
-        ):  # a low-pass of infinite bandwidth is none; an exponent may be told, not measured
-            form = (
-                0.0 if unit == _ANGLE or (statistic, name) == _PLACE else FORM_ERROR * mean
-            )  # angles have that of the size already
-            estimates[name] = _estimate(
-                mean, sd, unit, ends=ends, positive=_positive(kind, name), form=form
+        # a low-pass of infinite bandwidth is not given; nor is an exponent that was not measured
+        if math.isfinite(mean) and not math.isnan(sd):
+            is_exact = unit == _ANGLE or (statistic, name) == _PLACE  # angles have it already
+            form = 0.0 if is_exact else FORM_ERROR * mean
+            estimates[name] = _make_estimate(
+                mean, sd, unit, ends=ends, positive=_is_positive(kind, name), form=form
             )
-        _put(values, name, mean, axes)
+        _store_value(values, name, mean, axes)
     values |= {
         name: value
-        for name, value in by_view[statistic][0].variant.values.items()
+        for name, value in by_statistic[statistic][0].variant.values.items()
         if name not in values
     }
-    values |= _words(identification, by_view[statistic][0], state)
+    values |= _model_settings(identification, by_statistic[statistic][0], state)
     return Fitted(
         identification,
         axes,
         estimates,
-        _instance(kind, values, axes, identification.driver),
+        _make_effect(kind, values, axes, identification.driver),
         next((note for _, note in plain if note), ""),
     )
 
 
-def _elsewhere(
-    by_view: Mapping[str, list[Component]],
+def _sizes_on_other_axes(
+    by_statistic: Mapping[str, list[Component]],
     statistic: str,
     axes: tuple[str, ...],
     state: State,
     identifications: Identifications,
 ) -> dict[str, tuple[float, ...]]:
-    """Sizes on axes that the strongest view says nothing of, from the strongest of the others that does."""
-    seen = {axis for component in by_view[statistic] for axis in component.row}
+    """Return sizes on axes that the strongest statistic does not cover, from the next that does."""
+    seen = {axis for component in by_statistic[statistic] for axis in component.row}
     found: dict[str, tuple[float, ...]] = {}
     for other in sorted(
-        set(by_view) - {statistic},
-        key=lambda name: -sum(component.evidence_nats for component in by_view[name]),
+        set(by_statistic) - {statistic},
+        key=lambda name: -sum(component.evidence_nats for component in by_statistic[name]),
     ):
-        lacking = {axis for component in by_view[other] for axis in component.row} - seen
+        lacking = {axis for component in by_statistic[other] for axis in component.row} - seen
         if lacking:
-            sizes = _SIZES.get(other, _linear)(by_view[other], axes, state, identifications)
+            sizes = _SIZES.get(other, _linear_sizes)(
+                by_statistic[other], axes, state, identifications
+            )
             found |= {
                 name: size for name, size in sizes.items() if name.partition(".")[2] in lacking
             }
@@ -285,14 +290,14 @@ def _elsewhere(
     return found
 
 
-def _positive(kind: type[Effect], name: str) -> bool:
+def _is_positive(kind: type[Effect], name: str) -> bool:
     return next(
         (item.low >= 0.0 for item in kind.parameters() if item.name == name.split(".")[0]), False
     )
 
 
-def _put(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...]) -> None:
-    """A value by its name; "name.axis" goes to its place in a list."""
+def _store_value(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...]) -> None:
+    """Store a value by its name; ``name.axis`` goes to its place in a list."""
     base, _, axis = name.partition(".")
     if not axis:
         values[base] = value
@@ -301,8 +306,10 @@ def _put(values: dict[str, Any], name: str, value: float, axes: tuple[str, ...])
     known[axes.index(axis)] = value
 
 
-def _words(identification: Identification, component: Component, state: State) -> dict[str, Any]:
-    """What the model needs beside the numbers."""
+def _model_settings(
+    identification: Identification, component: Component, state: State
+) -> dict[str, Any]:
+    """Return settings that the model needs in addition to the sizes."""
     if identification.effect == "rotation_line":
         return {"harmonics": 1.0}
     if identification.effect == "feedback_reset" and "ramp_turns" in state.blocks:
@@ -326,7 +333,7 @@ def _words(identification: Identification, component: Component, state: State) -
     return {}
 
 
-def _instance(
+def _make_effect(
     kind: type[Effect], values: Mapping[str, Any], axes: tuple[str, ...], driver: tuple[str, ...]
 ) -> Effect | None:
     known = {item.name: item for item in kind.parameters()}
@@ -334,7 +341,9 @@ def _instance(
     for name, value in values.items():
         if name in known:
             item = known[name]
-            clean[name] = value if isinstance(value, str) else _within(value, item.low, item.high)
+            clean[name] = (
+                value if isinstance(value, str) else _clip_to_range(value, item.low, item.high)
+            )
     named = tuple(driver) if driver and all(driver) else ()
     size = {name: 0.0 for name in kind.required() if name not in clean}
     try:
@@ -343,58 +352,61 @@ def _instance(
         return None
 
 
-def _within(value: Any, low: float, high: float) -> Any:
+def _clip_to_range(value: Any, low: float, high: float) -> Any:
     if isinstance(value, list | tuple):
         return [min(max(float(one), low), high) for one in value]
     return min(max(float(value), low), high)
 
 
-def _estimate(
+def _make_estimate(
     mean: float, sd: float, unit: str, *, positive: bool, form: float, ends: Sequence[float] = ()
 ) -> Estimate:
-    """With the error of the `form` in it; `ends` are those of the 95 % interval without it, where that is not symmetric."""
-    if sd <= 0.0:  # what is counted, not measured, is exact
+    """Return an estimate with the error of the form.
+
+    `ends` are those of an asymmetric 95 % interval without it.
+    """
+    if sd <= 0.0:  # a count is exact
         return Estimate(mean, 0.0, mean, mean, unit)
-    low, high = ends or (mean - NORMAL_95 * sd, mean + NORMAL_95 * sd)
+    low, high = ends or (mean - SIGMA_95 * sd, mean + SIGMA_95 * sd)
     low, high = (
-        mean - math.hypot(mean - low, NORMAL_95 * form),
-        mean + math.hypot(high - mean, NORMAL_95 * form),
+        mean - math.hypot(mean - low, SIGMA_95 * form),
+        mean + math.hypot(high - mean, SIGMA_95 * form),
     )
     return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
 
 
-# --------------------------------------------------------------------------------
-# sizes
+# --------------------------------------------------------------------------------------------------
+# -------------- sizes
 
 
-def _linear(
+def _linear_sizes(
     components: list[Component],
     axes: tuple[str, ...],
     state: State,
     identifications: Identifications,
 ) -> dict[str, tuple[float, ...]]:
-    """Parameters of means, powers, profiles and transfers; by axis where there are several."""
+    """Return parameters of means, powers, profiles and transfers; by axis if there are several."""
     out: dict[str, tuple[float, ...]] = {}
     for component in components:
         if component.variant.columns[:1] == ("any",):
             continue
-        mean, covariance, nuisance = sizes_over(component, state, identifications)
+        mean, covariance, nuisance = average_sizes(component, state, identifications)
         for number, name in enumerate(component.variant.columns):
             value, sd = float(mean[number]), float(math.sqrt(covariance[number, number]))
             if component.variant.squared:
-                value, sd = _root(value, sd)
+                value, sd = _square_root(value, sd)
             out[name if len(axes) == 1 else f"{name}.{component.row[0]}"] = (value, sd)
         out |= nuisance
     return out
 
 
-def _root(square: float, sd: float) -> tuple[float, float]:
-    """Size and its error from those of the square."""
+def _square_root(square: float, sd: float) -> tuple[float, float]:
+    """Return a size and its error from those of its square."""
     value = math.sqrt(max(square, 0.0))
     return value, sd / (2.0 * value) if square > sd else math.sqrt(max(square, 0.0) + sd) - value
 
 
-def _common(
+def _common_sizes(
     components: list[Component],
     axes: tuple[str, ...],
     state: State,
@@ -403,24 +415,25 @@ def _common(
     return estimate_shared_factors(components, axes, state)
 
 
-def _turning(
+def _rotation_sizes(
     components: list[Component],
     axes: tuple[str, ...],
     state: State,
     identifications: Identifications,
 ) -> dict[str, tuple[float, ...]]:
-    """Amplitude and phase of what is locked to the rotation; of the earth, the latitude of a tool that points down.
+    """Return amplitude and phase of components locked to the rotation.
 
-    Angles have the error of the form that the amplitude has: a share of an angle would be none.
+    For the earth rate these are latitude and tool face of a tool that points down. Angles get the
+    error of the form of the amplitude: a share of an angle has no meaning.
     """
     out: dict[str, tuple[float, ...]] = {}
     for component in components:
-        size, sd, angle = _amplitude(component, state)
+        size, sd, angle = _fit_amplitude(component, state)
         error = math.hypot(sd / max(size, 1e-300), FORM_ERROR)
         if not component.candidate.each:
             across = size * float(np.abs(component.variant.design).max())
             return {
-                "latitude": _latitude(across, error * across),
+                "latitude": _latitude_from_rate(across, error * across),
                 "toolface": (angle, math.degrees(error)),
             }
         label = "" if len(axes) == 1 else f".{component.row[0]}"
@@ -434,23 +447,26 @@ def _turning(
     return out
 
 
-def _latitude(across: float, error: float) -> tuple[float, float, float, float]:
-    """Latitude [deg], its standard error and the ends of its 95 % interval, by the earth's rate across a tool that points down [deg/h]."""
+def _latitude_from_rate(across: float, error: float) -> tuple[float, float, float, float]:
+    """Return the latitude of a tool that points down, from the earth rate across it [deg/h].
+
+    The result [deg] has the standard error and the ends of the 95 % interval.
+    """
     low, middle, high = (
-        math.degrees(math.acos(min(max(rate, 0.0) / _EARTH, 1.0)))
-        for rate in (across + NORMAL_95 * error, across, across - NORMAL_95 * error)
+        math.degrees(math.acos(min(max(rate, 0.0) / EARTH_RATE, 1.0)))
+        for rate in (across + SIGMA_95 * error, across, across - SIGMA_95 * error)
     )
-    return middle, max((high - low) / (2.0 * NORMAL_95), 1e-12), low, high
+    return middle, max((high - low) / (2.0 * SIGMA_95), 1e-12), low, high
 
 
-def _amplitude(component: Component, state: State) -> tuple[float, float, float]:
-    """Amplitude of the first harmonic of a part, its standard error, and the phase [deg]."""
+def _fit_amplitude(component: Component, state: State) -> tuple[float, float, float]:
+    """Return amplitude, standard error and phase [deg] of the first harmonic of a component."""
     mean, covariance = component_mixture(component, state).moments()
     sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
     return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
 
 
-def _line(
+def _line_sizes(
     components: list[Component],
     axes: tuple[str, ...],
     state: State,
@@ -462,20 +478,20 @@ def _line(
     out: dict[str, tuple[float, float]] = {}
     for component in sorted(
         components, key=lambda component: component.evidence_nats
-    ):  # of several lines of an axis the strongest
-        amplitude, frequency = line_size(state.blocks, component.row[0], component.place)
+    ):  # the strongest of several lines of an axis is last
+        amplitude, frequency = estimate_line(state.blocks, component.row[0], component.place)
         label = "" if len(axes) == 1 or name == "sway" else f".{component.row[0]}"
         out[f"{name}{label}"], out["frequency"] = amplitude, frequency
     return out
 
 
-def _odd(
+def _count_sizes(
     components: list[Component],
     axes: tuple[str, ...],
     state: State,
     identifications: Identifications,
 ) -> dict[str, tuple[float, float]]:
-    return sample_count_sizes(
+    return estimate_from_counts(
         components[0].candidate.effect,
         components[0].variant.columns[0],
         components[0].row[0],
@@ -484,7 +500,7 @@ def _odd(
     )
 
 
-def _levels(
+def _telegraph_sizes(
     components: list[Component],
     axes: tuple[str, ...],
     state: State,
@@ -494,9 +510,9 @@ def _levels(
 
 
 _SIZES: Mapping[str, Callable[..., Mapping[str, tuple[float, ...]]]] = {
-    "cross": _common,
-    "order": _turning,
-    "line": _line,
-    "marks": _odd,
-    "levels": _levels,
+    "cross": _common_sizes,
+    "order": _rotation_sizes,
+    "line": _line_sizes,
+    "marks": _count_sizes,
+    "levels": _telegraph_sizes,
 }

@@ -1,4 +1,4 @@
-"""Sizes of an effect over the grid of what else is free in it, and what is told of that: lags, exponents, instants."""
+"""Average the sizes of an effect over its nuisance parameters: lags, exponents, instants."""
 
 from __future__ import annotations
 
@@ -8,37 +8,38 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.grid_refinement import Point, refined
-from gyrostab.diagnose.identify.forward_search import AMBIGUOUS, FORM
+from gyrostab.diagnose.estimate.grid_refinement import Point, refine_grid
 from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.identify.selection import AMBIGUOUS_NATS, FORM_ERROR_SHARE
 from gyrostab.diagnose.predict.candidates import Variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
 from gyrostab.physics.registry import effects
 
-__all__ = ["plain_places", "sizes_over"]
+__all__ = ["average_sizes", "plain_places"]
 
 Array = NDArray[np.float64]
-_AT_ONCE = 1e-2  # s: a lag that is as good as none
-_TAILS = (0.025, 0.975)
+MAX_ZERO_LAG_S = 1e-2  # a lag that counts as zero
+_TAILS = (0.025, 0.975)  # of a 95 % interval
 
 
-def sizes_over(
+def average_sizes(
     component: Component, state: State, identifications: Identifications
 ) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
-    """Sizes of a part, averaged over the noise and over what else is free.
+    """Return the sizes of a component, averaged over the noise and the nuisance parameters.
 
-    An exponent has its default and a lag is none, unless other values are better by 3 nats and an
-    error of the form. The scatter of the sizes holds all lags that the record allows also where
-    none is told; of an exponent the size is another one, in another unit.
+    Exponents have their defaults and lags are zero unless other values are better by 3 nats and an
+    error of the form. The scatter of the sizes includes all lags that the record allows, even when
+    the lag is given as zero. Exponents are not averaged over, because each gives the size another
+    unit.
 
     Parameters
     ----------
-    component : Part
+    component : Component
     state : State
-        With all else that is named.
-    identifications : Naming
+        With all other effects in the model.
+    identifications : Identifications
         Its candidates have the grid.
 
     Returns
@@ -47,26 +48,29 @@ def sizes_over(
     covariance : ndarray, shape (column, column)
         About that mean.
     nuisance : dict of str to (float, float) or (float, float, float, float)
-        Value and standard deviation of the others, and the ends of the 95 % interval where that is
-        not symmetric; NaN for one that is told, but not measured.
+        Value and standard deviation of the nuisance parameters, with the ends of the 95 % interval
+        if it is asymmetric; NaN as the standard deviation of one that is set but not measured.
     """
     grid = [
         Point(variant, component_mixture(component, state, variant))
-        for variant in _family(component, identifications)
+        for variant in _variant_family(component, identifications)
     ]
-    usual = _usual(component, [point.variant for point in grid], [point.evidence for point in grid])
-    points = refined(component, state, [grid[place] for place in usual])
+    usual = _usual_places(
+        component, [point.variant for point in grid], [point.evidence for point in grid]
+    )
+    points = refine_grid(component, state, [grid[place] for place in usual])
     family = [point.variant for point in points]
     evidence = np.array([point.evidence for point in points])
-    mean, covariance = _merged(points).moments()
-    at_once = _at_once(family)
-    told = [
+    mean, covariance = _merge_points(points).moments()
+    at_once = _places_without_lag(family)
+    without_lag = [
         place
         for place in at_once
-        if evidence[place] > evidence.max() - AMBIGUOUS - FORM * max(component.evidence_nats, 0.0)
+        if evidence[place]
+        > evidence.max() - AMBIGUOUS_NATS - FORM_ERROR_SHARE * max(component.evidence_nats, 0.0)
     ]
-    if told:
-        middle, _ = _merged([points[place] for place in told]).moments()
+    if without_lag:
+        middle, _ = _merge_points([points[place] for place in without_lag]).moments()
         mean, covariance = middle, covariance + np.outer(middle - mean, middle - mean)
     weighed = evidence + np.log([point.share for point in points])
     share = np.exp(weighed - np.logaddexp.reduce(weighed))
@@ -80,18 +84,21 @@ def sizes_over(
         if np.ptp(tried) == 0.0:
             nuisance[name] = (float(tried[0]), math.nan)
             continue
-        none = bool(told) and _is_lag(name)
-        middle_of = 0.0 if none else float(share @ tried)
+        has_no_lag = bool(without_lag) and _is_lag(name)
+        middle_of = 0.0 if has_no_lag else float(share @ tried)
         spread = max(
-            math.sqrt(float(share @ (tried - middle_of) ** 2)), 0.3 * _spacing(tried, middle_of)
+            math.sqrt(float(share @ (tried - middle_of) ** 2)),
+            0.3 * _grid_spacing(tried, middle_of),
         )
         nuisance[name] = (
-            (middle_of, spread) if none else (middle_of, spread, *_ends(tried, share, middle_of))
+            (middle_of, spread)
+            if has_no_lag
+            else (middle_of, spread, *_interval_ends(tried, share, middle_of))
         )
     return mean, covariance, nuisance
 
 
-def _merged(points: Sequence[Point]) -> Mixture:
+def _merge_points(points: Sequence[Point]) -> Mixture:
     several = [point.weighed() for point in points]
     return Mixture(
         *(
@@ -101,8 +108,8 @@ def _merged(points: Sequence[Point]) -> Mixture:
     )
 
 
-def _family(component: Component, identifications: Identifications) -> list[Variant]:
-    """Variants of the part with the same columns: the grid."""
+def _variant_family(component: Component, identifications: Identifications) -> list[Variant]:
+    """Return the variants of the component with the same columns: the grid."""
     candidate = next(
         (
             one
@@ -119,7 +126,10 @@ def _family(component: Component, identifications: Identifications) -> list[Vari
 
 
 def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
-    """Places of the variants with the default of every parameter that the grid has it of, but lags: their sizes are of one unit."""
+    """Return the places of variants whose parameters, except lags, have their defaults.
+
+    Their sizes have the same unit.
+    """
     known = {item.name: item.default for item in effects()[effect].parameters()}
     tried = {
         name
@@ -133,27 +143,29 @@ def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
     ]
 
 
-def _usual(component: Component, family: Sequence[Variant], evidence: Sequence[float]) -> list[int]:
-    """Places of the plain variants, unless others are clearly better."""
+def _usual_places(
+    component: Component, family: Sequence[Variant], evidence: Sequence[float]
+) -> list[int]:
+    """Return the places of the plain variants, unless others are clearly better."""
     plain, top = plain_places(component.candidate.effect, family), max(evidence)
     return (
         plain
-        if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS
+        if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS_NATS
         else list(range(len(family)))
     )
 
 
-def _at_once(family: Sequence[Variant]) -> list[int]:
-    """Places of the variants without any lag; none where nothing lags at all."""
-    lags = [_lags(one.values) for one in family]
+def _places_without_lag(family: Sequence[Variant]) -> list[int]:
+    """Return the places of the variants without a lag; empty where the effect has no lags."""
+    lags = [_lag_values(one.values) for one in family]
     return (
-        [place for place, mine in enumerate(lags) if mine and max(mine.values()) <= _AT_ONCE]
+        [place for place, mine in enumerate(lags) if mine and max(mine.values()) <= MAX_ZERO_LAG_S]
         if any(lags)
         else []
     )
 
 
-def _lags(values: Mapping[str, float | str]) -> dict[str, float]:
+def _lag_values(values: Mapping[str, float | str]) -> dict[str, float]:
     return {name: float(value) for name, value in values.items() if _is_lag(name)}
 
 
@@ -161,10 +173,12 @@ def _is_lag(name: str) -> bool:
     return name == "lag" or name.endswith("_lag")
 
 
-def _ends(tried: Array, share: Array, middle: float) -> tuple[float, float]:
-    """Ends of the 95 % interval: every value stands for all that are nearer to it than to the next, and for as much beyond the last.
+def _interval_ends(tried: Array, share: Array, middle: float) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of a nuisance parameter on a grid.
 
-    Lags, times and plays are known to a factor, so that there is more room above than below.
+    Each value represents all that are nearer to it than to its neighbours, and as much beyond the
+    last. Lags, time constants and dead bands are known to a factor, so that the interval extends
+    further up than down.
     """
     known, place = np.unique(tried, return_inverse=True)
     between = np.where(
@@ -179,8 +193,8 @@ def _ends(tried: Array, share: Array, middle: float) -> tuple[float, float]:
     return min(float(low), middle), max(float(high), middle)
 
 
-def _spacing(grid: Array, place: float) -> float:
-    """Distance of the grid's values about a place."""
+def _grid_spacing(grid: Array, place: float) -> float:
+    """Return the distance of the grid's values about a place."""
     known = np.unique(grid)
     nearest = int(np.abs(known - place).argmin())
     return float(np.diff(known[max(nearest - 1, 0) : nearest + 2]).mean())

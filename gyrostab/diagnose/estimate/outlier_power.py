@@ -1,4 +1,7 @@
-"""What odd samples add to the powers on average: naming leaves their blocks out, a picture of the simulation must not."""
+"""Add the mean power of anomalous samples to a baseline.
+
+The identification leaves their blocks out; a surface of the simulation must include them.
+"""
 
 from __future__ import annotations
 
@@ -14,21 +17,21 @@ from gyrostab.noise import sampled_psd
 
 __all__ = ["add_outlier_power"]
 
-_IN_ALL = "lattice"  # odd about every sample, so that the noise that was calibrated has it already
+_EVERYWHERE = "lattice"  # rounding affects every sample, so that the calibrated noise includes it
 
 
 def add_outlier_power(
     baseline: xr.Dataset, blocks: xr.Dataset, fitted: Sequence[Fitted]
 ) -> xr.Dataset:
-    """The baseline with the mean power of spikes, held samples and other odd samples, as their fitted numbers and their physics say.
+    """Add the mean power of anomalous samples to a baseline, from their fitted sizes.
 
     Parameters
     ----------
     baseline : xarray.Dataset
-        With the other effects, fitted to the blocks without odd samples.
+        With the other effects, fitted to the blocks without anomalous samples.
     blocks : xarray.Dataset
     fitted : sequence of Fitted
-        Effects of all kinds; those that leave no odd samples are passed over.
+        Effects of all kinds; those without anomalous samples are ignored.
     """
     axes = [str(axis) for axis in blocks["axis"].values]
     frequency, rate = blocks["frequency"].values, float(blocks.attrs["sampling_rate_hz"])
@@ -40,8 +43,8 @@ def add_outlier_power(
         ):
             continue
         rows = [axes.index(axis) for axis in one.axes]
-        seen = one.effect.explain(replace(make_windows(blocks, {}), axes=tuple(one.axes)))
-        if _IN_ALL in seen.marks:
+        seen = one.effect.explain(replace(windows_of(blocks, {}), axes=tuple(one.axes)))
+        if _EVERYWHERE in seen.marks:
             continue
         for name, density in seen.spectrum.items():
             added[rows] += getattr(one.effect, name) ** 2 * density

@@ -1,4 +1,7 @@
-"""The noise once more, with the named effects in the model: the first calibration took for noise what they do to its blocks."""
+"""Calibrate the noise again with the identified effects in the model.
+
+The first calibration takes what the effects do to its blocks for noise.
+"""
 
 from __future__ import annotations
 
@@ -46,26 +49,27 @@ from gyrostab.physics.phase import fold
 __all__ = ["recalibrate", "remove_fast_switching", "with_noise"]
 
 Array = NDArray[np.float64]
-_GROUPS = 150  # of blocks of like level, over which powers are averaged
-_LEAST = 24  # blocks
-_BLURRED = 1e-4  # share of its information that N must keep beside the effects
+LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
+MIN_BLOCKS = 24  # as the shortest record that is diagnosed
+MIN_INFORMATION_SHARE = 1e-4  # of its information, that N must keep with the effects in the model
 
 
 @dataclass
-class _Seen:
-    """What effects do on one axis.
+class AxisEffects:
+    """What the effects do on one axis.
 
     Attributes
     ----------
     known : ndarray, shape (block, band)
-        Power of a size that is known otherwise.
-    free : list of ndarray, shape (block, band)
-        Power per unit of a free size.
+        Power of fixed size.
     response : ndarray, shape (band,)
         Factor of the noise.
+    free : list of ndarray, shape (block, band)
+        Power per unit of a free size.
     means : list of ndarray, shape (block,)
+        Means per unit of a free size.
     doubt : float
-        Error of `known`, as a share of it.
+        Relative error of `known`.
     """
 
     known: Array
@@ -81,27 +85,28 @@ def recalibrate(
     fitted: Sequence[Fitted],
     known: NDArray[np.bool_] | None = None,
 ) -> xr.Dataset:
-    """Calibrate the noise with the named effects in the model, those of free size free.
+    """Calibrate the noise with the identified effects in the model, those of free size free.
 
-    An axis that no effect touches keeps its noise; so does one on which effects leave too little to
-    tell it by. Where something is unknown the quiet blocks are used, else the whole record: the
-    levels of an effect are told from noise by their course.
+    An axis without an effect keeps its noise; so does one on which the effects leave too little to
+    determine it. The course of an effect separates it from noise, so that the whole record is used;
+    with something unidentified on the axis, only its quiescent blocks are.
 
     Parameters
     ----------
-    identifications : Naming
+    identifications : Identifications
     baseline : xarray.Dataset
-        That the naming started from; returned as it is unless it was calibrated on the recording.
+        The baseline that the identification started from; returned as it is unless it was
+        calibrated on the recording.
     fitted : sequence of Fitted
-        The effects with their numbers.
+        The effects with their sizes.
     known : ndarray of bool, shape (block,), optional
         Blocks that may be used; all by default.
 
     Returns
     -------
     xarray.Dataset
-        As `gyrostab.diagnose.baseline.calibrate.calibrate_noise` has it; ``attrs["recalibrated"]``
-        names the axes.
+        As from `gyrostab.diagnose.baseline.calibrate.calibrate_noise`; ``attrs["recalibrated"]``
+        lists the axes.
     """
     if baseline.attrs.get("source") != "calibrated" or not identifications.identified:
         return baseline
@@ -115,18 +120,18 @@ def recalibrate(
     columns = noise_powers(blocks)
     changed, quiet = [], baseline["quiet"].transpose("axis", "block").values.copy()
     for row, axis in enumerate(state.axes):
-        seen = _seen(identifications, baseline, fitted, axis)
+        seen = _collect_effects(identifications, baseline, fitted, axis)
         posterior = None
         if seen is not None:
-            strange = any(axis in one.axes for one in identifications.unknown)
-            chosen = use & ~state.masked[row] & (quiet[row] if strange else True)
-            posterior = _posterior(state, row, seen, chosen)
+            has_unidentified = any(axis in one.axes for one in identifications.unknown)
+            chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
+            posterior = _fit_noise(state, row, seen, chosen)
             if posterior is not None:
                 changed.append(axis)
                 quiet[row] = chosen
                 columns[row] = noise_powers(blocks, seen.response)[row]
                 power[row] = columns[row] @ posterior.square + seen.known
-        found.append(_kept(baseline, row) if posterior is None else posterior)
+        found.append(_kept_posterior(baseline, row) if posterior is None else posterior)
     if not changed:
         return baseline
     out = assemble_baseline(
@@ -139,42 +144,44 @@ def recalibrate(
     out["columns"] = out["columns"].copy(data=columns)
     for row, axis in enumerate(state.axes):
         if axis not in changed:
-            for name in _OF_AXIS:
+            for name in _AXIS_VARIABLES:
                 out[name][row] = baseline[name].transpose("axis", ...).values[row]
     return out
 
 
-#: Variables of a baseline that an axis keeps whose noise is kept.
-_OF_AXIS = (
-    "coefficient", "stderr", "spectrum", "mean_variance", "square", "square_stderr", "posterior", "posterior_slow",
-    "grid_K", "grid_B", "grid_prior", "grid_calibrated",
+#: Variables of a baseline that an axis keeps with its noise.
+_AXIS_VARIABLES = (
+    "coefficient", "stderr", "spectrum", "mean_variance", "square", "square_stderr", "posterior",
+    "posterior_slow", "grid_K", "grid_B", "grid_prior", "grid_calibrated",
 )  # fmt: skip
 
 
 def remove_fast_switching(identifications: Identifications, baseline: xr.Dataset) -> xr.Dataset:
-    """The noise beside biases that hop within blocks alone: with these for noise it is another one, to which nothing can be compared.
+    """Calibrate the noise with only those biases in the model that switch within blocks.
+
+    With their power taken for noise, nothing can be compared with the baseline.
 
     Parameters
     ----------
-    identifications : Naming
+    identifications : Identifications
     baseline : xarray.Dataset
-        That the naming started from; returned as it is unless it was calibrated on the recording,
-        and such a bias is named.
+        The baseline that the identification started from; returned as it is unless it was
+        calibrated on the recording and such a bias is identified.
     """
-    hops = tuple(
+    switching = tuple(
         one
         for one in identifications.identified
         if any(component.variant.inside.size for component in one.components)
     )
-    if not hops:
+    if not switching:
         return baseline
-    alone = replace(identifications, identified=hops, unknown=())
+    alone = replace(identifications, identified=switching, unknown=())
     noise = recalibrate(alone, baseline, fit_identifications(alone, baseline))
     return noise if noise is baseline else noise.assign_attrs(recalibrated=[])
 
 
-def _kept(baseline: xr.Dataset, row: int) -> Posterior:
-    """A stand-in for an axis whose noise is kept."""
+def _kept_posterior(baseline: xr.Dataset, row: int) -> Posterior:
+    """Return the posterior of an axis whose noise is kept."""
     one = baseline.isel(axis=row)
     K, B = one["grid_K"].values, one["grid_B"].values
     weight = np.exp(one["grid_calibrated"].values)
@@ -192,19 +199,19 @@ def _kept(baseline: xr.Dataset, row: int) -> Posterior:
     )
 
 
-def _seen(
+def _collect_effects(
     identifications: Identifications, baseline: xr.Dataset, fitted: Sequence[Fitted], axis: str
-) -> _Seen | None:
-    """What all named effects do on an axis; None where they do nothing."""
+) -> AxisEffects | None:
+    """Collect what all identified effects do on an axis; None without any."""
     blocks = identifications.state.blocks
     shape = (blocks.sizes["block"], blocks.sizes["band"])
-    out = _Seen(np.zeros(shape), np.ones(shape[1]))
+    out = AxisEffects(np.zeros(shape), np.ones(shape[1]))
     touched = False
     for identification in identifications.identified:
         components = [component for component in identification.components if axis in component.row]
         touched |= bool(components)
         for component in components:
-            _add(out, component, identifications, baseline, axis)
+            _add_component(out, component, identifications, baseline, axis)
         numbers = next(
             (one for one in fitted if one.identification is identification and axis in one.axes),
             None,
@@ -212,14 +219,14 @@ def _seen(
         effect = None if numbers is None else numbers.effect
         in_power = any(
             component.candidate.statistic == "power" for component in components
-        )  # which has it with a free size
+        )  # that power has a free size
         if (
             numbers is not None
             and effect is not None
             and not in_power
-            and any(_only_said(component, blocks) for component in components)
+            and any(_is_power_from_effect(component, blocks) for component in components)
         ):
-            out.known += _said(effect, blocks, axis)
+            out.known += _effect_power(effect, blocks, axis)
             out.doubt = max(
                 [
                     out.doubt,
@@ -237,16 +244,19 @@ def _seen(
     return out if touched else None
 
 
-def _only_said(component: Component, blocks: xr.Dataset) -> bool:
-    """Whether the power of a part is in no column, but only in what the effect says of itself; with odd samples it may be left out."""
+def _is_power_from_effect(component: Component, blocks: xr.Dataset) -> bool:
+    """Return whether only the effect itself, and no column, gives the power of a component.
+
+    Blocks with anomalous samples are left out, and then their power may be too.
+    """
     return component.candidate.statistic == "cross" or (
         component.candidate.statistic == "marks"
         and not find_anomalous_blocks(component, blocks).any()
     )
 
 
-def _add(
-    out: _Seen,
+def _add_component(
+    out: AxisEffects,
     component: Component,
     identifications: Identifications,
     baseline: xr.Dataset,
@@ -257,9 +267,13 @@ def _add(
     if is_filter(statistic, component.variant):
         return
     if statistic == "transfer":
-        out.known += _followed(component, replace(state, weight=identifications.state.weight))
+        out.known += _transferred_power(
+            component, replace(state, weight=identifications.state.weight)
+        )
     elif statistic == "phase_locked":
-        out.known += _comb(component, replace(state, weight=identifications.state.weight))
+        out.known += _phase_locked_power(
+            component, replace(state, weight=identifications.state.weight)
+        )
     elif statistic in ("mean", "levels", "power", "order", "line"):
         given = condition_on_component(state, component).given
         out.free += [
@@ -268,8 +282,8 @@ def _add(
         out.means += given.get(("mean", axis), [])
 
 
-def _followed(component: Component, state: State) -> Array:
-    """Power that follows a channel or another axis, (block, band)."""
+def _transferred_power(component: Component, state: State) -> Array:
+    """Return the power that follows a channel or another axis, (block, band)."""
     mean, _ = component_mixture(component, state).moments()
     transfer = np.tensordot(mean, component.variant.design, axes=1)
     return np.asarray(
@@ -278,8 +292,8 @@ def _followed(component: Component, state: State) -> Array:
     )
 
 
-def _comb(component: Component, state: State) -> Array:
-    """Power of what is locked to the ramp: the lines of its mean over a turn, folded as samples see them, (block, band)."""
+def _phase_locked_power(component: Component, state: State) -> Array:
+    """Return the power locked to the ramp, (block, band): the aliased lines of its profile."""
     blocks = state.blocks
     mean, _ = component_mixture(component, state).moments()
     profile = np.tensordot(mean, component.variant.design, axes=1)
@@ -296,9 +310,9 @@ def _comb(component: Component, state: State) -> Array:
     return out
 
 
-def _said(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
-    """Power that an effect says it has on an axis, (block, band)."""
-    windows = replace(make_windows(blocks, find_drivers(effect)), axes=(axis,))
+def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
+    """Return the power that an effect itself predicts on an axis, (block, band)."""
+    windows = replace(windows_of(blocks, find_drivers(effect)), axes=(axis,))
     out = np.zeros((blocks.sizes["block"], blocks.sizes["band"]))
     many = {item.name: item.many for item in effect.parameters()}
     for name, density in effect.explain(windows).spectrum.items():
@@ -310,18 +324,22 @@ def _said(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
     return np.asarray(spread_by_gaps(out[None], blocks.sel(axis=[axis]))[0])
 
 
-def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -> Posterior | None:
-    """Noise of an axis beside effects; None where too little is left to tell it by."""
+def _fit_noise(
+    state: State, row: int, seen: AxisEffects, chosen: NDArray[np.bool_]
+) -> Posterior | None:
+    """Fit the noise of an axis with the effects; None where too little is left to determine it."""
     blocks = state.blocks
     power, shape = (
         blocks[name].transpose("axis", "block", "band").values[row] for name in ("power", "shape")
     )
     chosen = chosen & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
-    if chosen.sum() < _LEAST:
+    if chosen.sum() < MIN_BLOCKS:
         return None
     columns = noise_powers(blocks, seen.response)[row]
     common, alone = (one[row] for one in common_variance(blocks))
-    fit = _fit(power, _weights(shape, alone, common), columns, state.weight[row], seen, chosen)
+    fit = _average_groups(
+        power, _reduced_shapes(shape, alone, common), columns, state.weight[row], seen, chosen
+    )
     square, information = fit_squares(fit)
     plain = float(
         (
@@ -329,14 +347,14 @@ def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -
             * fit.columns[:, 1] ** 2
         ).sum()
     )
-    if not information[1, 1] > _BLURRED * plain or not square[1] > 0.0:
+    if not information[1, 1] > MIN_INFORMATION_SHARE * plain or not square[1] > 0.0:
         return None
     square = np.maximum(square, [0.0, floor_square(fit), 0.0, 0.0])
     count = blocks.sizes["axis"]
     variance = white_variance(blocks, np.tile(square, (count, 1)))[row]
     variance = variance * np.maximum(state.weight[row, :, 0] / (columns[:, 0] @ square), 0.1)
     mean = blocks["mean"].transpose("axis", "block").values[row]
-    effects_there = np.stack(seen.means, axis=1) if seen.means else None
+    effect_means = np.stack(seen.means, axis=1) if seen.means else None
     return noise_posterior(
         fit,
         mean,
@@ -345,29 +363,29 @@ def _posterior(state: State, row: int, seen: _Seen, chosen: NDArray[np.bool_]) -
         step=float(blocks.attrs["block_s"]),
         draws=DRAWS,
         rng=np.random.default_rng(row),
-        effects=effects_there,
+        effects=effect_means,
     )
 
 
-def _weights(shape: Array, alone: Array, common: Array) -> Array:
-    """Shapes of the powers, less what the common part of a block takes from them together."""
+def _reduced_shapes(shape: Array, alone: Array, common: Array) -> Array:
+    """Return the shapes of the powers, reduced by the scatter that the bands of a block share."""
     each = np.nansum(alone, axis=1)
     share = each / (1.0 + common * each) / np.maximum(np.nansum(shape, axis=1), 1e-300)
     return np.asarray(shape * np.minimum(share, 1.0)[:, None])
 
 
-def _fit(
+def _average_groups(
     power: Array,
     shape: Array,
     columns: Array,
     expected: Array,
-    seen: _Seen,
+    seen: AxisEffects,
     chosen: NDArray[np.bool_],
 ) -> Fit:
-    """Powers averaged over blocks of like level."""
+    """Average the powers over blocks of similar level."""
     level = np.where(chosen, np.log(expected.mean(axis=1)), np.inf)
     groups = np.array_split(
-        np.argsort(level, kind="stable")[: int(chosen.sum())], min(_GROUPS, int(chosen.sum()))
+        np.argsort(level, kind="stable")[: int(chosen.sum())], min(LEVEL_GROUPS, int(chosen.sum()))
     )
     size = [max(float(np.abs(one).max()), 1e-300) for one in seen.free]
     components = [
@@ -395,12 +413,12 @@ def _fit(
     weight = np.concatenate(weights)
     some = weight > 0.0
     flat = [np.concatenate(one)[some] for one in means]
-    beside = np.stack(flat[4:], axis=1) if len(flat) > 4 else np.empty((int(some.sum()), 0))
+    free = np.stack(flat[4:], axis=1) if len(flat) > 4 else np.empty((int(some.sum()), 0))
     known = flat[2][:, None]
-    precision = np.zeros(beside.shape[1])
-    if np.any(known > 0.0):  # what an effect is said to have is not known better than so
-        beside, precision = (
-            np.concatenate([beside, known], axis=1),
+    precision = np.zeros(free.shape[1])
+    if np.any(known > 0.0):  # the predicted power has an error too
+        free, precision = (
+            np.concatenate([free, known], axis=1),
             np.append(precision, 1.0 / seen.doubt**2),
         )
     return Fit(
@@ -408,18 +426,20 @@ def _fit(
         flat[1],
         weight[some],
         known=flat[2],
-        free_columns=beside,
+        beside=free,
         precision=precision,
         start=flat[3],
     )
 
 
 def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
-    """The naming with designs for another noise: a share of N^2 is a share of the new one.
+    """Return the identifications with designs for another noise.
+
+    A share of N^2 is a share of the new one.
 
     Parameters
     ----------
-    identifications : Naming
+    identifications : Identifications
     baseline : xarray.Dataset
         With the new noise.
     """

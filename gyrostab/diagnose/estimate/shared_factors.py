@@ -1,4 +1,7 @@
-"""Factors of noise that axes share: the record tells their products, and their low-pass no better than the bands do."""
+"""Estimate how much of a common noise each axis has.
+
+The record determines only the products of the factors of two axes.
+"""
 
 from __future__ import annotations
 
@@ -19,30 +22,32 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 __all__ = ["estimate_shared_factors"]
 
 Array = NDArray[np.float64]
-_DRAWS = 1000
-_ROUNDS = 50
-_WIDEST, _NARROWEST, _STEPS, _FINE = 1.5, 40.0, 11, 12  # low-passes, as parts of the sampling rate
-_ORDER = 0.05  # by which the level below a low-pass is another where it has two poles
-_ENDS = (0.025, 0.975)
+DRAWS = 1000  # of the posterior: 25 beyond each end of a 95 % interval
+FACTOR_ROUNDS = 50  # of the iteration for a matrix of rank 1
+# Grid of low-passes: bandwidths as parts of the sampling rate, their number, and interpolation.
+WIDEST_PART, NARROWEST_PART, BANDWIDTHS, FINE_STEPS = 1.5, 40.0, 11, 12
+ORDER_ERROR = 0.05  # relative change of the level below a low-pass if it has two poles
+_ENDS = (0.025, 0.975)  # of a 95 % interval
+WIDTH_95_SIGMA = 3.919928  # width of a 95 % interval of the normal law, in standard deviations
 
 
 def estimate_shared_factors(
     components: Sequence[Component], axes: tuple[str, ...], state: State
 ) -> dict[str, tuple[float, ...]]:
-    """Factor of every axis, with its standard error and the ends of its 95 % interval, and the low-pass of what is shared.
+    """Estimate the factor of every axis and the low-pass of the common noise.
 
-    White noise and low-passes of any bandwidth are weighed by the cross-spectra of all pairs. No
-    axis shares more than it has. One pair tells a product alone: its factors then lie anywhere
-    between what the other axis and the axis itself have at most.
+    The cross-spectra of all pairs weight white noise and low-passes of any bandwidth. No axis has
+    more common noise than noise. A single pair determines only a product: each factor then lies
+    anywhere between the limits that the other axis and the axis itself set.
 
     Parameters
     ----------
-    components : sequence of Part
-        In the view "cross".
+    components : sequence of Component
+        In the statistic "cross".
     axes : tuple of str
-        Of the effect.
+        Axes of the effect.
     state : State
-        With all else that is named.
+        With all other effects in the model.
 
     Returns
     -------
@@ -52,39 +57,46 @@ def estimate_shared_factors(
     name = components[0].variant.columns[0]
     rows = [row for row in pair_rows(state.blocks) if set(row) <= set(axes)]
     rng = np.random.default_rng(0)
-    seen = _seen(components[0], rows, axes, state)
-    chosen = rng.choice(seen.share.size, size=_DRAWS, p=seen.share)
-    product = seen.product[chosen] + seen.error[chosen] * rng.standard_normal((_DRAWS, len(rows)))
+    seen = _weight_bandwidths(components[0], rows, axes, state)
+    chosen = rng.choice(seen.share.size, size=DRAWS, p=seen.share)
+    product = seen.product[chosen] + seen.error[chosen] * rng.standard_normal((DRAWS, len(rows)))
     limit = seen.limit[chosen]
     factor = (
-        _of_pair(product[:, 0], limit, rng)
+        _draw_pair_factors(product[:, 0], limit, rng)
         if len(axes) == 2
-        else _of_many(product, rows, axes, limit)
+        else _solve_factors(product, rows, axes, limit)
     )
     white = np.isinf(seen.width)
-    factor *= np.exp(np.where(white[chosen], 0.0, _ORDER) * rng.standard_normal(_DRAWS))[:, None]
+    factor *= np.exp(np.where(white[chosen], 0.0, ORDER_ERROR) * rng.standard_normal(DRAWS))[
+        :, None
+    ]
     plain = bool(seen.share[white].sum() >= 0.5)
     alike = white[chosen] == plain
     sizes: dict[str, tuple[float, ...]] = {
-        name if len(axes) == 1 else f"{name}.{axis}": _told(factor[:, k], alike)
+        name if len(axes) == 1 else f"{name}.{axis}": _summarise_draws(factor[:, k], alike)
         for k, axis in enumerate(axes)
     }
     if "bandwidth" in components[0].variant.values:
         width = seen.width[chosen][alike]
         sizes["bandwidth"] = (
-            (math.inf, 0.0) if plain else _told(width, np.ones(width.size, np.bool_))
+            (math.inf, 0.0) if plain else _summarise_draws(width, np.ones(width.size, np.bool_))
         )
     return sizes
 
 
-def _told(draws: Array, alike: NDArray[np.bool_]) -> tuple[float, float, float, float]:
-    """Median of the draws of the likelier kind, and spread and ends of all."""
+def _summarise_draws(draws: Array, alike: NDArray[np.bool_]) -> tuple[float, float, float, float]:
+    """Return the median of the likelier draws, and spread and ends of the 95 % interval of all."""
     low, high = np.quantile(draws, _ENDS)
-    return float(np.median(draws[alike])), float((high - low) / 3.919928), float(low), float(high)
+    return (
+        float(np.median(draws[alike])),
+        float((high - low) / WIDTH_95_SIGMA),
+        float(low),
+        float(high),
+    )
 
 
-class _Seen(NamedTuple):
-    """What the cross-spectra say of white noise, and of low-passes.
+class CrossEvidence(NamedTuple):
+    """What the cross-spectra show for white noise and low-passes.
 
     Attributes
     ----------
@@ -93,9 +105,9 @@ class _Seen(NamedTuple):
     share : ndarray, shape (point,)
         Probability.
     product, error : ndarray, shape (point, pair)
-        Of the factors.
+        Products of the factors, and their errors.
     limit : ndarray, shape (point, axis)
-        The largest factor that the power of the axis leaves room for.
+        The largest factor that the power of the axis allows.
     """
 
     width: Array
@@ -105,29 +117,34 @@ class _Seen(NamedTuple):
     limit: Array
 
 
-def _seen(
+def _weight_bandwidths(
     component: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State
-) -> _Seen:
-    """White noise is as likely beforehand as all low-passes together; what lies between two bandwidths of the grid is smooth."""
+) -> CrossEvidence:
+    """Weight the bandwidths by their likelihood, interpolated between those of the grid.
+
+    White noise has the same prior probability as all low-passes together.
+    """
     from scipy.interpolate import CubicSpline
 
     rate = float(state.blocks.attrs["sampling_rate_hz"])
-    grid = np.geomspace(rate / _NARROWEST, rate / _WIDEST, _STEPS)
+    grid = np.geomspace(rate / NARROWEST_PART, rate / WIDEST_PART, BANDWIDTHS)
     widths = (
         np.append(grid, math.inf)
         if "bandwidth" in component.variant.values
         else np.array([math.inf])
     )
-    table = np.array([_of_width(component, float(width), rows, axes, state) for width in widths])
+    table = np.array(
+        [_score_bandwidth(component, float(width), rows, axes, state) for width in widths]
+    )
     prior = np.zeros(1)
     if widths.size > 1:
-        fine = np.geomspace(grid[0], grid[-1], _FINE * (_STEPS - 1) + 1)
+        fine = np.geomspace(grid[0], grid[-1], FINE_STEPS * (BANDWIDTHS - 1) + 1)
         between = CubicSpline(np.log(grid), table[:-1])(np.log(fine))
         widths, table = np.append(fine, math.inf), np.concatenate([between, table[-1:]])
         prior = np.append(np.full(fine.size, -math.log(fine.size)), 0.0)
     log, count = prior + table[:, 0], len(rows)
     share = np.exp(log - np.logaddexp.reduce(log))
-    return _Seen(
+    return CrossEvidence(
         widths,
         share,
         table[:, 1 : 1 + count],
@@ -136,14 +153,14 @@ def _seen(
     )
 
 
-def _of_width(
+def _score_bandwidth(
     component: Component,
     width: float,
     rows: Sequence[tuple[str, ...]],
     axes: tuple[str, ...],
     state: State,
 ) -> Array:
-    """Logarithm of the likelihood of a low-pass, products of the factors of each pair, their errors, and limits of the axes."""
+    """Return log likelihood, products of the pairs, their errors, and limits for one bandwidth."""
     variant = component.variant
     if "bandwidth" in variant.values:
         other = replace(variant, values={**variant.values, "bandwidth": width})
@@ -157,14 +174,14 @@ def _of_width(
     product, square = (
         np.array([float(one.flat[0]) for one in several]) for several in zip(*moments, strict=True)
     )
-    limit = [_level(axis, variant, state) for axis in axes]
+    limit = [_max_factor(axis, variant, state) for axis in axes]
     return np.concatenate(
         [[0.5 * float((product**2 / square).sum())], product, np.sqrt(square), limit]
     )
 
 
-def _level(axis: str, variant: Variant, state: State) -> float:
-    """The largest factor that the power of an axis leaves room for."""
+def _max_factor(axis: str, variant: Variant, state: State) -> float:
+    """Return the largest factor that the power of an axis allows."""
     blocks = state.blocks
     row = next(number for number, pair in enumerate(pair_rows(blocks)) if axis in pair)
     design = cross_column(variant.design[0], row, blocks).real
@@ -180,25 +197,28 @@ def _level(axis: str, variant: Variant, state: State) -> float:
     )
 
 
-def _of_pair(product: Array, limit: Array, rng: np.random.Generator) -> Array:
-    """Factors of two axes (draw, axis): each as likely at any share of its range, in logarithms."""
+def _draw_pair_factors(product: Array, limit: Array, rng: np.random.Generator) -> Array:
+    """Draw the factors of two axes (draw, axis), uniform in the logarithm over their range."""
     size = np.minimum(np.abs(product), limit.prod(axis=1))
     low, high = size / limit[:, 1], limit[:, 0]
     first = low * (high / low) ** rng.random(size.size)
     return np.stack([first, np.sign(product) * size / first], axis=1)
 
 
-def _of_many(
+def _solve_factors(
     product: Array, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], limit: Array
 ) -> Array:
-    """Factors (draw, axis) whose products are nearest to those of the pairs, of the sign in which they agree with the first of all."""
+    """Return the factors (draw, axis) whose products are nearest to those of the pairs.
+
+    Their sign is that in which they agree with the first axis.
+    """
     place = {row: number for number, row in enumerate(rows)}
     matrix = np.zeros((product.shape[0], len(axes), len(axes)))
     for (i, one), (j, other) in combinations(enumerate(axes), 2):
         number = place[one, other] if (one, other) in place else place[other, one]
         matrix[:, i, j] = matrix[:, j, i] = product[:, number]
     diagonal = np.arange(len(axes))
-    for _ in range(_ROUNDS):
+    for _ in range(FACTOR_ROUNDS):
         values, vectors = np.linalg.eigh(matrix)
         factor = vectors[..., -1] * np.sqrt(np.maximum(values[:, -1:], 0.0))
         matrix[:, diagonal, diagonal] = factor**2

@@ -1,4 +1,4 @@
-"""Numbers of a bias of two levels: its step by the means, its times by the hops."""
+"""Estimate a telegraph bias: its step from the means, its dwell times from the switches."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ __all__ = ["estimate_telegraph"]
 def estimate_telegraph(
     components: Sequence[Component], axes: tuple[str, ...], state: State
 ) -> dict[str, tuple[float, float]]:
-    """Step of every axis [degree hour-1] and mean times on both levels [s], each with its error.
+    """Estimate the step of every axis [degree hour-1] and the dwell times of both levels [s].
 
     Parameters
     ----------
-    components : sequence of Part
-        In the view "levels", one for each axis.
+    components : sequence of Component
+        In the statistic "levels", one for each axis.
     axes : tuple of str
-        Of the effect.
+        Axes of the effect.
     state : State
-        With all else that is named.
+        With all other effects in the model.
 
     Returns
     -------
     dict of str to (float, float)
-        The lower level is that of the axis that shows most; where another axis hops the other way
-        its step is negative.
+        Value and standard error. The lower level is that of the strongest axis; an axis that
+        switches the other way has a negative step.
     """
     ranked = sorted(components, key=lambda component: -component.evidence_nats)
     name, first = ranked[0].variant.columns[0], ranked[0].variant

@@ -1,4 +1,4 @@
-"""How large an effect may be that was not named."""
+"""Limit the sizes of effects that were not found."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from gyrostab.physics.registry import effects
 
 __all__ = ["UpperLimit", "find_upper_limits", "mixture_limit"]
 
-_LEVEL = 0.95
-_MOST = 9  # variants
-_ONE_SIDED = float(ndtri(_LEVEL))  # standard errors
+CONFIDENCE = 0.95
+MAX_VARIANTS = 9  # evenly spread over the grid of a mean: enough for a smooth mixture
+ONE_SIDED_SIGMA = float(ndtri(CONFIDENCE))  # quantile of the normal law
 
 
 @dataclass(frozen=True)
 class UpperLimit:
-    """An effect that was not found: how large it may be, at 95 %; NaN where the record cannot tell."""
+    """The 95 % upper limit of an effect that was not found; NaN where the record has none."""
 
     upper_limit: float
     unit: str
@@ -36,13 +36,12 @@ class UpperLimit:
 
 
 def find_upper_limits(identifications: Identifications) -> dict[str, UpperLimit]:
-    """How large every effect that was not named may be.
+    """Find how large each effect may be that was not identified.
 
     Returns
     -------
-    dict of str to Limit
-        95 % limit of the effect's first size, the largest over axes; of effects in means and
-        powers.
+    dict of str to UpperLimit
+        Of the effect's first size in means, powers or cross-spectra; the largest over the axes.
     """
     named = {
         identification.effect
@@ -59,7 +58,7 @@ def find_upper_limits(identifications: Identifications) -> dict[str, UpperLimit]
             out[name] = UpperLimit(math.nan, unit, identifications.reasons[name])
             continue
         found = [
-            _limit(one, identifications.state)
+            _limit_candidate(one, identifications.state)
             for one in identifications.candidates
             if one.effect == name and one.statistic in ("mean", "power", "cross")
         ]
@@ -77,11 +76,14 @@ def find_upper_limits(identifications: Identifications) -> dict[str, UpperLimit]
     return out
 
 
-def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
-    """Limit of the first parameter over the lags, times and plays of its grid, each as likely as the record says, largest over the rows."""
+def _limit_candidate(candidate: Candidate, state: State) -> tuple[float, str]:
+    """Return the limit of the first parameter, the largest over the rows.
+
+    It is over all lags, time constants and dead bands of the grid, weighted by their likelihood.
+    """
     if not candidate.variants[0].columns:
         return math.nan, ""
-    family = _told_over(
+    family = _select_variants(
         candidate,
         [one for one in candidate.variants if one.columns == candidate.variants[0].columns],
     )
@@ -90,32 +92,36 @@ def _limit(candidate: Candidate, state: State) -> tuple[float, str]:
         if candidate.statistic == "cross"
         else [(axis,) for axis in state.axes]
     )
-    found = [_of_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows]
+    found = [_limit_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows]
     known = [bound for bound in found if math.isfinite(bound)]
     worst = max(known) if known else math.nan
     return (math.sqrt(worst) if family[0].squared else worst), family[0].columns[0]
 
 
-def _told_over(candidate: Candidate, family: Sequence[Variant]) -> Sequence[Variant]:
-    """Of means some plain variants, evenly over the grid; of others the one in its middle: the sizes of the rest have other meanings."""
+def _select_variants(candidate: Candidate, family: Sequence[Variant]) -> Sequence[Variant]:
+    """Return the variants that a limit covers: plain ones, or the middle of the grid.
+
+    For means these are evenly spread over the grid. For other statistics, the sizes of other
+    variants have other meanings.
+    """
     plain = (
         [family[place] for place in plain_places(candidate.effect, family)]
         if candidate.statistic == "mean"
         else []
     )
-    every = -(-len(plain) // _MOST)
+    every = -(-len(plain) // MAX_VARIANTS)
     return plain[every // 2 :: every] if plain else [family[len(family) // 2]]
 
 
-def _of_row(component: Component, family: Sequence[Variant], state: State) -> float:
-    """The number that the size, or its square, is below at 95 %, on an axis or a pair; NaN where the record cannot tell."""
-    moves = [
+def _limit_row(component: Component, family: Sequence[Variant], state: State) -> float:
+    """Return the 95 % limit of a size (or its square) on an axis or pair; NaN without one."""
+    moving = [
         one
         for one in family
         if component.candidate.statistic != "mean"
         or np.ptp(mean_columns(one, state.axes.index(component.row[0]))[0]) > 0.0
     ]
-    sizes = [component_mixture(component, state, one) for one in moves]
+    sizes = [component_mixture(component, state, one) for one in moving]
     moments = [
         (float(mean[0]), math.sqrt(max(float(square[0, 0]), 0.0)))
         for mean, square in (one.moments() for one in sizes)
@@ -136,7 +142,7 @@ def _of_row(component: Component, family: Sequence[Variant], state: State) -> fl
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
     one_sided = (
         component.variant.squared and component.candidate.statistic == "power"
-    )  # a product of two axes has either sign
+    )  # the product of two axes may have either sign
     size = np.maximum(mean, 0.0) if one_sided else np.abs(mean)
     return mixture_limit(size, sd, share)
 
@@ -144,7 +150,7 @@ def _of_row(component: Component, family: Sequence[Variant], state: State) -> fl
 def mixture_limit(
     size: NDArray[np.float64], sd: NDArray[np.float64], share: NDArray[np.float64]
 ) -> float:
-    """Find the number that a mixture of normal laws is below with a probability of 95 %.
+    """Find the value that a mixture of normal laws is below with a probability of 95 %.
 
     Parameters
     ----------
@@ -158,10 +164,10 @@ def mixture_limit(
     """
 
     def excess(bound: float) -> float:
-        return float(share @ ndtr((bound - size) / sd)) - _LEVEL
+        return float(share @ ndtr((bound - size) / sd)) - CONFIDENCE
 
-    ends = size + _ONE_SIDED * sd
+    ends = size + ONE_SIDED_SIGMA * sd
     low, high = float(ends.min()), float(ends.max())
-    if excess(low) >= 0.0:  # by rounding: one law has all the weight, or all have one limit
+    if excess(low) >= 0.0:  # rounding: one law has all the weight, or all have the same limit
         return low
     return high if excess(high) <= 0.0 else float(brentq(excess, low, high))

@@ -1,1 +1,1 @@
-"""Which effects explain the difference, what cannot be told, and what is unknown."""
+"""Identify the effects that explain the differences, and what no effect explains."""

@@ -1,4 +1,4 @@
-"""Whether what is left, with all that is named in the model, is still structured in time: then the names are not the whole of it."""
+"""Check whether what the identified effects leave is still structured in time."""
 
 from __future__ import annotations
 
@@ -17,15 +17,23 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import mean_mixture
 from gyrostab.noise import HOUR
 
-__all__ = ["excess_low_frequency_noise", "flexible", "variance_fluctuation"]
+__all__ = ["excess_low_frequency_noise", "variance_fluctuation", "with_neighbouring_variants"]
 
 Array = NDArray[np.float64]
-_STEPS = (1.0, 3.0, 10.0, 30.0)  # of the flicker and random walk that just show
-_LOUDEST = 8.0  # standard deviations that the level of one block may be away
+#: Flicker and random walk that are tried, as multiples of the least that the record can show.
+_NOISE_STEPS = (1.0, 3.0, 10.0, 30.0)
+#: Deviation of the level of one block, in standard deviations, beyond which it is clipped.
+MAX_LEVEL_SIGMA = 8.0
+MIN_BLOCKS = 8  # fewer do not show a course in time
 
 
-def flexible(state: State, identified: Sequence[Identification], axis: str) -> State:
-    """The state with the next points of the nuisance grids beside those named: a time constant lies between two of them."""
+def with_neighbouring_variants(
+    state: State, identified: Sequence[Identification], axis: str
+) -> State:
+    """Return the state with the neighbours of the fitted nuisance values in the model as well.
+
+    A time constant lies between two points of its grid.
+    """
     row = state.axes.index(axis)
     for component in (
         component
@@ -43,13 +51,13 @@ def flexible(state: State, identified: Sequence[Identification], axis: str) -> S
 
 
 def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> float:
-    """What free random walk and flicker gain over the calibrated ones, with all that is named in the model [nats].
+    """Return the evidence [nats] of free random walk and flicker over the calibrated ones.
 
-    Zero where the noise is less red than calibrated: a calibration on blocks that an effect touches
-    takes it for noise.
+    All identified effects are in the model. It is zero where the free noise is the weaker: a
+    calibration on blocks with an effect takes the effect for noise.
     """
     given = state.given.get(("mean", axis))
-    beside = np.stack(given, axis=-1) if given else None
+    columns_given = np.stack(given, axis=-1) if given else None
     columns = [np.linspace(-1.0, 1.0, state.blocks.sizes["block"])] if not given else []
     evidence, strength = [], []
     span = state.blocks.sizes["block"] * float(state.blocks.attrs["block_s"])
@@ -60,7 +68,13 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
     for tier in ("free", "calibrated"):
         evidence.append(
             mean_factors(
-                state.blocks, state.baseline, [], axis=axis, tier=tier, given=beside, folds=folds
+                state.blocks,
+                state.baseline,
+                [],
+                axis=axis,
+                tier=tier,
+                given=columns_given,
+                folds=folds,
             )[0, 0, 0]
         )
         strength.append(float(mean_mixture(state, axis, columns, tier=tier).weights() @ slow))
@@ -68,16 +82,16 @@ def excess_low_frequency_noise(state: State, axis: str, folds: xr.DataArray) -> 
 
 
 def variance_fluctuation(state: State, axis: str) -> float:
-    """What a level of the powers that wanders freely, as flicker and random walk do, gains over one that stands still [nats].
+    """Return the evidence [nats] of a power level that wanders over one that is constant.
 
-    The level is that of all bands of a block together, over the one expected with all that is
-    named. It is the twin of `excess_low_frequency_noise`: where something is left, the noise
-    changes in another way than what is named says.
+    The level is that of all bands of a block together, relative to the expected one with all
+    identified effects. As in `excess_low_frequency_noise`, a large value shows that the noise
+    changes in another way than the effects predict.
     """
     row = state.axes.index(axis)
-    level, variance, columns = _levels(state, row, axis)
+    level, variance, columns = _power_levels(state, row, axis)
     present = np.isfinite(level) & np.isfinite(variance) & ~state.masked[row]
-    if present.sum() < 8:
+    if present.sum() < MIN_BLOCKS:
         return 0.0
     step = float(state.blocks.attrs["block_s"])
     usual = float(np.median(variance[present]))
@@ -85,12 +99,14 @@ def variance_fluctuation(state: State, axis: str) -> float:
     K, B = (
         component.ravel()
         for component in np.meshgrid(
-            *([0.0, *(one * np.array(_STEPS))] for one in least), indexing="ij"
+            *([0.0, *(one * np.array(_NOISE_STEPS))] for one in least), indexing="ij"
         )
     )
     safe = np.where(present, variance, usual)
     error = np.sqrt(safe)
-    values = np.clip(np.where(present, level, 0.0), -_LOUDEST * error, _LOUDEST * error)[:, None]
+    values = np.clip(
+        np.where(present, level, 0.0), -MAX_LEVEL_SIGMA * error, MAX_LEVEL_SIGMA * error
+    )[:, None]
     products = mean_products(values, columns, variance=safe, step=step, K=K, B=B, present=present)
     gram = products.gram + 1e-9 * np.eye(columns.shape[1]) * (
         1.0 + np.trace(products.gram, axis1=1, axis2=2)[:, None, None]
@@ -101,8 +117,11 @@ def variance_fluctuation(state: State, axis: str) -> float:
     return float(np.logaddexp.reduce(log[1:]) - np.log(log.size - 1) - log[0])
 
 
-def _levels(state: State, row: int, axis: str) -> tuple[Array, Array, Array]:
-    """Of every block: level over the expected less one, its variance, and what a change of size of all that is named does to it."""
+def _power_levels(state: State, row: int, axis: str) -> tuple[Array, Array, Array]:
+    """Return level and variance of each block, and what changes of size of the effects do to them.
+
+    The level is relative to the expected one, less 1.
+    """
     shape = state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values
     ratio = (
         state.blocks["power"].transpose("axis", "block", "band").values[row] / state.weight[row]

@@ -1,4 +1,4 @@
-"""Rows of views in which an effect shows, put together by effect."""
+"""Collect the components of an effect: the rows of statistics in which it shows."""
 
 from __future__ import annotations
 
@@ -11,28 +11,30 @@ from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.search import CandidateEvidence, combine_rows
 
 __all__ = [
-    "LEAST",
+    "MIN_COMPONENT_NATS",
     "PLAIN_LINE",
+    "are_lines",
     "axes_of",
-    "by_key",
+    "candidates_of",
     "evidence_of",
     "find_components",
-    "lines_only",
+    "group_components",
+    "merge_lines",
     "sum_evidence",
-    "tried_again",
-    "without_lines",
 ]
 
-#: What an axis must bring to be named with the others [nats].
-LEAST = 2.0
-#: The effect that says of a line no more than that it is there.
+#: Evidence that an axis must add to be named with the others: odds of 7 to 1.
+MIN_COMPONENT_NATS = 2.0
+#: The effect for a line of unknown cause.
 PLAIN_LINE = "spectral_line"
 
 
-def find_components(found: CandidateEvidence) -> list[Component]:
-    """Rows of a candidate that bring something."""
+def find_components(found: Found) -> list[Component]:
+    """Return the rows of a candidate with enough evidence, or the best one."""
     evidence_nats = found.evidence_nats[0]
-    rows = [number for number in range(evidence_nats.size) if evidence_nats[number] > LEAST]
+    rows = [
+        number for number in range(evidence_nats.size) if evidence_nats[number] > MIN_COMPONENT_NATS
+    ]
     rows = rows or [int(evidence_nats.argmax())]
     return [
         Component(
@@ -46,20 +48,25 @@ def find_components(found: CandidateEvidence) -> list[Component]:
     ]
 
 
-def by_key(found: Sequence[CandidateEvidence]) -> dict[str, list[Component]]:
-    """Parts of every effect, those that bring something, the strongest first."""
+def group_components(found: Sequence[Found]) -> dict[str, list[Component]]:
+    """Return the components of each effect with enough evidence, the strongest first."""
     out: dict[str, list[Component]] = {}
     for one in found:
         out.setdefault(one.candidate.key, []).extend(find_components(one))
     for key, components in out.items():
-        good = _once([component for component in components if component.evidence_nats > LEAST])
+        good = _drop_repeated_power(
+            [component for component in components if component.evidence_nats > MIN_COMPONENT_NATS]
+        )
         out[key] = sorted(good or components, key=lambda component: -component.evidence_nats)
     return out
 
 
-def _once(components: Sequence[Component]) -> list[Component]:
-    """Parts without the spectrum of an effect on axes whose course within blocks is known: that holds the same powers."""
-    told = {
+def _drop_repeated_power(components: Sequence[Component]) -> list[Component]:
+    """Drop the power of an effect on axes where its course within blocks is known.
+
+    The course contains the same powers.
+    """
+    has_course = {
         component.row
         for component in components
         if component.candidate.statistic == "levels" and component.variant.inside.size
@@ -67,16 +74,15 @@ def _once(components: Sequence[Component]) -> list[Component]:
     return [
         component
         for component in components
-        if component.candidate.statistic != "power" or component.row not in told
+        if component.candidate.statistic != "power" or component.row not in has_course
     ]
 
 
-def without_lines(components: dict[str, list[Component]]) -> dict[str, list[Component]]:
-    """The same, where a line counts for the plainest name only.
+def merge_lines(components: dict[str, list[Component]]) -> dict[str, list[Component]]:
+    """Let lines count only for the plainest effect, `spectral_line`.
 
-    Any line has the form that a ripple of the supply or a sway would have, and nothing in the line
-    itself tells of them; that they can be meant as well stands among the alternatives. What else
-    such an effect does counts as before.
+    Any line has the form that a ripple of the supply or a sway would have, and does not show its
+    cause. These effects are among its alternatives. Their other components count as before.
     """
     out = {}
     for key, several in components.items():
@@ -91,15 +97,15 @@ def without_lines(components: dict[str, list[Component]]) -> dict[str, list[Comp
     return out
 
 
-def lines_only(components: Sequence[Component]) -> bool:
-    """Whether all that these parts say is that lines are there."""
+def are_lines(components: Sequence[Component]) -> bool:
+    """Return whether all components are lines."""
     return bool(components) and all(
         component.candidate.statistic == "line" for component in components
     )
 
 
 def sum_evidence(components: Sequence[Component]) -> float:
-    """Gain of an effect from its parts [nats]."""
+    """Return the evidence of an effect from its components [nats]."""
     return (
         float(combine_rows(np.array([component.evidence_nats for component in components])))
         if components
@@ -108,7 +114,7 @@ def sum_evidence(components: Sequence[Component]) -> float:
 
 
 def evidence_of(components: Sequence[Component], like: Component) -> float:
-    """Gain of the part in the same view and row, and beside the same witness."""
+    """Return the evidence of the component with the same statistic, row and reference channel."""
     wanted = like.candidate.statistic, like.row, like.candidate.witness
     return next(
         (
@@ -120,8 +126,8 @@ def evidence_of(components: Sequence[Component], like: Component) -> float:
     )
 
 
-def tried_again(components: Sequence[Component]) -> list[Candidate]:
-    """Candidates that parts come from, each once."""
+def candidates_of(components: Sequence[Component]) -> list[Candidate]:
+    """Return the candidates that the components come from, each once."""
     seen: dict[tuple[str, str, tuple[str, ...]], Candidate] = {}
     for component in components:
         seen[
@@ -131,6 +137,6 @@ def tried_again(components: Sequence[Component]) -> list[Candidate]:
 
 
 def axes_of(components: Sequence[Component], order: Sequence[str]) -> tuple[str, ...]:
-    """Axes of parts, in order."""
+    """Return the axes of components, in order."""
     named = {axis for component in components for axis in component.row}
     return tuple(sorted(named, key=lambda axis: (order.index(axis) if axis in order else 0, axis)))

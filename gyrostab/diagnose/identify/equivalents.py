@@ -1,4 +1,4 @@
-"""The plainer form of an effect, where the data do not hold its terms apart."""
+"""Reduce effects of several terms to one where the data do not separate the terms."""
 
 from __future__ import annotations
 
@@ -14,86 +14,103 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 
 __all__ = ["prefer_plainer"]
 
-_ALIKE = 0.999  # correlation of the errors of two terms, from which on they are one to the data
-_AMBIGUOUS = 3.0  # nats by which one term alone must be better than another
-_NEEDED, _FORM = (
-    6.0,
-    0.01,
-)  # nats that a second term must bring, and of the first one's, which an error of its form may leave
+MAX_CORRELATION = 0.999  # of the errors of two terms, from which on the data do not separate them
+AMBIGUOUS_NATS = 3.0  # by which one term alone must be better than another: odds of 20 to 1
+NEEDED_NATS = 6.0  # that a second term must add: odds of 400 to 1
+FORM_ERROR_SHARE = 0.01  # of the first term's evidence, that an error of its form may leave
 
 
 def prefer_plainer(component: Component, state: State) -> tuple[Component, str]:
-    """The part with one of its terms, where that does as well as all, and a sentence about it; else the part as it is.
+    """Return a component with a single term where that explains as much, and a sentence about it.
 
-    A part of one term gets the first of those that alone do as well, but for 3 nats and an error of
-    the form. Terms that rise and fall together, as g^2 and g^4 at one level of vibration, have
-    sizes that are large, opposite and wrong.
+    A component of one term gets the first of those that explain as much, but for 3 nats and an
+    error of the form. Terms that rise and fall together, as g^2 and g^4 at one level of vibration,
+    would otherwise get large and opposite sizes that are both wrong.
 
     Parameters
     ----------
-    component : Part
-        Of means or powers.
+    component : Component
+        Of means or powers; any other is returned as it is.
     state : State
-        With all else that is named.
+        With all other effects in the model.
+
+    Returns
+    -------
+    component : Component
+    sentence : str
+        Empty when the component is unchanged.
     """
     if component.candidate.statistic not in ("mean", "power"):
         return component, ""
     if len(component.variant.columns) == 1:
-        return _first_alike(component, state)
+        return _prefer_first_term(component, state)
     mean, covariance = component_mixture(component, state).moments()
     error = np.sqrt(np.diagonal(covariance))
-    alike = float(np.abs(np.tril(covariance / np.outer(error, error), -1)).max())
-    found = ((name, _only(component, name)) for name in component.variant.columns)
+    correlation = float(np.abs(np.tril(covariance / np.outer(error, error), -1)).max())
+    found = ((name, _single_term_variant(component, name)) for name in component.variant.columns)
     alone = {name: one for name, one in found if one is not None}
     if not alone:
         return component, ""
-    gains = {name: _alone(component, state, variant) for name, variant in alone.items()}
+    gains = {
+        name: _single_term_evidence(component, state, variant) for name, variant in alone.items()
+    }
     best = max(gains.values())
+    # the first that explains as much as the best
     name = next(
-        name for name in component.variant.columns if gains.get(name, -np.inf) > best - _NEEDED
-    )  # the first that will do
+        name for name in component.variant.columns if gains.get(name, -np.inf) > best - NEEDED_NATS
+    )
     whole = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
-    if alike < _ALIKE and whole - gains[name] > _NEEDED + _FORM * gains[name]:
+    if (
+        correlation < MAX_CORRELATION
+        and whole - gains[name] > NEEDED_NATS + FORM_ERROR_SHARE * gains[name]
+    ):
         return component, ""
     others = [other for other in component.variant.columns if other != name]
-    return replace(component, variant=alone[name]), _untold(name, others)
+    return replace(component, variant=alone[name]), _describe_unseparated(name, others)
 
 
-def _first_alike(component: Component, state: State) -> tuple[Component, str]:
-    """A part of one term: by the first of the terms that alone do as well, whichever rounding or chance had put ahead."""
+def _prefer_first_term(component: Component, state: State) -> tuple[Component, str]:
+    """Return a component of one term with the first of the terms that explain as much.
+
+    Rounding or chance may have put another one ahead.
+    """
     names = dict.fromkeys(
         one.columns[0] for one in component.candidate.variants if len(one.columns) == 1
     )
-    terms = [one for name in names if (one := _only(component, name)) is not None]
-    own = _alone(component, state, component.variant)
-    alike = [
+    terms = [one for name in names if (one := _single_term_variant(component, name)) is not None]
+    own = _single_term_evidence(component, state, component.variant)
+    correlation = [
         one
         for one in terms
         if one.columns == component.variant.columns
-        or _alone(component, state, one) > own - _AMBIGUOUS - _FORM * own
+        or _single_term_evidence(component, state, one)
+        > own - AMBIGUOUS_NATS - FORM_ERROR_SHARE * own
     ]
-    if len(alike) < 2:
+    if len(correlation) < 2:
         return component, ""
-    first, *others = alike
-    return replace(component, variant=first), _untold(
+    first, *others = correlation
+    return replace(component, variant=first), _describe_unseparated(
         first.columns[0], [one.columns[0] for one in others]
     )
 
 
-def _alone(component: Component, state: State, variant: Variant) -> float:
-    """What a single term gains over none [nats]; nothing where it would take power away."""
+def _single_term_evidence(component: Component, state: State, variant: Variant) -> float:
+    """Return the evidence [nats] of a single term; zero where it would reduce the power."""
     size, spread = component_mixture(component, state, variant).moments()
     possible = max(float(size[0]), 0.0) if variant.squared else float(size[0])
     return 0.5 * possible**2 / float(spread[0, 0])
 
 
-def _untold(name: str, others: Sequence[str]) -> str:
+def _describe_unseparated(name: str, others: Sequence[str]) -> str:
     taken = "is" if len(others) == 1 else "are"
-    return f"The record does not tell its {name} from its {' and '.join(others)}, which {taken} taken as 0."
+    return (
+        f"The record does not separate its {name} from its {' and '.join(others)}, which {taken} "
+        "taken as 0."
+    )
 
 
-def _only(component: Component, name: str) -> Variant | None:
-    """The variant of the same values with this term alone."""
+def _single_term_variant(component: Component, name: str) -> Variant | None:
+    """Return the variant of the same values with this term alone."""
     for one in component.candidate.variants:
         if (
             one.columns == (name,)

@@ -1,10 +1,18 @@
-"""Effects that the simulation has as well, and whose size or course only the recording tells: odd samples, lines of the turning, levels."""
+"""Identify effects of the simulation whose size or time only the recording shows.
+
+These are anomalous samples, lines locked to the rotation, and telegraph biases.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from gyrostab.diagnose.identify.components import LEAST, axes_of, by_key, sum_evidence
+from gyrostab.diagnose.identify.components import (
+    MIN_COMPONENT_NATS,
+    axes_of,
+    group_components,
+    sum_evidence,
+)
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.condition import Component, condition_on
@@ -14,8 +22,8 @@ from gyrostab.physics.base import Effect
 
 __all__ = ["identify_expected_effects"]
 
-_ROUNDS = 6
-_ONCE = {"telegraph": "bias_jump"}  # a hop that does not come back
+MAX_ROUNDS_PER_EFFECT = 6  # components of one kind that an effect may add, one in each round
+_SINGLE_EVENT = {"telegraph": "bias_jump"}  # a switch that does not return
 
 
 def identify_expected_effects(
@@ -24,12 +32,12 @@ def identify_expected_effects(
     start: State,
     gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
 ) -> tuple[list[Identification], State]:
-    """Claims of effects that are expected, and the state with them in it; whatever else is named has to stand beside them.
+    """Identify effects that are expected, and put them into the model before any others.
 
-    Their sizes are free, for the model says how often something happens and the recording when. The
-    strongest comes first, but odd samples before all: they raise powers and means too. An effect
-    that holds several parts of a kind, as two jumps or two lines do, is taken as often as it brings
-    something.
+    Their sizes are free: the model says how often something happens, and the recording when. The
+    strongest comes first, but anomalous samples before all others, because they raise powers and
+    means too. An effect with several components of a kind, such as two jumps, is taken as long as
+    it adds evidence.
 
     Parameters
     ----------
@@ -38,51 +46,63 @@ def identify_expected_effects(
     candidates : sequence of Candidate
         All that are tried on this recording.
     start : State
-        With nothing named.
+        Without any effect.
     gains : callable
-        Gains of candidates in a state.
+        Computes the evidence of candidates in a state.
+
+    Returns
+    -------
+    identified : list of Identification
+    state : State
+        With these in the model.
     """
     identified: list[Identification] = []
     state, left = start, list(known)
-    rounds = _ROUNDS * len(left)
+    rounds = MAX_ROUNDS_PER_EFFECT * len(left)
     while left and rounds > 0:
         rounds -= 1
-        found = [(_parts(effect, candidates, state, gains), effect) for effect in left]
-        left = [effect for components, effect in found if sum_evidence(components) > LEAST]
-        components, effect = max(found, key=lambda one: (_odd(one[0]), sum_evidence(one[0])))
-        if sum_evidence(components) <= LEAST:
+        found = [(_best_components(effect, candidates, state, gains), effect) for effect in left]
+        left = [
+            effect for components, effect in found if sum_evidence(components) > MIN_COMPONENT_NATS
+        ]
+        components, effect = max(
+            found, key=lambda one: (_are_anomalous_samples(one[0]), sum_evidence(one[0]))
+        )
+        if sum_evidence(components) <= MIN_COMPONENT_NATS:
             break
-        identified.append(_claim(components, state))
+        identified.append(_make_identification(components, state))
         state = condition_on(state, components)
-        if _odd(components):  # their counts cannot be taken out
+        if _are_anomalous_samples(components):  # their counts cannot be taken out
             left = [one for one in left if one is not effect]
     return identified, state
 
 
-def _odd(components: Sequence[Component]) -> bool:
+def _are_anomalous_samples(components: Sequence[Component]) -> bool:
     return (
         bool(components)
         and components[0].candidate.statistic == "marks"
-        and sum_evidence(components) > LEAST
+        and sum_evidence(components) > MIN_COMPONENT_NATS
     )
 
 
-def _follows(candidate: Candidate, effect: Effect) -> bool:
-    """Whether a candidate is this effect of a model, with the channels that it has there; or what it is where it happens once."""
+def _is_candidate_of(candidate: Candidate, effect: Effect) -> bool:
+    """Return whether a candidate is this effect with its channels, or its single event."""
     named = {*filter(None, candidate.driver)}
-    return candidate.effect in (effect.name, _ONCE.get(effect.name)) and named <= {
+    return candidate.effect in (effect.name, _SINGLE_EVENT.get(effect.name)) and named <= {
         *effect.channel_names().values()
     }
 
 
-def _parts(
+def _best_components(
     effect: Effect,
     candidates: Sequence[Candidate],
     state: State,
     gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
 ) -> list[Component]:
-    """What an effect brings on its axes, in the views and with the channels in which it brings most."""
-    by = by_key(gains([one for one in candidates if _follows(one, effect)], state))
+    """Return the components of an effect with the most evidence on its axes."""
+    by = group_components(
+        gains([one for one in candidates if _is_candidate_of(one, effect)], state)
+    )
     own = [
         [
             component
@@ -94,7 +114,7 @@ def _parts(
     return max(own, key=sum_evidence, default=[])
 
 
-def _claim(components: Sequence[Component], state: State) -> Identification:
+def _make_identification(components: Sequence[Component], state: State) -> Identification:
     first = components[0].candidate
     return Identification(
         first.effect,
@@ -102,5 +122,5 @@ def _claim(components: Sequence[Component], state: State) -> Identification:
         axes_of(components, state.axes),
         tuple(components),
         sum_evidence(components),
-        LEAST,
+        MIN_COMPONENT_NATS,
     )

@@ -1,4 +1,4 @@
-"""What the data cannot tell by their nature, and sizes that physics does not allow."""
+"""Find effects that the data cannot separate, and reject sizes that physics does not allow."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.identification import Identification, Unidentified
-from gyrostab.diagnose.identify.jumps import is_lasting, is_sudden, levels
-from gyrostab.diagnose.identify.logger_filters import on_all_axes
+from gyrostab.diagnose.identify.jumps import is_lasting, is_sudden, lead_to_levels
+from gyrostab.diagnose.identify.logger_filters import fits_all_axes
 from gyrostab.diagnose.identify.steady import is_always_present
 from gyrostab.diagnose.predict.candidates import LARGEST_SIZE
 from gyrostab.diagnose.predict.condition import Component, add_fast_switching
@@ -35,38 +35,39 @@ OBSERVATIONALLY_EQUIVALENT: dict[str, tuple[str, ...]] = {
     "gauss_markov": ("telegraph",),
     "spectral_line": ("real_motion", "supply_bias"),
 }
-#: Effect -> effect that it becomes where a parameter goes to its end: without play, hysteresis is
-#: proportional to temperature.
+#: Effect -> effect that it becomes at the end of the range of a parameter: without a dead band,
+#: hysteresis is proportional to temperature.
 EQUIVALENTS = {"thermal_hysteresis": "temperature_bias"}
-_SMALLEST_FRINGE = 6e4  # deg/h: 5 km of fibre on 30 cm
-_SURE = 3.0  # standard errors beyond its range, from which on a size is impossible
-_COMB = 3  # lines that may be one comb
-_MOVING = 1.5  # times the expected power, from which on an axis moves
-_MORE, _FORM = 3.0, 0.01  # nats that further levels may gain, and of the first two's
-_LEAN, _SQUARE = (
-    2e-2,
-    1e-5,
-)  # shares of the turning: of an axis that is across it, at most; and to which one can be squared up
-_LEVELS = 0.97  # correlation of g and g^2 above which vibration has one level
+MIN_FRINGE_STEP = 6e4  # deg/h: one fringe of 5 km of fibre on a coil of 30 cm, lambda c / (L D)
+OUT_OF_RANGE_SIGMA = 3.0  # standard errors beyond its range at which a size is impossible
+MIN_COMB_LINES = 3  # lines that may be one comb
+MOVING_POWER_RATIO = 1.5  # power over expected power at which an axis moves
+MORE_LEVELS_NATS = 3.0  # that further levels may add by chance: odds of 20 to 1
+FORM_ERROR_SHARE = 0.01  # of the evidence, that an error of the form may leave
+MAX_LEAN_RAD = 2e-2  # share of the rotation that an axis across it sees at most: 1 degree
+MIN_LEAN_RAD = 1e-5  # to which an axis can be squared up
+MAX_LEVEL_CORRELATION = 0.97  # of g and g^2, above which the vibration has one level
 
 
 def without_pulses(
     chosen: Sequence[Identification | Unidentified],
 ) -> list[Identification | Unidentified]:
-    """What is chosen, without spikes on axes that have a comb of lines or a profile of the ramp.
+    """Drop spikes on axes that have a comb of lines or a profile of the feedback ramp.
 
-    A comb is a pulse that comes again and again, and what jumps out there is the pulse itself:
-    wrong samples would make no lines.
+    A comb is a periodic pulse, and the outliers are the pulse itself. Bad samples would make no
+    lines.
     """
     lines: Counter[str] = Counter()
     for component in (component for one in chosen for component in one.components):
-        weight = {"line": 1, "phase_locked": _COMB}.get(component.candidate.statistic, 0)
+        weight = {"line": 1, "phase_locked": MIN_COMB_LINES}.get(component.candidate.statistic, 0)
         lines.update(dict.fromkeys(component.row, weight))
     out: list[Identification | Unidentified] = []
     for one in chosen:
         if isinstance(one, Identification) and one.effect == "spikes":
             kept = tuple(
-                component for component in one.components if lines[component.row[0]] < _COMB
+                component
+                for component in one.components
+                if lines[component.row[0]] < MIN_COMB_LINES
             )
             out += (
                 [replace(one, components=kept, axes=tuple(component.row[0] for component in kept))]
@@ -81,35 +82,41 @@ def without_pulses(
 def is_physical(
     components: Sequence[Component], state: State, *, error: float = 0.0
 ) -> list[Component]:
-    """Those parts of an effect whose sizes are possible; on an axis without it chance may fit a size that is not.
+    """Return the components of an effect whose sizes are possible.
 
-    `error` is what errors of the form of all else that is named may leave to the effect [nats].
+    Without an effect on an axis, chance may fit an impossible size. `error` is what errors of the
+    form of all other effects may leave to this one [nats].
     """
     whole = (
-        on_all_axes(components, state)
+        fits_all_axes(components, state)
         and is_sudden(components, state, error=error)
         and is_lasting(components, state)
-        and levels(components, state)
+        and lead_to_levels(components, state)
     )
-    return [component for component in components if _possible(component, state)] if whole else []
+    return (
+        [component for component in components if _is_component_physical(component, state)]
+        if whole
+        else []
+    )
 
 
 def find_plainer_effect(components: Sequence[Component], state: State) -> str | None:
-    """Effect that says the same more plainly; None where there is none.
+    """Return the effect that explains the same more plainly, or None.
 
-    A real turning is seen by the cosine of the angle to the axis, which is rarely small; errors of
-    the scale factor are.
+    An axis senses a real rotation by the cosine of its angle to it, which is rarely small; errors
+    of the scale factor are.
     """
     effect = components[0].candidate.effect
     if effect == "real_motion" and all(
-        _spin(component) and _share(component, state) < _LEAN for component in components
+        _is_rotation(component) and _rotation_share(component, state) < MAX_LEAN_RAD
+        for component in components
     ):
         return "scale_factor"
     return EQUIVALENTS.get(effect)
 
 
-def _spin(component: Component) -> bool:
-    """Whether a part says that an axis sees the turning of the tool."""
+def _is_rotation(component: Component) -> bool:
+    """Return whether a component is that of an axis that senses the rotation of the tool."""
     return (
         component.candidate.effect == "real_motion"
         and component.candidate.statistic == "mean"
@@ -117,39 +124,39 @@ def _spin(component: Component) -> bool:
     )
 
 
-def _share(component: Component, state: State) -> float:
+def _rotation_share(component: Component, state: State) -> float:
     from gyrostab.diagnose.predict.sizes import component_size
 
     return abs(component_size(component, state)[0])
 
 
-def _possible(component: Component, state: State) -> bool:
+def _is_component_physical(component: Component, state: State) -> bool:
     from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 
     effect, statistic = component.candidate.effect, component.candidate.statistic
     if (
         effect == "misalignment"
         and statistic == "transfer"
-        and not _moves(component.candidate.witness[0], state)
+        and not _is_moving(component.candidate.witness[0], state)
     ):
         return False
-    if _spin(component) and _share(component, state) < _SQUARE:
+    if _is_rotation(component) and _rotation_share(component, state) < MIN_LEAN_RAD:
         return False
     if (
         effect == "fringe_hop"
         and abs(component_size(component, state)[0]) * np.abs(component.variant.design).max()
-        < _SMALLEST_FRINGE
+        < MIN_FRINGE_STEP
     ):
         return False
     if effect in LARGEST_SIZE and component.variant.columns[0] != "any":
         return bool(
             np.abs(component_mixture(component, state).moments()[0]).max() <= LARGEST_SIZE[effect]
         )
-    if statistic == "mean" and not _in_range(component, state):
+    if statistic == "mean" and not _is_in_range(component, state):
         return False
-    if statistic == "power" and not _from_least(component, state):
+    if statistic == "power" and not _is_above_least(component, state):
         return False
-    if statistic == "levels" and _more_levels(component, state):
+    if statistic == "levels" and _has_more_levels(component, state):
         return False
     if not is_always_present(component, state):
         return False
@@ -160,8 +167,8 @@ def _possible(component: Component, state: State) -> bool:
     )
 
 
-def _in_range(component: Component, state: State) -> bool:
-    """Whether the sizes of block means can lie where the registry allows the parameters: an instrument that has others is broken."""
+def _is_in_range(component: Component, state: State) -> bool:
+    """Return whether the sizes of a mean can lie in the ranges that the registry allows."""
     from gyrostab.diagnose.predict.sizes import component_mixture
 
     largest = {
@@ -169,15 +176,18 @@ def _in_range(component: Component, state: State) -> bool:
         for item in effects()[component.candidate.effect].parameters()
     }
     sizes, covariance = component_mixture(component, state).moments()
-    least = np.abs(sizes) - _SURE * np.sqrt(np.diagonal(covariance))
+    least = np.abs(sizes) - OUT_OF_RANGE_SIGMA * np.sqrt(np.diagonal(covariance))
     return all(
         size <= largest.get(name, np.inf)
         for name, size in zip(component.variant.columns, least, strict=True)
     )
 
 
-def _from_least(component: Component, state: State) -> bool:
-    """Whether the size of a level of the noise lies above the least that the registry allows: what ages does not get better."""
+def _is_above_least(component: Component, state: State) -> bool:
+    """Return whether the size of a noise level can be above the least that the registry allows.
+
+    Ageing, for example, does not improve a gyro.
+    """
     from gyrostab.diagnose.predict.sizes import component_size
 
     if component.variant.squared or len(component.variant.columns) != 1:
@@ -188,56 +198,59 @@ def _from_least(component: Component, state: State) -> bool:
     if least is None or not np.isfinite(least):
         return True
     size, error = component_size(component, state)
-    return size >= least - _SURE * error
+    return size >= least - OUT_OF_RANGE_SIGMA * error
 
 
-def _more_levels(component: Component, state: State) -> bool:
-    """Whether, beside the two levels, the bias hops once more: then it has three or more."""
+def _has_more_levels(component: Component, state: State) -> bool:
+    """Return whether the bias still switches with two levels in the model: it has three or more."""
     axis = component.row[0]
     if component.variant.inside.size:
         within = fast_switching_evidence(state.blocks, add_fast_switching(state, component), axis)
-        return within is not None and within.evidence_nats > _MORE + _FORM * component.evidence_nats
+        return (
+            within is not None
+            and within.evidence_nats > MORE_LEVELS_NATS + FORM_ERROR_SHARE * component.evidence_nats
+        )
     given = np.stack(
         [*state.given.get(("mean", axis), []), component.variant.design[0, 0]], axis=-1
     )
     evidence_nats, _ = telegraph_evidence(state.blocks, state.baseline, axis=axis, given=given)
-    return bool(evidence_nats[0] > _MORE + _FORM * component.evidence_nats)
+    return bool(evidence_nats[0] > MORE_LEVELS_NATS + FORM_ERROR_SHARE * component.evidence_nats)
 
 
-def _moves(axis: str, state: State) -> bool:
-    """Whether an axis shows more than its noise at some frequency: what is at rest cannot leak in."""
+def _is_moving(axis: str, state: State) -> bool:
+    """Return whether an axis exceeds its noise at some frequency; what is at rest cannot leak."""
     row = state.axes.index(axis)
     expected = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
     return bool(
         np.nanmax(np.nanmean(measured(state.blocks, "power").values[row] / expected, axis=0))
-        > _MOVING
+        > MOVING_POWER_RATIO
     )
 
 
 def find_equivalent_effects(
     effect: str, components: Sequence[Component], state: State, *, lines: int = 0
 ) -> list[str]:
-    """Effects that are part of the answer by their nature; `lines` are named in all."""
+    """Return effects that the data cannot separate from this one; `lines` counts all lines."""
     out = list(OBSERVATIONALLY_EQUIVALENT.get(effect, ()))
     blocks = state.blocks
-    if effect == "spectral_line" and "profile" not in blocks and lines >= _COMB:
+    if effect == "spectral_line" and "profile" not in blocks and lines >= MIN_COMB_LINES:
         out.append("feedback_reset")
     if (
         effect == "dead_zone" and len(state.axes) == 1
-    ):  # no other axis says whether the sample was lost
+    ):  # no other axis shows whether the sample was lost
         out.append("held_samples")
     if effect == "dead_zone" and any(
         possibly_truncated_axes(blocks)[state.axes.index(component.row[0])]
         for component in components
     ):
-        out.append("rate_quantization")  # cut off towards zero, its cell of zero is twice as wide
+        out.append("rate_quantization")  # truncation towards zero makes the zero bin twice as wide
     if effect == "telegraph" and not any(
         component.candidate.statistic == "levels" for component in components
     ):
-        out.append("gauss_markov")  # two levels show in the means only
+        out.append("gauss_markov")  # two levels show only in the means
     if effect == "vibration_rectification":
         vibration = blocks[f"channel_{components[0].candidate.driver[0]}"].values
         good = np.isfinite(vibration)
-        if np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1] > _LEVELS:
+        if np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1] > MAX_LEVEL_CORRELATION:
             out.append("g_sensitivity")
     return out

@@ -1,4 +1,4 @@
-"""What naming gives: claims, what is unknown, and what both rest on."""
+"""Define the result of the identification: identified effects, and what is unidentified."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.components import LEAST, axes_of, sum_evidence
+from gyrostab.diagnose.identify.components import MIN_COMPONENT_NATS, axes_of, sum_evidence
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.designs import Candidate
 from gyrostab.diagnose.predict.linear_model import State
@@ -27,14 +27,16 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-#: What an error of the spectrum of a driven noise leaves to a filter, as a share of its gain: 0.08
-#: was seen in loud vibration.
-_FILTER, _SPECTRUM = "logger_filter", 0.1
+#: What filters the noise of the log, and would explain an error in the spectrum of another effect.
+_FILTER = "logger_filter"
+#: Share of the evidence of a driven noise that an error of its spectrum may leave to a filter: 0.08
+#: was seen in simulated strong vibration.
+SPECTRUM_ERROR_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class Identification:
-    """An effect that is named.
+    """An effect that was identified.
 
     Attributes
     ----------
@@ -43,16 +45,17 @@ class Identification:
     driver : tuple of str
         Channels of the log that it follows, in the order of the effect's channels.
     axes : tuple of str
-    components : tuple of Part
-        Where it shows.
+    components : tuple of Component
+        Statistics and rows in which it shows.
     evidence_nats : float
-        On held-out time, with all others in the model [nats].
+        Held-out log Bayes factor with all others in the model [nats].
     threshold : float
-        That it had to pass [nats].
+        Evidence that it needed [nats].
     alternatives : tuple of str
-        Effects that these data cannot tell from it.
+        Effects that these data do not separate from it.
     surrogate_p : float
-        Share of slid copies of its channel that explain as much; NaN where there is no channel.
+        Share of the time-shifted surrogates of its channel that explain as much; NaN without
+        channel.
     """
 
     effect: str
@@ -67,19 +70,20 @@ class Identification:
 
 @dataclass(frozen=True)
 class Unidentified:
-    """Something is there that no effect explains.
+    """A difference that no effect explains.
 
     Attributes
     ----------
     generic : str
-        One of `GENERICS`.
+        One of `gyrostab.diagnose.predict.nuisance.NUISANCE_ALTERNATIVES`.
     axes : tuple of str
     evidence_nats : float
-        [nats]
+        Held-out log Bayes factor [nats].
     threshold : float
+        Evidence that it needed [nats].
     candidates : tuple of str
         Effects that come nearest, or whose channel is missing.
-    components : tuple of Part
+    components : tuple of Component
     """
 
     generic: str
@@ -92,29 +96,30 @@ class Unidentified:
 
 @dataclass(frozen=True)
 class Identifications:
-    """What naming found.
+    """What the identification found.
 
     Attributes
     ----------
-    identified : tuple of Claim
-        Effects named, the strongest first.
-    unknown : tuple of Unknown
+    identified : tuple of Identification
+        The strongest first.
+    unknown : tuple of Unidentified
     threshold : float
-        Gain that noise alone reaches in any effect, axis and grid point with the probability
-        `level` [nats].
+        Evidence that noise alone exceeds, in any effect, axis and grid point, with the false-alarm
+        probability [nats].
     null_best : ndarray
-        Largest gain in each null record, sorted [nats].
+        Best evidence in each null record, sorted [nats].
     reasons : dict of str to str
-        Effect -> why it cannot be seen in this record.
+        Effect -> why this record cannot show it.
     candidates : tuple of Candidate
-        All that was tried.
+        All that were tried.
     state : State
-        With all that was named.
+        With all of the above in the model.
     folds : xarray.DataArray
-    count_evidence : Tallies
-    expected : tuple of Claim
-        Effects that the simulation has as well, with the size and course that the recording gives
-        them; they are in `state` too.
+        Blocks that are held out together.
+    count_evidence : CountEvidence
+    expected : tuple of Identification
+        Effects that the simulation contains as well, with size and time from the recording; they
+        are in `state` too.
     """
 
     identified: tuple[Identification, ...]
@@ -130,7 +135,7 @@ class Identifications:
 
     @property
     def verdict(self) -> str:
-        """What to call it: "no mismatch", "explained", "partly explained" or "unknown"."""
+        """Return "no mismatch", "explained", "partly explained" or "unknown"."""
         if not self.identified:
             return "unknown" if self.unknown else "no mismatch"
         return "partly explained" if self.unknown else "explained"
@@ -139,12 +144,15 @@ class Identifications:
 def add_identification(
     chosen: Sequence[Identification | Unidentified], one: Identification | Unidentified
 ) -> list[Identification | Unidentified]:
-    """The list with another claim; one of the same effect and channel becomes one with it, but for lines of other frequencies."""
+    """Return the list with another selection; one of the same effect and channel is merged with it.
+
+    Lines of other frequencies are not merged.
+    """
     for place, other in enumerate(chosen):
         if (
             isinstance(one, Identification)
             and isinstance(other, Identification)
-            and _same(one, other)
+            and _is_same_effect(one, other)
         ):
             axes = tuple(sorted({*other.axes, *one.axes}))
             alike = tuple(dict.fromkeys([*other.alternatives, *one.alternatives]))
@@ -162,11 +170,14 @@ def add_identification(
 def with_axes_of(
     identification: Identification, again: Mapping[str, Sequence[Component]]
 ) -> Identification:
-    """A claim without the axes on which it no longer brings anything, by its parts that were found with the others in the model."""
+    """Return an identification without the axes on which it adds no evidence.
+
+    `again` has the components that were found with all others in the model.
+    """
     seen = {
         axis
         for component in again.get(identification.components[0].candidate.key, [])
-        if component.evidence_nats > LEAST
+        if component.evidence_nats > MIN_COMPONENT_NATS
         for axis in component.row
     }
     kept = tuple(component for component in identification.components if set(component.row) <= seen)
@@ -181,7 +192,7 @@ def with_axes_of(
     )
 
 
-def _same(one: Identification, other: Identification) -> bool:
+def _is_same_effect(one: Identification, other: Identification) -> bool:
     lines = {
         component.place
         for identification in (one, other)
@@ -194,7 +205,7 @@ def _same(one: Identification, other: Identification) -> bool:
 def find_unidentified(
     key: str, components: Sequence[Component], threshold: float, near: Sequence[str]
 ) -> Unidentified:
-    """What a generic found; `near` are the effects that come nearest."""
+    """Return what a nuisance alternative explains; `near` are the effects that come nearest."""
     return Unidentified(
         key,
         axes_of(components, ()),
@@ -211,15 +222,15 @@ def form_error(
     *,
     share: float,
 ) -> float:
-    """What errors of the form of what is named already may leave in the views and axes of these parts [nats].
+    """Return what errors of the form of other effects may leave to these components [nats].
 
-    A steady line leaves nothing at other frequencies: what it leaks into is taken out with it. What
-    follows a channel has a course in time that the record tells well, but its spectrum is that of a
-    simple law, in place of mounts and decimators: what that leaves over frequency, a filter takes
-    for its own.
+    Only effects in the same statistics and axes count. A steady line leaves nothing at other
+    frequencies, because what it leaks into is taken out with it. The record shows the course in
+    time of a driven noise well, but its spectrum is that of a simple law, without mounts and
+    decimators. A filter would explain what this leaves over frequency.
     """
     statistics = [
-        (_kind(component), set(component.row), component.candidate.effect)
+        (_statistic_group(component), set(component.row), component.candidate.effect)
         for component in components
         if component.candidate.statistic != "line"
     ]
@@ -229,7 +240,7 @@ def form_error(
             beside = [
                 effect
                 for statistic, axes, effect in statistics
-                if statistic in _leaves(component) and axes & set(component.row)
+                if statistic in _affected_statistics(component) and axes & set(component.row)
             ]
             of_spectrum = (
                 component.candidate.statistic == "power"
@@ -238,22 +249,25 @@ def form_error(
                 and _FILTER in beside
             )
             error += (
-                max(_SPECTRUM if of_spectrum else 0.0, share) * component.evidence_nats
+                max(SPECTRUM_ERROR_SHARE if of_spectrum else 0.0, share) * component.evidence_nats
                 if beside
                 else 0.0
             )
     return error
 
 
-def _leaves(component: Component) -> tuple[str, ...]:
-    """Views in which an error of the form of a part shows: a harmonic that is not quite where it should be is power, and shared."""
+def _affected_statistics(component: Component) -> tuple[str, ...]:
+    """Return the statistics in which an error of the form of a component shows.
+
+    A harmonic at a slightly wrong frequency is power, and common to the axes.
+    """
     return (
         ("order", "power", "cross")
         if component.candidate.statistic == "order"
-        else (_kind(component),)
+        else (_statistic_group(component),)
     )
 
 
-def _kind(component: Component) -> str:
-    """View of a part, for what it leaves to others: two levels are seen in the means."""
+def _statistic_group(component: Component) -> str:
+    """Return the statistic of a component, with telegraph biases among the means."""
     return "mean" if component.candidate.statistic == "levels" else component.candidate.statistic

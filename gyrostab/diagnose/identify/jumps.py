@@ -1,4 +1,4 @@
-"""Jumps of a bias at instants that nothing else tells of: whether the means step there, or go over, and stay where they went."""
+"""Check jumps at free instants: whether the means step there, and stay at the new level."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture, mean_mixture
 
-__all__ = ["is_lasting", "is_sudden", "jumps_at_will", "levels"]
+__all__ = ["is_free_jump", "is_lasting", "is_sudden", "lead_to_levels"]
 
 Array = NDArray[np.float64]
 _JUMP, _INSTANT = "bias_jump", "at"
-_BLOCKS = (4, 8)  # lengths of a transition that is no jump
-_BETTER, _FORM = 3.0, 0.01  # nats by which it must do better, and of what the jump gains
-_LENGTHS, _SHORT = (
-    48,
-    0.1,
-)  # lengths of an event that are tried; of the record, that it lasts at most, but for eight blocks
-_LEAST_BESIDE = 3  # blocks before and behind an event, that tell the level there
-_LOUDER = (10.0, 100.0, 1e3, 1e4, 1e5)  # times the usual variance of the means
-_SURE = 3.0  # standard errors of the level after an event, from which on it is another than before
+_TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is compared with
+#: Evidence by which another form must be better: of 41 jumps put into null records none reached it.
+BETTER_NATS = 3.0
+FORM_ERROR_SHARE = 0.01  # of the evidence of the jump, that an error of its form may leave
+EVENT_LENGTHS = 48  # that are tried, from two blocks up
+MAX_EVENT_SHARE = 0.1  # of the record, that an event lasts at most, but eight blocks always
+MIN_EVENT_LIMIT_BLOCKS = 8.0
+MIN_LEVEL_BLOCKS = 3  # before and after an event, that determine the level there
+_VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # over the usual variance of the means
+OTHER_LEVEL_SIGMA = 3.0  # standard errors between the levels before and after an event
 
 
-def jumps_at_will(component: Component, state: State) -> bool:
-    """Whether a part is a jump at an instant of its own choice, and not one at which power came back."""
+def is_free_jump(component: Component, state: State) -> bool:
+    """Return whether a component is a jump at a free instant, not at a restart."""
     if (
         component.candidate.effect != _JUMP
         or component.candidate.statistic != "mean"
@@ -40,108 +41,116 @@ def jumps_at_will(component: Component, state: State) -> bool:
 
 
 def is_sudden(components: Sequence[Component], state: State, *, error: float = 0.0) -> bool:
-    """Whether jumps step, rather than go over from one level to the other within some blocks.
+    """Return whether jumps are steps rather than gradual changes over some blocks.
 
-    Where a straight way of four or eight blocks about the same instant says more on all axes
-    together, something else came and went.
+    They are not if a straight transition over four or eight blocks about the same instant explains
+    more on all axes together.
 
     Parameters
     ----------
-    components : sequence of Part
-        Of an effect.
+    components : sequence of Component
+        Components of one effect.
     state : State
-        With all else that is named.
+        With all other effects in the model.
     error : float
-        What errors of the form of that may leave [nats].
+        What errors of the form of these may leave [nats].
     """
-    jumps = [component for component in components if jumps_at_will(component, state)]
+    jumps = [component for component in components if is_free_jump(component, state)]
     if not jumps:
         return True
-    step = sum(_evidence(component, state, 0) for component in jumps)
-    over = max(
-        sum(_evidence(component, state, length) for component in jumps) for length in _BLOCKS
+    step = sum(_transition_evidence(component, state, 0) for component in jumps)
+    gradual = max(
+        sum(_transition_evidence(component, state, length) for component in jumps)
+        for length in _TRANSITION_BLOCKS
     )
-    return over - step <= _BETTER + error + _FORM * sum(
+    return gradual - step <= BETTER_NATS + error + FORM_ERROR_SHARE * sum(
         max(component.evidence_nats, 0.0) for component in jumps
     )
 
 
 def is_lasting(components: Sequence[Component], state: State) -> bool:
-    """Whether the means stay on another level after jumps, rather than come back.
+    """Return whether the means stay at another level after jumps.
 
-    What lasts for two blocks to a tenth of the record before or after the instant, and says more
-    than a level that stays, on all axes together, is an event that ends. It is none where the level
-    behind it is another than the one before: then there are two jumps.
+    An event that lasts for two blocks to a tenth of the record, before or after the instant, and
+    explains more on all axes than a lasting level, ends again. It is two jumps if the level after
+    it differs from that before.
 
     Parameters
     ----------
-    components : sequence of Part
-        Of an effect.
+    components : sequence of Component
+        Components of one effect.
     state : State
-        With all else that is named.
+        With all other effects in the model.
     """
-    jumps = [component for component in components if jumps_at_will(component, state)]
+    jumps = [component for component in components if is_free_jump(component, state)]
     if not jumps:
         return True
-    step = sum(_evidence(component, state, 0) for component in jumps)
-    spans = _spans(jumps[0], state)
+    step = sum(_transition_evidence(component, state, 0) for component in jumps)
+    spans = _event_spans(jumps[0], state)
     if not spans:
         return True
     events = [
         sum(
-            float(np.logaddexp.reduce(_events(component, state, span)[0].log_weight))
+            float(np.logaddexp.reduce(_fit_event(component, state, span)[0].log_weight))
             for component in jumps
         )
         for span in spans
     ]
     best = int(np.argmax(events))
-    if events[best] - step <= _BETTER + np.log(len(spans)) + _FORM * sum(
+    if events[best] - step <= BETTER_NATS + np.log(len(spans)) + FORM_ERROR_SHARE * sum(
         max(component.evidence_nats, 0.0) for component in jumps
     ):
         return True
-    return any(_other_level(component, state, spans[best]) for component in jumps)
+    return any(_is_other_level(component, state, spans[best]) for component in jumps)
 
 
-def levels(components: Sequence[Component], state: State) -> bool:
-    """Whether jumps lead to levels, and are not the wildest of means that scatter more for a while.
+def lead_to_levels(components: Sequence[Component], state: State) -> bool:
+    """Return whether jumps lead to levels, rather than being extremes of noisy means.
 
-    Waves slower than a block make means scatter, and of such means any two that follow each other
-    are a jump. So the jumps must say something, but for 3 nats of chance, where the white noise of
-    the means may be louder for some stretch about the instant, with and without them.
+    Waves slower than a block make the means scatter, and any two such neighbours look like a jump.
+    Therefore jumps must keep their evidence, but for 3 nats of chance, when the white noise of the
+    means may be larger for some time about the instant, with and without the jumps.
 
     Parameters
     ----------
-    components : sequence of Part
-        Of an effect.
+    components : sequence of Component
+        Components of one effect.
     state : State
-        With all else that is named.
+        With all other effects in the model.
     """
-    jumps = [component for component in components if jumps_at_will(component, state)]
-    return not jumps or sum(_beside_scatter(component, state) for component in jumps) > -_BETTER
+    jumps = [component for component in components if is_free_jump(component, state)]
+    return (
+        not jumps
+        or sum(_evidence_in_scatter(component, state) for component in jumps) > -BETTER_NATS
+    )
 
 
-def _beside_scatter(component: Component, state: State) -> float:
-    """Logarithm of the Bayes factor of a jump of about the size that it has, where the means may scatter more for a while [nats]."""
-    variances = _scatter(component, state)
+def _evidence_in_scatter(component: Component, state: State) -> float:
+    """Return the log Bayes factor of a jump in means that may be noisy for a while [nats]."""
+    variances = _possible_variances(component, state)
     jump = [component_mixture(component, state, variance=one) for one in variances]
     none = [mean_mixture(state, component.row[0], [], variance=one) for one in variances]
-    with_it, without = (
+    with_jump, without = (
         np.array([np.logaddexp.reduce(one.log_weight) for one in several])
         for several in (jump, none)
     )
-    likely = jump[int(with_it.argmax())]
+    likely = jump[int(with_jump.argmax())]
     size, covariance = likely.moments()
     wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0]))) * float(
         np.ptp(component.variant.design)
     )
     instants = np.log(len(component.candidate.variants))
     return float(
-        np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without) - np.log(wide) - 0.5 - instants
+        np.logaddexp.reduce(with_jump)
+        - np.logaddexp.reduce(without)
+        - np.log(wide)
+        - 0.5
+        - instants
     )
 
 
-def _scatter(component: Component, state: State) -> list[Array]:
-    """White variances of the means: the usual one, and louder ones for stretches before, after and about the instant of a jump."""
+def _possible_variances(component: Component, state: State) -> list[Array]:
+    """Return white variances of the means: the usual, and larger ones for a time near the jump."""
     axis, block_count = component.row[0], state.blocks.sizes["block"]
     block = np.arange(block_count)
     at = round(float(component.variant.values[_INSTANT]) / float(state.blocks.attrs["block_s"]))
@@ -155,27 +164,31 @@ def _scatter(component: Component, state: State) -> list[Array]:
     inside = [(block >= first) & (block < stop) for first, stop in sorted(spans)]
     return [
         usual,
-        *(np.where(here, factor * usual, usual) for here in inside for factor in _LOUDER),
+        *(np.where(here, factor * usual, usual) for here in inside for factor in _VARIANCE_FACTORS),
     ]
 
 
-def _spans(component: Component, state: State) -> list[tuple[int, int]]:
-    """First block and the one behind the last of events that begin or end at the instant of a jump, and at no end of the record."""
+def _event_spans(component: Component, state: State) -> list[tuple[int, int]]:
+    """Return the first and last edges of events that begin or end at a jump."""
     block, block_count = float(state.blocks.attrs["block_s"]), state.blocks.sizes["block"]
     at = round(float(component.variant.values[_INSTANT]) / block)
     lengths = np.unique(
-        np.geomspace(2.0, max(_SHORT * block_count, 8.0), _LENGTHS).astype(int)
+        np.geomspace(
+            2.0, max(MAX_EVENT_SHARE * block_count, MIN_EVENT_LIMIT_BLOCKS), EVENT_LENGTHS
+        ).astype(int)
     ).tolist()
     both = [span for length in lengths for span in ((at, at + length), (at - length, at))]
     return [
         (first, stop)
         for first, stop in both
-        if first >= _LEAST_BESIDE and stop <= block_count - _LEAST_BESIDE
+        if first >= MIN_LEVEL_BLOCKS and stop <= block_count - MIN_LEVEL_BLOCKS
     ]
 
 
-def _events(component: Component, state: State, span: tuple[int, int]) -> tuple[Mixture, Mixture]:
-    """Sizes of an event of so many blocks; and those of it and of the level behind it."""
+def _fit_event(
+    component: Component, state: State, span: tuple[int, int]
+) -> tuple[Mixture, Mixture]:
+    """Fit an event over these blocks, alone, and together with the level after it."""
     block = np.arange(state.blocks.sizes["block"])
     shape = component.variant.design.shape
     during = np.broadcast_to(((block >= span[0]) & (block < span[1])).astype(np.float64), shape)
@@ -186,14 +199,14 @@ def _events(component: Component, state: State, span: tuple[int, int]) -> tuple[
     return component_mixture(component, state, alone), component_mixture(component, state, both)
 
 
-def _other_level(component: Component, state: State, span: tuple[int, int]) -> bool:
-    """Whether the level behind an event is surely another than the one before it."""
-    size, covariance = _events(component, state, span)[1].moments()
-    return bool(abs(size[-1]) > _SURE * np.sqrt(covariance[-1, -1]))
+def _is_other_level(component: Component, state: State, span: tuple[int, int]) -> bool:
+    """Return whether the level after an event clearly differs from that before it."""
+    size, covariance = _fit_event(component, state, span)[1].moments()
+    return bool(abs(size[-1]) > OTHER_LEVEL_SIGMA * np.sqrt(covariance[-1, -1]))
 
 
-def _evidence(component: Component, state: State, length: int) -> float:
-    """Logarithm of the evidence of a level that goes over within so many blocks, whatever its size; 0 for the jump itself."""
+def _transition_evidence(component: Component, state: State, length: int) -> float:
+    """Return the log evidence of a change of level over so many blocks; 0 is the jump itself."""
     variant = component.variant
     if length:
         block = float(state.blocks.attrs["block_s"])

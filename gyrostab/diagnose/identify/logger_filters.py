@@ -1,4 +1,4 @@
-"""Filters of the logger: their size from the shape of the spectrum, and lines that are nothing but its slope."""
+"""Fit filters of the logger to the spectrum, and drop lines that are only the slope of a filter."""
 
 from __future__ import annotations
 
@@ -21,30 +21,27 @@ from gyrostab.diagnose.predict.sizes import component_size
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 
-__all__ = ["filter_sizes", "on_all_axes", "without_slopes"]
+__all__ = ["fit_filter_sizes", "fits_all_axes", "without_slopes"]
 
 Array = NDArray[np.float64]
-_KEPT = 0.5  # of its gain, that a line must keep beside a filter
-_FINE, _ZOOMS = 21, 4
-_NEXT, _ELSEWHERE, _TAIL = (
-    0.25,
-    0.02,
-    0.025,
-)  # reach of a place on the grid; shares of what lies elsewhere
-_APART, _FORM = (
-    6.0,
-    0.1,
-)  # nats by which axes may disagree by chance; and of the gain, what an error of the spectrum may leave
+MIN_LINE_SHARE = 0.5  # of its evidence, that a line must keep with a filter in the model
+ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
+GRID_REACH = 0.25  # distance in ln(cutoff) of one place on the grid of filters
+MIN_ELSEWHERE_SHARE = 0.02  # of the probability, from which on other places widen the interval
+TAIL_PROBABILITY = 0.025  # of each end of a 95 % interval
+SIGMA_95 = 1.959964  # two-sided 95 % quantile of the normal law
+DISAGREEMENT_NATS = 6.0  # between axes, that chance explains: odds of 400 to 1
+SPECTRUM_ERROR_SHARE = 0.1  # of the evidence, that an error of the spectrum may leave
 
 
 def without_slopes(
     passing: list[str], components: Mapping[str, list[Component]], state: State, folds: xr.DataArray
 ) -> list[str]:
-    """Keys without lines that are gone, or nearly so, when the spectrum is straightened by a filter that passes as well.
+    """Drop lines that a passing filter explains, or the filter if lines remain.
 
-    A line is judged by its neighbours, so that the steep slope of a filter, or the lobes of an
-    average, look like one. Lines that stay come before the filter: what they leave in their bands,
-    many of them, has a broad form too.
+    A line is compared with its neighbours, so that the steep slope of a filter, or the lobes of an
+    average, look like one. Lines that keep half of their evidence come before the filter: many of
+    them together leave a broad form in the powers too.
     """
     lines = [key for key in passing if components[key][0].candidate.statistic == "line"]
     filters = [
@@ -58,23 +55,23 @@ def without_slopes(
     if not lines or not filters:
         return passing
     trial = condition_on(state, list(components[filters[0]]))
-    again = compute_evidence(_candidates(components, lines), trial.blocks, trial, folds)
+    again = compute_evidence(_candidates_of(components, lines), trial.blocks, trial, folds)
     left = {one.candidate.key: float(np.maximum(one.evidence_nats[0], 0.0).sum()) for one in again}
     before = {
         key: sum(max(component.evidence_nats, 0.0) for component in components[key])
         for key in lines
     }
-    real = {key for key in lines if left.get(key, 0.0) > _KEPT * before[key]}
+    real = {key for key in lines if left.get(key, 0.0) > MIN_LINE_SHARE * before[key]}
     return [
         key for key in passing if (key in real if key in lines else key not in filters or not real)
     ]
 
 
-def on_all_axes(components: Sequence[Component], state: State) -> bool:
-    """Whether one filter suits all axes: they pass the same logger, so that it takes the same share of the noise of each.
+def fits_all_axes(components: Sequence[Component], state: State) -> bool:
+    """Return whether one filter fits all axes.
 
-    The share of the strongest part is fitted on every axis, also on those that do not show it, and
-    once for all of them.
+    They pass the same logger, which takes the same share of the noise of each. The share of the
+    strongest component is fitted on every axis, and once for all of them.
     """
     shown = [
         component
@@ -88,36 +85,42 @@ def on_all_axes(components: Sequence[Component], state: State) -> bool:
         [component_size(replace(first, row=(axis,)), state) for axis in state.axes]
     ).T
     weight = error**-2.0
-    apart = 0.5 * float((weight * (share - (weight * share).sum() / weight.sum()) ** 2).sum())
-    return apart <= _APART + _FORM * sum(max(component.evidence_nats, 0.0) for component in shown)
+    disagreement = 0.5 * float(
+        (weight * (share - (weight * share).sum() / weight.sum()) ** 2).sum()
+    )
+    return disagreement <= DISAGREEMENT_NATS + SPECTRUM_ERROR_SHARE * sum(
+        max(component.evidence_nats, 0.0) for component in shown
+    )
 
 
-def _candidates(components: Mapping[str, list[Component]], keys: Iterable[str]) -> list[Candidate]:
+def _candidates_of(
+    components: Mapping[str, list[Component]], keys: Iterable[str]
+) -> list[Candidate]:
     return [components[key][0].candidate for key in keys]
 
 
-def filter_sizes(
+def fit_filter_sizes(
     components: Sequence[Component], state: State
 ) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
-    """Cutoff or length of a filter, and the words beside it, by the likelihood of the powers of all its axes with free noise.
+    """Fit the cutoff or length of a filter to the powers of all its axes, with free noise.
 
     Returns
     -------
     sizes : dict of str to (float, float) or (float, float, float, float)
-        The one parameter that is measured, with its error; and with the ends of its 95 % interval
-        where several places suit.
+        The parameter that is measured with its standard error, and with the ends of its 95 %
+        interval where several places of the grid fit.
     others : dict of str to float
-        Order, and what the samples are.
+        Order, and how the samples are made.
     """
     kind = effects()[components[0].candidate.effect]
-    fits = [_fit(component.row[0], state) for component in components]
+    fits = [_average_powers(component.row[0], state) for component in components]
 
     def likelihood(values: Mapping[str, Any]) -> float:
         filtered = (
             band_columns(state.blocks)
             * band_response(kind.example(**values), state.blocks)[:, None]
         )
-        return sum(_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
+        return sum(_max_log_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
 
     family = [one.values for one in components[0].candidate.variants if is_filter("power", one)]
     log = [likelihood(one) for one in family]
@@ -129,24 +132,26 @@ def filter_sizes(
     alike = sorted(
         {float(one[name]) for one in family if all(one[key] == best[key] for key in others)}
     )
-    sharp = _zoomed(alike, float(best[name]), lambda value: likelihood({**best, name: value}))
+    refined = _refine_on_grid(
+        alike, float(best[name]), lambda value: likelihood({**best, name: value})
+    )
     return {
-        name: _of_all(
-            sharp,
+        name: _widen_interval(
+            refined,
             [(float(one[name]), each) for one, each in zip(family, log, strict=True) if one[name]],
         )
     }, others
 
 
-def _zoomed(
+def _refine_on_grid(
     grid: Sequence[float], start: float, likelihood: Callable[[float], float]
 ) -> tuple[float, float]:
-    """Mean and standard deviation of a parameter about the best point of its grid, by a likelihood."""
+    """Return mean and standard deviation of a parameter about the best point of its grid."""
     place = grid.index(start)
     low, high = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
     mean, sd = start, (high - low) / 4.0
-    for _ in range(_ZOOMS):
-        values = np.linspace(low, high, _FINE)
+    for _ in range(ZOOM_STEPS):
+        values = np.linspace(low, high, ZOOM_POINTS)
         log = np.array([likelihood(value) for value in values])
         weight = np.exp(log - log.max())
         weight /= weight.sum()
@@ -156,34 +161,39 @@ def _zoomed(
     return mean, sd
 
 
-def _of_all(sharp: tuple[float, float], tried: Sequence[tuple[float, float]]) -> tuple[float, ...]:
-    """A parameter with its error; and with the ends of its 95 % interval where more of the grid than one place suits the record.
+def _widen_interval(
+    refined: tuple[float, float], tried: Sequence[tuple[float, float]]
+) -> tuple[float, ...]:
+    """Return a parameter with its error, and its 95 % interval if several filters fit.
 
-    With free noise that rises with frequency a low-pass far down does what a weak one far up does;
-    and other orders, or samples that are picked, have cutoffs of their own.
+    With free noise that rises with frequency, a low-pass at a low cutoff does what a weak one at a
+    high cutoff does. Other orders, and samples that are picked, have other cutoffs.
 
     Parameters
     ----------
-    sharp : (float, float)
+    refined : (float, float)
         Mean and standard deviation about the best place.
     tried : sequence of (float, float)
-        Values of all filters of the family, evenly spread in their logarithm, and logarithms of
-        their likelihoods.
+        Values of all filters of the family, evenly spread in their logarithm, and their log
+        likelihoods.
     """
     value, log = (np.array(one) for one in zip(*sorted(tried), strict=True))
     share = np.exp(log - np.logaddexp.reduce(log))
-    mean, sd = sharp
-    near = np.abs(np.log(value / mean)) <= max(_NEXT, 2.0 * sd / mean)
-    if share[~near].sum() < _ELSEWHERE:
-        return sharp
+    mean, sd = refined
+    near = np.abs(np.log(value / mean)) <= max(GRID_REACH, 2.0 * sd / mean)
+    if share[~near].sum() < MIN_ELSEWHERE_SHARE:
+        return refined
     below, above = share.cumsum(), share[::-1].cumsum()[::-1]
-    low = min(float(value[below >= _TAIL].min()), mean - NORMAL_95 * sd)
-    high = max(float(value[above >= _TAIL].max()), mean + NORMAL_95 * sd)
-    return mean, (high - low) / (2.0 * NORMAL_95), low, high
+    low = min(float(value[below >= TAIL_PROBABILITY].min()), mean - SIGMA_95 * sd)
+    high = max(float(value[above >= TAIL_PROBABILITY].max()), mean + SIGMA_95 * sd)
+    return mean, (high - low) / (2.0 * SIGMA_95), low, high
 
 
-def _fit(axis: str, state: State) -> tuple[Fit, Array]:
-    """Powers of an axis averaged over the record, with the noise and what else is named free; and how gaps mix the bands of the noise."""
+def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
+    """Average the powers of an axis over the record, with free noise and effects.
+
+    The second result is how gaps mix the bands of the noise.
+    """
     blocks = state.blocks
     row = state.axes.index(axis)
     power, shape = (
@@ -220,7 +230,7 @@ def _fit(axis: str, state: State) -> tuple[Fit, Array]:
     ), seen
 
 
-def _likelihood(fit: Fit) -> float:
-    """Largest log likelihood of the powers, over the noise."""
-    expected = expected_powers(fit)
+def _max_log_likelihood(fit: Fit) -> float:
+    """Return the largest log likelihood of the powers over the noise."""
+    expected = expected_of(fit)
     return float(-(fit.weight * (np.log(expected) + fit.power / expected)).sum())

@@ -1,7 +1,7 @@
-"""Axes that turn far above their noise with no effect to say why: their moving stretches are kept out of what is compared with noise.
+"""Leave out the blocks in which an axis moves far beyond its noise without an effect to explain it.
 
-What one axis measures while it turns stays there as what the others may see of it, through a lean
-of theirs.
+What a moving axis measures stays in the record, because other axes may sense it through their
+misalignment.
 """
 
 from __future__ import annotations
@@ -21,35 +21,28 @@ from gyrostab.progress import Stage, no_stage
 __all__ = ["moving_blocks", "unexplained_motion", "without_motion"]
 
 Array = NDArray[np.float64]
-_BEYOND, _FAR = 6.0, 100.0  # times the scatter of the means at rest
-_GROWN = 2  # blocks to either side that belong to a motion
-_FEWEST, _MOST = (
-    2,
-    2.0 / 3.0,
-)  # blocks that move, and share of them: what turns most of the time has no rest to be compared with
-_CORE, _CORE_WIDTH = (
-    0.25,
-    0.637,
-)  # share of the blocks whose means lie closest together, and its width in standard deviations
-_LEAST_REST = 12  # blocks
-_ROUNDS = 3
-_FITTED = (
-    "mean",
-    "levels",
-)  # views whose columns say how much of a mean that moves they account for
-_MEANS = (
-    "wander",
-    "marks",
-    "order",
-    "transfer",
-)  # views of effects that account for it in other ways
-# of the squares of the motion, which may be left by what accounts for it: an error of its form
-_LEFT = 0.1
-_KEPT = ("mean", "power", "cross")
+REST_SIGMA = 6.0  # scatter of the means at rest, within which a block is at rest
+MOTION_SIGMA = 100.0  # that a motion must reach to be left out
+NEIGHBOUR_BLOCKS = 2  # to either side, that belong to a motion
+MIN_MOVING_BLOCKS = 2
+MAX_MOVING_SHARE = 2.0 / 3.0  # of the blocks; what moves longer has no rest to compare with
+#: Share of the blocks whose means lie closest together, and the width of the central quarter of a
+#: normal law in standard deviations: 2 * 0.3186.
+CORE_SHARE, CORE_WIDTH_SIGMA = 0.25, 0.637
+MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal law
+MIN_REST_BLOCKS = 12
+REST_ROUNDS = 3  # in which centre and scatter at rest are refined
+#: Statistics whose columns show how much of a moving mean they explain.
+_FITTED = ("mean", "levels")
+#: Statistics of effects that explain a moving mean in other ways.
+_EXPLAINING = ("wander", "marks", "order", "transfer")
+#: Share of the squared motion that an effect may leave: an error of its form.
+MAX_LEFT_SHARE = 0.1
+_KEPT_STATISTICS = ("mean", "power", "cross")
 
 
 def moving_blocks(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Blocks in which an axis moves, of those axes that somewhere move far above their scatter at rest.
+    """Find the blocks in which an axis moves far beyond its scatter at rest.
 
     Parameters
     ----------
@@ -69,72 +62,76 @@ def moving_blocks(blocks: xr.Dataset) -> NDArray[np.bool_]:
     array([ 0, 24])
     """
     means = blocks["mean"].transpose("axis", "block").values
-    return np.stack([_moving(row) for row in means])
+    return np.stack([_moving_blocks_of_axis(row) for row in means])
 
 
-def _moving(mean: Array) -> NDArray[np.bool_]:
-    """Blocks of one axis."""
+def _moving_blocks_of_axis(mean: Array) -> NDArray[np.bool_]:
+    """Find the moving blocks of one axis."""
     good = np.isfinite(mean)
     nothing = np.zeros(mean.size, np.bool_)
-    if good.sum() < _LEAST_REST:
+    if good.sum() < MIN_REST_BLOCKS:
         return nothing
-    centre, scale = _core(mean[good])
+    centre, scale = _find_rest_level(mean[good])
     away = np.abs(mean - centre)
-    rest = good & (away <= _BEYOND * scale)
-    for _ in range(_ROUNDS):
-        if rest.sum() < max(_LEAST_REST, (1.0 - _MOST) * good.sum()):
+    rest = good & (away <= REST_SIGMA * scale)
+    for _ in range(REST_ROUNDS):
+        if rest.sum() < max(MIN_REST_BLOCKS, (1.0 - MAX_MOVING_SHARE) * good.sum()):
             return nothing
         away = np.abs(mean - np.median(mean[rest]))
-        scale = 1.4826 * float(np.median(away[rest]))
-        rest = good & (away <= _BEYOND * scale)
-    if not scale > 0.0 or not np.nanmax(away) > _FAR * scale:
+        scale = MAD_TO_SIGMA * float(np.median(away[rest]))
+        rest = good & (away <= REST_SIGMA * scale)
+    if not scale > 0.0 or not np.nanmax(away) > MOTION_SIGMA * scale:
         return nothing
-    there = good & ~rest
-    if there.sum() < _FEWEST:
+    is_moving = good & ~rest
+    if is_moving.sum() < MIN_MOVING_BLOCKS:
         return nothing
     place = np.flatnonzero(good)
     near = (
-        np.convolve(there[place], np.ones(2 * _GROWN + 1), "same") > 0.5
+        np.convolve(is_moving[place], np.ones(2 * NEIGHBOUR_BLOCKS + 1), "same") > 0.5
     )  # neighbours among the blocks that are there
     out = nothing.copy()
     out[place] = near
     return (
         out
-        if rest.sum() >= (1.0 - _MOST) * good.sum() and np.count_nonzero(~near) >= _LEAST_REST
+        if rest.sum() >= (1.0 - MAX_MOVING_SHARE) * good.sum()
+        and np.count_nonzero(~near) >= MIN_REST_BLOCKS
         else nothing
     )
 
 
-def _core(mean: Array) -> tuple[float, float]:
-    """Where the means lie closest together, and their scatter there: at rest, however much of the time the axis moves."""
+def _find_rest_level(mean: Array) -> tuple[float, float]:
+    """Return centre and scatter of the means where they lie closest together: the level at rest."""
     ordered = np.sort(mean)
-    size = int(np.ceil(_CORE * mean.size))
+    size = int(np.ceil(CORE_SHARE * mean.size))
     width = ordered[size - 1 :] - ordered[: mean.size - size + 1]
     first = int(width.argmin())
-    return float(np.median(ordered[first : first + size])), float(width[first]) / _CORE_WIDTH
+    return float(np.median(ordered[first : first + size])), float(width[first]) / CORE_WIDTH_SIGMA
 
 
 def unexplained_motion(
     blocks: xr.Dataset, identified: Iterable[Identification]
 ) -> NDArray[np.bool_]:
-    """Moving blocks, (axis, block), of the axes on which no named effect accounts for the means.
+    """Find the moving blocks of axes without an effect that explains the means.
 
-    What stands for a mean must leave next to nothing of the motion. It is not enough that it brings
-    something: of a turning that comes and goes, a step or a channel that drifts explains a part as
-    well.
+    An effect on the means must leave next to nothing of the motion. It is not enough that it adds
+    evidence: a step or a drifting channel also explains a part of an intermittent rotation.
 
     Parameters
     ----------
     blocks : xarray.Dataset
-    identified : iterable of Claim
+    identified : iterable of Identification
+
+    Returns
+    -------
+    ndarray of bool, shape (axis, block)
     """
     components = [
         component for identification in identified for component in identification.components
     ]
-    told = {
+    explained_axes = {
         axis
         for component in components
-        if component.candidate.statistic in _MEANS
+        if component.candidate.statistic in _EXPLAINING
         for axis in component.row
     }
     moving = moving_blocks(blocks)
@@ -145,9 +142,9 @@ def unexplained_motion(
             if component.candidate.statistic in _FITTED and component.row == (axis,)
             for column in mean_columns(component.variant, row)
         ]
-        if axis in told or (
+        if axis in explained_axes or (
             columns
-            and _accounted(
+            and _is_explained(
                 blocks["mean"].sel(axis=axis).values, moving[row], np.stack(columns, axis=1)
             )
         ):
@@ -155,8 +152,8 @@ def unexplained_motion(
     return moving
 
 
-def _accounted(mean: Array, moving: NDArray[np.bool_], columns: Array) -> bool:
-    """Whether these columns leave next to nothing of a motion: a step that stays is no turning that comes and goes."""
+def _is_explained(mean: Array, moving: NDArray[np.bool_], columns: Array) -> bool:
+    """Return whether these columns leave next to nothing of a motion."""
     good = np.isfinite(mean)
     if not (good & moving).any():
         return True
@@ -165,8 +162,10 @@ def _accounted(mean: Array, moving: NDArray[np.bool_], columns: Array) -> bool:
     size, *_ = np.linalg.lstsq(design, mean[good], rcond=None)
     left = mean[good] - design @ size
     away = mean[good] - np.median(mean[good & ~moving])
-    there = moving[good]
-    return float((left[there] ** 2).sum()) <= _LEFT * float((away[there] ** 2).sum())
+    is_moving = moving[good]
+    return float((left[is_moving] ** 2).sum()) <= MAX_LEFT_SHARE * float(
+        (away[is_moving] ** 2).sum()
+    )
 
 
 def without_motion(
@@ -177,7 +176,9 @@ def without_motion(
     restart_gap: Any = 5.0,
     progress: Stage = no_stage,
 ) -> xr.Dataset:
-    """The reduced record with the moving blocks left out on the axes that move; what they measured stays as ``measured_<name>``.
+    """Reduce a log without the moving blocks of the axes that move.
+
+    What they measured stays in variables ``measured_<name>``.
 
     Parameters
     ----------
@@ -186,11 +187,11 @@ def without_motion(
         The log, from `reduce_log`.
     moving : ndarray of bool, shape (axis, block)
     restart_gap, progress
-        As for `reduce_log`.
+        As in `reduce_log`.
     """
     same = f"{blocks.attrs['block_samples']}samples"
     out = reduce_log(log, block=same, restart_gap=restart_gap, left_out=moving, progress=progress)
-    out = out.assign({f"measured_{one}": blocks[one] for one in _KEPT if one in blocks})
+    out = out.assign({f"measured_{one}": blocks[one] for one in _KEPT_STATISTICS if one in blocks})
     out = out.drop_dims([dim for dim in ("gap", "restart") if dim in out.dims]).assign(
         {one: blocks[one] for one in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
     )

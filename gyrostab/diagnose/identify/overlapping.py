@@ -1,4 +1,7 @@
-"""Claims that hold the same row of a view more than once, as two jumps of one bias: each part is judged beside those before it."""
+"""Evaluate identifications with several components in the same row, such as two jumps of one bias.
+
+Each component is evaluated with those before it in the model.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-from gyrostab.diagnose.identify.components import by_key, tried_again
+from gyrostab.diagnose.identify.components import candidates_of, group_components
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import CandidateEvidence
 
-__all__ = ["found_again", "layers"]
+__all__ = ["find_layers_again", "split_layers"]
 
 
-def layers(components: Sequence[Component]) -> list[list[Component]]:
-    """Parts by how often their view, row and witness have come before."""
+def split_layers(components: Sequence[Component]) -> list[list[Component]]:
+    """Split components by how often their statistic, row and reference channel occurred before."""
     out: list[list[Component]] = []
     seen: Counter[tuple[object, ...]] = Counter()
     for component in components:
@@ -29,33 +32,33 @@ def layers(components: Sequence[Component]) -> list[list[Component]]:
     return out
 
 
-def found_again(
+def find_layers_again(
     components: Sequence[Component],
     first: Sequence[Component],
     state: State,
     gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
 ) -> list[list[Component]]:
-    """For each layer of a claim what is found of it anew with the layers before it in the model.
+    """Find the components of each layer again, with the layers before it in the model.
 
-    What several variants explain together is no gain of one of them: the first of two opposite
+    The evidence of several variants together is not that of one of them: the first of two opposite
     jumps explains little alone.
 
     Parameters
     ----------
-    components : sequence of Part
-        Of the claim.
-    first : sequence of Part
-        What was found of it with nothing of the claim in the model.
+    components : sequence of Component
+        Components of the identification.
+    first : sequence of Component
+        Those found with none of the identification in the model.
     state : State
-        With all other claims in the model.
+        With all other identifications in the model.
     gains : callable
-        Gains of candidates in a state.
+        Computes the evidence of candidates in a state.
     """
     out = [list(first)]
     weight, key = state.weight, components[0].candidate.key
     axes = {axis for component in components for axis in component.row}
-    for before, layer in pairwise(layers(components)):
+    for before, layer in pairwise(split_layers(components)):
         state = replace(condition_on(state, before), weight=weight)
-        again = by_key(gains(tried_again(layer), state)).get(key, [])
+        again = group_components(gains(candidates_of(layer), state)).get(key, [])
         out.append([component for component in again if set(component.row) & axes])
     return out

@@ -1,4 +1,4 @@
-"""Waves whose course is known: locked to the rotation of the tool, or to the ramp of the loop."""
+"""Separate components that are phase-locked to the rotation of the tool or to the feedback ramp."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ from dataclasses import replace
 
 from gyrostab.diagnose.identify.identification import Identifications
 
-__all__ = ["without_waves"]
+__all__ = ["remove_phase_locked"]
 
-_VIEWS = ("order", "phase_locked")
+_PHASE_LOCKED = ("order", "phase_locked")
 
 
-def without_waves(identifications: Identifications) -> tuple[Identifications, float]:
-    """The naming without what is locked to rotation or ramp, and what that gains on time that was kept apart [nats].
+def remove_phase_locked(identifications: Identifications) -> tuple[Identifications, float]:
+    """Drop phase-locked components, and return their held-out evidence [nats].
 
-    The powers of the bands know how large a wave is, but not its phase: with a wave in them they
-    gain a small part of what the wave is worth, and lose by every band that it frees. So a wave is
-    judged by its own view alone, and the powers of both models are without it.
+    The band powers show how large such a component is, but not its phase. In them it would gain a
+    small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
+    alone counts, and the powers of both models are without it.
     """
     evidence_nats, kept = 0.0, []
     for identification in identifications.identified:
-        waves = [
+        locked = [
             component
             for component in identification.components
-            if component.candidate.statistic in _VIEWS
+            if component.candidate.statistic in _PHASE_LOCKED
         ]
-        evidence_nats += sum(component.evidence_nats for component in waves)
+        evidence_nats += sum(component.evidence_nats for component in locked)
         rest = (
-            tuple(component for component in identification.components if component not in waves)
-            if waves
+            tuple(component for component in identification.components if component not in locked)
+            if locked
             else identification.components
         )
         if rest:
-            kept.append(replace(identification, components=rest) if waves else identification)
+            kept.append(replace(identification, components=rest) if locked else identification)
     return replace(identifications, identified=tuple(kept)), evidence_nats

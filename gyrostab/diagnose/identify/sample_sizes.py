@@ -1,4 +1,4 @@
-"""Sizes of lines and of odd samples, from line spectra and counts."""
+"""Estimate the sizes of lines and anomalous samples from line spectra and sample counts."""
 
 from __future__ import annotations
 
@@ -11,21 +11,25 @@ from gyrostab.diagnose.predict.search import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
 from gyrostab.units import HOUR
 
-__all__ = ["line_size", "sample_count_sizes"]
+__all__ = ["estimate_from_counts", "estimate_line"]
 
-_DEPARTURE = (
-    1.08  # of white noise from the median of eight samples beside each, in its own deviations
-)
-_USUAL = 0.2  # of the usual variance of a block, by which that of one may be higher by chance
-_CALM = 5  # blocks without an outlier that tell how loud the noise is
-# of the number and the size of outliers, by which the law of their sizes may be another; at least
-# half of those not seen
-_LAW = 0.1
+#: Standard deviation of the difference of white noise and the median of its eight neighbours, in
+#: standard deviations of the noise.
+MEDIAN_DEPARTURE_SIGMA = 1.08
+VARIANCE_TOLERANCE_SHARE = 0.2  # by which chance may raise the variance of a single block
+MIN_CLEAN_BLOCKS = 5  # without an outlier, that determine the noise level
+#: Relative error of number and size of outliers because the law of their sizes is unknown; at least
+#: half of the share that is not seen.
+LAW_ERROR_SHARE = 0.1
+SECONDS_PER_HOUR = 3600.0
 Pair = tuple[float, float]
 
 
-def line_size(blocks: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
-    """Amplitude [degree hour-1] and frequency [Hz] of a line, each with its error, from the power about it that is above the level."""
+def estimate_line(blocks: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
+    """Estimate amplitude [degree hour-1] and frequency [Hz] of a line, each with its error.
+
+    The amplitude follows from the power about the line that exceeds the local level.
+    """
     from gyrostab.diagnose.evidence.spectral_lines import line_skirt, local_level
 
     lines = blocks["line_frequency"].values
@@ -45,21 +49,21 @@ def line_size(blocks: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
     return (amplitude, noise / (2.0 * max(amplitude, math.sqrt(noise)))), (frequency, 0.5 * step)
 
 
-def sample_count_sizes(
+def estimate_from_counts(
     effect: str, mark: str, axis: str, blocks: xr.Dataset, count_evidence: CountEvidence
 ) -> dict[str, Pair]:
-    """Parameters of an effect on the distribution."""
+    """Estimate the parameters of an effect on the sample distribution."""
     from scipy.stats import norm
 
     samples = max(float(blocks["samples"].sel(axis=axis).sum()), 1.0)
     rate = float(blocks.attrs["sampling_rate_hz"])
-    hours = samples / rate / HOUR
+    hours = samples / rate / SECONDS_PER_HOUR
     if mark == "lattice":
         return {"step": (float(blocks["lattice"].sel(axis=axis)), 0.0)}
     row = [str(one) for one in blocks["axis"].values].index(axis)
     usual = float(count_evidence.of[mark][0][row].sum()) if mark in count_evidence.of else 0.0
     count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
-    spread = _spread(blocks, axis)
+    spread = _sample_deviation(blocks, axis)
     error = math.sqrt(count + usual)
     if effect == "spikes":
         count = max(
@@ -67,12 +71,12 @@ def sample_count_sizes(
             1.0,
         )
         error = math.sqrt(count)
-        told = _outliers(blocks, axis)
-        if told is None:  # no block was steady enough to have a kurtosis
+        outliers = _estimate_outliers(blocks, axis)
+        if outliers is None:  # no block was steady enough to have a kurtosis
             return {"per_hour": (count / hours, error / hours)}
-        seen, size, many = told
+        seen, size, many = outliers
         number = count / seen
-        law = max(_LAW, 0.5 * (1.0 - seen))
+        law = max(LAW_ERROR_SHARE, 0.5 * (1.0 - seen))
         doubt = math.hypot(1.0 / math.sqrt(2.0 * many), law)
         return {
             "per_hour": (number / hours, number / hours * math.hypot(1.0 / error, law)),
@@ -81,10 +85,12 @@ def sample_count_sizes(
     if effect == "held_samples":
         usual = (
             usual if float(blocks["lattice"].sel(axis=axis)) > 0.0 else 0.0
-        )  # without a lattice chance makes none
+        )  # without a quantization grid chance repeats no sample
         count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
         runs = _held_runs(blocks, axis, mark, usual)
-        length = max(count / runs, 1.0) / rate  # of a geometric law: scattered by itself
+        length = (
+            max(count / runs, 1.0) / rate
+        )  # of a geometric law, whose standard deviation is its mean
         return {
             "per_hour": (runs / hours, math.sqrt(runs) / hours),
             "length": (length, length / math.sqrt(runs)),
@@ -103,7 +109,7 @@ def sample_count_sizes(
 
 
 def _held_runs(blocks: xr.Dataset, axis: str, mark: str, usual: float) -> float:
-    """How often samples were held: runs of them, less those that a lattice makes by chance."""
+    """Return how often samples were held: runs of repeats, less those of the quantization grid."""
     own = {
         name: float(blocks[name].sel(axis=axis).sum())
         for name in ("adjacent", "repeats", "repeat_runs", "zeros", "zero_runs", "filled")
@@ -113,13 +119,14 @@ def _held_runs(blocks: xr.Dataset, axis: str, mark: str, usual: float) -> float:
     return max(own["repeat_runs"] - usual * (1.0 - usual / max(own["adjacent"], 1.0)), 1.0)
 
 
-def _outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, float] | None:
-    """Share of outliers that is seen, their rms size [degree hour-1], and outliers told by; None where nothing tells.
+def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, float] | None:
+    """Return the share of outliers seen, their rms size [degree hour-1], and their number.
 
-    Of a block of n samples of the deviation s with m outliers of the square u s^2 each, a = m u /
-    n, the fourth moment over the squared second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2,
-    which is solved for a. Only the larger ones of a normal law are seen, whose deviation is no less
-    than the least that is: below, the number of those not seen would be anything.
+    For a block of n samples of standard deviation s with m outliers of mean square u s^2, and a = m
+    u / n, the fourth moment over the squared second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2,
+    which is solved for a. Only the larger outliers of a normal law are seen, and the standard
+    deviation of the law is taken to be at least the smallest one seen: below that, the number of
+    those not seen is undetermined.
     """
     from scipy.stats import norm
 
@@ -128,35 +135,39 @@ def _outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, float] | Non
         for name in ("peaks", "kurtosis", "samples")
     )
     good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
-    alone = good & (count == 1.0)  # of several in a block the sizes differ
+    alone = good & (count == 1.0)  # several in a block differ in size
     good = alone if alone.any() else good
     if not good.any():
         return None
     many = count[good]
     most = (
         samples[good] / (many * (1.0 - many / samples[good])) - 3.0
-    )  # without noise, the mean of the block taken off
+    )  # without noise, after removal of the block mean
     tails = np.minimum(excess[good] + 3.0, (1.0 - 1e-4) * most)
     half, far = tails - 3.0, most - tails
     share = (half + np.sqrt(half**2 + far * half)) / far
     variance = blocks["variance"].sel(axis=axis).values
-    calm = (count == 0.0) & (
+    clean = (count == 0.0) & (
         variance > 0.0
-    )  # most blocks may have spikes: the median of all would not be the noise
+    )  # most blocks may have spikes: the median of all is not that of the noise
     usual = float(
-        np.median(variance[calm] if calm.sum() >= _CALM else variance[good] / (1.0 + share))
+        np.median(
+            variance[clean] if clean.sum() >= MIN_CLEAN_BLOCKS else variance[good] / (1.0 + share)
+        )
     )
     share = np.where(
-        many > 1.0, np.fmin(share, np.maximum(variance[good] / usual - 1.0, 0.0) + _USUAL), share
+        many > 1.0,
+        np.fmin(share, np.maximum(variance[good] / usual - 1.0, 0.0) + VARIANCE_TOLERANCE_SHARE),
+        share,
     )
     square = float((share * samples[good]).sum() / many.sum())
-    limit = _DEPARTURE * outlier_limit(float(samples.sum()))
+    limit = MEDIAN_DEPARTURE_SIGMA * outlier_limit(float(samples.sum()))
     ends = np.geomspace(1.0, 1e-4, 400)  # the least size that is seen, over the rms size
     seen_squares = (limit / ends) ** 2 * (1.0 + ends * norm.pdf(ends) / norm.sf(ends))
     size = limit / float(np.interp(square, seen_squares, ends))
     return float(2.0 * norm.sf(limit / size)), size * math.sqrt(usual), float(many.sum())
 
 
-def _spread(blocks: xr.Dataset, axis: str) -> float:
-    """Standard deviation of the samples about the means of their blocks [degree hour-1]."""
+def _sample_deviation(blocks: xr.Dataset, axis: str) -> float:
+    """Return the standard deviation of the samples about their block means [degree hour-1]."""
     return math.sqrt(float(blocks["variance"].sel(axis=axis).median()))

@@ -1,4 +1,4 @@
-"""Effects that nothing drives: what they add to the spectrum is there all the time."""
+"""Check that effects without a driver are present all the time."""
 
 from __future__ import annotations
 
@@ -14,48 +14,47 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 __all__ = ["is_always_present"]
 
 _STEADY = ("gauss_markov", "telegraph", "logger_filter")
-_PARTS, _LEAST = 8, 3  # of the record that are looked at one by one; blocks in each at least
-_APART, _FORM = (
-    8.0,
-    0.1,
-)  # nats by which they may differ by chance; and of the gain, what other effects may leave
+RECORD_PARTS = 8  # of the record, that are compared
+MIN_PART_BLOCKS = 3
+DISAGREEMENT_NATS = 8.0  # between the parts, that chance explains: a chi-square of 16 with 7 dof
+FORM_ERROR_SHARE = 0.1  # of the evidence, that other effects may leave
 
 
 def is_always_present(component: Component, state: State) -> bool:
-    """Whether a part that has no course in time has the same size in all eighths of the record; true for what may come and go.
+    """Return whether a steady component has the same size in all eighths of a record.
 
-    What is loud while the tool turns, or for any other while, has a broad spectrum too, and is no
-    filter and no wandering bias.
+    Noise that is present only while the tool rotates has a broad spectrum too, but is neither a
+    filter nor a wandering bias. True for effects that may be intermittent.
 
     Parameters
     ----------
-    component : Part
+    component : Component
     state : State
-        With all else that is named.
+        With all other effects in the model.
     """
     if (
         component.candidate.effect not in _STEADY
         or component.candidate.statistic != "power"
-        or state.blocks.sizes["block"] < _PARTS * _LEAST
+        or state.blocks.sizes["block"] < RECORD_PARTS * MIN_PART_BLOCKS
     ):
         return True
     state = replace(state, weight=condition_on(state, [component]).weight)
     size, error = np.array(
         [
-            _size(component, state, inside)
-            for inside in np.array_split(np.arange(state.blocks.sizes["block"]), _PARTS)
+            _fit_part(component, state, inside)
+            for inside in np.array_split(np.arange(state.blocks.sizes["block"]), RECORD_PARTS)
         ]
     ).T
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0
     size = np.where(weight > 0.0, size, 0.0)
-    apart = 0.5 * float(
+    disagreement = 0.5 * float(
         (weight * (size - (weight * size).sum() / max(weight.sum(), 1e-300)) ** 2).sum()
     )
-    return apart <= _APART + _FORM * max(component.evidence_nats, 0.0)
+    return disagreement <= DISAGREEMENT_NATS + FORM_ERROR_SHARE * max(component.evidence_nats, 0.0)
 
 
-def _size(component: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:
-    """Size of the first column by some blocks alone, and its error."""
+def _fit_part(component: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:
+    """Fit the first column to some blocks only; return its size and error."""
     outside = np.ones(state.masked.shape[1], np.bool_)
     outside[inside] = False
     row = state.axes.index(component.row[0])

@@ -1,4 +1,4 @@
-"""Negative controls: the channel or axis that an effect follows, slid in time, must not explain as much as the channel itself."""
+"""Test effects against time-shifted surrogates of the channel or axis that they follow."""
 
 from __future__ import annotations
 
@@ -17,52 +17,63 @@ from gyrostab.diagnose.predict.search import compute_evidence
 
 __all__ = ["TIME_SHIFTS", "passes_time_shift_test"]
 
-#: Copies of the channel at most.
+#: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
 TIME_SHIFTS = 200
-_ALIKE = 0.5  # correlation from which on a slid design is too much like the true one
-_FEWEST = 20
-_OF_AXES = ("misalignment",)  # effects that follow the means of other axes
+MAX_CORRELATION = 0.5  # of a surrogate with the true design, above which it is not a control
+MIN_SURROGATES = 20
+SHIFT_RANGE = (0.05, 0.95)  # of the record
+_FOLLOWING_AXES = ("misalignment",)  # effects that follow the means of other axes
 
 
 def passes_time_shift_test(
     components: Sequence[Component], state: State, folds: xr.DataArray, *, share: float = 0.01
 ) -> tuple[bool, float]:
-    """Whether an effect explains more than almost all slid copies of its channel do.
+    """Return whether an effect explains more than time-shifted surrogates of its channel.
 
     Parameters
     ----------
-    components : sequence of Part
-        Where the effect shows.
+    components : sequence of Component
+        Components of the effect.
     state : State
         What is in the model without it.
     folds : xarray.DataArray
         From `fold_blocks`.
     share : float
-        Copies that may do as well.
+        Share of the surrogates that may explain as much.
 
     Returns
     -------
-    beats : bool
-        True too where no copy can be made.
+    passed : bool
+        Also true where no surrogate can be made.
     p_value : float
-        Share of the copies that did as well; NaN where there are too few copies that differ.
+        Share of the surrogates that explained as much; NaN where too few of them differ from the
+        channel.
     """
-    own = [component for component in components if _follows(component, state)]
+    own = [component for component in components if _follows_channel(component, state)]
     if not own:
         return True, np.nan
     block_count = state.blocks.sizes["block"]
-    shifts = np.unique(np.linspace(block_count * 0.05, block_count * 0.95, TIME_SHIFTS).astype(int))
-    real, slid = 0.0, np.zeros(shifts.size)
+    shifts = np.unique(
+        np.linspace(block_count * SHIFT_RANGE[0], block_count * SHIFT_RANGE[1], TIME_SHIFTS).astype(
+            int
+        )
+    )
+    real, shifted = 0.0, np.zeros(shifts.size)
     valid = np.ones(shifts.size, np.bool_)
     for component in own:
-        copies = [_slid(component, state, int(shift)) for shift in shifts]
+        surrogates = [_make_surrogate(component, state, int(shift)) for shift in shifts]
         row = state.axes.index(component.row[0])
-        for number, copy in enumerate(copies):
-            if copy is None or _alike(copy, component.variant, row) > _ALIKE:
+        for number, surrogate in enumerate(surrogates):
+            if (
+                surrogate is None
+                or _max_correlation(surrogate, component.variant, row) > MAX_CORRELATION
+            ):
                 valid[number] = False
-        chosen = [copy if copy is not None else component.variant for copy in copies]
+        chosen = [
+            surrogate if surrogate is not None else component.variant for surrogate in surrogates
+        ]
         several = [
-            replace(component.candidate, effect=f"slid {number}", variants=(one,))
+            replace(component.candidate, effect=f"shifted {number}", variants=(one,))
             for number, one in enumerate(chosen)
         ]
         found = compute_evidence(
@@ -73,24 +84,24 @@ def passes_time_shift_test(
         )
         values = np.array([one.evidence_nats[0, row] for one in found])
         real += float(values[0])
-        slid += values[1:]
-    if valid.sum() < _FEWEST:
+        shifted += values[1:]
+    if valid.sum() < MIN_SURROGATES:
         return True, np.nan
-    p_value = float(np.mean(slid[valid] >= real))
+    p_value = float(np.mean(shifted[valid] >= real))
     return p_value <= share, p_value
 
 
-def _follows(component: Component, state: State) -> bool:
-    """Whether a part follows a channel in means or powers, or the means of other axes."""
+def _follows_channel(component: Component, state: State) -> bool:
+    """Return whether a component follows a channel, or the means of other axes."""
     if component.candidate.statistic not in ("mean", "power"):
         return False
     return any(component.candidate.driver) or (
-        component.candidate.statistic == "mean" and component.candidate.effect in _OF_AXES
+        component.candidate.statistic == "mean" and component.candidate.effect in _FOLLOWING_AXES
     )
 
 
-def _slid(component: Component, state: State, shift: int) -> Variant | None:
-    """The variant with its channels slid around the record."""
+def _make_surrogate(component: Component, state: State, shift: int) -> Variant | None:
+    """Return the variant for channels that are rotated in time, end to start."""
     candidate: Candidate = component.candidate
     blocks = state.blocks.copy()
     for name in filter(None, candidate.driver):
@@ -98,7 +109,7 @@ def _slid(component: Component, state: State, shift: int) -> Variant | None:
             blocks[key] = blocks[key].copy(data=np.roll(blocks[key].values, shift, axis=0))
     for key in (
         {"mean", "measured_mean"} & set(map(str, blocks.data_vars))
-        if candidate.effect in _OF_AXES
+        if candidate.effect in _FOLLOWING_AXES
         else ()
     ):
         blocks[key] = blocks[key].copy(
@@ -108,14 +119,14 @@ def _slid(component: Component, state: State, shift: int) -> Variant | None:
     return made
 
 
-def _alike(copy: Variant, true: Variant, row: int) -> float:
-    """Largest correlation of the columns over time, of either sign: so has the size."""
+def _max_correlation(surrogate: Variant, true: Variant, row: int) -> float:
+    """Return the largest correlation of the columns over time, of either sign."""
 
     def flat(design: NDArray[Any]) -> NDArray[Any]:
         rows = design[:, row if design.shape[1] > 1 else 0]
         rows = rows.reshape(rows.shape[0], rows.shape[1], -1).mean(axis=-1)
         return np.asarray(rows - rows.mean(axis=1, keepdims=True))
 
-    a, b = flat(copy.design), flat(true.design)
+    a, b = flat(surrogate.design), flat(true.design)
     size = np.sqrt((a**2).sum(axis=1) * (b**2).sum(axis=1))
     return float(np.max(np.abs((a * b).sum(axis=1)) / np.where(size > 0, size, 1.0)))

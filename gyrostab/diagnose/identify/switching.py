@@ -1,4 +1,8 @@
-"""Biases of two levels among the names: what follows a channel comes first, and the course is sought anew with all else in the model."""
+"""Order telegraph biases among the other effects, and find their course again.
+
+An effect that follows a channel comes first. The course of the switching is found again with all
+other effects in the model.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +14,33 @@ import numpy as np
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.components import axes_of, evidence_of
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
-from gyrostab.diagnose.identify.jumps import jumps_at_will
+from gyrostab.diagnose.identify.jumps import is_free_jump
 from gyrostab.diagnose.predict.condition import Component, mean_columns
 from gyrostab.diagnose.predict.designs import Candidate
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import CandidateEvidence
 
-__all__ = ["followed_first", "hops_alone", "identify_switching", "remove_telegraph_bias", "renewed"]
+__all__ = [
+    "drop_explained_jumps",
+    "identify_switching",
+    "put_followers_first",
+    "remove_telegraph_bias",
+    "renew_component",
+]
 
-_VIEW = "levels"
-# of the variance of a course of hops, from which on a channel that explains it may be their cause
-_LED = 0.5
+_TELEGRAPH = "levels"
+#: Share of the variance of a switching course that a channel explains if it may be its cause.
+LEADING_SHARE = 0.5
 
 
-def followed_first(
+def put_followers_first(
     passing: list[str], components: Mapping[str, Sequence[Component]], state: State
 ) -> list[str]:
-    """Keys without those of two levels, as long as a mean that follows a channel passes too and may be why they hop.
+    """Drop telegraph biases while a passing mean that follows a channel may be their cause.
 
-    A channel that switches makes two levels as well, and what its mean leaves, since its form is
-    not exact, hops where it hops. So the channel comes first where it brings more on the same axis,
-    or where half of the course of the hops is its own.
+    A channel that switches makes two levels as well, and because its form is not exact, what it
+    leaves switches with it. Therefore the channel comes first where it explains more on the same
+    axis, or half of the course of the switching.
     """
     led = [
         component
@@ -41,22 +51,25 @@ def followed_first(
     return [
         key
         for key in passing
-        if not any(_may_be_led(component, led, state) for component in components[key])
+        if not any(_has_possible_cause(component, led, state) for component in components[key])
     ]
 
 
-def _may_be_led(component: Component, led: Sequence[Component], state: State) -> bool:
+def _has_possible_cause(component: Component, led: Sequence[Component], state: State) -> bool:
     beside = [
-        one for one in led if component.candidate.statistic == _VIEW and one.row == component.row
+        one
+        for one in led
+        if component.candidate.statistic == _TELEGRAPH and one.row == component.row
     ]
     return any(
-        one.evidence_nats >= component.evidence_nats or _share_of(component, one, state) > _LED
+        one.evidence_nats >= component.evidence_nats
+        or _explained_share(component, one, state) > LEADING_SHARE
         for one in beside
     )
 
 
-def _share_of(component: Component, other: Component, state: State) -> float:
-    """Share of the variance of the first column of a part that the columns of another one on the same axis explain."""
+def _explained_share(component: Component, other: Component, state: State) -> float:
+    """Return the share of the variance of a course that another component explains."""
     row = state.axes.index(component.row[0])
     course, beside = (
         mean_columns(component.variant, row)[0],
@@ -77,14 +90,15 @@ def _share_of(component: Component, other: Component, state: State) -> float:
 def identify_switching(
     passing: list[str], components: Mapping[str, Sequence[Component]], state: State
 ) -> list[str]:
-    """Keys of biases that hop within blocks, unless a mean that follows a channel may be why; once on an axis.
+    """Return the keys of biases that switch within blocks and have no possible cause.
 
-    What hops beside hops that are named is no reason for powers and tails that these have not taken
-    yet, and may be a jump.
+    An axis has one of them: with it in the model, more switching does not explain powers and
+    tails that the first
+    has left, and may be a jump.
     """
     return [
         key
-        for key in followed_first(passing, components, state)
+        for key in put_followers_first(passing, components, state)
         if any(
             component.variant.inside.size and not state.given.get(("inner", component.row[0]))
             for component in components[key]
@@ -92,57 +106,63 @@ def identify_switching(
     ]
 
 
-def hops_alone(
+def drop_explained_jumps(
     chosen: Sequence[Identification | Unidentified],
     state_with: Callable[[Sequence[Identification | Unidentified]], State],
     gains: Callable[[Sequence[Candidate], State], list[CandidateEvidence]],
     threshold: float,
 ) -> list[Identification | Unidentified]:
-    """What is chosen, without jumps on the axis of hops that the hops explain as well when they are sought without them.
+    """Drop jumps that a telegraph bias on their axis explains when fitted without them.
 
-    The first and the last of few hops are jumps too, of the same step, and the hops that are found
-    beside these lack them.
+    The first and the last of a few switches are jumps of the same step, and a telegraph bias that
+    is fitted with them in the model lacks these switches.
 
     Parameters
     ----------
-    chosen : sequence of Claim or Unknown
-        With the gains with which they were chosen.
+    chosen : sequence of Identification or Unidentified
+        With the evidence with which they were selected.
     state_with : callable
-        The state with some of them in the model.
+        Returns the state with some of them in the model.
     gains : callable
-        Gains of candidates in a state.
+        Computes the evidence of candidates in a state.
     threshold : float
-        What jumps must bring beside the hops [nats].
+        Evidence that jumps must add to the telegraph bias [nats].
     """
     out = list(chosen)
     for component in [
         component
         for one in chosen
         for component in one.components
-        if component.candidate.statistic == _VIEW
+        if component.candidate.statistic == _TELEGRAPH
     ]:
-        jumps = _jumps_beside(component, out, state_with([]))
+        jumps = _jumps_on_axis(component, out, state_with([]))
         for some in [jumps, *([one] for one in jumps if len(jumps) > 1)]:
-            if not some or not _holds(out, some):
+            if not some or not _contains_all(out, some):
                 continue
             beside, alone = (
-                state_with(_without(out, left_out))
+                state_with(_drop_components(out, left_out))
                 for left_out in ([component], [component, *some])
             )
-            own = _of_blocks(component, beside)
+            own = _block_evidence(component, beside)
             if (
                 np.isfinite(own)
                 and own + sum(jump.evidence_nats for jump in some)
-                < _of_blocks(component, alone) + threshold
+                < _block_evidence(component, alone) + threshold
             ):
-                instead = _sought(component, gains([component.candidate], alone))
-                out = [_with_part(one, component, instead) for one in _without(out, some)]
+                instead = _component_found(component, gains([component.candidate], alone))
+                out = [
+                    _replace_component(one, component, instead)
+                    for one in _drop_components(out, some)
+                ]
                 component = instead
     return out
 
 
-def _of_blocks(component: Component, state: State) -> float:
-    """What two levels gain in the means of blocks [nats], which can be compared: those of pieces know more, and are not always there."""
+def _block_evidence(component: Component, state: State) -> float:
+    """Return the evidence of two levels in the block means [nats].
+
+    It can be compared; that of sub-blocks knows more, and is not always available.
+    """
     given = state.given.get(("mean", component.row[0]))
     evidence_nats, _ = telegraph_evidence(
         state.blocks,
@@ -153,7 +173,7 @@ def _of_blocks(component: Component, state: State) -> float:
     return float(evidence_nats[0])
 
 
-def _holds(
+def _contains_all(
     chosen: Sequence[Identification | Unidentified], components: Sequence[Component]
 ) -> bool:
     return all(
@@ -162,7 +182,7 @@ def _holds(
     )
 
 
-def _with_part(
+def _replace_component(
     identification: Identification | Unidentified, component: Component, instead: Component
 ) -> Identification | Unidentified:
     return replace(
@@ -171,21 +191,21 @@ def _with_part(
     )
 
 
-def _jumps_beside(
+def _jumps_on_axis(
     component: Component, chosen: Sequence[Identification | Unidentified], state: State
 ) -> list[Component]:
     return [
         one
         for identification in chosen
         for one in identification.components
-        if one.row == component.row and jumps_at_will(one, state)
+        if one.row == component.row and is_free_jump(one, state)
     ]
 
 
-def _without(
+def _drop_components(
     chosen: Sequence[Identification | Unidentified], left_out: Sequence[Component]
 ) -> list[Identification | Unidentified]:
-    """What is chosen without some of its parts; claims of which nothing is left are none."""
+    """Drop some components from the selections, and selections that lose all."""
     out = []
     for one in chosen:
         kept = tuple(
@@ -211,34 +231,42 @@ def _without(
     return out
 
 
-def _sought(component: Component, found: Sequence[CandidateEvidence]) -> Component:
-    """The part as it was found anew."""
+def _component_found(component: Component, found: Sequence[Found]) -> Component:
+    """Return the component as found again."""
     (one,) = found
     row = one.rows.index(component.row)
     return replace(component, variant=one.best[row], evidence_nats=float(one.evidence_nats[0, row]))
 
 
-def renewed(components: Sequence[Component], component: Component) -> Component:
-    """A part with its gain among `components`, which were found with all others in the model; and with the course that was found then."""
+def renew_component(components: Sequence[Component], component: Component) -> Component:
+    """Return a component with its evidence, and the course of its switching, among `components`.
+
+    These were found with all other effects in the model.
+    """
     fresh = replace(component, evidence_nats=evidence_of(components, component))
-    if component.candidate.statistic != _VIEW:
+    if component.candidate.statistic != _TELEGRAPH:
         return fresh
     return next(
         (
             replace(fresh, variant=one.variant)
             for one in components
-            if (one.candidate.statistic, one.row) == (_VIEW, component.row)
+            if (one.candidate.statistic, one.row) == (_TELEGRAPH, component.row)
         ),
         fresh,
     )
 
 
 def remove_telegraph_bias(identifications: Identifications) -> tuple[Identifications, float]:
-    """The naming without biases of two levels, whose course no other time tells; and what these gain [nats]."""
+    """Drop the telegraph biases, and return their evidence [nats].
+
+    No held-out data show the course of one.
+    """
     those = [
         identification
         for identification in identifications.identified
-        if any(component.candidate.statistic == _VIEW for component in identification.components)
+        if any(
+            component.candidate.statistic == _TELEGRAPH for component in identification.components
+        )
     ]
     kept = tuple(
         identification

@@ -1,1 +1,1 @@
-"""Where recording and simulation differ, against records of noise alone."""
+"""Locate where recording and simulation differ, by thresholds from null records."""

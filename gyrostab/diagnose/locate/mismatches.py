@@ -1,4 +1,4 @@
-"""Where recording and simulation differ: axes, time and averaging time of every mismatch, and how sure it is."""
+"""Locate the mismatches: their axes, times and averaging times, and their probability."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from gyrostab.diagnose.statistics.mean import region_mean
 from gyrostab.diagnose.statistics.variance_stability import scale_to_expected
 from gyrostab.errors import OptionError
 
-__all__ = ["FIELDS", "locate_mismatches", "louder"]
+__all__ = ["FIELDS", "find_level_regions", "locate_mismatches"]
 
 Array = NDArray[np.float64]
-_RAISED = 2.0  # of a piece that has a part in a mismatch
-_WHOLE = 0.7  # that a part of the record must show more than the whole does
-_GROWN = 3.0  # standard deviations of a cell that belongs to a mismatch beside it
-_MOST = 8  # mismatches of one view and row
-_TOLD = 30  # mismatches of a record
-_BESIDE_LINE = 3  # lines that a strong line leaks into
+RAISED_SIGMA = 2.0  # of a short window that is part of a mismatch which shows only in a long one
+WHOLE_RECORD_SIGMA = 0.7  # by which a part of the record must exceed the whole
+PIECES_SHARE = 0.8  # of the score of a window, that its short windows reach if they show the same
+NEIGHBOUR_SIGMA = 3.0  # of a cell that belongs to the mismatch next to it
+NEIGHBOUR_EXCESS_SHARE = 0.25  # of the largest excess, that such a cell must have
+MAX_PER_ROW = 8  # mismatches of one statistic and row
+MAX_MISMATCHES = 30  # of a record
+LINE_REACH_BINS = 3  # lines on either side that a strong line leaks into
 
 #: Fields of a mismatch, and their units.
 FIELDS = {
@@ -51,87 +53,94 @@ def locate_mismatches(
     *,
     level: float = 0.01,
 ) -> xr.Dataset:
-    """Find where a recording differs from the simulation by more than noise does.
+    """Locate where a recording differs from the simulation by more than noise does.
 
-    Every view scores its cells; a score counts in standard deviations of the null records, and its
-    p-value is the share of null records in which any cell of any view does as much. From the
-    largest on, cells become boxes: the span of time that explains most, and the averaging times
-    beside the largest that stand out there too. What a box explains is left out of the next.
+    Every statistic scores its cells, in standard deviations of the null records. The p-value of a
+    score is the share of null records in which any cell of any statistic reaches it. From the
+    largest score on, cells become regions: the time that explains most, and the neighbouring
+    averaging times that exceed noise there. What a region explains is left out of the next.
 
     Parameters
     ----------
     blocks : xarray.Dataset
-        Of `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
+        From `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
     baseline : xarray.Dataset
-        What the simulation expects.
+        What the simulation predicts.
     nulls : iterable of xarray.Dataset, or NullScores
-        Null records of `gyrostab.diagnose.nulls.records.null_records`, or what `null_scores` made
-        of them.
+        Null records from `gyrostab.diagnose.nulls.records.null_records`, or their `null_scores`.
     level : float
-        Share of records of the simulation itself in which anything may be found.
+        Probability that a recording without missing physics has any mismatch.
 
     Returns
     -------
     xarray.Dataset
-        By ``mismatch``, the surest first: ``statistic``, ``axes`` (parted by blanks), ``what``,
+        Along ``mismatch``, the surest first: ``view``, ``axes`` (separated by blanks), ``what``,
         ``begin``, ``end`` [s since the start], ``start_time``, ``end_time``, ``tau_min_s``,
         ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``,
-        ``ratio`` (observed over expected; in the mean and restart views the number of standard
-        deviations), ``estimate`` (see the view), ``p_value``.
+        ``ratio`` (observed over expected; for means and restarts the number of standard
+        deviations), ``estimate`` (depends on the statistic), ``p_value``.
 
     Raises
     ------
     OptionError
-        When `level` is no probability below a half, or the null records are too few.
+        When `level` is not between 0 and 0.5, or the null records are too few.
 
     Examples
     --------
-    >>> found = locate(blocks, baseline, null_records(blocks, baseline, count=400, rng=rng))   # doctest: +SKIP
-    >>> found.statistic.values, found.axes.values, found.begin.values, found.end.values               # doctest: +SKIP
-    (array(['davar']), array(['x']), array([1500.]), array([1800.]))
+    >>> nulls = null_records(blocks, baseline, count=400, rng=rng)  # doctest: +SKIP
+    >>> found = locate_mismatches(blocks, baseline, nulls)  # doctest: +SKIP
+    >>> found.axes.values, found.begin.values, found.end.values  # doctest: +SKIP
+    (array(['x']), array([1500.]), array([1800.]))
     """
     if not 0.0 < level < 0.5:
         raise OptionError(
-            f"level {level!r}: give the share of false alarms, above 0 and below 0.5, for instance 0.01"
+            f"level {level!r}: give a false-alarm probability above 0 and below 0.5, "
+            "for instance 0.01"
         )
     null = nulls if isinstance(nulls, NullScores) else null_scores(baseline, nulls)
     regions: list[dict[str, Any]] = []
     for name, score in STATISTICS.items():
         if name not in null.statistics:
             continue
-        find = _mean_boxes if name == "mean" else _boxes
+        find = _locate_mean_regions if name == "mean" else _locate_regions
         seen = (
-            scale_to_expected(blocks, baseline, louder(regions))
+            levelled(blocks, baseline, find_level_regions(regions))
             if name == "variance_stability"
             else blocks
         )
         regions += find(name, score, seen, baseline, null, level)
-    return _table(merge_regions(regions)[:_TOLD], blocks, null, level)
+    return _make_table(merge_regions(regions)[:MAX_MISMATCHES], blocks, null, level)
 
 
-def louder(regions: Iterable[Mapping[str, Any]]) -> list[tuple[list[str], float, float]]:
-    """Axes, begin and end [s] of the boxes that say how loud the noise is: to say that it changes would tell the same again."""
-    told = (
+def find_level_regions(
+    regions: Iterable[Mapping[str, Any]],
+) -> list[tuple[list[str], float, float]]:
+    """Return axes, begin and end [s] of the regions in which the noise level differs.
+
+    A change of level there is not reported again as a fluctuation.
+    """
+    level_regions = (
         region
         for region in regions
         if region["view"] == "davar" and region["what"] in ("avar", "level")
     )
     return [
         (str(region["axes"]).split(), float(region["begin"]), float(region["end"]))
-        for region in told
+        for region in level_regions
     ]
 
 
-def _boxes(
+def _locate_regions(
     name: str, score: Any, blocks: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
 ) -> list[dict[str, Any]]:
+    """Locate the regions of one statistic, row by row."""
     scores = score(blocks, baseline)
     z, critical = standardise(scores, null.statistics[name]), null.critical(name, level)
     found = []
     for row in range(z.shape[0]):
         left = z[row].copy()
-        for _ in range(_MOST):
-            region = _next_box(scores, row, left, z[row], critical)
+        for _ in range(MAX_PER_ROW):
+            region = _take_region(scores, row, left, z[row], critical)
             if region is None:
                 break
             region["p_value"] = float(null.p_value(name, region["z"]))
@@ -139,19 +148,22 @@ def _boxes(
     return found
 
 
-def _mean_boxes(
+def _locate_mean_regions(
     name: str, score: Any, blocks: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
 ) -> list[dict[str, Any]]:
-    """As `_boxes`; a step in one place pulls the mean of the record, so that each one found is taken off before the next is looked for."""
+    """Locate the regions of the mean, each with the ones before it removed.
+
+    A step at one place shifts the mean of the whole record.
+    """
     critical, found = null.critical(name, level), []
     known = baseline["known_mean"].transpose("axis", "block").copy(deep=True)
     open_rows = set(range(blocks.sizes["axis"]))
-    for _ in range(_MOST):
+    for _ in range(MAX_PER_ROW):
         now = baseline.assign(known_mean=known)
         scores = score(blocks, now)
         z = standardise(scores, null.statistics[name])
         for row in sorted(open_rows):
-            region = _next_box(scores, row, z[row].copy(), z[row], critical)
+            region = _take_region(scores, row, z[row].copy(), z[row], critical)
             if region is None:
                 open_rows.discard(row)
                 continue
@@ -170,20 +182,20 @@ def _mean_boxes(
     return merge_wandering_regions(found)
 
 
-def _next_box(
+def _take_region(
     scores: xr.Dataset, row: int, left: Array, z: Array, critical: float
 ) -> dict[str, Any] | None:
-    """Box around the largest score left, which is then taken out of `left`; None when none is above `critical`."""
+    """Return the region around the largest score left, or None; remove it from `left`."""
     if not np.isfinite(left).any() or np.nanmax(np.abs(left)) < critical:
         return None
     window, column = np.unravel_index(np.nanargmax(np.abs(left)), left.shape)
     sign = 1.0 if left[window, column] > 0 else -1.0
     free = np.where(
         np.isfinite(left[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0
-    )  # what is explained counts for nothing
-    begin, end, fine = _span(scores, free * sign, int(window))
-    together, ratio = _stacked(scores, row, z * sign, fine, int(window))
-    columns, reach = _columns(scores, together, ratio, int(column))
+    )  # explained windows do not count
+    begin, end, fine = _find_span(scores, free * sign, int(window))
+    together, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
+    columns, reach = _find_columns(scores, together, ratio, int(column))
     region = {
         "view": scores.attrs["view"],
         "axes": str(scores["axes"].values[row]),
@@ -212,15 +224,15 @@ def _next_box(
     return region
 
 
-def _span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float, NDArray[np.int64]]:
-    """Span of time around a window that explains most of a column: begin, end, and the shortest windows inside.
+def _find_span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float, NDArray[np.int64]]:
+    """Return begin and end of the time about a window that explains most of a column.
 
-    Of all runs of the shortest windows it is the one with the largest sum over the root of its
-    number.
+    It is the run of the shortest windows with the largest sum over the root of their number. The
+    third result is these windows.
     """
     first, stop = scores["first"].values, scores["stop"].values
     begin, end = scores["begin"].values, scores["end"].values
-    fine = _side_by_side(first, stop, np.flatnonzero(np.isfinite(z)))
+    fine = _disjoint_windows(first, stop, np.flatnonzero(np.isfinite(z)))
     near = 3 * (stop[window] - first[window])
     fine = fine[(stop[fine] > first[window] - near) & (first[fine] < stop[window] + near)]
     total = np.concatenate([[0.0], np.cumsum(z[fine])])
@@ -236,22 +248,26 @@ def _span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float, NDAr
             best, low, high = float(sums[place]), place, place + count
     chosen = fine[low:high]
     inside = fine[(first[fine] >= first[window]) & (stop[fine] <= stop[window])]
-    if best < 0.8 * z[window]:  # the pieces do not add up to what the window shows as one
-        raised = inside[z[inside] > _RAISED]
+    if best < PIECES_SHARE * z[window]:  # the short windows do not add up to the whole one
+        raised = inside[z[inside] > RAISED_SIGMA]
         chosen = (
             inside[(inside >= raised[0]) & (inside <= raised[-1])]
             if raised.size
             else np.array([window])
         )
-    elif first[window] == first.min() and stop[window] == stop.max() and best < z[window] + _WHOLE:
+    elif (
+        first[window] == first.min()
+        and stop[window] == stop.max()
+        and best < z[window] + WHOLE_RECORD_SIGMA
+    ):
         chosen = inside
     return float(begin[chosen[0]]), float(end[chosen[-1]]), chosen
 
 
-def _side_by_side(
+def _disjoint_windows(
     first: NDArray[np.int64], stop: NDArray[np.int64], usable: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The shortest windows, in order, of those that overlap every second one left out."""
+    """Return the shortest windows in order, without those that overlap the one before."""
     shortest = usable[(stop - first)[usable] == (stop - first)[usable].min()]
     chosen, until = [], -1
     for place in shortest[np.argsort(first[shortest], kind="stable")]:
@@ -261,10 +277,13 @@ def _side_by_side(
     return np.array(chosen, dtype=np.int64)
 
 
-def _stacked(
+def _combine_windows(
     scores: xr.Dataset, row: int, z: Array, fine: NDArray[np.int64], window: int
 ) -> tuple[Array, Array]:
-    """Scores of every column over the span, and the ratio there; those of the window where a column has no shorter ones."""
+    """Return scores and ratios of every column over the span.
+
+    A column without short windows has those of the window itself.
+    """
     ratio = scores["ratio"].values[row]
     known = np.isfinite(z[fine])
     count = known.sum(axis=0)
@@ -275,13 +294,13 @@ def _stacked(
     return np.where(coarse, z[window], together), np.where(coarse, ratio[window], mean)
 
 
-def _columns(
+def _find_columns(
     scores: xr.Dataset, together: Array, ratio: Array, column: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Columns of a box, and those that it explains."""
+    """Return the columns of a region, and those that it explains."""
     what, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
-    above = np.nan_to_num(together) > _GROWN
-    if what[column] == "level":  # all averaging times alike: the box has those that stand out
+    above = np.nan_to_num(together) > NEIGHBOUR_SIGMA
+    if what[column] == "level":  # of all averaging times: the region has those above the noise
         seen = np.flatnonzero(above & (what == "avar"))
         return (seen if seen.size else np.array([column])), np.arange(what.size)
     lower = upper = column
@@ -291,8 +310,8 @@ def _columns(
         upper += 1
     grown = np.arange(lower, upper + 1)
     excess = np.abs(ratio - 1.0) if scores.attrs["view"] == "davar" else np.abs(together)
-    region = grown[excess[grown] >= 0.25 * excess[column]]
-    beside = _BESIDE_LINE if what[column] == "line" else 0
+    region = grown[excess[grown] >= NEIGHBOUR_EXCESS_SHARE * excess[column]]
+    beside = LINE_REACH_BINS if what[column] == "line" else 0
     if what[column] == "line":
         return np.array([column]), np.arange(
             max(lower - beside, 0), min(upper + beside + 1, what.size)
@@ -301,7 +320,7 @@ def _columns(
     return region, np.flatnonzero(overlap)
 
 
-def _table(
+def _make_table(
     regions: list[dict[str, Any]], blocks: xr.Dataset, null: NullScores, level: float
 ) -> xr.Dataset:
     variables: dict[str, Any] = {}

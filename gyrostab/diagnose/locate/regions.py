@@ -1,4 +1,4 @@
-"""One mismatch of boxes that show the same: on several axes, in pieces, or as a mean that wanders."""
+"""Merge regions that show the same mismatch on several axes, or in several pieces."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 __all__ = ["merge_regions", "merge_wandering_regions"]
 
 Region = dict[str, Any]
-_LIKE = 0.5  # share of the time of both that two boxes have in common when they are one
-# of the longer of two boxes, which may lie between them when they are one, if it is no longer than
-# the shorter
-_NEAR = 0.25
-_LINE = 0.02  # share of the frequency by which one line may wander
-_KINDS = ("slow", "variance", "drifting")
-_STEPS = 3  # boxes of one mean, beyond which it is said to wander
+MIN_COMMON_SHARE = 0.5  # of the time of two regions, above which they are one
+#: Gap between two regions that are one, as a share of the longer; at most the shorter.
+MAX_GAP_SHARE = 0.25
+LINE_TOLERANCE_SHARE = 0.02  # of the frequency, by which one line may differ
+TAU_TOLERANCE = 0.99  # ratio of averaging times that are equal but for rounding
+_SEPARATE_KINDS = ("slow", "restless", "glide")
+MAX_MEAN_REGIONS = 3  # of an axis, beyond which its mean wanders
 
 
 def merge_regions(regions: Sequence[Region]) -> list[Region]:
-    """Join boxes, the surest first; the surest of those that are joined gives its numbers.
+    """Merge regions, the surest first; the surest gives the numbers.
 
-    Boxes of different axes are one when they share most of their time; those of the same axes also
-    when they lie side by side, and their joint box then spans both.
+    Regions of different axes are merged when they share most of their time. Those of the same axes
+    are also merged when they are adjacent, and then span both.
 
     Parameters
     ----------
@@ -30,26 +30,29 @@ def merge_regions(regions: Sequence[Region]) -> list[Region]:
 
     Examples
     --------
-    >>> region = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 60.0, "tau_min_s": 0.01, "tau_max_s": 0.1,
-    ...        "frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
-    >>> [(one["axes"], one["end"]) for one in merged([region, region | {"axes": "y", "z": 8.0}, region | {"begin": 60.0, "end": 90.0, "z": 7.0}])]
+    >>> region = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 60.0,
+    ...           "tau_min_s": 0.01, "tau_max_s": 0.1, "frequency": float("nan"), "sign": 1,
+    ...           "z": 9.0, "p_value": 1e-6}
+    >>> on_y = region | {"axes": "y", "z": 8.0}
+    >>> later = region | {"begin": 60.0, "end": 90.0, "z": 7.0}
+    >>> [(merged["axes"], merged["end"]) for merged in merge_regions([region, on_y, later])]
     [('x y', 90.0)]
     """
     kept: list[Region] = []
     for region in sorted(regions, key=lambda one: (one["p_value"], -abs(one["z"]))):
         for other in kept:
-            if not _alike(region, other):
+            if not _are_alike(region, other):
                 continue
-            if _shared(region, other) > _LIKE or _touching(region, other):
-                _join(other, region)
+            if _common_share(region, other) > MIN_COMMON_SHARE or _are_adjacent(region, other):
+                _extend_region(other, region)
                 break
         else:
             kept.append(dict(region))
     return kept
 
 
-def _alike(one: Region, other: Region) -> bool:
-    """The same view, direction, and averaging times or line."""
+def _are_alike(one: Region, other: Region) -> bool:
+    """Return whether statistic, direction, and averaging times or line are the same."""
     if one["view"] != other["view"] or (
         one["sign"] != other["sign"] and one["view"] != "cross_axis"
     ):
@@ -57,29 +60,34 @@ def _alike(one: Region, other: Region) -> bool:
     if one["what"] == "line" or other["what"] == "line":
         return bool(
             one["what"] == other["what"]
-            and abs(one["frequency"] / other["frequency"] - 1.0) < _LINE
+            and abs(one["frequency"] / other["frequency"] - 1.0) < LINE_TOLERANCE_SHARE
         )
-    if _kind(one) != _kind(other):
+    if _kind_of(one) != _kind_of(other):
         return False
     return bool(
         min(one["tau_max_s"], other["tau_max_s"])
-        >= 0.99 * max(one["tau_min_s"], other["tau_min_s"])
+        >= TAU_TOLERANCE * max(one["tau_min_s"], other["tau_min_s"])
     )
 
 
-def _kind(region: Region) -> str:
-    """What is never one mismatch: inside of blocks and from one to the next, a level and its scatter, lines that stand and that move."""
+def _kind_of(region: Region) -> str:
+    """Return the kind of a region; regions of different kinds are not merged.
+
+    The kinds are within blocks and between them, levels and their scatter, steady and drifting
+    lines.
+    """
     kind = str(region["what"]).split(" ")[0]
-    return kind if kind in _KINDS else ""
+    return kind if kind in _SEPARATE_KINDS else ""
 
 
-def _shared(one: Region, other: Region) -> float:
+def _common_share(one: Region, other: Region) -> float:
+    """Return the time in common as a share of the time that both span."""
     common = min(one["end"], other["end"]) - max(one["begin"], other["begin"])
     return float(common / (max(one["end"], other["end"]) - min(one["begin"], other["begin"])))
 
 
-def _touching(one: Region, other: Region) -> bool:
-    """Pieces of the same axes that lie side by side."""
+def _are_adjacent(one: Region, other: Region) -> bool:
+    """Return whether two regions of the same axes are adjacent."""
     if not set(one["axes"].split()) <= set(other["axes"].split()) or one["view"] in (
         "mean",
         "restart",
@@ -88,12 +96,13 @@ def _touching(one: Region, other: Region) -> bool:
     shorter, longer = sorted([one["end"] - one["begin"], other["end"] - other["begin"]])
     return bool(
         max(one["begin"], other["begin"]) - min(one["end"], other["end"])
-        <= min(_NEAR * longer, shorter) + 1e-6
+        <= min(MAX_GAP_SHARE * longer, shorter) + 1e-6
     )
 
 
-def _join(region: Region, other: Region) -> None:
-    if _shared(region, other) <= _LIKE:
+def _extend_region(region: Region, other: Region) -> None:
+    """Extend a region to another one."""
+    if _common_share(region, other) <= MIN_COMMON_SHARE:
         region["begin"], region["end"] = (
             min(region["begin"], other["begin"]),
             max(region["end"], other["end"]),
@@ -111,17 +120,19 @@ def _join(region: Region, other: Region) -> None:
 
 
 def merge_wandering_regions(regions: Sequence[Region]) -> list[Region]:
-    """Boxes of the mean, those of an axis as one when there are many: its mean wanders, and the largest gives the numbers.
+    """Merge the regions of the mean of an axis when there are many: its mean wanders.
+
+    The largest gives the numbers.
 
     Parameters
     ----------
     regions : sequence of dict
-        Boxes of the mean view, one axis each.
+        Regions of the mean, one axis each.
     """
     found = []
     for axes in dict.fromkeys(region["axes"] for region in regions):
         mine = [region for region in regions if region["axes"] == axes]
-        if len(mine) > _STEPS:
+        if len(mine) > MAX_MEAN_REGIONS:
             largest = max(mine, key=lambda region: abs(region["z"]))
             begin, end = (
                 min(region["begin"] for region in mine),

@@ -1,1 +1,1 @@
-"""What a diagnosis says: evidence on held-out time, surfaces, sentences, and the tables of the contract."""
+"""Write a diagnosis: attribution, evidence, verdict, tables, text and surfaces."""

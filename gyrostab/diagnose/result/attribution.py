@@ -1,4 +1,4 @@
-"""Which named effect accounts for which mismatch: the same view with the effects in the model, where they are in the same place."""
+"""Attribute each mismatch to the named effects that explain it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
-from gyrostab.diagnose.identify.forward_search import Identification
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.condition import Component, find_anomalous_blocks, mean_columns
-from gyrostab.diagnose.result.attribution_weights import Scores, left_of, needed, statistic_scores
+from gyrostab.diagnose.result.attribution_weights import (
+    Scores,
+    needed_effects,
+    score_left,
+    statistic_scores,
+)
 
-__all__ = ["active_spans", "attribute_mismatches", "spans", "unexpected"]
+__all__ = ["active_blocks", "attribute_mismatches", "drop_expected", "join_blocks"]
 
 Array = NDArray[np.float64]
-#: Where an effect shows -> views of mismatches that it can explain; "model" ones are looked at
-#: again with the effect in the model.
-_SHOWS: dict[str, tuple[str, ...]] = {
+#: Statistic of a component -> values of `view` of the mismatches that it can explain.
+_VIEWS_SHOWN: dict[str, tuple[str, ...]] = {
     "mean": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
     "power": ("davar", "spectrum", "distribution"),
     "cross": ("cross_axis", "davar"),
@@ -33,40 +37,35 @@ _SHOWS: dict[str, tuple[str, ...]] = {
     "wander": ("mean", "davar", "restart", "cross_axis"),
     "levels": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
 }
-_MODELLED = (
-    "mean",
-    "power",
-    "cross",
-    "wander",
-    "levels",
-)  # parts that the baseline with the effects holds
-_ACTS = 0.1  # of its largest, that a contribution counts as there
-_STILL, _RESTS = (
-    0.05,
-    0.05,
-)  # of the largest, that is as good as nothing, and share of the blocks that must be so
-_MEETS = 0.3  # of the shorter of effect and mismatch
-_MOST_SPANS = 6
-_BESIDE, _SHARP = (
-    3,
-    0.02,
-)  # lines beside a strong one, and share of its frequency, that belong to it
-_BUMP, _WIDE = 0.371, 4.0
-_MOVES = (
-    "mean",
-    "levels",
-)  # parts that may move the rate within a block, which is power there and at the lowest lines
-_MOVED = 0.1  # of the largest step from block to block
+#: Statistics of the components that the baseline with the effects contains.
+_MODELLED = ("mean", "power", "cross", "wander", "levels")
+#: Statistics that may move the rate within a block, which is power at its lowest lines.
+_MOVING = ("mean", "levels")
+# Shares of the largest contribution of an effect; choices that separate acting from resting.
+ACTIVE_SHARE = 0.1  # a contribution above it counts as acting
+REST_SHARE = 0.05  # a contribution below it counts as resting
+MIN_REST_BLOCK_SHARE = 0.05  # share of the blocks at rest that makes zero the level of rest
+MOVING_STEP_SHARE = 0.1  # of the largest step between blocks, above which the rate moves within one
+MIN_OVERLAP_SHARE = 0.3  # of the shorter of effect and mismatch, above which they coincide
+MAX_SPANS = 6  # more intervals than that are reported as the whole record
+# Lines next to a strong one, and share of its frequency, that belong to it.
+LINE_REACH_BINS = 3
+LINE_REACH_SHARE = 0.02  # of the frequency
+SINE_TAU_CYCLES = 0.371  # tau * f where the Allan variance of a sine is largest
+TAU_REACH_FACTOR = 4.0  # averaging times around that maximum at which a line still shows
 
 
-def active_spans(identification: Identification, blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Blocks in which an effect does something, from its designs and from the turning of the tool; all where neither depends on time."""
+def active_blocks(identification: Identification, blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Return the blocks in which an effect acts, from its designs and the rotation of the tool.
+
+    These are all blocks when neither depends on time.
+    """
     block_count = blocks.sizes["block"]
     there = np.zeros(block_count, bool)
     for component in identification.components:
         design = component.variant.design
         if component.candidate.statistic == "order":
-            there |= _turning(blocks)
+            there |= _rotating_blocks(blocks)
             continue
         if (
             component.candidate.statistic not in ("mean", "power", "cross", "wander")
@@ -77,31 +76,37 @@ def active_spans(identification: Identification, blocks: xr.Dataset) -> NDArray[
         if not place:
             return np.ones(block_count, bool)
         size = np.asarray(np.moveaxis(np.asarray(design), place[0], 0).reshape(block_count, -1))
-        size = np.abs(size - _rest(size) if component.candidate.statistic == "mean" else size)
+        size = np.abs(size - _rest_level(size) if component.candidate.statistic == "mean" else size)
         largest = np.nanmax(size, axis=0, initial=0.0)
-        there |= (size > _ACTS * np.where(largest > 0, largest, np.inf)).any(axis=1)
+        there |= (size > ACTIVE_SHARE * np.where(largest > 0, largest, np.inf)).any(axis=1)
     return there if there.any() else np.ones(block_count, bool)
 
 
-def _rest(size: Array) -> Array:
-    """Level of every column (block, column) at rest: zero where it stays there for a while, else its median, for the constant is free."""
-    still = np.abs(size) <= _STILL * np.nanmax(np.abs(size), axis=0, initial=0.0)
-    return np.where(still.mean(axis=0) >= _RESTS, 0.0, np.median(size, axis=0))
+def _rest_level(size: Array) -> Array:
+    """Return the level of every column (block, column) at rest.
+
+    It is zero where the column stays near zero for a while; else the median, because the constant
+    is free.
+    """
+    still = np.abs(size) <= REST_SHARE * np.nanmax(np.abs(size), axis=0, initial=0.0)
+    return np.where(still.mean(axis=0) >= MIN_REST_BLOCK_SHARE, 0.0, np.median(size, axis=0))
 
 
-def _turning(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Blocks in which the tool turns: those that the harmonics of its turning are measured in."""
+def _rotating_blocks(blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Return the blocks in which the tool rotates: its harmonics are measured in these."""
     turn = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values))
-    return np.asarray(turn > _STILL * turn.max(initial=0.0))
+    return np.asarray(turn > REST_SHARE * turn.max(initial=0.0))
 
 
-def spans(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[float, float]]:
-    """Stretches of time [s] in which it is true, short pauses bridged; the whole record where it comes and goes all the time.
+def join_blocks(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[float, float]]:
+    """Join blocks to stretches of time [s], with short pauses bridged.
+
+    An intermittent effect with many stretches gets the whole record.
 
     Examples
     --------
     >>> t = np.arange(10.0)
-    >>> spans(np.array([0, 0, 1, 1, 1, 0, 0, 0, 0, 0], bool), t, t + 1)
+    >>> join_blocks(np.array([0, 0, 1, 1, 1, 0, 0, 0, 0, 0], bool), t, t + 1)
     [(2.0, 5.0)]
     """
     if there.mean() > 0.9:
@@ -115,7 +120,7 @@ def spans(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[floa
             joined[-1][1] = stop
         else:
             joined.append([first, stop])
-    if len(joined) > _MOST_SPANS:
+    if len(joined) > MAX_SPANS:
         return [(float(begin[0]), float(end[-1]))]
     return [(float(begin[first]), float(end[stop - 1])) for first, stop in joined]
 
@@ -131,36 +136,36 @@ def attribute_mismatches(
     without: Callable[[Sequence[Identification]], xr.Dataset] | None = None,
     still: xr.Dataset | None = None,
 ) -> list[list[str]]:
-    """Effects that explain each mismatch.
+    """Find the effects that explain each mismatch.
 
-    An effect explains it when it acts on one of its axes at its time and can show in its view; and
-    where the baseline with the effects holds what it does there, when the mismatch is gone with
-    that baseline, or nearly so, and takes this effect for it. A mismatch of the mean may also stand
-    before or after what an effect does, where that is what the mean differs from. Where an effect
-    moves the rate within blocks, these blocks have more power than the noise, and the lines more at
-    their low end.
+    An effect explains a mismatch when it acts on one of its axes at its time and can show in its
+    statistic. If the baseline with the effects contains what the effect does there, two more
+    conditions apply: the mismatch is gone with that baseline, or nearly so, and this effect is
+    needed for that. A mismatch of the mean may also lie before or after the effect, when the effect
+    causes the difference. In blocks within which an effect moves the rate, power and the lowest
+    lines exceed the noise; the effect explains these too.
 
     Parameters
     ----------
     found : xarray.Dataset
-        From `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
-    identified : sequence of Claim
+        Mismatches from `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
+    identified : sequence of Identification
     blocks, after : xarray.Dataset
         The recording, and the baseline with the effects.
     null : NullScores
-        What was found is measured by.
+        Scores of the null records.
     level : float
         False-alarm level.
     without : callable, optional
-        Gives the baseline with the effects but for some of them, at the sizes that they have beside
-        these. Without it every effect that is in the place of a mismatch is said to explain it.
+        Returns the baseline with the effects except those given, at the sizes of the joint fit.
+        Without it, every effect at the place of a mismatch explains it.
     still : xarray.Dataset, optional
-        Has the line spectra of the recording without the blocks in which an effect moves the rate.
+        Line spectra of the recording without the blocks in which an effect moves the rate.
 
     Returns
     -------
     list of list of str
-        Names, for each mismatch.
+        Names of effects, for each mismatch.
     """
     regions = [
         {str(name): found[name].values[number] for name in found.data_vars}
@@ -182,17 +187,17 @@ def attribute_mismatches(
                 if number not in chosen
             ]
             known[chosen] = statistic_scores(blocks, without(out), null, regions, rest, still=still)
-        return left_of(region, known[chosen], null, level)
+        return score_left(region, known[chosen], null, level)
 
-    when = [_reach(identification, blocks) for identification in identified]
-    moves = [_moves(identification, blocks, after) for identification in identified]
+    when = [_explained_spans(identification, blocks) for identification in identified]
+    moves = [_moving_spans(identification, blocks, after) for identification in identified]
     told = []
     for region in regions:
-        score, limit = left_of(region, scores, null, level)
+        score, limit = score_left(region, scores, null, level)
         shown = []
         for identification, its_time, its_moves in zip(identified, when, moves, strict=True):
-            moved = _is_inside(region, blocks) and any(
-                _overlap(region, span) > 0.0 for span in its_moves
+            moved = _is_within_blocks(region, blocks) and any(
+                _overlap_seconds(region, span) > 0.0 for span in its_moves
             )
             components = [
                 component
@@ -203,27 +208,29 @@ def attribute_mismatches(
                 component
                 for component in components
                 if moved
-                or component.candidate.statistic not in _MOVES
+                or component.candidate.statistic not in _MOVING
                 or region["view"] != "spectrum"
             ]
             if not components or not set(str(region["axes"]).split()) & set(identification.axes):
                 continue
             if score >= limit and {
                 component.candidate.statistic for component in components
-            } <= _modelled(identification, region):
+            } <= _modelled_statistics(identification, region):
                 continue
             if (
                 moved
-                or any(_meet(region, span) for span in its_time)
+                or any(_is_coincident(region, span) for span in its_time)
                 or (
                     without is not None
-                    and _beside(region, components, partial(left, region, (identification,)))
+                    and _is_caused_elsewhere(
+                        region, components, partial(left, region, (identification,))
+                    )
                 )
             ):
                 shown.append((identification, components))
         several = without is not None and score < limit
         kept = (
-            needed(region, shown, partial(left, region))
+            needed_effects(region, shown, partial(left, region))
             if several
             else [identification for identification, _ in shown]
         )
@@ -231,7 +238,7 @@ def attribute_mismatches(
     return told
 
 
-def unexpected(
+def drop_expected(
     found: xr.Dataset,
     expected: Sequence[Identification],
     blocks: xr.Dataset,
@@ -240,14 +247,14 @@ def unexpected(
     *,
     level: float,
 ) -> xr.Dataset:
-    """Mismatches without those that effects explain which the simulation has as well.
+    """Drop the mismatches that effects of the simulation itself explain.
 
     Parameters
     ----------
     found : xarray.Dataset
-        Located where odd samples that are expected were left out; so these explain what is odd and
-        no more.
-    expected : sequence of Claim
+        Mismatches located with the expected anomalous samples left out. Effects with such samples
+        therefore explain mismatches of the sample distribution only.
+    expected : sequence of Identification
     blocks, before : xarray.Dataset
         The recording, and the baseline with these effects.
     null : NullScores
@@ -274,15 +281,15 @@ def unexpected(
     return found.isel(mismatch=~np.array(told, np.bool_)) if expected else found
 
 
-def _beside(
+def _is_caused_elsewhere(
     region: Mapping[str, Any],
     components: Sequence[Component],
     left: Callable[[], tuple[float, float]],
 ) -> bool:
-    """Whether a mismatch of the mean is there for what an effect does at other times.
+    """Return whether a mismatch of the mean is due to what an effect does at other times.
 
-    The constant of a record is free: a mean that is higher in one part is one that is lower in the
-    rest, and either may stand out.
+    The constant of a record is free: a mean that is higher in one part is lower in the rest, and
+    either may be the mismatch.
     """
     if str(region["view"]) != "mean" or not {
         component.candidate.statistic for component in components
@@ -295,8 +302,11 @@ def _beside(
     return score >= limit
 
 
-def _modelled(identification: Identification, region: Mapping[str, Any]) -> set[str]:
-    """Parts that must take the mismatch away; that several axes wander as one is in no model, and what wanders on them may do it."""
+def _modelled_statistics(identification: Identification, region: Mapping[str, Any]) -> set[str]:
+    """Return the statistics of components whose effect on a mismatch the baseline contains.
+
+    Several axes that wander together are in no model, so that a wandering effect may explain that.
+    """
     held = {*_MODELLED, "line", "marks"} if region["view"] == "cross_axis" else set(_MODELLED)
     wanders = (
         str(region["what"]) == "slow"
@@ -306,12 +316,11 @@ def _modelled(identification: Identification, region: Mapping[str, Any]) -> set[
 
 
 def _can_show(component: Component, region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
-    """Whether a part of an effect can be seen where a mismatch is.
+    """Return whether a component of an effect can show in a mismatch.
 
-    A line explains a line at its own frequency only, and a mean of what axes share only what is
-    slow.
+    A line explains only a line at its own frequency, and a mean in common only slow covariance.
     """
-    if str(region["view"]) not in _SHOWS.get(component.candidate.statistic, ()):
+    if str(region["view"]) not in _VIEWS_SHOWN.get(component.candidate.statistic, ()):
         return False
     if (
         component.candidate.statistic in ("mean", "wander", "levels")
@@ -331,43 +340,49 @@ def _can_show(component: Component, region: Mapping[str, Any], blocks: xr.Datase
     mine = float(lines[component.place])
     if np.isfinite(region["frequency"]):
         return bool(
-            abs(region["frequency"] - mine) <= _BESIDE * (lines[1] - lines[0]) + _SHARP * mine
+            abs(region["frequency"] - mine)
+            <= LINE_REACH_BINS * (lines[1] - lines[0]) + LINE_REACH_SHARE * mine
         )
-    tau = _BUMP / mine  # where the Allan variance of a sine is largest
-    return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
-        region["tau_min_s"] / _WIDE <= tau <= region["tau_max_s"] * _WIDE
+    tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
+    return str(region["what"]).startswith(("avar", "level", "restless")) and bool(
+        region["tau_min_s"] / TAU_REACH_FACTOR <= tau <= region["tau_max_s"] * TAU_REACH_FACTOR
     )
 
 
-def _reach(identification: Identification, blocks: xr.Dataset) -> list[tuple[float, float]]:
-    """Stretches whose mismatches an effect can explain: a line of the turning stands out also where a part turns but little."""
+def _explained_spans(
+    identification: Identification, blocks: xr.Dataset
+) -> list[tuple[float, float]]:
+    """Return the stretches whose mismatches an effect can explain.
+
+    A line locked to the rotation shows also in parts that rotate only a little.
+    """
     begin, end = blocks["begin"].values, blocks["end"].values
     if any(component.candidate.statistic == "order" for component in identification.components):
         return [(float(begin[0]), float(end[-1]))]
-    return spans(active_spans(identification, blocks), begin, end)
+    return join_blocks(active_blocks(identification, blocks), begin, end)
 
 
-def _meet(region: Mapping[str, Any], span: tuple[float, float]) -> bool:
-    return _overlap(region, span) >= _MEETS * min(
+def _is_coincident(region: Mapping[str, Any], span: tuple[float, float]) -> bool:
+    return _overlap_seconds(region, span) >= MIN_OVERLAP_SHARE * min(
         float(region["end"] - region["begin"]), span[1] - span[0]
     )
 
 
-def _overlap(region: Mapping[str, Any], span: tuple[float, float]) -> float:
+def _overlap_seconds(region: Mapping[str, Any], span: tuple[float, float]) -> float:
     return float(min(region["end"], span[1]) - max(region["begin"], span[0]))
 
 
-def _is_inside(region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
-    """Whether a mismatch is of the inside of blocks, and not of their means."""
+def _is_within_blocks(region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
+    """Return whether a mismatch concerns the inside of blocks rather than their means."""
     return str(region["view"]) in ("spectrum", "distribution") or float(
         region["tau_max_s"]
     ) < float(blocks.attrs["block_s"])
 
 
-def _moves(
+def _moving_spans(
     identification: Identification, blocks: xr.Dataset, after: xr.Dataset
 ) -> list[tuple[float, float]]:
-    """Blocks [s] in which an effect moves the rate of an axis too fast for what is said of their inside."""
+    """Return the blocks [s] in which an effect moves the rate of an axis within the block."""
     axes, moving = (
         [str(axis) for axis in blocks["axis"].values],
         expect_known_motion(blocks, after),
@@ -376,12 +391,12 @@ def _moves(
     for component in (
         component
         for component in identification.components
-        if component.candidate.statistic in _MOVES and component.variant.design.size
+        if component.candidate.statistic in _MOVING and component.variant.design.size
     ):
         row = axes.index(component.row[0])
         for column in mean_columns(component.variant, row):
             step = np.abs(np.diff(np.nan_to_num(column)))
-            far = step > _MOVED * step.max(initial=0.0)
+            far = step > MOVING_STEP_SHARE * step.max(initial=0.0)
             there |= moving[row] & (np.append(far, False) | np.append(False, far))
     return [
         (float(blocks["begin"].values[block]), float(blocks["end"].values[block]))

@@ -1,4 +1,4 @@
-"""What is left of a mismatch with the effects in the model, and which of them it takes for that."""
+"""Find which effects are needed to explain a mismatch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import remove_known_motion
 from gyrostab.diagnose.identify.identification import Identification
-from gyrostab.diagnose.locate.mismatches import louder
+from gyrostab.diagnose.locate.mismatches import find_level_regions
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.condition import Component, drop_changed_tails, mask_anomalous_blocks
 from gyrostab.diagnose.predict.filter_response import is_filter
@@ -19,12 +19,12 @@ from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.variance_stability import scale_to_expected
 
-__all__ = ["Scores", "left_of", "needed", "statistic_scores"]
+__all__ = ["Scores", "needed_effects", "score_left", "statistic_scores"]
 
 Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
-Box = Mapping[str, Any]
+Region = Mapping[str, Any]
 #: View of a mismatch -> parts of effects of which it holds what they bring there.
-_WEIGHED: dict[str, tuple[str, ...]] = {
+_STATISTICS_CONTAINED: dict[str, tuple[str, ...]] = {
     "davar": (
         "mean",
         "levels",
@@ -41,25 +41,25 @@ _WEIGHED: dict[str, tuple[str, ...]] = {
     "cross_axis": ("mean", "levels", "cross", "line", "marks"),
     "distribution": ("power",),
 }
-_OF_LINES = ("spectral_line", "drifting_line")  # views of the spectrum at full resolution
-_LEFT = 0.3  # of a mismatch, that an error of the form may leave
-_FAIR = 0.5  # of an equal share
+_LINE_STATISTICS = ("spectral_line", "drifting_line")  # of the spectrum at full resolution
+MODEL_ERROR_SHARE = 0.3  # of the score of a mismatch, that an error of an effect's form may leave
+FAIR_SHARE = 0.5  # of an equal share, from which on an effect is needed; see `needed_effects`
 
 
 def statistic_scores(
     blocks: xr.Dataset,
     after: xr.Dataset,
     null: NullScores,
-    regions: Sequence[Box],
+    regions: Sequence[Region],
     identified: Iterable[Identification] = (),
     *,
     still: xr.Dataset | None = None,
 ) -> Scores:
-    """Views of the recording against a baseline with effects in it.
+    """Score the recording against a baseline with effects.
 
-    What is said of blocks leaves out those of odd samples of `identified`, and what is said of their
-    inside those in which an effect moves the rate; so do the lines of `still`, which are those of
-    `blocks` by default.
+    Statistics of whole blocks leave out those with anomalous samples of `identified`, and
+    statistics of their inside those in which an effect moves the rate. The line statistics use the
+    lines of `still`, by default those of `blocks`.
     """
     out = []
     blocks = remove_known_motion(blocks, after)
@@ -73,11 +73,12 @@ def statistic_scores(
     )
     special = {
         "sample_counts": turns_left_out,
-        "variance_stability": scale_to_expected(seen, after, louder(regions)),
+        "variance_stability": levelled(seen, after, find_level_regions(regions)),
     }
     if still is not None:
         special |= dict.fromkeys(
-            _OF_LINES, seen.assign({name: still[name] for name in ("line_power", "line_weight")})
+            _LINE_STATISTICS,
+            seen.assign({name: still[name] for name in ("line_power", "line_weight")}),
         )
     for name, score in STATISTICS.items():
         scores = score(special.get(name, seen), after) if name in null.statistics else None
@@ -89,9 +90,10 @@ def statistic_scores(
 def _with_shared_lines(
     blocks: xr.Dataset, after: xr.Dataset, identified: Sequence[Identification]
 ) -> xr.Dataset:
-    """The baseline with the covariance of a line that axes have in common: its mean over the record, in the bands where the line is.
+    """Return the baseline with the covariance of lines that axes have in common.
 
-    The lowest band stays as it is, for it tells what the means of the blocks share.
+    It is the mean over the record, in the bands where the line is. The lowest band is unchanged,
+    because it shows what the block means have in common.
     """
     lines = [
         (component.place, component.row[0])
@@ -133,8 +135,10 @@ def _with_shared_lines(
     return after.assign(cross=(("pair", "block", "band"), cross))
 
 
-def left_of(region: Box, scores: Scores, null: NullScores, level: float) -> tuple[float, float]:
-    """Largest score where the mismatch was, and the score from which on that is one still."""
+def score_left(
+    region: Region, scores: Scores, null: NullScores, level: float
+) -> tuple[float, float]:
+    """Return the largest score left at a mismatch, and the score that still makes it one."""
     left, limit = 0.0, np.inf
     for name, statistic, z in scores:
         if (
@@ -157,32 +161,35 @@ def left_of(region: Box, scores: Scores, null: NullScores, level: float) -> tupl
         cells = np.abs(z[np.ix_(rows, inside, columns)])
         if np.isfinite(cells).any():
             left = max(left, float(np.nanmax(cells)))
-            limit = min(limit, max(null.critical(name, level), _LEFT * abs(float(region["z"]))))
+            limit = min(
+                limit, max(null.critical(name, level), MODEL_ERROR_SHARE * abs(float(region["z"])))
+            )
     return left, limit
 
 
-def needed(
-    region: Box,
+def needed_effects(
+    region: Region,
     shown: Sequence[tuple[Identification, Sequence[Component]]],
     left: Callable[[Sequence[Identification]], tuple[float, float]],
 ) -> list[Identification]:
-    """Those of the effects in the place of a mismatch that it takes to explain it.
+    """Select the effects that are needed to explain a mismatch.
 
-    It takes an effect without which alone the mismatch would be one again. Of several that do the
-    same, none is so: it takes each that brings half of an equal share or more of what all of them
-    take off the largest score. What brings less could be larger or smaller by its own size, and the
-    mismatch would be gone all the same. An effect of which a view does not hold what it brings
-    stays, and so does the one that brings most.
+    An effect is needed when the mismatch returns without it. When several effects do the same,
+    none is needed in this sense. Therefore each that contributes half of an equal share or more of
+    what they all take off the largest score counts as needed too. An effect that contributes less
+    could be larger or smaller within its error, and the mismatch would be gone all the same. An
+    effect whose contribution the statistic does not contain stays, and so does the largest
+    contributor.
 
     Parameters
     ----------
     region : mapping
         The mismatch, with the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
-    shown : sequence of (Claim, sequence of Part)
-        Effects that act there and together leave nothing of it, each with its parts that can show
-        in its view.
+    shown : sequence of (Identification, sequence of Component)
+        Effects that act there and together remove it, each with its components that can show in its
+        statistic.
     left : callable
-        The score that is left there when some effects are left out, and the score of a mismatch.
+        Takes effects to leave out; returns the score that is left, and the score of a mismatch.
     """
     weighed = [
         one
@@ -194,7 +201,7 @@ def needed(
     whole = left(())[0]
     brought = left(weighed)[0] - whole
     without = [left((one,)) for one in weighed]
-    fair = _FAIR * brought / len(shown)
+    fair = FAIR_SHARE * brought / len(shown)
     kept = [
         number
         for number, (score, limit) in enumerate(without)
@@ -206,8 +213,11 @@ def needed(
     return [one for one, _ in shown if id(one) not in dropped]
 
 
-def _is_weighed(component: Component, region: Box) -> bool:
-    """Whether a view holds what a part brings; a low-pass may be in the noise of the baseline by now."""
-    return component.candidate.statistic in _WEIGHED.get(str(region["view"]), ()) and not is_filter(
-        component.candidate.statistic, component.variant
-    )
+def _is_weighed(component: Component, region: Region) -> bool:
+    """Return whether a statistic contains what a component contributes.
+
+    A low-pass may be in the noise of the baseline already.
+    """
+    return component.candidate.statistic in _STATISTICS_CONTAINED.get(
+        str(region["view"]), ()
+    ) and not is_filter(component.candidate.statistic, component.variant)

@@ -1,4 +1,4 @@
-"""From names to a result: fit the effects, see what they are worth and what is left, and put it all together."""
+"""Turn identified effects into a diagnosis: fit them, measure their evidence, write all tables."""
 
 from __future__ import annotations
 
@@ -12,21 +12,20 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.expected_effects import expected_baseline, fit_expected
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.estimate.outlier_power import add_outlier_power
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.identify.forward_search import Identifications
-from gyrostab.diagnose.identify.identification import Identification
-from gyrostab.diagnose.identify.phase_locked import without_waves
+from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.phase_locked import remove_phase_locked
 from gyrostab.diagnose.identify.switching import remove_telegraph_bias
 from gyrostab.diagnose.predict.channel_use import unused_channels
-from gyrostab.diagnose.predict.condition import mask_anomalous_blocks
-from gyrostab.diagnose.result.attribution import active_spans, attribute_mismatches
+from gyrostab.diagnose.predict.condition import Component, mask_anomalous_blocks
+from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
 from gyrostab.diagnose.result.diagnosis import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
-from gyrostab.diagnose.result.held_out import forecast_from, held_out
+from gyrostab.diagnose.result.held_out import held_out, select_forecast_start
 from gyrostab.diagnose.result.size_gate import keep_supported
 from gyrostab.diagnose.result.surfaces import make_surfaces
 from gyrostab.diagnose.result.tables import (
@@ -42,23 +41,23 @@ from gyrostab.diagnose.result.tables import (
     unidentified_tables,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
-from gyrostab.diagnose.task import Compared, Task, still_lines
+from gyrostab.diagnose.task import Comparison, Task, lines_without_motion
 from gyrostab.simulate.model import Model
 
-__all__ = ["Fit", "finish_diagnosis", "fit_supported", "fitted_beside_their_noise", "worth"]
+__all__ = ["Fit", "finish_diagnosis", "fit_supported", "measure_evidence", "refit_with_noise"]
 
 
 class Fit(NamedTuple):
-    """The effects in their final numbers.
+    """The effects with their final sizes.
 
     Attributes
     ----------
-    identifications : Naming
+    identifications : Identifications
         With designs for the noise below.
     noise : xarray.Dataset
-        The baseline with the noise as it is beside the effects.
+        The baseline with the noise that the effects leave.
     fitted, expected : list of Fitted
-        Effects that the simulation lacks, and those that it has as well.
+        Effects that the simulation lacks, and those that it already contains.
     """
 
     identifications: Identifications
@@ -67,15 +66,17 @@ class Fit(NamedTuple):
     expected: list[Fitted]
 
 
-def finish_diagnosis(task: Task, compared: Compared, begun: float) -> Diagnosis:
-    """Fit what was named, see what it is worth and what is left, and put it all into one result."""
-    blocks, baseline = compared.blocks, compared.baseline
-    identifications, first, fit = fit_supported(compared.identifications, baseline)
+def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diagnosis:
+    """Fit the identified effects, measure their evidence, and attribute the mismatches."""
+    blocks, baseline = comparison.blocks, comparison.baseline
+    identifications, first, fit = fit_supported(comparison.identifications, baseline)
     before = expected_baseline(fit.identifications, baseline)
-    after = predicted(fit.identifications, fit.noise) if identifications.identified else before
-    mismatches = _mismatches(task, compared, fit, after)
+    after = (
+        predict_baseline(fit.identifications, fit.noise) if identifications.identified else before
+    )
+    mismatches = _attributed_mismatches(task, comparison, fit, after)
     unexplained = [region["id"] for region in mismatches if not region["explained_by"]]
-    held = worth(blocks, baseline, identifications, first)
+    held = measure_evidence(blocks, baseline, identifications, first)
     content = {
         "schema": SCHEMA,
         "recording": recording_table(blocks),
@@ -88,12 +89,12 @@ def finish_diagnosis(task: Task, compared: Compared, begun: float) -> Diagnosis:
         "not_found": limit_tables(find_upper_limits(fit.identifications)),
         "unused_channels": unused_channels(blocks, _used_channels(fit.identifications)),
         "held_out": {name: held[name] for name in HELD_OUT},
-        "seconds": round(time.perf_counter() - begun, 3),
+        "seconds": round(time.perf_counter() - started, 3),
     }
-    own = task.given if isinstance(task.given, Model) else None
+    own = task.simulation if isinstance(task.simulation, Model) else None
     diagnosis = Diagnosis(
         plain(content),
-        _surfaces(blocks, fit, before, after),
+        _make_surfaces_with_outliers(blocks, fit, before, after),
         model_tables(fit.noise, fit.fitted, own),
     )
     check_diagnosis(diagnosis.content)
@@ -101,29 +102,33 @@ def finish_diagnosis(task: Task, compared: Compared, begun: float) -> Diagnosis:
 
 
 def _used_channels(identifications: Identifications) -> set[str]:
-    """Channels that some effect could follow, or was compared with."""
-    return {name for one in identifications.candidates for name in (*one.driver, *one.witness)}
+    """Return the channels that an effect could follow, or was compared with."""
+    return {
+        name
+        for candidate in identifications.candidates
+        for name in (*candidate.driver, *candidate.witness)
+    }
 
 
 def fit_supported(
     identifications: Identifications, baseline: xr.Dataset
 ) -> tuple[Identifications, list[Fitted], Fit]:
-    """Fit the effects until each that is left has a size away from zero.
+    """Fit the effects, and drop those whose size may be zero, until none is left to drop.
 
     Returns
     -------
-    identifications : Naming
+    identifications : Identifications
         Without the effects whose size may be zero.
     first : list of Fitted
-        Their numbers beside the noise of `baseline`.
+        Sizes with the noise of `baseline`.
     fit : Fit
-        Their numbers beside the noise that they leave.
+        Sizes with the noise that the effects leave.
     """
     while True:
         first = fit_identifications(identifications, baseline)
-        fit = fitted_beside_their_noise(identifications, baseline, first)
+        fit = refit_with_noise(identifications, baseline, first)
         numbers = [
-            [one for one in fit.fitted if one.identification is identification]
+            [fitted for fitted in fit.fitted if fitted.identification is identification]
             for identification in fit.identifications.identified
         ]
         kept = keep_supported(identifications, numbers)
@@ -132,10 +137,10 @@ def fit_supported(
         identifications = kept
 
 
-def fitted_beside_their_noise(
+def refit_with_noise(
     identifications: Identifications, baseline: xr.Dataset, first: list[Fitted]
 ) -> Fit:
-    """Calibrate the noise beside the effects as they were fitted `first`, and fit them once more to what is left."""
+    """Calibrate the noise with the effects of the `first` fit in the model, and fit them again."""
     noise = recalibrate(identifications, baseline, first)
     if noise is baseline:
         return Fit(identifications, baseline, first, fit_expected(identifications, baseline))
@@ -148,81 +153,89 @@ def fitted_beside_their_noise(
     )
 
 
-def worth(
+def measure_evidence(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
     identifications: Identifications,
     first: Sequence[Fitted],
 ) -> dict[str, float]:
-    """What the effects gain on time that they were not fitted to, each by the views that can tell; the noise is fitted with them."""
-    told, hopping = remove_telegraph_bias(identifications)
-    judged, waving = without_waves(told)
+    """Measure what the effects gain on held-out data, with the noise fitted together with them.
 
-    def trained(chosen: Identifications, known: NDArray[np.bool_]) -> xr.Dataset:
-        own = recalibrate(chosen, baseline, first, known)
-        return predicted(with_noise(chosen, own), own, known)
-
-    components = [
-        component for identification in told.identified for component in identification.components
-    ]
-    odd = sum(
+    The likelihood of `held_out` is that of means, powers and cross-spectra. Sample counts,
+    telegraph biases and phase-locked components are in none of these: their evidence is added.
+    """
+    without_telegraph, telegraph_nats = remove_telegraph_bias(identifications)
+    judged, phase_locked_nats = remove_phase_locked(without_telegraph)
+    identified = without_telegraph.identified
+    count_nats = sum(
         component.evidence_nats
-        for component in components
+        for component in _components(identified)
         if component.candidate.statistic == "marks"
-    )  # no other number has them
-    clean = mask_anomalous_blocks(
-        blocks,
-        [
-            *components,
-            *(
-                component
-                for identification in told.expected
-                for component in identification.components
-            ),
-        ],
     )
-    start = partial(expected_baseline, told, baseline) if told.expected else baseline
-    whole, rest = (partial(trained, one) if one.identified else start for one in (told, judged))
-    later = tuple(
+    clean = mask_anomalous_blocks(
+        blocks, [*_components(identified), *_components(without_telegraph.expected)]
+    )
+
+    def train(chosen: Identifications, known: NDArray[np.bool_]) -> xr.Dataset:
+        noise = recalibrate(chosen, baseline, first, known)
+        return predict_baseline(with_noise(chosen, noise), noise, known)
+
+    before = (
+        partial(expected_baseline, without_telegraph, baseline)
+        if without_telegraph.expected
+        else baseline
+    )
+    after = partial(train, judged) if judged.identified else before
+    with_phase_locked = partial(train, without_telegraph) if identified else before
+    lasting = tuple(
         identification
         for identification in judged.identified
         if _can_be_forecast(identification, blocks)
     )
-    forecast = partial(trained, replace(judged, identified=later)) if later else start
-    found = held_out(
+    evidence = held_out(
         clean,
-        start,
-        rest,
-        more_gain=odd + hopping + waving,
-        shown=whole if waving else None,
-        forecast=forecast,
+        before,
+        after,
+        more_gain=count_nats + telegraph_nats + phase_locked_nats,
+        shown=with_phase_locked if phase_locked_nats else None,
+        forecast=partial(train, replace(judged, identified=lasting)) if lasting else before,
     )
-    return found if later or not told.identified else found | {"forecast_gain": np.nan}
+    if identified and not lasting:
+        evidence["forecast_gain"] = np.nan  # no effect can be forecast
+    return evidence
+
+
+def _components(identified: Sequence[Identification]) -> list[Component]:
+    return [component for identification in identified for component in identification.components]
 
 
 def _can_be_forecast(identification: Identification, blocks: xr.Dataset) -> bool:
-    """Return whether an effect acts both in the time that a forecast is fitted to and in the time that it predicts.
+    """Return whether an effect acts both before and after the time that a forecast begins from.
 
-    The size of an event in the last part is not known before, and one that is over says nothing of
-    later. Counts of odd samples are in neither means nor powers, which the forecast predicts.
+    The size of an event in the last part is unknown before, and an event that is over does not
+    affect the last part. Sample counts are in neither means nor powers, which are forecast.
     """
     if {component.candidate.statistic for component in identification.components} <= {"marks"}:
         return False
-    acts, known = active_spans(identification, blocks), forecast_from(blocks)
+    acts, known = active_blocks(identification, blocks), select_forecast_start(blocks)
     return bool(acts[known].any() and acts[~known].any())
 
 
-def _mismatches(
-    task: Task, compared: Compared, fit: Fit, after: xr.Dataset
+def _attributed_mismatches(
+    task: Task, comparison: Comparison, fit: Fit, after: xr.Dataset
 ) -> list[dict[str, Any]]:
-    """Places beyond chance and those of what was named, each with the effects that explain it."""
-    blocks, found, identified = compared.blocks, compared.found, fit.identifications.identified
+    """Return the mismatches that were located or identified, each with what explains it."""
+    blocks, found, identified = (
+        comparison.blocks,
+        comparison.mismatches,
+        fit.identifications.identified,
+    )
 
     def without(left_out: Sequence[Identification]) -> xr.Dataset:
-        return predicted(fit.identifications, fit.noise, left_out=left_out)
+        return predict_baseline(fit.identifications, fit.noise, left_out=left_out)
 
     lines = (
-        still_lines(task, blocks, after)
+        lines_without_motion(task, blocks, after)
         if identified and (found["view"] == "spectrum").any()
         else None
     )
@@ -231,7 +244,7 @@ def _mismatches(
         identified,
         blocks,
         after,
-        compared.null,
+        comparison.null,
         level=task.level / 2.0,
         without=without,
         still=lines,
@@ -242,8 +255,10 @@ def _mismatches(
     return mismatches + motion_tables(identified, blocks, mismatches)
 
 
-def _surfaces(blocks: xr.Dataset, fit: Fit, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
-    """The recording beside the simulation without and with the effects, odd samples in both of them as they are in the recording."""
+def _make_surfaces_with_outliers(
+    blocks: xr.Dataset, fit: Fit, before: xr.Dataset, after: xr.Dataset
+) -> xr.Dataset:
+    """Return the surfaces with the power of outliers in both simulations."""
     before = add_outlier_power(before, blocks, fit.expected)
     after = add_outlier_power(after, blocks, [*fit.expected, *fit.fitted])
     return surfaces_with_blocks(make_surfaces(blocks, before, after), blocks, before, after)

@@ -13,30 +13,30 @@ from gyrostab.physics.registry import effects
 
 __all__ = ["has_zero", "keep_supported", "supported_axes"]
 
-#: View of a part of an effect -> nuisance alternative that its unexplained rest is reported as.
-_REST = {
+#: Statistic of a component -> nuisance alternative that its unexplained rest is reported as.
+_NUISANCE_ALTERNATIVE_OF = {
     "mean": "~bias(t)", "levels": "~bias(t)", "wander": "~red", "power": "~N(t)", "cross": "~cov",
     "marks": "~outliers",
 }  # fmt: skip
 
 
 def has_zero(estimate: Estimate) -> bool:
-    """Return whether the 95 % interval of a parameter holds zero, or is not known."""
+    """Return whether the 95 % interval of a parameter contains zero, or is unknown."""
     return not (estimate.low > 0.0 or estimate.high < 0.0)
 
 
 def supported_axes(fitted: Fitted) -> tuple[str, ...]:
-    """Find the axes on which a size of the effect is away from zero.
+    """Find the axes on which a size of the effect differs from zero.
 
     Parameters
     ----------
     fitted : Fitted
-        Effect with its numbers. A parameter ``name.axis`` belongs to one axis, any other to all.
+        Effect with its sizes. A parameter ``name.axis`` belongs to one axis, any other to all.
 
     Returns
     -------
     tuple of str
-        All axes when no size is measured, as for motion that has another form in every band.
+        All axes when no size is measured, as for motion with another form in every band.
     """
     sizes = effects()[fitted.identification.effect].size_parameters
     measured = {name: one for name, one in fitted.parameters.items() if name.split(".")[0] in sizes}
@@ -51,20 +51,20 @@ def supported_axes(fitted: Fitted) -> tuple[str, ...]:
 def keep_supported(
     identifications: Identifications, fitted: Sequence[Sequence[Fitted]]
 ) -> Identifications:
-    """Keep the effects whose size is away from zero, on the axes where it is.
+    """Keep the effects whose size differs from zero, on the axes where it does.
 
-    What an effect gained on the other axes stays in the naming as something unknown where that
-    is more than its threshold: it was found, but the record does not say that this effect did it.
+    What an effect gained on the other axes becomes unidentified if that exceeds its threshold:
+    something is there, but the record does not show that this effect caused it.
 
     Parameters
     ----------
-    identifications : Naming
+    identifications : Identifications
     fitted : sequence of sequence of Fitted
-        Numbers of each claim of `identifications`, in the same order.
+        Fits of each identification, in the same order.
 
     Returns
     -------
-    Naming
+    Identifications
         `identifications` itself when every effect keeps all of its axes.
     """
     identified: list[Identification] = []
@@ -88,7 +88,7 @@ def keep_supported(
         else:
             lost = identification.components
         if sum_evidence(lost) > identification.threshold:
-            unknown.append(_unsupported(identification, lost))
+            unknown.append(_make_unidentified(identification, lost))
         changed = True
     if not changed:
         return identifications
@@ -97,15 +97,17 @@ def keep_supported(
     )
 
 
-def _unsupported(identification: Identification, components: tuple[Component, ...]) -> Unidentified:
-    """Turn the parts of an effect whose size may be zero into something unknown."""
+def _make_unidentified(
+    identification: Identification, components: tuple[Component, ...]
+) -> Unidentified:
+    """Turn the components of an effect whose size may be zero into something unidentified."""
     strongest = max(components, key=lambda component: component.evidence_nats).candidate.statistic
     axes = tuple(
         axis
         for axis in identification.axes
         if any(axis in component.row for component in components)
     )
-    generic = _REST.get(strongest, "~S(f)")
+    generic = _NUISANCE_ALTERNATIVE_OF.get(strongest, "~S(f)")
     return Unidentified(
         generic,
         axes,

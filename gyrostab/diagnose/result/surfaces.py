@@ -1,4 +1,4 @@
-"""Recording, simulation before and simulation after on the same axes: what `diagnosis.nc` holds and the report draws."""
+"""Compute the surfaces of recording and simulation for `diagnosis.nc` and the report."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows
 
 __all__ = ["CASES", "make_surfaces"]
 
-#: What stands side by side.
+#: The three cases side by side: the simulation without and with the effects.
 CASES = ("recording", "before", "after")
-_WINDOW = 15  # blocks
-_MOST = 240  # windows
+WINDOW_BLOCKS = 15  # 5 min at 20 s: the length of the windows of the DAVAR in the report
+MAX_WINDOWS = 240  # columns that a page can show
 
 
 def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
-    """Lay out Allan variances and window means of the recording and of what the simulation expects without and with the effects.
+    """Compute Allan variances and window means of the recording, and of both simulations.
 
     Parameters
     ----------
@@ -34,12 +34,12 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     -------
     xarray.Dataset
         ``avar`` (case, axis, window, tau) [degree2 hour-2], case one of `CASES`; ``avar_low``,
-        ``avar_high``, where 95 % of recordings of that simulation lie (NaN for the recording
-        itself); ``mean`` (case, axis, window) [degree hour-1] and ``mean_stderr``, how far a
-        recording of that simulation may be from it; coordinates ``begin``, ``end`` [s since the
+        ``avar_high``, the band of 95 % of recordings of that simulation (NaN for the recording
+        itself); ``mean`` (case, axis, window) [degree hour-1] and ``mean_stderr``, the standard
+        deviation of a recording of that simulation; coordinates ``begin``, ``end`` [s since the
         start], ``time``, ``tau`` [s].
     """
-    windows = _windows(blocks.sizes["block"])
+    windows = _make_windows(blocks.sizes["block"])
     plain = before.assign(known_mean=before["known_mean"] * 0.0)
     recorded = allan_surface(blocks, plain, windows)
     keep = (recorded["columns"]["what"] == "avar") & np.isfinite(recorded["shape"]).any(axis=(0, 1))
@@ -49,33 +49,36 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
         [],
     )
     high.append(low[0])
-    mean, error = [_averaged(blocks, values_in_order(blocks, "mean", "axis", "block"), windows)], []
+    mean, error = (
+        [_average_windows(blocks, values_of(blocks, "mean", "axis", "block"), windows)],
+        [],
+    )
     error.append(np.full(mean[0].shape, np.nan))
     for baseline in (before, after):
         noise = allan_surface(blocks, baseline, windows)
         shape = noise["shape"][..., keep]
-        known = _known(blocks, baseline, windows)[..., keep]
+        known = _known_avar(blocks, baseline, windows)[..., keep]
         with np.errstate(invalid="ignore"):
             avar.append(noise["expected"][..., keep] + known)
             low.append(noise["expected"][..., keep] * gammaincinv(shape, 0.025) / shape + known)
             high.append(noise["expected"][..., keep] * gammaincinv(shape, 0.975) / shape + known)
             information = window_means(blocks, baseline, windows)[1]
             error.append(1.0 / np.sqrt(information))
-        mean.append(_predicted(blocks, baseline, windows))
-    return _labelled(
+        mean.append(_predicted_means(blocks, baseline, windows))
+    return _attach_labels(
         blocks, windows, recorded["columns"]["tau_min_s"][keep], [avar, low, high], [mean, error]
     )
 
 
-def _windows(block_count: int) -> Windows:
-    length = min(_WINDOW, max(1, block_count // 2))
-    step = max(1, block_count // _MOST)
+def _make_windows(block_count: int) -> Windows:
+    length = min(WINDOW_BLOCKS, max(1, block_count // 2))
+    step = max(1, block_count // MAX_WINDOWS)
     first = np.arange(0, block_count - length + 1, step)
     return Windows(first, first + length)
 
 
-def _known(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
-    """Allan variance of the known mean, which the noise is without."""
+def _known_avar(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
+    """Return the Allan variance of the known mean, which that of the noise does not include."""
     means = np.where(
         np.isfinite(values_in_order(blocks, "mean", "axis", "block")),
         values_in_order(baseline, "known_mean", "axis", "block"),
@@ -90,8 +93,8 @@ def _known(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
     )
 
 
-def _averaged(blocks: xr.Dataset, values: Array, windows: Windows) -> Array:
-    """Mean over windows, weighted with the samples present where the recording has a mean."""
+def _average_windows(blocks: xr.Dataset, values: Array, windows: Windows) -> Array:
+    """Average over windows, weighted with the samples present where the recording has a mean."""
     weight = np.where(
         np.isfinite(values_in_order(blocks, "mean", "axis", "block")),
         values_in_order(blocks, "samples", "axis", "block"),
@@ -105,8 +108,8 @@ def _averaged(blocks: xr.Dataset, values: Array, windows: Windows) -> Array:
         return np.asarray(np.where(total > 0, sums / total, np.nan))
 
 
-def _predicted(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
-    """Mean of the effects, and the constant that the recording has beside them."""
+def _predicted_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Array:
+    """Return the window means of the effects plus the constant that fits the recording."""
     known, mean = (
         values_in_order(baseline, "known_mean", "axis", "block"),
         values_in_order(blocks, "mean", "axis", "block"),
@@ -119,10 +122,10 @@ def _predicted(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Ar
         level = (weight * np.nan_to_num(mean - known)).sum(axis=-1, keepdims=True) / weight.sum(
             axis=-1, keepdims=True
         )
-    return _averaged(blocks, known + level, windows)
+    return _average_windows(blocks, known + level, windows)
 
 
-def _labelled(
+def _attach_labels(
     blocks: xr.Dataset, windows: Windows, tau: Array, squares: list[Any], means: list[Any]
 ) -> xr.Dataset:
     cube, plane = ("case", "axis", "window", "tau"), ("case", "axis", "window")
@@ -139,16 +142,16 @@ def _labelled(
         name: (
             cube,
             np.stack(np.broadcast_arrays(*values)),
-            {"units": units["avar"], "long_name": told},
+            {"units": units["avar"], "long_name": long_name},
         )
-        for (name, told), values in zip(names, squares, strict=True)
+        for (name, long_name), values in zip(names, squares, strict=True)
     }
-    for (name, told), values in zip(
+    for (name, long_name), values in zip(
         (("mean", "mean rate"), ("mean_stderr", "standard deviation of the mean")),
         means,
         strict=True,
     ):
-        data[name] = (plane, np.stack(values), {"units": units["mean"], "long_name": told})
+        data[name] = (plane, np.stack(values), {"units": units["mean"], "long_name": long_name})
     coordinates: dict[str, Any] = {
         "case": ("case", list(CASES)),
         "axis": ("axis", [str(axis) for axis in blocks["axis"].values]),

@@ -1,4 +1,4 @@
-"""The tables of `diagnosis.json` from what the steps of a diagnosis found."""
+"""Build the tables of `diagnosis.json` from the results of the steps."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.estimate.upper_limits import UpperLimit
-from gyrostab.diagnose.identify.forward_search import Identification, Identifications, Unidentified
+from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.nuisance import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.reduce.block_statistics import measured
-from gyrostab.diagnose.result.attribution import active_spans, spans
+from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
 from gyrostab.diagnose.result.text import (
     axes_text,
@@ -50,31 +50,36 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-_TAIL = 0.25
-_LEAST_P = 1e-12
-_FAST = 16  # samples of an instrument that is much faster than the log
-#: Generic -> view in which it is told.
-_GENERIC_VIEW = {
-    "~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar", "~S(f)": "davar", "~cov": "cross_axis",
-    "~outliers": "distribution",
+TAIL_SHARE = 0.25  # upper share of the null records that the exponential tail is fitted to
+MIN_P_VALUE = 1e-12  # floor of the extrapolated tail; text.py prints no less than 1e-6
+MIN_TAIL_SCALE_NATS = 0.1  # keeps the tail from vanishing when null records score alike
+#: Samples of an instrument that is "much faster than the log" (`instrument = 0`): a low-pass of the
+#: instrument is then resolved in the samples of the log.
+FAST_INSTRUMENT_SAMPLES = 16
+#: Nuisance alternative -> `view` in `diagnosis.json`.
+_NUISANCE_VIEWS = {
+    "~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar", "~S(f)": "davar",
+    "~cov": "cross_axis", "~outliers": "distribution",
 }  # fmt: skip
-#: Where an effect shows -> view in which it is told.
-_PART_VIEW = {
-    "mean": "mean", "wander": "mean", "levels": "mean", "power": "davar", "transfer": "davar", "cross": "cross_axis",
-    "marks": "distribution", "line": "spectrum", "order": "spectrum", "phase_locked": "spectrum",
+#: Statistic of a component -> `view` in `diagnosis.json`.
+_COMPONENT_VIEWS = {
+    "mean": "mean", "wander": "mean", "levels": "mean", "power": "davar", "transfer": "davar",
+    "cross": "cross_axis", "marks": "distribution", "line": "spectrum", "order": "spectrum",
+    "phase_locked": "spectrum",
 }  # fmt: skip
-_BUMP = 0.371  # averaging time times frequency where the Allan variance of a sine is largest
-_MOST_LINES = 4000
+#: tau * f at the maximum of sin(pi f tau)^4 / (pi f tau)^2, the Allan variance of a sine.
+SINE_TAU_CYCLES = 0.371
+MAX_LINES = 4000  # bins of the line spectrum in `diagnosis.nc`: enough for a page, small on disk
 
 
 def iso(blocks: xr.Dataset, seconds: float) -> str:
-    """Time [s since the start of the record] as ISO 8601."""
+    """Write a time [s since the start of the record] as ISO 8601."""
     start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
     return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
 
 
 def recording_table(blocks: xr.Dataset) -> dict[str, Any]:
-    """What the recording is."""
+    """Describe the recording."""
     channels = [
         str(name).removeprefix("channel_")
         for name in blocks.data_vars
@@ -92,7 +97,7 @@ def recording_table(blocks: xr.Dataset) -> dict[str, Any]:
 
 
 def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str, Any]:
-    """The noise that the recording is compared with, and the effects of the simulation that have the size which the recording shows."""
+    """Describe the noise compared with, and the effects of the simulation that fit it."""
     noise: dict[str, Any] = {}
     for axis in baseline["axis"].values:
         noise[str(axis)] = {}
@@ -126,7 +131,7 @@ def baseline_table(baseline: xr.Dataset, expected: Sequence[Fitted]) -> dict[str
 def mismatch_tables(
     found: xr.Dataset, blocks: xr.Dataset, explained: Sequence[Sequence[str]]
 ) -> list[dict[str, Any]]:
-    """The mismatches, each with its sentence."""
+    """Return the located mismatches, each with its sentence."""
     whole = float(blocks["end"].values[-1])
     out = []
     for number, names in enumerate(explained):
@@ -155,18 +160,25 @@ def mismatch_tables(
 
 
 def chance_of_gain(best: Array, evidence_nats: float) -> float:
-    """Share of null records whose largest gain is `evidence_nats` or more; by an exponential tail beyond their upper quarter."""
-    start = float(np.quantile(best, 1.0 - _TAIL))
+    """Return the share of null records whose best evidence reaches `evidence_nats`.
+
+    Beyond the upper quarter of the null records, an exponential tail extrapolates it.
+    """
+    start = float(np.quantile(best, 1.0 - TAIL_SHARE))
     if evidence_nats <= start:
         return float((best >= evidence_nats).mean())
-    scale = max(float((best[best > start] - start).mean()), 0.1)
-    return max(_TAIL * math.exp(-(evidence_nats - start) / scale), _LEAST_P)
+    scale = max(float((best[best > start] - start).mean()), MIN_TAIL_SCALE_NATS)
+    return max(TAIL_SHARE * math.exp(-(evidence_nats - start) / scale), MIN_P_VALUE)
 
 
 def identification_tables(
     identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Mismatches that only naming saw: where a named effect acts that explains none of those known, by its strongest part."""
+    """Return mismatches that only the identification shows.
+
+    These are the places of named effects that explain no other mismatch. The statistic of the
+    strongest component describes them.
+    """
     out: list[dict[str, Any]] = []
     begin, end = blocks["begin"].values, blocks["end"].values
     for identification in identifications.identified:
@@ -177,10 +189,10 @@ def identification_tables(
         ):
             continue
         strongest = max(identification.components, key=lambda component: component.evidence_nats)
-        statistic = _PART_VIEW.get(strongest.candidate.statistic, "davar")
-        low, high = _taus(strongest, statistic, blocks)
+        statistic = _COMPONENT_VIEWS.get(strongest.candidate.statistic, "davar")
+        low, high = _averaging_times(strongest, statistic, blocks)
         p_value = chance_of_gain(identifications.null_best, identification.evidence_nats)
-        for first, last in spans(active_spans(identification, blocks), begin, end):
+        for first, last in join_blocks(active_blocks(identification, blocks), begin, end):
             when = span_text(first, last, float(end[-1]))
             out.append(
                 {
@@ -202,11 +214,16 @@ def identification_tables(
     return out
 
 
-def _taus(component: Component, statistic: str, blocks: xr.Dataset) -> tuple[float, float]:
-    """Averaging times [s] at which a part of an effect shows: those of its line, of block means, or those within a block."""
+def _averaging_times(
+    component: Component, statistic: str, blocks: xr.Dataset
+) -> tuple[float, float]:
+    """Return the averaging times [s] at which a component shows.
+
+    A line shows near its period, a mean at those of block means, and anything else within a block.
+    """
     block, whole = float(blocks.attrs["block_s"]), float(blocks["end"].values[-1])
     if component.candidate.statistic == "line" and component.place >= 0:
-        tau = _BUMP / float(blocks["line_frequency"].values[component.place])
+        tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.place])
         return tau, tau
     if statistic == "mean":
         return block, whole / 2.0
@@ -216,10 +233,10 @@ def _taus(component: Component, statistic: str, blocks: xr.Dataset) -> tuple[flo
 def unidentified_tables(
     identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Mismatches that only naming saw: what no effect explains, where no box that is left says so already."""
+    """Return mismatches without an effect, where no other unexplained mismatch covers them."""
     out: list[dict[str, Any]] = []
     for one in identifications.unknown:
-        statistic = _GENERIC_VIEW.get(one.generic, "davar")
+        statistic = _NUISANCE_VIEWS.get(one.generic, "davar")
         told = any(
             region["view"] == statistic
             and set(region["axes"]) & set(one.axes)
@@ -228,12 +245,14 @@ def unidentified_tables(
         )
         if not told:
             out.append(
-                _unknown_table(one, identifications, blocks, len(known) + len(out) + 1, statistic)
+                _unidentified_table(
+                    one, identifications, blocks, len(known) + len(out) + 1, statistic
+                )
             )
     return out
 
 
-def _unknown_table(
+def _unidentified_table(
     one: Unidentified,
     identifications: Identifications,
     blocks: xr.Dataset,
@@ -241,11 +260,11 @@ def _unknown_table(
     statistic: str,
 ) -> dict[str, Any]:
     p_value = chance_of_gain(identifications.null_best, one.evidence_nats)
-    near = ", ".join(plain_name(name) for name in one.candidates)
-    beside = f"; what comes nearest: {near}" if near else ""
+    candidates = ", ".join(plain_name(name) for name in one.candidates)
+    nearest = f"; the closest candidates are {candidates}" if candidates else ""
     means, what = statistic == "mean", NUISANCE_ALTERNATIVES.get(one.generic, "something differs")
     rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
-    begin, end, when = _when(one, blocks)
+    begin, end, when = _find_event(one, blocks)
     return {
         "id": number,
         "view": statistic,
@@ -257,12 +276,15 @@ def _unknown_table(
         "ratio": None,
         "p_value": p_value,
         "explained_by": [],
-        "statement": f"On {axes_text(one.axes)} {what}{when}, and no known effect says why{beside} ({chance(p_value)}).",
+        "statement": (
+            f"On {axes_text(one.axes)} {what}{when}; no known effect explains it{nearest} "
+            f"({chance(p_value)})."
+        ),
     }
 
 
-def _when(one: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
-    """Begin and end of what has no name [s], with words for an event; else the whole record."""
+def _find_event(one: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
+    """Return begin and end [s] of an unidentified event with their text, or the whole record."""
     whole = float(blocks["end"].values[-1])
     found = [
         (component.variant.values["begin"], component.variant.values["end"])
@@ -278,7 +300,10 @@ def _when(one: Unidentified, blocks: xr.Dataset) -> tuple[float, float, str]:
 def motion_tables(
     identified: Sequence[Identification], blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """One mismatch for every axis whose moving stretches were left out of the comparison, from the first of them to the last."""
+    """Return one mismatch for each axis with moving blocks that the comparison left out.
+
+    It extends from the first of these blocks to the last.
+    """
     if "moving" not in blocks:
         return []
     begin, end, block = (
@@ -307,21 +332,21 @@ def motion_tables(
                 "tau_min_s": 1.0 / float(blocks.attrs["sampling_rate_hz"]),
                 "tau_max_s": max((last - first) / 2.0, block),
                 "ratio": None,
-                "p_value": _LEAST_P,
+                "p_value": MIN_P_VALUE,
                 "explained_by": [],
                 "statement": motion_statement(
                     axis,
                     span_text(first, last, float(end[-1])),
                     largest,
-                    _followers(axis, identified),
+                    _axes_following(axis, identified),
                 ),
             }
         )
     return out
 
 
-def _followers(axis: str, identified: Sequence[Identification]) -> list[str]:
-    """Axes on which the rate of an axis is seen through a lean of theirs."""
+def _axes_following(axis: str, identified: Sequence[Identification]) -> list[str]:
+    """Return the axes that sense the rate of `axis` through their misalignment."""
     components = [
         component
         for identification in identified
@@ -339,18 +364,17 @@ def _followers(axis: str, identified: Sequence[Identification]) -> list[str]:
 
 
 def effect_tables(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[dict[str, Any]]:
-    """The named effects, the strongest first.
+    """Return the named effects, the strongest first.
 
-    An effect with different numbers on several axes is one claim in as many tables, each with the
-    gain of the claim, which is what passed the threshold. The standard error of a held-out gain is
-    the one that the logarithm of a likelihood ratio has where the model is right: the root of twice
-    the gain.
+    An effect with different sizes on several axes is one identification in as many tables, each
+    with the evidence of the whole identification, because that passed the threshold. The standard
+    error of a held-out gain is that of a log-likelihood ratio under the right model: sqrt(2 gain).
     """
     begin, end = blocks["begin"].values, blocks["end"].values
     out = []
     for one in fitted:
         identification = one.identification
-        when = spans(active_spans(identification, blocks), begin, end)
+        when = join_blocks(active_blocks(identification, blocks), begin, end)
         whole = float(end[-1])
         out.append(
             {
@@ -378,7 +402,7 @@ def effect_tables(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[dict[str
 
 
 def limit_tables(found: Mapping[str, UpperLimit]) -> dict[str, Any]:
-    """How large what was not found may be, and why it was not."""
+    """Return the upper limit of each effect that was not found, and why it was not."""
     return {
         name: {"upper_limit": one.upper_limit, "unit": one.unit, "reason": one.reason}
         for name, one in found.items()
@@ -388,7 +412,7 @@ def limit_tables(found: Mapping[str, UpperLimit]) -> dict[str, Any]:
 def model_tables(
     baseline: xr.Dataset, fitted: Sequence[Fitted], own: Model | None
 ) -> dict[str, Any]:
-    """The simulation with the effects added, as the tables of a model; `own` is the model that was given."""
+    """Return the tables of the model with the effects added; `own` is the model that was given."""
     noise = {
         str(axis): {
             str(term): float(f"{float(baseline['coefficient'].sel(axis=axis, term=term)):.6g}")
@@ -399,33 +423,42 @@ def model_tables(
     before = list(own.effects) if own is not None else []
     found = [one.effect for one in fitted if one.effect is not None]
     instrument = max(
-        [int(own.log.get("oversampling", 1)) if own is not None else 1, *map(_instrument, found)]
+        [
+            int(own.log.get("oversampling", 1)) if own is not None else 1,
+            *map(_instrument_samples, found),
+        ]
     )
     log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
     return {**log, "noise": noise, "effect": [effect_table(effect) for effect in [*before, *found]]}
 
 
-def _instrument(effect: Effect) -> int:
-    """Samples of the instrument in one of the log that an effect needs: a filter works at the rate of the instrument."""
-    return int(getattr(effect, "instrument", 1)) or _FAST
+def _instrument_samples(effect: Effect) -> int:
+    """Return the instrument samples per log sample that an effect needs.
+
+    A filter runs at the rate of the instrument.
+    """
+    return int(getattr(effect, "instrument", 1)) or FAST_INSTRUMENT_SAMPLES
 
 
 def surfaces_with_blocks(
     surfaces: xr.Dataset, blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset
 ) -> xr.Dataset:
-    """The surfaces with what else the report draws: block means, channels, and spectra of the whole record."""
+    """Add block means, channels and spectra of the whole record to the surfaces, for the report."""
     power = "degree2 hour-2 s"
     channels = {
         str(name): blocks[name] for name in blocks.data_vars if str(name).startswith("channel_")
     }
     with np.errstate(invalid="ignore"):
         cases = [blocks["power"], before["spectrum"], after["spectrum"]]
-        there = np.isfinite(blocks["power"].transpose("axis", "block", "band").values)
+        has_data = np.isfinite(blocks["power"].transpose("axis", "block", "band").values)
         density = np.stack(
-            [_mean_where(one.transpose("axis", "block", "band").values, there) for one in cases]
+            [
+                _average_where(one.transpose("axis", "block", "band").values, has_data)
+                for one in cases
+            ]
         )
         lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
-    step = max(1, lines.sizes["line"] // _MOST_LINES)
+    step = max(1, lines.sizes["line"] // MAX_LINES)
     lines = lines.coarsen(line=step, boundary="trim").max() if step > 1 else lines
     frequency = (
         blocks["line_frequency"].coarsen(line=step, boundary="trim").mean()
@@ -467,11 +500,11 @@ def surfaces_with_blocks(
     return surfaces.merge(added, compat="no_conflicts", join="exact")
 
 
-def _mean_where(values: Array, there: NDArray[np.bool_]) -> Array:
-    count = there.sum(axis=1)
+def _average_where(values: Array, has_data: NDArray[np.bool_]) -> Array:
+    count = has_data.sum(axis=1)
     return np.asarray(
         np.divide(
-            np.where(there, values, 0.0).sum(axis=1),
+            np.where(has_data, values, 0.0).sum(axis=1),
             count,
             out=np.full(count.shape, np.nan),
             where=count > 0,

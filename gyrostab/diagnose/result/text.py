@@ -1,10 +1,10 @@
-"""What a diagnosis says in plain words: where, when, how much, how sure, what else it could be, and what to measure next."""
+"""Write a diagnosis in sentences: what differs, where, when, by how much, and how sure."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,91 +31,147 @@ __all__ = [
     "without_chance",
 ]
 
-_SURE = 1e-6  # chances below that are not told apart
-_CHANCE_WORDS = re.compile(r" \(noise alone does that in [^()]*\)(?=\.$)")
+#: Smallest probability that is printed: the extrapolated tail of the null records goes no further.
+MIN_PRINTED_PROBABILITY = 1e-6
+#: A stretch that starts and ends within this share of the record from its ends is the whole record.
+END_TOLERANCE_SHARE = 0.02
+_CHANCE = "noise alone would show this in {share} such records"
+_CHANCE_PATTERN = re.compile(r" \(noise alone would show this in [^()]*\)(?=\.$)")
 
 #: What each effect is called in a sentence.
 _NAMES = {
     "temperature_bias": "a bias that follows temperature",
     "shupe": "a bias that follows the rate of change of temperature (Shupe effect)",
-    "thermal_gradient": "a bias that follows a difference of two temperatures",
-    "warm_up": "warming up after power-on",
-    "thermal_hysteresis": "a bias that remembers earlier temperatures",
-    "vibration_rectification": "a bias made by vibration (rectification)",
+    "thermal_gradient": "a bias that follows a temperature difference",
+    "warm_up": "warm-up after power-on",
+    "thermal_hysteresis": "a bias with temperature hysteresis",
+    "vibration_rectification": "a bias caused by vibration (vibration rectification)",
     "g_sensitivity": "a bias that follows acceleration",
     "scale_factor": "a scale-factor error",
-    "misalignment": "rotation about another axis that leaks in",
-    "earth_rate": "earth rate, turned by the tool",
-    "dead_zone": "an output that sticks near zero rate",
+    "misalignment": "rotation about another axis, coupled in by misalignment",
+    "earth_rate": "earth rate, which varies with the tool face",
+    "dead_zone": "a dead zone near zero rate",
     "feedback_reset": "an error of the feedback ramp",
     "fringe_hop": "steps of one fringe",
-    "bias_jump": "a jump of the bias",
+    "bias_jump": "a bias jump",
     "telegraph": "a bias that switches between two levels",
-    "gauss_markov": "a slowly wandering bias",
+    "gauss_markov": "a slowly wandering bias (Gauss-Markov process)",
     "supply_bias": "a bias that follows supply voltage or light power",
     "magnetic": "a bias that follows the magnetic field",
-    "ageing_bias": "a bias that trends with time",
-    "temperature_noise": "white noise that follows temperature",
-    "light_power_noise": "white noise that follows light power",
+    "ageing_bias": "a bias trend in time",
+    "temperature_noise": "white noise that varies with temperature",
+    "light_power_noise": "white noise that varies with light power",
     "vibration_noise": "noise that rises with vibration",
     "vibration_random_walk": "a random walk that rises with vibration",
-    "ageing_noise": "white noise that trends with time",
-    "shared_source": "noise that the axes share (one light source)",
-    "spectral_line": "a steady line or resonance",
-    "rotation_line": "lines locked to the tool's rotation",
+    "ageing_noise": "white noise with a trend in time",
+    "shared_source": "noise common to the axes (shared light source)",
+    "spectral_line": "a steady spectral line or resonance",
+    "rotation_line": "lines locked to the rotation of the tool",
     "logger_filter": "a filter in the logger",
-    "aliased_vibration": "vibration folded down by sampling",
-    "rate_quantization": "rounding of the output",
+    "aliased_vibration": "vibration aliased by the sampling",
+    "rate_quantization": "quantization of the output",
     "spikes": "bit errors or outliers",
-    "held_samples": "samples that are repeated or filled with zeros",
+    "held_samples": "repeated or zero-filled samples",
     "clipping": "clipped extremes",
     "clock_error": "an error of the clock",
     "real_motion": "real rotation of the tool, not a sensor error",
 }
 
-#: What tells an effect from the others that look like it.
-_NEXT = {
-    "temperature_bias": "heat and cool once with a hold at each end: what follows temperature stays on the hold and returns later",
-    "shupe": "hold the temperature after a ramp: what follows its rate of change dies away, and changes sign when the ramp is reversed",
+#: Measurement that separates an effect from the others that look like it.
+_NEXT_MEASUREMENTS = {
+    "temperature_bias": (
+        "heat and cool once with a hold at each end: a bias that follows temperature stays during"
+        " the hold and returns later"
+    ),
+    "shupe": (
+        "hold the temperature after a ramp: a Shupe bias decays, and changes sign when the ramp "
+        "is reversed"
+    ),
     "thermal_gradient": "log a second temperature at the other end of the coil",
-    "warm_up": "switch off and on again at a steady outer temperature: warming up repeats itself after every start",
-    "thermal_hysteresis": "go round a closed temperature cycle twice: with hysteresis the two directions differ, and the loop repeats",
-    "vibration_rectification": "repeat at twice the vibration: rectification grows fourfold, g-sensitivity twofold; "
-    "then turn the tool over: g-sensitivity changes sign",
-    "g_sensitivity": "turn the tool over, at rest: g-sensitivity changes sign with gravity, rectification does not",
-    "scale_factor": "turn at two known rates in both directions: a scale-factor error is proportional to the rate",
-    "misalignment": "turn about one axis at a time and look at the others",
-    "earth_rate": "stop the rotation at four tool faces 90 degrees apart: earth rate follows the tool face",
+    "warm_up": (
+        "switch off and on again at a steady outside temperature: warm-up repeats after every start"
+    ),
+    "thermal_hysteresis": (
+        "run a closed temperature cycle twice: with hysteresis heating and cooling differ, and "
+        "the loop repeats"
+    ),
+    "vibration_rectification": (
+        "repeat at twice the vibration: rectification grows fourfold, g-sensitivity twofold; then"
+        " turn the tool over: g-sensitivity changes sign"
+    ),
+    "g_sensitivity": (
+        "turn the tool over, at rest: g-sensitivity changes sign with gravity, rectification does"
+        " not"
+    ),
+    "scale_factor": (
+        "rotate at two known rates in both directions: a scale-factor error is proportional to "
+        "the rate"
+    ),
+    "misalignment": "rotate about one axis at a time and read the others",
+    "earth_rate": (
+        "stop the rotation at four tool faces 90 degrees apart: earth rate follows the tool face"
+    ),
     "dead_zone": "add a slow known rotation that carries the rate through zero",
-    "feedback_reset": "log the phase of the feedback ramp, and repeat at another rotation rate: lines of the ramp move with it",
+    "feedback_reset": (
+        "log the phase of the feedback ramp, and repeat at another rotation rate: lines of the "
+        "ramp move with it"
+    ),
     "fringe_hop": "compare the size of the steps with the rate of one fringe of this coil",
-    "bias_jump": "switch off and on several times without any other change, and compare the bias before and after",
-    "telegraph": "record longer, for at least ten switches: two levels show in the histogram of the means",
-    "gauss_markov": "record at rest for at least ten times the time over which the bias wanders",
+    "bias_jump": (
+        "switch off and on several times with nothing else changed, and compare the bias before "
+        "and after"
+    ),
+    "telegraph": (
+        "record longer, for at least ten switches: the histogram of the means then shows two levels"
+    ),
+    "gauss_markov": "record at rest for at least ten times the correlation time of the bias",
     "supply_bias": "change the supply voltage in steps at a steady temperature",
-    "magnetic": "turn a magnet, or the tool in the earth's field, and log a magnetometer",
-    "ageing_bias": "reverse the temperature once: a trend with time goes on, what follows temperature returns",
-    "temperature_noise": "return to the first temperature: noise that follows temperature returns too, ageing does not",
+    "magnetic": "turn a magnet, or turn the tool in the earth's field, and log a magnetometer",
+    "ageing_bias": (
+        "reverse the temperature once: a trend in time continues, a bias that follows temperature"
+        " returns"
+    ),
+    "temperature_noise": (
+        "return to the first temperature: noise that follows temperature returns too, noise that "
+        "follows age does not"
+    ),
     "light_power_noise": "change the light power in steps at a steady temperature, and log it",
-    "vibration_noise": "log an accelerometer at the full rate: its spectrum, and its coherence with the rate, tell noise from motion",
-    "vibration_random_walk": "vibrate evenly for at least half an hour: a random walk goes on growing between the edges, a step does not",
+    "vibration_noise": (
+        "log an accelerometer at the full rate: its spectrum and its coherence with the gyro "
+        "separate noise from motion"
+    ),
+    "vibration_random_walk": (
+        "vibrate evenly for at least half an hour: a random walk keeps growing between the edges,"
+        " a step does not"
+    ),
     "ageing_noise": "repeat the record at the same temperature some days later",
     "shared_source": "log the light power of the source, or run the axes on separate sources",
-    "spectral_line": "change the sampling rate: a folded line moves, a true one stays; change the rotation rate to see whether it follows",
-    "rotation_line": "repeat at another rotation rate: what is locked to the tool moves with it",
-    "logger_filter": "read the logger's settings, or log at a higher rate: a filter leaves the long averaging times as they are",
-    "aliased_vibration": "log at a higher rate, or with an analogue filter: what is folded moves or goes",
+    "spectral_line": (
+        "change the sampling rate: an aliased line moves, a true one stays; change the rotation "
+        "rate to see whether the line follows"
+    ),
+    "rotation_line": "repeat at another rotation rate: lines locked to the tool move with it",
+    "logger_filter": (
+        "read the logger settings, or log at a higher rate: a filter leaves the long averaging "
+        "times unchanged"
+    ),
+    "aliased_vibration": (
+        "log at a higher rate, or with an analogue filter: an aliased band moves or disappears"
+    ),
     "rate_quantization": "log with one more bit, or in counts",
-    "spikes": "log the raw words: bit errors change by powers of two counts",
+    "spikes": "log the raw data words: bit errors change them by powers of two counts",
     "held_samples": "log a counter with each sample",
-    "clipping": "widen the range of the output",
+    "clipping": "widen the output range",
     "clock_error": "log a second clock, or a known line such as the mains",
-    "real_motion": "log accelerometers and a second gyro on the same block: both see real motion, a sensor error shows in one",
+    "real_motion": (
+        "log accelerometers and a second gyro on the same block: real motion shows in all of "
+        "them, a sensor error in one"
+    ),
 }
 
 
 def plain_name(name: str) -> str:
-    """What an effect is called in a sentence.
+    """Return what an effect is called in a sentence.
 
     Examples
     --------
@@ -128,91 +184,81 @@ def plain_name(name: str) -> str:
 
 
 def axes_text(axes: Sequence[str]) -> str:
-    """``"axis x"``, ``"axes x and y"``."""
-    names = " and ".join(filter(None, [", ".join(axes[:-1]), axes[-1]])) if axes else ""
-    return f"ax{'i' if len(axes) == 1 else 'e'}s {names}" if axes else "the record"
+    """Return ``"axis x"`` or ``"axes x and y"``."""
+    if not axes:
+        return "the record"
+    names = " and ".join(filter(None, [", ".join(axes[:-1]), axes[-1]]))
+    return f"ax{'i' if len(axes) == 1 else 'e'}s {names}"
 
 
 def chance(p_value: float) -> str:
-    """A probability in words, never smaller than the null records can tell.
+    """Describe the probability that noise alone gives a result, no smaller than is known.
 
     Examples
     --------
-    >>> chance(0.004), chance(1e-12)
-    ('noise alone does that in 1 of 250 such records', 'noise alone does that in fewer than 1 of a million such records')
+    >>> chance(0.004)
+    'noise alone would show this in 1 of 250 such records'
+    >>> chance(1e-12)
+    'noise alone would show this in fewer than 1 in a million such records'
     """
-    return f"noise alone does that in {chance_share(p_value)} such records"
+    return _CHANCE.format(share=chance_share(p_value))
 
 
 def chance_share(p_value: float) -> str:
-    """Give a probability as one in so many, never smaller than the null records can tell.
+    """Write a probability as one of so many, no smaller than the null records support.
 
     Examples
     --------
     >>> chance_share(0.004), chance_share(0.03), chance_share(1e-12)
-    ('1 of 250', '1 of 33', 'fewer than 1 of a million')
+    ('1 of 250', '1 of 33', 'fewer than 1 in a million')
     """
-    if p_value < _SURE:
-        return "fewer than 1 of a million"
+    if p_value < MIN_PRINTED_PROBABILITY:
+        return "fewer than 1 in a million"
     number = 1.0 / p_value
-    return f"1 of {number:.2g}" if number < 100 else f"1 of {_round(number)}"
+    return f"1 of {number:.2g}" if number < 100 else f"1 of {_round_to_two_digits(number)}"
 
 
-def _round(number: float) -> str:
+def _round_to_two_digits(number: float) -> str:
     size = 10.0 ** (math.floor(math.log10(number)) - 1)
     return f"{round(number / size) * size:,.0f}".replace(",", " ")
 
 
 def clock(seconds: float) -> str:
-    """Time since the start of the record, as hours, minutes and seconds.
+    """Write the time since the start of the record as hours, minutes and seconds.
 
     Examples
     --------
     >>> clock(83.0), clock(5400.0), clock(0.5)
     ('1:23', '1:30:00', '0:00.5')
     """
-    whole, rest = divmod(round(seconds * 10), 10)
+    whole, tenths = divmod(round(seconds * 10), 10)
     minutes, second = divmod(int(whole), 60)
     hours, minute = divmod(minutes, 60)
-    tail = f"{second:02d}" + (f".{int(rest)}" if rest and seconds < 60 else "")
+    tail = f"{second:02d}" + (f".{int(tenths)}" if tenths and seconds < 60 else "")
     return f"{hours}:{minute:02d}:{tail}" if hours else f"{minute}:{tail}"
 
 
-def motion_statement(axis: str, when: str, largest: float, followers: Sequence[str]) -> str:
-    """Sentence for an axis that moves far above its noise [deg/h], with nothing in the record to say why.
-
-    Examples
-    --------
-    >>> motion_statement("z", "from 1 min to 5 min after the start", 389.0, ["x"])[-95:]
-    'xis x sees a share of it, so it is real rotation of the tool, whose true rate no channel tells.'
-    """
-    told = (
-        f"The rate of axis {axis} moves far above its noise {when}, by {largest:.3g} deg/h at most"
-    )
-    if followers:
-        sees = "sees a share" if len(followers) == 1 else "see shares"
-        return f"{told}; {axes_text(followers)} {sees} of it, so it is real rotation of the tool, whose true rate no channel tells."
-    near = " or ".join(plain_name(name) for name in ("real_motion", "scale_factor"))
-    return f"{told}, and no channel says why; it may be {near}."
-
-
 def span_text(begin: float, end: float, whole: float) -> str:
-    """When something is there, for people: over the whole record, or from when to when since the start [s]."""
-    if begin <= 0.02 * whole and end >= 0.98 * whole:
+    """Write a stretch of a record [s since its start]; `whole` is the length of the record."""
+    if begin <= END_TOLERANCE_SHARE * whole and end >= (1.0 - END_TOLERANCE_SHARE) * whole:
         return "over the whole record"
     return f"from {clock(begin)} to {clock(end)} after the start"
 
 
 def length_text(seconds: float) -> str:
-    """A length of time for people."""
-    for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min")):
+    """Write a duration with the unit that suits it."""
+    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
         if seconds >= 2 * size:
             return f"{seconds / size:.3g} {name}"
     return f"{seconds:.3g} s" if seconds >= 0.1 else f"{seconds * 1e3:.3g} ms"
 
 
+# ------------------------------------------------------------------------------------------------
+# mismatches
+
+
 def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
-    """One sentence on a place where recording and simulation differ.
+    """Write one sentence on a place where recording and simulation differ.
 
     Parameters
     ----------
@@ -223,158 +269,239 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
 
     Examples
     --------
-    >>> mismatch_statement({"view": "davar", "what": "avar", "axes": ["x"], "begin": 1500.0, "end": 1800.0, "tau_min_s": 0.01,
-    ...                     "tau_max_s": 3.0, "ratio": 1.8, "sign": 1, "p_value": 0.0004, "estimate": 1.8, "frequency": np.nan}, 3600.0)
-    'Axis x is noisier than simulated from 25:00 to 30:00 after the start, at averaging times of 10 ms to 3 s: its Allan variance is
-     1.8 times the expected one (noise alone does that in 1 of 2 500 such records).'
+    >>> mismatch_statement({"view": "davar", "what": "avar", "axes": ["x"], "begin": 1500.0,
+    ...                     "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
+    ...                     "sign": 1, "p_value": 0.0004, "estimate": 1.8}, 3600.0)
+    'Axis x is noisier than the simulation from 25:00 to 30:00 after the start: at averaging times
+     of 10 ms to 3 s its Allan variance is 1.8 times the expected value (noise alone would show
+     this in 1 of 2 500 such records).'
     """
-    axes, when = axes_text(region["axes"]), span_text(region["begin"], region["end"], whole)
-    low, high = length_text(region["tau_min_s"]), length_text(region["tau_max_s"])
-    taus = (
-        f"averaging times of {low} to {high}"
-        if region["tau_max_s"] > 1.01 * region["tau_min_s"]
-        else f"an averaging time of {low}"
+    when = span_text(region["begin"], region["end"], whole)
+    describe = _DESCRIBERS.get(str(region["view"]), _describe_samples)
+    return f"{describe(region, when)} ({chance(region['p_value'])})."
+
+
+def _describe_allan_variance(region: Mapping[str, Any], when: str) -> str:
+    if str(region.get("what", "")).startswith("restless"):
+        return _describe_fluctuation(region, when)
+    is_single = len(region["axes"]) == 1
+    return (
+        f"{_subject(region)} {'is' if is_single else 'are'} "
+        f"{'noisier' if _is_higher(region) else 'quieter'} than the simulation {when}: "
+        f"at {_taus_text(region)} {'its' if is_single else 'their'} Allan variance is "
+        f"{region['ratio']:.3g} times the expected value"
     )
-    verb = "is" if len(region["axes"]) == 1 else "are"
-    more = region.get("sign", 1) >= 0
-    sure = chance(region["p_value"])
-    begin = axes[0].upper() + axes[1:]
-    one, estimate = len(region["axes"]) == 1, region.get("estimate", np.nan)
-    if region["view"] == "davar" and str(region.get("what", "")).startswith("variance"):
-        pace = length_text(float(str(region["what"]).split()[1]))
-        size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
+
+
+def _describe_fluctuation(region: Mapping[str, Any], when: str) -> str:
+    pace = length_text(float(str(region["what"]).split()[1]))
+    estimate = region.get("estimate", np.nan)
+    size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
+    return (
+        f"The noise level of {axes_text(region['axes'])} fluctuates {when}: at "
+        f"{_taus_text(region)} its power changes{size} from one stretch of {pace} to another, "
+        f"which is {region['ratio']:.3g} times the scatter of steady noise"
+    )
+
+
+def _describe_mean(region: Mapping[str, Any], when: str) -> str:
+    axes, estimate = axes_text(region["axes"]), region.get("estimate", np.nan)
+    if region.get("sign", 1) == 0:
         return (
-            f"The noise of {axes} goes up and down {when}, at {taus}: from one stretch of {pace} to another its power changes{size}, which "
-            f"is {region['ratio']:.3g} times the scatter of steady noise ({sure})."
+            f"The mean rate of {axes} wanders {when}, by up to {abs(estimate):.3g} deg/h, more "
+            "than drift and noise allow"
         )
-    if region["view"] == "davar":
-        what = "noisier" if more else "quieter"
+    size = f"{abs(estimate):.3g} deg/h " if np.isfinite(estimate) else ""
+    return (
+        f"The mean rate of {axes} is {size}{'above' if _is_higher(region) else 'below'} its "
+        f"expected value {when}, more than drift and noise allow"
+    )
+
+
+def _describe_cross_axis(region: Mapping[str, Any], when: str) -> str:
+    estimate = region.get("estimate", np.nan)
+    if region.get("what") == "slow":
         return (
-            f"{begin} {verb} {what} than simulated {when}, at {taus}: {'its' if one else 'their'} Allan variance is "
-            f"{region['ratio']:.3g} times the expected one ({sure})."
+            f"{_subject(region)} drift together (correlation {estimate:.2g}) {when}, at "
+            f"{_taus_text(region)}, which the random walks of independent gyros do not"
         )
-    if region["view"] == "mean" and region.get("sign", 1) == 0:
-        return f"The mean rate of {axes} wanders {when} by more than drift and noise allow, {abs(estimate):.3g} deg/h at most ({sure})."
-    if region["view"] == "mean":
-        size = f" by {abs(estimate):.3g} deg/h" if np.isfinite(estimate) else ""
-        return f"The mean rate of {axes} is {'higher' if more else 'lower'}{size} {when} than drift and noise allow ({sure})."
-    if region["view"] == "cross_axis" and region.get("what") == "slow":
-        size = f" (correlation {estimate:.2g})"
-        return f"{begin} wander together{size} {when}, at {taus}, which the random walks of independent gyros do not ({sure})."
-    if region["view"] == "cross_axis":
-        size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
-        return f"{begin} vary together{size} {when}, at {taus}, which independent gyros do not ({sure})."
-    what = str(region.get("what", ""))
-    if region["view"] == "spectrum" and what.startswith("order"):
+    size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
+    return (
+        f"{_subject(region)} vary together{size} {when}, at {_taus_text(region)}, which "
+        "independent gyros do not"
+    )
+
+
+def _describe_spectrum(region: Mapping[str, Any], when: str) -> str:
+    axes, what = axes_text(region["axes"]), str(region.get("what", ""))
+    if what.startswith("order"):
+        order = what.removeprefix("order ")
+        multiple = "" if order == "1" else f"{order} times "
         return (
-            f"The rate of {axes} has a part of {estimate:.3g} deg/h that turns {what.removeprefix('order ')} times with every turn of the "
-            f"tool {when} ({sure})."
+            f"The rate of {axes} has a component of {region['estimate']:.3g} deg/h at {multiple}"
+            f"the rotation rate of the tool {when}"
         )
-    if region["view"] == "spectrum" and what == "ramp phase":
-        return f"The rate of {axes} has a part of {estimate:.3g} deg/h rms that follows the phase of the feedback ramp {when} ({sure})."
-    if region["view"] == "spectrum" and what.startswith("drifting"):
-        begins, ends = what.split()[1:]
-        return f"The spectrum of {axes} has a line that moves {when}, from about {begins} Hz to about {ends} Hz ({sure})."
-    if region["view"] == "spectrum":
+    if what == "ramp phase":
         return (
-            f"The spectrum of {axes} has a line at {region.get('frequency', np.nan):.5g} Hz {when}, {region['ratio']:.3g} times the level "
-            f"of the noise ({sure})."
+            f"The rate of {axes} has a component of {region['estimate']:.3g} deg/h rms that is "
+            f"locked to the phase of the feedback ramp {when}"
         )
-    if region["view"] == "restart":
+    if what.startswith("glide"):
+        first, last = what.split()[1:]
         return (
-            f"The rate of {axes} does not begin where it ended when the power comes back ({sure})."
+            f"The spectrum of {axes} has a drifting line {when}, from about {first} Hz to about "
+            f"{last} Hz"
         )
-    told = _MARKS.get(what, "an unusual distribution of its samples")
-    return f"{begin} {'has' if one else 'have'} {told} {when} ({sure})."
+    return (
+        f"The spectrum of {axes} has a line at {region.get('frequency', np.nan):.5g} Hz {when}, at "
+        f"{region['ratio']:.3g} times the noise level"
+    )
+
+
+def _describe_restart(region: Mapping[str, Any], when: str) -> str:
+    return (
+        f"The rate of {axes_text(region['axes'])} does not resume where it ended when the power "
+        f"returns, {when}"
+    )
+
+
+def _describe_samples(region: Mapping[str, Any], when: str) -> str:
+    samples = _SAMPLES.get(str(region.get("what", "")), "an unusual distribution of its samples")
+    verb = "has" if len(region["axes"]) == 1 else "have"
+    return f"{_subject(region)} {verb} {samples} {when}"
+
+
+_DESCRIBERS: dict[str, Callable[[Mapping[str, Any], str], str]] = {
+    "davar": _describe_allan_variance,
+    "mean": _describe_mean,
+    "cross_axis": _describe_cross_axis,
+    "spectrum": _describe_spectrum,
+    "restart": _describe_restart,
+}
+_SAMPLES = {
+    "outliers": "outliers",
+    "repeats": "more repeated samples than noise produces",
+    "extremes": "many samples at the same smallest or largest value",
+    "zeros": "samples that are exactly zero",
+    "kurtosis": "a sample distribution that is not normal",
+    "lattice": "values on a coarse quantization grid",
+}
+
+
+def _subject(region: Mapping[str, Any]) -> str:
+    axes = axes_text(region["axes"])
+    return axes[0].upper() + axes[1:]
+
+
+def _is_higher(region: Mapping[str, Any]) -> bool:
+    return bool(region.get("sign", 1) >= 0)
+
+
+def _taus_text(region: Mapping[str, Any]) -> str:
+    low, high = length_text(region["tau_min_s"]), length_text(region["tau_max_s"])
+    if region["tau_max_s"] > 1.01 * region["tau_min_s"]:
+        return f"averaging times of {low} to {high}"
+    return f"an averaging time of {low}"
+
+
+def motion_statement(axis: str, when: str, largest: float, followers: Sequence[str]) -> str:
+    """Write a sentence on an axis that moves far beyond its noise and that no channel explains.
+
+    Parameters
+    ----------
+    axis, when : str
+        Where and when; `when` from `span_text`.
+    largest : float
+        Largest deviation [deg/h].
+    followers : sequence of str
+        Axes that see the same motion through a misalignment.
+
+    Examples
+    --------
+    >>> motion_statement("z", "from 1:00 to 5:00 after the start", 389.0, ["x"])
+    'The rate of axis z moves far beyond its noise from 1:00 to 5:00 after the start, by up to
+     389 deg/h. Axis x senses part of it, so it is real rotation of the tool; no channel records
+     its true rate.'
+    """
+    size = f"by up to {largest:.3g} deg/h"
+    text = f"The rate of axis {axis} moves far beyond its noise {when}, {size}"
+    if followers:
+        subject = _subject({"axes": followers})
+        return (
+            f"{text}. {subject} {'senses' if len(followers) == 1 else 'sense'} part of it, so it "
+            "is real rotation of the tool; no channel records its true rate."
+        )
+    causes = " or ".join(plain_name(name) for name in ("real_motion", "scale_factor"))
+    return f"{text}. No channel explains it; it may be {causes}."
 
 
 def named_statement(
     statistic: str, effect: str, axes: Sequence[str], when: str, p_value: float
 ) -> str:
-    """One sentence on what shows only when an effect says where to look.
+    """Write a sentence on a difference that shows only with the pattern of an effect.
 
     Examples
     --------
     >>> named_statement("mean", "shupe", ["y"], "over the whole record", 0.004)
-    'The mean rate of axis y differs over the whole record, in no single place, but taken together as a bias that follows the
-     rate of change of temperature (Shupe effect) would have it (noise alone does that in 1 of 250
-     such records).'
+    'The mean rate of axis y differs from the simulation over the whole record: by no more than
+     noise at any single place, but as a whole with the pattern of a bias that follows the rate of
+     change of temperature (Shupe effect) (noise alone would show this in 1 of 250 such records).'
     """
-    what = _SHOWN.get(statistic, "The noise")
+    quantity = _QUANTITIES.get(statistic, "The noise")
     return (
-        f"{what} of {axes_text(axes)} differs {when}, in no single place, but taken together as {plain_name(effect)} would have it "
+        f"{quantity} of {axes_text(axes)} differs from the simulation {when}: by no more than "
+        f"noise at any single place, but as a whole with the pattern of {plain_name(effect)} "
         f"({chance(p_value)})."
     )
 
 
-_SHOWN = {
+_QUANTITIES = {
     "mean": "The mean rate",
     "cross_axis": "The covariance",
     "spectrum": "The spectrum",
     "distribution": "The distribution of the samples",
 }
 
-_MARKS = {
-    "outliers": "samples that jump out",
-    "repeats": "more repeated samples than noise makes",
-    "extremes": "many samples at the same smallest or largest value",
-    "zeros": "samples that are exactly zero",
-    "kurtosis": "a distribution of samples that is not normal",
-    "lattice": "values that stand on a coarse lattice",
-}
+
+def without_chance(statement: str) -> str:
+    """Return a sentence on a mismatch without its probability, for lists that have it elsewhere.
+
+    Examples
+    --------
+    >>> without_chance(f"Axis x has outliers ({chance(0.004)}).")
+    'Axis x has outliers.'
+    """
+    return _CHANCE_PATTERN.sub("", statement)
+
+
+# ------------------------------------------------------------------------------------------------
+# effects
 
 
 def unsized_statement(effect: str, axes: Sequence[str]) -> str:
-    """Say that the record shows an effect whose size it does not give.
+    """Write a sentence on an effect whose size the record does not determine.
 
     Examples
     --------
     >>> unsized_statement("real_motion", ["z"])
-    'The record shows real rotation of the tool, not a sensor error, on axis z. It does not give a size.'
+    'The record shows real rotation of the tool, not a sensor error, on axis z, but does not
+     determine the size.'
     """
-    return f"The record shows {plain_name(effect)}, on {axes_text(axes)}. It does not give a size."
-
-
-def without_chance(statement: str) -> str:
-    """Return a statement on a mismatch without its closing words on chance, for lists that show the chance elsewhere.
-
-    Examples
-    --------
-    >>> without_chance("Axis x is noisier than simulated (noise alone does that in 1 of 250 such records).")
-    'Axis x is noisier than simulated.'
-    """
-    return _CHANCE_WORDS.sub("", statement)
-
-
-def next_measurement(name: str, alternatives: Sequence[str]) -> str:
-    """What to measure to tell an effect from those that the record cannot tell it from; empty when nothing is known.
-
-    Examples
-    --------
-    >>> next_measurement("g_sensitivity", ["vibration_rectification"])
-    'To tell them apart, turn the tool over, at rest: g-sensitivity changes sign with gravity, rectification does not.'
-    """
-    steps = list(dict.fromkeys(_NEXT[one] for one in (name, *alternatives[:2]) if one in _NEXT))
-    if not steps:
-        return ""
-    if "vibration_rectification" in (name, *alternatives) and "g_sensitivity" in (
-        name,
-        *alternatives,
-    ):
-        steps = [_NEXT[name]]
-    begin = "To tell them apart, " if alternatives else "To confirm it, "
-    return begin + "; or ".join(steps[:2] if alternatives else steps[:1]) + "."
+    return (
+        f"The record shows {plain_name(effect)}, on {axes_text(axes)}, but does not determine "
+        "the size."
+    )
 
 
 def effect_statement(
-    said: str, *, alternatives: Sequence[str] = (), intervals: Sequence[str] = ()
+    description: str, *, alternatives: Sequence[str] = (), intervals: Sequence[str] = ()
 ) -> str:
-    """What a named effect does and when, and what the record cannot tell it from.
+    """Describe an effect, when it acts, and what the record cannot distinguish it from.
 
     Parameters
     ----------
-    said : str
-        What `Effect.say` says, with its numbers.
+    description : str
+        What the effect does, with its numbers; from `Effect.say`.
     alternatives : sequence of str
         Names of the effects that look the same in this record.
     intervals : sequence of str
@@ -382,49 +509,73 @@ def effect_statement(
 
     Examples
     --------
-    >>> effect_statement("The bias jumps on axis x.", alternatives=["telegraph"], intervals=["from 1:00 to 2:00 after the start"])
-    'The bias jumps on axis x. It shows from 1:00 to 2:00 after the start. This record cannot tell it from a bias that
-     switches between two levels.'
+    >>> effect_statement("The bias jumps on axis x.", alternatives=["telegraph"],
+    ...                  intervals=["from 1:00 to 2:00 after the start"])
+    'The bias jumps on axis x. It is active from 1:00 to 2:00 after the start. This record cannot
+     distinguish it from a bias that switches between two levels.'
     """
-    components = [said]
+    sentences = [description]
     if intervals:
-        components.append(f"It shows {', and '.join(intervals)}.")
+        sentences.append(f"It is active {', and '.join(intervals)}.")
     if alternatives:
-        components.append(
-            f"This record cannot tell it from {', or '.join(plain_name(one) for one in alternatives)}."
-        )
-    return " ".join(components)
+        names = ", or ".join(plain_name(name) for name in alternatives)
+        sentences.append(f"This record cannot distinguish it from {names}.")
+    return " ".join(sentences)
+
+
+def next_measurement(name: str, alternatives: Sequence[str]) -> str:
+    """Say what to measure to separate an effect from its alternatives; empty if nothing is known.
+
+    Examples
+    --------
+    >>> next_measurement("g_sensitivity", ["vibration_rectification"])
+    'To tell them apart, turn the tool over, at rest: g-sensitivity changes sign with gravity,
+     rectification does not.'
+    """
+    names = (name, *alternatives)
+    known = _NEXT_MEASUREMENTS
+    steps = list(dict.fromkeys(known[other] for other in names[:3] if other in known))
+    if not steps:
+        return ""
+    if {"vibration_rectification", "g_sensitivity"} <= set(names):
+        steps = [known[name]]  # either measurement separates the two
+    if alternatives:
+        return f"To tell them apart, {'; or '.join(steps[:2])}."
+    return f"To confirm it, {steps[0]}."
+
+
+# ------------------------------------------------------------------------------------------------
+# the whole record
 
 
 def summary(content: Mapping[str, Any]) -> str:
-    """The verdict as one sentence for the head of a report."""
-    axes = axes_text(content["recording"]["axes"])
-    found, named, left = len(content["mismatches"]), content["effects"], content["unexplained"]
+    """Write the verdict as the first sentences of a report."""
     if content["verdict"] == "no mismatch":
+        axes = axes_text(content["recording"]["axes"])
         level = 100.0 * content["false_alarm_level"]
-        return f"On {axes} nothing differs from the simulation by more than noise does (chance of a false alarm: {level:g} %)."
-    are, them = ("is", "it") if found == 1 else ("are", "them")
-    places = (
-        f"{found} place{'' if found == 1 else 's'} where the recording differs from the simulation"
-    )
-    if not named:
-        return f"There {are} {places}; none of the known effects explains {them}."
-    names, failed = _named_text(named), failed_checks(content["held_out"])
-    but = (
-        f" The named effects do not describe the record well: {'; '.join(failed)}."
-        if failed
-        else ""
-    )
+        return (
+            f"On {axes} the recording agrees with the simulation within noise (false-alarm "
+            f"probability: {level:g} %)."
+        )
+    count = len(content["mismatches"])
+    places, them = ("1 place", "it") if count == 1 else (f"{count} places", "them")
+    differs = f"The recording differs from the simulation in {places}"
+    if not content["effects"]:
+        return f"{differs}; none of the known effects explains {them}."
+    names = _list_effects(content["effects"])
+    failed = failed_checks(content["held_out"])
+    doubt = f" The effects do not describe the record well: {'; '.join(failed)}." if failed else ""
     if content["verdict"] == "unknown":
-        return f"There {are} {places}. What was named does not explain {them}: {names}.{but}"
+        return f"{differs}. The effects that were found do not explain {them}: {names}.{doubt}"
+    left = len(content["unexplained"])
     if not left:
-        return f"There {are} {places}. What explains {them}: {names}.{but}"
-    rest = f"{len(left)} of them {'is' if len(left) == 1 else 'are'} not."
-    return f"There {are} {places}. Part of {them} is explained: {names}. {rest}{but}"
+        return f"{differs}. Explanation: {names}.{doubt}"
+    rest = "1 place is" if left == 1 else f"{left} places are"
+    return f"{differs}. Partial explanation: {names}. {rest} not explained.{doubt}"
 
 
-def _named_text(named: Sequence[Mapping[str, Any]]) -> str:
-    """List the named effects, each once for the axes that it acts on."""
+def _list_effects(named: Sequence[Mapping[str, Any]]) -> str:
+    """List the effects, each once for the axes that it acts on."""
     texts = [f"{plain_name(effect['name'])}, on {axes_text(effect['axes'])}" for effect in named]
     counts = {text: texts.count(text) for text in texts}
     return "; ".join(

@@ -1,4 +1,4 @@
-"""Whether the named effects explain a record, by its mismatches and its held-out data."""
+"""Decide whether the named effects explain a record, by its mismatches and its held-out data."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Any
 
 __all__ = ["decide_verdict", "failed_checks"]
 
-#: Coverage that a right model has, and the fall that counts as worse: two standard errors of a
-#: share of 95 % in the cells of the 36 stretches that are held out at least, three lengths of
-#: window and some ten averaging times each: 2 * sqrt(0.95 * 0.05 / 1080).
-RIGHT_COVERAGE, COVERAGE_TOLERANCE = 0.95, 0.013
+#: Share of the cells inside their 95 % band when the model is right.
+RIGHT_COVERAGE = 0.95
+#: Fall of that share that counts as worse: two standard errors, 2 * sqrt(0.95 * 0.05 / 1080), for
+#: the cells of at least 36 held-out stretches, three window lengths and some ten averaging times.
+COVERAGE_TOLERANCE = 0.013
 
 
 def _is_positive(value: Any) -> bool:
@@ -33,22 +34,24 @@ def _has_coverage(held: Mapping[str, Any]) -> bool:
     return bool(after >= min(before, RIGHT_COVERAGE) - COVERAGE_TOLERANCE)
 
 
-#: Check of the held-out evidence, and what to say where it fails.
+#: Checks of the held-out evidence, each with the message of a failure.
 _CHECKS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
     (
         _has_gain,
-        "held-out data are not predicted better (log-likelihood gain {log_likelihood_gain:.3g} nats)",
+        "held-out data are not predicted better "
+        "(log-likelihood gain {log_likelihood_gain:.3g} nats)",
     ),
     (_has_forecast, "the forecast of the last 30 % is worse ({forecast_gain:.3g} nats)"),
     (
         _has_coverage,
-        "fewer cells lie in their 95 % band ({coverage95_after:.1%} after {coverage95_before:.1%})",
+        "fewer cells lie inside their 95 % band "
+        "({coverage95_after:.1%}, before {coverage95_before:.1%})",
     ),
 )
 
 
 def failed_checks(held: Mapping[str, Any]) -> list[str]:
-    """List what the held-out data say against the named effects.
+    """List the held-out checks that the effects fail.
 
     Parameters
     ----------
@@ -57,7 +60,8 @@ def failed_checks(held: Mapping[str, Any]) -> list[str]:
 
     Examples
     --------
-    >>> held = {"log_likelihood_gain": 41.2, "forecast_gain": -3.0, "coverage95_before": 0.71, "coverage95_after": 0.95}
+    >>> held = {"log_likelihood_gain": 41.2, "forecast_gain": -3.0,
+    ...         "coverage95_before": 0.71, "coverage95_after": 0.95}
     >>> failed_checks(held)
     ['the forecast of the last 30 % is worse (-3 nats)']
     """
@@ -76,7 +80,7 @@ def decide_verdict(
     Parameters
     ----------
     mismatches, named : sequence
-        Mismatches and named effects.
+        Mismatches, and named effects.
     unexplained : iterable of int
         Mismatches that no effect explains.
     held : mapping
@@ -84,9 +88,12 @@ def decide_verdict(
 
     Examples
     --------
-    >>> good = {"log_likelihood_gain": 9.0, "forecast_gain": 2.0, "coverage95_before": 0.7, "coverage95_after": 0.9}
-    >>> decide_verdict([1], ["shupe"], [], good), decide_verdict([1], ["shupe"], [], good | {"forecast_gain": -1.0})
-    ('explained', 'partly explained')
+    >>> good = {"log_likelihood_gain": 9.0, "forecast_gain": 2.0,
+    ...         "coverage95_before": 0.7, "coverage95_after": 0.9}
+    >>> decide_verdict([1], ["shupe"], [], good)
+    'explained'
+    >>> decide_verdict([1], ["shupe"], [], good | {"forecast_gain": -1.0})
+    'partly explained'
     >>> decide_verdict([1], ["shupe"], [], good | {"log_likelihood_gain": -2.0})
     'unknown'
     """

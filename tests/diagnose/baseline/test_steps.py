@@ -12,7 +12,7 @@ import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.task import Task, still_lines
+from gyrostab.diagnose.task import Task, lines_without_motion
 from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
 from tests.support.named import nulls, record
@@ -88,14 +88,14 @@ def test_a_part_of_moving_blocks_has_no_lines(jumped):
     course = np.zeros((1, blocks.sizes["block"]))
     course[:, :12:2] = 5.0  # the first part has the blocks 0 to 11
     known = baseline.assign(known_mean=(("axis", "block"), course))
-    found = still_lines(task, blocks, known)
+    found = lines_without_motion(task, blocks, known)
     assert found["line_weight"].values[0, 0] == 0.0
     np.testing.assert_allclose(found["line_power"][:, 2:], blocks["line_power"][:, 2:])
     xr.testing.assert_identical(
         found.drop_vars(["line_power", "line_weight"]),
         blocks.drop_vars(["line_power", "line_weight"]),
     )
-    assert still_lines(task, blocks, baseline) is blocks
+    assert lines_without_motion(task, blocks, baseline) is blocks
 
 
 def test_only_blocks_with_known_motion_are_left_out():

@@ -7,11 +7,12 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.outlier_power import add_outlier_power
 from gyrostab.diagnose.estimate.recalibrate import recalibrate
-from gyrostab.diagnose.identify.forward_search import Identifications, name_effects
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.ingest.make_log import make_log
@@ -232,7 +233,7 @@ def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_power
     size, number = fitted.parameters["size"], fitted.parameters["per_hour"]
     assert size.low < 70.0 * SCATTER < size.high
     assert number.low < 0.009 * 36_000 < number.high
-    clean = predicted(found, recalibrate(found, baseline, [fitted]))
+    clean = predict_baseline(found, recalibrate(found, baseline, [fitted]))
     whole = add_outlier_power(clean, blocks, [fitted])["spectrum"].mean()
     assert float(whole) == pytest.approx(float(blocks["power"].mean()), rel=0.4)
     assert float(clean["spectrum"].mean()) < 0.1 * float(whole)
@@ -240,7 +241,7 @@ def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_power
         ([fitted], []),
         ([], [fitted]),
     ):  # effects of the recording alone, or of the simulation too
-        surfaces = conclude._surfaces(
+        surfaces = conclude._make_surfaces_with_outliers(
             blocks, conclude.Fit(found, clean, lacking, known), clean, clean
         )
         short = surfaces["avar"].isel(tau=0).mean(["axis", "window"])

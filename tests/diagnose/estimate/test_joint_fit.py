@@ -9,12 +9,13 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.forward_search import Identification, Identifications, name_effects
-from gyrostab.diagnose.identify.sample_sizes import line_size
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.identification import Identification, Identifications
+from gyrostab.diagnose.identify.sample_sizes import estimate_line
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on
@@ -192,17 +193,17 @@ def test_the_model_has_the_effect(shaken):
 
 def test_the_prediction_fits_only_what_it_may_see(shaken):
     identifications, baseline = shaken
-    after = predicted(identifications, baseline)
+    after = predict_baseline(identifications, baseline)
     vibration = identifications.state.blocks["channel_vibration"].values
     gained = (after["known_mean"] - baseline["known_mean"]).sel(axis="y").values
     assert np.ptp(gained) == pytest.approx(0.005 * np.max(vibration**2), rel=0.35)
     assert np.allclose((after["known_mean"] - baseline["known_mean"]).sel(axis="x"), 0.0)
-    blind = predicted(identifications, baseline, vibration < 1.0)
+    blind = predict_baseline(identifications, baseline, vibration < 1.0)
     changed = replace(identifications, state=replace(identifications.state, blocks=identifications.state.blocks.assign(
         mean=identifications.state.blocks["mean"] + xr.DataArray(np.where(vibration < 1.0, 0.0, 5.0), dims="block")
     )))  # fmt: skip
     np.testing.assert_allclose(
-        predicted(changed, baseline, vibration < 1.0)["known_mean"], blind["known_mean"]
+        predict_baseline(changed, baseline, vibration < 1.0)["known_mean"], blind["known_mean"]
     )
 
 
@@ -223,7 +224,7 @@ def test_size_of_a_line():
     blocks = record([table])
     power = blocks["line_power"].sel(axis="x").mean("part")
     place = int(power.values.argmax())
-    (amplitude, error), (frequency, _) = line_size(blocks, "x", place)
+    (amplitude, error), (frequency, _) = estimate_line(blocks, "x", place)
     assert amplitude == pytest.approx(0.4, abs=max(4 * error, 0.04))
     assert frequency == pytest.approx(2.345, abs=0.03)
 

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
@@ -93,13 +93,13 @@ def test_vibration_at_two_levels_and_never_none(shaken):
 def test_a_diagnosis_tells_noise_and_effects_as_they_are_beside_each_other(shaken):
     """The first calibration has the vibration in its noise, and finds less of it than there is."""
     identifications, baseline, after = shaken
-    fit = conclude.fitted_beside_their_noise(
+    fit = conclude.refit_with_noise(
         identifications, baseline, first := fit_identifications(identifications, baseline)
     )
     assert noise_of(fit.noise, "N")[0] == noise_of(after, "N")[0] < 1.2 * 0.003
     (size,) = fit.fitted[0].parameters.values()
     assert size.low < 0.002 < size.high
-    held = conclude.worth(identifications.state.blocks, baseline, identifications, first)
+    held = conclude.measure_evidence(identifications.state.blocks, baseline, identifications, first)
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.15)
 
 
@@ -117,7 +117,7 @@ def test_a_size_in_shares_of_the_noise_is_one_of_the_noise_beside_it():
     baseline = calibrate_noise(blocks)
     identifications = naming_of(blocks, baseline, "temperature_noise", "power", ("linear",))
     first = fit_identifications(identifications, baseline)
-    fit = conclude.fitted_beside_their_noise(identifications, baseline, first)
+    fit = conclude.refit_with_noise(identifications, baseline, first)
     assert first[0].parameters["linear"].high < 0.05
     growth = fit.fitted[0].parameters["linear"].value * noise_of(fit.noise, "N")[0] ** 2
     assert growth == pytest.approx(0.05 * 0.003**2, rel=0.1)
@@ -131,7 +131,7 @@ def test_an_axis_without_an_effect_keeps_its_noise(shaken):
 
 def test_effect_and_new_noise_make_the_record(shaken):
     identifications, _, after = shaken
-    model = predicted(with_noise(identifications, after), after)
+    model = predict_baseline(with_noise(identifications, after), after)
     ratio = (identifications.state.blocks["power"] / model["spectrum"]).sel(axis="x")
     shape = identifications.state.blocks["shape"].sel(axis="x")
     for block_count in (slice(0, 42), slice(43, None)):

@@ -11,10 +11,10 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
-from gyrostab.diagnose.identify.components import by_key, without_lines
+from gyrostab.diagnose.identify.components import group_components, merge_lines
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identification, add_identification, form_error
-from gyrostab.diagnose.identify.sample_sizes import line_size
+from gyrostab.diagnose.identify.sample_sizes import estimate_line
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.designs import Candidate, Variant
@@ -78,7 +78,7 @@ def test_the_skirt_contains_only_its_line(wander: float) -> None:
     skirt = line_skirt(blocks, "x", place)
     assert skirt[place]
     assert (np.abs(lines[skirt] - 1.0) < 1.5).all()
-    (amplitude, error), (frequency, _) = line_size(blocks, "x", place)
+    (amplitude, error), (frequency, _) = estimate_line(blocks, "x", place)
     assert amplitude == pytest.approx(3.0, abs=max(4.0 * error, 0.15))
     assert frequency == pytest.approx(1.0, abs=0.03)
 
@@ -109,7 +109,7 @@ def test_a_line_does_not_change_the_evidence_of_means() -> None:
     state, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
     candidates, _ = effect_candidates(blocks, state.baseline["coefficient"])
     found = compute_evidence(candidates, blocks, state, folds)
-    line, jump = (by_key(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
+    line, jump = (group_components(found)[effect][0] for effect in ("spectral_line", "bias_jump"))
     assert line.evidence_nats > 10.0
     named = condition_on(state, [line])
     kept = reusable_mean_evidence(found, state, named)
@@ -146,7 +146,7 @@ def test_a_line_counts_only_for_the_simplest_effect() -> None:
         ],
         "real_motion": [component("real_motion", "line", 50.0)],
     }
-    kept = without_lines(found)
+    kept = merge_lines(found)
     assert kept["spectral_line"] == found["spectral_line"]
     assert [one.candidate.statistic for one in kept["supply_bias(supply)"]] == ["mean"]
     assert "real_motion" not in kept

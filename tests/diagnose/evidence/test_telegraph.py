@@ -17,7 +17,7 @@ from gyrostab.diagnose.evidence.telegraph import (
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.identify.switching import followed_first, hops_alone
+from gyrostab.diagnose.identify.switching import drop_explained_jumps, put_followers_first
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.condition import Component, condition_on_components
 from gyrostab.diagnose.predict.linear_model import State
@@ -245,8 +245,8 @@ def test_an_effect_of_a_switching_channel_comes_first(
         FOLLOWS[0]: [led(channel, evidence_nats, axis)],
         "bias_jump": [jump(50, 20.0)],
     }
-    assert followed_first(HOPS_FIRST, components, state) == expected
-    assert followed_first(["telegraph", "bias_jump"], components, state) == [
+    assert put_followers_first(HOPS_FIRST, components, state) == expected
+    assert put_followers_first(["telegraph", "bias_jump"], components, state) == [
         "telegraph",
         "bias_jump",
     ]
@@ -304,7 +304,7 @@ def test_switches_are_not_also_jumps(
         evidence_nats,
         8.0,
     )
-    left = hops_alone([first, hopping], state_with, gains, 8.0)
+    left = drop_explained_jumps([first, hopping], state_with, gains, 8.0)
     assert [one.effect for one in left] == ["bias_jump"] * bool(kept) + ["telegraph"]
     assert [
         one.variant.values["at"]

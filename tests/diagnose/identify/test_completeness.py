@@ -11,9 +11,10 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.completeness import variance_fluctuation
-from gyrostab.diagnose.identify.forward_search import _Search, name_effects
-from gyrostab.diagnose.predict.condition import refit_weights
-from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.selection import Search
+from gyrostab.diagnose.predict.condition import reweighted
+from gyrostab.diagnose.predict.linear_model import State, begin_state
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
 from gyrostab.diagnose.predict.search import CandidateEvidence, CountEvidence, compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -110,8 +111,8 @@ def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
             unit="deg/h",
         )
     )
-    state = initial_state(blocks, calibrate_noise(blocks))
-    search = _Search(nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0)
+    state = begin_state(blocks, calibrate_noise(blocks))
+    search = Search(nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0)
 
     def common(found: list[CandidateEvidence]) -> float:
         return max(
@@ -119,7 +120,7 @@ def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
         )
 
     assert common(compute_evidence(search.candidates, blocks, state, search.folds)) > 100.0
-    assert common(search._ranked(state, set())) < 3.0
+    assert common(search._score_candidates(state, set())) < 3.0
 
 
 def test_no_jump_and_no_ageing_is_named_beside_a_drift_of_no_name_that_brings_more():

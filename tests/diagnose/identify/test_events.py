@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key, sum_evidence
+from gyrostab.diagnose.identify.components import group_components, sum_evidence
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
@@ -60,7 +60,9 @@ def candidate(state: State, effect: str, statistic: str) -> Candidate:
 
 
 def parts_of(state: State, one: Candidate) -> list[Component]:
-    return by_key(compute_evidence([one], state.blocks, state, fold_blocks(state.blocks)))[one.key]
+    return group_components(
+        compute_evidence([one], state.blocks, state, fold_blocks(state.blocks))
+    )[one.key]
 
 
 @pytest.mark.parametrize("inside", [slice(0, 3), slice(-4, None)])

@@ -12,8 +12,9 @@ import xarray as xr
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_count_evidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
-from gyrostab.diagnose.identify.forward_search import Identification, name_effects, tail_level
+from gyrostab.diagnose.identify.forward_search import name_effects, tail_level
 from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.search import combine_rows

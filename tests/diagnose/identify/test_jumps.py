@@ -7,9 +7,9 @@ import pytest
 
 from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key, sum_evidence
+from gyrostab.diagnose.identify.components import group_components, sum_evidence
 from gyrostab.diagnose.identify.identifiability import is_physical
-from gyrostab.diagnose.identify.jumps import is_sudden, jumps_at_will
+from gyrostab.diagnose.identify.jumps import is_free_jump, is_sudden
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
@@ -38,11 +38,13 @@ def test_what_goes_over_within_some_blocks_is_no_jump(way: float, size: float, j
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if (one.effect, one.statistic) == ("bias_jump", "mean")
     )
-    state = initial_state(blocks, baseline)
-    components = by_key(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[jumps.key]
+    state = begin_state(blocks, baseline)
+    components = group_components(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[
+        jumps.key
+    ]
     assert sum_evidence(components) > 10.0
     assert abs(float(components[0].variant.values["at"]) - MIDDLE) <= 30.0
-    assert all(jumps_at_will(component, state) for component in components)
+    assert all(is_free_jump(component, state) for component in components)
     assert is_sudden(components, state) == jump
     assert bool(is_physical(components, state)) == jump
 
@@ -66,5 +68,5 @@ def test_where_power_came_back_a_jump_may_settle() -> None:
         instant: Component(jumps, jumps.variants[int(np.abs(at - instant).argmin())], ("x",), 20.0)
         for instant in (960.0, 1010.0)
     }
-    assert [jumps_at_will(component, state) for component in components.values()] == [False, True]
+    assert [is_free_jump(component, state) for component in components.values()] == [False, True]
     assert [is_sudden([component], state) for component in components.values()] == [True, False]

@@ -9,9 +9,9 @@ from scipy.signal import butter, lfilter, sosfilt
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key, sum_evidence
+from gyrostab.diagnose.identify.components import group_components, sum_evidence
 from gyrostab.diagnose.identify.identifiability import is_physical
-from gyrostab.diagnose.identify.logger_filters import filter_sizes, on_all_axes
+from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes, fits_all_axes
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.filter_response import is_filter
@@ -43,12 +43,12 @@ def test_a_filter_that_other_axes_deny_is_none_of_the_logger(late, one_filter):
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect == "logger_filter"
     ]
-    state = initial_state(blocks, baseline)
-    components = by_key(compute_evidence(filters, blocks, state, fold_blocks(blocks)))[
+    state = begin_state(blocks, baseline)
+    components = group_components(compute_evidence(filters, blocks, state, fold_blocks(blocks)))[
         "logger_filter"
     ]
     assert sum_evidence(components) > 10.0
-    assert on_all_axes(components, state) == one_filter
+    assert fits_all_axes(components, state) == one_filter
     assert is_physical(components, state) == (components if one_filter else [])
 
 
@@ -89,5 +89,5 @@ def _cutoff(log: xr.Dataset) -> tuple[float, float]:
     components = [
         Component(candidate, variant, (str(axis),), 50.0) for axis in blocks["axis"].values
     ]
-    mean, error, *ends = filter_sizes(components, initial_state(blocks, baseline))[0]["cutoff"]
+    mean, error, *ends = fit_filter_sizes(components, begin_state(blocks, baseline))[0]["cutoff"]
     return (ends[0], ends[1]) if ends else (mean - 1.96 * error, mean + 1.96 * error)

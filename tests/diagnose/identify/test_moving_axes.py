@@ -156,7 +156,7 @@ def test_one_mismatch_says_where_it_moves_and_who_sees_it(seen):
     assert "scale-factor" in alone["statement"]
     assert "40" in alone["statement"] or "39" in alone["statement"]
     (witnessed,) = motion_tables([identification("misalignment", "mean", "x")], rest, [])
-    assert "axis x sees a share" in witnessed["statement"]
+    assert "Axis x senses part of it" in witnessed["statement"]
     assert "real rotation" in witnessed["statement"]
 
 
@@ -175,6 +175,6 @@ def test_what_moves_stays_in_where_the_rest_is_too_little_to_calibrate_on(turnin
     whole = reduce_log(log)
     with pytest.raises(SchemaError, match="axis z"):
         calibrate_noise(without_motion(log, whole, moving_blocks(whole)))
-    with pytest.warns(UserWarning, match="compared with its motion in it.*axis z"):
+    with pytest.warns(UserWarning, match="the diagnosis includes unexplained motion.*axis z"):
         found = diagnose(log, nulls=100)
     assert found.verdict != "no mismatch"

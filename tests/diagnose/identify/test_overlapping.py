@@ -9,7 +9,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.components import evidence_of
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identification, with_axes_of
-from gyrostab.diagnose.identify.overlapping import layers
+from gyrostab.diagnose.identify.overlapping import split_layers
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.condition import Component
@@ -36,7 +36,7 @@ def test_rows_that_come_again_are_a_layer_of_their_own():
         component(6.0, witness="seismometer"),
         component(5.0),
     ]
-    assert [[one.evidence_nats for one in layer] for layer in layers(components)] == [
+    assert [[one.evidence_nats for one in layer] for layer in split_layers(components)] == [
         [9.0, 8.0, 6.0],
         [7.0],
         [5.0],

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.identify.phase_locked import without_waves
+from gyrostab.diagnose.identify.phase_locked import remove_phase_locked
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.simulate import simulate
@@ -47,7 +47,7 @@ def test_only_waves_are_taken_out_with_what_they_gain() -> None:
         None,
         xr.DataArray(),
     )  # type: ignore[arg-type]
-    left, evidence_nats = without_waves(identifications)
+    left, evidence_nats = remove_phase_locked(identifications)
     assert evidence_nats == 27.0
     assert [one.components for one in left.identified] == [(mean,), (mean,)]
     assert left.identified[1] is identifications.identified[2]

@@ -8,7 +8,7 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key
+from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, is_physical
 from gyrostab.diagnose.predict.candidates import effect_candidates
@@ -51,8 +51,8 @@ def _parts(blocks: xr.Dataset):
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect in ("scale_factor", "real_motion")
     ]
-    state = initial_state(blocks, baseline)
-    components = by_key(
+    state = begin_state(blocks, baseline)
+    components = group_components(
         compute_evidence(
             [one for one in known if one.statistic == "mean"], blocks, state, fold_blocks(blocks)
         )

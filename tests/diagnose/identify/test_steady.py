@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key
+from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.steady import is_always_present
 from gyrostab.diagnose.predict.candidates import effect_candidates
@@ -37,8 +37,8 @@ def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], S
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.key == "gauss_markov" and one.statistic == "power"
     ]
-    state = initial_state(blocks, baseline)
-    return by_key(compute_evidence(biases, blocks, state, fold_blocks(blocks)))[
+    state = begin_state(blocks, baseline)
+    return group_components(compute_evidence(biases, blocks, state, fold_blocks(blocks)))[
         "gauss_markov"
     ], state
 

@@ -8,7 +8,7 @@ import pytest
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import by_key, sum_evidence
+from gyrostab.diagnose.identify.components import group_components, sum_evidence
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import condition_on
@@ -51,14 +51,16 @@ def test_earth_rate_is_taken_out_and_made_again(around):
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
     orders = [one for one in known if one.statistic == "order"]
-    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
-    components = by_key(compute_evidence(orders, blocks, start, folds))["earth_rate(rotation_rate)"]
+    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    components = group_components(compute_evidence(orders, blocks, start, folds))[
+        "earth_rate(rotation_rate)"
+    ]
     assert sum_evidence(components) > 1000.0
     state = condition_on(start, components)
     assert (
         max(
             sum_evidence(one)
-            for one in by_key(compute_evidence(orders, blocks, state, folds)).values()
+            for one in group_components(compute_evidence(orders, blocks, state, folds)).values()
         )
         < 5.0
     )
@@ -88,8 +90,8 @@ def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most
     blocks = reduce_log(log)
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
-    components = by_key(
+    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    components = group_components(
         compute_evidence([one for one in known if one.statistic == "order"], blocks, start, folds)
     )["earth_rate(rotation_rate)"]
     identification = Identification(
@@ -133,8 +135,8 @@ def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
     orders = [one for one in known if one.statistic == "order" and one.effect == "rotation_line"]
-    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
-    components = by_key(compute_evidence(orders, blocks, start, folds))[
+    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    components = group_components(compute_evidence(orders, blocks, start, folds))[
         "rotation_line(rotation_rate)"
     ]
     identification = Identification(

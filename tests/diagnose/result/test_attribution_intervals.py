@@ -10,7 +10,7 @@ import pytest
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.result.attribution import active_spans, spans
+from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from tests.support.named import COEFFICIENT, WORLD, record
 
 
@@ -32,8 +32,8 @@ def identification(blocks, effect, statistic):
 
 
 def test_what_is_locked_to_the_rotation_acts_while_the_tool_turns(turning):
-    found = spans(
-        active_spans(identification(turning, "rotation_line", "order"), turning),
+    found = join_blocks(
+        active_blocks(identification(turning, "rotation_line", "order"), turning),
         turning["begin"].values,
         turning["end"].values,
     )
@@ -45,16 +45,16 @@ def test_what_stands_at_rest_as_well_acts_at_rest_as_well(turning):
     both = replace(
         one, components=(*one.components, *identification(turning, "earth_rate", "mean").components)
     )
-    assert spans(active_spans(both, turning), turning["begin"].values, turning["end"].values) == [
-        (0.0, 3600.0)
-    ]
+    assert join_blocks(
+        active_blocks(both, turning), turning["begin"].values, turning["end"].values
+    ) == [(0.0, 3600.0)]
 
 
 def test_an_effect_of_a_channel_that_rests_less_than_half_of_the_time_acts_while_it_does_not_rest(
     turning,
 ):
-    (span,) = spans(
-        active_spans(identification(turning, "scale_factor", "mean"), turning),
+    (span,) = join_blocks(
+        active_blocks(identification(turning, "scale_factor", "mean"), turning),
         turning["begin"].values,
         turning["end"].values,
     )
@@ -67,7 +67,7 @@ def test_a_tenth_of_the_largest_counts_as_there(level, there):
     g = np.zeros(blocks.sizes["block"])
     g[40:60], g[100:120] = 5.0, 5.0 * level
     shaken = blocks.assign(channel_vibration=blocks["channel_vibration"].copy(data=g))
-    found = active_spans(identification(shaken, "vibration_rectification", "mean"), shaken)
+    found = active_blocks(identification(shaken, "vibration_rectification", "mean"), shaken)
     np.testing.assert_array_equal(
         np.flatnonzero(found), [*range(40, 60), *(range(100, 120) if there else ())]
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.estimate.conditioned_baseline import predicted
+from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
@@ -18,7 +18,7 @@ from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on, find_anomalous_blocks
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.result.attribution import attribute_mismatches
-from gyrostab.diagnose.result.attribution_weights import needed
+from gyrostab.diagnose.result.attribution_weights import needed_effects
 from gyrostab.diagnose.statistics import mean
 from tests.support.named import COEFFICIENT, nulls, record
 
@@ -71,7 +71,7 @@ def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(s
     blocks, baseline, identifications, _ = shaken
     loud, bias, _ = identifications.identified
     whole, silent, level = (
-        predicted(identifications, baseline, left_out=out) for out in ([], [loud], [bias])
+        predict_baseline(identifications, baseline, left_out=out) for out in ([], [loud], [bias])
     )
     quiet = blocks["channel_vibration"].values < 1.0
     np.testing.assert_allclose(silent["known_mean"], whole["known_mean"])
@@ -90,7 +90,7 @@ def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(s
 def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
     blocks, baseline, identifications, null = shaken
     found = locate_mismatches(blocks, baseline, null)
-    after = predicted(identifications, baseline)
+    after = predict_baseline(identifications, baseline)
 
     def told(statistic, **options):
         lists = attribute_mismatches(
@@ -103,7 +103,7 @@ def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
         }
 
     def without(out):
-        return predicted(identifications, baseline, left_out=out)
+        return predict_baseline(identifications, baseline, left_out=out)
 
     assert {"vibration_noise", "vibration_rectification", "spikes"} in told("davar")
     noise = told("davar", without=without)
@@ -117,7 +117,7 @@ def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
     loud, _, spikes = identifications.identified
     assert find_anomalous_blocks(spikes.components[0], blocks).sum() == 2
     found = locate_mismatches(blocks, baseline, null)
-    after = predicted(identifications, baseline)
+    after = predict_baseline(identifications, baseline)
     one = attribute_mismatches(
         found, [loud], blocks, after, null, level=0.005
     )  # the loudest two blocks are still there
@@ -170,14 +170,17 @@ def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
             region,
             [identification],
             moved,
-            predicted(identifications, baseline),
+            predict_baseline(identifications, baseline),
             null,
             level=0.005,
             **options,
         )[0]
 
     assert explained() == []  # by its time alone
-    assert explained(without=lambda out: predicted(identifications, baseline, left_out=out)) == told
+    assert (
+        explained(without=lambda out: predict_baseline(identifications, baseline, left_out=out))
+        == told
+    )
 
 
 BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
@@ -217,21 +220,24 @@ def test_an_effect_is_needed_without_which_it_is_a_mismatch_or_that_brings_a_fai
     sizes, kept
 ):
     shown = _shown("power", "mean")
-    found = needed(BOX, shown, _brought(effect_0=sizes[0], effect_1=sizes[1]))
+    found = needed_effects(BOX, shown, _brought(effect_0=sizes[0], effect_1=sizes[1]))
     assert found == [f"effect {number}" for number in kept]
 
 
 def test_what_a_view_does_not_hold_stays():
-    assert needed(
+    assert needed_effects(
         BOX | {"view": "spectrum"}, _shown("power", "line"), _brought(effect_0=0.0, effect_1=0.0)
     ) == ["effect 0", "effect 1"]
-    assert needed(BOX, _shown("power", "wander"), _brought(effect_0=9.0, effect_1=0.0)) == [
+    assert needed_effects(BOX, _shown("power", "wander"), _brought(effect_0=9.0, effect_1=0.0)) == [
         "effect 0",
         "effect 1",
     ]
     low_pass = _shown("power", "power")
     low_pass[1][1][0].variant = SimpleNamespace(columns=())
-    assert needed(BOX, low_pass, _brought(effect_0=9.0, effect_1=0.0)) == ["effect 0", "effect 1"]
+    assert needed_effects(BOX, low_pass, _brought(effect_0=9.0, effect_1=0.0)) == [
+        "effect 0",
+        "effect 1",
+    ]
 
 
 @pytest.mark.parametrize(("begin", "regions"), [(70.0, 2), (85.0, 1)])

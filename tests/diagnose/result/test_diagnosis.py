@@ -1,4 +1,4 @@
-"""A diagnosis as data and as files: the contract's JSON to the letter, the model that runs, the folder, the page."""
+"""A diagnosis as data and as files: JSON schema, model, folder, report page, and sentences."""
 
 from __future__ import annotations
 
@@ -44,26 +44,26 @@ from tests.support.diagnosed import content, diagnosis, model, surfaces
 
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages of words alone, for tests that are about something else."""
-    monkeypatch.setattr("gyrostab.report.diagnosis._figures", lambda _: [])
+    """Leave out the figures in tests that are about the text of a page."""
+    monkeypatch.setattr("gyrostab.report.diagnosis._make_figures", lambda _: [])
 
 
 plain_pages = pytest.mark.usefixtures("without_figures")
 
-# -------------------------------------------------------------------------------------------------------------------
-# schema
+# --------------------------------------------------------------------------------------------------
+# ----------------- schema
 
 
-def test_what_is_made_by_hand_after_the_contract_passes():
+def test_content_made_by_hand_passes_the_check():
     check_diagnosis(content())
     check_diagnosis(json.loads(diagnosis().to_json()))
 
 
-def test_every_key_is_explained_on_the_page():
+def test_docs_explain_every_key():
     text = (Path(__file__).resolve().parents[3] / "docs" / "diagnosis.md").read_text(
         encoding="utf-8"
     )
-    section = text[text.index("## What stands in `diagnosis.json`") :].split("\n## ")[0]
+    section = text[text.index("## Contents of `diagnosis.json`") :].split("\n## ")[0]
     keys = {str(key) for place in _places(content()) for key in place[-1:] if isinstance(key, str)}
     assert keys > {"verdict", "held_out", "nats"}
     assert not [key for key in [*keys, *VERDICTS] if f"`{key}`" not in section]
@@ -111,13 +111,13 @@ def test_nothing_may_be_left_out_or_be_of_another_kind(place: tuple[Any, ...]):
         (lambda c: c.update(verdict="fine"), "the verdict is 'fine'"),
         (lambda c: c.update(schema="gyrostab.diagnosis/9"), "expected 'gyrostab.diagnosis/1'"),
         (lambda c: c["mismatches"][0].update(view="taste"), "view is 'taste'"),
-        (lambda c: c["mismatches"][0].update(p_value=1.5), "no probability"),
+        (lambda c: c["mismatches"][0].update(p_value=1.5), "expected a probability"),
         (
             lambda c: c["mismatches"][0].update(explained_by=["shupe"]),
             "'shupe', which is not among the effects",
         ),
-        (lambda c: c["mismatches"][1].update(id=1), "each must be there once"),
-        (lambda c: c["mismatches"][0].update(start="yesterday"), "no time of ISO 8601"),
+        (lambda c: c["mismatches"][1].update(id=1), "are not unique"),
+        (lambda c: c["mismatches"][0].update(start="yesterday"), "expected a time in ISO 8601"),
         (lambda c: c.update(unexplained=[7]), "mismatch 7"),
         (lambda c: c["baseline"].update(source="guess"), "'guess'"),
         (lambda c: c["effects"][0]["parameters"]["white"].pop("low"), "white.low"),
@@ -145,8 +145,8 @@ def test_json_knows_no_infinities():
         broken.to_json()
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# model
+# --------------------------------------------------------------------------------------------------
+# ------------------ model
 
 
 @pytest.mark.parametrize("name", list(effects()))
@@ -186,8 +186,8 @@ def test_the_model_runs(tmp_path: Path):
     assert loud.mean() - quiet.mean() == pytest.approx(0.0022 * (6.0**2 - 0.02**2), abs=0.06)
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# files
+# --------------------------------------------------------------------------------------------------
+# ------------------ files
 
 
 @plain_pages
@@ -256,8 +256,8 @@ def test_what_is_no_diagnosis_is_said(tmp_path: Path, spoil: str):
         open_diagnosis(folder)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# page
+# --------------------------------------------------------------------------------------------------
+# ------------------- page
 
 
 class Page(HTMLParser):
@@ -296,18 +296,18 @@ def page(tmp_path_factory) -> Page:
     return Page(path.read_text(encoding="utf-8"))
 
 
-def test_the_page_needs_nothing_beside_it(page: Page):
+def test_page_is_self_contained(page: Page):
     assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
     assert len(page.pictures) == 5
     assert page.pictures[0] == "Recording, simulation before and after"
 
 
-def test_the_page_says_what_where_when_how_much_how_sure_what_else_and_what_next(page: Page):
+def test_page_gives_size_time_evidence_alternatives_and_next_step(page: Page):
     text = re.sub(r"\s+", " ", " ".join(page.words))
     for piece in (
         "Noise that rises with vibration, axis x",
         "25:00 to 30:00 after the start",
-        "1.8 times the expected one",
+        "1.8 times the expected value",
         "1 of 2 500",
         "0.00045",
         "31 ± 6 nats",
@@ -329,20 +329,20 @@ def test_a_page_without_findings_says_so(tmp_path: Path):
     }
     write_diagnosis_report(Diagnosis(nothing, surfaces(), {"noise": {}}), tmp_path / "report.html")
     text = " ".join(Page((tmp_path / "report.html").read_text(encoding="utf-8")).words)
-    assert "nothing differs from the simulation" in text
+    assert "agrees with the simulation within noise" in text
     assert "Nowhere" in text
 
 
 @plain_pages
-def test_the_page_escapes_names(tmp_path: Path):
-    odd = content()
-    odd["recording"]["files"] = ["<script>alert(1)</script>"]
-    write_diagnosis_report(Diagnosis(odd, surfaces(), model()), tmp_path / "report.html")
+def test_page_escapes_names(tmp_path: Path):
+    scripted = content()
+    scripted["recording"]["files"] = ["<script>alert(1)</script>"]
+    write_diagnosis_report(Diagnosis(scripted, surfaces(), model()), tmp_path / "report.html")
     assert "<script>" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("axes", ["x", "xyz"])
-def test_the_page_takes_any_number_of_axes(tmp_path: Path, axes: str):
+def test_page_has_all_figures_for_any_number_of_axes(tmp_path: Path, axes: str):
     one = content()
     one["recording"]["axes"] = list(axes)
     page = write_diagnosis_report(
@@ -351,7 +351,7 @@ def test_the_page_takes_any_number_of_axes(tmp_path: Path, axes: str):
     assert page.read_text(encoding="utf-8").count("<img") == 5
 
 
-def test_the_command_report_takes_the_folder_too(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_command_report_accepts_the_folder(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     write_diagnosis(diagnosis(), tmp_path / "found")
     assert (
         call("report", tmp_path / "found", "-o", tmp_path / "again.html", "--quiet-progress") == 0
@@ -363,8 +363,8 @@ def test_the_command_report_takes_the_folder_too(tmp_path: Path, capfd: pytest.C
     assert call("report", tmp_path / "found", "-o", tmp_path / "other.html", "--log", "x.nc") == 2
 
 
-# ----------------------------------------------------------------------------------------------------------------
-# sentences
+# --------------------------------------------------------------------------------------------------
+# -------------- sentences
 
 
 def test_every_effect_has_a_plain_name_and_a_next_measurement():
@@ -379,7 +379,7 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
     "statistic", ["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"]
 )
 @pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
-def test_every_view_has_a_sentence(statistic: str, axes: list[str]):
+def test_every_statistic_has_a_sentence(statistic: str, axes: list[str]):
     region = {
         "view": statistic, "what": "outliers", "axes": axes, "begin": 0.0, "end": 3600.0, "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
         "sign": -1, "p_value": 0.002, "estimate": -0.2, "frequency": 13.0,
@@ -393,9 +393,9 @@ def test_every_view_has_a_sentence(statistic: str, axes: list[str]):
         assert re.search(rf"\b{axis}\b", sentence)
 
 
-def test_numbers_are_said_as_people_say_them():
+def test_format_of_times_and_probabilities():
     assert clock(3599.96) == "1:00:00"
-    assert chance(0.03) == "noise alone does that in 1 of 33 such records"
+    assert chance(0.03) == "noise alone would show this in 1 of 33 such records"
     assert chance(0.0000123).endswith("1 of 81 000 such records")
 
 
@@ -415,7 +415,7 @@ def test_every_verdict_has_a_summary(verdict: str):
 
 def test_a_diagnosis_prints_its_verdict_and_sentences():
     text = str(diagnosis())
-    assert text.startswith("explained: There are 2 places")
+    assert text.startswith("explained: The recording differs from the simulation in 2 places")
     assert "- vibration_noise: Vibration raises the noise" in text
     assert (
         make_effect({"name": "vibration_noise", "white": 0.00045, "axes": ["x"]}).say(
@@ -426,12 +426,13 @@ def test_a_diagnosis_prints_its_verdict_and_sentences():
 
 
 @plain_pages
-def test_a_page_of_many_mismatches_gives_their_chance_in_a_column(tmp_path: Path):
-    """24 places: the words on chance are said once for all of them, and each has its number."""
+def test_page_with_many_mismatches_lists_probabilities_in_a_column(tmp_path: Path):
+    """The phrase on noise alone is not repeated in 24 sentences; each mismatch has its number."""
     one = diagnosis()
     region = one.content["mismatches"][0] | {"p_value": 1e-12, "explained_by": []}
     region["statement"] = (
-        "Axis x is noisier than simulated (noise alone does that in fewer than 1 of a million such records)."
+        "Axis x is noisier than the simulation "
+        "(noise alone would show this in fewer than 1 in a million such records)."
     )
     regions = [region | {"id": number} for number in range(1, 25)]
     many = replace(
@@ -440,16 +441,16 @@ def test_a_page_of_many_mismatches_gives_their_chance_in_a_column(tmp_path: Path
         | {"mismatches": regions, "unexplained": list(range(1, 25)), "effects": []},
     )
     text = write_diagnosis_report(many, tmp_path / "page.html").read_text(encoding="utf-8")
-    assert text.count("<td>fewer than 1 of a million</td>") == 24
-    assert "noise alone does that" not in text
-    assert str(many).count("of a million") == 1
+    assert text.count("<td>fewer than 1 in a million</td>") == 24
+    assert "noise alone would show" not in text
+    assert str(many).count("in a million") == 1
 
 
-def test_effects_without_a_size_have_a_whole_sentence():
+def test_effect_without_a_size_has_a_sentence():
     motion = make_effect({"name": "real_motion", "x": 0.02, "axes": ["z"]})
     assert motion.say() == "The tool really rotates on axis z: tilt 0.02 mrad/g along x."
     text = unsized_statement("real_motion", ["x", "z"])
-    assert (
-        text
-        == "The record shows real rotation of the tool, not a sensor error, on axes x and z. It does not give a size."
+    assert text == (
+        "The record shows real rotation of the tool, not a sensor error, on axes x and z, but does "
+        "not determine the size."
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.result.held_out import held_out, log_likelihood, stretches
+from gyrostab.diagnose.result.held_out import cut_stretches, held_out, log_likelihood
 from gyrostab.diagnose.result.surfaces import CASES, make_surfaces
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
@@ -220,12 +220,12 @@ def test_the_allan_variance_is_compared_with_the_model_that_is_shown():
 
 def test_stretches_cover_the_record_once_and_short_records_are_refused():
     _, found = _record()
-    cut = stretches(found)
+    cut = cut_stretches(found)
     assert cut.first[0] == 0
     assert cut.stop[-1] == 180
     np.testing.assert_array_equal(cut.stop[:-1], cut.first[1:])
-    with pytest.raises(OptionError, match="10 blocks, too few"):
-        stretches(found.isel(block=slice(10)))
+    with pytest.raises(OptionError, match="10 blocks, and 12 are needed"):
+        cut_stretches(found.isel(block=slice(10)))
 
 
 def test_gaps_leave_the_coverage_as_it_is():

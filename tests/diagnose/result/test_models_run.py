@@ -12,7 +12,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.estimate.joint_fit import _instance
+from gyrostab.diagnose.estimate.joint_fit import _make_effect
 from gyrostab.diagnose.result.diagnosis import effect_table, model_text
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import read_model, simulate
@@ -54,7 +54,7 @@ def simulated(name: str, scale: float, seed: int) -> xr.Dataset | None:
         )
         value = typical * (scale if size in kind.size_parameters else 1.0)
         sizes[size] = [value, -value] if known[size].many else value
-    effect = _instance(kind, sizes, ("x", "y"), ())
+    effect = _make_effect(kind, sizes, ("x", "y"), ())
     if effect is None:
         return None
     text = model_text(

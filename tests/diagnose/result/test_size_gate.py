@@ -139,11 +139,11 @@ def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
     assert effect_tables(fit.fitted, blocks) == []
     (region,) = unidentified_tables(fit.identifications, blocks, [])
     assert region["explained_by"] == []
-    assert "a bias made by vibration" in region["statement"]
+    assert "a bias caused by vibration" in region["statement"]
 
 
-# ---------------------------------------------------------------------------------------------------------------
-# verdict
+# --------------------------------------------------------------------------------------------------
+# ------------- verdict
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: b
     identifications = naming_of(
         blocks, baseline, "vibration_noise", "power", ("white",), exponent=1.0
     )
-    held = conclude.worth(
+    held = conclude.measure_evidence(
         blocks, baseline, identifications, fit_identifications(identifications, baseline)
     )
     assert math.isfinite(held["forecast_gain"]) == told

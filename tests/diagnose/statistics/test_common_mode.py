@@ -186,7 +186,7 @@ def test_common_motion_is_one_region_explained_by_its_effect(base, null):
         if regions[name].dtype.kind != "M"
     }
     said = mismatch_statement(fields | {"axes": ["x", "y", "z"]}, BLOCKS * BLOCK_S)
-    assert said.startswith("Axes x, y and z wander together (correlation 0.")
+    assert said.startswith("Axes x, y and z drift together (correlation 0.")
     assert "random walks of independent gyros" in said
     known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _waveform()))
 

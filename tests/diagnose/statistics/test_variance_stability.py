@@ -297,12 +297,12 @@ def test_statements_give_time_scale_and_frequencies():
     }
     region |= {"ratio": 4.38, "estimate": 0.08, "sign": 1, "p_value": 1e-4, "frequency": np.nan}
     told = mismatch_statement(region, 2000.0)
-    assert "axes x and y goes up and down over the whole record" in told
+    assert "axes x and y fluctuates over the whole record" in told
     assert "one stretch of 40 s to another" in told
     assert "8 % (rms)" in told
     glide = region | {"view": "spectrum", "what": "drifting 1.58 3.42", "axes": ["y"]}
     assert (
-        "a line that moves over the whole record, from about 1.58 Hz to about 3.42 Hz"
+        "a drifting line over the whole record, from about 1.58 Hz to about 3.42 Hz"
         in mismatch_statement(glide, 2000.0)
     )
 

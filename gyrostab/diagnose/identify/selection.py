@@ -1,0 +1,626 @@
+"""Select effects one after the other, by their evidence with all others in the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.diagnose.identify.completeness import (
+    excess_low_frequency_noise,
+    variance_fluctuation,
+    with_neighbouring_variants,
+)
+from gyrostab.diagnose.identify.components import (
+    PLAIN_LINE,
+    are_lines,
+    axes_of,
+    candidates_of,
+    find_components,
+    group_components,
+    merge_lines,
+    sum_evidence,
+)
+from gyrostab.diagnose.identify.identifiability import (
+    find_equivalent_effects,
+    find_plainer_effect,
+    is_physical,
+    without_pulses,
+)
+from gyrostab.diagnose.identify.identification import (
+    Identification,
+    Unidentified,
+    add_identification,
+    find_unidentified,
+    form_error,
+    with_axes_of,
+)
+from gyrostab.diagnose.identify.logger_filters import without_slopes
+from gyrostab.diagnose.identify.overlapping import find_layers_again, split_layers
+from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
+from gyrostab.diagnose.identify.switching import (
+    drop_explained_jumps,
+    identify_switching,
+    put_followers_first,
+    renew_component,
+)
+from gyrostab.diagnose.predict.candidates import Candidate
+from gyrostab.diagnose.predict.condition import (
+    Component,
+    condition_on,
+    condition_on_components,
+    reweighted,
+)
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import CountEvidence, Found, compute_evidence, of_means
+
+__all__ = ["AMBIGUOUS_NATS", "FORM_ERROR_SHARE", "Search"]
+
+#: An effect whose evidence is this close to that of the best may be meant as well: odds of 20 to 1.
+AMBIGUOUS_NATS = 3.0
+#: Share of the evidence that an error of the form may leave: 10 % of the size, squared.
+FORM_ERROR_SHARE = 0.01
+MAX_EFFECTS = 10
+#: Lines are counted apart: whatever rotates or switches makes combs of them.
+MAX_LINES = 40
+#: Structure that may be left in time, in addition to errors of the form.
+MAX_LEFT_NATS = 2.0
+#: Share of the evidence of one effect that may be left in time.
+MAX_LEFT_SHARE = 0.1
+#: Powers are weighted anew with the strongest effect when its evidence exceeds so many thresholds.
+REWEIGHT_THRESHOLDS = 3.0
+#: Effects that change the white variance of the means, which the calibration then misjudges.
+_SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
+_PHASE_LOCKED = ("order", "phase_locked")
+#: Statistics whose weights are the expected powers.
+_POWER_WEIGHTED = ("power", "cross", "order", "phase_locked", "transfer")
+#: Sample counts of zeros: a sample is zero for one reason only.
+_ZERO_COUNTS = {"stuck", "filled"}
+
+Selection = Identification | Unidentified
+
+
+@dataclass(frozen=True)
+class Search:
+    """Forward selection over the candidates.
+
+    Attributes
+    ----------
+    candidates : sequence of Candidate
+        Effects and nuisance alternatives.
+    folds : xarray.DataArray
+        From `gyrostab.diagnose.evidence.folds.fold_blocks`.
+    count_evidence : CountEvidence
+        Evidence from sample counts.
+    threshold : float
+        Evidence [nats] that noise alone exceeds with the false-alarm probability.
+    expected : tuple of Identification
+        Effects that the simulation contains as well.
+    """
+
+    candidates: Sequence[Candidate]
+    folds: xr.DataArray
+    count_evidence: CountEvidence
+    threshold: float
+    expected: tuple[Identification, ...] = ()
+
+    def run(self, start: State) -> tuple[list[Identification], list[Unidentified], State]:
+        """Select effects until none passes, then test each again with the others.
+
+        Parameters
+        ----------
+        start : State
+            With the expected effects in the model.
+
+        Returns
+        -------
+        identified : list of Identification
+            The strongest first.
+        unidentified : list of Unidentified
+        state : State
+            With all of these in the model.
+        """
+        chosen = self._select_all(start)
+        chosen = drop_explained_jumps(
+            chosen, lambda some: self._condition(start, some), self._evidence, self.threshold
+        )
+        chosen = self._prune(start, without_pulses(chosen))
+        chosen, identified = self._settle(start, chosen)
+        unidentified = [one for one in chosen if isinstance(one, Unidentified)]
+        state = self._condition(start, [*identified, *unidentified])
+        kept, withdrawn = self._withdraw_incomplete(start, state, identified, unidentified)
+        unidentified += withdrawn
+        if len(kept) < len(identified) or withdrawn:
+            state = self._condition(start, [*kept, *unidentified])
+        return sorted(kept, key=lambda one: -one.evidence_nats), unidentified, state
+
+    def _select_all(self, start: State) -> list[Selection]:
+        """Select the best candidate, put it into the model, and repeat while one passes."""
+        chosen: list[Selection] = []
+        state = before = start
+        barred = {
+            key
+            for one in self.expected
+            for key in (one.components[0].candidate.key, *self._explained_count_keys(one))
+        }
+        effects_left, lines_left = MAX_EFFECTS, MAX_LINES
+        found: list[Found] = []
+        while effects_left and lines_left:
+            known = of_means(found, before, state)
+            found, before = self._score_candidates(state, barred, known), state
+            selected = self._select_next(found, state, chosen)
+            if selected is None:
+                break
+            selection, rejected = selected
+            barred |= rejected
+            if selection is not None and are_lines(selection.components):
+                lines_left -= 1
+            else:
+                effects_left -= 1
+            if selection is not None:
+                chosen = add_identification(chosen, selection)
+                barred |= self._explained_count_keys(selection)
+                state = condition_on(state, list(selection.components))
+        return chosen
+
+    def _explained_count_keys(self, selection: Selection) -> set[str]:
+        """Return the keys of candidates for sample counts that a selection explains.
+
+        Counts have no columns to put into the model, so that these candidates are barred instead.
+        """
+        components = selection.components
+        if any(
+            component.candidate.effect in ("logger_filter", "~S(f)") for component in components
+        ):
+            return {"~outliers"}  # the kurtosis of a block is that of other noise
+        if not any(component.candidate.statistic == "marks" for component in components):
+            return set()
+        counts = {name for component in components for name in component.variant.columns}
+        counts |= {"kurtosis"}
+        counts |= _ZERO_COUNTS if counts & _ZERO_COUNTS else set()
+        return {
+            candidate.key
+            for candidate in self.candidates
+            if candidate.statistic == "marks" and counts & set(candidate.marks)
+        }
+
+    def _evidence(self, candidates: Sequence[Candidate], state: State) -> list[Found]:
+        return compute_evidence(
+            candidates, state.blocks, state, self.folds, count_evidence=self.count_evidence
+        )
+
+    def _score_candidates(
+        self, state: State, barred: set[str], known: Sequence[Found] = ()
+    ) -> list[Found]:
+        """Compute the evidence of all candidates that are not barred; `known` ones are reused.
+
+        Powers are weighted with the strongest effect in the powers, because its noise is in every
+        statistic.
+        """
+        is_known = {id(one.candidate) for one in known}
+        sought = [
+            candidate
+            for candidate in self.candidates
+            if candidate.key not in barred and id(candidate) not in is_known
+        ]
+        found = [
+            *(one for one in known if one.candidate.key not in barred),
+            *self._evidence(sought, state),
+        ]
+        weighted = [one.candidate for one in found if one.candidate.statistic in _POWER_WEIGHTED]
+        for _ in range(2):
+            powers = [one for one in found if one.candidate.statistic == "power"]
+            strongest = max(powers, key=_positive_evidence, default=None)
+            if (
+                strongest is None
+                or _positive_evidence(strongest) < REWEIGHT_THRESHOLDS * self.threshold
+            ):
+                break
+            trial = condition_on(state, find_components(strongest))
+            again = compute_evidence(
+                weighted, state.blocks, replace(state, weight=trial.weight), self.folds
+            )
+            found = [one for one in found if one.candidate.statistic not in _POWER_WEIGHTED] + again
+        return found
+
+    def _select_next(
+        self, found: list[Found], state: State, chosen: Sequence[Selection]
+    ) -> tuple[Selection | None, set[str]] | None:
+        """Select the next effect, or the nuisance alternative that explains more.
+
+        Returns
+        -------
+        selection : Identification, Unidentified or None
+            None when only effects passed that fail the time-shift test.
+        rejected : set of str
+            Keys that fail it. Instead of both, None when nothing passes.
+        """
+        components = merge_lines(group_components(found))
+        required = {
+            key: self.threshold
+            + form_error(several, [*self.expected, *chosen], share=FORM_ERROR_SHARE)
+            for key, several in components.items()
+        }
+        for key, several in list(components.items()):
+            if not key.startswith("~") and sum_evidence(several) > required[key]:
+                components[key] = is_physical(several, state, error=required[key] - self.threshold)
+        passing = self._order_passing(components, required, state)
+        if not passing:
+            return None
+        rivals = self._order_rivals(passing, components, state)
+        rejected: set[str] = set()
+        for key in rivals:
+            passed, p_value = passes_time_shift_test(components[key], state, self.folds)
+            if passed:
+                least = sum_evidence(components[key]) - AMBIGUOUS_NATS
+                close = [
+                    components[other][0].candidate.effect
+                    for other in rivals
+                    if other != key
+                    and other not in rejected
+                    and sum_evidence(components[other]) >= least
+                ]
+                return self._identify(components[key], required[key], close, p_value), rejected
+            rejected.add(key)
+        if rejected:
+            return None, rejected
+        alternative = passing[0]
+        effects = [key for key in passing if not key.startswith("~")]
+        nearest = [components[key][0].candidate.effect for key in effects[:3]]
+        return find_unidentified(
+            alternative, components[alternative], required[alternative], nearest
+        ), set()
+
+    def _order_passing(
+        self, components: dict[str, list[Component]], required: dict[str, float], state: State
+    ) -> list[str]:
+        """Return the keys that pass, in the order in which they are to be named.
+
+        Anomalous samples come first, because they raise powers and means too, and not the other
+        way round. Then motion that another sensor confirms, then a bias that switches within
+        blocks: its spectrum, its tails and its changing noise level would be taken for others.
+        """
+        ranked = sorted(components, key=lambda key: -sum_evidence(components[key]))
+        passing = [key for key in ranked if sum_evidence(components[key]) > required[key]]
+        counts = [
+            key
+            for key in passing
+            if components[key][0].candidate.statistic == "marks" and not key.startswith("~")
+        ]
+        confirmed = [
+            key
+            for key in passing
+            if sum_evidence(_confirmed_components(components[key], state)) > required[key]
+        ]
+        switching = identify_switching(passing, components, state)
+        first_count = min(map(passing.index, counts), default=0)
+        if switching and passing.index(switching[0]) < first_count:
+            counts = []
+        first = (
+            counts
+            or confirmed
+            or switching
+            or without_slopes(
+                self._without_locked_lines(passing, components, state),
+                components,
+                state,
+                self.folds,
+            )
+        )
+        return put_followers_first(first, components, state)
+
+    def _order_rivals(
+        self, passing: list[str], components: dict[str, list[Component]], state: State
+    ) -> list[str]:
+        """Return the effects that come close to the best, plainer ones first."""
+        best = sum_evidence(components[passing[0]])
+        least = best - AMBIGUOUS_NATS - FORM_ERROR_SHARE * best
+        rivals = [
+            key
+            for key in passing
+            if not key.startswith("~") and sum_evidence(components[key]) >= least
+        ]
+        effects = {components[key][0].candidate.effect for key in rivals}
+        is_later = {
+            key: self._is_on_single_axis(components[key])
+            or find_plainer_effect(components[key], state) in effects
+            for key in rivals
+        }
+        return sorted(
+            rivals,
+            key=lambda key: -sum_evidence(components[key]) + AMBIGUOUS_NATS * is_later[key],
+        )
+
+    def _without_locked_lines(
+        self, passing: list[str], components: dict[str, list[Component]], state: State
+    ) -> list[str]:
+        """Drop lines that a passing phase-locked effect explains."""
+        locked = [key for key in passing if components[key][0].candidate.statistic in _PHASE_LOCKED]
+        lines = [key for key in passing if components[key][0].candidate.statistic == "line"]
+        if not lines:
+            return passing
+        masks = [
+            mask
+            for key in locked
+            for mask in condition_on(state, components[key]).given.get(("line", "all"), [])
+        ]
+        return [
+            key
+            for key in passing
+            if key not in lines or not any(mask[components[key][0].place] for mask in masks)
+        ]
+
+    def _is_on_single_axis(self, components: Sequence[Component]) -> bool:
+        """Return whether an effect that should be one process on all axes shows on one only."""
+        key = components[0].candidate.key
+        is_common = any(one.key == key and one.statistic == "cross" for one in self.candidates)
+        return is_common and len({axis for component in components for axis in component.row}) == 1
+
+    def _identify(
+        self, components: list[Component], threshold: float, names: Sequence[str], p_value: float
+    ) -> Identification:
+        """Make an identification of these components; `names` are effects close to it."""
+        first = components[0].candidate
+        return Identification(
+            first.effect,
+            first.driver,
+            axes_of(components, list(map(str, self.folds.attrs.get("axes", ())))),
+            tuple(components),
+            sum_evidence(components),
+            threshold,
+            tuple(dict.fromkeys(name for name in names if name != first.effect)),
+            p_value,
+        )
+
+    def _condition(
+        self, start: State, chosen: Sequence[Selection], without: Selection | None = None
+    ) -> State:
+        """Return the state with all selections but one in the model."""
+        state, has_new_lines = start, False
+        for selection in (one for one in chosen if one is not without):
+            if are_lines(selection.components):
+                # what lines add to the powers is fitted once for all of a comb
+                state = condition_on_components(state, selection.components)
+                has_new_lines = True
+                continue
+            state = reweighted(state) if has_new_lines else state
+            state, has_new_lines = condition_on(state, list(selection.components)), False
+        return reweighted(state) if has_new_lines else state
+
+    def _prune(self, start: State, chosen: list[Selection]) -> list[Selection]:
+        """Drop what fails the threshold with the others in the model, the weakest first.
+
+        Unidentified ones are tested before identifications, and these lose the axes that no longer
+        show them. The first selection stays, unless it is of anomalous samples, which come first
+        whatever their evidence.
+        """
+        for selection in sorted(
+            chosen, key=lambda one: (isinstance(one, Identification), one.evidence_nats)
+        ):
+            if len(chosen) < 2:
+                break
+            state = self._condition(start, chosen, selection)
+            again = group_components(self._evidence(candidates_of(selection.components), state))
+            is_leading = (
+                selection is chosen[0]
+                and isinstance(selection, Identification)
+                and selection.components[0].candidate.statistic != "marks"
+            )
+            best = max((sum_evidence(components) for components in again.values()), default=0.0)
+            if not is_leading and best < self.threshold:
+                chosen = [other for other in chosen if other is not selection]
+            elif isinstance(selection, Identification):
+                reduced = with_axes_of(selection, again)
+                chosen = [reduced if other is selection else other for other in chosen]
+        return chosen
+
+    def _settle(
+        self, start: State, chosen: list[Selection]
+    ) -> tuple[list[Selection], list[Identification]]:
+        """Finish the identifications, and drop the weakest until all reach their threshold."""
+        while True:
+            identified = {
+                place: self._finish(start, one, chosen)
+                for place, one in enumerate(chosen)
+                if isinstance(one, Identification)
+            }
+            margin = {
+                place: one.evidence_nats - self._required_nats(one, identified)
+                for place, one in identified.items()
+            }
+            weakest = min(margin, key=lambda place: margin[place], default=None)
+            if weakest is None or margin[weakest] >= 0.0:
+                return chosen, list(identified.values())
+            chosen = [*chosen[:weakest], *chosen[weakest + 1 :]]
+
+    def _required_nats(
+        self, identification: Identification, identified: dict[int, Identification]
+    ) -> float:
+        """Return the evidence that an identification needs, whatever was named first."""
+        others = [
+            *self.expected,
+            *(one for one in identified.values() if one is not identification),
+        ]
+        return max(
+            identification.threshold,
+            self.threshold + form_error(identification.components, others, share=FORM_ERROR_SHARE),
+        )
+
+    def _finish(
+        self, start: State, identification: Identification, chosen: Sequence[Selection]
+    ) -> Identification:
+        """Return an identification with its evidence and its rivals, all others in the model."""
+        state = self._condition(start, chosen, identification)
+        weight = condition_on(state, list(identification.components)).weight
+        weighted = replace(state, weight=weight)
+        statistics = {component.candidate.statistic for component in identification.components}
+        near = [one for one in self.candidates if one.statistic in statistics]
+        axes, key = set(identification.axes), identification.components[0].candidate.key
+        on_axes = {
+            other: [component for component in components if set(component.row) & axes]
+            for other, components in group_components(
+                compute_evidence(
+                    near, state.blocks, weighted, self.folds, count_evidence=self.count_evidence
+                )
+            ).items()
+        }
+        again = find_layers_again(
+            identification.components, on_axes.get(key, []), weighted, self._evidence
+        )
+        evidence_nats = (
+            sum(max(sum_evidence(layer), 0.0) for layer in again) or identification.evidence_nats
+        )
+        least = evidence_nats - AMBIGUOUS_NATS
+        rivals = [
+            components[0].candidate.effect
+            for other, components in on_axes.items()
+            if components
+            and other != key
+            and not other.startswith("~")
+            and sum_evidence(components) >= least
+            and sum_evidence(is_physical(components, state)) >= least
+        ]
+        lines = {
+            component.place
+            for other in chosen
+            for component in other.components
+            if component.candidate.effect == PLAIN_LINE
+        }
+        rivals += find_equivalent_effects(
+            identification.effect, identification.components, state, lines=len(lines)
+        )
+        alternatives = dict.fromkeys([*identification.alternatives, *rivals])
+        alternatives.pop(identification.effect, None)
+        components = tuple(
+            renew_component(found, component)
+            for layer, found in zip(split_layers(identification.components), again, strict=True)
+            for component in layer
+        )
+        return replace(
+            identification,
+            evidence_nats=evidence_nats,
+            alternatives=tuple(alternatives),
+            components=components,
+        )
+
+    def _withdraw_incomplete(
+        self,
+        start: State,
+        state: State,
+        identified: list[Identification],
+        unidentified: Sequence[Unidentified],
+    ) -> tuple[list[Identification], list[Unidentified]]:
+        """Withdraw effects that leave structure in time, in the means or in the powers."""
+        kept, withdrawn = list(identified), []
+        for axis in state.axes:
+            kept, unexplained = self._withdraw_in_means(state, kept, unidentified, axis)
+            withdrawn += unexplained
+        for axis in state.axes:
+            on_axis = _identified_on(kept, "power", axis)
+            if not on_axis:
+                continue
+            weak, _ = _find_weak(on_axis, variance_fluctuation(self._condition(start, kept), axis))
+            if weak:
+                kept = [one for one in kept if one not in weak]
+                rest = self._condition(start, [*kept, *unidentified])
+                withdrawn += self._find_fluctuation(rest, axis, weak)
+        return kept, withdrawn
+
+    def _withdraw_in_means(
+        self,
+        state: State,
+        kept: list[Identification],
+        unidentified: Sequence[Unidentified],
+        axis: str,
+    ) -> tuple[list[Identification], list[Unidentified]]:
+        """Withdraw effects on the means of an axis that leave more slow noise than calibrated."""
+        on_axis = _identified_on(kept, "mean", axis)
+        part_of_drift = _find_part_of_drift(on_axis, unidentified, axis)
+        kept = [one for one in kept if one not in part_of_drift]
+        has_alternative = any(
+            one.generic in ("~bias(t)", "~S(f)", "~cov") and axis in one.axes
+            for one in unidentified
+        )
+        has_shape = any(
+            component.candidate.effect in _SPECTRAL_SHAPES and axis in component.row
+            for one in kept
+            for component in one.components
+        )
+        if has_alternative or has_shape:
+            return kept, []
+        left = excess_low_frequency_noise(
+            with_neighbouring_variants(state, on_axis, axis), axis, self.folds
+        )
+        weak, strength = _find_weak(on_axis, left)
+        if not weak and left <= self.threshold + FORM_ERROR_SHARE * strength:
+            return kept, []
+        names = tuple(one.effect for one in weak)
+        unexplained = Unidentified("~red", (axis,), left, self.threshold, names)
+        return [one for one in kept if one not in weak], [unexplained]
+
+    def _find_fluctuation(
+        self, state: State, axis: str, weak: Sequence[Identification]
+    ) -> list[Unidentified]:
+        """Return what a free noise level explains on an axis, instead of withdrawn effects."""
+        free = [one for one in self.candidates if one.effect == "~N(t)"]
+        found = group_components(compute_evidence(free, state.blocks, state, self.folds))
+        components = [
+            component
+            for component in found.get("~N(t)", [])
+            if component.row == (axis,) and component.evidence_nats > self.threshold
+        ]
+        names = [one.effect for one in weak]
+        return [find_unidentified("~N(t)", components, self.threshold, names)] if components else []
+
+
+def _positive_evidence(found: Found) -> float:
+    return float(np.maximum(found.evidence_nats[0], 0.0).sum())
+
+
+def _identified_on(
+    identified: Sequence[Identification], statistic: str, axis: str
+) -> list[Identification]:
+    """Return the identifications with a component in a statistic of an axis."""
+    return [
+        one
+        for one in identified
+        if any(
+            component.candidate.statistic == statistic and component.row == (axis,)
+            for component in one.components
+        )
+    ]
+
+
+def _find_part_of_drift(
+    on_axis: Sequence[Identification], unidentified: Sequence[Unidentified], axis: str
+) -> list[Identification]:
+    """Return effects without a channel that explain less than an unidentified drift of the axis.
+
+    They may be a piece of that drift.
+    """
+    drift = sum(
+        one.evidence_nats for one in unidentified if one.generic == "~bias(t)" and axis in one.axes
+    )
+    return [one for one in on_axis if not any(one.driver) and one.evidence_nats < drift]
+
+
+def _find_weak(
+    identified: Sequence[Identification], left: float
+) -> tuple[list[Identification], float]:
+    """Return the effects that explain too little for what they leave [nats], and their sum."""
+    strength = sum(one.evidence_nats for one in identified)
+    most = MAX_LEFT_NATS + FORM_ERROR_SHARE * strength
+    weak = [one for one in identified if left > max(most, MAX_LEFT_SHARE * one.evidence_nats)]
+    return weak, strength
+
+
+def _confirmed_components(components: Sequence[Component], state: State) -> list[Component]:
+    """Return the components that a channel other than an axis of the gyro sees as well."""
+    return [
+        component
+        for component in components
+        if component.candidate.statistic == "transfer"
+        and component.candidate.witness[0] not in state.axes
+    ]

@@ -1,0 +1,148 @@
+"""Check the options, the axes and the simulation that a diagnosis is called with."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from gyrostab.errors import OptionError, SchemaError
+from gyrostab.ingest.convert import as_log
+from gyrostab.simulate.model import Model, read_model
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import first_stamp
+
+__all__ = ["check_options", "parse_quiescent_span", "read_simulation", "varying_axes"]
+
+#: Fewest null records: one of them is expected beyond the default level of 1 %.
+MIN_NULL_RECORDS = 100
+#: Largest power [deg^2/h] that rounding alone gives a constant rate; noise of any gyro has more.
+MAX_ROUNDING_POWER = 1e-20
+
+
+def check_options(nulls: int, level: float, seed: int) -> None:
+    """Raise `OptionError` unless these options of `gyrostab.diagnose` make sense."""
+    if not 0.0 < level < 0.5:
+        raise OptionError(
+            f"false_alarm_level={level!r}: give a false-alarm probability above 0 and below 0.5, "
+            "for instance 0.01"
+        )
+    if nulls < MIN_NULL_RECORDS:
+        raise OptionError(
+            f"nulls={nulls!r}: fewer than {MIN_NULL_RECORDS} null records do not determine the "
+            "false-alarm probability; give 400"
+        )
+    if seed < 0:
+        raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
+
+
+def read_simulation(
+    simulation: str | os.PathLike[str] | Mapping[str, Any] | Model | xr.Dataset | None,
+    log: xr.Dataset,
+) -> Model | xr.Dataset | None:
+    """Return the simulation as a model, or as a log with the time stamps and axes of `log`.
+
+    Raises
+    ------
+    OptionError
+        When a simulated log has other time stamps or axes than the recording.
+    """
+    if isinstance(simulation, xr.Dataset):
+        simulated = as_log(simulation)
+        _check_same_stamps(log, simulated)
+        return simulated
+    if simulation is None or isinstance(simulation, Model):
+        return simulation
+    return read_model(simulation)
+
+
+def _check_same_stamps(log: xr.Dataset, simulated: xr.Dataset) -> None:
+    """Raise `OptionError` unless the two logs have the same time stamps and axes."""
+    for (quantity, expected), value in zip(
+        _describe_stamps(log).items(), _describe_stamps(simulated).values(), strict=True
+    ):
+        if value != expected:
+            raise OptionError(
+                f"the {quantity} of the simulated log is {value}, that of the recording "
+                f"{expected}; simulate on the time stamps of the recording: "
+                "gyrostab simulate MODEL.toml --like RECORDING, or give the model itself"
+            )
+
+
+def _describe_stamps(log: xr.Dataset) -> dict[str, str]:
+    return {
+        "sampling rate": f"{float(log.attrs['sampling_rate_hz']):.10g} Hz",
+        "number of samples": str(log.sizes["time"]),
+        "list of axes": ", ".join(map(str, log["axis"].values)),
+        "start": f"{np.datetime64(first_stamp(log), 'ns')}",
+    }
+
+
+def varying_axes(blocks: xr.Dataset) -> list[str]:
+    """Find the axes whose samples are not all the same, and warn of the others.
+
+    Raises
+    ------
+    SchemaError
+        When no axis varies.
+    """
+    largest_power = blocks["power"].max(["block", "band"]).values
+    axes = [str(axis) for axis in blocks["axis"].values]
+    varying = [
+        axis
+        for axis, power in zip(axes, largest_power, strict=True)
+        if not power <= MAX_ROUNDING_POWER
+    ]
+    constant = ", ".join(axis for axis in axes if axis not in varying)
+    if not varying:
+        raise SchemaError(
+            f"all samples are the same on axis {constant}: without noise there is nothing to "
+            "compare; check that the right column was read"
+        )
+    if constant:
+        warnings.warn(
+            f"all samples are the same on axis {constant}: left out of the diagnosis",
+            stacklevel=4,
+        )
+    return varying
+
+
+def parse_quiescent_span(text: str) -> tuple[float | str, float | str]:
+    """Read a quiescent stretch as written on the command line.
+
+    Raises
+    ------
+    OptionError
+        When it does not have two ends, or one of them is neither a time nor a duration.
+
+    Examples
+    --------
+    >>> parse_quiescent_span("0s/30min")
+    (0.0, 1800.0)
+    >>> parse_quiescent_span("2026-03-14T08:00/2026-03-14T08:30Z")
+    ('2026-03-14T08:00', '2026-03-14T08:30')
+    """
+    ends = [end.strip() for end in text.split("/")]
+    if len(ends) != 2 or not all(ends):
+        raise OptionError(
+            f"quiet {text!r}: write START/END, for instance 2026-03-14T08:00/2026-03-14T08:30, "
+            "or 0s/30min after the start"
+        )
+    return _parse_end(ends[0], text), _parse_end(ends[1], text)
+
+
+def _parse_end(end: str, text: str) -> float | str:
+    """Read one end of a stretch: an ISO time, or seconds after the start."""
+    try:
+        if "-" in end:
+            return str(np.datetime64(end.removesuffix("Z")))
+        return 0.0 if end in ("0", "0s") else duration_seconds(end, "quiet")
+    except ValueError as error:
+        raise OptionError(
+            f"quiet {text!r}: {end!r} is neither a time (2026-03-14T08:00) nor a duration after "
+            "the start (30min)"
+        ) from error
