@@ -38,7 +38,6 @@ _STYLES: dict[str, dict[str, Any]] = {
 MAX_CHANNELS = 3  # panels below the means
 INSIDE_BAND_OPACITY = 0.3  # of cells inside the 95 % band
 MIN_FRAME_SHARE = 0.012  # width of a frame, as a share of the panel
-SIGMA_95 = 1.96  # two-sided 95 % quantile of the normal law
 _RED = "#D00000"
 
 
@@ -271,8 +270,8 @@ def plot_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> Figure:
             panel.plot(time, mean, **_STYLES[case], label=f"{_TITLES[case].lower()}, 95 %")
             panel.fill_between(
                 time,
-                mean - SIGMA_95 * error,
-                mean + SIGMA_95 * error,
+                mean - NORMAL_95 * error,
+                mean + NORMAL_95 * error,
                 color=_STYLES[case]["color"],
                 alpha=0.18,
                 lw=0,

@@ -63,7 +63,7 @@ def predict_baseline(
     for name in ("mean", "power", "cross"):
         if name in seen:
             seen[name] = seen[name].where(xr.DataArray(keep, dims="block"))
-    state = begin_state(seen, baseline)
+    state = initial_state(seen, baseline)
     # for each column in the model, whether it belongs to an effect that is left out
     is_left_out: dict[tuple[str, str], list[bool]] = {}
     identified = (*identifications.expected, *identifications.identified)
@@ -104,7 +104,7 @@ def predict_baseline(
     ]
     if not shared:
         return after
-    expected = known_cross(baseline)
+    expected = expected_cross(baseline)
     cross = _cross_spectra(shared, state, identifications)
     return after.assign(
         cross=(("pair", "block", "band"), cross if expected is None else cross + expected)

@@ -18,7 +18,7 @@ from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
 
 __all__ = ["Point", "refine_grid"]
-_SECONDS = {"s": 1.0, "h": 3600.0}
+_SECONDS = {"s": 1.0, "h": HOUR}
 #: Units of parameters that have values between those of the grid.
 _SCALES = (*_SECONDS, "degC")
 _INSTANT = "at"  # a parameter in seconds whose grid is fine already

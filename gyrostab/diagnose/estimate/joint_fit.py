@@ -18,7 +18,7 @@ from gyrostab.diagnose.identify.equivalents import prefer_plainer
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes
 from gyrostab.diagnose.identify.sample_sizes import estimate_from_counts, estimate_line
-from gyrostab.diagnose.predict.condition import Component, condition_on, mirrored
+from gyrostab.diagnose.predict.condition import Component, condition_on, is_reversed
 from gyrostab.diagnose.predict.filter_response import is_filter
 from gyrostab.diagnose.predict.linear_model import State, harmonic_sets, initial_state
 from gyrostab.diagnose.predict.sizes import component_mixture
@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 #: Error of the form of an effect, as a share of its size: no effect is exactly what its equation
 #: says. With forms wrong by the shares in docs/diagnosis.md, the intervals still hold the truth.
 FORM_ERROR = 0.04
-SIGMA_95 = 1.959964  # two-sided 95 % quantile of the normal law
 _ANGLE = "deg"
 _PLACE = "line", "frequency"  # where a line is does not depend on what makes it
 EARTH_RATE = 15.041067  # deg/h: 360 degrees in a sidereal day of 23.934470 h
@@ -134,13 +133,13 @@ def _fit_identification(
         is_filter(component.candidate.statistic, component.variant)
         for component in identification.components
     )  # all axes pass the filter of the one logger
-    together = (
+    fitted_together = (
         many
         or filtered
         or "cross" in statistics
         or any(not component.candidate.each for component in identification.components)
     )
-    if together:
+    if fitted_together:
         return [
             _fit_components(
                 identification,
@@ -367,10 +366,10 @@ def _make_estimate(
     """
     if sd <= 0.0:  # a count is exact
         return Estimate(mean, 0.0, mean, mean, unit)
-    low, high = ends or (mean - SIGMA_95 * sd, mean + SIGMA_95 * sd)
+    low, high = ends or (mean - NORMAL_95 * sd, mean + NORMAL_95 * sd)
     low, high = (
-        mean - math.hypot(mean - low, SIGMA_95 * form),
-        mean + math.hypot(high - mean, SIGMA_95 * form),
+        mean - math.hypot(mean - low, NORMAL_95 * form),
+        mean + math.hypot(high - mean, NORMAL_95 * form),
     )
     return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
 
@@ -454,9 +453,9 @@ def _latitude_from_rate(across: float, error: float) -> tuple[float, float, floa
     """
     low, middle, high = (
         math.degrees(math.acos(min(max(rate, 0.0) / EARTH_RATE, 1.0)))
-        for rate in (across + SIGMA_95 * error, across, across - SIGMA_95 * error)
+        for rate in (across + NORMAL_95 * error, across, across - NORMAL_95 * error)
     )
-    return middle, max((high - low) / (2.0 * SIGMA_95), 1e-12), low, high
+    return middle, max((high - low) / (2.0 * NORMAL_95), 1e-12), low, high
 
 
 def _fit_amplitude(component: Component, state: State) -> tuple[float, float, float]:

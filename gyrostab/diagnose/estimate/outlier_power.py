@@ -43,7 +43,7 @@ def add_outlier_power(
         ):
             continue
         rows = [axes.index(axis) for axis in one.axes]
-        seen = one.effect.explain(replace(windows_of(blocks, {}), axes=tuple(one.axes)))
+        seen = one.effect.explain(replace(make_windows(blocks, {}), axes=tuple(one.axes)))
         if _EVERYWHERE in seen.marks:
             continue
         for name, density in seen.spectrum.items():

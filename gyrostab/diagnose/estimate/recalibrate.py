@@ -312,7 +312,7 @@ def _phase_locked_power(component: Component, state: State) -> Array:
 
 def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
     """Return the power that an effect itself predicts on an axis, (block, band)."""
-    windows = replace(windows_of(blocks, find_drivers(effect)), axes=(axis,))
+    windows = replace(make_windows(blocks, find_drivers(effect)), axes=(axis,))
     out = np.zeros((blocks.sizes["block"], blocks.sizes["band"]))
     many = {item.name: item.many for item in effect.parameters()}
     for name, density in effect.explain(windows).spectrum.items():

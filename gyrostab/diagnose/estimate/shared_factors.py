@@ -18,6 +18,7 @@ from gyrostab.diagnose.predict.candidates import Variant, rebuild_variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State, cross_column, pair_rows
 from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.noise import NORMAL_95
 
 __all__ = ["estimate_shared_factors"]
 
@@ -28,7 +29,6 @@ FACTOR_ROUNDS = 50  # of the iteration for a matrix of rank 1
 WIDEST_PART, NARROWEST_PART, BANDWIDTHS, FINE_STEPS = 1.5, 40.0, 11, 12
 ORDER_ERROR = 0.05  # relative change of the level below a low-pass if it has two poles
 _ENDS = (0.025, 0.975)  # of a 95 % interval
-WIDTH_95_SIGMA = 3.919928  # width of a 95 % interval of the normal law, in standard deviations
 
 
 def estimate_shared_factors(
@@ -89,7 +89,7 @@ def _summarise_draws(draws: Array, alike: NDArray[np.bool_]) -> tuple[float, flo
     low, high = np.quantile(draws, _ENDS)
     return (
         float(np.median(draws[alike])),
-        float((high - low) / WIDTH_95_SIGMA),
+        float((high - low) / (2.0 * NORMAL_95)),
         float(low),
         float(high),
     )

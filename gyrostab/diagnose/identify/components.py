@@ -29,7 +29,7 @@ MIN_COMPONENT_NATS = 2.0
 PLAIN_LINE = "spectral_line"
 
 
-def find_components(found: Found) -> list[Component]:
+def find_components(found: CandidateEvidence) -> list[Component]:
     """Return the rows of a candidate with enough evidence, or the best one."""
     evidence_nats = found.evidence_nats[0]
     rows = [
@@ -48,7 +48,7 @@ def find_components(found: Found) -> list[Component]:
     ]
 
 
-def group_components(found: Sequence[Found]) -> dict[str, list[Component]]:
+def group_components(found: Sequence[CandidateEvidence]) -> dict[str, list[Component]]:
     """Return the components of each effect with enough evidence, the strongest first."""
     out: dict[str, list[Component]] = {}
     for one in found:

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.sample_counts import Expected
+from gyrostab.diagnose.evidence.sample_counts import ExpectedCounts
 from gyrostab.diagnose.identify.expected import identify_expected_effects
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.selection import Search
 from gyrostab.diagnose.predict.candidates import Candidate, effect_candidates
-from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
-from gyrostab.diagnose.predict.search import CountEvidence, compute_evidence, totals
+from gyrostab.diagnose.predict.search import CountEvidence, compute_evidence, evidence_by_effect
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
@@ -78,7 +78,7 @@ def name_effects(
     folds = fold_blocks(blocks)
     effects, reasons = effect_candidates(blocks, baseline["coefficient"])
     candidates = [*effects, *nuisance_alternatives(blocks)]
-    start = begin_state(blocks, baseline)
+    start = initial_state(blocks, baseline)
     best, count_evidence = _score_null_records(
         candidates, nulls, start, folds, np.random.default_rng(seed), progress
     )
@@ -123,7 +123,7 @@ def _score_null_records(
     The evidence of counts needs the counts of all null records. It is added in a second pass, for
     which the counts are kept.
     """
-    expected = Expected()
+    expected = ExpectedCounts()
     linear = [candidate for candidate in candidates if candidate.statistic != "marks"]
     counts = [candidate for candidate in candidates if candidate.statistic == "marks"]
     sums: list[dict[str, Array]] = []
@@ -142,7 +142,7 @@ def _score_null_records(
     count_evidence = CountEvidence.gathered(expected, rounded_rates(state.blocks, state.baseline))
     best = []
     for linear_sums, chunk in zip(sums, kept, strict=True):
-        count_sums = totals(
+        count_sums = evidence_by_effect(
             compute_evidence(counts, chunk, state, folds, count_evidence=count_evidence)
         )
         zero = np.zeros(chunk.sizes["record"])

@@ -29,7 +29,6 @@ ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
 GRID_REACH = 0.25  # distance in ln(cutoff) of one place on the grid of filters
 MIN_ELSEWHERE_SHARE = 0.02  # of the probability, from which on other places widen the interval
 TAIL_PROBABILITY = 0.025  # of each end of a 95 % interval
-SIGMA_95 = 1.959964  # two-sided 95 % quantile of the normal law
 DISAGREEMENT_NATS = 6.0  # between axes, that chance explains: odds of 400 to 1
 SPECTRUM_ERROR_SHARE = 0.1  # of the evidence, that an error of the spectrum may leave
 
@@ -184,9 +183,9 @@ def _widen_interval(
     if share[~near].sum() < MIN_ELSEWHERE_SHARE:
         return refined
     below, above = share.cumsum(), share[::-1].cumsum()[::-1]
-    low = min(float(value[below >= TAIL_PROBABILITY].min()), mean - SIGMA_95 * sd)
-    high = max(float(value[above >= TAIL_PROBABILITY].max()), mean + SIGMA_95 * sd)
-    return mean, (high - low) / (2.0 * SIGMA_95), low, high
+    low = min(float(value[below >= TAIL_PROBABILITY].min()), mean - NORMAL_95 * sd)
+    high = max(float(value[above >= TAIL_PROBABILITY].max()), mean + NORMAL_95 * sd)
+    return mean, (high - low) / (2.0 * NORMAL_95), low, high
 
 
 def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:

@@ -21,7 +21,6 @@ MIN_CLEAN_BLOCKS = 5  # without an outlier, that determine the noise level
 #: Relative error of number and size of outliers because the law of their sizes is unknown; at least
 #: half of the share that is not seen.
 LAW_ERROR_SHARE = 0.1
-SECONDS_PER_HOUR = 3600.0
 Pair = tuple[float, float]
 
 
@@ -57,7 +56,7 @@ def estimate_from_counts(
 
     samples = max(float(blocks["samples"].sel(axis=axis).sum()), 1.0)
     rate = float(blocks.attrs["sampling_rate_hz"])
-    hours = samples / rate / SECONDS_PER_HOUR
+    hours = samples / rate / HOUR
     if mark == "lattice":
         return {"step": (float(blocks["lattice"].sel(axis=axis)), 0.0)}
     row = [str(one) for one in blocks["axis"].values].index(axis)

@@ -51,10 +51,15 @@ from gyrostab.diagnose.predict.condition import (
     Component,
     condition_on,
     condition_on_components,
-    reweighted,
+    refit_weights,
 )
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import CountEvidence, Found, compute_evidence, of_means
+from gyrostab.diagnose.predict.search import (
+    CandidateEvidence,
+    CountEvidence,
+    compute_evidence,
+    reusable_mean_evidence,
+)
 
 __all__ = ["AMBIGUOUS_NATS", "FORM_ERROR_SHARE", "Search"]
 
@@ -146,9 +151,9 @@ class Search:
             for key in (one.components[0].candidate.key, *self._explained_count_keys(one))
         }
         effects_left, lines_left = MAX_EFFECTS, MAX_LINES
-        found: list[Found] = []
+        found: list[CandidateEvidence] = []
         while effects_left and lines_left:
-            known = of_means(found, before, state)
+            known = reusable_mean_evidence(found, before, state)
             found, before = self._score_candidates(state, barred, known), state
             selected = self._select_next(found, state, chosen)
             if selected is None:
@@ -186,14 +191,14 @@ class Search:
             if candidate.statistic == "marks" and counts & set(candidate.marks)
         }
 
-    def _evidence(self, candidates: Sequence[Candidate], state: State) -> list[Found]:
+    def _evidence(self, candidates: Sequence[Candidate], state: State) -> list[CandidateEvidence]:
         return compute_evidence(
             candidates, state.blocks, state, self.folds, count_evidence=self.count_evidence
         )
 
     def _score_candidates(
-        self, state: State, barred: set[str], known: Sequence[Found] = ()
-    ) -> list[Found]:
+        self, state: State, barred: set[str], known: Sequence[CandidateEvidence] = ()
+    ) -> list[CandidateEvidence]:
         """Compute the evidence of all candidates that are not barred; `known` ones are reused.
 
         Powers are weighted with the strongest effect in the powers, because its noise is in every
@@ -226,7 +231,7 @@ class Search:
         return found
 
     def _select_next(
-        self, found: list[Found], state: State, chosen: Sequence[Selection]
+        self, found: list[CandidateEvidence], state: State, chosen: Sequence[Selection]
     ) -> tuple[Selection | None, set[str]] | None:
         """Select the next effect, or the nuisance alternative that explains more.
 
@@ -385,9 +390,9 @@ class Search:
                 state = condition_on_components(state, selection.components)
                 has_new_lines = True
                 continue
-            state = reweighted(state) if has_new_lines else state
+            state = refit_weights(state) if has_new_lines else state
             state, has_new_lines = condition_on(state, list(selection.components)), False
-        return reweighted(state) if has_new_lines else state
+        return refit_weights(state) if has_new_lines else state
 
     def _prune(self, start: State, chosen: list[Selection]) -> list[Selection]:
         """Drop what fails the threshold with the others in the model, the weakest first.
@@ -575,7 +580,7 @@ class Search:
         return [find_unidentified("~N(t)", components, self.threshold, names)] if components else []
 
 
-def _positive_evidence(found: Found) -> float:
+def _positive_evidence(found: CandidateEvidence) -> float:
     return float(np.maximum(found.evidence_nats[0], 0.0).sum())
 
 

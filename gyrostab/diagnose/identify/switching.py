@@ -231,7 +231,7 @@ def _drop_components(
     return out
 
 
-def _component_found(component: Component, found: Sequence[Found]) -> Component:
+def _component_found(component: Component, found: Sequence[CandidateEvidence]) -> Component:
     """Return the component as found again."""
     (one,) = found
     row = one.rows.index(component.row)

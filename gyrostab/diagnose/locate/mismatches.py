@@ -194,8 +194,8 @@ def _take_region(
         np.isfinite(left[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0
     )  # explained windows do not count
     begin, end, fine = _find_span(scores, free * sign, int(window))
-    together, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
-    columns, reach = _find_columns(scores, together, ratio, int(column))
+    combined, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
+    columns, reach = _find_columns(scores, combined, ratio, int(column))
     region = {
         "view": scores.attrs["view"],
         "axes": str(scores["axes"].values[row]),
@@ -210,7 +210,7 @@ def _take_region(
             sign
             * max(
                 abs(left[window, column]),
-                together[column] if np.isfinite(together[column]) else 0.0,
+                combined[column] if np.isfinite(combined[column]) else 0.0,
             )
         ),
         "ratio": float(ratio[column]),
@@ -288,18 +288,18 @@ def _combine_windows(
     known = np.isfinite(z[fine])
     count = known.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        together = np.where(known, z[fine], 0.0).sum(axis=0) / np.sqrt(count)
+        combined = np.where(known, z[fine], 0.0).sum(axis=0) / np.sqrt(count)
         mean = np.where(known, ratio[fine], 0.0).sum(axis=0) / count
     coarse = 2 * count < fine.size
-    return np.where(coarse, z[window], together), np.where(coarse, ratio[window], mean)
+    return np.where(coarse, z[window], combined), np.where(coarse, ratio[window], mean)
 
 
 def _find_columns(
-    scores: xr.Dataset, together: Array, ratio: Array, column: int
+    scores: xr.Dataset, combined: Array, ratio: Array, column: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the columns of a region, and those that it explains."""
     what, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
-    above = np.nan_to_num(together) > NEIGHBOUR_SIGMA
+    above = np.nan_to_num(combined) > NEIGHBOUR_SIGMA
     if what[column] == "level":  # of all averaging times: the region has those above the noise
         seen = np.flatnonzero(above & (what == "avar"))
         return (seen if seen.size else np.array([column])), np.arange(what.size)
@@ -309,7 +309,7 @@ def _find_columns(
     while upper + 1 < what.size and above[upper + 1] and what[upper + 1] == what[column]:
         upper += 1
     grown = np.arange(lower, upper + 1)
-    excess = np.abs(ratio - 1.0) if scores.attrs["view"] == "davar" else np.abs(together)
+    excess = np.abs(ratio - 1.0) if scores.attrs["view"] == "davar" else np.abs(combined)
     region = grown[excess[grown] >= NEIGHBOUR_EXCESS_SHARE * excess[column]]
     beside = LINE_REACH_BINS if what[column] == "line" else 0
     if what[column] == "line":

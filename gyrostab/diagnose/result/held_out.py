@@ -27,7 +27,6 @@ MIN_STRETCHES = 36  # in records shorter than an hour the stretches are shorter 
 MIN_BLOCKS = 12  # three held-out blocks in each of the four folds
 FORECAST_FROM_SHARE = 0.7  # share of the record that a forecast begins from
 SHORT_WINDOW_BLOCKS = 5  # length of the middle one of the three windows of the Allan variance
-SIGMA_95 = 1.959964  # two-sided 95 % quantile of the normal law
 
 
 def held_out(
@@ -354,7 +353,7 @@ def _summarise_scores(squares: dict[str, list[Array]]) -> dict[str, float]:
     for name in ("before", "after"):
         cells = joined[name]
         found[f"misfit_{name}"] = float(cells.mean()) if cells.size else np.nan
-        found[f"coverage95_{name}"] = float((cells < SIGMA_95**2).mean()) if cells.size else np.nan
+        found[f"coverage95_{name}"] = float((cells < NORMAL_95**2).mean()) if cells.size else np.nan
         means = joined[f"mean_{name}"]
         found[f"mean_misfit_{name}"] = float(means.mean()) if means.size else np.nan
     return found

@@ -247,7 +247,7 @@ def span_text(begin: float, end: float, whole: float) -> str:
 
 def length_text(seconds: float) -> str:
     """Write a duration with the unit that suits it."""
-    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+    for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min")):
         if seconds >= 2 * size:
             return f"{seconds / size:.3g} {name}"
     return f"{seconds:.3g} s" if seconds >= 0.1 else f"{seconds * 1e3:.3g} ms"

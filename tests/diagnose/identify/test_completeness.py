@@ -13,8 +13,8 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.completeness import variance_fluctuation
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.selection import Search
-from gyrostab.diagnose.predict.condition import reweighted
-from gyrostab.diagnose.predict.linear_model import State, begin_state
+from gyrostab.diagnose.predict.condition import refit_weights
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
 from gyrostab.diagnose.predict.search import CandidateEvidence, CountEvidence, compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -111,7 +111,7 @@ def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
             unit="deg/h",
         )
     )
-    state = begin_state(blocks, calibrate_noise(blocks))
+    state = initial_state(blocks, calibrate_noise(blocks))
     search = Search(nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0)
 
     def common(found: list[CandidateEvidence]) -> float:

@@ -38,7 +38,7 @@ def test_what_goes_over_within_some_blocks_is_no_jump(way: float, size: float, j
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if (one.effect, one.statistic) == ("bias_jump", "mean")
     )
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     components = group_components(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[
         jumps.key
     ]

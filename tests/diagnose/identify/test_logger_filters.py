@@ -43,7 +43,7 @@ def test_a_filter_that_other_axes_deny_is_none_of_the_logger(late, one_filter):
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect == "logger_filter"
     ]
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     components = group_components(compute_evidence(filters, blocks, state, fold_blocks(blocks)))[
         "logger_filter"
     ]
@@ -89,5 +89,5 @@ def _cutoff(log: xr.Dataset) -> tuple[float, float]:
     components = [
         Component(candidate, variant, (str(axis),), 50.0) for axis in blocks["axis"].values
     ]
-    mean, error, *ends = fit_filter_sizes(components, begin_state(blocks, baseline))[0]["cutoff"]
+    mean, error, *ends = fit_filter_sizes(components, initial_state(blocks, baseline))[0]["cutoff"]
     return (ends[0], ends[1]) if ends else (mean - 1.96 * error, mean + 1.96 * error)

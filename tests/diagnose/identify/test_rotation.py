@@ -51,7 +51,7 @@ def _parts(blocks: xr.Dataset):
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect in ("scale_factor", "real_motion")
     ]
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     components = group_components(
         compute_evidence(
             [one for one in known if one.statistic == "mean"], blocks, state, fold_blocks(blocks)

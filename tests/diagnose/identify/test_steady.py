@@ -37,7 +37,7 @@ def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], S
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.key == "gauss_markov" and one.statistic == "power"
     ]
-    state = begin_state(blocks, baseline)
+    state = initial_state(blocks, baseline)
     return group_components(compute_evidence(biases, blocks, state, fold_blocks(blocks)))[
         "gauss_markov"
     ], state

@@ -51,7 +51,7 @@ def test_earth_rate_is_taken_out_and_made_again(around):
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
     orders = [one for one in known if one.statistic == "order"]
-    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(compute_evidence(orders, blocks, start, folds))[
         "earth_rate(rotation_rate)"
     ]
@@ -90,7 +90,7 @@ def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most
     blocks = reduce_log(log)
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(
         compute_evidence([one for one in known if one.statistic == "order"], blocks, start, folds)
     )["earth_rate(rotation_rate)"]
@@ -135,7 +135,7 @@ def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
     orders = [one for one in known if one.statistic == "order" and one.effect == "rotation_line"]
-    start, folds = begin_state(blocks, baseline), fold_blocks(blocks)
+    start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(compute_evidence(orders, blocks, start, folds))[
         "rotation_line(rotation_rate)"
     ]
