@@ -426,7 +426,7 @@ def _average_groups(
         flat[1],
         weight[some],
         known=flat[2],
-        beside=free,
+        free_columns=free,
         precision=precision,
         start=flat[3],
     )

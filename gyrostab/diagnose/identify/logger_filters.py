@@ -231,5 +231,5 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
 
 def _max_log_likelihood(fit: Fit) -> float:
     """Return the largest log likelihood of the powers over the noise."""
-    expected = expected_of(fit)
+    expected = expected_powers(fit)
     return float(-(fit.weight * (np.log(expected) + fit.power / expected)).sum())

@@ -104,7 +104,7 @@ def locate_mismatches(
             continue
         find = _locate_mean_regions if name == "mean" else _locate_regions
         seen = (
-            levelled(blocks, baseline, find_level_regions(regions))
+            scale_to_expected(blocks, baseline, find_level_regions(regions))
             if name == "variance_stability"
             else blocks
         )

@@ -13,7 +13,7 @@ MIN_COMMON_SHARE = 0.5  # of the time of two regions, above which they are one
 MAX_GAP_SHARE = 0.25
 LINE_TOLERANCE_SHARE = 0.02  # of the frequency, by which one line may differ
 TAU_TOLERANCE = 0.99  # ratio of averaging times that are equal but for rounding
-_SEPARATE_KINDS = ("slow", "restless", "glide")
+_SEPARATE_KINDS = ("slow", "variance", "drifting")
 MAX_MEAN_REGIONS = 3  # of an axis, beyond which its mean wanders
 
 

@@ -344,7 +344,7 @@ def _can_show(component: Component, region: Mapping[str, Any], blocks: xr.Datase
             <= LINE_REACH_BINS * (lines[1] - lines[0]) + LINE_REACH_SHARE * mine
         )
     tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
-    return str(region["what"]).startswith(("avar", "level", "restless")) and bool(
+    return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
         region["tau_min_s"] / TAU_REACH_FACTOR <= tau <= region["tau_max_s"] * TAU_REACH_FACTOR
     )
 

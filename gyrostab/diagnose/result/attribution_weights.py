@@ -73,7 +73,7 @@ def statistic_scores(
     )
     special = {
         "sample_counts": turns_left_out,
-        "variance_stability": levelled(seen, after, find_level_regions(regions)),
+        "variance_stability": scale_to_expected(seen, after, find_level_regions(regions)),
     }
     if still is not None:
         special |= dict.fromkeys(

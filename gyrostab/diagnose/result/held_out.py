@@ -221,7 +221,9 @@ def _gain_variance(
     For the powers it follows from the scatter of their cells about `after`; for normal laws it is
     twice the gain.
     """
-    power, shape = (values_of(blocks, name, "axis", "block", "band") for name in ("power", "shape"))
+    power, shape = (
+        values_in_order(blocks, name, "axis", "block", "band") for name in ("power", "shape")
+    )
     one, other = (
         values_in_order(baseline, "spectrum", "axis", "block", "band")
         for baseline in (after, before)
@@ -234,8 +236,10 @@ def _gain_variance(
 
 def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     """Return the log-likelihood of the band powers of every block, by gamma laws."""
-    power, shape = (values_of(blocks, name, "axis", "block", "band") for name in ("power", "shape"))
-    spectrum = values_of(baseline, "spectrum", "axis", "block", "band")
+    power, shape = (
+        values_in_order(blocks, name, "axis", "block", "band") for name in ("power", "shape")
+    )
+    spectrum = values_in_order(baseline, "spectrum", "axis", "block", "band")
     has_data = np.isfinite(power) & np.isfinite(shape) & (spectrum > 0)
     safe = np.where(has_data, spectrum, 1.0)
     return np.asarray(

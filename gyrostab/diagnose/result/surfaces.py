@@ -50,7 +50,7 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     )
     high.append(low[0])
     mean, error = (
-        [_average_windows(blocks, values_of(blocks, "mean", "axis", "block"), windows)],
+        [_average_windows(blocks, values_in_order(blocks, "mean", "axis", "block"), windows)],
         [],
     )
     error.append(np.full(mean[0].shape, np.nan))

@@ -282,7 +282,7 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
 
 
 def _describe_allan_variance(region: Mapping[str, Any], when: str) -> str:
-    if str(region.get("what", "")).startswith("restless"):
+    if str(region.get("what", "")).startswith("variance"):
         return _describe_fluctuation(region, when)
     is_single = len(region["axes"]) == 1
     return (
@@ -346,7 +346,7 @@ def _describe_spectrum(region: Mapping[str, Any], when: str) -> str:
             f"The rate of {axes} has a component of {region['estimate']:.3g} deg/h rms that is "
             f"locked to the phase of the feedback ramp {when}"
         )
-    if what.startswith("glide"):
+    if what.startswith("drifting"):
         first, last = what.split()[1:]
         return (
             f"The spectrum of {axes} has a drifting line {when}, from about {first} Hz to about "
