@@ -2,7 +2,7 @@
 
     python benchmarks/correlation.py --records 400 --output docs/temperature.md
 
-False claims, coverage of the intervals, and power beside an oracle that knows the noise; all on
+False claims, coverage of the intervals, and power against an oracle that knows the noise; all on
 simulated records (tests/support/coupled.py) whose seeds count from `SEED`, so that the same command
 makes the same tables.
 """
@@ -62,7 +62,10 @@ def held(noises: str, heat: str, gap: bool, seed: int) -> float:
 def seen(
     noises: str, heat: str, inverse: np.ndarray, strength: int, seed: int
 ) -> tuple[bool, bool, float]:
-    """Whether the oracle and gyrostab see a slope of so many of the oracle's standard errors; its swing against the noise."""
+    """Return whether the oracle and gyrostab see a slope of this many standard errors.
+
+    The errors are those of the oracle. The last item is the swing of the slope against the noise.
+    """
     product = coupled.product(seed=seed, noises=noises, heat=heat, terms=False, axes="x")
     warm, mean = product["temperature"].values, product["window_mean"].values[0]
     good = np.isfinite(mean)
@@ -100,7 +103,7 @@ def share(spread: Callable[..., Any], job: Callable[..., Any], records: int) -> 
     return np.mean(spread(job, range(SEED, SEED + records), chunksize=5), axis=0)
 
 
-def claims(spread: Callable[..., Any], records: int) -> list[str]:
+def count_claims(spread: Callable[..., Any], records: int) -> list[str]:
     rows = [
         "| noise | temperature | axes | records | records with a claim |",
         "|---|---|---|---|---|",
@@ -157,7 +160,7 @@ def main() -> None:
     )
     chosen = parser.parse_args()
     with Pool() as pool:
-        for name, table in {"claims": claims, "intervals": intervals, "power": power}.items():
+        for name, table in {"claims": count_claims, "intervals": intervals, "power": power}.items():
             text = "\n".join(table(pool.map, chosen.records))
             print(f"{name}\n{text}\n", flush=True)
             if chosen.output:

@@ -3,10 +3,10 @@
     python benchmarks/diagnose_null.py --records 300
     python benchmarks/diagnose_null.py --records 300 --whole
 
-Every record is reduced and calibrated by itself, and its largest held-out gain over steps, trends,
+Every record is reduced and calibrated separately, and its largest held-out gain over steps, trends,
 events, curves, bands and filters is ranked among null records drawn from its own calibration. The
 ranks must be uniform: a share of 1 % below 1 %. With --whole the diagnosis itself runs, and what it
-claims is counted. Prints a Markdown table, and beside it each record in which something was found.
+claims is counted. Prints a Markdown table, and then each record in which something was found.
 """
 
 from __future__ import annotations
@@ -58,10 +58,19 @@ def main() -> None:
         for row in count(rate, lost, options, first=number * options.records)
     ]
     if options.whole:
-        head = "| rate [Hz] | lost | records | named an effect | found a mismatch | 95 % bound of the share that is named | seconds a record |"
+        head = (
+            "| rate [Hz] | lost | records | named an effect | found a mismatch | 95 % "
+            "bound of the share that is named | seconds a record |"
+        )
     else:
-        head = "| rate [Hz] | lost | in | noise | p < 0.01 | p < 0.05 | p < 0.1 | uniform (Kolmogorov-Smirnov) | gain at 99 %: null, raw |"
-    said = f"{machine()}; {options.records} records of 1 h, one axis, N = 0.003, B = 0.004, K = 0.02; {options.nulls} null records each."
+        head = (
+            "| rate [Hz] | lost | in | noise | p < 0.01 | p < 0.05 | p < 0.1 | uniform "
+            "(Kolmogorov-Smirnov) | gain at 99 %: null, raw |"
+        )
+    said = (
+        f"{machine()}; {options.records} records of 1 h, one axis, N = 0.003, B = 0.004, "
+        f"K = 0.02; {options.nulls} null records each."
+    )
     print(f"{said}\n", head, "|" + "---|" * head.count(" | ") + "---|", *rows, sep="\n")
 
 
@@ -146,7 +155,8 @@ def ranks(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
         shares = " | ".join(f"{(p < level).mean():.3f}" for level in (0.01, 0.05, 0.1))
         uniform = kstest(p, "uniform").pvalue
         rows.append(
-            f"| {rate:g} | {lost:g} | {view} | {tier} | {shares} | {uniform:.2f} | {limit.mean():.1f}, {np.quantile(own, 0.99):.1f} |"
+            f"| {rate:g} | {lost:g} | {view} | {tier} | {shares} | {uniform:.2f} | "
+            f"{limit.mean():.1f}, {np.quantile(own, 0.99):.1f} |"
         )
     return rows
 
@@ -173,7 +183,8 @@ def whole(rate: float, lost: float, options: argparse.Namespace, *, first: int) 
     bound = float(levels[binom.cdf(named, options.records, levels) >= 0.05].max())
     seconds = (time.monotonic() - begin) / options.records
     return [
-        f"| {rate:g} | {lost:g} | {options.records} | {named} | {found} | {bound:.3f} | {seconds:.1f} |"
+        f"| {rate:g} | {lost:g} | {options.records} | {named} | {found} | {bound:.3f} | "
+        f"{seconds:.1f} |"
     ]
 
 

@@ -1,4 +1,6 @@
-"""Kill, damage, starve and disturb the commands that write, and count what was lost; writes the table of docs/durability.md.
+"""Kill, damage, starve and disturb the commands that write, and count the losses.
+
+Writes the table of docs/durability.md.
 
     python benchmarks/durability.py [--kills 50] [--seed 1] [--minutes 8] [--write
     docs/durability.md]
@@ -60,7 +62,7 @@ class Trials:
 
 
 def write_inputs(folder: Path) -> None:
-    """A log of one axis at 100 Hz for `run`, the same as text for `ingest`, and ten minutes at 10 Hz for `diagnose`."""
+    """Write logs: one axis at 100 Hz, the same as text, and ten minutes at 10 Hz."""
     from gyrostab import make_log, to_netcdf
 
     rng = np.random.default_rng(3)
@@ -78,7 +80,7 @@ def write_inputs(folder: Path) -> None:
 
 
 def begin(*arguments: object, before: Callable[[], object] | None = None) -> tuple[int, Path]:
-    """Begin a command in a child of this process, in a group of its own; its process and the file of its stderr."""
+    """Start a command in a separate process group; return its process and its stderr file."""
     import dask.threaded
 
     from gyrostab.cli import main
@@ -125,7 +127,7 @@ def read_tree(folder: Path) -> dict[str, bytes]:
 
 
 def is_hidden(folder: Path, name: str) -> bool:
-    """Whether what lies beside an output is a leftover or the folder of a run."""
+    """Whether what lies next to an output is a leftover or the folder of a run."""
     from gyrostab.store.output import is_leftover
 
     return is_leftover(name) or name.endswith(".job")
@@ -170,7 +172,7 @@ class Bench:
             self.whole[name] = self.content(name, folder / f"{name}-{output}")
 
     def content(self, name: str, output: Path) -> object:
-        """What is compared of an output: all bytes; of a diagnosis, which holds the time it took, what it says."""
+        """Return what is compared of an output: all bytes, but of a diagnosis only its content."""
         if not os.path.lexists(output):
             return None
         if name != "diagnose":
@@ -195,8 +197,10 @@ class Bench:
         """Kill a command at random moments; then let it finish, and compare."""
         command, output = self.commands[name]
         again = ["--resume"] if name == "run" else []
-        trials = Trials(f"`kill -9` of `{name}` at a random moment, then the same command{_AFTER_KILL.get(name, '')}",
-                        "no output or the whole one after the kill, inputs unchanged, the same output in the end")  # fmt: skip
+        trials = Trials(f"`kill -9` of `{name}` at a random moment, then the same "
+                        f"command{_AFTER_KILL.get(name, '')}",
+                        "no output or the whole one after the kill, inputs unchanged, the same "
+                        "output in the end")  # fmt: skip
         inputs = read_tree(self.inputs)
         while trials.count < kills and time.monotonic() < deadline:
             with self.trial() as folder:
@@ -279,7 +283,7 @@ class Bench:
         return kinds
 
     def full_disk(self, count: int) -> Trials:
-        """Write to a file system without room: a small tmpfs where root may mount one, else under a limit of the file size."""
+        """Write to a full file system: a small tmpfs where possible, else a file size limit."""
         import resource
 
         mount = self.folder / "small"
@@ -474,7 +478,8 @@ def main() -> int:
         publish(
             given.write,
             trials,
-            f"Made by `python benchmarks/durability.py --kills {given.kills} --seed {given.seed} --minutes {given.minutes:g}`; "
+            f"Made by `python benchmarks/durability.py --kills {given.kills} --seed {given.seed} "
+            f"--minutes {given.minutes:g}`; "
             f"undisturbed, {seconds}.",
         )
     return 1 if any(kind.wrong for kind in trials) else 0

@@ -1,9 +1,11 @@
-"""From files to product, against merely reading the files: NetCDF (int32, zstd), Zarr (int32, blosc) and CSV, with 1 and 2 workers.
+"""From files to product, compared with merely reading the files, with 1 and 2 workers.
+
+The files are NetCDF (int32, zstd), Zarr (int32, blosc) and CSV.
 
     python benchmarks/end_to_end.py --output docs/performance.md
 
 Prints a Markdown table, and puts it into its place in a page. Every figure is the best of some
-runs, each in a process of its own that is warm: kernels compiled, files in the cache of the system.
+runs, each in a separate, warm process: kernels compiled, files in the cache of the system.
 Beside the time on the clock stands the processor time of all threads, which says more where the
 machine has other work to do. A run uses every second difference (``full``, as by default) or those
 that ``--overlap octave`` leaves. The peer reads every sample as a double into memory: xarray, one
@@ -66,10 +68,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as root:
         rows = [row for form in options.formats for row in compare(form, Path(root, form), options)]
     head = (
-        "| archive | hours | workers | terms | peer reads [s] | own reader [s] | whole run [s] | Msamples/s | run / peer | target "
+        "| archive | hours | workers | terms | peer reads [s] | own reader [s] | whole run [s] | "
+        "Msamples/s | run / peer | target "
         "| run / own reader | processor: peer [s] | own reader [s] | run [s] | run / peer |"
     )
-    said = f"{machine()}; {options.rate:g} Hz, 3 axes, files of one hour with gaps; best of {options.repeat}."
+    said = (
+        f"{machine()}; {options.rate:g} Hz, 3 axes, files of one hour with gaps; best of "
+        f"{options.repeat}."
+    )
     text = "\n".join([f"{said}\n", head, "|" + "---|" * 15, *rows])
     print(text)
     if options.output:
@@ -124,7 +130,7 @@ def compare(form: str, folder: Path, options: argparse.Namespace) -> list[str]:
 def measure(
     what: str, workers: int, folder: Path, options: argparse.Namespace
 ) -> tuple[float, float]:
-    """Seconds on the clock and of the processor, measured in a process of its own."""
+    """Seconds on the clock and of the processor, measured in a separate process."""
     command = [
         sys.executable,
         __file__,
@@ -203,7 +209,7 @@ def read_arrow(files: list[Path], workers: int, repeat: int) -> tuple[float, flo
 
 
 def run_whole(terms: str, files: list[Path], workers: int, repeat: int) -> tuple[float, float]:
-    """The command ``gyrostab run`` with ``--overlap`` as said, after a first one on the first file."""
+    """Time ``gyrostab run`` with this ``--overlap``, after a first run on the first file."""
     from gyrostab.cli import main as command
 
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as folder:

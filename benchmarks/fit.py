@@ -1,7 +1,7 @@
 """Time the fit of windows: the kernel, the limits, and what is made once for a surface.
 
     python benchmarks/fit.py                                  # a minute
-    python benchmarks/fit.py --output docs/performance.md     # renew the part of the document between its marks
+    python benchmarks/fit.py --output docs/performance.md     # update the part between the markers
 
 Windows of 5 min at 400 Hz of quantization noise, angle and rate random walk; processor time of one
 thread, the best of several runs.
@@ -49,7 +49,11 @@ def record(missing: bool) -> np.ndarray:
 
 
 def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
-    """Averaging times, and microseconds a window: all, kernel, limits and the rest, quick fit of davar; seconds of the tables."""
+    """Measure a fit: number of averaging times, then microseconds a window of each part.
+
+    The parts are all, kernel, limits, the rest and the quick fit of davar; last come the seconds of
+    the tables.
+    """
     surface = davar(make_log(x, rate=RATE, unit="deg/h"), window="5min", step="15s", taus=taus)
     cells, ks, rate, window = fit._fit_inputs(surface)
     flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells]
@@ -82,7 +86,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     lines = [
-        "| gaps | averaging times | fit_noise, us a window | kernel | limits | rest | quick fit in davar | tables, once, s |",
+        "| gaps | averaging times | fit_noise, us a window | kernel | limits | rest | quick fit "
+        "in davar | tables, once, s |",
         "|---|---|---|---|---|---|---|---|",
     ]
     with dask.config.set(scheduler="sync"):
@@ -94,7 +99,8 @@ def main() -> None:
                 )
                 name = "10 % in blocks of 1000" if missing else "none"
                 lines.append(
-                    f"| {name} | {size} | {whole:.0f} | {kernel:.0f} | {limits:.1f} | {rest:.1f} | {quick:.1f} | {once:.2f} |"
+                    f"| {name} | {size} | {whole:.0f} | {kernel:.0f} | {limits:.1f} | {rest:.1f} "
+                    f"| {quick:.1f} | {once:.2f} |"
                 )
     text = f"{machine()}; best of {arguments.repeats}.\n\n" + "\n".join(lines)
     print(text)

@@ -50,7 +50,7 @@ def simulate(rng: np.random.Generator, truth: dict[str, float]) -> np.ndarray:
 
 
 def seen_law(product: xr.Dataset, truth: dict[str, float]) -> xr.DataArray:
-    """Expected Allan variance of each cell, with what the gaps do to white and quantization noise."""
+    """Return the expected Allan variance of each cell, with the effect of the gaps."""
     response = {"Q": product.quantization_response, "N": product.white_response}
     parts = [
         response.get(term, 1.0) * (0 * product.avar + model_avar(product.tau, {term: value}))
@@ -80,9 +80,15 @@ def row(rng: np.random.Generator, truth: dict[str, float], share: float, block: 
             cells.append(f"claimed {claimed:.3f}")
             continue
         z = (product[term] - truth[term]) / product[f"{term}_stderr"]
-        text = f"{float(product[term].mean()) / truth[term]:.3f}; z {float(z.mean()):+.2f} ± {float(z.std()):.2f}; seen {claimed:.2f}"
+        text = (
+            f"{float(product[term].mean()) / truth[term]:.3f}; z {float(z.mean()):+.2f} ± "
+            f"{float(z.std()):.2f}; seen {claimed:.2f}"
+        )
         if (seen == 1).sum() >= 100:
-            text += f"; limit holds {float((product[f'{term}_upper'] >= truth[term]).where(seen == 1).mean()):.3f}"
+            text += (
+                "; limit holds "
+                f"{float((product[f'{term}_upper'] >= truth[term]).where(seen == 1).mean()):.3f}"
+            )
         cells.append(text)
     return " | ".join(cells)
 

@@ -1,4 +1,4 @@
-"""Time and peak memory of `gyrostab run` on files of other programs that hold one time stamp per sample.
+"""Time and peak memory of `gyrostab run` on files of other programs, one stamp per sample.
 
     python benchmarks/foreign.py [--hours 12 48] [--formats own-zarr own-netcdf netcdf ...]
     [--rounds 1] [--jitter 0]
@@ -13,7 +13,8 @@ CSV file of 200 h has 18 GB. Give --folder on a disk with 60 GB free: TMPDIR of 
 is set to it.
 
     python benchmarks/foreign.py --hours 12 48                                    # a few minutes
-    python benchmarks/foreign.py --hours 200 --formats own-zarr netcdf zarr2 zarr3 parquet hdf5 matlab csv --output docs/scaling.md
+    python benchmarks/foreign.py --hours 200 --output docs/scaling.md \\
+        --formats own-zarr netcdf zarr2 zarr3 parquet hdf5 matlab csv
 
 The table is Markdown; `--output docs/scaling.md` puts it in its place there.
 """
@@ -89,7 +90,7 @@ def blocks(hours: float, jitter_us: float) -> Iterator[Block]:
 def write_netcdf(
     path: Path, hours: float, jitter_us: float, *, kind: str = "NETCDF4", packed: bool = False
 ) -> Path:
-    """A CF file with one variable per axis; doubles as xarray writes them, or packed, shuffled and deflated counts."""
+    """Write a CF file with one variable per axis: doubles, or packed and deflated counts."""
     import netCDF4
 
     with netCDF4.Dataset(path, "w", format=kind) as file:
@@ -234,7 +235,7 @@ FORMATS: dict[str, tuple[str, Callable[[Path, float, float], Path]]] = {
 
 
 def measure(work: str, path: Path, given: argparse.Namespace) -> dict[str, float] | None:
-    """The quickest of several child processes, with the largest of their peaks; None where the work fails."""
+    """Return the shortest time and the largest peak of several runs; None if the work fails."""
     found = []
     for _ in range(given.rounds):
         request = json.dumps(

@@ -1,4 +1,6 @@
-"""How often the 95 % intervals of a diagnosis hold the truth: fits of many records whose statistics are drawn from their laws.
+"""How often the 95 % intervals of a diagnosis contain the truth.
+
+Many records are fitted whose statistics are drawn from their laws.
 
     python benchmarks/intervals.py --output docs/diagnosis.md
 
@@ -54,7 +56,7 @@ def frames(reduced, baseline, effect, view, column):
 
 
 def held(reduced, baseline, drawn, effect, view, column, truth, change):
-    """Share of records whose interval holds the truth, and the mean error of the fit as a share of the truth."""
+    """Return the share of intervals that contain the truth, and the mean relative error."""
     frame = frames(reduced, baseline, effect, view, column)
     inside, ratio = [], []
     for number in range(drawn.sizes["record"]):
@@ -78,7 +80,7 @@ def cases(reduced):
     def shifted(shape):
         return lambda one: one.assign(mean=one["mean"] + xr.DataArray(shape, dims="block"))
 
-    def louder(factor):
+    def scale_noise(factor):
         return lambda one: one.assign(power=one["power"] * xr.DataArray(factor, dims="block"))
 
     for level, size in (("low", 0.1), ("high", 0.5)):
@@ -101,7 +103,7 @@ def cases(reduced):
                 level,
                 form,
                 0.003 * share**0.5 / 6.0,
-                louder(1.0 + share * (g / 6.0) ** power),
+                scale_noise(1.0 + share * (g / 6.0) ** power),
             )
     for level, size in (("low", 0.3), ("high", 2.0)):
         for form, bend in (("right", 0.0), ("wrong", 0.06)):

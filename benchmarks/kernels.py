@@ -1,13 +1,13 @@
-"""Time the DAVAR kernels beside their peers and beside the bare loop on as many terms, in turns.
+"""Compare the times of the DAVAR kernels, in turns, with peers and a bare loop on as many terms.
 
 x1, x2 and vibration are the shapes of Wang et al., Sensors 16 (2016); the archive is a piece of a
 multi-day log of three axes at 400 Hz. The bare loop squares and adds second differences of one
-averaging factor in the first-level cache, in numba and, where gcc is there, in C: what a processor
+averaging factor in the first-level cache, in numba and, if gcc is installed, in C: what a processor
 can do that is given one averaging factor at a time. Run it on an idle machine:
 
     make bench                                                      # ten minutes or so
     python benchmarks/kernels.py --quick                            # short records, one repeat
-    python benchmarks/kernels.py --output docs/performance.md       # renew the part of the document between its marks
+    python benchmarks/kernels.py --output docs/performance.md   # update the part between markers
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def seconds(call: Callable[[], object], repeats: int) -> float:
 
 
 def in_turns(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Best wall time of each call, all called in turn so that a slow moment of the machine meets them all."""
+    """Return the best wall time of each call; calls alternate, so that load affects all alike."""
     best = dict.fromkeys(calls, np.inf)
     for turn in range(repeats + 1):
         for label, call in calls.items():
@@ -204,7 +204,10 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
         "bare loop, as many terms": bare(number_of_terms(parts, unit)),
     }
     yield f"\n**{name}**, {n} samples, window {window}, step {step}, {tau.size} averaging times\n"
-    yield "| one thread | seconds | times as fast as allantools | share of the bare loop |\n|---|---|---|---|"
+    yield (
+        "| one thread | seconds | times as fast as allantools | share of the bare loop "
+        "|\n|---|---|---|---|"
+    )
     with dask.config.set(scheduler="sync"):
         took = {label: seconds(call, times) for label, (call, times) in slow.items()} | in_turns(
             fast, 2 * repeats + 3
@@ -232,8 +235,14 @@ def archive(repeats: int, quick: bool) -> Iterator[str]:
     x = np.random.default_rng(1).standard_normal((3, samples)).astype(np.float32)
     window, step = 120_000, 24_000
     ks = averaging_factors(40, rate=400.0, window=window, tau_max=None)
-    yield f"\n**archive**, 3 axes of {samples} samples (float32) at 400 Hz, window 5 min, step 1 min, {ks.size} averaging times to 100 s\n"
-    yield "| terms | missing | terms per sample | kernel, 1 thread | 2 threads | ratio | share of the bare loop | `davar`, 1 | `davar`, 2 |"
+    yield (
+        f"\n**archive**, 3 axes of {samples} samples (float32) at 400 Hz, window 5 min, "
+        f"step 1 min, {ks.size} averaging times to 100 s\n"
+    )
+    yield (
+        "| terms | missing | terms per sample | kernel, 1 thread | 2 threads | ratio | "
+        "share of the bare loop | `davar`, 1 | `davar`, 2 |"
+    )
     yield "|---|---|---|---|---|---|---|---|---|"
     records = {"none": x, "in blocks": with_gaps(x)}
     for octave in (False, True):
@@ -257,8 +266,10 @@ def archive(repeats: int, quick: bool) -> Iterator[str]:
             ]
             share = took[f"{name} bare"] / took[f"{name} kernel 1"]
             yield (
-                f"| {options['overlap']} | {np.isnan(record).mean():.0%} | {terms[name] / record.size:.1f} | {speeds[0]:.0f} "
-                f"| {speeds[1]:.0f} | {speeds[1] / speeds[0]:.2f} | {share:.2f} | {speeds[2]:.0f} | {speeds[3]:.0f} |"
+                f"| {options['overlap']} | {np.isnan(record).mean():.0%} | "
+                f"{terms[name] / record.size:.1f} | {speeds[0]:.0f} "
+                f"| {speeds[1]:.0f} | {speeds[1] / speeds[0]:.2f} | {share:.2f} | "
+                f"{speeds[2]:.0f} | {speeds[3]:.0f} |"
             )
 
 
@@ -286,12 +297,18 @@ def processor() -> str:
         if info.exists()
         else []
     )
-    return f"{names[0] if names else 'processor not named'}, {os.cpu_count()} cores, numba {numba.__version__}, numpy {np.__version__}"
+    return (
+        f"{names[0] if names else 'processor not named'}, {os.cpu_count()} cores, numba "
+        f"{numba.__version__}, numpy {np.__version__}"
+    )
 
 
 def report(quick: bool) -> Iterator[str]:
     repeats = 1 if quick else 5
-    yield f"{processor()}; {date.today().isoformat()}; 1-minute load before the run {os.getloadavg()[0]:.2f}; medians of {repeats}.\n"
+    yield (
+        f"{processor()}; {date.today().isoformat()}; 1-minute load before the run "
+        f"{os.getloadavg()[0]:.2f}; medians of {repeats}.\n"
+    )
     roofs = rooflines()
     yield (
         "Bare loop, 1e9 terms per second: "
@@ -302,7 +319,10 @@ def report(quick: bool) -> Iterator[str]:
         for taus in ("32", "all"):
             yield from shape(name, taus, repeats, quick)
     yield from archive(repeats, quick)
-    yield "\nShares are of the numba loop on as many terms, the best of several turns; the archive is in millions of samples per second."
+    yield (
+        "\nShares are of the numba loop on as many terms, the best of several turns; the "
+        "archive is in millions of samples per second."
+    )
 
 
 def main() -> None:

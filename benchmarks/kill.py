@@ -1,8 +1,8 @@
-"""Kill runs of the command line at random moments, continue them, and compare the products byte for byte.
+"""Kill runs of the command line at random moments, continue them, and compare the products.
 
     python benchmarks/kill.py [--kills 50] [--seed 1] [--hours 6]
 
-Each run is a process of its own, `gyrostab run`, killed with SIGKILL (with its worker processes,
+Each run is a separate process, `gyrostab run`, killed with SIGKILL (with its worker processes,
 where it has some) at a moment drawn evenly over the time that an undisturbed run takes; some runs
 are killed several times before they may finish. One run in three works with processes instead of
 threads. At the end one of them is given the wrong options, which must be refused.
@@ -45,7 +45,7 @@ def write_log(path: Path, hours: float) -> Path:
 
 
 def start(log: Path, output: Path, *options: str) -> subprocess.Popen[str]:
-    """Begin a run as a user does, in a process group of its own."""
+    """Begin a run as a user does, in a separate process group."""
     command = [
         sys.executable,
         "-c",
@@ -133,7 +133,8 @@ def main() -> int:
             runs += 1
         code, said = finish(start(log, output, "--resume", "--terms", "N"))
         print(
-            f"seed {given.seed}: {kills} kills in {runs} runs of {seconds:.1f} s; {parts} parts were found again"
+            f"seed {given.seed}: {kills} kills in {runs} runs of {seconds:.1f} s; {parts} parts "
+            "were found again"
         )
         print(f"{len(bad)} of {runs} products differ from the undisturbed one")
         print(f"resume with another option: exit {code}, {said.strip()}")

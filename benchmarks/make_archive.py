@@ -1,4 +1,6 @@
-"""Make a big archive of gyro logs, file by file, for timing: counts with white noise and a slow walk, gaps, and a temperature.
+"""Make a big archive of gyro logs for timing.
+
+The files hold counts with white noise and a slow walk, gaps, and a temperature.
 
     python benchmarks/make_archive.py ARCHIVE --hours 200 --rate 400 --axes 3 --format nc --gaps
     0.02 --overlap 5s --seed 1
@@ -94,7 +96,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 def samples(
     options: argparse.Namespace, number: int, walk: NDArray[np.float64], size: int
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.bool_]]:
-    """The first `size` samples of a file: counts (axis, time), the walk at their end, and which samples are missing.
+    """Return the first `size` samples of a file: counts (axis, time), last walk, missing samples.
 
     They follow from the seed, the number of the file and the end of the walk before it; so two
     files agree where they overlap.
@@ -125,7 +127,7 @@ def samples(
 
 
 def gaps(options: argparse.Namespace, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Stretches of a file that are missing; the last of them reaches over its end, so that there is one between two files."""
+    """Return the gaps of a file; the last one extends beyond the end of the file."""
     whole = round(options.file_hours * 3600 * options.rate)
     left = round(options.gaps * whole)
     found = []
@@ -158,7 +160,7 @@ def write(
 def regular_log(
     counts: NDArray[np.int32], missing: NDArray[np.bool_], first: int, options: argparse.Namespace
 ) -> xr.Dataset:
-    """The file as a log of gyrostab: degree per hour, NaN where missing, a temperature every second, the table of gaps."""
+    """Return the file as a log in degree per hour, with a temperature every second."""
     present = np.flatnonzero(~missing)
     a, b = int(present[0]), int(present[-1]) + 1
     counts, missing = counts[:, a:b], missing[a:b]
@@ -236,7 +238,7 @@ def write_csv(
     first: int,
     options: argparse.Namespace,
 ) -> None:
-    """Write one file as text: nanoseconds since 1970, counts, and a temperature in the first row of each second."""
+    """Write one file as text: nanoseconds since 1970, counts, a temperature every second."""
     import pyarrow as pa
     from pyarrow import csv
 

@@ -20,7 +20,10 @@ def machine() -> str:
             ),
             name,
         )
-    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}; {date.today()}, 1-minute load {os.getloadavg()[0]:.1f}"
+    return (
+        f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}; "
+        f"{date.today()}, 1-minute load {os.getloadavg()[0]:.1f}"
+    )
 
 
 def renew(page: Path, name: str, text: str) -> None:

@@ -1,14 +1,14 @@
-"""How the time of a run grows with the length of the log, the number of averaging times, and the window over the step; and its memory.
+"""How time and memory of a run grow with log length, averaging times and window over step.
 
     python benchmarks/scaling.py [--hours 1 2 5 10 20 50 100 200] [--workers 2] [--rounds 3]
     [--output docs/scaling.md]
 
-Each run is the whole `gyrostab run` (read, DAVAR, fit, write) in a process of its own, from a Zarr
+Each run is the whole `gyrostab run` (read, DAVAR, fit, write) in a separate process, from a Zarr
 store of integer counts of three axes at 400 Hz, so that its peak memory is its own. The best of
-several rounds counts; what any run costs, however short (tables, compiled kernels), is fitted
-beside the exponent. The processor time of all threads stands beside the time on the clock, and says
-more where the machine has other work to do. The tables are Markdown; `--output docs/scaling.md`
-puts them in their place there.
+several rounds counts. The constant cost of any run (tables, compiled kernels) is fitted together
+with the exponent. The processor time of all threads is given next to the wall time; it is the
+better measure on a busy machine. The tables are Markdown; `--output docs/scaling.md` inserts them
+there.
 """
 
 from __future__ import annotations
@@ -39,9 +39,11 @@ def work(paths, output, windows, options):
     start, used = time.perf_counter(), time.process_time()
     run(paths, output, windows=windows, overwrite=True, stage=stage, **options)
     end = time.perf_counter()
-    spans = {label: after - before for (label, before), (_, after) in zip(stages, [*stages[1:], ("", end)])}
+    following = [*stages[1:], ("", end)]
+    spans = {label: after - before for (label, before), (_, after) in zip(stages, following)}
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps({"seconds": end - start, "processor": time.process_time() - used, "peak": peak, "spans": spans}))
+    used = time.process_time() - used
+    print(json.dumps({"seconds": end - start, "processor": used, "peak": peak, "spans": spans}))
 if __name__ == "__main__":
     work(*json.loads(sys.argv[1]))
 """
@@ -78,7 +80,7 @@ def write_store(path: Path, hours: float) -> Path:
 
 
 def measure(store: Path, windows: dict[str, str], options: dict[str, object], rounds: int) -> dict:
-    """The best of several runs, by the clock and by the processor; the largest of their peaks of memory."""
+    """Return the best wall and processor time of several runs, and their largest memory peak."""
     found = []
     for _ in range(rounds):
         command = [
@@ -100,7 +102,7 @@ def measure(store: Path, windows: dict[str, str], options: dict[str, object], ro
 
 
 def exponent(hours: list[float], seconds: list[float]) -> str:
-    """Fit ``fixed + factor * hours**exponent``, each time good to the same share of itself, and say it in a line."""
+    """Fit ``fixed + factor * hours**exponent`` with equal relative errors; return one line."""
     from scipy.optimize import curve_fit
 
     def law(length: np.ndarray, fixed: float, factor: float, power: float) -> np.ndarray:
@@ -109,7 +111,10 @@ def exponent(hours: list[float], seconds: list[float]) -> str:
     begin = [np.log(seconds[0]), np.log(seconds[-1] / hours[-1]), 1.0]
     (fixed, factor, power), covariance = curve_fit(law, np.array(hours), np.log(seconds), p0=begin)
     error = float(np.sqrt(covariance[2, 2]))
-    return f"{np.exp(fixed):.2f} s + {np.exp(factor):.4f} s (length / h)^p with p = {power:.3f} ± {error:.3f}"
+    return (
+        f"{np.exp(fixed):.2f} s + {np.exp(factor):.4f} s (length / h)^p with p = "
+        f"{power:.3f} ± {error:.3f}"
+    )
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -132,15 +137,30 @@ def against_length(folder: Path, given: argparse.Namespace, options: dict[str, o
             values.append(one[name])
         spans = [one["spans"].get(name, 0.0) for name in ("reading", "computing", "writing")]
         rows.append(
-            [f"{hours:g} h", f"{samples / 1e6:.1f}", f"{one['seconds']:.2f}", *(f"{span:.2f}" for span in spans),
-             f"{samples / one['seconds'] / 1e6:.1f}", f"{one['processor']:.2f}", f"{1e9 * one['processor'] / samples:.1f}",
-             f"{one['peak']:.0f}"]
-        )  # fmt: skip
+            [
+                f"{hours:g} h",
+                f"{samples / 1e6:.1f}",
+                f"{one['seconds']:.2f}",
+                *(f"{span:.2f}" for span in spans),
+                f"{samples / one['seconds'] / 1e6:.1f}",
+                f"{one['processor']:.2f}",
+                f"{1e9 * one['processor'] / samples:.1f}",
+                f"{one['peak']:.0f}",
+            ]
+        )
         print(rows[-1], flush=True)
     head = [
-        "length", "10^6 samples", "seconds", "of that open", "compute", "write", "Msamples/s", "processor [s]", "processor [ns a sample]",
+        "length",
+        "10^6 samples",
+        "seconds",
+        "of that open",
+        "compute",
+        "write",
+        "Msamples/s",
+        "processor [s]",
+        "processor [ns a sample]",
         "peak MiB",
-    ]  # fmt: skip
+    ]
     text = table(head, rows)
     for name, said in (("seconds", "Time"), ("processor", "Processor time")):
         if len(given.hours) > 4:

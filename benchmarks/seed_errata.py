@@ -1,8 +1,8 @@
-"""Slips of the three papers that gyrostab starts from, each with a number that shows it.
+"""Errors of the three papers that gyrostab starts from, each with a number that shows it.
 
 P16: Wang et al., Sensors 16 (2016). P15: Wang et al., Measurement 75 (2015) 263. L13: Li et al.,
-Chin. J. Lasers 40 (2013) 0908004. The formulae are evaluated here as they are printed, and beside
-them what is right.
+Chin. J. Lasers 40 (2013) 0908004. The formulae are evaluated here as printed, and as they
+should be.
 
     python benchmarks/seed_errata.py --output docs/seeds.md
 """
@@ -31,7 +31,7 @@ _AT_REST = {"Q": 5.49020943, "N": 0.01657046, "B": 0.13814101, "K": 0.31584771, 
 
 
 class Erratum(NamedTuple):
-    """One slip: where it stands, what is said there, what is right, and a quantity with the value from each."""
+    """One error: place, printed statement, correction, and a quantity with both values."""
 
     where: str
     printed: str
@@ -65,7 +65,10 @@ def _avar(values: Array, k: int, *, kind: str = "rate", gaps: str = "bridge") ->
 
 
 def _filtered(density: Callable[[Array], Array], tau: float) -> float:
-    """P16 Eq. 7 with df: 4 int S(f) sin^4(pi f tau) / (pi f tau)^2 df, in the variable pi f tau on a grid of even ratio."""
+    """Integrate P16 Eq. 7 with df, 4 int S(f) sin^4(pi f tau) / (pi f tau)^2 df.
+
+    The variable is pi f tau on a geometric grid.
+    """
     u = np.geomspace(1e-5, 2e4, 2_000_001)
     weight = np.where(u < 300.0, np.sin(u) ** 4, 0.375) / u**2  # beyond, the mean of sin^4
     return float(
@@ -207,7 +210,8 @@ def _angle_across_gaps() -> Erratum:
     return Erratum(
         "P16 Eq. 21, 22",
         "a difference counts if its three angles are there",
-        "a log of rates loses the angle in a gap: all 2k samples must be there, or clusters be weighted",
+        "a log of rates loses the angle in a gap: all 2k samples must be there, or clusters be "
+        "weighted",
         "Allan variance at 1 s over 0.01, mean rate 10 deg/h, 5 % lost",
         100.0 * _avar(angle, 100, kind="angle"),
         100.0 * _avar(rate, 100),
@@ -286,7 +290,8 @@ def _step_for_walk() -> Erratum:
     return Erratum(
         "P16 section 8",
         "K grows under vibration",
-        f"a step D of the mean looks like K = D/√W ({step / math.sqrt(hours):.1f} for 0.27 deg/h in 5 s)",
+        f"a step D of the mean looks like K = D/√W ({step / math.sqrt(hours):.1f} for 0.27 deg/h "
+        "in 5 s)",
         "K fitted to white noise with such a step, and its true K [deg/h^1.5]",
         float(fit_noise(surface, terms="NK", observed_only=False)["K"].values.item()),
         0.0,

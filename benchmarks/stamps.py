@@ -29,7 +29,7 @@ RATE = 99.7
 def measure(
     jitter: str, losses: str, scatter: float, unit: str, rows: int, seed: int
 ) -> tuple[float, float, int, int]:
-    """Share of rows kept, error of the rate [1e-6], error of the number of samples, largest error of a row's sample."""
+    """Return share of rows kept, errors of rate [1e-6] and sample count, largest row error."""
     random = np.random.default_rng(seed)
     samples = lose_samples(losses, rows, random)
     log = regularise(
@@ -52,7 +52,8 @@ def main() -> None:
     """Print the table."""
     rows = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
     print(
-        "| jitter | losses | rows kept | rate error [ppm] | samples too many or few | row from its sample, at most |"
+        "| jitter | losses | rows kept | rate error [ppm] | samples too many or few | row from "
+        "its sample, at most |"
     )
     print("|---|---|---|---|---|---|")
     for jitter, losses in itertools.product(JITTER, LOSSES):
@@ -63,7 +64,8 @@ def main() -> None:
         ]
         kept, error, size, far = (list(column) for column in zip(*found, strict=True))
         print(
-            f"| {jitter} | {losses} | {100 * min(kept):.2f} % | {max(error):.2f} | {max(size)} | {max(far)} |",
+            f"| {jitter} | {losses} | {100 * min(kept):.2f} % | {max(error):.2f} | {max(size)} | "
+            f"{max(far)} |",
             flush=True,
         )
 
