@@ -1,12 +1,12 @@
-"""Files and arrays to regular logs.
+"""Convert files and arrays to regular logs.
 
-A reader of `gyrostab.ingest.formats` turns a file into a raw log: rows with their stamps as they
-were written. `gyrostab.ingest.grid` places the rows on a uniform time axis with NaN at every
-missing sample.
+A reader of `gyrostab.ingest.formats` reads a file into a raw log: rows with their stamps as
+written. `gyrostab.ingest.grid` places the rows on a uniform time axis with NaN at every missing
+sample.
 
 Each format is one module with ``matches(path)``, ``scan(path, options)`` and ``read(path,
-options)``, found by the entry point group ``gyrostab.readers``; another package adds a format by
-declaring such an entry point.
+options)``, found by the entry point group ``gyrostab.readers``; another package adds a format with
+such an entry point.
 """
 
 from __future__ import annotations

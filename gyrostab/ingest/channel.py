@@ -24,14 +24,14 @@ def read_channel(
     map: Mapping[str, str] | None = None,
     unit: Mapping[str, str] | None = None,
 ) -> xr.DataArray:
-    r"""Read one channel from a file in any format that gyrostab reads; gyro axes are not asked for.
+    r"""Read one channel from a file in any readable format; the file needs no gyro axes.
 
     Parameters
     ----------
     path : path
         File with a time column.
     name : str
-        The channel, by its name here (after `map`).
+        Name of the channel after `map` is applied.
     epoch, map, unit
         As for `gyrostab.read_log`.
 
@@ -43,7 +43,7 @@ def read_channel(
     Raises
     ------
     FormatError, UnitError, OptionError, TimeError
-        When the file cannot be read or holds no such channel.
+        When the file cannot be read or does not contain the channel.
 
     Examples
     --------
@@ -54,12 +54,13 @@ def read_channel(
     array([20.5, 21. ])
     """
     chosen: dict[str, Any] = {"epoch": epoch, "map": dict(map or {}), "unit": dict(unit or {})}
-    held = attach_channels(
+    channels = attach_channels(
         xr.Dataset(), [read_file(Path(path), ReadOptions(channels_only=True, **chosen))]
     )
-    if name not in held.data_vars:
-        there = ", ".join(map_name for map_name in sorted(str(key) for key in held.data_vars))
+    if name not in channels.data_vars:
+        available = ", ".join(sorted(str(key) for key in channels.data_vars))
         raise OptionError(
-            f"{path}: it has no channel {name!r}; it has {there}: name one of these, or rename one with --map"
+            f"{path}: no channel {name!r}; the channels are {available}: name one of these, or "
+            "rename one with --map"
         )
-    return held[name]
+    return channels[name]

@@ -1,4 +1,4 @@
-"""Several files to one raw log: order, union of axes and channels, channels from other files."""
+"""Combine several files into one raw log: order, axes and channels of all, channel files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["attach_channels", "concatenate", "memory_bytes", "move_to_disk", "wi
 
 
 def memory_bytes(part: xr.Dataset) -> int:
-    """Bytes of the columns of a raw log that are held in memory."""
+    """Return the size of the columns of a raw log that are in memory [bytes]."""
     arrays = sum(
         variable.nbytes
         for variable in part.variables.values()
@@ -38,7 +38,7 @@ def _columns_in_pieces(part: xr.Dataset) -> list[PiecewiseColumn]:
 
 
 def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
-    """The same raw log with its columns in a temporary file."""
+    """Return the raw log with its columns moved to a temporary file."""
 
     def moved(variable: xr.Variable) -> Any:
         values = variable.values
@@ -59,7 +59,7 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
 
 
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Join the raw logs of several files along ``row``, in the order of their first stamps; rows that two files hold count once.
+    """Concatenate raw logs along ``row`` in the order of their first stamps, without repeated rows.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     UnitError
         When files hold different kinds of signal, or a channel changes its unit.
     FormatError
-        When there is one row only.
+        When there is only one row.
     """
     if len(parts) == 1:
         joined = parts[0]
@@ -88,19 +88,19 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         joined = with_channels(joined, apart)
     if joined.sizes["row"] < 2:
         name = joined.attrs["source_files"][0]
-        raise FormatError(f"{name}: there is one row of data only; a log needs two at least")
+        raise FormatError(f"{name}: there is only one row of data; a log needs at least two")
     return joined
 
 
 def _slow_channels(part: xr.Dataset) -> list[str]:
-    """Channels that have a time of their own."""
+    """Return the channels that have a separate time coordinate."""
     return [
         str(name) for name, variable in part.data_vars.items() if variable.dims == (f"time_{name}",)
     ]
 
 
 def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
-    """Put files that have no axis in common, but the same time, into groups of their own; otherwise all are one group."""
+    """Group files by their axes if the groups cover the same time; otherwise all form one group."""
     groups = [
         [parts[number] for number in group]
         for group in group_axes([_axis_names(part) for part in parts])
@@ -115,7 +115,7 @@ def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
     )
     in_time = [
         later[0] > earlier[1] for earlier, later in pairwise(ends)
-    ]  # one begins after the other has ended
+    ]  # the later group begins after the earlier one has ended
     return [list(parts)] if any(in_time) else groups
 
 
@@ -133,7 +133,8 @@ def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
             for want in (True, False)
         )
         raise TimeError(
-            f"{with_time} has time stamps and {without} has none; read them one by one, or give the latter a time column"
+            f"{with_time} has time stamps and {without} has none; read them one by one, or give "
+            "the latter a time column"
         )
     return sorted(parts, key=_first_stamp)
 
@@ -156,7 +157,8 @@ def _common_signal(parts: Sequence[xr.Dataset]) -> str | None:
                 strict=True,
             )
             raise UnitError(
-                f"{a} holds a gyro signal of kind {kind_a!r}, {b} of kind {kind_b!r}; read them one by one"
+                f"{a} holds a gyro signal of kind {kind_a!r}, {b} of kind {kind_b!r}; read them "
+                "one by one"
             )
     return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
 
@@ -231,7 +233,7 @@ def _has_channel(part: xr.Dataset, *, name: str) -> bool:
 
 
 def _files_without(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], bool]) -> list[str]:
-    """Name the files that lack something which others of their group have; those of other groups hold other axes."""
+    """Name the files that lack something which other files of their group contain."""
     found = [
         (str(part.attrs["source_files"][0]), has(part))
         for group in groups
@@ -242,7 +244,7 @@ def _files_without(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], b
 
 
 def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
-    """The signal of all parts, (axis, row); NaN where a part lacks an axis."""
+    """Stack the signal of all parts, (axis, row); NaN where a part lacks an axis."""
     if all(isinstance(part[signal].data, np.ndarray) for part in parts):
         whole = np.full((len(axes), sum(part.sizes["row"] for part in parts)), np.nan)
         end = 0
@@ -278,13 +280,14 @@ def _channel_units(parts: list[xr.Dataset], channel: str) -> str:
     if len(units) > 1:
         listed = ", ".join(f"{unit!r} in {name}" for unit, name in units.items())
         raise UnitError(
-            f"channel {channel!r} has different units: {listed}; give one with --unit {channel}=UNIT or drop it with --map {channel}=-"
+            f"channel {channel!r} has different units: {listed}; give one with --unit "
+            f"{channel}=UNIT or drop it with --map {channel}=-"
         )
     return next(iter(units))
 
 
 def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Add the channels of other tables of the same files, each on its own ``time_<channel>``; the log's attributes stay as they are."""
+    """Add channels of other tables of the same files, each on ``time_<channel>``."""
     return (
         attach_channels(log, sources).drop_attrs(deep=False).assign_attrs(log.attrs)
         if sources
@@ -293,12 +296,12 @@ def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Add the channels of other files, each on its own ``time_<channel>`` with values only where present.
+    """Add the channels of other files, each on ``time_<channel>`` with its filled rows only.
 
     Raises
     ------
     OptionError
-        When a channel is in the log already, or a file holds no channel or no stamps.
+        When the log already contains a channel, or a file has no channel or no stamps.
     """
     pieces: dict[str, list[tuple[NDArray[Any], NDArray[Any], str]]] = {}
     files: list[str] = []
@@ -315,7 +318,8 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
     for channel, found in pieces.items():
         if len({units for _, _, units in found}) > 1:
             raise UnitError(
-                f"channel {channel!r} has different units in {name_some(files)}; give one with --unit {channel}=UNIT"
+                f"channel {channel!r} has different units in {name_some(files)}; give one with "
+                f"--unit {channel}=UNIT"
             )
         stamps, values = (np.concatenate([piece[place] for piece in found]) for place in (0, 1))
         order = np.argsort(stamps, kind="stable")
@@ -343,7 +347,8 @@ def _read_channels(
             continue
         if dim not in source.variables:
             raise OptionError(
-                f"--channel {name}: it has no time column, so its rows cannot be placed; add one, or --map NAME=time"
+                f"--channel {name}: it has no time column, so its rows cannot be placed; add "
+                "one, or --map NAME=time"
             )
         stamps, values = np.asarray(source[dim].values), np.asarray(variable.values)
         filled = np.isfinite(values) & ~np.isnat(stamps)

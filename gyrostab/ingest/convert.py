@@ -1,4 +1,4 @@
-"""Logs from what the user holds: a log with other dimensions or attributes than ours, a DataArray, a pandas table."""
+"""Convert data in memory to logs: changed logs, DataArrays, pandas tables."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ _LONG_NAMES = {"rate": "rotation rate", "angle": "angle"}
 
 
 def as_log(data: Any) -> xr.Dataset:
-    """Take a log as the user holds it: what every function that takes a log begins with.
+    """Convert any supported object to a regular log; functions that take a log call this first.
 
     Parameters
     ----------
     data : xarray.Dataset, xarray.DataArray, pandas.DataFrame or pandas.Series
-        A log, also one that xarray operations have changed (see
-        `gyrostab.ingest.uniform.as_uniform`); a signal with units, on ``time`` or ``(axis, time)``;
-        a table with a DatetimeIndex and units in the names of its columns or in ``attrs["units"]``.
+        A log, also after xarray operations (see `gyrostab.ingest.uniform.as_uniform`); a signal
+        with units on ``time`` or ``(axis, time)``; a table with a DatetimeIndex and units in the
+        names of its columns or in ``attrs["units"]``.
 
     Returns
     -------
     xarray.Dataset
-        Regular log: uniform time, NaN where samples are missing, true attributes.
+        Regular log: uniform time, NaN where samples are missing, consistent attributes.
 
     Raises
     ------
     SchemaError, TimeError, UnitError, OptionError
-        When it is none of these, its time is not uniform or not in order, or its units are not
-        known.
+        When the object has another type, its time is not uniform or not in order, or its units are
+        unknown.
     """
     if isinstance(data, xr.DataArray):
         return as_uniform(_dataset_of(data, None, None)[0])
@@ -90,7 +90,7 @@ def from_dataframe(
     MissingUnitError
         When the gyro columns carry no unit.
     SchemaError
-        When the index holds no times.
+        When the index does not hold times.
     TimeError
         When the index runs backwards, or has no sampling rate.
     FormatError, OptionError, UnitError
@@ -156,7 +156,8 @@ def from_dataarray(
     Examples
     --------
     >>> time = pd.date_range("2026-01-01", periods=3, freq="10ms")
-    >>> log = from_dataarray(xr.DataArray([1.0, 2.0, 4.0], {"time": time}, attrs={"units": "deg/s"}))
+    >>> data = xr.DataArray([1.0, 2.0, 4.0], {"time": time}, attrs={"units": "deg/s"})
+    >>> log = from_dataarray(data)
     >>> log.rate.values, log.attrs["sampling_rate_hz"]
     (array([[ 3600.,  7200., 14400.]]), 100.0)
     """
@@ -178,7 +179,8 @@ def from_dataarray(
         _warn_notes(found)
     if rate is not None and abs(rate / found.attrs["sampling_rate_hz"] - 1) > 1e-6:
         raise TimeError(
-            f"rate={rate:g} Hz, but the time of the DataArray says {found.attrs['sampling_rate_hz']:.9g} Hz; leave rate out"
+            f"rate={rate:g} Hz, but the time of the DataArray says "
+            f"{found.attrs['sampling_rate_hz']:.9g} Hz; leave rate out"
         )
     if increments:
         found["rate"] = found["rate"].copy(
@@ -188,21 +190,24 @@ def from_dataarray(
 
 
 def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[xr.Dataset, bool]:
-    """The array as a log whose time is not checked yet, and whether its values are increments, still to be divided by the period."""
+    """Convert an array to a log with unchecked time; also return whether it has increments."""
     if set(da.dims) not in ({"time"}, {"axis", "time"}):
         raise SchemaError(
-            f"the DataArray has dimensions {da.dims}; a log has 'time', or 'axis' and 'time': rename them, da.rename(...)"
+            f"the DataArray has dimensions {da.dims}; a log has 'time', or 'axis' and 'time': "
+            "rename them, da.rename(...)"
         )
     if "time" not in da.coords or da["time"].dtype.kind != "M":
         raise SchemaError(
-            "the DataArray has no datetime64 coordinate 'time'; give it one, or use gyrostab.make_log(values, rate=..., unit=...)"
+            "the DataArray has no datetime64 coordinate 'time'; give it one, or use "
+            "gyrostab.make_log(values, rate=..., unit=...)"
         )
     unit = _unit_of(da, units)
     if kind not in (None, "rate", "angle"):
         raise OptionError(f"kind={kind!r}: give 'rate' or 'angle'")
     if unit.quantity == "angle" and kind is None and da.name != "angle":
         raise OptionError(
-            f"the values are angles ({unit.text}): give kind='angle' if they are cumulative, kind='rate' if increments"
+            f"the values are angles ({unit.text}): give kind='angle' if they are cumulative, "
+            "kind='rate' if increments"
         )
     increments = unit.quantity == "angle" and kind == "rate"
     if unit.quantity == "rate" and kind == "angle":
@@ -233,12 +238,14 @@ def _unit_of(da: xr.DataArray, units: str | None) -> Unit:
     text = da.attrs.get("units") if units is None else units
     if text is None:
         raise MissingUnitError(
-            "the DataArray has no units; give them: gyrostab.from_dataarray(da, units='deg/s'), or da.attrs['units']"
+            "the DataArray has no units; give them: gyrostab.from_dataarray(da, units='deg/s'), "
+            "or da.attrs['units']"
         )
     unit = parse_unit(str(text))
     if unit.quantity not in SIGNAL_UNITS:
         raise UnitError(
-            f"unit {text!r} of the DataArray is a unit of {unit.quantity}; units of rates are {known_units('rate')}"
+            f"unit {text!r} of the DataArray is a unit of {unit.quantity}; units of rates are "
+            f"{known_units('rate')}"
         )
     return unit
 

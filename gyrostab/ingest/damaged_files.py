@@ -1,4 +1,4 @@
-"""Files of an archive that cannot be read: what is said of them, and where the gap lies that each of them leaves."""
+"""Unreadable files of an archive: notes on them, and the gap that each of them leaves."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from gyrostab.schema import texts
 
 __all__ = ["LostFile", "add_lost_notes", "check_share", "find_lost_spans", "is_damage"]
 
-#: When a larger share of the files cannot be read, it is no damage but a wrong option.
+#: Largest share of unreadable files; more suggest a wrong option instead of damage.
 MAX_LOST_SHARE = 0.5
 
-#: What the system says of itself and not of the one file.
+#: Errors of the system that do not concern the single file.
 _SYSTEM = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EINTR)
 
 Span = tuple[int, int]
@@ -29,16 +29,16 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class LostFile:
-    """A file that cannot be read, and why."""
+    """A file that cannot be read, and the reason."""
 
     path: Path
     reason: str
 
 
 def is_damage(path: Path, error: Exception) -> bool:
-    """Whether an error tells of one damaged or missing file, so that the others can be read all the same.
+    """Return whether an error is due to one damaged or missing file.
 
-    A wrong option, a missing unit, or a system without room, memory or file handles is none.
+    A wrong option, a missing unit, or a system out of disk space, memory or file handles is not.
     """
     if path.is_dir() and path.suffix.lower() != ".zarr":
         return False
@@ -48,7 +48,7 @@ def is_damage(path: Path, error: Exception) -> bool:
 
 
 def reason_of(path: Path, error: Exception) -> str:
-    """What is wrong with the file, in one line that begins with its name."""
+    """Describe what is wrong with a file, in one line that begins with its name."""
     if isinstance(error, OSError) and not isinstance(error, GyrostabError):
         return f"{path.name}: cannot be read ({error.strerror or error})"
     text = " ".join(str(error).split())
@@ -69,7 +69,7 @@ def check_share(lost: Sequence[LostFile], total: int) -> None:
 
 
 def _name_key(path: Path) -> list[tuple[int, int, str]]:
-    """Order of names in which run_9 comes before run_10."""
+    """Return a sort key by which run_9 comes before run_10."""
     return [
         (0, int(piece), "") if piece.isdigit() else (1, 0, piece)
         for piece in re.split(r"(\d+)", str(path))
@@ -80,11 +80,10 @@ def _name_key(path: Path) -> list[tuple[int, int, str]]:
 def find_lost_spans(
     lost: Sequence[LostFile], spans: Mapping[Path, Span], look: Callable[[Path], FileSummary]
 ) -> dict[Path, Span]:
-    """Where the time of the lost files lies, of those that let it be told.
+    """Find the time spans of lost files, as far as they can be determined.
 
-    A lost file fills the time between the files whose names come before and after its own, when
-    these follow each other in time with a gap between them. Otherwise the stamps that a look at the
-    file still shows tell it.
+    A lost file fills the gap between the files whose names come before and after its name, if these
+    follow each other in time. Otherwise the stamps that are still readable are used.
 
     Parameters
     ----------
@@ -92,8 +91,8 @@ def find_lost_spans(
         Files that could not be read.
     spans : mapping of Path to (int, int)
         First and last stamp [ns since 1970] of the files that were read.
-    look : callable
-        Path to `FileSummary`; may fail.
+    scan : callable
+        Path -> `FileSummary`; may fail.
 
     Returns
     -------
@@ -114,7 +113,7 @@ def find_lost_spans(
 
 
 def _span_between(spans: Mapping[Path, Span], before: Path, after: Path) -> Span | None:
-    """Time between two files that follow each other, in either order, without a third one in between."""
+    """Return the time between two consecutive files; None if a third lies between."""
     (_, end), (start, _) = sorted([spans[before], spans[after]])
     others = [span for path, span in spans.items() if path not in (before, after)]
     free = end < start and not any(first < start and last > end for first, last in others)
@@ -122,7 +121,7 @@ def _span_between(spans: Mapping[Path, Span], before: Path, after: Path) -> Span
 
 
 def _span_of_stamps(path: Path, look: Callable[[Path], FileSummary]) -> Span | None:
-    """First and last stamp that a look at a damaged file shows."""
+    """Return the first and last readable stamp of a damaged file."""
     with contextlib.suppress(GyrostabError, OSError, RuntimeError, ValueError):
         summary = look(path)
         if summary.first is not None and summary.last is not None and summary.first < summary.last:
@@ -137,7 +136,7 @@ def _to_ns(stamp: np.datetime64) -> int:
 def add_lost_notes(
     log: xr.Dataset, lost: Sequence[LostFile], spans: Mapping[Path, Span]
 ) -> xr.Dataset:
-    """The log with notes on the lost files, and their names in ``unreadable_files``."""
+    """Add notes on the lost files, and their names as ``unreadable_files``."""
     if not lost:
         return log
     notes = []
@@ -149,7 +148,8 @@ def add_lost_notes(
                 for stamp in spans[one.path]
             )
             where = (
-                f"its time is between {first} and {last}, which is a gap unless another file has it"
+                f"its time is between {first} and {last}, which is a gap unless another file "
+                "covers it"
             )
         notes.append(f"{one.reason}; the file is left out: {where}")
     return log.assign_attrs(

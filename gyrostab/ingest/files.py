@@ -1,4 +1,4 @@
-"""From paths to one raw log: find the reader, read, put the files in order, add the channels of other files."""
+"""Read paths into one raw log: find the reader, read, order the files, add channel files."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from gyrostab.schema import texts
 __all__ = ["OnFile", "Reader", "check_options", "read_log", "readers", "scan_file"]
 
 GROUP = "gyrostab.readers"
-#: Text files that are read side by side.
+#: Text files that are read in parallel.
 _FILES_AHEAD = 2
 
 #: Called with the number of a file, the number of files and the path.
@@ -46,16 +46,16 @@ OnFile = Callable[[int, int, Path], None]
 
 
 class Reader(Protocol):
-    """What a reader module has."""
+    """Interface of a reader module."""
 
     def matches(self, path: Path) -> bool:
-        """Whether the file is of this format."""
+        """Return whether the file has this format."""
 
     def scan(self, path: Path, options: ReadOptions) -> FileSummary:
-        """Look without reading the data."""
+        """Summarise the file without reading its data."""
 
     def read(self, path: Path, options: ReadOptions) -> xr.Dataset:
-        """Read into a raw log, or open a regular log."""
+        """Read the file into a raw log, or open a regular log."""
 
 
 @cache
@@ -67,7 +67,7 @@ def _entry_points() -> dict[str, Any]:
 
 
 def readers() -> tuple[str, ...]:
-    """Names of the formats that can be read.
+    """Return the names of the formats that can be read.
 
     Examples
     --------
@@ -78,7 +78,7 @@ def readers() -> tuple[str, ...]:
 
 
 def _find_reader(path: Path) -> Reader:
-    """The reader of a file; text is tried last, as it is the least particular."""
+    """Find the reader of a file; text is tried last, as it matches most files."""
     if not path.exists():
         raise FormatError(f"{path}: there is no such file")
     if not has_layout(path):
@@ -89,7 +89,8 @@ def _find_reader(path: Path) -> Reader:
             return reader
     if path.is_dir():
         raise FormatError(
-            f"{path}: no reader takes this directory; name the files in it, for instance {path / '*.csv'}"
+            f"{path}: no reader takes this directory; name the files in it, for instance "
+            f"{path / '*.csv'}"
         )
     what = f"no reader takes this file with the suffix {path.suffix!r}, and it is not text"
     raise FormatError(
@@ -98,12 +99,12 @@ def _find_reader(path: Path) -> Reader:
 
 
 def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """The files that paths and patterns stand for, each once.
+    """Return the files that paths and patterns name, each once.
 
     Raises
     ------
     FormatError
-        When a pattern fits no file.
+        When a pattern matches no file.
     """
     found: list[Path] = []
     for item in [paths] if isinstance(paths, str | Path) else paths:
@@ -121,25 +122,24 @@ def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
 
 
 def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSummary:
-    r"""Look at a file without reading its data.
+    r"""Summarise a file without reading its data.
 
     Parameters
     ----------
     path : path
         The file.
     options : ReadOptions, optional
-        Reading options; what they leave unclear stands in the notes.
+        Reading options; what remains unclear is in the notes.
 
     Returns
     -------
     FileSummary
-        Format, columns, axes, channels, and what is cheap to know of the stamps and the number of
-        rows.
+        Format, columns, axes, channels; stamps and number of rows where they are cheap to find.
 
     Raises
     ------
     FormatError
-        When no reader takes the file, or it cannot be read at all.
+        When no reader accepts the file, or it cannot be read at all.
 
     Examples
     --------
@@ -177,12 +177,12 @@ def read_log(
     limits: Mapping[str, float] | None = None,
     on_file: OnFile | None = None,
 ) -> xr.Dataset:
-    r"""Read one log or many as they were written.
+    r"""Read one or more logs as they were written.
 
     Parameters
     ----------
     paths : path, pattern, or several of them
-        Files are put in the order of their first stamps and joined; an axis or channel that one of
+        Files are concatenated in the order of their first stamps; an axis or channel that one of
         them lacks is NaN there. Either raw logs, or regular logs that gyrostab wrote, which become
         one regular log without being loaded.
     rate : float, optional
@@ -200,8 +200,8 @@ def read_log(
     channel : path or sequence of path, optional
         Files with further channels; each keeps its stamps as ``time_<channel>``.
     strict : bool
-        Raise an error for a damaged or missing file. Otherwise one among several is left out with a
-        note, and its time is a gap.
+        Raise an error for a damaged or missing file. Otherwise such a file among several is left
+        out with a note, and its time is a gap.
     max_gap : str or float
         Between regular logs, a longer step of time is taken as a step of the clock (raw logs: see
         `gyrostab.regularise`); a number is in seconds.
@@ -223,14 +223,15 @@ def read_log(
     Raises
     ------
     FormatError, UnitError, OptionError, TimeError
-        With the file, the place, what is wrong and what to do. `FormatError` also when more than
-        half of the files cannot be read.
+        With file, position, what is wrong and what to do. `FormatError` also when more than half of
+        the files cannot be read.
 
     Examples
     --------
     >>> from tempfile import mkdtemp
     >>> path = Path(mkdtemp()) / "log.csv"
-    >>> _ = path.write_text("time [s],gyro_x [deg/s],temperature [degC]\n0.0,0.5,21\n0.5,****,\n1.0,0.25,\n")
+    >>> header = "time [s],gyro_x [deg/s],temperature [degC]\n"
+    >>> _ = path.write_text(header + "0.0,0.5,21\n0.5,****,\n1.0,0.25,\n")
     >>> raw = read_log(path)
     >>> raw.rate.sel(axis="x").values
     array([1800.,   nan,  900.])
@@ -255,7 +256,8 @@ def read_log(
     if regular and len(regular) < len(parts):
         raw = next(path for path in parts if path not in regular)
         raise OptionError(
-            f"{regular[0].name} is a regular log already and {raw.name} is not; make a regular log of the latter and its like with "
+            f"{regular[0].name} is a regular log already and {raw.name} is not; make a regular "
+            "log of the latter and its like with "
             "gyrostab ingest, and then join the regular logs"
         )
     channels = [read_file(path, replace(options, channels_only=True, start=None)) for path in extra]
@@ -277,19 +279,20 @@ def read_log(
         log = concatenate(list(parts.values()))
         if lost and "time" not in log.variables:
             raise FormatError(
-                f"{lost[0].reason}; the files have no time stamps, so the time of those that follow it is not known: mend it"
+                f"{lost[0].reason}; the files have no time stamps, so the time of those that "
+                "follow it is not known: mend it"
             )
         if spans:
             log.attrs["unreadable_spans"] = [
                 list(span) for span in spans.values()
-            ]  # where regularise will find the gaps
+            ]  # regularise marks the gaps there
     return attach_channels(add_lost_notes(log, lost, spans), channels)
 
 
 def _read_all(
     paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None = None
 ) -> tuple[dict[Path, xr.Dataset], list[LostFile]]:
-    """Read the files one by one; what does not fit into memory together waits on disk."""
+    """Read the files one by one; move them to disk when they exceed the memory limit together."""
     parts: dict[Path, xr.Dataset] = {}
     lost: list[LostFile] = []
     spool = Spool()
@@ -315,7 +318,7 @@ def _read_all(
 def _read_ahead(
     paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None
 ) -> Generator[Callable[[], xr.Dataset], None, None]:
-    """What reads each file; a text file is read already, while the one before it is looked at, as its beginning takes one thread."""
+    """Yield a function that reads each file; text files are read ahead in threads."""
     stop = Event()
     with ThreadPoolExecutor(_FILES_AHEAD, thread_name_prefix="gyrostab-file") as pool:
         waiting: deque[Callable[[], xr.Dataset]] = deque()
@@ -348,11 +351,11 @@ def _is_text(path: Path) -> bool:
     try:
         return bool(_find_reader(path) is _entry_points()["text"].load())
     except FormatError:
-        return False  # which reading will say
+        return False  # reading raises the error
 
 
 def _stamp_spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:
-    """First and last stamp [ns since 1970] of the files that have stamps."""
+    """Return the first and last stamp [ns since 1970] of the files with stamps."""
     spans = {}
     for path, part in parts.items():
         if "sampling_rate_hz" in part.attrs:
@@ -363,11 +366,12 @@ def _stamp_spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]
 
 
 def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Dataset:
-    """A regular log has its rate, names and units; what the user says against that is refused, what is idle is noted."""
+    """Refuse options that contradict a regular log, and note options that have no effect on it."""
     rate = float(log.attrs["sampling_rate_hz"])
     if options.rate is not None and abs(options.rate / rate - 1) > 1e-6:
         raise OptionError(
-            f"{name} is a regular log of {rate:.10g} Hz, not of {options.rate:.10g} Hz; leave out --rate, or ingest its source anew"
+            f"{name} is a regular log of {rate:.10g} Hz, not of {options.rate:.10g} Hz; leave "
+            "out --rate, or ingest its source anew"
         )
     idle = [
         f"--{option}"
@@ -381,7 +385,7 @@ def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Datas
 
 
 def check_options(parts: Sequence[xr.Dataset]) -> None:
-    """Refuse a ``--map`` or ``--unit`` that no file has a use for: it is a slip of the pen."""
+    """Refuse a ``--map`` or ``--unit`` that matches no file; it is probably mistyped."""
     unmatched = set.intersection(*(set(part.attrs.pop("unmatched_options", ())) for part in parts))
     headers = dict.fromkeys(name for part in parts for name in part.attrs.pop("headers", ()))
     if unmatched:
@@ -389,5 +393,6 @@ def check_options(parts: Sequence[xr.Dataset]) -> None:
             dict.fromkeys(name for part in parts for name in part.attrs["source_files"])
         )
         raise OptionError(
-            f"{' and '.join(sorted(unmatched))}: no such column in {files}; the columns are {', '.join(headers)}"
+            f"{' and '.join(sorted(unmatched))}: no such column in {files}; the columns are "
+            f"{', '.join(headers)}"
         )

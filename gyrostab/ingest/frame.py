@@ -1,4 +1,4 @@
-"""A pandas table with a time index as a raw log, by the rules for files."""
+"""Read a pandas table with a time index as a raw log, by the rules for files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def read_frame(
     map: Mapping[str, str] | None = None,
     kind: str | None = None,
 ) -> xr.Dataset:
-    """Read a pandas table into a raw log; see `gyrostab.from_dataframe` for the parameters and errors.
+    """Read a pandas table into a raw log; parameters and errors as for `gyrostab.from_dataframe`.
 
     Returns
     -------
@@ -40,7 +40,8 @@ def read_frame(
     )
     if not isinstance(table, pd.DataFrame):
         raise SchemaError(
-            f"this is a {type(frame).__name__}; give a pandas DataFrame or Series with a DatetimeIndex"
+            f"this is a {type(frame).__name__}; give a pandas DataFrame or Series with a "
+            "DatetimeIndex"
         )
     index = _check_index(table)
     units = frame.attrs.get("units") if units is None else units
@@ -66,12 +67,12 @@ def read_frame(
 
 
 def _is_axis_name(name: str) -> bool:
-    """Whether a column is called by the bare name of an axis: x, y, z."""
+    """Return whether a column has the bare name of an axis: x, y, z."""
     return len(name) == 1 and name.lower() in "xyz"
 
 
 def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
-    """The stamps in UTC, which must not run backwards."""
+    """Return the stamps in UTC; raise an error if they run backwards."""
     index: Any = table.index
     columns: Any = table.columns
     if not isinstance(index, pd.DatetimeIndex):
@@ -88,6 +89,7 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
         values = index.to_numpy()
         at = int(np.argmax(values[1:] < values[:-1]))
         raise TimeError(
-            f"the index of the DataFrame runs backwards after row {at} ({index[at]}); sort it: df.sort_index()"
+            f"the index of the DataFrame runs backwards after row {at} ({index[at]}); sort it: "
+            "df.sort_index()"
         )
     return pd.DatetimeIndex(index)

@@ -1,4 +1,4 @@
-"""The table of gaps of a log, by sample: its columns, its form as variables, and the words for times and durations."""
+"""Table of gaps of a log, by sample: columns, variables, and format of times and durations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
     "name_lost",
 ]
 
-#: Rows of the table from which on neighbours of one cause are counted in one row.
+#: Largest table; in a longer one, neighbours of one cause are merged into one row.
 MAX_TABLE_ROWS = 10_000
 
 #: Columns of the table: first missing sample, first present sample after, samples missing, rows
@@ -40,11 +40,11 @@ _NEVER_THINNED = (GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart"))
 
 
 def format_duration(seconds: float) -> str:
-    """Write a duration as people say it.
+    """Format a duration with a suitable unit.
 
     Examples
     --------
-    >>> duration(1068.0), duration(0.0045), duration(200 * 3600)
+    >>> format_duration(1068.0), format_duration(0.0045), format_duration(200 * 3600)
     ('1068.0 s', '4.5 ms', '200.0 h')
     """
     if abs(seconds) < 1.0:
@@ -53,7 +53,7 @@ def format_duration(seconds: float) -> str:
 
 
 def format_stamp(stamp: int) -> str:
-    """Write a stamp [ns since 1970] as ISO 8601, to the millisecond."""
+    """Format a stamp [ns since 1970] as ISO 8601, to the millisecond."""
     return (
         "no stamp"
         if stamp == np.iinfo(np.int64).min
@@ -62,7 +62,7 @@ def format_stamp(stamp: int) -> str:
 
 
 def merge_neighbours(table: NDArray[np.int64], most: int = MAX_TABLE_ROWS) -> NDArray[np.int64]:
-    """At most about `most` lines: the nearest neighbours of one cause are counted together."""
+    """Reduce a table to about `most` lines by merging the nearest neighbours of one cause."""
     if len(table) <= most:
         return table
     parts = []
@@ -105,7 +105,7 @@ def clip_table(table: NDArray[np.int64], low: int, high: int) -> NDArray[np.int6
 def name_lost(
     table: NDArray[np.int64], spans: Iterable[Iterable[int]], start: int, rate: float
 ) -> NDArray[np.int64]:
-    """The table with the cause of those gaps changed to "unreadable" that files leave which could not be read.
+    """Change the cause of gaps that lost files leave to "unreadable".
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def name_lost(
 
 
 def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str, Any]:
-    """Variables of the table of gaps, for a log that starts at `start` [ns] with `rate` [Hz]."""
+    """Return the variables of a table of gaps; `start` [ns since 1970], `rate` [Hz]."""
     flags = {
         "flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8),
         "flag_meanings": " ".join(GAP_CAUSES),

@@ -1,14 +1,14 @@
-"""A guess at what the columns of a file are: which three are the gyro, their unit, and the time.
+"""Guess what the columns of a file are: which three are the gyro, their unit, and the time.
 
-Names and units decide where there are any, and the numbers where there are none. The bounds come
-from physics and from the market:
+Names and units decide if present, otherwise the numbers. The bounds come from physics and from the
+market:
 
-- a gyro at rest turns with the Earth, 15.04 deg/h (7.292e-5 rad/s; IERS conventions 2010, table 1.2), so the mean of three axes is that
-  much or more, and that of one axis of a fine gyro is not more;
+- a gyro at rest turns with the Earth, 15.04 deg/h (7.292e-5 rad/s; IERS conventions 2010, table
+  1.2), so the mean of three axes is at least that, and that of one axis of a fine gyro at most;
 - the largest range of gyros on the market is 4000 deg/s (automotive and sports MEMS);
-- angle random walk goes from 3e-4 deg/sqrt(h) (laser gyros) to 10 deg/sqrt(h) (the noisiest MEMS); that of the usual MEMS parts is
-  0.1 to 1 deg/sqrt(h) (IEEE Std 952, and the data sheets of the recordings that are named in
-  docs/real-recordings.md).
+- angle random walk ranges from 3e-4 deg/sqrt(h) (laser gyros) to 10 deg/sqrt(h) (the noisiest
+  MEMS); that of usual MEMS parts is 0.1 to 1 deg/sqrt(h) (IEEE Std 952, and the data sheets of the
+  recordings in docs/real-recordings.md).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 __all__ = ["Guess", "guess_columns"]
 
 
-#: Rates of gyro logs are some decades about this [Hz].
+#: Typical rate of gyro logs [Hz], and spread [decades].
 TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
 
 
-#: What a group of columns must score to be called the gyro: one sign in its name, or its unit.
+#: Smallest score of a group of columns that is taken for the gyro: one sign in its name, or a unit.
 MIN_SCORE = 1.5
 
 
@@ -67,6 +67,12 @@ _EPOCHS = {
 }  # Unix time between 2001 and 2033 is 1 to 2 of these
 
 
+_TIME_UNIT_PATTERNS = (
+    (r"nanos|(^|[^a-z])ns$|_ns|nsec", "ns"),
+    (r"micros|usec|timeus|(^|[^a-z])us$|_us", "us"),
+    (r"millis|msec|(^|[^a-z])ms$|_ms", "ms"),
+    (r"seconds|(^|[^a-z])s$|_sec$|_s$", "s"),
+)
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
@@ -75,11 +81,11 @@ _AXES = {**{a: a for a in "xyz"}, **dict(zip("012", "xyz", strict=True)), "pqr":
 
 @dataclass(frozen=True)
 class Guess:
-    """What the columns are taken for; each part says why.
+    """Guessed roles of the columns of a file, with the reasons.
 
-    `axes` are the columns of the gyro by axis (empty when none looks like one); `unit` has to be
-    given for them, None when they carry one; `time` and `time_unit` likewise; `rate` [Hz] is given
-    where there is no time. `sampling_rate_hz` is the rate that was taken for the guess.
+    `axes` are the columns of the gyro by axis (empty if no column looks like one); `unit` is the
+    unit to give for them, None if they carry one; `time` and `time_unit` likewise; `rate` [Hz] is
+    set for a file without time. `sampling_rate_hz` is the rate that the guess is based on.
     """
 
     axes: dict[str, ColumnInspection]
@@ -104,14 +110,14 @@ def guess_columns(
 
     Parameters
     ----------
-    look : FileLook
-        The look into the file.
+    inspection : FileInspection
+        Inspection of the file.
     rate : float, optional
-        Sampling rate [Hz] that the user gave.
+        Sampling rate given by the user [Hz].
     rate_hint : float, optional
-        Sampling rate [Hz] that a text in the file names.
+        Sampling rate that a text in the file contains [Hz].
     angles : bool
-        The user says that the gyro columns are angles.
+        Whether the gyro columns are angles.
 
     Returns
     -------
@@ -188,12 +194,11 @@ def _guess_time(
 
 
 def _time_unit(column: ColumnInspection) -> tuple[str, str]:
-    """The unit of a numeric time column, and by what."""
+    """Guess the unit of a numeric time column; also return the evidence."""
     if column.unit and is_time_unit(column.unit):
         return column.unit, "its name"
     name = column.key.lower()
-    for pattern, unit in ((r"nanos|(^|[^a-z])ns$|_ns|nsec", "ns"), (r"micros|usec|timeus|(^|[^a-z])us$|_us", "us"),
-                          (r"millis|msec|(^|[^a-z])ms$|_ms", "ms"), (r"seconds|(^|[^a-z])s$|_sec$|_s$", "s")):  # fmt: skip
+    for pattern, unit in _TIME_UNIT_PATTERNS:
         if re.search(pattern, name):
             return unit, "its name"
     for unit, scale in _EPOCHS.items():
@@ -229,7 +234,7 @@ def _guess_axes(
         if others and len(group) == 3:
             score += (
                 0.75 if own <= min(others) else -0.75 if own > max(others) else 0.0
-            )  # gravity makes an accelerometer steady
+            )  # gravity makes the mean of an accelerometer large
         if score >= MIN_SCORE and (best is None or score > best[0]):
             best = score, group
     if best is None:
@@ -243,7 +248,7 @@ def _guess_axes(
 
 
 def _may_be_gyro(column: ColumnInspection) -> bool:
-    """Whether its unit, in the header or in the name, is none of another quantity."""
+    """Return whether the unit of a column, in header or name, allows a gyro."""
     if column.unit is not None and is_unit_of(column.unit, ("rate", "angle", "number")):
         return True
     if column.unit is not None and any(
@@ -260,7 +265,7 @@ def _may_be_gyro(column: ColumnInspection) -> bool:
 def _group_columns(
     columns: Sequence[ColumnInspection],
 ) -> Iterator[tuple[str, dict[str, ColumnInspection]]]:
-    """Columns whose names differ in the axis only, with the name that they share; and each column for itself."""
+    """Yield groups of columns whose names differ only in the axis, and each column alone."""
     templates: dict[str, dict[str, ColumnInspection]] = {}
     for column in columns:
         for match in re.finditer(r"[xyzXYZpqrENZ]|\d+", column.key):
@@ -299,7 +304,7 @@ def _group_columns(
 
 
 def _gyro_score(template: str, group: Sequence[ColumnInspection], look: FileInspection) -> float:
-    """How much a group of columns looks like a gyro."""
+    """Return a score of how much a group of columns looks like a gyro."""
     low = template.lower()
     if any(given_unit(column) for column in group):
         score = 4.0
@@ -337,13 +342,15 @@ def _gyro_score(template: str, group: Sequence[ColumnInspection], look: FileInsp
 
 
 def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:
-    """Mean over scatter."""
+    """Return the ratio of mean and scatter."""
     return math.hypot(*(c.mean for c in group)) / max(
         math.hypot(*(c.scatter for c in group)), 1e-300
     )
 
 
 def _is_temperature(column: ColumnInspection) -> bool:
-    return bool(re.search(r"temp", column.key.lower())) and column.std > 0 and (
-        name_unit(column, "temperature") is not None or (column.unit is not None and is_unit_of(column.unit, ("temperature",)))
-    )  # fmt: skip
+    has_unit = column.unit is not None and is_unit_of(column.unit, ("temperature",))
+    is_named = bool(re.search(r"temp", column.key.lower()))
+    return (
+        is_named and column.std > 0 and (has_unit or name_unit(column, "temperature") is not None)
+    )

@@ -26,11 +26,11 @@ __all__ = [
 EARTH_RATE_DPH = 15.041
 
 
-#: A fine gyro at rest measures it this well: its bias is a few tenths of a deg/h.
+#: Relative error with which a fine gyro measures it; its bias is a few tenths of a deg/h.
 EARTH_TOLERANCE = 0.02
 
 
-#: One with a bias of some deg/h measures it this well.
+#: Relative error of a gyro with a bias of a few deg/h.
 EARTH_NEIGHBOURHOOD = 0.3
 
 
@@ -38,7 +38,7 @@ EARTH_NEIGHBOURHOOD = 0.3
 MAX_RATE_DPH = 4000.0 * HOUR
 
 
-#: Angle random walk of the usual sensor, and how far others are from it [deg/sqrt(h), decades].
+#: Angle random walk of a usual sensor [deg/sqrt(h)], and spread of other sensors [decades].
 TYPICAL_ARW, ARW_DECADES = 0.3, 1.0
 
 
@@ -48,7 +48,7 @@ def given_unit(column: ColumnInspection) -> bool:
 
 
 def name_unit(column: ColumnInspection, quantity: str) -> str | None:
-    """The unit that the end of a name says, ``deg/h`` of ``gx_deg_per_h``."""
+    """Return the unit at the end of a column name, such as ``deg/h`` in ``gx_deg_per_h``."""
     tokens = [
         token for token in re.split(r"[\s_./\-]+", re.sub(r"\[\d+\]$", "", column.key)) if token
     ]
@@ -69,7 +69,7 @@ def name_unit(column: ColumnInspection, quantity: str) -> str | None:
 
 
 def temperature_unit(column: ColumnInspection) -> str:
-    """The unit of a column of temperatures, of its header or its name."""
+    """Return the unit of a temperature column, from its header or its name."""
     given = column.unit is not None and is_unit_of(column.unit, ("temperature",))
     return str(column.unit if given else name_unit(column, "temperature") or "degC")
 
@@ -108,7 +108,8 @@ def guess_unit(
             return named
     if angles:
         warnings.append(
-            "nothing says the unit of the angles; deg is an assumption, put the true one in its place"
+            "nothing says the unit of the angles; deg is an assumption, put the true one in its "
+            "place"
         )
         return "deg"
     counts = [
@@ -132,10 +133,12 @@ def guess_unit(
     factor = parse_unit(unit).factor
     walk = scatter * factor / (60.0 * math.sqrt(rate)) if rate > 0 else math.nan
     reasons.append(
-        f"unit {unit}, by the noise: {walk:.2g} deg/sqrt(h); the mean is {np.linalg.norm(means) * factor:.4g} deg/h"
+        f"unit {unit}, by the noise: {walk:.2g} deg/sqrt(h); the mean is "
+        f"{np.linalg.norm(means) * factor:.4g} deg/h"
     )
     warnings.append(
-        f"the unit {unit} is a guess from the numbers, as the file says none; check it with the data sheet"
+        f"the unit {unit} is a guess from the numbers, as the file says none; check it with the "
+        "data sheet"
     )
     return unit
 
@@ -143,26 +146,26 @@ def guess_unit(
 def rate_plausibility(
     means: np.ndarray, scatter: float, top: float, factor: float, rate: float
 ) -> float:
-    """How well a unit of `factor` deg/h fits the numbers of a gyro, as a logarithm."""
+    """Return the log-plausibility that the numbers of a gyro have a unit of `factor` deg/h."""
     if top * factor > MAX_RATE_DPH:
         return -math.inf
     walk = max(scatter, 1e-300) * factor / (60.0 * math.sqrt(rate)) if rate > 0 else TYPICAL_ARW
     score = -((math.log10(walk / TYPICAL_ARW) / ARW_DECADES) ** 2) / 2
     norm = float(np.linalg.norm(means)) * factor
     if len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_TOLERANCE:
-        # the rotation of the Earth; by chance 0.04 of 4 ln 10 in the logarithm, which is e^-5
+        # Earth rate; the chance is 0.04 of 4 ln 10 in the logarithm, e^-5
         score += 4.0
     elif len(means) == 3 and abs(norm / EARTH_RATE_DPH - 1) < EARTH_NEIGHBOURHOOD:
-        score += 2.0  # with a bias of some deg/h; by chance 0.6 of 4 ln 10, which is e^-3
+        score += 2.0  # with a bias of a few deg/h; the chance is 0.6 of 4 ln 10, e^-3
     elif len(means) == 3 and norm < 0.5 * EARTH_RATE_DPH:
-        score -= 1.0  # less than the Earth turns: only if the mean was taken off
+        score -= 1.0  # below Earth rate: only if the mean was removed
     return score
 
 
 def _scale_of_counts(
     group: Sequence[ColumnInspection], reasons: list[str], warnings: list[str]
 ) -> str:
-    """A unit for counts, so that a run is possible: nothing in the file says how much a count is."""
+    """Return a provisional unit for counts, whose scale the file does not contain."""
     norm = math.hypot(*(c.mean for c in group))
     if len(group) == 3 and norm > 0:
         per_count = EARTH_RATE_DPH / norm  # deg/h = arcsec/s
@@ -173,10 +176,12 @@ def _scale_of_counts(
         )
         if abs(round_one / per_count - 1) < EARTH_TOLERANCE:
             reasons.append(
-                f"{round_one:g} arcsec/s a count, as the mean of the three axes is then the rotation of the Earth"
+                f"{round_one:g} arcsec/s a count, as the mean of the three axes is then the "
+                "rotation of the Earth"
             )
             warnings.append(
-                f"the scale of {round_one:g} arcsec/s a count is a guess; put that of the data sheet in its place"
+                f"the scale of {round_one:g} arcsec/s a count is a guess; put that of the data "
+                "sheet in its place"
             )
             return f"{round_one:g} arcsec/s"
     earth = EARTH_RATE_DPH / parse_unit("rad/s").factor
@@ -184,9 +189,11 @@ def _scale_of_counts(
     unit = "nrad/s" if exponent == -9 else f"1e{exponent:d} rad/s"
     text = f"1 {unit}" if unit == "nrad/s" else unit
     reasons.append(
-        f"{text} a count is the largest decimal scale at which the mean is not more than the rotation of the Earth"
+        f"{text} a count is the largest decimal scale at which the mean is not more than the "
+        "rotation of the Earth"
     )
     warnings.append(
-        f"the columns are counts, and nothing in the file says how much one is: put the scale of the data sheet for {text}"
+        "the columns are counts, and nothing in the file says how much one is: put the scale of "
+        f"the data sheet for {text}"
     )
     return text

@@ -1,4 +1,4 @@
-"""A look into every column of a file, whether or not it can be read as a gyro log."""
+"""Inspect every column of a file, whether or not it can be read as a gyro log."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 
 __all__ = ["ColumnInspection", "FileInspection", "inspect_file"]
 
-#: Columns that are looked into; a log of sensors has tens of them.
+#: Largest number of columns to inspect; a sensor log has tens of them.
 MAX_COLUMNS = 100
-#: Rows that are looked at together.
+#: Rows that are inspected at one time.
 CHUNK_ROWS = 2**18
-#: Share of whole numbers above which a column is of counts: junk in the first rows makes no
-#: difference.
+#: Share of whole numbers above which a column holds counts; tolerates invalid first rows.
 WHOLE_SHARE = 0.999
-#: Numbers of this size are fillers: the squares of smaller ones can be summed.
+#: Larger numbers are fill values; the squares of smaller ones can be summed.
 MAX_MAGNITUDE = 1e100
 #: Blocks of a chunk in which the mean step is taken.
 MEAN_STEP_BLOCKS = 64
@@ -36,12 +35,12 @@ _MEDIAN_STEP = 0.6745 * math.sqrt(2.0)
 
 @dataclass(frozen=True)
 class ColumnInspection:
-    """What one column holds; the numbers are in the unit of the file, NaN where the column holds no numbers.
+    """Statistics of one column, in the unit of the file; NaN if the column holds no numbers.
 
-    `scatter` is the standard deviation of a sample about its neighbours, by the median of the
-    steps; `held` is the share of samples equal to the one before, `rising` the share of steps
-    upwards, `pace` the mean step by the median of blocks, `rows` the filled ones, and `rate_hz` how
-    many of them there are in a second, NaN where no time is known.
+    `scatter` is the standard deviation of a sample about its neighbours, from the median of the
+    steps; `held` is the share of samples equal to the previous one, `rising` the share of upward
+    steps, `pace` the mean step (median of blocks), `rows` the number of filled rows, and `rate_hz`
+    the number of filled rows a second, NaN if the time is unknown.
     """
 
     key: str
@@ -66,7 +65,7 @@ class ColumnInspection:
 
 @dataclass(frozen=True)
 class FileInspection:
-    """What a file holds: its summary, the columns, the rows, and the column of the time where that is known."""
+    """Inspection of a file: summary, columns, number of rows, and time column if known."""
 
     summary: FileSummary
     columns: tuple[ColumnInspection, ...]
@@ -77,19 +76,19 @@ class FileInspection:
 
 
 def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileInspection:
-    r"""Look into every column of a file, in any format that gyrostab reads.
+    r"""Inspect every column of a file, in any format that gyrostab reads.
 
     Parameters
     ----------
     path : path
         The file.
     options : ReadOptions, optional
-        What is known of it; nothing needs to be.
+        Known reading options, if any.
 
     Returns
     -------
-    FileLook
-        The columns with range, scatter and rate, up to `MAX_COLUMNS` of them.
+    FileInspection
+        The first `MAX_COLUMNS` columns, with range, scatter and rate.
 
     Raises
     ------
@@ -101,7 +100,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     >>> from tempfile import mkdtemp
     >>> path = Path(mkdtemp()) / "log.csv"
     >>> _ = path.write_text("n,wx\n" + "".join(f"{n},{n % 2}\n" for n in range(9)))
-    >>> [(column.key, column.low, column.high) for column in look_into(path).columns]
+    >>> [(column.key, column.low, column.high) for column in inspect_file(path).columns]
     [('n', 0.0, 8.0), ('wx', 0.0, 1.0)]
     """
     path, options = Path(path), options or ReadOptions()
@@ -118,7 +117,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
         chosen[time.key] = "time" if time.unit == "ISO 8601" else f"time [{time.unit}]"
         if (
             time.key == "time" and "time" not in options.map
-        ):  # stamps of the format, which no option names
+        ):  # stamps of the format, not a named column
             del chosen[time.key]
     reading = replace(
         options,
@@ -138,7 +137,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     if not any(column.rows for column in columns):
         raise FormatError(f"{path.name}: there is no number in any of its columns; is it a log?")
     notes = (
-        [f"{len(others) - MAX_COLUMNS} further columns are not looked into"]
+        [f"{len(others) - MAX_COLUMNS} further columns are not inspected"]
         if len(others) > MAX_COLUMNS
         else []
     )
@@ -147,7 +146,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
 
 
 def _row_rate(log: xr.Dataset, dim: str) -> float:
-    """Rows in a second, NaN without stamps."""
+    """Return the number of rows a second, NaN without stamps."""
     clock = "time" if dim == "row" else dim
     if clock not in log.variables or dim not in log.sizes:
         return math.nan
@@ -162,7 +161,7 @@ def _row_rate(log: xr.Dataset, dim: str) -> float:
 
 
 def _mean_steps(values: NDArray[np.float64]) -> list[float]:
-    """Mean step from row to row in each of a few blocks: their median knows of no restarts, gaps and bursts."""
+    """Return the mean steps of several blocks; their median ignores restarts, gaps, bursts."""
     blocks = np.array_split(values, min(MEAN_STEP_BLOCKS, max(1, values.size // 8)))
     return [float((block[-1] - block[0]) / (block.size - 1)) for block in blocks if block.size > 1]
 
@@ -210,7 +209,7 @@ def _inspect_column(column: ColumnSummary, log: xr.Dataset, name: str) -> Column
             typical = float(np.median(np.abs(steps))) / _MEDIAN_STEP
             scatters.append(
                 (typical or float(np.sqrt(np.mean(steps**2) / 2)), steps.size)
-            )  # most samples may be held
+            )  # most samples may repeat the previous one
     rows, steps_seen = counts["rows"], max(1, counts["steps"])
     mean = origin + total / rows if rows else math.nan
     variance = squares / rows - (total / rows) ** 2 if rows else math.nan

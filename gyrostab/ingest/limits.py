@@ -1,8 +1,8 @@
-"""The limits of what a reader does for the bytes that are there, each with its reason and the option that lifts it.
+"""Limits of the readers, each with its reason and the option that raises it.
 
-Every reader knows rows, columns and bytes of a file before it reads values, and the regularisation
-knows rows and samples before it lays out the grid. They compare these numbers with the limits here,
-so a damaged or absurd file ends in one message.
+A reader knows rows, columns and bytes of a file before it reads values, and the regularisation
+knows rows and samples before it allocates the grid. They compare these numbers with the limits, so
+a damaged or absurd file ends in one message.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Limit:
-    """A limit that a user may raise with ``--limit NAME=NUMBER`` (``limits={"NAME": NUMBER}`` in Python)."""
+    """A limit that ``--limit NAME=NUMBER`` raises (``limits={"NAME": NUMBER}`` in Python)."""
 
     value: float
     unit: str
@@ -44,49 +44,55 @@ LIMITS: Mapping[str, Limit] = {
     "columns": Limit(
         30_000,
         "columns",
-        "A logger writes tens of columns, a bus recorder thousands. The header of this many is understood in a few seconds; beyond it "
+        "A logger writes tens of columns, a bus recorder thousands. The header of this many is "
+        "understood in a few seconds; beyond it "
         "the separator is probably wrong, or the table is transposed.",
     ),
     "channels": Limit(
         200,
         "channels",
-        "A channel takes 8 bytes a row in memory or in a temporary file, and xarray looks through all variables for each of them. "
+        "A channel takes 8 bytes a row in memory or in a temporary file, and xarray looks "
+        "through all variables for each of them. "
         "Channels with a known name, and those that --map or --unit names, are kept beyond it.",
     ),
     "grid_samples": Limit(
         1e9,
         "samples of one axis",
-        "The default --max-gap of 10 days at 1 kHz makes 8.6e8 samples. An axis of 1e9 samples takes about ten seconds to analyse "
-        "(10 ns a sample) even if the file has a hundred rows. Above it a grid may have 100 samples for each row, which allows a "
+        "The default --max-gap of 10 days at 1 kHz makes 8.6e8 samples. An axis of 1e9 samples "
+        "takes about ten seconds to analyse "
+        "(10 ns a sample) even if the file has a hundred rows. Above it a grid may have 100 "
+        "samples for each row, which allows a "
         "recorder that runs for 1 % of the time.",
     ),
     "stored_samples": Limit(
         1e9,
         "samples of all columns",
-        "As for grid_samples. Above it a file may have 1000 samples for each of its bytes: deflate never packs more than 1032 "
+        "As for grid_samples. Above it a file may have 1000 samples for each of its bytes: "
+        "deflate never packs more than 1032 "
         "bytes into one, so a file below that ratio holds almost no written values.",
     ),
     "chunk_bytes": Limit(
         2**28,
         "bytes",
-        "A chunk is decoded as a whole in memory, and those of all columns that are read side by side are held: 256 MiB keep a run "
-        "near 1.5 GiB. Such a chunk holds 23 hours of one axis at 400 Hz in doubles; usual chunks hold 1 to 128 MiB.",
+        "A chunk is decoded as a whole in memory, and those of all columns that are read side by "
+        "side are held: 256 MiB keep a run "
+        "near 1.5 GiB. Such a chunk holds 23 hours of one axis at 400 Hz in doubles; usual "
+        "chunks hold 1 to 128 MiB.",
     ),
 }
 
-#: Samples of the grid for each row, and samples claimed for each byte present, that are in
-#: proportion; see `LIMITS`.
+#: Largest plausible ratio of grid samples to rows, and of declared samples to bytes; see `LIMITS`.
 GRID_SAMPLES_PER_ROW = 100
 STORED_SAMPLES_PER_BYTE = 1000
 
 
 def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
-    """Return the limits that a user gave, as numbers.
+    """Check the limits that a user set, and return them as numbers.
 
     Raises
     ------
     OptionError
-        For a name that is not a limit, or a value that is not a number above 0.
+        When a name is not that of a limit, or a value is not a number above 0.
 
     Examples
     --------
@@ -96,9 +102,7 @@ def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
     found = {}
     for name, text in (given or {}).items():
         if name not in LIMITS:
-            raise OptionError(
-                f"--limit {name}: there is no such limit; the limits are {', '.join(LIMITS)}"
-            )
+            raise OptionError(f"--limit {name}: unknown limit; the limits are {', '.join(LIMITS)}")
         try:
             found[name] = float(text)
         except (TypeError, ValueError) as error:
@@ -111,7 +115,7 @@ def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
 
 
 def limit_value(name: str, given: Mapping[str, float] | None = None) -> float:
-    """Return the value of a limit, as the user set it or by default.
+    """Return a limit, as set by the user or by default.
 
     Examples
     --------
@@ -122,7 +126,7 @@ def limit_value(name: str, given: Mapping[str, float] | None = None) -> float:
 
 
 def describe_limit(name: str, needed: float, given: Mapping[str, float] | None = None) -> str:
-    """Return the end of a message: the limit, and the option that lifts it.
+    """Return the end of a message: the limit, and the option that raises it.
 
     Examples
     --------
@@ -130,11 +134,14 @@ def describe_limit(name: str, needed: float, given: Mapping[str, float] | None =
     'the limit is 3e+04 columns, and --limit columns=1e+05 lifts it'
     """
     allowed = limit_value(name, given)
-    return f"the limit is {allowed:.4g} {LIMITS[name].unit}, and --limit {name}={_round_up(needed)} lifts it"
+    return (
+        f"the limit is {allowed:.4g} {LIMITS[name].unit}, and --limit "
+        f"{name}={_round_up(needed)} lifts it"
+    )
 
 
 def _round_up(needed: float) -> str:
-    """Return a number of two digits that is not below `needed`.
+    """Round up to two digits.
 
     Examples
     --------
@@ -146,7 +153,7 @@ def _round_up(needed: float) -> str:
 
 
 def is_absurd_grid(samples: int, rows: int, given: Mapping[str, float] | None = None) -> bool:
-    """Return whether a grid has far more samples than there are rows; see ``grid_samples`` in `LIMITS`.
+    """Return whether a grid has far more samples than rows; see ``grid_samples`` in `LIMITS`.
 
     Examples
     --------
@@ -174,21 +181,21 @@ def bytes_present(path: Path) -> int:
 def check_stored(
     path: Path, rows: int, columns: int, given: Mapping[str, float] | None = None
 ) -> None:
-    """Refuse a file that claims far more samples than its bytes can hold.
+    """Refuse a file that declares far more samples than its bytes can hold.
 
     Parameters
     ----------
     path : Path
         File or directory.
     rows, columns : int
-        What the file claims to hold, of the columns that are read.
+        Declared size of the columns that are read.
     given : mapping of str to float, optional
         Limits that the user set.
 
     Raises
     ------
     FormatError
-        With the numbers, and the option that lifts the limit.
+        With the numbers, and the option that raises the limit.
     """
     claimed = rows * columns
     if claimed <= limit_value("stored_samples", given):
@@ -196,22 +203,25 @@ def check_stored(
     present = bytes_present(path)
     if claimed > STORED_SAMPLES_PER_BYTE * present:
         raise FormatError(
-            f"{path.name}: it claims {rows:.4g} samples in each of {columns} columns, but holds {present:,} bytes: nearly all of them "
-            f"were never written. Copy it again, or cut it to what was recorded; {describe_limit('stored_samples', claimed, given)}"
+            f"{path.name}: it declares {rows:.4g} samples in each of {columns} columns, but "
+            f"holds {present:,} bytes: nearly all of them "
+            "were never written. Copy it again, or cut it to what was recorded; "
+            f"{describe_limit('stored_samples', claimed, given)}"
         )
 
 
 def check_columns(path: Path, columns: int, given: Mapping[str, float] | None = None) -> None:
-    """Refuse a table of absurdly many columns.
+    """Refuse a table with too many columns.
 
     Raises
     ------
     FormatError
-        With their number, and the option that lifts the limit.
+        With their number, and the option that raises the limit.
     """
     if columns > limit_value("columns", given):
         raise FormatError(
-            f"{path.name}: it has {columns:,} columns; is the separator another one, or is the table transposed? Write a file of the "
+            f"{path.name}: it has {columns:,} columns; is the separator another one, or is the "
+            "table transposed? Write a file of the "
             f"columns that are needed; {describe_limit('columns', columns, given)}"
         )
 
@@ -219,15 +229,16 @@ def check_columns(path: Path, columns: int, given: Mapping[str, float] | None = 
 def check_chunk(
     path: Path, name: str, chunk_bytes: int, given: Mapping[str, float] | None = None
 ) -> None:
-    """Refuse a variable whose chunks are too large to be decoded in memory.
+    """Refuse a variable whose chunks are too large to decode in memory.
 
     Raises
     ------
     FormatError
-        With the size of a chunk, and the option that lifts the limit.
+        With the size of a chunk, and the option that raises the limit.
     """
     if chunk_bytes > limit_value("chunk_bytes", given):
         raise FormatError(
-            f"{path.name}: a chunk of {name!r} has {chunk_bytes:.4g} bytes. If the file is damaged, copy it again, else store it in "
+            f"{path.name}: a chunk of {name!r} has {chunk_bytes:.4g} bytes. If the file is "
+            "damaged, copy it again, else store it in "
             f"smaller chunks; {describe_limit('chunk_bytes', chunk_bytes, given)}"
         )

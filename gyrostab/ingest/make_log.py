@@ -1,4 +1,4 @@
-"""A log from an array: the way in for data that is already in memory."""
+"""Make a log from an array in memory."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def make_log(
     axis : sequence of str, optional
         Names of the axes; x, y, z by default.
     kind : {"rate", "angle"}
-        Whether the values are rates or cumulative angles.
+        Kind of the values: rates or cumulative angles.
     channels : mapping, optional
-        Name to (values on the same time, unit), for instance ``{"temperature": (t, "degC")}``.
+        Name -> (values on the same time, unit), for instance ``{"temperature": (t, "degC")}``.
 
     Returns
     -------
@@ -54,7 +54,7 @@ def make_log(
     Raises
     ------
     OptionError
-        When shape, rate, start or kind make no sense.
+        When shape, rate, start or kind is invalid.
     UnitError
         When the unit is unknown or does not fit `kind`.
 
@@ -78,7 +78,8 @@ def make_log(
     names = list(axis) if axis is not None else list("xyz")[: data.shape[0]]
     if data.ndim != 2 or len(names) != data.shape[0]:
         raise OptionError(
-            f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, time) and one name per axis"
+            f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, "
+            "time) and one name per axis"
         )
     if parsed.factor != 1.0:
         data = data * parsed.factor

@@ -1,4 +1,4 @@
-"""What the user may say about a log, and what a look at a file tells."""
+"""Reading options of the user, and the summary of a file."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ __all__ = ["ColumnSummary", "FileSummary", "ReadOptions"]
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """Everything a reader may be told, checked once.
+    """Options of a reader, checked once.
 
     Parameters
     ----------
     rate : float, optional
-        Sampling rate [Hz] of files without a time column; with one, the rate to check against.
+        Sampling rate [Hz] of files without a time column; otherwise the rate to check against.
     start : str, optional
         Stamp of the first row (ISO 8601, UTC) of files without a time column.
     epoch : str, optional
         Zero of a numeric time column (ISO 8601, UTC); 1970-01-01 when not given.
     map : mapping of str to str
-        Header name -> contract name, with a unit if wanted: ``{"wx": "gyro_x [deg/s]"}``. ``""`` or
-        ``"-"`` drops the column. Files without a header row are mapped by column number counted
-        from 0: ``{"1": "gyro_x"}``.
+        Header name -> contract name, optionally with a unit: ``{"wx": "gyro_x [deg/s]"}``. ``""``
+        or ``"-"`` drops the column. Files without a header row are mapped by column number from 0:
+        ``{"1": "gyro_x"}``.
     unit : mapping of str to str
         Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time":
         "us"}``; factors allowed (``"0.1 arcsec/s"``).
@@ -38,18 +38,18 @@ class ReadOptions:
         How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` the increment of each
         sample.
     channel : sequence of path
-        Files that hold further channels.
+        Files with further channels.
     channels_only : bool
-        The file is read for its channels; gyro axes are not asked for.
+        Whether the file is read only for its channels, without gyro axes.
     strict : bool
-        A damaged place in a regular log is an error instead of a gap.
+        Whether damage in a regular log is an error instead of a gap.
     limits : mapping of str to float
         Limits of `gyrostab.ingest.limits` with other values.
 
     Raises
     ------
     OptionError
-        When a value makes no sense by itself.
+        When a value is invalid.
 
     Examples
     --------
@@ -73,7 +73,8 @@ class ReadOptions:
             check_rate(self.rate, "--rate")
         if self.kind not in (None, "rate", "angle"):
             raise OptionError(
-                f"--kind {self.kind}: choose 'rate' (increment of each sample) or 'angle' (cumulative angle)"
+                f"--kind {self.kind}: choose 'rate' (increment of each sample) or 'angle' "
+                "(cumulative angle)"
             )
         for name in ("start", "epoch"):
             value = getattr(self, name)
@@ -88,25 +89,25 @@ class ReadOptions:
 
     @property
     def epoch_ns(self) -> int:
-        """Zero of numeric time [ns since 1970]."""
+        """Epoch of numeric time [ns since 1970]."""
         return 0 if self.epoch is None else stamp_ns(self.epoch, "--epoch")
 
 
 @dataclass(frozen=True)
 class ColumnSummary:
-    """One column of a file: how it is called there and how it is understood."""
+    """One column of a file: its name there, its role and unit here."""
 
     header: str
     name: str
     role: str  # "time", "gyro", "channel" or "left out"
     quantity: str | None
     unit: str | None
-    key: str = ""  # what --map calls it
+    key: str = ""  # name for --map
 
 
 @dataclass(frozen=True)
 class FileSummary:
-    """What a cheap look at a file tells; no stamp or row count is looked for where it would cost a pass over the data."""
+    """Summary of a file; stamps and row count only if they do not cost a pass over the data."""
 
     path: Path
     format: str

@@ -1,4 +1,4 @@
-"""Files of one recording that overlap: rows that two of them hold are kept once."""
+"""Drop rows that overlapping files of one recording repeat."""
 
 from __future__ import annotations
 
@@ -14,29 +14,27 @@ from gyrostab.schema import SIGNAL_UNITS
 __all__ = ["drop_repeats", "stamp_span"]
 
 _BLOCK_ROWS = 2**20
-_COMPARED_ROWS = 2**15  # rows at each end of an overlap whose values are compared
-_MIN_ALIKE_SHARE = (
-    0.9  # share of the compared rows that must be alike; a copy may have been damaged
-)
+_COMPARED_ROWS = 2**15  # at each end of an overlap
+_MIN_ALIKE_SHARE = 0.9  # share of equal rows in a copy, which may be damaged
 
 
 def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-    """Leave out what a file repeats of the files before it.
+    """Drop the rows of each file that repeat rows of earlier files.
 
-    Two files overlap when rows of both have the same stamps and the same values. Files whose clocks
-    merely cover the same hours, as after a restart of the clock, have other values and stay as they
-    are.
+    Two files overlap if rows of both have the same stamps and the same values. Files whose clocks
+    merely cover the same hours, as after a restart of the clock, have other values and stay
+    unchanged.
 
     Parameters
     ----------
     parts : sequence of xarray.Dataset
-        Raw logs with stamps, in the order of their first ones.
+        Raw logs with stamps, in the order of their first stamps.
 
     Returns
     -------
     list of xarray.Dataset
-        The raw logs without repeated rows, each with a note where rows were left out; a file that
-        holds nothing new is left out as a whole, and the file that holds its rows says so.
+        The raw logs without repeated rows, with notes on dropped rows; a file without new rows is
+        dropped as a whole, with a note in the file that contains its rows.
     """
     kept: list[xr.Dataset] = []
     ends: list[int] = []
@@ -51,7 +49,7 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
                 continue
             if (
                 head > held.sizes["row"] - tail and end >= ends[place]
-            ):  # it has rows that the earlier file lost
+            ):  # it contains rows that the earlier file lost
                 kept[place], part = _drop_rows(held, slice(0, tail), part)
                 ends[place] = first - 1
             else:
@@ -65,7 +63,7 @@ def drop_repeats(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
 
 
 def _drop_rows(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """The rows of `part` that stay, and `other`, which holds the rest; what was left out stands in the notes of one of them."""
+    """Keep the given rows of `part`; add a note on the dropped rows to `part` or `other`."""
     name, holder = (str(one.attrs["source_files"][0]) for one in (part, other))
     shorter = part.isel(row=rows)
     left_out = part.sizes["row"] - shorter.sizes["row"]
@@ -91,18 +89,18 @@ def _read_stamps(part: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
 
 
 def stamp_span(part: xr.Dataset) -> tuple[int, int]:
-    """First and latest stamp of a raw log [ns since 1970]."""
+    """Return the first and the latest stamp of a raw log [ns since 1970]."""
     first, latest = None, NAT
     for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
         stamps = _read_stamps(part, begin, begin + _BLOCK_ROWS)
-        latest = max(latest, int(stamps.max()))  # NAT is the least integer
+        latest = max(latest, int(stamps.max()))  # NAT is the smallest integer
         if first is None and latest != NAT:
             first = int(stamps[np.argmax(stamps != NAT)])
     return (first if first is not None else int(np.iinfo(np.int64).max)), latest
 
 
 def _rows_from(part: xr.Dataset, first: int) -> int:
-    """Row from which the stamps are `first` or later, looked for from the end."""
+    """Return the row from which all stamps are `first` or later, searching from the end."""
     row = part.sizes["row"]
     while row > 0:
         stamps = _read_stamps(part, row - _BLOCK_ROWS, row)
@@ -114,7 +112,7 @@ def _rows_from(part: xr.Dataset, first: int) -> int:
 
 
 def _rows_until(part: xr.Dataset, last: int) -> int:
-    """Number of rows before the first stamp later than `last`."""
+    """Return the number of rows before the first stamp later than `last`."""
     for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
         late = np.flatnonzero(_read_stamps(part, begin, begin + _BLOCK_ROWS) > last)
         if len(late):
@@ -123,7 +121,7 @@ def _rows_until(part: xr.Dataset, last: int) -> int:
 
 
 def _is_copy(held: xr.Dataset, part: xr.Dataset, tail: int, head: int) -> bool:
-    """Whether the rows of `held` from `tail` on and the first `head` rows of `part` are the same samples."""
+    """Return whether the first `head` rows of `part` repeat those of `held` from `tail` on."""
     near = _count_common(held, part, (tail, tail + _COMPARED_ROWS), (0, min(head, _COMPARED_ROWS)))
     size = held.sizes["row"]
     far = _count_common(
@@ -136,7 +134,7 @@ def _is_copy(held: xr.Dataset, part: xr.Dataset, tail: int, head: int) -> bool:
 def _count_common(
     held: xr.Dataset, part: xr.Dataset, rows: tuple[int, int], others: tuple[int, int]
 ) -> tuple[int, int]:
-    """How many rows of two stretches have the same stamp, and how many of these the same values; NaN is like anything."""
+    """Count rows with equal stamps, and those with equal values; NaN equals anything."""
     ours, theirs = _read_stamps(held, *rows), _read_stamps(part, *others)
     stamps, a, b = np.intersect1d(ours, theirs, return_indices=True)
     a, b = a[stamps != NAT], b[stamps != NAT]

@@ -1,4 +1,4 @@
-"""A table of what is in some logs, before anything is computed from them."""
+"""Summarise logs in a table, and inspect files that need options."""
 
 from __future__ import annotations
 
@@ -21,13 +21,12 @@ if TYPE_CHECKING:
 __all__ = ["COLUMNS", "InspectedFile", "ScanResult", "scan", "scan_and_inspect"]
 
 
-#: Share of missing samples above which the sampling rate may be wrong: it is then tried with the
-#: mean rate of the rows.
+#: Largest share of missing samples at a plausible sampling rate; above it, the mean rate of the
+#: rows is tried.
 MAX_MISSING_SHARE = 0.1
 
 
-#: Columns of the table; span in s, rate in Hz, missing as a share of the samples between start and
-#: end.
+#: Columns of the table: span [s], rate [Hz], share of missing samples between start and end.
 COLUMNS = (
     "file",
     "format",
@@ -45,9 +44,9 @@ COLUMNS = (
 
 
 def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFrame:
-    r"""Say what is in some logs, one row a file.
+    r"""Summarise logs in a table, one row a file.
 
-    Each file is read once, by itself, and put on a uniform time axis to count what is missing.
+    Each file is read separately and placed on a uniform time axis to count missing samples.
 
     Parameters
     ----------
@@ -61,20 +60,21 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     -------
     pandas.DataFrame
         Columns of `COLUMNS`: file, format, start and end (UTC), span [s], sampling rate [Hz], axes,
-        channels, rows, number of gaps, share of missing samples, and what is odd (for a file that
-        cannot be read, why).
+        channels, rows, number of gaps, share of missing samples, and notes ("odd"; for a file that
+        cannot be read, the reason).
 
     Raises
     ------
     GyrostabError
-        When none of the files can be read: the reason of the first.
+        When no file can be read, with the reason for the first.
 
     Examples
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = Path(folder) / "tool.csv"
-    ...     _ = path.write_text("time [s],gyro_x [deg/h]\n" + "".join(f"{n / 10},{n % 3}\n" for n in range(50)))
+    ...     rows = "".join(f"{n / 10},{n % 3}\n" for n in range(50))
+    ...     _ = path.write_text("time [s],gyro_x [deg/h]\n" + rows)
     ...     table = scan(path)
     >>> print(table.loc[0, "rate_hz"], table.loc[0, "axes"], table.loc[0, "rows"])
     10.0 x 50
@@ -87,19 +87,19 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
 
 @dataclass(frozen=True)
 class InspectedFile:
-    """What was found in a file that cannot be read as it is: its columns, the guess, and the options that read it."""
+    """Inspection of a file that needs options, with a guess and options that read it."""
 
-    paths: list[Path]  # with the same columns; the first was looked into
+    paths: list[Path]  # files with the same columns; the first was inspected
     look: FileInspection
     guess: Guess
     options: dict[str, Any]
-    row: dict[str, Any] | None  # of the table, read with these options
-    error: str | None  # why it cannot be read with them
+    row: dict[str, Any] | None  # row of the table, read with these options
+    error: str | None  # why these options do not read it
 
 
 @dataclass(frozen=True)
 class ScanResult:
-    """The table of `scan`, the errors of files that cannot be read as they are, and a look into them."""
+    """Table of `scan`, with errors and inspections of the files that need options."""
 
     table: pd.DataFrame
     errors: list[GyrostabError]
@@ -109,19 +109,19 @@ class ScanResult:
 def scan_and_inspect(
     paths: Sequence[str | Path] | str | Path, *, look: bool = True, **reading: Any
 ) -> ScanResult:
-    """Scan logs, and look into each column of those that cannot be read as they are.
+    """Scan logs, and inspect the columns of those that need options.
 
     Parameters
     ----------
     paths, **reading
         As for `scan`.
     look : bool
-        Look into the columns. Of files with the same columns the first is looked into.
+        Whether to inspect columns; of files with the same columns the first is inspected.
 
     Returns
     -------
     Examined
-        Nothing is raised for a file that cannot be read.
+        Errors of unreadable files are collected, not raised.
     """
     from gyrostab.ingest.files import expand
 
@@ -148,7 +148,7 @@ def scan_and_inspect(
 def _inspect_once(
     path: Path, reading: dict[str, Any], looks: dict[Any, InspectedFile | None]
 ) -> InspectedFile | None:
-    """Look into a file, unless one with the same columns was looked into."""
+    """Inspect a file, unless one with the same columns was inspected."""
     from gyrostab.ingest import ReadOptions, scan_file
     from gyrostab.ingest.guess import guess_columns
     from gyrostab.ingest.inspect import inspect_file
@@ -179,7 +179,7 @@ def _inspect_once(
 def _try_guess(
     path: Path, look: FileInspection, guess: Guess, reading: dict[str, Any]
 ) -> InspectedFile:
-    """Read the file by the guess, and with the sampling rate if the stamps alone do not tell it."""
+    """Read a file by the guess, also with its mean rate if many samples seem to be missing."""
     from gyrostab.ingest.guess_unit import temperature_unit
 
     options = {
@@ -223,7 +223,7 @@ def _try_guess(
 
 
 def _named_rate(path: Path) -> float | None:
-    """A sampling rate that a text at the beginning of a file names, as ``100 Hz``."""
+    """Find a sampling rate such as ``100 Hz`` in the text at the beginning of a file."""
     from gyrostab.ingest.formats.text import read_head
 
     found = re.search(r"(?<![\w.])(\d+(?:\.\d+)?) ?(k?)Hz\b", read_head(path), re.IGNORECASE)

@@ -19,14 +19,14 @@ __all__ = ["next_command", "print_inspection", "print_next", "print_scan"]
 
 
 def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
-    """The complete command that makes a product of logs.
+    """Return the complete command that makes a product of logs.
 
     Parameters
     ----------
     paths : sequence of path
         The logs.
     options : dict
-        Options of reading, as `scan` takes them.
+        Reading options, as for `scan`.
 
     Examples
     --------
@@ -53,7 +53,7 @@ def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
 
 
 def print_scan(table: pd.DataFrame) -> None:
-    """Print the table of `scan`: framed on a terminal, plain tab-separated text elsewhere."""
+    """Print the table of `scan`: framed on a terminal, tab-separated otherwise."""
     if not sys.stdout.isatty():
         table.to_csv(sys.stdout, sep="\t", index=False)
         return
@@ -109,7 +109,7 @@ INSPECTION_COLUMNS = ("column", "unit", "low", "high", "mean", "scatter", "rate_
 
 
 def _inspection_rows(found: InspectedFile) -> list[tuple[str, ...]]:
-    """The columns of a file as texts, one row each, as in `INSPECTION_COLUMNS`."""
+    """Return the columns of a file as rows of text, in the order of `INSPECTION_COLUMNS`."""
     guess = found.guess
     taken = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
     if guess.time is not None:
@@ -157,14 +157,15 @@ def _format_number(value: float) -> str:
 
 
 def print_inspection(found: InspectedFile) -> None:
-    """Print what is in the columns of a file and the guess; in a pipe every line begins with ``#``."""
+    """Print the columns of a file and the guess; in a pipe every line begins with ``#``."""
     rows = _inspection_rows(found)
     guess = found.guess
     told = [*guess.reasons, *(f"check: {warning}" for warning in guess.warnings), *found.look.notes]
     if found.row is not None:
         read = found.row
         told.append(
-            f"read so: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes {read['axes']}, {read['missing_share']:.2%} missing"
+            f"read so: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes "
+            f"{read['axes']}, {read['missing_share']:.2%} missing"
         )
     if found.error is not None and guess.axes:
         told.append(f"not readable by this guess: {found.error}")
@@ -195,7 +196,7 @@ def print_inspection(found: InspectedFile) -> None:
 
 
 def print_next(command: str, *, apart: bool = False) -> None:
-    """Print the command to run next; with `apart` on stderr if stdout is a pipe, which then holds the plain table only."""
+    """Print the command to run next; with `apart`, on stderr if stdout is a pipe."""
     if sys.stdout.isatty():
         print(f"next: {command}")
     elif apart:

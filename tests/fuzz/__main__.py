@@ -1,8 +1,7 @@
-"""Run a campaign and write its table: ``python -m tests.fuzz --count 100000 --seed 1 --jobs 2 --output docs/fuzzing.md``.
+"""Run a campaign: ``python -m tests.fuzz --count 100000 --jobs 2 --output docs/fuzzing.md``.
 
-A campaign that is stopped goes on where it was when it is started again with the same seed and the
-same code; ``--fresh`` forgets it. ``--replay FOLDER`` tries the inputs again that failed and were
-kept.
+A stopped campaign continues when it is started again with the same seed and the same code;
+``--fresh`` restarts it. ``--replay FOLDER`` tries saved failing inputs again.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def state_of_code() -> str:
-    """Digest of the package and of the harness: results of other code are not taken over."""
+    """Return a digest of the package and the harness; results of other code are not reused."""
     digest = hashlib.sha256()
     for path in sorted(
         [*(ROOT / "gyrostab").rglob("*.py"), *(ROOT / "tests" / "fuzz").glob("*.py")]
@@ -42,7 +41,7 @@ def state_of_code() -> str:
 
 
 def batches(count: int, formats: Sequence[str], size: int) -> Iterator[tuple[str, int, int]]:
-    """Format, first number and size of each batch: all formats in turn, so that a part of a campaign holds all of them."""
+    """Yield format, first number and size of each batch, all formats in turn."""
     for first in range(0, -(-count // len(formats)), size):
         for place, form in enumerate(formats):
             total = count // len(formats) + (place < count % len(formats))
@@ -53,7 +52,7 @@ def batches(count: int, formats: Sequence[str], size: int) -> Iterator[tuple[str
 def run(
     count: int, seed: int, jobs: int, formats: Sequence[str], *, work: Path, fresh: bool
 ) -> tuple[dict[str, Tally], float, bool]:
-    """Try `count` inputs; the tallies by format, the seconds it took, and whether all were tried."""
+    """Try `count` inputs; return the tallies by format, the seconds, and whether it finished."""
     work.mkdir(parents=True, exist_ok=True)
     key = f"{state_of_code()} {seed}"
     done: dict[tuple[str, int, int], Tally] = {}
@@ -95,7 +94,8 @@ def run(
                 tried = sum(tally.codes.total() for tally in done.values())
                 failed = sum(len(tally.failures) for tally in done.values())
                 print(
-                    f"\r{tried} of {count} inputs, {failed} failures, {tried / max(seconds, 1e-9):.0f} inputs/s ",
+                    f"\r{tried} of {count} inputs, {failed} failures, "
+                    f"{tried / max(seconds, 1e-9):.0f} inputs/s ",
                     end="",
                     flush=True,
                 )
@@ -114,7 +114,7 @@ def run(
 
 
 def replay(folder: Path) -> int:
-    """Try kept inputs again and print what becomes of them; the number that fail."""
+    """Try saved inputs again, print the results, and return the number of failures."""
     failed = 0
     for place in sorted(path.parent for path in folder.rglob("call.json")):
         item = load_input(place)
@@ -142,9 +142,9 @@ def main() -> int:
         help="folder for the state and the failing inputs",
     )
     parser.add_argument(
-        "--fresh", action="store_true", help="forget what an earlier call of the same campaign did"
+        "--fresh", action="store_true", help="restart the campaign instead of continuing it"
     )
-    parser.add_argument("--replay", type=Path, help="folder of kept inputs to try again")
+    parser.add_argument("--replay", type=Path, help="folder of saved inputs to try again")
     given = parser.parse_args()
     if given.replay:
         return min(replay(given.replay), 1)
@@ -154,7 +154,8 @@ def main() -> int:
     print(table(totals))
     for failure in [failure for tally in totals.values() for failure in tally.failures]:
         print(
-            f"{failure['format']}-{failure['name']} {failure['command']}: {failure['code']} {failure['text']}"
+            f"{failure['format']}-{failure['name']} {failure['command']}: {failure['code']} "
+            f"{failure['text']}"
         )
     if given.output:
         with replace_file(given.output) as part:

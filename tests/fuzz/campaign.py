@@ -1,4 +1,4 @@
-"""A campaign: batches of damaged inputs, each of which follows from the seed, the format and its number alone."""
+"""Batches of damaged inputs, determined by the seed, the format and their number alone."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BATCH = 100
 
 @dataclass(frozen=True)
 class Input:
-    """What is given to a command."""
+    """Input of one command."""
 
     format: str
     files: dict[str, bytes]
@@ -34,34 +34,34 @@ class Input:
 
 @dataclass
 class Tally:
-    """What became of the inputs of one format."""
+    """Results for the inputs of one format."""
 
     codes: Counter[str] = field(default_factory=Counter)
-    seconds: float = 0.0  # of the processor
+    seconds: float = 0.0  # processor time
     slowest: float = 0.0
     bytes: int = 0
     failures: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
-        """Count the inputs of another batch too."""
+        """Add the results of another batch."""
         self.codes.update(other.codes)
         self.seconds += other.seconds
         self.slowest, self.bytes = max(self.slowest, other.slowest), max(self.bytes, other.bytes)
         self.failures += other.failures
 
     def as_json(self) -> dict[str, Any]:
-        """The tally as JSON holds it; `Tally.from_json` reads it back."""
+        """Return the tally as JSON; `Tally.from_json` reads it back."""
         return {**vars(self), "codes": dict(self.codes)}
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> Tally:
-        """A tally that `as_json` gave."""
+        """Return the tally that `as_json` wrote."""
         return cls(**{**stored, "codes": Counter(stored["codes"])})
 
 
 @cache
 def seeds() -> dict[str, list[Seed]]:
-    """Valid inputs by format, made once in each process."""
+    """Return valid inputs by format, made once in each process."""
     import warnings
 
     with warnings.catch_warnings():
@@ -71,7 +71,7 @@ def seeds() -> dict[str, list[Seed]]:
 
 @cache
 def server() -> Server:
-    """The child of this process."""
+    """Return the child of this process."""
     made = Server()
     atexit.register(made.close)
     return made
@@ -79,13 +79,30 @@ def server() -> Server:
 
 #: Rows of the result table.
 FORMATS = (
-    "text", "parquet", "netcdf3", "netcdf4", "zarr2", "zarr3", "hdf5", "matlab5", "matlab7.3", "miniseed", "ulog", "las", "tdms", "binary",
-    "layout", "model", "options", "checkpoint", *STRUCTURED,
-)  # fmt: skip
+    "text",
+    "parquet",
+    "netcdf3",
+    "netcdf4",
+    "zarr2",
+    "zarr3",
+    "hdf5",
+    "matlab5",
+    "matlab7.3",
+    "miniseed",
+    "ulog",
+    "las",
+    "tdms",
+    "binary",
+    "layout",
+    "model",
+    "options",
+    "checkpoint",
+    *STRUCTURED,
+)
 
 
 def make_input(form: str, seed: int, number: int) -> Input:
-    """One damaged input; the same for the same arguments."""
+    """Make one damaged input, determined by the arguments."""
     draw = random.Random(f"{seed} {form} {number}")
     chosen = draw.choice(seeds()[form])
     others = [other for group in seeds().values() for other in group]
@@ -101,7 +118,7 @@ def ignore_interrupts() -> None:
 def run_batch(
     form: str, seed: int, first: int, count: int, folder: str | None
 ) -> tuple[str, int, Tally]:
-    """Try some inputs of one format; those that fail are kept in `folder`."""
+    """Try inputs of one format; failing ones are saved in `folder`."""
     tally = Tally()
     if form in STRUCTURED:
         inputs = (
@@ -123,7 +140,7 @@ def run_batch(
 
 
 def report(item: Input, outcome: Outcome, folder: str | None) -> dict[str, Any]:
-    """A failure in a few words; its input goes to `folder`."""
+    """Describe a failure, and save its input in `folder`."""
     name = hashlib.sha256(
         repr(sorted(item.files.items())).encode() + item.command.encode()
     ).hexdigest()[:12]
@@ -139,7 +156,7 @@ def report(item: Input, outcome: Outcome, folder: str | None) -> dict[str, Any]:
 
 
 def keep_input(item: Input, place: Path) -> None:
-    """Write an input so that `load_input` finds it again."""
+    """Write an input for `load_input`."""
     for name, data in item.files.items():
         (place / "files" / name).parent.mkdir(parents=True, exist_ok=True)
         (place / "files" / name).write_bytes(data)
@@ -154,7 +171,7 @@ def keep_input(item: Input, place: Path) -> None:
 
 
 def load_input(place: Path) -> Input:
-    """An input that `keep_input` wrote."""
+    """Read an input that `keep_input` wrote."""
     call = json.loads((place / "call.json").read_text())
     files = {
         str(path.relative_to(place / "files")): path.read_bytes()

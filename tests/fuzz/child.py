@@ -1,4 +1,4 @@
-"""A process that serves many calls of the command line, one after the other: nothing is imported or compiled twice.
+"""Serve many calls of the command line in one process, so that nothing is loaded twice.
 
 Each line of its standard input is the arguments of a call as JSON; each line of its answer says
 what became of it. It shares the limits of memory and time with nobody: its parent stops and
@@ -20,18 +20,18 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-#: Address space [bytes] that a call may take beyond what the loaded program takes.
+#: Address space that a call may take in addition to the loaded program [bytes].
 SPACE_BYTES = 3 * 2**29
 
 
 def innermost_is_ours(error: BaseException, package: str) -> bool:
-    """Whether an exception was raised by a statement of gyrostab and not by a library that it called."""
+    """Return whether gyrostab itself raised an exception, not a library that it called."""
     frames = traceback.extract_tb(error.__traceback__)
     return bool(frames) and frames[-1].filename.startswith(package)
 
 
 def own_fault(error: BaseException | None, package: str) -> str:
-    """Where our own code raised an exception that was then taken for a damaged file; empty when it did not."""
+    """Return where our own code raised an error reported as a damaged file, or ""."""
     from gyrostab.errors import DamageError
     from gyrostab.store.layout import ChunkDamage
 
@@ -52,7 +52,7 @@ def own_fault(error: BaseException | None, package: str) -> str:
 
 
 def unexpected(error: BaseException | None) -> str:
-    """The last frames of what ended with exit code 1."""
+    """Return the last frames of an error with exit code 1."""
     if error is None:
         return ""
     frames = [
@@ -63,7 +63,7 @@ def unexpected(error: BaseException | None) -> str:
 
 
 def peak_bytes(*, reset: bool = False) -> int:
-    """Largest resident memory since the last reset."""
+    """Return the largest resident memory since the last reset [bytes]."""
     if reset:
         with contextlib.suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")
@@ -76,7 +76,7 @@ def peak_bytes(*, reset: bool = False) -> int:
 
 
 def space_bytes() -> int:
-    """Address space in use."""
+    """Return the address space in use [bytes]."""
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 
@@ -110,11 +110,11 @@ def call(arguments: list[str], seen: dict[str, Any]) -> dict[str, Any]:
 
 
 def serve() -> None:
-    """Answer until the input ends."""
+    """Answer requests until the input ends."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     faulthandler.enable(open(sys.argv[1], "w"))  # noqa: SIM115
-    os.fsync = lambda handle: None  # the disk is not what is tested here
+    os.fsync = lambda handle: None  # the disk is not under test
     from gyrostab import cli
 
     seen: dict[str, Any] = {"error": None}

@@ -1,4 +1,4 @@
-"""Damage: what a bad cable, a full disk, a careless editor or an attacker does to bytes."""
+"""Damage bytes like a bad cable, a full disk, a careless editor or an attacker."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 
 from tests.fuzz.seeds import Seed
 
-#: Numbers at which counters, sizes and signs break.
+#: Critical values of counters, sizes and signs.
 INTEGERS = (
     0,
     1,
@@ -26,21 +26,72 @@ INTEGERS = (
     2**63,
     2**64 - 1,
 )
-#: Texts at which parsers break.
+#: Critical texts for parsers.
 TOKENS = (
-    b"", b"nan", b"-nan", b"inf", b"1e999", b"-1e-320", b"-0", b"0", b"1", b"-1", b"9" * 5000, b"1e300", b"0x10", b"1_0", b"+", b"-", b".",
-    b"e5", b"2300-01-01T00:00:00", b"1500-01-01", b"2026-02-30", b"2026-03-01T25:00:00Z", b"9223372036854775807", b"9223372036854775808",
-    b"1e19", b"\xff\xfe", b"\x00", b"\"", b"'", b"#", b"[", b"]", b"[]", b"{}", b"null", b"true", b"\xc2\xb5s", b"time", b"gyro_x",
-    b"[deg/h]", b"deg/s", b"1,5", b"\r", b"\n", b"\t", b"0.1 arcsec/s", b"{{7*7}}", b"$\\frac{$", b"<svg>", b"/", b"../x",
+    b"",
+    b"nan",
+    b"-nan",
+    b"inf",
+    b"1e999",
+    b"-1e-320",
+    b"-0",
+    b"0",
+    b"1",
+    b"-1",
+    b"9" * 5000,
+    b"1e300",
+    b"0x10",
+    b"1_0",
+    b"+",
+    b"-",
+    b".",
+    b"e5",
+    b"2300-01-01T00:00:00",
+    b"1500-01-01",
+    b"2026-02-30",
+    b"2026-03-01T25:00:00Z",
+    b"9223372036854775807",
+    b"9223372036854775808",
+    b"1e19",
+    b"\xff\xfe",
+    b"\x00",
+    b'"',
+    b"'",
+    b"#",
+    b"[",
+    b"]",
+    b"[]",
+    b"{}",
+    b"null",
+    b"true",
+    b"\xc2\xb5s",
+    b"time",
+    b"gyro_x",
+    b"[deg/h]",
+    b"deg/s",
+    b"1,5",
+    b"\r",
+    b"\n",
+    b"\t",
+    b"0.1 arcsec/s",
+    b"{{7*7}}",
+    b"$\\frac{$",
+    b"<svg>",
+    b"/",
+    b"../x",
     b"\xf0\x9f\x8c\x8d",
-    b"1e-300", b"1" + b"0" * 400, b"seconds since now", b"[[[[[[[[[[", b"\"\"\"",
-)  # fmt: skip
+    b"1e-300",
+    b"1" + b"0" * 400,
+    b"seconds since now",
+    b"[[[[[[[[[[",
+    b'"""',
+)
 _TOKEN = re.compile(rb"[^\s,;=\[\]{}:\"]+|[,;=\[\]{}:\"\n]")
 TEXT = ("text", "las", "layout", "model", "options")
 
 
 def damage(seed: Seed, others: list[Seed], draw: random.Random) -> dict[str, bytes]:
-    """The files of a seed with one or several of them damaged."""
+    """Return the files of a seed, with one or several of them damaged."""
     files = dict(seed.files)
     names = [name for name in files if name not in seed.keep]
     small = [name for name in names if len(files[name]) < 4096]
@@ -65,7 +116,7 @@ def damage(seed: Seed, others: list[Seed], draw: random.Random) -> dict[str, byt
 
 
 def damage_bytes(data: bytes, spare: bytes, draw: random.Random, *, textual: bool) -> bytes:
-    """Some bytes, damaged in one to a few ways."""
+    """Damage bytes in one or several ways."""
     for _ in range(draw.choice((1, 1, 1, 2, 3, 8))):
         data = (
             replace_token(data, draw)
@@ -76,7 +127,7 @@ def damage_bytes(data: bytes, spare: bytes, draw: random.Random, *, textual: boo
 
 
 def place_in(data: bytes | bytearray, draw: random.Random) -> int:
-    """A place, as often near one of the ends as anywhere: that is where headers and footers are."""
+    """Draw a position, half of the time near one of the ends, where headers and footers are."""
     kind = draw.random()
     if kind < 0.35:
         return draw.randrange(min(len(data), 512))

@@ -17,7 +17,7 @@ import pytest
 
 ROWS = 80
 RATE = 10.0
-#: In the text of an input this stands for the folder that it is written to.
+#: Placeholder in inputs for the folder that they are written to.
 FOLDER = "@FOLDER@"
 WINDOWS = ("--window", "4s", "--step", "1s", "--taus", "6")
 
@@ -29,15 +29,15 @@ class Seed:
     Attributes
     ----------
     format : str
-        The row of the result table.
+        Row of the result table.
     files : dict
         Name within a folder -> bytes.
     main : str
-        File or folder that is given to the command.
+        File or folder to pass to the command.
     options : tuple of str
         Reading options that the format needs.
     commands : tuple of str
-        Commands that take it.
+        Commands that accept it.
     keep : tuple of str
         Files that are not damaged.
     """
@@ -51,7 +51,7 @@ class Seed:
 
 
 def signals() -> tuple[np.ndarray, np.ndarray]:
-    """Two gyro axes [deg/h, counts] and a temperature [degC]."""
+    """Return two gyro axes [deg/h, counts] and a temperature [degC]."""
     generator = np.random.default_rng(11)
     return generator.integers(-2000, 2000, (2, ROWS)), np.round(20.0 + 0.01 * np.arange(ROWS), 2)
 
@@ -63,7 +63,7 @@ def folder() -> Iterator[Path]:
 
 
 def contents(path: Path, root: Path) -> dict[str, bytes]:
-    """Bytes of a file, or of all files of a folder, by their name below `root`."""
+    """Return the bytes of a file, or of all files of a folder, by their name below `root`."""
     files = [path] if path.is_file() else sorted(item for item in path.rglob("*") if item.is_file())
     return {str(item.relative_to(root)): item.read_bytes() for item in files}
 
@@ -127,7 +127,7 @@ def text_seeds() -> Iterator[Seed]:
 
 
 def columns() -> dict[str, tuple[str, np.ndarray]]:
-    """Columns with their units, as formats of typed columns hold them."""
+    """Return columns with units, for formats with typed columns."""
     (x, y), temperature = signals()
     return {
         "time": ("us", np.arange(ROWS, dtype=np.int64) * 100_000),
@@ -257,7 +257,7 @@ def hdf5_seeds() -> Iterator[Seed]:
 
 
 def undate(path: Path) -> None:
-    """Write over the date in the header of a MATLAB file."""
+    """Overwrite the date in the header of a MATLAB file."""
     with path.open("r+b") as file:
         file.write(b"MATLAB 5.0 MAT-file".ljust(116))
 
@@ -383,7 +383,10 @@ def las_seeds() -> Iterator[Seed]:
     head = (
         "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 7.9 :\nSTEP.S 0.1 :\nNULL. -999.25 :\n"
     )
-    curves = "~C\nTIME.S : time\nGYRO_X.deg/h : rate\nGYRO_Y.deg/h : rate\nTEMPERATURE.degC : in the tool\n~A\n"
+    curves = (
+        "~C\nTIME.S : time\nGYRO_X.deg/h : rate\nGYRO_Y.deg/h : rate\nTEMPERATURE.degC : in "
+        "the tool\n~A\n"
+    )
     yield Seed("las", {"log.las": (head + curves + rows + "\n").encode()}, "log.las")
 
 
@@ -579,7 +582,7 @@ def option_seeds() -> Iterator[Seed]:
 
 
 def move_job(data: bytes, old: str, new: str) -> bytes:
-    """The job file of a run in another folder; its checksum is made anew if it was right."""
+    """Move a job file to another folder; a valid checksum is recomputed."""
     from gyrostab.jobs.job import _hash_json
 
     moved = data.replace(old.encode(), new.encode())
@@ -596,7 +599,7 @@ def move_job(data: bytes, old: str, new: str) -> bytes:
 
 
 def checkpoint_seeds() -> Iterator[Seed]:
-    """A run that was stopped before its product was written."""
+    """Return a run that was stopped before its product was written."""
     import contextlib
     import io
     import os
@@ -661,7 +664,7 @@ MAKERS: tuple[Callable[[], Iterator[Seed]], ...] = (
 
 
 def make_seeds() -> dict[str, list[Seed]]:
-    """Valid inputs by format."""
+    """Return valid inputs by format."""
     found: dict[str, list[Seed]] = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "1767225600")

@@ -1,4 +1,4 @@
-"""The other end of `tests.fuzz.child`: start it, ask it, and replace it when it hangs, crashes or grows old."""
+"""Start `tests.fuzz.child`, send it calls, and replace it when it hangs, crashes or is old."""
 
 from __future__ import annotations
 
@@ -17,21 +17,20 @@ from pathlib import Path
 
 from tests.fuzz.seeds import CHANGED_NS, FOLDER, WINDOWS, move_job, text_seeds
 
-#: Of the processor; on the clock it is `PATIENCE` times as much, for a child that waits for
-#: something.
+#: Limit of processor time [s]; the limit of elapsed time is `PATIENCE` times as much.
 LIMIT_SECONDS = 20.0
 PATIENCE = 6
 LIMIT_BYTES = 2**30
-#: Calls after which a child is replaced, so that what libraries keep does not add up.
+#: Calls after which a child is replaced, so that memory kept by libraries does not accumulate.
 CALLS = 4000
-#: The windows of the harness are a second apart: a gap of days, which a damaged stamp easily makes,
-#: would hold a million of them.
+#: The windows of the harness are a second apart; a gap of days, easily made by a damaged stamp,
+#: would contain a million of them.
 MAX_GAP = ("--max-gap", "1h")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of an input."""
+    """Result for one input."""
 
     code: int | str  # exit code, "signal 11", "hang", "memory", "traceback", "own fault"
     seconds: float
@@ -40,7 +39,7 @@ class Outcome:
     text: str
 
     def is_right(self, *, may_be_interrupted: bool = False) -> bool:
-        """Whether the exit code is one that the contract allows here."""
+        """Return whether the contract allows the exit code here."""
         return self.code in ((0, 2, 3) if may_be_interrupted else (0, 2))
 
 
@@ -111,7 +110,7 @@ class Server:
             raise RuntimeError("the child does not start")
 
     def _ask(self, request: object, seconds: float) -> dict | None:
-        """The answer, or None when there is none in time."""
+        """Return the answer, or None if it does not come in time."""
         assert self.child is not None
         assert self.child.stdin is not None
         assert self.child.stdout is not None
@@ -121,9 +120,7 @@ class Server:
         except BrokenPipeError:
             return None
         begun, ready = self._worked(), []
-        for _ in range(
-            int(4 * PATIENCE)
-        ):  # a machine with other work gives the child little of its time
+        for _ in range(int(4 * PATIENCE)):  # on a busy machine the child gets little processor time
             ready, _, _ = select.select([self.child.stdout], [], [], seconds / 4)
             if ready or self._worked() - begun > seconds:
                 break
@@ -131,7 +128,7 @@ class Server:
         return json.loads(line) if line.endswith(b"\n") else None
 
     def _worked(self) -> float:
-        """Processor time of the child [s]; the time on the clock where the system does not say it."""
+        """Return the processor time of the child [s], or elapsed time if that is unavailable."""
         assert self.child is not None
         try:
             fields = Path(f"/proc/{self.child.pid}/stat").read_text().rpartition(")")[2].split()
@@ -185,7 +182,7 @@ class Server:
 
     @contextlib.contextmanager
     def written(self, files: dict[str, bytes]) -> Iterator[Path]:
-        """A new folder with the files of an input, removed afterwards."""
+        """Write the files of an input to a new folder, which is removed afterwards."""
         import shutil
 
         self.number += 1
@@ -205,13 +202,13 @@ class Server:
     def try_input(
         self, files: dict[str, bytes], command: str, main: str, options: Sequence[str] = ()
     ) -> Outcome:
-        """Give an input to a command."""
+        """Pass an input to a command."""
         with self.written(files) as place:
             return self.call(arguments_of(command, place, main, options))
 
 
 def arguments_of(command: str, place: Path, main: str, options: Sequence[str]) -> list[str]:
-    """The command line for an input that lies in `place`."""
+    """Return the command line for an input in `place`."""
     path, output = str(place / main), str(place / "out.nc")
     given = [option.replace(FOLDER, str(place)) for option in options]
     if command == "scan":

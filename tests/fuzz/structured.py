@@ -1,4 +1,4 @@
-"""Inputs that are well formed and odd: drawn by hypothesis from grammars of logs, stamps, options, models and layouts."""
+"""Draw unusual but well-formed inputs with hypothesis: logs, stamps, options, models."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ NAMES = st.one_of(
 
 @st.composite
 def stamp_lists(draw: Any) -> list[int]:
-    """Whole stamps of a log: even ones, with bursts, repeats, steps of the clock, gaps and reversals."""
+    """Draw the stamps of a log, with bursts, repeats, clock steps, gaps and reversals."""
     stamps, now = [], draw(st.sampled_from([0, 0, 1_767_225_600_000, -(10**6), 2**62]))
     for _ in range(draw(st.integers(1, 6))):
         step = draw(st.sampled_from([1, 1, 7, 10, 10, 100, 0, -1, -10, 1000, 10**6, 10**12]))
@@ -144,7 +144,7 @@ def stamp_lists(draw: Any) -> list[int]:
 
 
 @st.composite
-def odd_logs(draw: Any) -> Parts:
+def unusual_logs(draw: Any) -> Parts:
     stamps = draw(stamp_lists())
     unit = draw(st.sampled_from(["s", "ms", "us", "ns", "min", "d"]))
     values = draw(
@@ -191,7 +191,7 @@ def odd_logs(draw: Any) -> Parts:
 
 
 @st.composite
-def odd_options(draw: Any) -> Parts:
+def unusual_options(draw: Any) -> Parts:
     kind = draw(st.sampled_from(["stamped", "bare", "words"]))
     names = [draw(NAMES) for _ in range(draw(st.integers(1, 4)))]
     header = (
@@ -235,7 +235,7 @@ def odd_options(draw: Any) -> Parts:
 
 
 @st.composite
-def odd_models(draw: Any) -> Parts:
+def unusual_models(draw: Any) -> Parts:
     from gyrostab.physics.registry import effects
 
     values = st.one_of(
@@ -288,11 +288,15 @@ def odd_models(draw: Any) -> Parts:
     )
 
 
-STRATEGIES = {"odd logs": odd_logs(), "odd options": odd_options(), "odd models": odd_models()}
+STRATEGIES = {
+    "odd logs": unusual_logs(),
+    "odd options": unusual_options(),
+    "odd models": unusual_models(),
+}
 
 
 def draw_inputs(form: str, seed: str, count: int) -> Iterator[Parts]:
-    """Draw inputs of a kind; the same for the same seed."""
+    """Draw inputs of a kind, determined by the seed."""
     found: list[Parts] = []
 
     @seeded(seed)

@@ -1,4 +1,4 @@
-"""A short campaign, the seeds of all campaigns, and the inputs that once failed."""
+"""Test a short campaign, the seeds of all campaigns, and the inputs that once failed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COUNT = 40  # inputs of each format
 
 @pytest.mark.slow
 def test_every_seed_is_read() -> None:
-    """What the harness damages is valid before that."""
+    """The inputs are valid before the harness damages them."""
     wrong = []
     for group in seeds().values():
         for seed in group:
@@ -74,7 +74,7 @@ def test_an_input_that_once_failed(
     assert not answer["fault"]
 
 
-def test_an_exception_of_our_own_code_is_told_from_one_of_a_library() -> None:
+def test_exception_of_our_own_code_is_distinguished_from_one_of_a_library() -> None:
     import json
 
     from gyrostab import errors

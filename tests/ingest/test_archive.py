@@ -1,4 +1,4 @@
-"""Hundreds of files as one log: regular logs joined lazily."""
+"""Hundreds of regular logs concatenated lazily to one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def join(*logs: xr.Dataset, **options) -> xr.Dataset:
 
 
 def table_of(log: xr.Dataset) -> np.ndarray:
-    """First sample, end and length of every gap."""
+    """Return first sample, end and length of every gap."""
     table = gap_table(log)
     index = log.xindexes["time"]
     assert isinstance(index, TimeGridIndex)
@@ -55,7 +55,7 @@ def table_of(log: xr.Dataset) -> np.ndarray:
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".zarr"])
-def test_stored_pieces_in_any_order_give_back_the_whole(tmp_path: Path, suffix: str) -> None:
+def test_stored_pieces_in_any_order_restore_the_whole_log(tmp_path: Path, suffix: str) -> None:
     values = signal()
     values[:, 1999:2001] = values[:, 4799] = 1.0  # pieces begin and end with a sample
     paths = []
@@ -85,7 +85,7 @@ def test_stored_pieces_in_any_order_give_back_the_whole(tmp_path: Path, suffix: 
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_every_sample_that_some_piece_has_is_there_once(data: st.DataObject) -> None:
+def test_every_sample_of_any_piece_appears_once(data: st.DataObject) -> None:
     size = data.draw(st.integers(300, 900), label="samples")
     values = signal(size, seed=data.draw(st.integers(0, 99), label="seed"))
     spans = data.draw(
@@ -117,7 +117,7 @@ def test_every_sample_that_some_piece_has_is_there_once(data: st.DataObject) -> 
     np.testing.assert_array_equal(missing, np.isnan(expected[0, first:last]))
 
 
-def test_the_table_of_gaps_keeps_causes_and_marks_what_lies_between() -> None:
+def test_table_of_gaps_keeps_causes_and_lists_gaps_between_logs() -> None:
     values = signal(1000, holes=0)
     values[:, 100:120] = values[:, 800:810] = np.nan
     first, second = cut(values, (0, 400), (600, 1000))
@@ -129,7 +129,7 @@ def test_the_table_of_gaps_keeps_causes_and_marks_what_lies_between() -> None:
     assert table["rows"].tolist() == [20, 0, 0]
 
 
-def test_joining_gives_what_reading_all_source_files_gives(tmp_path: Path) -> None:
+def test_concatenated_logs_equal_a_log_of_all_source_files(tmp_path: Path) -> None:
     rng = np.random.default_rng(8)
     stamps = START + (np.arange(3000) * 1e9 / RATE + rng.uniform(0, 3e6, 3000)).astype(np.int64)
     values = np.round(rng.normal(size=3000), 4)
@@ -176,7 +176,7 @@ def test_it_is_lazy_and_its_graph_is_small(tmp_path: Path) -> None:
     assert len(dict(graph)) < 40
 
 
-def test_chunks_lie_on_a_raster() -> None:
+def test_chunks_have_one_length() -> None:
     values = np.zeros((2, 400_000))
     joined = join(
         *(rechunked(log, 70_000) for log in cut(values, (0, 140_000), (140_300, 400_000)))
@@ -187,7 +187,7 @@ def test_chunks_lie_on_a_raster() -> None:
 @pytest.mark.parametrize(
     ("shift", "sample"), [(100_000, 0), (7_000_000, 0), (-9_000_000, 0), (13_000_000, 1)]
 )
-def test_a_log_between_the_samples_goes_to_the_nearest(shift: int, sample: int) -> None:
+def test_log_between_the_samples_takes_the_nearest(shift: int, sample: int) -> None:
     values = signal(1000, holes=0)
     first, second = *cut(values, (0, 500)), *cut(values, (600, 1000), shift=shift)
     joined = join(first, second)
@@ -253,7 +253,7 @@ def test_logs_of_other_rates_and_kinds_are_refused_by_name() -> None:
         join(first, angle)
 
 
-def test_samples_in_common_tell_where_a_log_lies() -> None:
+def test_common_samples_locate_a_log() -> None:
     values = signal(3000)
     joined = join(
         *cut(values, (0, 2000)), *cut(values, (1500, 3000), shift=70_000_000)
@@ -262,7 +262,7 @@ def test_samples_in_common_tell_where_a_log_lies() -> None:
     assert "10.0 s from" in said(joined)
 
 
-def test_a_copy_that_differs_here_and_there_is_still_a_copy() -> None:
+def test_damaged_copy_is_recognised() -> None:
     values = signal(2000, holes=0)
     first, second = values[:, :1200].copy(), values[:, 1000:].copy()
     first[:, 1100:1110] = np.nan
@@ -273,7 +273,7 @@ def test_a_copy_that_differs_here_and_there_is_still_a_copy() -> None:
     assert len(gap_table(joined)) == 0
 
 
-def test_a_clock_that_begins_again_is_no_overlap() -> None:
+def test_restarted_clock_is_not_an_overlap() -> None:
     first, second = signal(1000, seed=1, holes=0), signal(800, seed=2, holes=0)
     joined = join(log_of(first), log_of(second, 3))
     np.testing.assert_array_equal(
@@ -299,7 +299,7 @@ def test_a_long_pause_is_a_step_of_the_clock() -> None:
         join(log_of(values), far, max_gap="long")
 
 
-def test_a_few_samples_on_top_of_others_are_no_step_of_the_clock() -> None:
+def test_small_overlap_is_not_a_step_of_the_clock() -> None:
     first, second = signal(500, seed=1, holes=0), signal(500, seed=2, holes=0)
     joined = join(log_of(first), log_of(second, 495))
     np.testing.assert_array_equal(joined.rate, np.concatenate([first, second[:, 5:]], axis=1))
@@ -330,7 +330,7 @@ def test_axes_and_channels_that_some_logs_lack_are_missing_there() -> None:
 
 
 def with_temperature(log: xr.Dataset, seconds: np.ndarray) -> xr.Dataset:
-    """A temperature that says its own second, on its own stamps."""
+    """Return a temperature equal to its own second, on separate stamps."""
     stamps = (START + seconds * 10**9).view("datetime64[ns]")
     return log.assign_coords(time_temperature=stamps).assign(
         temperature=("time_temperature", seconds * 1.0, {"units": "degree_Celsius"})
@@ -338,7 +338,7 @@ def with_temperature(log: xr.Dataset, seconds: np.ndarray) -> xr.Dataset:
 
 
 @pytest.mark.parametrize("lazy", [False, True])
-def test_channels_on_their_own_stamps_are_joined_once(lazy: bool) -> None:
+def test_channels_with_separate_stamps_are_concatenated_without_duplicates(lazy: bool) -> None:
     values = signal(3000, holes=0)
     spans, seconds = (
         [(0, 1500), (1000, 2000), (2500, 3000)],
@@ -385,7 +385,6 @@ def test_two_hundred_logs_open_without_being_read() -> None:
 
 
 # --- memory
-# ------------------------------------------------------------------------------------------------------
 
 READ_THROUGH = """
 import sys, warnings
@@ -398,7 +397,8 @@ def most():
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
 def through(files):
-    with warnings.catch_warnings(), dask.config.set(scheduler="threads", num_workers=2), read_log(files) as log:
+    threads = dask.config.set(scheduler="threads", num_workers=2)
+    with warnings.catch_warnings(), threads, read_log(files) as log:
         warnings.simplefilter("ignore")
         for begin in range(0, log.sizes["time"], 60_000):  # never whole chunks
             log.rate[:, begin : begin + 60_000].values
@@ -415,7 +415,7 @@ print(few, through(files))
     reason="only Linux tells the peak of the memory this way",
 )
 def test_memory_does_not_grow_with_the_number_of_files(tmp_path: Path) -> None:
-    """Each file has six chunks of 256 KiB, the last of each axis short, and shares some samples with the next."""
+    """Files of six chunks of 256 KiB, the last of each axis short, which overlap a little."""
     size, paths = 70_000, []
     values = signal(size, holes=0)
     values[:, -100:] = values[:, :100]

@@ -1,4 +1,4 @@
-"""Damaged and missing files of an archive, which leave a gap."""
+"""Damaged and missing files of an archive leave a gap."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support.regular_logs import RATE, cut, log_of, said, signal
 
 @pytest.fixture
 def archive(tmp_path: Path) -> list[Path]:
-    """Five raw files of ten seconds each, a second apart; their names sort like run_9, run_10."""
+    """Write five raw files of ten seconds, a second apart, named like run_9, run_10."""
     values = signal(2750, holes=0)
     paths = []
     for place in range(5):
@@ -76,12 +76,12 @@ def test_the_first_and_the_last_file_leave_no_gap(archive: list[Path]) -> None:
     log = load_log(archive)
     assert gap_table(log)["cause"].tolist() == ["missing"] * 3
     assert (
-        "run_8.csv: the file is empty; copy it again; the file is left out: where no other file has its time"
-        in said(log)
+        "run_8.csv: the file is empty; copy it again; the file is left out: where no other file "
+        "has its time" in said(log)
     )
 
 
-def test_more_than_half_is_no_damage(archive: list[Path]) -> None:
+def test_more_than_half_unreadable_is_an_error(archive: list[Path]) -> None:
     for path in archive[:3]:
         empty(path)
     with pytest.raises(
@@ -94,7 +94,7 @@ def test_more_than_half_is_no_damage(archive: list[Path]) -> None:
     assert two.attrs["unreadable_files"] == ["run_8.csv"]
 
 
-def test_a_wrong_option_is_no_damage(archive: list[Path]) -> None:
+def test_wrong_option_is_not_taken_for_damage(archive: list[Path]) -> None:
     with pytest.raises(OptionError, match="no such column"):
         read_log(archive, map={"wx": "gyro_x"})
     with pytest.raises(FormatError, match="no reader takes this directory"):
@@ -143,7 +143,7 @@ def test_raw_files_and_regular_logs_do_not_mix(archive: list[Path], tmp_path: Pa
         read_log([path, archive[0]])
 
 
-def test_each_file_is_told_as_it_is_read(archive: list[Path]) -> None:
+def test_progress_is_reported_for_each_file(archive: list[Path]) -> None:
     told: list[tuple[int, int, str]] = []
     log = load_log(
         archive, on_file=lambda number, total, path: told.append((number, total, path.name))
@@ -152,7 +152,7 @@ def test_each_file_is_told_as_it_is_read(archive: list[Path]) -> None:
     assert "on_file" not in log.attrs["history"]
 
 
-def test_the_command_line_goes_on_unless_strict(
+def test_command_line_continues_unless_strict(
     archive: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     binary(archive[2])

@@ -1,4 +1,4 @@
-"""Recordings whose axes stand in files of their own: one log comes of them, and a skew between the axes is stated."""
+"""Recordings with one file for each axis form one log, with a note on the skew of the axes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def write(
     stamped: bool = True,
     extra: bool = False,
 ) -> Path:
-    """One axis at some samples of the grid, its stamps `skew` samples late."""
+    """Make one axis at some samples of the grid, with its stamps `skew` samples late."""
     kept = np.arange(N) if samples is None else samples
     stamps = START + np.rint((kept + skew) * PERIOD_NS).astype(np.int64)
     columns = {f"gyro_{axis} [deg/h]": truth(axis)[kept]}
@@ -70,7 +70,7 @@ def test_three_files_of_one_axis_are_one_log(tmp_path, suffix):
     np.testing.assert_array_equal(log.rate.values, [truth(axis) for axis in "xyz"])
     assert gap_table(log).empty
     assert log.attrs["source_files"] == [f"gyro_{axis}{suffix}" for axis in "xyz"]
-    note = next(note for note in log.attrs["notes"] if "stamps of their own" in note)
+    note = next(note for note in log.attrs["notes"] if "separate stamps" in note)
     assert all(f"{axis} in gyro_{axis}{suffix}" in note for axis in "xyz")
     assert not any("missing" in note or "lie on samples" in note for note in log.attrs["notes"])
 
@@ -100,7 +100,7 @@ def test_a_skew_is_stated_and_each_sample_is_the_nearest(tmp_path, skew, shift):
         assert f"{abs(skew - round(skew)):.2g} of a sample" in note
 
 
-def test_what_one_axis_lacks_is_missing_in_that_axis_and_a_gap(tmp_path):
+def test_missing_samples_of_one_axis_are_a_gap(tmp_path):
     kept = np.setdiff1d(np.arange(N), np.arange(500, 520))
     log = regularise(
         read_log([write(tmp_path / "x.csv", "x"), write(tmp_path / "y.csv", "y", samples=kept)])
@@ -143,7 +143,7 @@ def test_regular_logs_of_one_axis_are_one_log(tmp_path):
     assert not any("lie on samples" in note or "missing" in note for note in log.attrs["notes"])
 
 
-def test_axes_recorded_one_after_the_other_stay_pieces_in_time(tmp_path):
+def test_axes_recorded_one_after_the_other_are_concatenated_in_time(tmp_path):
     paths = [
         write(tmp_path / "x.csv", "x", samples=np.arange(900)),
         write(tmp_path / "y.csv", "y", samples=np.arange(1000, N)),
@@ -154,7 +154,7 @@ def test_axes_recorded_one_after_the_other_stay_pieces_in_time(tmp_path):
     assert any("axis x is not in y.csv" in note for note in log.attrs["notes"])
 
 
-def test_long_files_stay_on_disk_and_are_read_directly(tmp_path, monkeypatch):
+def test_long_files_stay_on_disk_and_are_read_lazily(tmp_path, monkeypatch):
     monkeypatch.setattr(buffers, "_MAX_PLAIN_VALUES", 0)
     monkeypatch.setattr(files, "SPILL_BYTES", 1000)
     paths = [write(tmp_path / f"{axis}.csv", axis) for axis in "xyz"]
@@ -176,7 +176,7 @@ def test_logs_are_grouped_by_the_axes_they_share():
 def write_miniseed(
     path: Path, codes: dict[str, str], *, skew: dict[str, float], start: int = 0, size: int = N
 ) -> Path:
-    """Codes of channels and the axes that they hold, in 100 counts a deg/h; stamps in microseconds, as miniSEED 2 has them."""
+    """Write channels by code, 100 counts for each deg/h, with stamps in microseconds."""
     from pymseed import MS3TraceList
 
     with path.open("wb") as file:
@@ -207,7 +207,7 @@ def test_miniseed_files_of_one_channel_are_one_log(tmp_path):
         "z.mseed",
         "x.mseed",
         "y.mseed",
-    ]  # in the order of their first stamps
+    ]  # by first stamps
     assert any(
         "y.mseed" in note and "0.5 of a sample" in note for note in log.attrs["notes"]
     )  # from z, which begins first
@@ -234,7 +234,7 @@ def test_axes_of_other_rates_are_refused_by_name(tmp_path):
         regularise(read_log([x, y]))
 
 
-def test_rows_that_were_selected_are_not_taken_for_the_whole(tmp_path):
+def test_selected_rows_are_refused(tmp_path):
     raw = read_log([write(tmp_path / f"{axis}.csv", axis) for axis in "xy"])
     with pytest.raises(SchemaError, match="regularise the whole"):
         regularise(raw.isel(row=slice(0, 3000)))

@@ -1,4 +1,4 @@
-"""Work and memory of the readers stay within the bytes that are there, and within limits that a message names."""
+"""Time and memory of the readers are bounded by the bytes of the file and by named limits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ regularise_module = sys.modules["gyrostab.ingest.grid.regularise"]
 
 
 def write_stamped_netcdf(path: Path, rows: int) -> Path:
-    """A CF file with an int64 stamp per sample at 400 Hz."""
+    """Write a CF file with an int64 stamp for each sample at 400 Hz."""
     with netCDF4.Dataset(path, "w") as file:
         file.createDimension("time", rows)
         time = file.createVariable("time", "i8", ("time",))
@@ -42,7 +42,7 @@ def write_stamped_netcdf(path: Path, rows: int) -> Path:
 
 
 def peak_of(work: Callable[[], object]) -> int:
-    """Bytes that Python and numpy allocate at most while `work` runs."""
+    """Return the peak of the memory that Python and numpy allocate in `work` [bytes]."""
     tracemalloc.start()
     try:
         work()
@@ -66,7 +66,7 @@ def test_foreign_netcdf_takes_less_memory_than_its_stamps(
 
 
 def write_csv(path: Path, stamps_ns: np.ndarray) -> Path:
-    """A text log of one axis with these stamps."""
+    """Write a text log of one axis with these stamps."""
     rows = "".join(f"{stamp},{row % 7}.5\n" for row, stamp in enumerate(stamps_ns.tolist()))
     path.write_text("time [ns],gyro_x [deg/h]\n" + rows)
     return path
@@ -76,20 +76,21 @@ START_NS = 1_780_000_000 * 10**9
 DAY_NS = 86_400 * 10**9
 
 
-def test_stamp_days_ahead_at_10_khz_is_named_before_the_grid_is_laid_out(tmp_path: Path) -> None:
+def test_stamp_days_ahead_at_10_khz_is_named_before_the_grid_is_allocated(tmp_path: Path) -> None:
     stamps = START_NS + np.arange(5000) * 100_000
     stamps[-1] += 9 * DAY_NS
     path = write_csv(tmp_path / "log.csv", stamps)
     with pytest.raises(
         TimeError,
-        match=r"log\.csv: from 2026-05-28T20:26:40.499 \(row 4998\) to 2026-06-06.*--max-gap .*--limit grid_samp",
+        match=r"log\.csv: from 2026-05-28T20:26:40.499 \(row 4998\) to 2026-06-06.*--max-gap "
+        r".*--limit grid_samp",
     ):
         regularise(read_log(path))
     stepped = regularise(read_log(path), max_gap="1h")  # as the message advises
     assert stepped.sizes["time"] == 5001
 
 
-def test_stamps_a_nanosecond_apart_are_refused_before_the_grid_is_laid_out(tmp_path: Path) -> None:
+def test_stamps_a_nanosecond_apart_are_refused_before_the_grid_is_allocated(tmp_path: Path) -> None:
     stamps = START_NS + np.sort(
         np.concatenate([np.arange(3000) * 2_500_000, np.arange(3000) * 2_500_000 + 1])
     )
@@ -107,7 +108,7 @@ def test_gap_of_eight_days_at_400_hz_stays_a_gap(tmp_path: Path) -> None:
     assert table.loc[0, "missing_share"] == pytest.approx(1.0 - 6000 / (8 * 86_400 * 400 + 6000))
 
 
-def test_logs_years_apart_are_refused_before_the_grid_is_laid_out(tmp_path: Path) -> None:
+def test_logs_years_apart_are_refused_before_the_grid_is_allocated(tmp_path: Path) -> None:
     for number, start in enumerate(("2026-01-01", "2026-01-09T12:00:00")):
         to_netcdf(
             make_log(np.arange(2000.0) % 5, rate=1e4, unit="deg/h", start=start),
@@ -115,7 +116,8 @@ def test_logs_years_apart_are_refused_before_the_grid_is_laid_out(tmp_path: Path
         )
     with pytest.raises(
         TimeError,
-        match=r"0\.nc ends at 2026-01-01.*1\.nc begins at 2026-01-09.*--max-gap.*--limit grid_samples=",
+        match=r"0\.nc ends at 2026-01-01.*1\.nc begins at 2026-01-09.*--max-gap.*--limit "
+        r"grid_samples=",
     ):
         read_log(tmp_path / "?.nc")
 
@@ -227,7 +229,7 @@ def test_values_of_foreign_files_stay_in_the_file(
     np.testing.assert_array_equal(regularise(lazy)["rate"], regularise(whole)["rate"])
 
 
-def test_windows_of_a_file_whose_values_stay_there_are_those_of_values_in_memory(
+def test_windows_of_values_in_a_file_equal_those_in_memory(
     tmp_path: Path,
 ) -> None:
     path = write_stamped_netcdf(tmp_path / "log.nc", 300_000)
@@ -238,7 +240,7 @@ def test_windows_of_a_file_whose_values_stay_there_are_those_of_values_in_memory
     np.testing.assert_array_equal(part["avar"], whole["avar"].isel(time=slice(0, 5)))
 
 
-def test_store_that_claims_samples_it_never_held_is_refused(tmp_path: Path) -> None:
+def test_store_that_declares_unwritten_samples_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log.zarr"
     write_zarr(path, 3)
     group = zarr.open_group(path, mode="r+")
@@ -246,7 +248,8 @@ def test_store_that_claims_samples_it_never_held_is_refused(tmp_path: Path) -> N
     group["gyro"].resize((10**11, 3))
     with pytest.raises(
         FormatError,
-        match=r"log\.zarr: it claims 1e\+11 samples in each of 4 columns, but holds .* bytes.*--limit stored_samples=4e\+11",
+        match=r"log\.zarr: it declares 1e\+11 samples in each of 4 columns, but holds .* "
+        r"bytes.*--limit stored_samples=4e\+11",
     ):
         read_log(path)
 
@@ -262,18 +265,20 @@ def test_file_of_unwritten_variables_is_refused(suffix: str, tmp_path: Path) -> 
         if suffix == "nc":
             file["time"].make_scale("time")
             file["gyro_x"].dims[0].attach_scale(file["time"])
-    with pytest.raises(FormatError, match=r"claims 1e\+11 samples .*--limit stored_samples=2e\+11"):
+    with pytest.raises(
+        FormatError, match=r"declares 1e\+11 samples .*--limit stored_samples=2e\+11"
+    ):
         read_log(path)
 
 
-def test_own_log_that_claims_samples_it_never_held_is_refused(tmp_path: Path) -> None:
+def test_own_log_that_declares_unwritten_samples_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log.zarr"
     to_zarr(make_log(np.arange(200_000.0) % 7, rate=100.0, unit="deg/h"), path)
     for name in (".zmetadata", "rate/.zarray"):
         file = path / name
         file.write_text(file.read_text().replace("200000", "100000000000"))
     with pytest.raises(
-        FormatError, match=r"log\.zarr: it claims 1e\+11 samples .*--limit stored_samples"
+        FormatError, match=r"log\.zarr: it declares 1e\+11 samples .*--limit stored_samples"
     ):
         read_log(path)
 
@@ -321,7 +326,7 @@ def test_flipped_bytes_in_a_classic_header_take_no_memory(tmp_path: Path) -> Non
 
 
 def write_wide_csv(path: Path, header: str, columns: int) -> Path:
-    """A text log of one axis, with very many further columns."""
+    """Write a text log of one axis with very many further columns."""
     names = ["time [s]", "gyro_x [deg/h]", *(header.format(number) for number in range(columns))]
     rows = (",".join([f"{row / 100}", "2.5", *["1.5"] * columns]) for row in range(6))
     path.write_text("\n".join([",".join(names), *rows]) + "\n")
@@ -346,7 +351,7 @@ def test_table_of_20_000_columns_is_read_for_those_that_are_used(
         )
 
 
-def test_limit_of_channels_is_lifted_by_its_option(tmp_path: Path) -> None:
+def test_limit_of_channels_is_raised_by_its_option(tmp_path: Path) -> None:
     path = write_wide_csv(tmp_path / "log.csv", "c{} [V]", 5)
     assert len(read_log(path, limits={"channels": 2}).data_vars) == 3
     mapped = read_log(path, limits={"channels": 2}, map={"c4": "c4"})
@@ -359,7 +364,8 @@ def test_table_of_100_000_columns_is_refused_at_once(header: str, tmp_path: Path
     begun = time.process_time()
     with pytest.raises(
         FormatError,
-        match=r"it has 100,002 columns.* the limit is 3e\+04 columns, and --limit columns=1.1e\+05 lifts it",
+        match=r"it has 100,002 columns.* the limit is 3e\+04 columns, and --limit "
+        r"columns=1.1e\+05 lifts it",
     ):
         read_log(path)
     assert time.process_time() - begun < 10.0
@@ -372,7 +378,7 @@ def test_line_of_a_wide_table_is_longer_than_the_usual_head(tmp_path: Path) -> N
 
 
 def write_gappy_netcdf(path: Path, rows: int, stamps: np.ndarray) -> Path:
-    """A CF file with lost rows, missing cells of one axis, and a channel that is filled in every tenth row."""
+    """Write a CF file with lost rows, missing cells, and a channel filled in every tenth row."""
     draw = np.random.default_rng(6)
     with netCDF4.Dataset(path, "w") as file:
         file.createDimension("time", rows)
@@ -392,7 +398,7 @@ def write_gappy_netcdf(path: Path, rows: int, stamps: np.ndarray) -> Path:
 
 
 @pytest.mark.parametrize("even", [True, False])
-def test_log_of_values_that_stay_in_the_file_is_the_log_of_values_in_memory(
+def test_log_of_values_in_a_file_equals_that_in_memory(
     even: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(arrays, "BATCH_ROWS", 1024)
@@ -406,7 +412,7 @@ def test_log_of_values_that_stay_in_the_file_is_the_log_of_values_in_memory(
     assert whole.attrs["notes"] == lazy.attrs["notes"]
 
 
-def test_even_stamps_are_placed_by_a_look_at_the_beginning(
+def test_even_stamps_are_placed_from_the_beginning_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(regularise_module, "_EVEN_ROWS", 2**14)

@@ -1,4 +1,4 @@
-"""--from, --to and --exclude: the part of a log that is used."""
+"""--from, --to and --exclude: cut a log to a part."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def stored(log: xr.Dataset, path) -> str:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """The same log as our own file, as two of them, as text, and as text with a channel in another file."""
+    """Write one log as regular log, as two of them, as text, and as text with a channel file."""
     folder = tmp_path_factory.mktemp("cut")
     log = make()
     stamps = pd.DatetimeIndex(log.time.values).strftime("%Y-%m-%dT%H:%M:%S.%f")
@@ -72,7 +72,7 @@ def expected(low: int, high: int, *spans: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["own", "two", "text"])
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_every_way_to_a_log(files, kind):
+def test_cut_works_for_every_source_of_a_log(files, kind):
     for given in (
         {"time_from": "1min", "time_to": "4min", "exclude": ["90s/100s"]},
         {
@@ -91,7 +91,7 @@ def test_every_way_to_a_log(files, kind):
         assert "from" in log.attrs["history"]
 
 
-def test_the_ends_are_half_open_and_on_the_sample():
+def test_ends_are_half_open_and_exact_to_the_sample():
     log = make()
     assert (
         cut_log(log, time_from="1s", time_to="2s").time.values[[0, -1]].tolist()
@@ -136,7 +136,7 @@ def test_channels_of_another_file_are_cut_too(files):
     assert not ((there >= 70) & (there < 80)).any()
 
 
-def test_what_is_lazy_stays_lazy():
+def test_lazy_log_stays_lazy():
     import dask.array as da
 
     held = []
@@ -160,7 +160,8 @@ def test_what_is_lazy_stays_lazy():
     [
         (
             {"time_from": "10min"},
-            r"--from 10min lies outside the record; the record goes from 2026-03-01T10:00:00 to .*T10:05:00 \(300 s\)",
+            r"--from 10min lies outside the record; the record goes from 2026-03-01T10:00:00 to "
+            r".*T10:05:00 \(300 s\)",
         ),
         ({"time_from": "2026-02-01T00:00"}, "outside the record"),
         ({"time_to": "2027-02-01T00:00"}, "--to 2027-02-01T00:00 lies outside the record"),
@@ -179,13 +180,13 @@ def test_what_is_lazy_stays_lazy():
         ({"exclude": ["0s/5min"]}, "leaves nothing"),
     ],
 )
-def test_what_is_refused(given, said):
+def test_invalid_input_is_refused(given, said):
     with pytest.raises(OptionError, match=said):
         cut_log(make(), **given)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_commands_take_them(files, tmp_path, capsys):
+def test_commands_accept_the_options(files, tmp_path, capsys):
     cut = ["--from", "1min", "--to", "4min", "--exclude", "90s/100s", "--exclude", "110s/111s"]
     assert main(["ingest", *files["text"], "-o", str(tmp_path / "cut.nc"), *cut]) == 0
     with gyrostab.open_log(tmp_path / "cut.nc") as log:

@@ -1,4 +1,4 @@
-"""One log in many files: formats, packing, units, epochs and calendars never change what is read, or the file is refused.
+"""One log in many files: formats, packing, units, epochs and calendars do not change the log.
 
 The truth is a grid of known samples. Each example draws how a file holds it; what comes back
 through `read_log` and `regularise` is the grid to 1e-9, or an error that names the file. A file is
@@ -56,13 +56,13 @@ GUESSED = ["now", "01-03-2026", "1/3/2026", "2026", "yesterday", "2026-02-30"]
 
 
 def counts() -> np.ndarray:
-    """Whole numbers of both axes (x, y) on the whole grid."""
+    """Return whole numbers of both axes (x, y) on the whole grid."""
     return np.random.default_rng(11).integers(-90, 91, (2, N))
 
 
 @dataclass(frozen=True)
 class Law:
-    """How stored numbers become rates: ``stored * scale + offset`` in a unit."""
+    """Conversion of stored numbers to rates: ``stored * scale + offset`` in a unit."""
 
     scale: float = 1.0
     offset: float = 0.0
@@ -75,7 +75,7 @@ class Law:
         return float(cf_units.Unit(plain).convert(1.0, cf_units.Unit("degree hour-1")))
 
     def rates(self) -> np.ndarray:
-        """The truth: rates [deg/h] on the whole grid, NaN where there is no value."""
+        """Return the ground truth: rates [deg/h] on the whole grid, NaN where missing."""
         grid = (counts() * self.scale + self.offset) * self.per_hour
         grid[:, LOST] = np.nan
         grid[0, VOID] = np.nan
@@ -83,7 +83,7 @@ class Law:
 
 
 def check(paths: Path | list[Path], law: Law, *, within_ns: int = 1000, **options: Any) -> None:
-    """Compare what is read with the truth."""
+    """Compare the log with the ground truth."""
     log = regularise(read_log(paths, **options))
     np.testing.assert_allclose(
         log.rate.sel(axis=["x", "y"]).values, law.rates(), rtol=1e-9, atol=1e-12 * law.per_hour
@@ -117,7 +117,7 @@ laws = st.builds(
 
 
 def values_of(law: Law) -> np.ndarray:
-    """Rates in the law's unit at the rows that are kept, NaN where there is no value."""
+    """Return the rates of the kept rows in the unit of the conversion, NaN where missing."""
     values = (counts() * law.scale + law.offset).astype(float)
     values[0, VOID] = np.nan
     return values[:, KEPT]
@@ -188,7 +188,7 @@ def test_parquet(law, stamps, group, compression, nulls):
 
 @dataclass(frozen=True)
 class Packed:
-    """How the axes are stored."""
+    """Storage of the axes."""
 
     dtype: str = "i2"
     void: str = "_FillValue"
@@ -199,7 +199,7 @@ class Packed:
         return self.dtype == "unsigned"
 
     def store(self) -> tuple[np.ndarray, Any]:
-        """Stored numbers of both axes at the rows that are kept, and the one that means "no value"."""
+        """Return the stored numbers of the kept rows, and the number that marks missing values."""
         stored = counts()
         void = {
             "i1": -127,
@@ -223,7 +223,7 @@ class Packed:
         )
 
     def attributes(self, law: Law, void: Any) -> dict[str, Any]:
-        """Attributes by the CF conventions."""
+        """Return the attributes by the CF conventions."""
         offset = law.offset - (100.0 * law.scale if self.is_unsigned else 0.0)
         attributes: dict[str, Any] = {"units": law.unit}
         if law.scale != 1.0 or offset:
@@ -259,7 +259,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class Clock:
-    """How the stamps are stored."""
+    """Storage of the stamps."""
 
     unit: str = "ms"
     epoch: str = "1970-01-01"
@@ -272,20 +272,24 @@ class Clock:
         return self.epoch in GUESSED or self.calendar in ("noleap", "360_day", "all_leap")
 
     def zero(self) -> int:
-        """The epoch [ns since 1970] by cftime and by hand."""
+        """Return the epoch [ns since 1970], by cftime and by hand."""
         if self.is_refused:
             return 0
         day, hours = {
-            "2026-03-01 06:00:00": (1, 6), "2026-3-1": (1, 0), "2026-03-01T00:00:00Z": (1, 0), "1970-01-01": (None, 0),
-            "2026-03-01 01:00 +01:00": (1, 0), "20260301T000000": (1, 0),
-        }[self.epoch]  # fmt: skip
+            "2026-03-01 06:00:00": (1, 6),
+            "2026-3-1": (1, 0),
+            "2026-03-01T00:00:00Z": (1, 0),
+            "1970-01-01": (None, 0),
+            "2026-03-01 01:00 +01:00": (1, 0),
+            "20260301T000000": (1, 0),
+        }[self.epoch]
         date = (1970, 1, 1) if day is None else (2026, 3, day)
         origin = cftime.datetime(1970, 1, 1, calendar="standard").toordinal()
         days = cftime.datetime(*date, calendar=self.calendar or "standard").toordinal() - origin
         return (days * 24 + hours) * 3600 * 10**9
 
     def store(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """Stored stamps and their attributes."""
+        """Return the stored stamps and their attributes."""
         step = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "hours": 3600 * 10**9}[self.unit]
         since = STAMPS - self.zero()
         attributes: dict[str, Any] = {"units": f"{self.unit} Since {self.epoch}"}
@@ -334,7 +338,7 @@ clocks = st.builds(
 
 
 def tolerance(clock: Clock) -> int:
-    """What binary floating point leaves of stamps [ns]: half a unit in the last place of the largest, and the sum with an offset."""
+    """Return the rounding error of stamps in floating point [ns], with that of an offset."""
     return 2000 if clock.unit == "hours" or clock.dtype == "f8" or clock.packed else 1
 
 
@@ -532,7 +536,7 @@ def test_regular_logs(law, own, store, packed, chunk, epoch):
 def write_regular(
     path: Path, law: Law, packed: Packed, clock: Clock, store: str, chunk: int
 ) -> None:
-    """A regular log as another program writes it, with rows for the samples that are lost."""
+    """Write a regular log like another program, with rows for lost samples."""
     stored, void = packed.store()
     whole = np.full((2, N), void)
     whole[:, KEPT] = stored

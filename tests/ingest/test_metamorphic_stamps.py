@@ -1,4 +1,4 @@
-"""One log, its rows given in other ways: in pieces, in any order, twice, in other units of time and zones, in other blocks and chunks."""
+"""One log with its rows in other pieces, orders, units of time, zones, blocks and chunks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNITS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 
 
 def write_rows(path: Path, rows: np.ndarray, *, unit: str = "ns", zone: str = "") -> Path:
-    """A text file of some rows, with stamps in a unit, or as ISO 8601 in a zone."""
+    """Write a text file of rows, with stamps in a unit, or as ISO 8601 in a zone."""
     if unit == "iso":
         hours = int(zone[:3]) if zone not in ("", "Z") else 0
         times = (STAMPS[rows] + hours * 3600 * 10**9).astype("datetime64[ns]")
@@ -53,7 +53,7 @@ def whole(tmp_path_factory) -> xr.Dataset:
     return regular([write_rows(tmp_path_factory.mktemp("whole") / "log.csv", np.arange(ROWS))])
 
 
-def test_the_log_is_the_one_that_was_written(whole):
+def test_log_equals_the_written_one(whole):
     truth = np.full((2, SAMPLES[-1] + 1), np.nan)
     truth[:, SAMPLES] = VALUES
     np.testing.assert_array_equal(whole.rate.values, truth)
@@ -105,7 +105,7 @@ def test_the_same_file_under_two_names(whole, tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_rows_given_twice_one_by_one(whole, tmp_path, seed):
+def test_single_repeated_rows(whole, tmp_path, seed):
     again = np.sort(np.random.default_rng(seed).choice(np.arange(50, ROWS - 50), 20, replace=False))
     assert_same(
         whole,
@@ -114,14 +114,14 @@ def test_rows_given_twice_one_by_one(whole, tmp_path, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_stretch_given_twice(whole, tmp_path, seed):
+def test_repeated_stretch(whole, tmp_path, seed):
     begin = int(np.random.default_rng(seed).integers(200, 1500))
     rows = np.r_[0 : begin + 800, begin:ROWS]
     assert_same(whole, regular([write_rows(tmp_path / "log.csv", rows)]))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_neighbours_that_changed_places(whole, tmp_path, seed):
+def test_swapped_neighbours(whole, tmp_path, seed):
     rows = np.arange(ROWS)
     for at in np.random.default_rng(seed).choice(np.arange(50, 1100, 10), 30, replace=False):
         rows[[at, at + 1]] = rows[[at + 1, at]]
@@ -144,7 +144,7 @@ def test_blocks_and_chunks(block, chunk, scatter):
 
 
 @pytest.mark.parametrize("shift", [1, 10**15, -(10**17)])
-def test_another_beginning(shift):
+def test_different_start_time(shift):
     noise = np.random.default_rng(5).normal(0, 0.4 / RATE * 1e9, ROWS).astype(np.int64)
     one, other = (gyrostab.regularise(raw_log(STAMPS + noise + by, VALUES)) for by in (0, shift))
     np.testing.assert_array_equal(one.rate.values, other.rate.values)

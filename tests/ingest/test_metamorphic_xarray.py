@@ -1,4 +1,4 @@
-"""What xarray lets a user do to a log: the product is right, or the call is refused; it is never wrong in silence."""
+"""Logs after xarray operations: the product is correct, or the call is refused."""
 
 from __future__ import annotations
 
@@ -51,15 +51,20 @@ def make(x: np.ndarray | None = None, *, rate: float = RATE, **options) -> xr.Da
 
 
 def stamped(log: xr.Dataset) -> xr.Dataset:
-    """The log with its stamps in memory, as any other program would hand it over."""
+    """Return the log with its stamps in memory, as another program would pass it."""
     return log.assign_coords(time=log.time.values)
 
 
 def surface_of(log, *, rate: float, window: int = 800, **options) -> xr.Dataset:
     made = gyrostab.davar(
-        log, window=f"{window / rate}s", step=f"{window / rate}s", taus=[k / rate for k in KS], min_strict=0.0, min_coverage=0.0,
+        log,
+        window=f"{window / rate}s",
+        step=f"{window / rate}s",
+        taus=[k / rate for k in KS],
+        min_strict=0.0,
+        min_coverage=0.0,
         **options,
-    ).load()  # fmt: skip
+    ).load()
     np.testing.assert_allclose(made.tau, np.array(KS) / rate, rtol=1e-12)
     assert made.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-12)
     return made
@@ -68,7 +73,7 @@ def surface_of(log, *, rate: float, window: int = 800, **options) -> xr.Dataset:
 def check_against(
     log, x: np.ndarray, *, rate: float, rtol: float = 1e-9, window: int = 800
 ) -> None:
-    """The surface of a log is that of the samples `x`, by the definition."""
+    """Check that the surface of a log is that of the samples `x`, by the definition."""
     made = surface_of(log, rate=rate, window=window)
     for row, values in enumerate(np.atleast_2d(x)):
         avar, count = direct_surface(values.astype(np.float64), window, window, KS)
@@ -79,7 +84,7 @@ def check_against(
 @pytest.mark.parametrize("explicit", [False, True])
 @pytest.mark.parametrize("chunked", [False, True])
 @pytest.mark.parametrize("stride", [2, 3, 7])
-def test_a_stride(explicit, chunked, stride):
+def test_thinned_log_has_its_new_rate(explicit, chunked, stride):
     x = record(lost=0.05)
     log = stamped(make(x)) if explicit else make(x)
     log = log.chunk(time=999) if chunked else log
@@ -115,7 +120,7 @@ def test_dropped_samples_without_a_declared_rate():
     check_against(dropped, x[:, first : last + 1], rate=RATE)
 
 
-def test_means_of_groups_have_their_own_rate():
+def test_averaged_log_has_its_new_rate():
     x = record()
     means = x.reshape(2, -1, 4).mean(axis=2)
     check_against(make(x).coarsen(time=4).mean(), means, rate=RATE / 4, window=300)
@@ -178,7 +183,7 @@ ORDER = {
 
 @pytest.mark.parametrize("explicit", [False, True])
 @pytest.mark.parametrize("name", list(ORDER))
-def test_what_is_refused(name, explicit, tmp_path):
+def test_invalid_input_is_refused(name, explicit, tmp_path):
     changed = ORDER[name](stamped(make()) if explicit else make())
     with pytest.raises(GyrostabError) as refusal:
         gyrostab.davar(changed, window="8s")
@@ -191,7 +196,7 @@ def test_what_is_refused(name, explicit, tmp_path):
             gyrostab.to_netcdf(changed, tmp_path / "log.nc")
 
 
-def test_sorting_mends_what_is_out_of_order():
+def test_sorting_repairs_a_log_out_of_order():
     x = record()
     shuffled = make(x).isel(time=np.random.default_rng(1).permutation(SIZE))
     check_against(shuffled.sortby("time"), x, rate=RATE)
@@ -199,7 +204,7 @@ def test_sorting_mends_what_is_out_of_order():
 
 
 @pytest.mark.parametrize("explicit", [False, True])
-def test_a_hole_between_two_pieces(explicit):
+def test_gap_between_two_pieces_is_missing(explicit):
     x = record()
     log = stamped(make(x)) if explicit else make(x)
     joined = xr.concat([log.isel(time=slice(0, 2000)), log.isel(time=slice(2500, None))], "time")
@@ -256,7 +261,7 @@ KEEPS = {
 
 @pytest.mark.parametrize("explicit", [False, True])
 @pytest.mark.parametrize("name", list(KEEPS))
-def test_what_keeps_the_rate(name, explicit):
+def test_operations_that_keep_the_rate(name, explicit):
     change, truth = KEEPS[name]
     x = record()
     log = stamped(make(x)) if explicit else make(x)
@@ -302,8 +307,10 @@ def test_a_log_of_angles():
     declared=st.booleans(),
     seed=st.integers(0, 999),
 )
-def test_the_grid_of_any_samples(rate, size, stride, lost, resolution, declared, seed):
-    """Every kept sample lies where it was, and the rate is that of the grid or a whole part of it."""
+def test_grid_is_found_for_any_subset_of_samples(
+    rate, size, stride, lost, resolution, declared, seed
+):
+    """Every kept sample stays in place, and the rate is that of the grid or a whole fraction."""
     rng = np.random.default_rng(seed)
     log = make_log(np.arange(float(size)), rate=rate, unit="deg/h", start=START)
     log = log.assign_coords(
@@ -477,7 +484,7 @@ class TestDataArray:
             (lambda a: a.expand_dims("run"), "rename them"),
         ],
     )
-    def test_others_are_refused(self, change, said):
+    def test_other_inputs_are_refused(self, change, said):
         with pytest.raises(SchemaError, match=said):
             gyrostab.davar(change(make().rate), window="8s")
 
@@ -511,7 +518,7 @@ class TestDataFrame:
         np.testing.assert_allclose(log.temperature, 26.85)
 
     @pytest.mark.filterwarnings("ignore::UserWarning")
-    def test_rows_that_are_dropped_and_time_zones(self):
+    def test_dropped_rows_and_time_zones(self):
         x = record(lost=0.1)
         x[:, [0, -1]] = 0.0
         frame = self.frame(x).tz_localize("Europe/Berlin").dropna()
@@ -519,7 +526,7 @@ class TestDataFrame:
         check_against(log, x, rate=RATE)
         assert log.time[0].values == np.datetime64("2026-03-01T09:00:00")
 
-    def test_what_is_refused(self):
+    def test_invalid_input_is_refused(self):
         x = record()
         with pytest.raises(MissingUnitError, match="no unit"):
             gyrostab.davar(self.frame(x), window="8s")
@@ -539,7 +546,7 @@ class TestSurface:
     def surface(self) -> xr.Dataset:
         return gyrostab.davar(make(), window="8s", taus=12).load()
 
-    def test_parts_of_it_are_fitted(self):
+    def test_parts_of_a_surface_are_fitted(self):
         surface = self.surface()
         whole = gyrostab.fit_noise(surface)
         xr.testing.assert_allclose(
@@ -560,7 +567,7 @@ class TestSurface:
             lambda s: s.drop_attrs(deep=False),
         ],
     )
-    def test_others_are_refused(self, change):
+    def test_other_inputs_are_refused(self, change):
         with pytest.raises(GyrostabError):
             gyrostab.fit_noise(change(self.surface()))
 
@@ -576,7 +583,7 @@ class TestSurface:
             "confidence_interval",
         ],
     )
-    def test_an_array_is_no_surface(self, function, tmp_path):
+    def test_array_is_not_a_surface(self, function, tmp_path):
         extra = (tmp_path / "imu.yaml",) if function == "to_kalibr" else ()
         with pytest.raises(SchemaError, match="this is a DataArray"):
             getattr(gyrostab, function)(self.surface().avar, *extra)
@@ -584,7 +591,7 @@ class TestSurface:
     @pytest.mark.parametrize("form", ["nc", "zarr"])
     @pytest.mark.parametrize("turned", [False, True])
     @pytest.mark.filterwarnings("ignore:Consolidated metadata")
-    def test_what_xarray_wrote_is_opened(self, tmp_path, form, turned):
+    def test_files_written_by_xarray_are_opened(self, tmp_path, form, turned):
         product = gyrostab.fit_noise(self.surface())
         path = tmp_path / f"product.{form}"
         given = product.transpose("tau", "time", ...) if turned else product
@@ -604,7 +611,7 @@ class TestSurface:
     @pytest.mark.parametrize("form", ["nc", "zarr"])
     @pytest.mark.parametrize("reader", [gyrostab.open_log, gyrostab.read_log])
     @pytest.mark.filterwarnings("ignore:Consolidated metadata")
-    def test_a_log_that_xarray_wrote_is_opened(self, tmp_path, form, reader):
+    def test_log_written_by_xarray_is_opened(self, tmp_path, form, reader):
         x = record(lost=0.2)
         path = tmp_path / f"log.{form}"
         thinned = make(x).isel(time=slice(None, None, 2)).dropna("time", subset=["rate"])

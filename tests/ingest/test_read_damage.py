@@ -1,4 +1,4 @@
-"""Damaged files that once got past the readers."""
+"""Damaged files that readers once accepted."""
 
 from __future__ import annotations
 
@@ -18,17 +18,24 @@ from gyrostab.ingest.formats.matlab5 import check_structure
 
 @pytest.fixture(scope="module")
 def matlab(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Everything that scipy writes: numbers, text, structures, cells, sparse and complex arrays."""
+    """Return all that scipy writes: numbers, text, structures, cells, sparse and complex arrays."""
     import scipy.sparse
 
     folder = tmp_path_factory.mktemp("matlab")
     content = {
-        "numbers": np.arange(12.0).reshape(3, 4), "counts": np.arange(5, dtype=np.int16), "one": 1.0, "empty": np.empty((0, 3)),
-        "complex": np.array([1 + 2j, 3.0]), "text": "hello", "texts": np.array(["ab", "cde"], dtype=object),
+        "numbers": np.arange(12.0).reshape(3, 4),
+        "counts": np.arange(5, dtype=np.int16),
+        "one": 1.0,
+        "empty": np.empty((0, 3)),
+        "complex": np.array([1 + 2j, 3.0]),
+        "text": "hello",
+        "texts": np.array(["ab", "cde"], dtype=object),
         "flag": np.array([True, False]),
-        "log": {"t": np.arange(4.0), "inner": {"x": np.float32(2.0), "name": "tool"}}, "sparse": scipy.sparse.csc_array(np.eye(3)),
-        "cells": np.array([1.0, "a", np.arange(3)], dtype=object), "long_name_of_a_variable": np.zeros((2, 2, 2)),
-    }  # fmt: skip
+        "log": {"t": np.arange(4.0), "inner": {"x": np.float32(2.0), "name": "tool"}},
+        "sparse": scipy.sparse.csc_array(np.eye(3)),
+        "cells": np.array([1.0, "a", np.arange(3)], dtype=object),
+        "long_name_of_a_variable": np.zeros((2, 2, 2)),
+    }
     for packed in (False, True):
         savemat(
             folder / f"packed{packed}.mat", content, do_compression=packed, long_field_names=True

@@ -1,4 +1,4 @@
-"""Many files to one log, channels of other files, gyrostab's own logs, and the registry."""
+"""Several files as one log, channel files, logs that gyrostab wrote, and the registry."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def write(path: Path, text: str) -> Path:
 
 @pytest.fixture
 def pair(tmp_path: Path) -> list[Path]:
-    """Two pieces of a log in the wrong order, the earlier one without gyro_y and temperature."""
+    """Write two pieces of a log in reverse order, the earlier without gyro_y and temperature."""
     late = write(tmp_path / "a.csv", HEADER + "10,1,2,20\n11,3,4,\n12,****,5,21\n")
     early = write(tmp_path / "b.csv", "time [ms],gyro_x [deg/s],depth [m]\n0,1,7\n1000,2,8\n")
     return [late, early]
 
 
-def test_files_are_joined_in_the_order_of_their_stamps(pair: list[Path]) -> None:
+def test_files_are_concatenated_in_the_order_of_their_stamps(pair: list[Path]) -> None:
     raw = read_log(pair)
     check_raw(raw)
     assert raw.attrs["source_files"] == ["b.csv", "a.csv"]
@@ -72,7 +72,7 @@ def test_patterns_and_repeated_paths(pair: list[Path]) -> None:
         read_log(folder)
 
 
-def test_many_files_wait_on_disk(pair: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_files_are_moved_to_disk(pair: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     expected = read_log(pair)
     monkeypatch.setattr(files, "SPILL_BYTES", 100)
     raw = read_log(pair)
@@ -141,7 +141,7 @@ def test_a_copy_in_another_unit_and_with_damage_is_a_copy(
     )
 
 
-def test_a_clock_that_begins_again_in_the_next_file_is_no_overlap(
+def test_restarted_clock_in_the_next_file_is_not_an_overlap(
     tmp_path: Path, values: np.ndarray
 ) -> None:
     first = write(tmp_path / "a.csv", HEADER + _rows(values, slice(None)))
@@ -152,7 +152,7 @@ def test_a_clock_that_begins_again_in_the_next_file_is_no_overlap(
 
 
 @pytest.mark.parametrize("name", ["tool.d01", "noending", "TOOL.CSV"])
-def test_text_is_read_whatever_its_name_is(pair: list[Path], name: str) -> None:
+def test_text_is_read_with_any_suffix(pair: list[Path], name: str) -> None:
     other = pair[0].rename(pair[0].with_name(name))
     np.testing.assert_array_equal(read_log(other).rate, [[1, 3, np.nan], [2, 4, 5]])
 
@@ -183,7 +183,7 @@ def test_kinds_and_channel_units_must_agree(tmp_path: Path) -> None:
         read_log([rate, other])
 
 
-def test_a_map_that_fits_one_of_the_files_is_no_slip(pair: list[Path]) -> None:
+def test_map_that_matches_one_of_the_files_is_accepted(pair: list[Path]) -> None:
     raw = read_log(pair, map={"depth": "bit_depth"})
     assert "bit_depth" in raw
     with pytest.raises(OptionError, match=r"--map depht: no such column in a.csv, b.csv"):
@@ -218,12 +218,13 @@ def test_channels_of_another_file_keep_their_own_time(tmp_path: Path) -> None:
     assert both.attrs["channel_files"] == ["slow.csv", "more.csv"]
 
 
-def test_channel_files_that_cannot_serve_are_explained(tmp_path: Path) -> None:
+def test_unusable_channel_files_are_explained(tmp_path: Path) -> None:
     log = write(tmp_path / "log.csv", HEADER + "0,1,1,20\n1,1,1,20\n")
     doubled = write(tmp_path / "slow.csv", "time [s],temperature [degC]\n0,1\n1,1\n")
     with pytest.raises(
         OptionError,
-        match=r"channel 'temperature' of slow.csv is in the log too.*--map temperature=temperature_2",
+        match=r"channel 'temperature' of slow.csv is in the log too.*--map "
+        r"temperature=temperature_2",
     ):
         read_log(log, channel=doubled)
     with pytest.raises(OptionError, match=r"no channel with a unit"):
@@ -248,7 +249,6 @@ def test_channels_from_netcdf(tmp_path: Path) -> None:
 
 
 # --- logs that gyrostab wrote
-# ------------------------------------------------------------------------------------
 
 
 def regular_log(size: int = 5000, rate: float = 300.0) -> xr.Dataset:
@@ -306,7 +306,7 @@ def test_a_log_of_gyrostab_comes_back_lazily_on_its_exact_grid(tmp_path: Path, n
 
 @pytest.mark.filterwarnings("ignore:.*does not have a Zarr V3 specification.*")
 def test_channels_of_a_zarr_store_come_in_the_order_of_their_names(tmp_path: Path) -> None:
-    """Its directory keeps no order."""
+    """The order within its directory is arbitrary."""
     names = [f"channel_{letter}" for letter in "gbhdafce"]
     log = regular_log(100)
     path = store(
@@ -318,7 +318,7 @@ def test_channels_of_a_zarr_store_come_in_the_order_of_their_names(tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", ["log.nc", "log.zarr"])
-def test_what_export_writes_is_read(tmp_path: Path, name: str) -> None:
+def test_exported_files_are_read(tmp_path: Path, name: str) -> None:
     from gyrostab.io import datasets as export
 
     log = regular_log()
@@ -347,7 +347,7 @@ def test_stored_stamps_off_the_grid_are_kept_as_rows(tmp_path: Path) -> None:
     assert "sampling_rate_hz" not in raw.attrs
 
 
-def test_a_log_takes_channels_and_gives_its_own(tmp_path: Path) -> None:
+def test_channels_can_be_added_to_and_read_from_a_regular_log(tmp_path: Path) -> None:
     path = store(regular_log(), tmp_path / "log.nc")
     extra = write(
         tmp_path / "extra.csv", "time,pressure [Pa]\n2026-01-01T00:00:01,5\n2026-01-01T00:00:02,6\n"
@@ -374,11 +374,10 @@ def test_a_log_in_wrong_units_is_refused(tmp_path: Path) -> None:
 
 
 # --- registry
-# ----------------------------------------------------------------------------------------------------
 
 
 class _Point:
-    """An entry point of a format that another package brings."""
+    """An entry point of a format in another package."""
 
     name = "counts"
 
@@ -414,6 +413,9 @@ def test_a_format_of_another_package_is_found(
 
 
 def test_heavy_libraries_load_when_they_are_used() -> None:
-    code = "import sys, gyrostab.ingest; print([m for m in ('pyarrow.csv', 'netCDF4', 'h5py', 'scipy.io', 'dask.array') if m in sys.modules])"
+    code = (
+        "import sys, gyrostab.ingest; print([m for m in ('pyarrow.csv', 'netCDF4', 'h5py', "
+        "'scipy.io', 'dask.array') if m in sys.modules])"
+    )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

@@ -1,4 +1,4 @@
-"""Columns as other programs name them: units in parentheses, names twice, channels without a unit, several times."""
+"""Columns of other programs: units in parentheses, duplicate names, channels without units."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_header_with_parentheses_needs_no_units_from_the_user(tmp_path: Path) 
         "accel_z",
     ],
 )
-def test_a_channel_that_nobody_asked_for_stops_no_run(tmp_path: Path, header: str) -> None:
+def test_unusable_channel_that_was_not_requested_is_left_out(tmp_path: Path, header: str) -> None:
     path = write(tmp_path, f"time [s],gyro_x [deg/h],{header}\n0,1,2\n1,2,3\n")
     raw = read_log(path)
     assert list(raw.data_vars) == ["rate"]
@@ -76,7 +76,7 @@ def test_a_channel_that_nobody_asked_for_stops_no_run(tmp_path: Path, header: st
     ("header", "unit"),
     [("temperature", "degC"), ("temperature [furlong]", "degC"), ("pressure [x8103]", "Pa")],
 )
-def test_a_note_says_how_to_keep_a_channel_and_that_works(
+def test_advice_of_the_note_on_a_dropped_channel_works(
     tmp_path: Path, header: str, unit: str
 ) -> None:
     path = write(tmp_path, f"time [s],gyro_x [deg/h],{header}\n0,1,2\n1,2,3\n")
@@ -110,9 +110,7 @@ def test_a_note_says_how_to_keep_a_channel_and_that_works(
         ("time [s],gyro_x [deg/h]\n0,1\n1,2\n", {"kind": "angle"}),
     ],
 )
-def test_the_advice_of_a_message_works_when_it_is_followed(
-    tmp_path: Path, text: str, options: dict
-) -> None:
+def test_advice_of_a_message_works(tmp_path: Path, text: str, options: dict) -> None:
     path = write(tmp_path, text)
     with pytest.raises(GyrostabError) as caught:
         read_log(path, **options)
@@ -124,13 +122,13 @@ def test_the_advice_of_a_message_works_when_it_is_followed(
                 key, _, value = words[at + 1].rstrip(",;").partition("=")
                 if "UNIT" not in value:
                     options[option].setdefault(key, value)
-                break  # the first advice is enough
+                break  # the first advice suffices
     if "UNIT" in str(caught.value) and not options["unit"]:
         options["unit"] = {"temperature": "degC"}
     assert read_log(path, **options).sizes["row"] == 2
 
 
-def test_a_unit_from_the_user_wins_over_a_header_that_holds_none(tmp_path: Path) -> None:
+def test_unit_option_overrules_a_header_without_a_unit(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [x8005],temperature [x8014]\n0,1,20\n1,2,21\n")
     raw = read_log(path, unit={"gyro": "deg/s", "temperature": "degC"})
     assert raw.rate[0].values.tolist() == [3600, 7200]
@@ -138,19 +136,22 @@ def test_a_unit_from_the_user_wins_over_a_header_that_holds_none(tmp_path: Path)
     assert has_note(raw, "gyro_x [x8005]", "--unit gyro=deg/s")
 
 
-def test_a_channel_that_was_asked_for_is_an_error_without_a_unit(tmp_path: Path) -> None:
+def test_requested_channel_without_a_unit_is_an_error(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [deg/h],T\n0,1,2\n1,2,3\n")
     probe = write(tmp_path, "time [s],temperature\n0,1\n1,2\n", "probe.csv")
     with pytest.raises(MissingUnitError, match="'T' carries no unit"):
         read_log(path, map={"T": "temperature"})
-    with pytest.raises(UnitError, match="no known unit of temperature"):
+    with pytest.raises(UnitError, match="not a known unit of temperature"):
         read_log(path, map={"T": "temperature"}, unit={"temperature": "V"})
     with pytest.raises(MissingUnitError, match="'temperature' carries no unit"):
         read_log(path, channel=probe)
 
 
-def test_columns_of_one_name_are_kept_apart(tmp_path: Path) -> None:
-    header = "time [s],gyro_x [deg/h],Flags [x8103],Flags [x8108],temperature [degC],temperature [degF],load [%],load [%]"
+def test_columns_of_one_name_are_renamed(tmp_path: Path) -> None:
+    header = (
+        "time [s],gyro_x [deg/h],Flags [x8103],Flags [x8108],temperature [degC],temperature "
+        "[degF],load [%],load [%]"
+    )
     path = write(tmp_path, header + "\n0,1,3,4,20,68,5,6\n1,2,3,4,20,68,5,6\n")
     raw = read_log(path)
     expected = {
@@ -164,12 +165,12 @@ def test_columns_of_one_name_are_kept_apart(tmp_path: Path) -> None:
     assert {name: float(raw[name][0]) for name in raw.data_vars if name != "rate"} == pytest.approx(
         expected
     )
-    assert has_note(raw, "kept apart", "'Flags [x8108]' is 'Flags_2'")
+    assert has_note(raw, "are renamed", "'Flags [x8108]' is 'Flags_2'")
     assert "load_2" not in read_log(path, map={"load_2": "-"})
     assert "Flags_2" not in read_log(path, map={"Flags [x8108]": "-"})
 
 
-def test_a_mapped_axis_wins_over_a_column_of_its_name(tmp_path: Path) -> None:
+def test_mapped_axis_overrules_a_column_of_its_name(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [deg/h],raw_x [deg/h]\n0,1,5\n1,2,6\n")
     raw = read_log(path, map={"raw_x": "gyro_x"})
     assert raw.rate[0].values.tolist() == [5, 6]
@@ -183,7 +184,8 @@ def test_a_mapped_axis_wins_over_a_column_of_its_name(tmp_path: Path) -> None:
         ("time [s],timestamp [us],gyro_x [deg/h]\n0,0,1\n0,1000000,2\n", "timestamp [us]", [0, 1]),
         ("Time [s],time (ms),gyro_x [deg/h]\n7,0,1\n6,1000,2\n", "time (ms)", [0, 1]),
         (
-            "time,timestamp [ms],gyro_x [deg/h]\n1970-01-01T00:00:03,0,1\n1970-01-01T00:00:04,1000,2\n",
+            "time,timestamp [ms],gyro_x "
+            "[deg/h]\n1970-01-01T00:00:03,0,1\n1970-01-01T00:00:04,1000,2\n",
             "time",
             [3, 4],
         ),
@@ -211,7 +213,7 @@ def test_another_time_column_can_be_named(tmp_path: Path) -> None:
     assert seconds(read_log(path, map={"Time::TimeStartup": "time"})) == [0, 2]
 
 
-def test_durations_as_matlab_writes_them_are_the_time(tmp_path: Path) -> None:
+def test_matlab_durations_are_the_time(tmp_path: Path) -> None:
     rows = "".join(f"{n / 100:g} sec,{n},20\n" for n in range(300))
     raw = read_log(write(tmp_path, "Time,gyro_x,T\n" + rows), unit={"gyro": "deg/h"})
     assert seconds(raw) == [n / 100 for n in range(300)]

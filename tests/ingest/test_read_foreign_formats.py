@@ -1,4 +1,4 @@
-"""Formats as other programs leave them: cut off, with codes for names, in objects that only their maker reads."""
+"""Files of other programs: truncated, with codes as names, in proprietary objects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VALUES = np.random.default_rng(11).integers(-20000, 20000, (3, ROWS)).astype(np.
 
 
 def write_miniseed(path: Path, codes: str = "ENZ", band: str = "H") -> bytes:
-    """Channels of a rotation sensor, one after the other as archives keep them."""
+    """Write channels of a rotation sensor one after the other, as in archives."""
     from pymseed import DataEncoding, MS3TraceList
 
     with path.open("wb") as file:
@@ -56,7 +56,7 @@ def test_rotation_channels_of_miniseed_are_axes(tmp_path: Path, codes: str, band
 
 
 @pytest.mark.parametrize("cut", [1, 100, 470, 511, 512, 900])
-def test_miniseed_that_is_cut_keeps_its_complete_records(tmp_path: Path, cut: int) -> None:
+def test_truncated_miniseed_keeps_its_complete_records(tmp_path: Path, cut: int) -> None:
     whole, path = tmp_path / "a.mseed", tmp_path / "b.mseed"
     data = write_miniseed(whole)
     path.write_bytes(data[:-cut])
@@ -75,7 +75,10 @@ def test_miniseed_that_is_cut_keeps_its_complete_records(tmp_path: Path, cut: in
 
 def write_las(path: Path, date: str, clock: str, rows: list[str]) -> Path:
     head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 9 :\nSTEP.S 0 :\nNULL. -999.25 :\n"
-    curves = f"~C\nDATE.{date} : date\nTIME.{clock} : time\nGYRO_X.deg/h : rate\nTEMPERATURE.degC : in the tool\n~A\n"
+    curves = (
+        f"~C\nDATE.{date} : date\nTIME.{clock} : time\nGYRO_X.deg/h : "
+        "rate\nTEMPERATURE.degC : in the tool\n~A\n"
+    )
     path.write_text(head + curves + "".join(f"{row} 1.5 60\n" for row in rows))
     return path
 
@@ -104,7 +107,7 @@ def test_date_and_time_curves_of_las_are_the_time(
     assert list(raw.data_vars) == ["rate", "temperature"]
 
 
-def test_dates_whose_order_is_not_clear_are_refused(tmp_path: Path) -> None:
+def test_ambiguous_dates_are_refused(tmp_path: Path) -> None:
     path = write_las(tmp_path / "a.las", "", "S", ["03/04/2026 1", "03/05/2026 2"])
     with pytest.raises(FormatError, match=r"order of day and month.*--map DATE=-"):
         read_log(path)
@@ -116,7 +119,7 @@ def matlab_element(kind: int, data: bytes) -> bytes:
 
 
 def write_timeseries(path: Path) -> None:
-    """A MATLAB 5 file with a timeseries `ts`: an object, whose values are where MATLAB alone finds them."""
+    """Write a MATLAB 5 file with a timeseries `ts`, an object that only MATLAB can read."""
     inner = (
         matlab_element(6, struct.pack("<II", 13, 0))
         + matlab_element(5, struct.pack("<ii", 6, 1))
@@ -134,7 +137,7 @@ def write_timeseries(path: Path) -> None:
     path.write_bytes(head + matlab_element(14, body + matlab_element(14, inner)))
 
 
-def test_a_matlab_timeseries_says_what_can_be_done(tmp_path: Path) -> None:
+def test_matlab_timeseries_is_refused_with_advice(tmp_path: Path) -> None:
     write_timeseries(tmp_path / "ts.mat")
     with pytest.raises(FormatError, match=r"a timeseries 'ts'.*MATLAB alone.*ts\.Data") as caught:
         read_log(tmp_path / "ts.mat")
@@ -163,7 +166,7 @@ def test_a_matlab_table_saved_as_structures_is_read(tmp_path: Path) -> None:
     assert raw.rate[0].values.tolist() == [0, 2, 4]
 
 
-def test_fields_of_a_structure_are_known_by_their_own_names(tmp_path: Path) -> None:
+def test_structure_fields_are_recognised_by_their_names(tmp_path: Path) -> None:
     from scipy.io import savemat
 
     time, rates = np.arange(5) / 10, np.arange(15.0).reshape(3, 5)
@@ -197,7 +200,8 @@ def test_fields_of_a_structure_are_known_by_their_own_names(tmp_path: Path) -> N
         ),
         (
             "log.xml",
-            b'<?xml version="1.0"?>\n<logs xmlns="http://www.witsml.org/schemas/1series" version="1.4.1.1">',
+            b'<?xml version="1.0"?>\n<logs xmlns="http://www.witsml.org/schemas/1series" '
+            b'version="1.4.1.1">',
             "WITSML.*LAS or CSV",
         ),
         ("a.gps", b"\xaa\x44\x12\x1c" + bytes(100), "NovAtel.*RAWIMU"),
@@ -215,7 +219,7 @@ def test_fields_of_a_structure_are_known_by_their_own_names(tmp_path: Path) -> N
         ("a.db3", b"SQLite format 3\0" + bytes(100), "SQLite"),
     ],
 )
-def test_known_formats_that_are_not_read_are_named(
+def test_known_formats_that_are_not_read_are_refused_by_name(
     tmp_path: Path, name: str, data: bytes, message: str
 ) -> None:
     (tmp_path / name).write_bytes(data)
@@ -224,7 +228,7 @@ def test_known_formats_that_are_not_read_are_named(
             look(tmp_path / name)
 
 
-def test_a_layout_of_its_own_is_stronger_than_a_signature(tmp_path: Path) -> None:
+def test_layout_file_overrules_a_signature(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"\xa3\x95\x80\x80" * 10)
     path.with_name("a.bin.toml").write_text('fields = [{name = "gyro_x [deg/h]", type = "int32"}]')

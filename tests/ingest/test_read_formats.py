@@ -1,4 +1,4 @@
-"""The contract that every format passes: the same data in every format give the same raw log."""
+"""Contract of the formats: the same data in every format give the same raw log."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEADERS = ["time [us]", "gyro_y [deg/s]", "gyro_x [deg/s]", "temperature [K]", "
 
 
 def columns() -> list[np.ndarray]:
-    """Integer stamps with jitter, two axes in the wrong order, a slow channel and one of a name that nobody knows."""
+    """Return integer stamps with jitter, two axes in reverse order, two channels."""
     rng = np.random.default_rng(7)
     stamps = START_US + 2500 * np.arange(ROWS) + rng.integers(-3, 4, ROWS)
     gyro = np.round(rng.normal(size=(2, ROWS)), 6)
@@ -129,7 +129,7 @@ def as_mat73(path: Path) -> dict[str, Any]:
     }
 
 
-#: file name -> maker; the maker returns the reading options that the format needs.
+#: File name -> function that writes the file and returns the reading options that it needs.
 CONTRACT: dict[str, Callable[[Path], dict[str, Any]]] = {
     "comma.csv": as_text,
     "comma.csv.gz": as_text,
@@ -195,7 +195,7 @@ def test_a_scan_agrees_with_the_reading(made: tuple[Path, dict[str, Any]]) -> No
     assert roles["time"][0] == "time"
 
 
-def test_columns_on_disk_hold_what_columns_in_memory_hold(
+def test_columns_on_disk_equal_columns_in_memory(
     made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, options = made
@@ -207,7 +207,7 @@ def test_columns_on_disk_hold_what_columns_in_memory_hold(
     xr.testing.assert_identical(on_disk.compute().drop_attrs(), in_memory.drop_attrs())
 
 
-def test_without_a_time_column_the_rate_is_asked_for_and_kept(tmp_path: Path) -> None:
+def test_without_a_time_column_the_rate_is_required_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "ch.mat"
     savemat(path, {"gyro": np.ones((50, 3))})
     mapping = {f"gyro/{i}": f"gyro_{axis} [deg/h]" for i, axis in enumerate("xyz")}
@@ -247,7 +247,7 @@ def test_parquet_dates_and_field_units(tmp_path: Path) -> None:
     assert raw.attrs["unreadable_cells"] == 1
 
 
-def test_float32_stamps_are_pointed_out(tmp_path: Path) -> None:
+def test_float32_stamps_are_noted(tmp_path: Path) -> None:
     path = tmp_path / "single.parquet"
     parquet.write_table(
         pa.table({"time [s]": np.arange(5, dtype=np.float32), "gyro_x [deg/h]": np.ones(5)}), path
@@ -255,7 +255,7 @@ def test_float32_stamps_are_pointed_out(tmp_path: Path) -> None:
     assert "float32" in " ".join(read_log(path).attrs["notes"])
 
 
-def test_netcdf_attribute_units_give_way_to_the_option(tmp_path: Path) -> None:
+def test_unit_option_overrules_netcdf_units(tmp_path: Path) -> None:
     path = tmp_path / "counts.nc"
     with netCDF4.Dataset(path, "w") as file:
         file.createDimension("time", 4)
@@ -299,7 +299,7 @@ def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".mat"])
-def test_damage_in_the_midst_of_the_data_is_no_fault_of_ours(tmp_path: Path, suffix: str) -> None:
+def test_damage_within_the_data_is_an_input_error(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"log{suffix}"
     noise = np.random.default_rng(2).normal(size=50_000)
     if suffix == ".parquet":
@@ -333,7 +333,7 @@ def test_plain_hdf5_with_units_as_attributes(tmp_path: Path) -> None:
     assert scan_file(path).format == "hdf5"
 
 
-def test_a_matlab_file_of_words_is_refused(tmp_path: Path) -> None:
+def test_matlab_file_without_numbers_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "words.mat"
     savemat(path, {"note": "hello", "scalar": 4.0})
     with pytest.raises(FormatError, match="no vector or matrix"):
@@ -349,7 +349,7 @@ def test_shorter_matlab_vectors_are_left_out_with_a_note(tmp_path: Path) -> None
         read_log(path, rate=1)
 
 
-def test_buffers_spill_and_give_back() -> None:
+def test_buffers_spill_to_disk_and_read_back() -> None:
     rng = np.random.default_rng(0)
     blocks = [{"a": rng.normal(size=n), "b": np.arange(n)} for n in (5, 1, 30, 7)]
     expected = {key: np.concatenate([block[key] for block in blocks]) for key in "ab"}

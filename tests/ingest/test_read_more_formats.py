@@ -1,4 +1,4 @@
-"""Formats of optional libraries, and binary: real files against their conversions to text, small ones written and read back."""
+"""Formats of optional libraries, and binary: real files and small files written for the tests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ VALUES = np.random.default_rng(5).integers(-20000, 20000, (2, ROWS))
 DEG_H = 3600.0 * np.rad2deg(1e-9)  # of a nanoradian per second
 
 
-def test_blueseis_is_what_its_text_says(recordings: Find) -> None:
+def test_blueseis_matches_its_text_export(recordings: Find) -> None:
     path, ramp = (
         recordings("fog-blueseis-ramp/FOG.mseed"),
         recordings("fog-blueseis-ramp/RAMP.mseed"),
@@ -46,7 +46,7 @@ def test_blueseis_is_what_its_text_says(recordings: Find) -> None:
     assert (summary.first, summary.last) == (log.time.values[0], log.time.values[-1])
 
 
-def test_rotation_and_ground_motion_have_stamps_of_their_own(recordings: Find) -> None:
+def test_rotation_and_ground_motion_keep_separate_stamps(recordings: Find) -> None:
     path = recordings("fog-rotation-earthquake/bspf_M5.2_6c.mseed")
     text = pd.read_csv(recordings("fog-rotation-earthquake/bspf_M5.2_6c.csv.gz"))
     axes = {"HJE": "gyro_x", "HJN": "gyro_y", "HJZ": "gyro_z", "HHZ": "ground [m/s]"}
@@ -57,7 +57,7 @@ def test_rotation_and_ground_motion_have_stamps_of_their_own(recordings: Find) -
     assert log.time.values[0] - log.time_ground.values[0] == np.timedelta64(3_700_000, "ns")
 
 
-def test_ring_laser_is_what_its_netcdf_says(recordings: Find) -> None:
+def test_ring_laser_matches_its_netcdf_export(recordings: Find) -> None:
     path = recordings("ringlaser-g-3h/romy_eventM7.0.mseed")
     log = read_log(path, map={"BJZ": "gyro_z"}, unit={"gyro": "1 rad/s"})
     with xr.open_dataset(recordings("ringlaser-g-3h/ringlaser_g_3h.nc")) as other:
@@ -69,7 +69,7 @@ def test_ring_laser_is_what_its_netcdf_says(recordings: Find) -> None:
     assert regularise(log).attrs["sampling_rate_hz"] == 20.0
 
 
-def test_px4_log_is_what_its_text_says(recordings: Find) -> None:
+def test_px4_log_matches_its_text_export(recordings: Find) -> None:
     axes = {f"gyro_rad[{place}]": f"gyro_{axis}" for place, axis in enumerate("xyz")}
     path = recordings("px4-bench-dropouts/sample.ulg")
     log = read_log(path, map={**axes, "load": "cpu [1]"}, unit={"gyro": "rad/s"})
@@ -133,7 +133,7 @@ MINISEED = {
 }
 
 
-def test_pieces_of_miniseed_leave_a_gap(tmp_path: Path) -> None:
+def test_time_between_miniseed_segments_is_a_gap(tmp_path: Path) -> None:
     write_miniseed(tmp_path / "a.mseed", gap=7)
     log = read_log(tmp_path / "a.mseed", **MINISEED)
     assert np.array_equal(log.rate.values, VALUES * 0.5)
@@ -157,8 +157,14 @@ def las(tmp_path: Path) -> Path:
     rows = "\n".join(
         f"{k / RATE:.2f} {x} {-999.25 if k == 3 else y} 21.5" for k, (x, y) in enumerate(VALUES.T)
     )
-    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 9.98 :\nSTEP.S 0.02 :\nNULL. -999.25 :\n"
-    curves = "~C\nTIME.S : time\nGYRO_X.deg/h : rate\nGYRO_Y.deg/h : rate\nTEMPERATURE.degC : in the tool\n~A\n"
+    head = (
+        "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 9.98 :\nSTEP.S 0.02 :\nNULL. "
+        "-999.25 :\n"
+    )
+    curves = (
+        "~C\nTIME.S : time\nGYRO_X.deg/h : rate\nGYRO_Y.deg/h : rate\nTEMPERATURE.degC : in "
+        "the tool\n~A\n"
+    )
     path = tmp_path / "run.las"
     path.write_text(head + curves + rows + "\n")
     return path
@@ -249,7 +255,7 @@ def write_binary(path: Path, order: str, *, tail: bytes = b"") -> None:
 
 @pytest.mark.parametrize("order", ["little", "big"])
 @pytest.mark.parametrize("name", ["run.bin.toml", "run.toml", "layout.toml"])
-def test_binary_by_its_layout(tmp_path: Path, order: str, name: str) -> None:
+def test_binary_file_is_read_by_its_layout(tmp_path: Path, order: str, name: str) -> None:
     write_binary(tmp_path / "run.bin", order, tail=b"cut")
     (tmp_path / name).write_text(LAYOUT.format(order=order))
     log = read_log(tmp_path / "run.bin", epoch=str(START))
@@ -261,7 +267,7 @@ def test_binary_by_its_layout(tmp_path: Path, order: str, name: str) -> None:
     assert (summary.format, summary.n_rows, summary.last) == ("binary", ROWS, STAMPS[-1])
 
 
-def test_any_file_with_a_layout_beside_it_is_binary(tmp_path: Path) -> None:
+def test_any_file_with_a_layout_file_is_binary(tmp_path: Path) -> None:
     write_binary(tmp_path / "run.dat", "little")
     (tmp_path / "run.dat.toml").write_text(LAYOUT.format(order="little"))
     assert np.array_equal(read_log(tmp_path / "run.dat").rate.values[0], VALUES[0])
@@ -270,15 +276,15 @@ def test_any_file_with_a_layout_beside_it_is_binary(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("layout", "said"),
     [
-        (None, r"nothing says how its records are laid out; write run\.bin\.toml"),
-        ("fields = [", "no TOML"),
+        (None, r"the layout of its records is unknown; write run\.bin\.toml"),
+        ("fields = [", "not valid TOML"),
         ("fields = []", "needs fields"),
         ('fields = [{name = "a", type = "int24"}]', "field 1 is .*float64"),
-        ("rows = 3", "'rows' is no part"),
+        ("rows = 3", "'rows' is not a key"),
         ('byte_order = "mixed"\nfields = []', "byte_order"),
     ],
 )
-def test_a_wrong_layout_says_what_is_wrong(tmp_path: Path, layout: str | None, said: str) -> None:
+def test_wrong_layout_is_explained(tmp_path: Path, layout: str | None, said: str) -> None:
     write_binary(tmp_path / "run.bin", "little")
     if layout is not None:
         (tmp_path / "run.bin.toml").write_text(layout)
@@ -286,7 +292,7 @@ def test_a_wrong_layout_says_what_is_wrong(tmp_path: Path, layout: str | None, s
         read_log(tmp_path / "run.bin")
 
 
-def test_a_file_shorter_than_a_record(tmp_path: Path) -> None:
+def test_file_shorter_than_a_record_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run.bin").write_bytes(b"HEADER OF 16 BYT12345")
     (tmp_path / "run.bin.toml").write_text(LAYOUT.format(order="little"))
     with pytest.raises(FormatError, match=r"run\.bin: it holds no record"):
@@ -310,13 +316,14 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes) -> N
         ("lasio", "a.las", "las"),
     ],
 )
-def test_a_library_that_is_not_installed_is_named(
+def test_missing_library_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, name: str, extra: str
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / name).write_bytes(b"~A\n")
     with pytest.raises(
         OptionError,
-        match=rf"{name}: reading it needs {module}; install it with pip install 'gyrostab\[{extra}\]'",
+        match=rf"{name}: reading it needs {module}; install it with pip install "
+        rf"'gyrostab\[{extra}\]'",
     ):
         read_log(tmp_path / name)

@@ -1,4 +1,4 @@
-"""Columns that are read are kept in less room than 8 bytes a value, and come back bit for bit."""
+"""Columns are packed in less than 8 bytes a value, and restored bit for bit."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def bits(values: np.ndarray) -> np.ndarray:
     st.sampled_from([None, np.nan, np.inf, -np.inf]),
 )
 @settings(max_examples=150, deadline=None)
-def test_decimals_come_back_as_a_parser_reads_them(wholes, digits, law, missing):
+def test_packed_decimals_equal_parsed_ones(wholes, digits, law, missing):
     texts = [
         f"{'-' * (n < 0)}{abs(n) // 10**digits}.{abs(n) % 10**digits:0{digits}d}"
         if digits
@@ -74,7 +74,7 @@ def test_decimals_come_back_as_a_parser_reads_them(wholes, digits, law, missing)
 
 
 @pytest.mark.parametrize("odd", [1 / 3, -0.0, 2.0**31, np.nextafter(0.25, 1), 1e300])
-def test_what_is_no_decimal_of_32_bits_is_not_packed(odd):
+def test_other_numbers_than_32_bit_decimals_are_not_packed(odd):
     values = np.array([1.0, odd, 2.5])
     assert not to_decimals(values, 100.0, np.empty(3, np.int32))[0]
     assert decimals_of(np.array([1.0, 2.5, np.nan])) == 10.0
@@ -82,7 +82,7 @@ def test_what_is_no_decimal_of_32_bits_is_not_packed(odd):
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400))
 @settings(max_examples=60, deadline=None)
-def test_even_steps_come_back(seed, n):
+def test_packed_even_steps_are_restored(seed, n):
     rng = np.random.default_rng(seed)
     steps = np.where(rng.random(n) < 0.005, rng.integers(-(10**12), 10**12, n), 2_500_000)
     stamps = 1_767_225_600_000_000_000 + np.cumsum(steps)
@@ -144,7 +144,8 @@ def text_log(path: Path, first: int, rows: int, *, decimals: int) -> Path:
         x, y = rng.normal(scale=30), rng.integers(-500, 500)
         temperature = f"{20 + n / 1000:.2f}" if n % 10 == 0 else ""
         lines.append(
-            f"{(first + n + 40 * (n > 700)) * 10},{x:.{decimals}f},{'****' if n == 333 else y},{temperature}"
+            f"{(first + n + 40 * (n > 700)) * 10},{x:.{decimals}f},"
+            f"{'****' if n == 333 else y},{temperature}"
         )
     lines[500] = "@@@@,,,"
     path.write_text("\n".join(lines) + "\n")
@@ -153,7 +154,7 @@ def text_log(path: Path, first: int, rows: int, *, decimals: int) -> Path:
 
 @pytest.mark.parametrize("limit", [100, 10**9])
 @pytest.mark.parametrize("decimals", [3, 12])
-def test_a_log_that_is_packed_is_the_log(tmp_path, monkeypatch, limit, decimals):
+def test_packed_log_equals_the_plain_log(tmp_path, monkeypatch, limit, decimals):
     paths = [
         text_log(tmp_path / f"{number}.csv", 1100 * number, 1000, decimals=decimals)
         for number in range(3)
@@ -168,7 +169,7 @@ def test_a_log_that_is_packed_is_the_log(tmp_path, monkeypatch, limit, decimals)
     np.testing.assert_array_equal(bits(packed.rate.compute().values), bits(plain.rate.values))
 
 
-def test_reading_ahead_ends_with_what_stops_it(tmp_path, monkeypatch):
+def test_reading_ahead_stops_with_an_error(tmp_path, monkeypatch):
     paths = [
         text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)
     ]
@@ -192,14 +193,14 @@ def test_reading_ahead_ends_with_what_stops_it(tmp_path, monkeypatch):
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("gyrostab-")]
 
 
-def test_whole_numbers_at_even_steps_take_less_than_half_the_room(tmp_path, monkeypatch):
+def test_whole_numbers_at_even_steps_take_less_than_half_the_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(buffers, "_MAX_PLAIN_VALUES", 0)
     path = text_log(tmp_path / "log.csv", 0, 3000, decimals=2)
     assert memory_bytes(read_log(path)) < 0.55 * 8 * 4 * 3000
 
 
-def test_even_stamps_are_placed_as_those_that_are_not_quite():
-    """A nanosecond of jitter takes the rows another way through the kernel; more rows than it remembers samples of."""
+def test_even_stamps_are_placed_like_nearly_even_ones():
+    """With a nanosecond of jitter the kernel takes another path; the log exceeds its memory."""
     rng = np.random.default_rng(5)
     kept = np.sort(rng.choice(50_000, 49_900, replace=False))
     rows = np.concatenate(

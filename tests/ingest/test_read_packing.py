@@ -1,4 +1,4 @@
-"""Packed variables of NetCDF and HDF5 files, against values that are computed from the CF conventions by hand."""
+"""Packed variables of NetCDF and HDF5 files, compared with the CF conventions by hand."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def write(
     time: dict[str, Any] | None = None,
     form: str = "NETCDF4",
 ) -> Path:
-    """One gyro axis of the given stored numbers; the fill value goes in with the other attributes."""
+    """Write one gyro axis of stored numbers, with the fill value among the attributes."""
     time = {"units": "s", **(time or {})}
     if path.suffix == ".h5":
         with h5py.File(path, "w") as file:
@@ -63,17 +63,37 @@ INVALID = np.isin(COUNTS, [-30, 29])
 CASES = {
     "plain": (COUNTS, {}, COUNTS.astype(float)),
     "scale and offset": (COUNTS, {"scale_factor": 0.1, "add_offset": 5.0}, COUNTS * 0.1 + 5.0),
-    "whole scale": (COUNTS, {"scale_factor": np.int16(3), "add_offset": np.int16(-7)}, COUNTS * 3.0 - 7.0),
+    "whole scale": (
+        COUNTS,
+        {"scale_factor": np.int16(3), "add_offset": np.int16(-7)},
+        COUNTS * 3.0 - 7.0,
+    ),
     "big endian": (COUNTS.astype(">i2"), {"scale_factor": 0.5}, COUNTS * 0.5),
-    "fill": (COUNTS, {"_FillValue": np.int16(-30), "missing_value": np.int16(29)}, np.where(INVALID, np.nan, COUNTS)),
-    "several missing": (COUNTS, {"missing_value": np.array([-30, 29], "i2"), "scale_factor": 2.0}, np.where(INVALID, np.nan, COUNTS * 2.0)),
-    "missing of another type": (COUNTS, {"missing_value": np.array([-30.0, 29.0, np.nan, 1e9])}, np.where(INVALID, np.nan, COUNTS)),
+    "fill": (
+        COUNTS,
+        {"_FillValue": np.int16(-30), "missing_value": np.int16(29)},
+        np.where(INVALID, np.nan, COUNTS),
+    ),
+    "several missing": (
+        COUNTS,
+        {"missing_value": np.array([-30, 29], "i2"), "scale_factor": 2.0},
+        np.where(INVALID, np.nan, COUNTS * 2.0),
+    ),
+    "missing of another type": (
+        COUNTS,
+        {"missing_value": np.array([-30.0, 29.0, np.nan, 1e9])},
+        np.where(INVALID, np.nan, COUNTS),
+    ),
     "missing among floats": (
         FLOATS,
         {"missing_value": np.float64(-0.1), "_FillValue": np.float32(np.nan)},
         np.where(COUNTS == -1, np.nan, FLOATS.astype(float)),
     ),
-    "valid range": (COUNTS, {"valid_range": np.array([-29, 28], "i2")}, np.where(INVALID, np.nan, COUNTS)),
+    "valid range": (
+        COUNTS,
+        {"valid_range": np.array([-29, 28], "i2")},
+        np.where(INVALID, np.nan, COUNTS),
+    ),
     "valid range, packed": (
         COUNTS,
         {"valid_range": np.array([-29, 28], "i2"), "scale_factor": 0.1},
@@ -84,26 +104,51 @@ CASES = {
         {"valid_range": np.array([-2.9, 2.8]), "scale_factor": 0.1},
         np.where(INVALID, np.nan, COUNTS * 0.1),
     ),
-    "valid range, unpacked, mirrored": (COUNTS, {"valid_min": -2.8, "scale_factor": -0.1}, np.where(COUNTS > 28, np.nan, COUNTS * -0.1)),
+    "valid range, unpacked, mirrored": (
+        COUNTS,
+        {"valid_min": -2.8, "scale_factor": -0.1},
+        np.where(COUNTS > 28, np.nan, COUNTS * -0.1),
+    ),
     "valid min": (COUNTS, {"valid_min": np.int16(-29)}, np.where(COUNTS < -29, np.nan, COUNTS)),
-    "valid max": (COUNTS, {"valid_max": np.int16(28), "add_offset": 100.0}, np.where(COUNTS > 28, np.nan, COUNTS + 100.0)),
-    "valid max of a float": (FLOATS, {"valid_max": 2.8}, np.where(COUNTS > 28, np.nan, FLOATS.astype(float))),
+    "valid max": (
+        COUNTS,
+        {"valid_max": np.int16(28), "add_offset": 100.0},
+        np.where(COUNTS > 28, np.nan, COUNTS + 100.0),
+    ),
+    "valid max of a float": (
+        FLOATS,
+        {"valid_max": 2.8},
+        np.where(COUNTS > 28, np.nan, FLOATS.astype(float)),
+    ),
     "unsigned": (BYTES.view("i1"), {"_Unsigned": "true"}, BYTES.astype(float)),
-    "unsigned, packed": (BYTES.view("i1"), {"_Unsigned": "true", "scale_factor": 0.5, "add_offset": -50.0}, BYTES * 0.5 - 50.0),
+    "unsigned, packed": (
+        BYTES.view("i1"),
+        {"_Unsigned": "true", "scale_factor": 0.5, "add_offset": -50.0},
+        BYTES * 0.5 - 50.0,
+    ),
     "unsigned, with fill": (
         BYTES.view("i1"),
-        {"_Unsigned": "true", "_FillValue": np.int8(-97), "valid_range": np.array([101, -98], "i1"), "scale_factor": 0.5},
+        {
+            "_Unsigned": "true",
+            "_FillValue": np.int8(-97),
+            "valid_range": np.array([101, -98], "i1"),
+            "scale_factor": 0.5,
+        },
         np.where((BYTES == 159) | (BYTES == 100), np.nan, BYTES * 0.5),
     ),
-    "unsigned, limit beyond its type": (BYTES.view("i1"), {"_Unsigned": "true", "valid_max": np.int16(300)}, BYTES.astype(float)),
+    "unsigned, limit beyond its type": (
+        BYTES.view("i1"),
+        {"_Unsigned": "true", "valid_max": np.int16(300)},
+        BYTES.astype(float),
+    ),
     "signed": (COUNTS.view("u2"), {"_Unsigned": "false", "scale_factor": 0.5}, COUNTS * 0.5),
-}  # fmt: skip
+}
 
 
 @pytest.mark.filterwarnings("ignore:variable 'gyro_x' has multiple fill values")
 @pytest.mark.parametrize("form", ["NETCDF4", "NETCDF3_CLASSIC", "hdf5"])
 @pytest.mark.parametrize("case", list(CASES))
-def test_packed_numbers_become_the_values_that_the_conventions_give(tmp_path, case, form):
+def test_packed_numbers_are_decoded_by_the_cf_conventions(tmp_path, case, form):
     stored, attributes, wanted = CASES[case]
     if (form, case) == ("NETCDF3_CLASSIC", "signed"):
         pytest.skip("this format has no unsigned type")
@@ -117,7 +162,7 @@ def test_packed_numbers_become_the_values_that_the_conventions_give(tmp_path, ca
 @pytest.mark.parametrize(
     "case", ["scale and offset", "several missing", "unsigned, packed", "signed"]
 )
-def test_packed_numbers_become_the_values_that_xarray_gives(tmp_path, case):
+def test_packed_numbers_are_decoded_like_xarray(tmp_path, case):
     stored, attributes, _ = CASES[case]
     path = write(tmp_path / "log.nc", stored, dict(attributes))
     raw = read_log(path)
@@ -193,7 +238,7 @@ def test_counts_beyond_the_digits_of_a_float_are_compared_exactly():
 def write_regular(
     path: Path, stored: np.ndarray, attributes: dict[str, Any], *, zarr_format: int = 3, **time: Any
 ) -> Path:
-    """A regular log of some other program: axis, a stamp for each sample, the sampling rate as an attribute."""
+    """Write a regular log of another program: axis, stamps, the sampling rate as attribute."""
     stamps = (["time"], np.arange(ROWS) * 10, {"units": "milliseconds since 2026-01-01", **time})
     log = xr.Dataset(
         {"rate": (["axis", "time"], stored[None], {"units": "degree hour-1", **attributes})},
@@ -221,7 +266,7 @@ def write_regular(
         "unsigned, packed",
     ],
 )
-def test_a_regular_log_of_another_program_is_decoded_alike(tmp_path, case, suffix):
+def test_regular_log_of_another_program_is_decoded_like_a_raw_log(tmp_path, case, suffix):
     stored, attributes, wanted = CASES[case]
     log = read_log(write_regular(tmp_path / f"log{suffix}", stored, attributes))
     np.testing.assert_allclose(log.rate.values[0], wanted, rtol=1e-12)
@@ -232,7 +277,7 @@ def test_a_regular_log_of_another_program_is_decoded_alike(tmp_path, case, suffi
 @pytest.mark.parametrize(
     ("attribute", "value"), [("calendar", "noleap"), ("units", "seconds since now")]
 )
-def test_a_regular_log_with_dates_of_no_recording_is_refused(tmp_path, attribute, value):
+def test_regular_log_with_a_climate_calendar_is_refused(tmp_path, attribute, value):
     with pytest.raises(UnitError, match=f"log.nc: variable 'time': .*{value}"):
         read_log(write_regular(tmp_path / "log.nc", COUNTS, {}, **{attribute: value}))
 
@@ -247,8 +292,8 @@ def test_an_unwritten_sample_of_a_regular_log_is_missing(tmp_path):
 
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("named", [True, False])
-def test_the_fill_value_that_zarr_gives_to_every_array_means_nothing(tmp_path, named, regular):
-    """Zarr writes a fill value of 0 by default; samples of 0 are values, in stores with and without names of dimensions."""
+def test_default_fill_value_of_zarr_is_ignored(tmp_path, named, regular):
+    """Zarr writes a fill value of 0 by default, but samples of 0 are values."""
     path = tmp_path / "log.zarr"
     if regular:
         if not named:

@@ -1,4 +1,4 @@
-"""Files of known programs: header lines as those programs write them, a few rows of our own."""
+"""Files of known programs: their header lines, with a few rows of our own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RAD = math.degrees(1) * 3600  # deg/h
 
 
 class Sample(NamedTuple):
-    """A file of a program: its name, its text, and what the first row means."""
+    """A file of a program: its name, its text, and the expected first row."""
 
     file: str
     text: str
@@ -68,9 +68,12 @@ SAMPLES = {
     ),
     "microstrain-mip": Sample(
         "mip.csv",
-        "FILE_INFO\nListSeparator=comma\nDecimalSeparator=period\n\nSESSION_INFO\nStartTime,1/2/2017 1:02:03 PM\n\n"
+        "FILE_INFO\nListSeparator=comma\nDecimalSeparator=period\n\n"
+        "SESSION_INFO\nStartTime,1/2/2017 "
+        "1:02:03 PM\n\n"
         "DEVICE_INFO\nModelName,3DM\nSerialNumber,6225-1\nFirmwareVersion,1.1.19\n\nDATA_START\n"
-        "GPS TFlags,GPS Week,GPS TOW,X Accel [x8004],Y Accel [x8004],Z Accel [x8004],X Gyro [x8005],Y Gyro [x8005],Z Gyro [x8005],"
+        "GPS TFlags,GPS Week,GPS TOW,X Accel [x8004],Y Accel [x8004],Z Accel [x8004],X Gyro "
+        "[x8005],Y Gyro [x8005],Z Gyro [x8005],"
         "Lat [x8103],Flags [x8103],Flags [x8108]\n"
         + "".join(
             f"5,1936,{494410 + n / 50:.6f},0.1,0.2,1.0,0.001,-0.002,0.003,,,\n" for n in range(4)
@@ -81,8 +84,10 @@ SAMPLES = {
     ),
     "instinct-imu": Sample(
         "kvh.csv",
-        "Time [s],GpsCycle,GpsWeek,GpsToW [s],TimeStartup [ns],UnCompMagX [Gauss],UnCompMagY [Gauss],UnCompMagZ [Gauss],"
-        "UnCompAccX [m/s^2],UnCompAccY [m/s^2],UnCompAccZ [m/s^2],UnCompGyroX [rad/s],UnCompGyroY [rad/s],UnCompGyroZ [rad/s],"
+        "Time [s],GpsCycle,GpsWeek,GpsToW [s],TimeStartup [ns],UnCompMagX [Gauss],UnCompMagY "
+        "[Gauss],UnCompMagZ [Gauss],"
+        "UnCompAccX [m/s^2],UnCompAccY [m/s^2],UnCompAccZ [m/s^2],UnCompGyroX "
+        "[rad/s],UnCompGyroY [rad/s],UnCompGyroZ [rad/s],"
         "Temperature [Celsius]\n"
         + "".join(
             f"{n / 100},,,,{n * 10**7 + 5},1,2,3,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5\n"
@@ -94,8 +99,10 @@ SAMPLES = {
     ),
     "instinct-vectornav": Sample(
         "vn310.csv",
-        "Time [s],GpsCycle,GpsWeek,GpsToW [s],Time::TimeStartup [ns],IMU::UncompMag::X [Gauss],IMU::UncompAccel::X [m/s^2],"
-        "IMU::UncompAccel::Y [m/s^2],IMU::UncompAccel::Z [m/s^2],IMU::UncompGyro::X [rad/s],IMU::UncompGyro::Y [rad/s],"
+        "Time [s],GpsCycle,GpsWeek,GpsToW [s],Time::TimeStartup [ns],IMU::UncompMag::X "
+        "[Gauss],IMU::UncompAccel::X [m/s^2],"
+        "IMU::UncompAccel::Y [m/s^2],IMU::UncompAccel::Z [m/s^2],IMU::UncompGyro::X "
+        "[rad/s],IMU::UncompGyro::Y [rad/s],"
         "IMU::UncompGyro::Z [rad/s],IMU::Temp [Celsius],IMU::Pres [kPa]\n"
         + "".join(
             f",,,,{n * 10**7 + 5},1,0.1,0.2,9.80665,0.001,-0.002,0.003,21.5,101.3\n"
@@ -107,15 +114,17 @@ SAMPLES = {
     ),
     "phyphox": Sample(
         "Gyroscope.csv",
-        '"Time (s)","Gyroscope x (rad/s)","Gyroscope y (rad/s)","Gyroscope z (rad/s)","Absolute (rad/s)"\n'
-        + "".join(f"{n / 100:.9E},1.0E-3,-2.0E-3,3.0E-3,3.7E-3\n" for n in range(4)),
+        '"Time (s)","Gyroscope x (rad/s)","Gyroscope y (rad/s)","Gyroscope z (rad/s)","Absolute '
+        '(rad/s)"\n' + "".join(f"{n / 100:.9E},1.0E-3,-2.0E-3,3.0E-3,3.7E-3\n" for n in range(4)),
         (0.001 * RAD, -0.002 * RAD, 0.003 * RAD),
         0.01,
     ),
     "x-io": Sample(
         "sensors.csv",
-        "Time (s),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),Accelerometer X (g),Accelerometer Y (g),"
-        "Accelerometer Z (g),Magnetometer X (uT),Magnetometer Y (uT),Magnetometer Z (uT),Barometer (hPa)\n"
+        "Time (s),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),Accelerometer X "
+        "(g),Accelerometer Y (g),"
+        "Accelerometer Z (g),Magnetometer X (uT),Magnetometer Y (uT),Magnetometer Z "
+        "(uT),Barometer (hPa)\n"
         + "".join(f"{n / 100},0.5,-0.25,0.125,0.1,0.2,1.0,20,0,-40,1013\n" for n in range(4)),
         (1800, -900, 450),
         0.01,
@@ -123,7 +132,8 @@ SAMPLES = {
     ),
     "x-io, x-IMU": Sample(
         "LoggedData_CalInertialAndMag.csv",
-        "Packet number,Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),Accelerometer X (g),Accelerometer Y (g),"
+        "Packet number,Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),Accelerometer "
+        "X (g),Accelerometer Y (g),"
         "Accelerometer Z (g),Magnetometer X (G),Magnetometer Y (G),Magnetometer Z (G)\n"
         + "".join(f"{n},0.5,-0.25,0.125,0.1,0.2,1.0,0.2,0,-0.4\n" for n in range(4)),
         (1800, -900, 450),
@@ -157,7 +167,8 @@ SAMPLES = {
         "field.orientation.w,field.orientation_covariance0,field.angular_velocity.x,field.angular_velocity.y,field.angular_velocity.z,"
         "field.linear_acceleration.x,field.linear_acceleration.y,field.linear_acceleration.z\n"
         + "".join(
-            f"{1609060336768428032 + n * 10**7 + 999},{n},{1609060336768428032 + n * 10**7},imu_link,0,0,0,1,-1,"
+            f"{1609060336768428032 + n * 10**7 + 999},{n},"
+            f"{1609060336768428032 + n * 10**7},imu_link,0,0,0,1,-1,"
             "0.001,-0.002,0.003,0.1,0.2,9.80665\n"
             for n in range(4)
         ),
@@ -221,7 +232,7 @@ def test_a_file_of_a_known_program_needs_no_options(tmp_path: Path, name: str) -
         assert float(raw[channel][0]) == pytest.approx(value, rel=1e-9), channel
 
 
-def test_what_the_user_says_is_stronger_than_a_preset(tmp_path: Path) -> None:
+def test_options_overrule_a_preset(tmp_path: Path) -> None:
     sample = SAMPLES["xsens-mt-manager"]
     path = tmp_path / sample.file
     path.write_text(sample.text)
@@ -237,7 +248,7 @@ def test_what_the_user_says_is_stronger_than_a_preset(tmp_path: Path) -> None:
     assert "accel_z" not in counted
 
 
-def test_names_that_are_ours_are_taken_for_no_other_program(tmp_path: Path) -> None:
+def test_contract_names_match_no_preset(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text(
         "time [s],gyro_x [deg/h],gyro_rad[0],gyro_rad[1],gyro_rad[2]\n0,1,0,0,0\n1,2,0,0,0\n"
@@ -247,7 +258,7 @@ def test_names_that_are_ours_are_taken_for_no_other_program(tmp_path: Path) -> N
     assert not any("preset" in note for note in raw.attrs["notes"])
 
 
-def test_a_preset_without_time_or_rate_asks_for_the_rate(tmp_path: Path) -> None:
+def test_preset_without_time_or_rate_requires_the_rate(tmp_path: Path) -> None:
     sample = SAMPLES["x-io, x-IMU"]
     path = tmp_path / sample.file
     path.write_text(sample.text)

@@ -1,4 +1,4 @@
-"""Real recordings read rightly: numbers checked against their README, their source's own arithmetic, or a second reader."""
+"""Real recordings, checked against their README, their source, or a second reader."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_rocket_flights(recordings: Find, number: int, rows: int) -> None:
     np.testing.assert_array_equal(raw.time.values.astype(np.int64), exact)
     assert "update_timestamp_ns" in " ".join(
         scan_file(path).notes
-    )  # a second clock, listed and not taken for the time
+    )  # a second clock is listed, but is not the time
 
 
 def test_px4_microseconds(recordings: Find) -> None:
@@ -141,7 +141,7 @@ def test_px4_microseconds(recordings: Find) -> None:
     xr.testing.assert_equal(recognised[["rate", "time"]], raw[["rate", "time"]])
 
 
-def test_euroc_spoiled_by_a_spreadsheet(recordings: Find) -> None:
+def test_euroc_damaged_by_a_spreadsheet(recordings: Find) -> None:
     path = recordings("mav-flight-adis16448/imu0_data.csv")
     recognised = read_log(path)
     assert any("preset" in note and "EuRoC" in note for note in recognised.attrs["notes"])

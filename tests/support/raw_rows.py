@@ -19,7 +19,7 @@ def raw_log(
     name: str = "tool.csv",
     **channels: ArrayLike,
 ) -> xr.Dataset:
-    """A raw log; `stamps` in ns (int), None for a file without time; values by row, or by axis and row."""
+    """Make a raw log; `stamps` [ns] or None without time; values by row, or axis and row."""
     n = len(stamps) if stamps is not None else np.shape(values)[-1]
     values = np.atleast_2d(np.arange(1.0, n + 1) if values is None else values)
     signal = "rate" if kind == "rate" else "angle"
@@ -38,12 +38,12 @@ def raw_log(
 
 
 def stamps_of(samples: ArrayLike, rate: float) -> NDArray[np.int64]:
-    """Stamps [ns] of samples, from the start on."""
+    """Return the stamps of samples [ns], from the start on."""
     return START + np.rint(np.asarray(samples) * (1e9 / rate)).astype(np.int64)
 
 
 def expected(samples: ArrayLike) -> NDArray[np.float64]:
-    """Signal on the grid when row i (value i + 1) belongs to samples[i]; a negative sample is a dropped row."""
+    """Return the signal on the grid if row i has sample ``samples[i]``, negative if dropped."""
     of = np.asarray(samples)
     out = np.full(of.max() + 1, np.nan)
     out[of[of >= 0]] = np.flatnonzero(of >= 0) + 1.0

@@ -1,4 +1,4 @@
-"""Regular logs of plain counts, cut in pieces: for the tests of archives."""
+"""Regular logs of counts, cut into pieces, for the tests of archives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIZE = 6000
 
 
 def signal(size: int = SIZE, *, seed: int = 5, holes: float = 0.05) -> np.ndarray:
-    """Two axes of counts, with stretches missing in both."""
+    """Return two axes of counts, with stretches missing in both."""
     rng = np.random.default_rng(seed)
     values = np.round(rng.normal(0, 180, (2, size)))
     for start in rng.integers(0, size, int(holes * size / 10)):
@@ -23,7 +23,7 @@ def signal(size: int = SIZE, *, seed: int = 5, holes: float = 0.05) -> np.ndarra
 
 
 def nan_runs(values: np.ndarray) -> np.ndarray:
-    """Table of gaps of samples (axis, time) that are missing in every axis, by the plain way."""
+    """Return the table of gaps of samples (axis, time) missing in every axis."""
     bad = np.isnan(values).all(axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]))).reshape(-1, 2)
     length = edges[:, 1] - edges[:, 0]
@@ -39,7 +39,7 @@ def log_of(
     shift: int = 0,
     axes: str = "xy",
 ) -> xr.Dataset:
-    """A lazy regular log of the samples from `first` on of a grid; its clock is `shift` [ns] late."""
+    """Make a lazy regular log from sample `first` of a grid on, with its clock `shift` ns late."""
     begin = int(grid_times(start, rate, first)) + shift
     log = xr.Dataset(
         {

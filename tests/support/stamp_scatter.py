@@ -1,4 +1,4 @@
-"""Stamps of known samples with jitter, packets, late rows and losses, for the tests and the benchmark of the regular time axis."""
+"""Stamps of known samples with jitter, packets, late rows and losses, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PACKET = 7  # rows
 
 
 def lose_samples(kind: str, rows: int, random: np.random.Generator) -> NDArray[np.int64]:
-    """True sample of each of about `rows` rows: all, 1 % lost one by one, 30 % lost in bursts, or one long gap."""
+    """Return the true samples of about `rows` rows, with losses of the given kind."""
     if kind == "single":
         samples = np.flatnonzero(random.random(int(rows * 1.01)) >= 0.01)
     elif kind == "bursts":
@@ -32,7 +32,7 @@ def lose_samples(kind: str, rows: int, random: np.random.Generator) -> NDArray[n
 def scatter_stamps(
     samples: NDArray[np.int64], kind: str, scatter: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Times of arrival [samples]: a standard deviation (half a range if uniform) of `scatter`, in several ways."""
+    """Return times of arrival [samples] with a jitter of `scatter` (half range if uniform)."""
     noise = (
         random.uniform(-scatter, scatter, len(samples))
         if kind == "uniform"
@@ -43,7 +43,7 @@ def scatter_stamps(
         return np.sort(times)
     if kind == "latest":
         return np.maximum.accumulate(times)
-    if kind == "packets":  # all rows of a packet have the time at which it is complete, and sent
+    if kind == "packets":  # all rows of a packet arrive when it is complete
         packet = samples // PACKET
         return (packet + 1) * PACKET + np.abs(random.normal(0, scatter, packet[-1] + 1))[packet]
     if kind == "late":
@@ -55,5 +55,5 @@ def scatter_stamps(
 
 
 def round_stamps(times: NDArray[np.float64], rate: float, unit: str) -> NDArray[np.int64]:
-    """Stamps [ns] in a unit."""
+    """Round times of arrival to stamps [ns] in a unit."""
     return START + np.rint(times / rate * 1e9 / UNITS[unit]).astype(np.int64) * UNITS[unit]

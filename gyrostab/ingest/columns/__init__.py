@@ -1,1 +1,1 @@
-"""Columns of any file to a raw log: names, units, stamps, and columns that may be larger than memory."""
+"""Convert the columns of any file to a raw log: names, units, stamps, columns beyond memory."""

@@ -1,4 +1,4 @@
-"""Growing columns that move from memory to an unlinked temporary file when they become large."""
+"""Growing columns that move from memory to a temporary file when they become large."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ __all__ = [
     "take_rows",
 ]
 
-#: Columns of one file together stay in memory up to this size [bytes].
+#: Largest total size of the columns of one file that is held in memory [bytes].
 SPILL_BYTES = 128 * 2**20
 
-#: Rows of one dask chunk of a column in pieces.
+#: Rows of one dask chunk of a piecewise column.
 CHUNK_ROWS = 2**21
 
-#: Values of all columns of a file up to which they are put together to plain arrays.
+#: Largest number of values of all columns of a file for which `finish` returns plain arrays.
 _MAX_PLAIN_VALUES = 2**21
 
 
 def take_rows(column: NDArray[Any] | PiecewiseColumn, rows: NDArray[np.int64]) -> NDArray[Any]:
-    """The values of a few rows."""
+    """Return the values of a few rows."""
     if isinstance(column, PiecewiseColumn):
         return np.concatenate(
             [np.empty(0, column.dtype), *(column[row : row + 1] for row in rows.tolist())]
@@ -43,7 +43,7 @@ def take_rows(column: NDArray[Any] | PiecewiseColumn, rows: NDArray[np.int64]) -
 
 
 def set_rows(column: NDArray[Any] | PiecewiseColumn, rows: NDArray[np.int64], value: int) -> None:
-    """Change a few rows."""
+    """Set the values of a few rows."""
     if isinstance(column, PiecewiseColumn):
         for row in rows.tolist():
             column.set_value(row, value)
@@ -54,8 +54,8 @@ def set_rows(column: NDArray[Any] | PiecewiseColumn, rows: NDArray[np.int64], va
 class Buffers:
     """Columns of 8-byte numbers that grow block by block.
 
-    Up to `limit` bytes they stay in memory; beyond it they are appended to a spool. Where they are
-    few and in memory, they end as arrays, of which the columns `rows_of` are the rows of one.
+    Up to `limit` bytes they stay in memory; beyond it they are appended to a spool. Small columns
+    in memory are returned as arrays, and the columns `rows_of` as the rows of one matrix.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Buffers:
         self._held = self._moved = 0  # bytes in memory; pieces of each column that were spilled
 
     def add(self, block: Mapping[Any, NDArray[Any] | Piece]) -> None:
-        """Append one block: every column, all of one length."""
+        """Append one block, in which all columns have the same length."""
         size = 0
         for key, values in block.items():
             piece = self._as_piece(key, values) if isinstance(values, np.ndarray) else values
@@ -84,7 +84,7 @@ class Buffers:
     def _as_piece(self, key: Any, values: NDArray[Any]) -> Piece:
         whole = np.ascontiguousarray(values, dtype=self.dtypes[key])
         if isinstance(whole.base, np.ndarray) and whole.base.nbytes > whole.nbytes:
-            whole = whole.copy()  # or else what it is a part of would stay in memory
+            whole = whole.copy()  # a view would keep its whole base in memory
         return PlainPiece(whole.view(np.int64))
 
     def _spill_to_disk(self) -> None:
@@ -94,7 +94,7 @@ class Buffers:
         self._held, self._moved = 0, max(map(len, self._pieces.values()))
 
     def finish(self) -> dict[Any, NDArray[Any] | PiecewiseColumn]:
-        """The columns: arrays where they are small, or else in pieces."""
+        """Return the columns: plain arrays if they are small, otherwise piecewise columns."""
         found: dict[Any, NDArray[Any] | PiecewiseColumn] = {}
         stays = any(
             isinstance(piece, FilePiece) for pieces in self._pieces.values() for piece in pieces
@@ -120,7 +120,7 @@ class Buffers:
 
 
 def stack_as_rows(columns: Sequence[Any]) -> Any:
-    """Columns as the rows of one array, numpy if they are, without a copy if they are the rows of one already."""
+    """Stack columns as the rows of one array, without a copy if they already share one matrix."""
     if not isinstance(columns[0], np.ndarray):
         stacked = stack_rows(columns)
         stacked.gyrostab_pieces = [pieces for column in columns for pieces in pieces_of(column)]
@@ -136,7 +136,7 @@ def stack_as_rows(columns: Sequence[Any]) -> Any:
 
 
 def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:
-    """A dask array over a column in pieces; an array in memory is returned as it is."""
+    """Wrap a piecewise column in a dask array; return an array in memory unchanged."""
     if not isinstance(values, PiecewiseColumn):
         return values
     import dask.array
@@ -152,5 +152,5 @@ def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:
 
 
 def pieces_of(array: Any) -> list[PiecewiseColumn]:
-    """The columns in pieces that an array of `as_lazy` or `stack_as_rows` reads."""
+    """Return the piecewise columns that an array of `as_lazy` or `stack_as_rows` reads."""
     return list(getattr(array, "gyrostab_pieces", ()))

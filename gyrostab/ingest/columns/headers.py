@@ -1,4 +1,4 @@
-"""What header cells say: the name and unit of a column, and which names have a meaning here."""
+"""Parse header cells: name and unit of a column, and the names that gyrostab knows."""
 
 from __future__ import annotations
 
@@ -60,31 +60,29 @@ KNOWN_CHANNEL_PATTERN = re.compile(
 
 @dataclass
 class Header:
-    """A column while it is being understood."""
+    """A column whose role is being determined."""
 
     source: int
     header: str
     name: str
     unit: str | None
-    stored: str | None = (
-        None  # the unit that the format keeps beside the header, weaker than --unit
-    )
+    stored: str | None = None  # unit that the format stores outside the header; --unit overrules it
     calendar: str | None = None  # the CF calendar of that unit
-    mapped: bool = False  # by the user
-    preset: bool = False  # known from the program that wrote the file
+    mapped: bool = False  # named by --map
+    preset: bool = False  # named by the preset of the program that wrote the file
     stamped: bool = False
-    key: str = ""  # what --map may call it, to mean this column and no other
+    key: str = ""  # unique name for --map
 
     @property
     def low(self) -> str:
-        """The name in small letters."""
+        """Name in lower case."""
         return self.name.lower()
 
 
 def split_header(text: str) -> tuple[str, str | None]:
-    """Name and unit of a header cell.
+    """Split a header cell into name and unit.
 
-    A unit is in square brackets, or in parentheses if it is a known one. A whole number in brackets
+    A unit is in square brackets, or in parentheses if the unit is known. A whole number in brackets
     is an index and stays in the name.
 
     Examples
@@ -113,7 +111,7 @@ def split_header(text: str) -> tuple[str, str | None]:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is a unit, of time or of anything else that `gyrostab.units` knows."""
+    """Return whether a text is a known unit, of time or of any other quantity."""
     for parse in (parse_unit, parse_time_unit):
         try:
             parse(text)
@@ -124,7 +122,7 @@ def is_unit(text: str) -> bool:
 
 
 def is_unit_of(text: str, quantities: Collection[str]) -> bool:
-    """Whether a text is a unit of one of these quantities."""
+    """Return whether a text is a unit of one of these quantities."""
     for quantity in quantities:
         try:
             if parse_unit(text, quantity).quantity == quantity:
@@ -135,7 +133,7 @@ def is_unit_of(text: str, quantities: Collection[str]) -> bool:
 
 
 def is_time_unit(text: str) -> bool:
-    """Whether a text is a unit of time."""
+    """Return whether a text is a unit of time."""
     try:
         parse_time_unit(text)
     except GyrostabError:
@@ -144,7 +142,7 @@ def is_time_unit(text: str) -> bool:
 
 
 def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
-    """The columns, each with a key of its own: its name, or where that is not the only one its header, or a number behind it."""
+    """Yield the columns, each with a unique key: name, header or numbered name."""
     split = [(header.strip(), *split_header(header)) for header in headers]
     names = Counter(name.lower() for _, name, _ in split)
     whole = Counter(header.lower() for header, _, _ in split)
@@ -160,14 +158,14 @@ def distinct_columns(headers: Sequence[str]) -> Iterator[Header]:
 
 
 def free_name(stem: str, taken: Collection[str], number: int = 2) -> str:
-    """The first name with a number behind it that is not taken."""
+    """Return the first free name of the form stem plus number."""
     while f"{stem}{number}" in taken or f"{stem}{number}".lower() in taken:
         number += 1
     return f"{stem}{number}"
 
 
 def quantity_of(low: str) -> str | None:
-    """What a channel of this name measures."""
+    """Return the quantity that a channel of this name measures, None if unknown."""
     return (
         QUANTITIES.get(low)
         or QUANTITIES.get(low.split("_")[0])
@@ -178,12 +176,12 @@ def quantity_of(low: str) -> str | None:
 
 
 def unit_quantity(quantity: str) -> str:
-    """The quantity whose units a channel may have."""
+    """Return the quantity in whose units a channel may be given."""
     return "rate" if quantity == "rotation_rate" else quantity
 
 
 def example_unit(quantity: str | None) -> str:
-    """A unit for a message."""
+    """Return a unit to suggest in a message."""
     return (
         "1"
         if quantity is None
@@ -194,5 +192,5 @@ def example_unit(quantity: str | None) -> str:
 
 
 def is_contract_name(low: str) -> bool:
-    """Whether a name in small letters is one that has a meaning of its own: an axis, the time or a known channel."""
+    """Return whether a lower-case name is that of an axis, the time or a known channel."""
     return bool(AXIS_PATTERN.match(low) or KNOWN_CHANNEL_PATTERN.match(low) or low == "time")

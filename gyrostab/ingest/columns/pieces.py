@@ -1,8 +1,8 @@
-"""Columns of 8-byte values in pieces, packed where that loses nothing, in memory or in an unlinked temporary file.
+"""Columns of 8-byte values in pieces, packed without loss, in memory or in a temporary file.
 
-Files are read back with `gyrostab.store.system.read_at`, not mapped: pages of a mapped file would count as memory of
-this process, more and more of them as a long log is gone through, and every map holds a file handle
-of its own, of which hundreds of files would need thousands.
+Files are read back with `gyrostab.store.system.read_at`, not mapped: the pages of a mapped file
+count as memory of this process, and their number grows as a long log is read. Each map also holds a
+file handle, so hundreds of files would need thousands of handles.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 
 
 class Spool:
-    """A temporary file without a name, which the system removes with the last reference to it."""
+    """An unlinked temporary file, which the system removes with the last reference to it."""
 
     def __init__(self) -> None:
         self.file: IO[bytes] | None = None
@@ -40,7 +40,7 @@ class Spool:
         self._lock = threading.Lock()
 
     def add(self, values: NDArray[Any]) -> int:
-        """Append an array; the byte at which it begins."""
+        """Append an array and return its byte offset."""
         try:
             with self._lock:
                 if self.file is None:
@@ -51,12 +51,13 @@ class Spool:
         except OSError as error:
             where = tempfile.gettempdir()
             raise OutputError(
-                f"{where}: the columns of a long log are kept there while it is read, and cannot be written ({error.strerror}); "
+                f"{where}: the columns of a long log are kept there while it is read, and cannot "
+                f"be written ({error.strerror}); "
                 "make room, or name a larger place in the environment variable TMPDIR"
             ) from error
 
     def store(self, values: NDArray[Any]) -> PiecewiseColumn:
-        """Move a column to the file."""
+        """Write a column to the file and return it as a piecewise column."""
         pieces = PiecewiseColumn(
             values.dtype, [PlainPiece(np.ascontiguousarray(values).view(np.int64))]
         )
@@ -65,7 +66,7 @@ class Spool:
 
     @property
     def handle(self) -> int:
-        """Number of the open file."""
+        """File descriptor."""
         assert self.file is not None
         return self.file.fileno()
 
@@ -86,7 +87,7 @@ class _SpooledArray:
     dtype: np.dtype[Any]
 
     def read(self, first: int, out: NDArray[Any]) -> None:
-        """Its values from number `first` on."""
+        """Read values from index `first` on into `out`."""
         wide, done = self.dtype.itemsize, 0
         view = out.data.cast("B")
         while done < view.nbytes:
@@ -96,7 +97,7 @@ class _SpooledArray:
             done += got
 
     def write(self, number: int, value: int) -> None:
-        """Change one value."""
+        """Set one value."""
         write_at(
             self.spool.handle,
             np.array(value, self.dtype).tobytes(),
@@ -128,29 +129,29 @@ def _read_part(kept: _Values, first: int, size: int) -> NDArray[Any]:
 
 
 class Piece(Protocol):
-    """Some rows of a column."""
+    """Consecutive rows of a column."""
 
     @property
     def rows(self) -> int:
-        """How many."""
+        """Number of rows."""
 
     @property
     def memory_bytes(self) -> int:
         """Bytes in memory."""
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Put the values from row `first` on into `out`."""
+        """Read the values from row `first` on into `out`."""
 
     def to_spool(self, spool: Spool) -> Piece:
-        """The same with its values in a spool."""
+        """Return the piece with its values moved to a spool."""
 
     def set_value(self, row: int, value: int) -> Piece:
-        """The same with another value in one row, by its bits."""
+        """Return the piece with the bits of one value replaced."""
 
 
 @dataclass(frozen=True)
 class PlainPiece:
-    """Values as they are, by their bits."""
+    """Values stored as they are, by their bits."""
 
     words: _Values  # int64
 
@@ -165,7 +166,7 @@ class PlainPiece:
         return _memory_bytes(self.words)
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Put the values from row `first` on into `out`."""
+        """Read the values from row `first` on into `out`."""
         target = out.view(np.int64)
         if isinstance(self.words, np.ndarray):
             target[:] = self.words[first : first + out.size]
@@ -173,11 +174,11 @@ class PlainPiece:
             self.words.read(first, target)
 
     def to_spool(self, spool: Spool) -> Piece:
-        """The same with its values in a spool."""
+        """Return the piece with its values moved to a spool."""
         return PlainPiece(_move_to_spool(self.words, spool))
 
     def set_value(self, row: int, value: int) -> Piece:
-        """The same with another value in one row, by its bits."""
+        """Return the piece with the bits of one value replaced."""
         if isinstance(self.words, np.ndarray):
             self.words[row] = value
         else:
@@ -187,7 +188,7 @@ class PlainPiece:
 
 @dataclass(frozen=True)
 class DecimalPiece:
-    """Decimals as whole numbers of 32 bits (`gyrostab.kernels.encoding.decimals`), to be converted to another unit as they are read."""
+    """Decimals stored as 32-bit integers (`kernels.encoding.decimals`), converted when read."""
 
     counts: _Values  # int32
     tens: float
@@ -205,7 +206,7 @@ class DecimalPiece:
         return _memory_bytes(self.counts)
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Put the values from row `first` on into `out`."""
+        """Read the values from row `first` on into `out`."""
         from gyrostab.kernels.encoding.decimals import from_decimals
 
         from_decimals(
@@ -213,17 +214,17 @@ class DecimalPiece:
         )
 
     def to_spool(self, spool: Spool) -> Piece:
-        """The same with its values in a spool."""
+        """Return the piece with its values moved to a spool."""
         return DecimalPiece(_move_to_spool(self.counts, spool), self.tens, self.factor, self.offset)
 
     def set_value(self, row: int, value: int) -> Piece:
-        """The same with another value in one row, by its bits."""
+        """Return the piece with the bits of one value replaced."""
         return _unpack_piece(self, np.float64).set_value(row, value)
 
 
 @dataclass(frozen=True)
 class EvenStampsPiece:
-    """Stamps in stretches of even steps; so few numbers that they stay in memory."""
+    """Stamps stored as runs of even steps; small enough to stay in memory."""
 
     table: NDArray[np.int64]
     rows: int
@@ -234,32 +235,32 @@ class EvenStampsPiece:
         return self.table.nbytes
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Put the values from row `first` on into `out`."""
+        """Read the values from row `first` on into `out`."""
         from gyrostab.kernels.encoding.decimals import unroll_steps
 
         unroll_steps(self.table, first, out.view(np.int64))
 
     def to_spool(self, spool: Spool) -> Piece:
-        """The same with its values in a spool."""
+        """Return the piece with its values moved to a spool."""
         return self
 
     def set_value(self, row: int, value: int) -> Piece:
-        """The same with another value in one row, by its bits."""
+        """Return the piece with the bits of one value replaced."""
         return _unpack_piece(self, np.int64).set_value(row, value)
 
 
 @dataclass(frozen=True)
 class FilePiece:
-    """Values that stay in the file they came from, and are read and converted each time.
+    """Values that stay in their source file and are read and converted on each access.
 
     Attributes
     ----------
     read : callable
-        First row of the file, row after the last one -> values, converted.
+        First row of the file, row after the last one -> converted values.
     begin, rows : int
         First row of the file, and number of rows.
     changes : dict
-        Row of the piece -> value that stands there instead, by its bits.
+        Row of the piece -> bits of the value that replaces the stored one.
     """
 
     read: Callable[[int, int], NDArray[Any]]
@@ -273,39 +274,39 @@ class FilePiece:
         return 0
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Put the values from row `first` on into `out`."""
+        """Read the values from row `first` on into `out`."""
         out[:] = self.read(self.begin + first, self.begin + first + out.size).view(out.dtype)
         for row, value in self.changes.items():
             if first <= row < first + out.size:
                 out.view(np.int64)[row - first] = value
 
     def to_spool(self, spool: Spool) -> Piece:
-        """The same, which takes no memory."""
+        """Return the piece, which takes no memory."""
         return self
 
     def set_value(self, row: int, value: int) -> Piece:
-        """The same with another value in one row, by its bits."""
+        """Return the piece with the bits of one value replaced."""
         self.changes[row] = value
         return self
 
 
 @dataclass(frozen=True)
 class NaNPiece:
-    """Rows without a value; they take no room."""
+    """Rows without a value; they take no memory."""
 
     rows: int
     memory_bytes: int = 0
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Put NaN into `out`."""
+        """Fill `out` with NaN."""
         out[:] = np.nan
 
     def to_spool(self, spool: Spool) -> Piece:
-        """Return the same."""
+        """Return the piece, which takes no memory."""
         return self
 
     def set_value(self, row: int, value: int) -> Piece:
-        """Return the same with another value in one row, by its bits."""
+        """Return the piece with the bits of one value replaced."""
         return _unpack_piece(self, np.float64).set_value(row, value)
 
 
@@ -316,7 +317,7 @@ def _unpack_piece(piece: Piece, dtype: Any) -> PlainPiece:
 
 
 class PiecewiseColumn:
-    """A column, behind the few attributes that dask asks for; dask copies whatever has a ``copy``."""
+    """A column with the few attributes that dask needs; no ``copy``, which dask would call."""
 
     ndim = 1
 
@@ -325,11 +326,11 @@ class PiecewiseColumn:
         self._pieces = [piece for piece in pieces if piece.rows]
         self._rows = np.cumsum(
             [0, *(piece.rows for piece in self._pieces)]
-        ).tolist()  # at which the pieces begin, and the end of the last
+        ).tolist()  # first row of each piece, and the end of the last
         self.shape = (self._rows[-1],)
 
     def view(self, dtype: Any) -> PiecewiseColumn:
-        """The same bytes as another type; what spills or changes the one does so to the other."""
+        """Return the same bytes as another type; both share their pieces."""
         same = PiecewiseColumn(dtype, ())
         same._pieces, same._rows, same.shape = self._pieces, self._rows, self.shape
         return same
@@ -340,7 +341,7 @@ class PiecewiseColumn:
         return sum(piece.memory_bytes for piece in self._pieces)
 
     def find_line(self) -> tuple[int, int] | None:
-        """Return the first value and the step, where all values are even steps without a break; None where they are not."""
+        """Return first value and step if all values are evenly spaced, otherwise None."""
         if not self._pieces or not all(
             isinstance(piece, EvenStampsPiece) and len(piece.table) == 1 for piece in self._pieces
         ):
@@ -353,7 +354,7 @@ class PiecewiseColumn:
         return first, step
 
     def move_to(self, spool: Spool) -> None:
-        """Move what is in memory to a file."""
+        """Move the pieces in memory to a file."""
         self._pieces[:] = [piece.to_spool(spool) for piece in self._pieces]
 
     def __getitem__(self, part: Any) -> NDArray[Any]:
@@ -363,7 +364,7 @@ class PiecewiseColumn:
         return out[:: rows.step]
 
     def read_into(self, _row: int, begin: int, out: NDArray[Any]) -> None:
-        """The values from row `begin` of the log on: `gyrostab.store.lazy_slices.RowReader`."""
+        """Read the values from row `begin` of the log on into `out`."""
         done, number = 0, bisect_right(self._rows, begin) - 1
         while done < out.size:
             first = begin + done - self._rows[number]
@@ -372,6 +373,6 @@ class PiecewiseColumn:
             done, number = done + part.size, number + 1
 
     def set_value(self, row: int, value: int) -> None:
-        """Change a value, by its bits."""
+        """Replace the bits of a value."""
         number = bisect_right(self._rows, row) - 1
         self._pieces[number] = self._pieces[number].set_value(row - self._rows[number], value)

@@ -1,4 +1,4 @@
-"""Header names to roles, units and factors: the same for every format."""
+"""Determine roles, units and factors of columns from their headers, for every format."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["Column", "Plan", "plan_columns", "split_header"]
 
 @dataclass(frozen=True)
 class Plan:
-    """How the columns of one file are understood."""
+    """Roles and units of the columns of one file, with notes and problems."""
 
     path: Path
     columns: tuple[Column, ...]
@@ -34,22 +34,22 @@ class Plan:
     problems: tuple[GyrostabError, ...]
     unmatched: tuple[str, ...]
     rate: float | None = (
-        None  # [Hz], where the lines above the header tell it and there is no time column
+        None  # [Hz], from the lines above the header of a file without a time column
     )
 
     def check(self) -> Plan:
-        """Raise the first problem, if there is one."""
+        """Raise the first problem, or return the plan."""
         if self.problems:
             raise self.problems[0]
         return self
 
     def of(self, role: str) -> list[Column]:
-        """The columns of a role."""
+        """Return the columns of a role."""
         return [column for column in self.columns if column.role == role]
 
     @property
     def time(self) -> Column | None:
-        """The column of stamps."""
+        """Column of stamps, None if there is none."""
         return next(iter(self.of("time")), None)
 
 
@@ -66,36 +66,36 @@ def plan_columns(
     is_filled: Callable[[int], bool] | None = None,
     coded: Mapping[int, str] | None = None,
 ) -> Plan:
-    """Decide what each column is.
+    """Determine the role and unit of each column.
 
     Parameters
     ----------
     path : Path
         The file, for messages.
     headers : sequence of str
-        Header cells as they are written, or ``"0"``, ``"1"``, ... where there are none.
+        Header cells as written, or ``"0"``, ``"1"``, ... for a file without a header.
     options : ReadOptions
-        What the user said.
+        Reading options of the user.
     units : mapping of int to str, optional
-        Units that the format stores beside the header (NetCDF attributes).
+        Units that the format stores outside the header (NetCDF attributes).
     calendars : mapping of int to str, optional
         CF calendars of those units that name an epoch.
     stamped : collection of int
-        Columns whose values are dates already (ISO 8601 text, datetime types).
+        Columns whose values are dates (ISO 8601 text, datetime types).
     rising : callable, optional
-        Says of a column whether its first values rise; it decides between several columns that look
-        like the time.
+        Returns whether the first values of a column rise; decides between several candidates for
+        the time column.
     above : sequence of str
-        Lines above the header, which may tell the program that wrote the file.
+        Lines above the header, which may identify the program that wrote the file.
     is_filled : callable, optional
-        Says of a column whether its first cells hold anything.
+        Returns whether any of the first cells of a column is filled.
     coded : mapping of int to str, optional
-        What columns are by a code of the format, in the form of ``--map``, which is stronger.
+        Roles of columns by a code of the format, in the form of ``--map``, which overrules them.
 
     Returns
     -------
     Plan
-        ``Plan.check()`` raises what is wrong.
+        ``Plan.check()`` raises the first problem.
 
     Raises
     ------
@@ -130,7 +130,10 @@ def plan_columns(
     ]:
         draft.notes.append(f"taken for axes: {list_names(found)}; --map overrules it")
     if time is None and options.rate is None and rate is None and not draft.problems:
-        message = f"{path.name}: there is no time column; give the sampling rate with --rate HZ (and --start)"
+        message = (
+            f"{path.name}: there is no time column; give the sampling rate with --rate HZ "
+            "(and --start)"
+        )
         draft.problems.append(
             OptionError(
                 f"{message}, or name the column: --map NAME=time. Columns: {list_names(headers)}"
@@ -163,7 +166,7 @@ def _known_program(
     above: Sequence[str],
     is_filled: Callable[[int], bool] | None,
 ) -> PresetMatch:
-    """The preset of a file, unless the file names its axes in our way."""
+    """Return the preset of a file, unless the file names its axes ``gyro_x`` ... itself."""
     split = [(header, split_header(header)[0]) for header in headers]
     if any(AXIS_PATTERN.match(name.lower()) for _, name in split):
         return PresetMatch("")

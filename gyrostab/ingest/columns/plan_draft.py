@@ -21,7 +21,7 @@ __all__ = ["Column", "PlanDraft", "by_lower_name", "list_names"]
 
 @dataclass(frozen=True)
 class Column:
-    """A column that is read: ``inner = value * factor + offset`` in `units`; stamps convert by `time_unit` (None: ISO 8601)."""
+    """A column to read, as ``value * factor + offset`` in `units`; stamps by `time_unit`."""
 
     source: int
     header: str
@@ -35,7 +35,7 @@ class Column:
 
 
 class PlanDraft:
-    """The lists that grow while a file's header is being understood."""
+    """Columns, notes and problems of a plan while it is being made."""
 
     def __init__(self, path: Path, options: ReadOptions, rising: Callable[[int], bool]):
         self.path, self.options, self.rising = path, options, rising
@@ -59,7 +59,7 @@ class PlanDraft:
         *,
         prefer_given: bool = False,
     ) -> str | None:
-        """The unit of a column: that of the header, unless it is none and the user gave one."""
+        """Return the unit of a column: from its header if usable, otherwise from the user."""
         given = by_lower_name(self.options.unit)
         key = next((given[low] for low in map(str.lower, keys) if low in given), None)
         if key is None:
@@ -70,10 +70,14 @@ class PlanDraft:
             return text
         if not usable(written):
             self.notes.append(
-                f"column {column.header!r} says [{written}], which is no usable unit; it is read by --unit {key}={text}"
+                f"column {column.header!r} says [{written}], which is not a usable unit; it is "
+                f"read by --unit {key}={text}"
             )
             return text
-        note = f"column {column.header!r} says [{written}], so --unit {key}={text} is not applied to it"
+        note = (
+            f"column {column.header!r} says [{written}], so --unit {key}={text} is not "
+            "applied to it"
+        )
         self.notes.append(
             f'{note}; to overrule the header give --map "{column.key}={column.low} [{text}]"'
         )
@@ -90,20 +94,25 @@ class PlanDraft:
         self.summaries.append(ColumnSummary(column.header, name, role, quantity, unit, column.key))
 
     def add_notes(self, headers: Sequence[str]) -> None:
-        """Notes on what was left out, summaries in the order of the file."""
+        """Add notes on columns that were left out, and sort the summaries as in the file."""
         if self.unitless:
             name, quantity, _ = min(
                 self.unitless, key=lambda entry: entry[1] is None
-            )  # one of a known quantity first
+            )  # a known quantity first
             how = f"keep one with a unit: --unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
             self.notes.append(
-                f"left out, as they carry no unit: {list_names([header for _, _, header in self.unitless])} ({how})"
+                "left out, as they carry no unit: "
+                f"{list_names([header for _, _, header in self.unitless])} ({how})"
             )
         if self.surplus:
             needed = self.kept_channels + len(self.surplus)
-            how = f"map those that are needed (--map NAME=NAME); {describe_limit('channels', needed, self.options.limits)}"
+            how = (
+                "map those that are needed (--map NAME=NAME); "
+                f"{describe_limit('channels', needed, self.options.limits)}"
+            )
             self.notes.append(
-                f"left out, as there are more channels than a log keeps: {list_names(self.surplus, 5)} ({how})"
+                "left out, as there are more channels than a log keeps: "
+                f"{list_names(self.surplus, 5)} ({how})"
             )
         if self.left_out:
             self.notes.append(

@@ -26,7 +26,7 @@ def name_columns(
     stamped: frozenset[int],
     presets: Mapping[int, str],
 ) -> list[Header]:
-    """Apply the map, then the preset, and drop what they drop."""
+    """Name the columns by ``--map``, then by the preset, and drop those that either drops."""
     wanted = {key.strip().lower(): key for key in draft.options.map}
     targets = {split_header(target)[0].lower() for target in draft.options.map.values()}
     named: list[Header] = []
@@ -48,9 +48,7 @@ def name_columns(
                 draft.leave_out(column)
                 continue
             column.name, column.preset = target, True
-            if (
-                target_unit is not None
-            ):  # weaker than --unit, stronger than a header that holds no unit
+            if target_unit is not None:  # overruled by --unit, overrules a header without a unit
                 column.unit, column.stored = None, target_unit
         if column.name:
             named.append(column)
@@ -58,7 +56,7 @@ def name_columns(
 
 
 def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
-    """Give columns of one name names of their own; an axis must be one column."""
+    """Give columns of one name different names; an axis must be one column."""
     groups: dict[str, list[Header]] = {}
     for column in named:
         groups.setdefault(column.low if is_contract_name(column.low) else column.name, []).append(
@@ -82,7 +80,8 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
             others = [column for column in same if not column.mapped]
             dropped.update(column.source for column in others)
             draft.notes.append(
-                f"left out, as --map names another column {name}: {list_names([column.header for column in others])}"
+                f"left out, as --map names another column {name}: "
+                f"{list_names([column.header for column in others])}"
             )
         else:
             for number, column in enumerate(
@@ -93,12 +92,12 @@ def resolve_duplicates(draft: PlanDraft, named: list[Header]) -> list[Header]:
                 renamed.append(f"{column.header!r} is {column.name!r}")
     if renamed:
         more = f" and {len(renamed) - 5} more" if len(renamed) > 5 else ""
-        draft.notes.append(f"columns of one name are kept apart: {', '.join(renamed[:5])}{more}")
+        draft.notes.append(f"columns of one name are renamed: {', '.join(renamed[:5])}{more}")
     return [column for column in named if column.source not in dropped]
 
 
 def _is_taken(target: str, asked: set[str]) -> bool:
-    """Whether the user has named a column for what a preset has another one for; axes are named all together."""
+    """Return whether --map names a column for this target, or for any axis if it is an axis."""
     return target in asked or (
         bool(AXIS_PATTERN.match(target)) and any(AXIS_PATTERN.match(name) for name in asked)
     )

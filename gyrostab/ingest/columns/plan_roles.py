@@ -33,7 +33,7 @@ __all__ = ["find_time", "plan_channels", "plan_gyro"]
 
 
 def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
-    """The one time column, with its unit; others that look like it are left out with a note."""
+    """Choose the time column and its unit; other candidates are left out with a note."""
     found = [c for c in named if c.low == "time" and c.mapped] or [
         c for c in named if c.low == "time" and c.preset
     ]
@@ -62,7 +62,8 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
     if others:
         names = " and ".join(repr(c.header) for c in [column, *others][:3])
         draft.notes.append(
-            f'{names} look like the time; {column.header!r} is used (for another: --map "{others[0].key}=time")'
+            f"{names} look like the time; {column.header!r} is used (for another: --map "
+            f'"{others[0].key}=time")'
         )
         for other in others:
             draft.leave_out(other)
@@ -97,7 +98,7 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
 
 def _may_be_time(column: Header) -> bool:
     written = column.unit or column.stored
-    # An epoch that cannot be read is reported, not passed over.
+    # An epoch that cannot be read is reported, not ignored.
     return written is None or names_epoch(written) or is_time_unit(written)
 
 
@@ -110,7 +111,10 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
     keys = [column.name, column.key, column.header, "time"]
     text = draft.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
     if text is None:
-        message = f"{draft.path.name}: the time column {column.header!r} holds numbers and carries no unit"
+        message = (
+            f"{draft.path.name}: the time column {column.header!r} holds numbers and "
+            "carries no unit"
+        )
         draft.problems.append(
             MissingUnitError(f"{message}; give it with --unit time=s (or ms, us, ns)")
         )
@@ -121,7 +125,8 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
         how = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
         draft.problems.append(
             UnitError(
-                f"{draft.path.name}: column {column.header!r}: {error}; or give it with --unit {how}"
+                f"{draft.path.name}: column {column.header!r}: {error}; or give it with --unit "
+                f"{how}"
             )
         )
         return None
@@ -130,7 +135,7 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
 def plan_gyro(
     draft: PlanDraft, gyro: list[Header], headers: Sequence[str]
 ) -> tuple[str | None, str | None]:
-    """Units of the gyro axes, and whether they are rates, increments or cumulative angles."""
+    """Plan the gyro axes; return signal and kind (rates, increments or cumulative angles)."""
     if draft.options.channels_only:
         for column in gyro:
             draft.leave_out(column)
@@ -187,7 +192,10 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
                 UnitError(f"{draft.path.name}: column {column.header!r}: {error}")
             )
             return None
-        hint = f'known are {known_units("rate")}; give it with --unit {stem}={example}, or with a factor --unit "{stem}=0.1 arcsec/s"'
+        hint = (
+            f"known are {known_units('rate')}; give it with --unit {stem}={example}, or with "
+            f'a factor --unit "{stem}=0.1 arcsec/s"'
+        )
         draft.problems.append(
             UnitError(
                 f"{draft.path.name}: column {column.header!r}: unit {text!r} is not known; {hint}"
@@ -196,11 +204,18 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
         draft.add_summary(column, column.low, "gyro", None, text)
         return None
     if unit.quantity not in allowed:
-        message = f"{draft.path.name}: column {column.header!r} has the unit {text!r}, which is a unit of {unit.quantity}, not of {allowed[0]}"
-        how = f"{allowed[0]} units are {known_units(allowed[0])}; give the right one with --unit {stem}={example}"
+        message = (
+            f"{draft.path.name}: column {column.header!r} has the unit {text!r}, which is "
+            f"a unit of {unit.quantity}, not of {allowed[0]}"
+        )
+        how = (
+            f"{allowed[0]} units are {known_units(allowed[0])}; give the right one with --unit "
+            f"{stem}={example}"
+        )
         draft.problems.append(
             UnitError(
-                f'{message}; {how}, or with a factor for counts: --unit "{stem}=0.1 {_arcsec_unit(stem)}"'
+                f'{message}; {how}, or with a factor for counts: --unit "{stem}=0.1 '
+                f'{_arcsec_unit(stem)}"'
             )
         )
         draft.add_summary(column, column.low, "gyro", unit.quantity, text)
@@ -233,13 +248,16 @@ def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) 
         message = (
             f"{draft.path.name}: column {header!r} is an angle, and nothing says of which kind"
         )
-        how = "--kind angle if it is the cumulative angle, --kind rate if each row is the increment since the row before"
+        how = (
+            "--kind angle if it is the cumulative angle, --kind rate if each row is the "
+            "increment since the row before"
+        )
         draft.problems.append(OptionError(f"{message}; give {how}"))
     return "angle" if draft.options.kind == "angle" else "increment"
 
 
 def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
-    """Channels: what carries a unit is kept, the rest is left out with a note, or refused if it was asked for."""
+    """Plan the channels: those with a unit are kept, others left out with a note or refused."""
     for column in rest:
         quantity = quantity_of(column.low)
         known = bool(KNOWN_CHANNEL_PATTERN.match(column.low))
@@ -261,7 +279,10 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
             or (known and draft.options.channels_only)
         )
         if text is None and asked:
-            message = f"{draft.path.name}: column {column.header!r} carries no unit; give it with --unit {name}={example_unit(quantity)}"
+            message = (
+                f"{draft.path.name}: column {column.header!r} carries no unit; give it "
+                f"with --unit {name}={example_unit(quantity)}"
+            )
             draft.problems.append(
                 MissingUnitError(f'{message}, or drop the column with --map "{column.key}=-"')
             )
@@ -300,8 +321,11 @@ def _plan_channel(
         elif quantity == "number":
             units = INNER["number"]
         elif known:
-            message = f"column {column.header!r}: {text!r} is no known unit of {expected}"
-            how = f"known are {known_units(expected)}; give it with --unit {name}={example_unit(quantity)}"
+            message = f"column {column.header!r}: {text!r} is not a known unit of {expected}"
+            how = (
+                f"known are {known_units(expected)}; give it with --unit "
+                f"{name}={example_unit(quantity)}"
+            )
             if not asked:
                 draft.notes.append(f"{message}, so it is left out; {how}")
                 draft.leave_out(column)
@@ -344,8 +368,14 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
         if likely and likely.unit and is_unit_of(likely.unit, ("rate", "angle"))
         else f" --unit gyro={unit}"
     )
-    message = f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: {list_names([c.name for c in columns], 100)}"
-    how = f'Say which they are, for instance: --map "{likely.key if likely else "NAME"}=gyro_x"{given}'
+    message = (
+        f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
+        f"{list_names([c.name for c in columns], 100)}"
+    )
+    how = (
+        "Say which they are, for instance: --map "
+        f'"{likely.key if likely else "NAME"}=gyro_x"{given}'
+    )
     return FormatError(
         f"{message}. {how}; gyrostab scan {shlex.quote(path.name)} looks into each column"
     )

@@ -1,10 +1,10 @@
-"""What columns are in the files of known programs: small TOML files in ``presets``, recognised by the header and the lines above it.
+"""Presets for the files of known programs: TOML files, recognised by headers and lines above them.
 
-A preset has a `name`, the `times` that may be the time column (the first that is filled is taken),
-and `columns`: what a column is, in the form of ``--map``, and how the program heads it. `above` and
-`file` are patterns for a line above the header and for the file's name, `needs` are headers that
-must be there too, `drops` are columns that are not kept, and `rate` finds the sampling rate [Hz]
-above the header.
+A preset has a `name`, `times` (candidates for the time column; the first that is filled is used)
+and `columns`: target in the form of ``--map`` -> headers that the program writes. `above` and
+`file` are patterns for a line above the header and for the file name, `needs` lists further headers
+that must be present, `drops` lists columns that are not kept, and `rate` is a pattern that finds
+the sampling rate [Hz] above the header.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
 
 @dataclass(frozen=True)
 class PresetMatch:
-    """A preset that fits a file: column number -> what it is, and the sampling rate [Hz] where the file tells it."""
+    """A preset that fits a file: column number -> target of ``--map``; rate [Hz] if known."""
 
     name: str
     columns: dict[int, str] = field(default_factory=dict)
@@ -34,7 +34,7 @@ class PresetMatch:
 
 @cache
 def _load_presets() -> dict[str, dict[str, Any]]:
-    """The presets by the names of their files."""
+    """Load the presets, by file name."""
     found = {}
     for place in sorted(
         files("gyrostab.ingest.columns").joinpath("presets").iterdir(), key=lambda place: place.name
@@ -47,7 +47,7 @@ def _load_presets() -> dict[str, dict[str, Any]]:
 
 
 def preset_names() -> dict[str, str]:
-    """Name of each preset -> the program whose files it describes.
+    """Return the name of each preset and the program whose files it describes.
 
     Examples
     --------
@@ -71,16 +71,16 @@ def find_preset(
     path : Path
         The file, for its name.
     headers : sequence of (str, str)
-        Whole header and name without its unit of each column.
+        Full header and name without unit of each column.
     above : sequence of str
         Lines above the header.
     is_filled : callable, optional
-        Says of a column whether its first cells hold anything.
+        Returns whether any of the first cells of a column is filled.
 
     Returns
     -------
     Found or None
-        What the columns are, or None for the files of other programs.
+        The targets of the columns, or None for the files of other programs.
     """
     places: dict[str, int] = {}
     for place, names in reversed(list(enumerate(headers))):

@@ -1,4 +1,4 @@
-"""From blocks of columns, as a format delivers them, to the raw log: units, counts of what is unreadable, labels."""
+"""Build the raw log from blocks of columns: units, counts of unreadable cells, labels."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from gyrostab.store.row_inspection import RowInspection, with_inspections
 
 __all__ = ["ConvertedBlock", "RawLogBuilder", "summary_of"]
 
-#: How many bad places a note names.
+#: Largest number of bad places that a note lists.
 MAX_NAMED_PLACES = 10
-#: A file with a larger share of unreadable rows is refused.
-MAX_UNREADABLE = 0.5
+#: Largest share of unreadable rows; a file with more is refused.
+MAX_UNREADABLE_SHARE = 0.5
 
 Values = dict[int, NDArray[np.float64]]
 Locate = Callable[[Sequence[int]], list[str]]
 
 
 class ConvertedBlock(NamedTuple):
-    """A block of rows as `Intake.add` takes it; rows are counted from its first.
+    """A converted block of rows for `RawLogBuilder.add`; row numbers count from its first row.
 
     Attributes
     ----------
@@ -46,17 +46,16 @@ class ConvertedBlock(NamedTuple):
     block : dict
         Column number -> values in the inner unit, or a piece of the column.
     ranges : dict
-        Column number -> values missing, range of the others as they stand in the file, whether
-        these are whole numbers.
+        Column number -> number of missing values, range of the others in the unit of the file, and
+        whether these are whole numbers.
     bad_rows, cell_rows : ndarray of int64
-        Rows that are unreadable, and others in which a gyro cell is.
+        Unreadable rows, and other rows with an unreadable gyro cell.
     bad_cells, cells : int
-        Cells that are unreadable, and gyro cells of `cell_rows`.
+        Unreadable cells, and unreadable gyro cells of `cell_rows`.
     low, high : int
-        Range of the stamps of readable rows [ns since 1970]; the other way round where there are
-        none.
+        Range of the stamps of readable rows [ns since 1970]; high < low if there are none.
     seen : Seen or None
-        What a look at the values found, where they stay in the file.
+        Findings of the scan pass over values that stay in the file.
     """
 
     rows: int
@@ -83,16 +82,16 @@ def _row_names(first: int) -> Locate:
 
 
 class RawLogBuilder:
-    """Collects the blocks of one file and makes the raw log of them.
+    """Collect the blocks of one file and build its raw log.
 
     Parameters
     ----------
     plan : Plan
-        What each column is.
+        Role and unit of each column.
     options : ReadOptions
-        What the user said.
+        Reading options of the user.
     limit : int
-        Size [bytes] above which the columns move to disk.
+        Size of the columns above which they move to disk [bytes].
     """
 
     def __init__(self, plan: Plan, options: ReadOptions, *, limit: int = SPILL_BYTES):
@@ -107,7 +106,7 @@ class RawLogBuilder:
         self.buffers = Buffers(dtypes, limit=limit, rows_of=[column.source for column in self.gyro])
         self.tens = {
             column.source: 1.0 for column in [*self.gyro, *self.channels]
-        }  # powers of ten that are tried; 0 for none
+        }  # power of ten to try when packing decimals; 0: not packed
         self.bad_rows = self.bad_cells = self.cells = self.cell_rows = 0
         self.bad_places: list[str] = []
         self.cell_places: list[str] = []
@@ -121,18 +120,17 @@ class RawLogBuilder:
     def prepare(
         self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0
     ) -> ConvertedBlock:
-        """Convert one block, and pack what can be packed; several threads may do so side by side.
+        """Convert one block and pack its columns where possible; thread-safe.
 
         Parameters
         ----------
         values : dict of int to ndarray
-            Column number -> values in the file's unit, NaN where unreadable or empty. Changed in
-            place.
+            Column number -> values in the unit of the file, NaN where unreadable or empty. Changed
+            in place.
         stamps : ndarray of int64 or None
             Stamps [ns since 1970], `NAT` where unreadable; None without a time column.
         words : int
-            Cells of channels that hold something that is no number (empty ones are not filled,
-            which is no fault).
+            Channel cells whose text is not a number (empty cells do not count).
         """
         from gyrostab.kernels.encoding.decimals import even_steps
 
@@ -149,7 +147,7 @@ class RawLogBuilder:
             block[source], ranges[source] = self._convert_column(column, values[source])
             unknown = (
                 np.isnan if block[source] is values[source] else _not_finite
-            )  # what is packed is not converted yet
+            )  # packed values are not converted yet
             masks.append(unknown(values[source]) if ranges[source][0] else None)
         gyro = [mask for mask in masks[: len(self.gyro)] if mask is not None]
         bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro)
@@ -171,14 +169,14 @@ class RawLogBuilder:
         )  # fmt: skip
 
     def add(self, taken: ConvertedBlock, locate: Locate | None = None) -> None:
-        """Take one block.
+        """Add one block.
 
         Parameters
         ----------
         taken : Taken
             From `prepare`.
         locate : callable, optional
-            Row numbers within the block -> how a message calls them.
+            Row numbers within the block -> names of the rows for messages.
         """
         if taken.rows == 0:
             return
@@ -199,7 +197,7 @@ class RawLogBuilder:
     def _convert_column(
         self, column: Column, values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | Piece, tuple[int, float, float, bool]]:
-        """Convert to the inner unit, in place or packed, infinities to NaN; and what `Taken.ranges` tells of the column."""
+        """Convert a column to the inner unit, packed or in place; return it and its range."""
         from gyrostab.kernels.encoding.decimals import decimals_of, to_decimals
         from gyrostab.kernels.encoding.rows import clean_column
 
@@ -217,12 +215,12 @@ class RawLogBuilder:
                         found[3],
                     )
             tens = decimals_of(values) if tens else 0.0
-        self.tens[column.source] = 0.0  # no decimals: the next blocks are not tried
+        self.tens[column.source] = 0.0  # not decimals: do not try later blocks
         missing, low, high, whole = clean_column(values, column.factor, column.offset)
         return values, (missing, low, high, whole)
 
     def _packing_of(self, columns: Sequence[Column]) -> dict[str, Any]:
-        """The encoding of columns of whole numbers that have one factor; none for others."""
+        """Return the encoding of columns of whole numbers with one factor; empty for others."""
         spans = [self.whole[column.source] for column in columns]
         factors = {column.factor for column in columns if column.offset == 0.0}
         if None in spans or len(factors) != 1 or any(column.offset != 0.0 for column in columns):
@@ -248,7 +246,7 @@ class RawLogBuilder:
             )
 
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
-        """The raw log.
+        """Return the raw log.
 
         Raises
         ------
@@ -258,13 +256,18 @@ class RawLogBuilder:
         name, rows = self.plan.path.name, self.buffers.rows
         if rows == 0:
             raise FormatError(
-                f"{name}: there is a header but no data row below it; copy it again, or look at what the logger wrote"
+                f"{name}: there is a header but no data row below it; copy it again, or check "
+                "what the logger wrote"
             )
-        if self.bad_rows > MAX_UNREADABLE * rows:
+        if self.bad_rows > MAX_UNREADABLE_SHARE * rows:
             share, first = self.bad_rows / rows, self.bad_places[0]
-            what = "the separator, the columns that --map names and the unit of time (stamps lie in the years 1678 to 2262)"
+            what = (
+                "the separator, the columns that --map names and the unit of time (stamps lie "
+                "in the years 1678 to 2262)"
+            )
             raise FormatError(
-                f"{name}: {share:.0%} of {rows} rows are unreadable, the first is {first}; look at it, and check {what}"
+                f"{name}: {share:.0%} of {rows} rows are unreadable, the first is {first}; look "
+                f"at it, and check {what}"
             )
         columns = self.buffers.finish()
         stamps = self._finish_stamps(columns)
@@ -294,7 +297,7 @@ class RawLogBuilder:
             written = take_rows(stamps, rows)
             set_rows(
                 stamps, rows[(written < self.low) | (written > self.high)], NAT
-            )  # scratch numbers in a junk row are no stamp
+            )  # a number in an unreadable row is not a stamp
         return as_lazy(stamps.view("datetime64[ns]"))
 
     def _make_dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:
@@ -333,12 +336,14 @@ class RawLogBuilder:
         notes = []
         if self.bad_rows:
             notes.append(
-                f"{self.bad_rows} of {rows} rows are unreadable: {_join_places(self.bad_places, self.bad_rows)}"
+                f"{self.bad_rows} of {rows} rows are unreadable: "
+                f"{_join_places(self.bad_places, self.bad_rows)}"
             )
         if self.cell_places:
             where = _join_places(self.cell_places, self.cell_rows)
             notes.append(
-                f"{self.cells} gyro cells hold no number in rows that are readable otherwise: {where}"
+                f"{self.cells} gyro cells hold no number in rows that are readable otherwise: "
+                f"{where}"
             )
         if self.options.start is not None and self.time is not None:
             notes.append("--start is not used: the file has its own time column")
@@ -346,7 +351,7 @@ class RawLogBuilder:
 
 
 def _join_places(places: Sequence[str], total: int) -> str:
-    """Bad places in a row: ``lines 7, 8, 9 and others``."""
+    """Join the names of bad places: ``lines 7, 8, 9 and others``."""
     kind = places[0].split(" ")[0]
     numbers = ", ".join(place.removeprefix(f"{kind} ") for place in places)
     return f"{kind}{'s' * (len(places) > 1)} {numbers}{' and others' * (total > len(places))}"
@@ -361,20 +366,20 @@ def summary_of(
     tail: Sequence[int] | NDArray[np.int64] = (),
     notes: Sequence[str] = (),
 ) -> FileSummary:
-    """What a cheap look tells of a file.
+    """Summarise a file without reading all of its data.
 
     Parameters
     ----------
     plan : Plan
-        What each column is, and what stands in the way of reading.
+        Role and unit of each column, and the problems that prevent reading.
     form : str
         Name of the format.
     rows : int or None
-        Number of rows, where it is known.
+        Number of rows, if known.
     head, tail : sequence of int
         Stamps at the two ends [ns since 1970], `NAT` where unreadable.
     notes : sequence of str
-        What the reader says.
+        Notes of the reader.
     """
     first, last = (
         next((np.datetime64(int(stamp), "ns") for stamp in end if stamp != NAT), None)

@@ -1,4 +1,4 @@
-"""Time stamps as integers: nanoseconds since 1970-01-01T00:00:00 UTC, without a float on the way where the text is exact.
+"""Convert time stamps to integers, nanoseconds since 1970-01-01T00:00:00 UTC, exactly.
 
 References
 ----------
@@ -55,23 +55,22 @@ _ISO = re.compile(
     r"^\s*\d{4}-?\d\d-?\d\d([T ]\d\d(:?\d\d){0,2}([.,]\d+)?\s*(Z|[+-]\d\d(:?\d\d)?)?)?\s*$"
 )
 _SINCE = re.compile(r"\bsince\b", re.IGNORECASE)
-#: Calendars in which a date is an instant; the others are those of climate models, whose dates
-#: never were.
+#: Calendars in which a date is an instant; the others are calendars of climate models.
 _CALENDARS = {
     "standard": "standard",
     "gregorian": "standard",
     "proleptic_gregorian": "proleptic_gregorian",
     "julian": "julian",
 }
-#: Characters of a cell above which it is no stamp: a double written in full has at most 325 before
-#: and 1074 after the point.
+#: Longest cell that can be a stamp [characters]: a double written in full has at most 325 digits
+#: before and 1074 after the point.
 _MAX_DIGITS = 1400
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?$")
 
 
 @dataclass(frozen=True)
 class TimeUnit:
-    """Unit of a numeric time column: nanoseconds per unit, and the epoch [ns since 1970] where the unit names one."""
+    """Unit of a numeric time column: nanoseconds per unit, and epoch [ns since 1970]."""
 
     text: str
     ns: Fraction
@@ -79,7 +78,7 @@ class TimeUnit:
 
     @property
     def digits(self) -> int | None:
-        """Decimals that make one nanosecond (9 for seconds), or None when the unit is no power of ten of it.
+        """Decimals down to one nanosecond (9 for seconds); None if not a power of ten.
 
         Also None when the epoch is outside the years 1678 to 2262, so that sums with it exceed 64
         bits.
@@ -90,25 +89,25 @@ class TimeUnit:
 
 
 def names_epoch(text: str) -> bool:
-    """Return whether a unit is one of time since an epoch, such as ``seconds since 1970-01-01``."""
+    """Return whether a unit counts from an epoch, such as ``seconds since 1970-01-01``."""
     return bool(_SINCE.search(text))
 
 
 def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
-    """Read a time unit, with a factor in front or a CF epoch behind if there is one.
+    """Parse a time unit, with an optional leading factor and an optional CF epoch.
 
     Parameters
     ----------
     text : str
-        The unit; upper and lower case are alike, as in UDUNITS.
+        The unit; not case-sensitive, as in UDUNITS.
     calendar : str, optional
         The CF calendar of the epoch, `standard` when not given.
 
     Raises
     ------
     UnitError
-        When the text is no time unit, when its epoch can be read in several ways or depends on the
-        clock, or when the calendar is not one of real dates.
+        When the text is not a time unit, when its epoch is ambiguous or depends on the clock, or
+        when the calendar is not one of real dates.
 
     Examples
     --------
@@ -122,30 +121,33 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     factor, _, bare = name.rpartition(" ")
     ns = (
         None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))
-    )  # Ms: a megasecond, or a slip
+    )  # Ms is ambiguous: megasecond, or milliseconds mistyped
     if ns is None or (
         factor and not (len(factor) <= _MAX_DIGITS and _NUMBER.match(factor.strip()))
     ):
         known = "s, ms, us, ns, min, h, d, week, with a factor in front if needed"
         raise UnitError(
-            f"time unit {text!r} is not known; known are {known}; months and years have no fixed length"
+            f"time unit {text!r} is not known; known are {known}; months and years have no fixed "
+            "length"
         )
     scale = Fraction(factor.strip() or "1")
     if not 0 < ns * scale < 2**63 or (ns * scale).denominator >= 2**63:
         raise UnitError(
-            f"time unit {text!r}: the factor {factor} is not usable; give a number above 0, of less than 292 years"
+            f"time unit {text!r}: the factor {factor} is not usable; give a number above 0, of "
+            "less than 292 years"
         )
     return TimeUnit(text, ns * scale, epoch)
 
 
 def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
-    """Return the epoch [ns since 1970] of a unit, however far back it is."""
+    """Return the epoch of a unit [ns since 1970], which may exceed 64 bits."""
     import cftime
 
     known = _CALENDARS.get((calendar or "standard").strip().lower())
     if known is None:
         raise UnitError(
-            f"time unit {text!r}: dates of the calendar {calendar!r} are not instants of a recording; "
+            f"time unit {text!r}: dates of the calendar {calendar!r} are not instants of a "
+            "recording; "
             "write the times in the standard calendar"
         )
     fields = split_instant(since)
@@ -163,14 +165,15 @@ def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
 
 
 def looks_iso(text: str) -> bool:
-    """Whether a cell is written as an ISO 8601 date or time (a bare number of 8 digits is not)."""
+    """Return whether a cell is an ISO 8601 date or time (a bare number of 8 digits is not)."""
     return bool(_ISO.match(text)) and not text.strip().isdigit()
 
 
 def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
-    """Convert datetime64 of any unit to nanoseconds since 1970; what 64 bits do not hold (before 1678, after 2262) is `NAT`.
+    """Convert datetime64 of any unit to nanoseconds since 1970.
 
-    numpy itself wraps such dates around in silence.
+    Dates that exceed 64 bits (before 1678, after 2262) become `NAT`; numpy would wrap them around
+    without an error.
 
     Parameters
     ----------
@@ -193,7 +196,7 @@ def dates_to_ns(dates: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
-    """Stamps of ISO 8601 texts (UTC unless they say otherwise); unreadable ones are `NAT`."""
+    """Convert ISO 8601 texts (UTC by default) to stamps; unreadable ones become `NAT`."""
     stamps = pd.to_datetime(
         pd.Series(list(texts), dtype=object), format="ISO8601", utc=True, errors="coerce"
     )
@@ -201,7 +204,7 @@ def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
 
 
 def _all_fit(values: NDArray[np.int64], units: int, up: int, rest: int) -> bool:
-    """Whether no stamp, nor a step on the way to it, leaves 64 bits: as a rule, and found out by the range of the values alone."""
+    """Return whether all stamps and intermediate results fit into 64 bits."""
     ends = (int(values.min()) + units, int(values.max()) + units)
     return all(
         abs(end) < _MAX_INT64 and abs(end * up) < _MAX_INT64 and abs(end * up + rest) < _MAX_INT64
@@ -210,11 +213,10 @@ def _all_fit(values: NDArray[np.int64], units: int, up: int, rest: int) -> bool:
 
 
 def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
-    """Stamps of whole numbers of `unit` since `epoch`; a stamp outside the years 1678 to 2262 is `NAT`."""
+    """Convert counts of `unit` since `epoch` to stamps; `NAT` outside 1678 to 2262."""
     zero = epoch if unit.epoch is None else unit.epoch
     up, down = unit.ns.numerator, unit.ns.denominator
-    # Whole units of the epoch are added to the counts, so that no sum exceeds 64 bits however far
-    # back it is.
+    # Whole units of the epoch are added to the counts, so no sum exceeds 64 bits for any epoch.
     units, rest = divmod(zero, up) if down == 1 else (0, zero)
     limit = (_MAX_INT64 - down) // up - 1
     if max(abs(units), abs(rest)) > _MAX_INT64 // 2:
@@ -232,7 +234,7 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
 
 
 def signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
-    """Return whole numbers as int64; unsigned ones that exceed it become the largest, which is no stamp."""
+    """Return whole numbers as int64; larger unsigned ones become its maximum."""
     wide = (
         np.minimum(counts, np.uint64(_MAX_INT64))
         if counts.dtype.kind == "u" and counts.dtype.itemsize == 8
@@ -244,7 +246,7 @@ def signed_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
 def floats_to_ns(
     values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int
 ) -> NDArray[np.int64]:
-    """Stamps of binary floating point numbers: whole units as integers, only the fraction as a float."""
+    """Convert floats to stamps: whole units as integers, only the fraction in floating point."""
     wide = np.asarray(values, dtype=np.float64)
     usable = np.isfinite(wide) & (np.abs(wide) < 2.0**62)
     whole = np.floor(np.where(usable, wide, 0.0))
@@ -254,7 +256,7 @@ def floats_to_ns(
 
 
 def cells_to_ns(cells: Sequence[str], unit: TimeUnit | None, epoch: int) -> NDArray[np.int64]:
-    """Stamps of text cells, exact to the last decimal (the slow way): numbers of `unit`, or ISO 8601 where `unit` is None."""
+    """Convert text cells to stamps, exact to the last decimal: numbers of `unit`, or ISO 8601."""
     if unit is None:
         return texts_to_ns([cell.strip() if looks_iso(cell) else None for cell in cells])
     zero = epoch if unit.epoch is None else unit.epoch

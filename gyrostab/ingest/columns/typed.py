@@ -1,4 +1,4 @@
-"""What the formats of typed columns share: batches of rows, numbers of any type to float64, stamps to nanoseconds."""
+"""Shared code of formats with typed columns: batches of rows, conversion of numbers and stamps."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
     "to_stamps",
 ]
 
-#: Rows and bytes of all columns that are taken at one time, at most.
+#: Largest number of rows, and of bytes of all columns, that are converted at one time.
 BATCH_ROWS = 2**20
 BATCH_BYTES = 2**26
 END_ROWS = 64
@@ -48,7 +48,7 @@ Fetch = Callable[[int, int, int], Any]
 
 
 def to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
-    """Values as a new float64 array with NaN for what is missing, and how many cells hold something that is no number."""
+    """Convert values to float64, NaN where missing, and count the cells that are not numbers."""
     if np.ma.isMaskedArray(values):
         mask = np.ma.getmaskarray(values)
         plain, words = to_floats(np.ma.getdata(values))
@@ -69,7 +69,7 @@ def to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
 
 
 def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.int64]:
-    """Stamps [ns since 1970] of a column of dates, numbers or text."""
+    """Convert a column of dates, numbers or text to stamps [ns since 1970]."""
     mask = np.ma.getmaskarray(values) if np.ma.isMaskedArray(values) else None
     array = np.ma.getdata(values) if mask is not None else np.asarray(values)
     unit = column.time_unit
@@ -87,7 +87,7 @@ def to_stamps(values: Any, column: Column, options: ReadOptions) -> NDArray[np.i
 
 
 def holds_dates(values: Any) -> bool:
-    """Whether a sample of a column is dates, or text that looks like dates."""
+    """Return whether sample values of a column are dates or text that looks like dates."""
     array = np.asarray(values)
     return array.dtype.kind == "M" or (
         array.dtype.kind in "OUST" and any(isinstance(v, str) and looks_iso(v) for v in array[:50])
@@ -104,14 +104,14 @@ def read_columns(
     limit: int = SPILL_BYTES,
     lasting: bool = False,
 ) -> xr.Dataset:
-    """Make the raw log of columns that can be fetched by ranges of rows.
+    """Build the raw log of columns that can be fetched by ranges of rows.
 
     Parameters
     ----------
     plan : Plan
-        What each column is.
+        Role and unit of each column.
     options : ReadOptions
-        What the user said.
+        Reading options of the user.
     rows : int
         Number of rows.
     fetch : callable
@@ -119,10 +119,10 @@ def read_columns(
     notes : sequence of str
         Notes of the reader.
     limit : int
-        Size [bytes] above which the columns are not held in memory.
+        Size of the columns above which they are not held in memory [bytes].
     lasting : bool
-        Several threads may call `fetch`, and at any later time: then values above the limit stay in
-        the file.
+        Whether `fetch` is thread-safe and can be called at any later time; columns above the limit
+        then stay in the file.
     """
     intake = RawLogBuilder(plan.check(), options, limit=limit)
     stay = lasting and 8 * rows * len(plan.columns) > limit
@@ -137,7 +137,7 @@ def read_columns(
 
 
 def batch_rows(columns: int) -> int:
-    """Return how many rows are taken at one time.
+    """Return the number of rows to convert at one time.
 
     Examples
     --------
@@ -155,7 +155,7 @@ def _convert_span(
     stay: bool,
     span: tuple[int, int],
 ) -> ConvertedBlock:
-    """Convert one batch; where the values stay in the file, only what was found in them is kept."""
+    """Convert one batch; keep only its findings if the values stay in the file."""
     taken = convert_batch(
         intake, options, {column.source: fetch(column.source, *span) for column in plan.columns}
     )
@@ -206,7 +206,7 @@ def _read_stamps(
 def convert_batch(
     intake: RawLogBuilder, options: ReadOptions, batch: dict[int, Any]
 ) -> ConvertedBlock:
-    """Convert one batch of columns for the intake."""
+    """Convert one batch of columns for the builder."""
     values, words = {}, 0
     for column in [*intake.gyro, *intake.channels]:
         values[column.source], odd = to_floats(batch[column.source])
@@ -218,19 +218,20 @@ def convert_batch(
 
 
 def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:
-    """A warning when the stamps are stored with 24 bits only."""
+    """Return a warning if the stamps are stored in single precision."""
     time = plan.time
     if time is None or str(dtypes[time.source]) not in ("float32", "float", ">f4", "<f4"):
         return []
     return [
-        f"the stamps in {time.header!r} are stored as float32, which keeps 7 digits; expect jitter, or store them as float64 or integers"
+        f"the stamps in {time.header!r} are stored as float32, which keeps 7 digits; expect "
+        "jitter, or store them as float64 or integers"
     ]
 
 
 def summarise_columns(
     form: str, plan: Plan, options: ReadOptions, rows: int, fetch: Fetch, notes: Sequence[str] = ()
 ) -> FileSummary:
-    """A summary with the first and last stamps fetched from the two ends."""
+    """Summarise a file, with the first and last stamps fetched from the two ends."""
     time = plan.time
     if time is None or not rows:
         return summary_of(plan, form, rows, notes=notes)

@@ -1,4 +1,4 @@
-"""Many regular logs to one: their samples on one grid, lazily, with one table of gaps."""
+"""Concatenate regular logs lazily: their samples on one grid, with one table of gaps."""
 
 from gyrostab.ingest.concat.axes import group_axes, split_axes
 from gyrostab.ingest.concat.core import concatenate_logs, log_span

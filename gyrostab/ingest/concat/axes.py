@@ -1,4 +1,4 @@
-"""Logs that hold some of the axes of a recording: which belong together, and a raw log taken apart by its axes."""
+"""Logs with only some axes of a recording: group them, and split a raw log by its axes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["group_axes", "split_axes"]
 
 
 def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
-    """Group logs by the axes they hold: logs of one group have axes in common, directly or through others.
+    """Group logs by their axes: logs of one group share axes, directly or through other logs.
 
     Parameters
     ----------
@@ -43,23 +43,23 @@ def group_axes(axes: Sequence[Sequence[str]]) -> list[list[int]]:
 
 
 def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
-    """Split a raw log whose axes have stamps of their own into raw logs that do not, as lazy as the whole.
+    """Split a raw log whose groups of axes have separate stamps into one raw log for each group.
 
     Parameters
     ----------
     raw : xarray.Dataset
-        Raw log; its attribute ``axis_rows`` lists axes, first row and row after the last of each
-        group.
+        Raw log, in memory or lazy; its attribute ``axis_rows`` lists axes, first row and row after
+        the last of each group.
 
     Returns
     -------
     list of xarray.Dataset
-        One raw log for each group; the log itself where the attribute is missing.
+        One raw log for each group; the log itself if it has no such attribute.
 
     Raises
     ------
     SchemaError
-        When rows were taken out of the log after it was read.
+        When rows were selected from the log after it was read.
     """
     groups = raw.attrs.get("axis_rows")
     if groups is None:
@@ -67,7 +67,8 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
     parts = []
     if int(groups[-1][2]) != raw.sizes["row"]:
         raise SchemaError(
-            "the rows of this raw log were selected after it was read; regularise the whole, and select from the regular log"
+            "the rows of this raw log were selected after it was read; regularise the whole, and "
+            "select from the regular log"
         )
     name = signal_name(raw)
     signal, places = raw[name], [str(axis) for axis in raw["axis"].values]

@@ -1,4 +1,4 @@
-"""The channels of several logs as one: on the common grid, or on their own stamps, each value once."""
+"""Concatenate the channels of several logs, on the common grid or on their own stamps."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["concatenate_channels"]
 
-# of a sampling period: the stamps of two copies differ by the rounding of each to its own grid
+# stamps of two copies of a value differ by the rounding of each to its own grid
 _SAME_STAMP_PERIODS = 0.75
-_MAX_SLICES_PER_LOG = 16  # slices for each log up to which values stay lazy
+_MAX_SLICES_PER_LOG = 16  # values in more slices than that are loaded
 
 
 def concatenate_channels(
     pieces: Sequence[PlacedLog], start: int, rate: float, size: int, chunk: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Join the channels of logs that lie on one grid.
+    """Concatenate the channels of logs that are placed on one grid.
 
     Returns
     -------
     variables, coordinates : dict
-        Channels, NaN where a log has none, and the stamps ``time_<channel>`` of those that have
-        their own.
+        Channels, NaN where a log lacks them, and the stamps ``time_<channel>`` of those with
+        separate stamps.
 
     Raises
     ------
@@ -72,13 +72,14 @@ def _channel_attributes(holders: Sequence[PlacedLog], name: str) -> dict[str, An
     if len(units) > 1:
         listed = ", ".join(f"{unit!r} in {file}" for unit, file in units.items())
         raise UnitError(
-            f"channel {name!r} has different units: {listed}; ingest one of them anew with --unit {name}=UNIT or --map {name}=-"
+            f"channel {name!r} has different units: {listed}; ingest one of them anew with "
+            f"--unit {name}=UNIT or --map {name}=-"
         )
     return dict(holders[0].source.log[name].attrs)
 
 
 def _on_time(piece: PlacedLog, name: str, start: int, rate: float) -> PlacedArray:
-    """A channel on the time of its log; one that has its own stamps, which other logs have not, at the samples nearest to them."""
+    """Return a channel on the time of its log, with separate stamps at the nearest samples."""
     channel = piece.source.log[name]
     if channel.dims == ("time",):
         return channel.data, None, piece.runs
@@ -104,7 +105,7 @@ def _scatter_values(
 
 
 def _channel_stamps(piece: PlacedLog, name: str, start: int, rate: float) -> NDArray[np.int64]:
-    """Stamps of a channel [ns since 1970], moved with its log where that stands after a step of the clock."""
+    """Return the stamps of a channel [ns since 1970], shifted with its log after a clock step."""
     stamps = (
         piece.source.log.variables[f"time_{name}"].values.astype("datetime64[ns]").view(np.int64)
     )
@@ -115,11 +116,11 @@ def _channel_stamps(piece: PlacedLog, name: str, start: int, rate: float) -> NDA
 def _own_time(
     holders: Sequence[PlacedLog], name: str, start: int, rate: float
 ) -> tuple[NDArray[np.int64], Any]:
-    """Stamps and values in the order of time; of values that two logs have, those of the earlier log."""
+    """Return stamps and values in order of time; duplicates are taken from the earlier log."""
     near = int(_SAME_STAMP_PERIODS * 1e9 / rate)
     done: list[
         tuple[NDArray[np.int64], NDArray[np.int64]]
-    ] = []  # stamps and places among all values, in the order of time
+    ] = []  # stamps and positions among all values, in order of time
     arrays, offset = [], 0
     for piece in holders:
         values = piece.source.log.variables[name].data
@@ -151,12 +152,12 @@ def _own_time(
     if not done:
         return np.empty(0, dtype=np.int64), np.empty(0)
     stamps, places = (np.concatenate(column) for column in zip(*done, strict=True))
-    done.clear()  # of channels of many days a copy less
+    done.clear()  # saves one copy of a long channel
     return stamps, _select_values(arrays, places)
 
 
 def _select_values(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
-    """The values at `places`, in slices; in memory when that would be very many slices, or when all are there already."""
+    """Select the values at `places` as lazy slices; load them if the slices would be very many."""
     if all(isinstance(array, np.ndarray) for array in arrays):
         return np.concatenate(arrays)[places]
     import dask.array as da
@@ -174,7 +175,7 @@ def _select_values(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
 
 
 def _slices_at(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[PlacedArray]:
-    """The values at `places` as stretches of the arrays."""
+    """Return the values at `places` as slices of the arrays."""
     begins = np.cumsum([0, *map(len, arrays)]).tolist()
     edges = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
     parts: list[PlacedArray] = []

@@ -1,4 +1,4 @@
-"""Many regular logs to one lazy regular log."""
+"""Concatenate many regular logs to one lazy regular log."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from gyrostab.time.grid import grid_times, time_coordinate
 
 __all__ = ["concatenate_logs", "log_span"]
 
-#: Share of a log without an axis that other logs hold, from which a note says so; recorders are
-#: started one after the other.
+#: Smallest share of a log without an axis of other logs that is noted; recorders are started one
+#: after the other.
 _NOTED_SHARE = 0.01
 
-#: What the clocks of two loggers, or of one that is now hot and now cold, may differ by; more is
-#: another rate.
+#: Largest relative difference of the rates of two logger clocks, or of one clock over temperature;
+#: more is a different sampling rate.
 RATE_TOLERANCE = 1e-4
 
 
@@ -45,7 +45,7 @@ def concatenate_logs(
     lost: Sequence[tuple[int, int]] = (),
     limits: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
-    """Join regular logs along time, lazily.
+    """Concatenate regular logs along time, lazily.
 
     Parameters
     ----------
@@ -53,13 +53,13 @@ def concatenate_logs(
         Regular logs, in any order, overlapping or with gaps between them: ``rate(axis, time)``
         [degree hour-1] or ``angle(axis, time)`` [degree], channels, tables of gaps.
     paths : sequence of path
-        Their files, for messages.
+        Files of the logs, for messages.
     max_gap : str or float
-        A longer pause is a step of the clock, and the log that follows comes after one missing
+        A longer pause is taken as a step of the clock, and the next log follows after one missing
         sample; a number is in seconds.
     lost : sequence of (int, int)
-        First and last instant [ns since 1970] of files that cannot be read; the gaps there are of
-        the cause "unreadable".
+        First and last instant [ns since 1970] of files that cannot be read; gaps there have the
+        cause "unreadable".
     limits : mapping of str to float, optional
         Limits of `gyrostab.ingest.limits` with other values; ``grid_samples`` bounds the samples of
         an axis.
@@ -67,25 +67,29 @@ def concatenate_logs(
     Returns
     -------
     xarray.Dataset
-        One regular log on the grid of the first: a sample of another log takes the nearest sample
-        of the grid. Of samples that two logs have, that of the earlier counts, where it is not NaN.
-        Logs that hold other axes over the same time are put side by side. Axes and channels that a
-        log lacks are NaN there. The table of gaps holds those of the logs and those between them.
-        The signal is one dask task for each chunk.
+        One regular log on the grid of the first: each sample of another log takes the nearest
+        sample of the grid. Where logs overlap, the earlier one counts unless it is NaN. Logs with
+        other axes over the same time are put side by side. Axes and channels that a log lacks are
+        NaN there. The table of gaps lists the gaps of the logs and those between them. The signal
+        is one dask task for each chunk.
 
     Raises
     ------
     TimeError
-        When the sampling rates differ by more than 100 parts per million, or the common grid has
-        far more samples than the logs.
+        When the sampling rates differ by more than 100 parts per million, or the common grid is
+        much longer than the logs together.
     UnitError
-        When the logs hold different kinds of signal, or a channel has different units.
+        When the logs have different kinds of signal, or a channel has different units.
 
     Examples
     --------
     >>> from gyrostab.ingest.make_log import make_log
-    >>> first, second = (make_log(np.full(4, float(n)), rate=1.0, unit="deg/h", start=f"2026-01-01T00:00:0{6 * n}") for n in range(2))
-    >>> join_logs([second, first], ["b.nc", "a.nc"]).rate.values
+    >>> starts = ["2026-01-01T00:00:00", "2026-01-01T00:00:06"]
+    >>> first, second = (
+    ...     make_log(np.full(4, float(n)), rate=1.0, unit="deg/h", start=start)
+    ...     for n, start in enumerate(starts)
+    ... )
+    >>> concatenate_logs([second, first], ["b.nc", "a.nc"]).rate.values
     array([[ 0.,  0.,  0.,  0., nan, nan,  1.,  1.,  1.,  1.]])
     """
     if len(logs) == 1:
@@ -129,12 +133,12 @@ def concatenate_logs(
     )
     joined.set_close(
         partial(_close_files, [log._close for log in logs if log._close is not None])
-    )  # and nothing else of them
+    )  # keeps no other reference to the logs
     return joined
 
 
 def _check_grid(pieces: Sequence[PlacedLog], size: int, limits: Mapping[str, float] | None) -> None:
-    """Refuse a common grid that is out of proportion to the samples of the logs."""
+    """Refuse a common grid that has far more samples than the logs."""
     if not is_absurd_grid(size, sum(piece.source.size for piece in pieces), limits):
         return
     ordered = sorted(pieces, key=lambda piece: piece.first)
@@ -143,9 +147,12 @@ def _check_grid(pieces: Sequence[PlacedLog], size: int, limits: Mapping[str, flo
     )
     before, after = (ordered[place].source for place in (widest - 1, widest))
     raise TimeError(
-        f"{before.name} ends at {format_stamp(before.end)} and {after.name} begins at {format_stamp(after.start)}: the grid of "
-        f"{before.rate:.10g} Hz would have {size:.4g} samples. Correct the time of one of them, or give a shorter --max-gap to take the "
-        f"pause for a clock step. If the pause is real: {describe_limit('grid_samples', size, limits)}"
+        f"{before.name} ends at {format_stamp(before.end)} and {after.name} begins at "
+        f"{format_stamp(after.start)}: the grid of "
+        f"{before.rate:.10g} Hz would have {size:.4g} samples. Correct the time of one of them, "
+        "or give a shorter --max-gap to take the "
+        "pause for a clock step. If the pause is real: "
+        f"{describe_limit('grid_samples', size, limits)}"
     )
 
 
@@ -155,18 +162,20 @@ def _close_files(files: Sequence[Callable[[], None]]) -> None:
 
 
 def _check_same(sources: Sequence[Source]) -> None:
-    """Refuse logs of another kind or another sampling rate than the first."""
+    """Refuse logs whose kind or sampling rate differs from the first."""
     first = sources[0]
     kind = signal_name(first.log)
     for source in sources[1:]:
         other = signal_name(source.log)
         if other != kind:
             raise UnitError(
-                f"{first.name} holds a gyro signal of kind {kind!r}, {source.name} of kind {other!r}; run them one by one"
+                f"{first.name} holds a gyro signal of kind {kind!r}, {source.name} of kind "
+                f"{other!r}; run them one by one"
             )
         if abs(source.rate / first.rate - 1) > RATE_TOLERANCE:
             raise TimeError(
-                f"{first.name} is a log of {first.rate:.10g} Hz and {source.name} one of {source.rate:.10g} Hz; one log has one sampling "
+                f"{first.name} is a log of {first.rate:.10g} Hz and {source.name} one of "
+                f"{source.rate:.10g} Hz; one log has one sampling "
                 "rate: run them one by one, or ingest their source files together"
             )
 
@@ -185,7 +194,7 @@ def _signal_attributes(sources: Sequence[Source], name: str) -> dict[str, Any]:
 
 
 def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
-    """Sentences on axes and channels that some of the logs lack; logs of other axes are not expected to have them."""
+    """Return notes on axes and channels that some logs lack, unless those hold other axes."""
     groups = [
         [sources[number] for number in group]
         for group in group_axes([source.axes for source in sources])
@@ -206,7 +215,7 @@ def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str
 
 
 def _logs_without(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:
-    """Name the logs that lack something, unless they hold other axes over the time that the holders span."""
+    """Name the logs that lack something, except logs of other axes at the same time."""
     if not holders:
         return []
     first, last = min(holder.start for holder in holders), max(holder.end for holder in holders)
@@ -239,7 +248,10 @@ def _common_attributes(
         for names, source in zip(files, sources, strict=True)
     ]
     now = time_of_day()
-    done = f"{now} gyrostab.read_log: {len(sources)} regular logs on {size} samples at {sources[0].rate:.10g} Hz"
+    done = (
+        f"{now} gyrostab.read_log: {len(sources)} regular logs on {size} samples at "
+        f"{sources[0].rate:.10g} Hz"
+    )
     lost = [name for source in sources for name in texts(source.log, "unreadable_files")]
     return {
         **kept,

@@ -1,4 +1,4 @@
-"""One table of gaps from those of several logs on one grid: what is missing in all that could have it, and what lies between them."""
+"""Merge the tables of gaps of several logs on one grid, with the gaps between them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAX_SAMPLE = np.iinfo(np.int64).max // 2
 
 
 def _own_gaps(piece: PlacedLog) -> Table:
-    """The table of one log, on the common grid."""
+    """Return the table of gaps of one log, on the common grid."""
     log, source = piece.source.log.variables, piece.source
     table = _EMPTY
     if "gap_start" in log and log["gap_start"].size:
@@ -47,7 +47,7 @@ def _own_gaps(piece: PlacedLog) -> Table:
 
 
 def _rate_slips(piece: PlacedLog) -> Table:
-    """Samples left empty, or left out, where a slightly different rate has drifted by one sample."""
+    """Return the samples left empty or dropped where a different rate has drifted by one sample."""
     end, own_end = piece.runs[:-1, 0] + piece.runs[:-1, 2], piece.runs[:-1, 1] + piece.runs[:-1, 2]
     start, own = piece.runs[1:, 0], piece.runs[1:, 1]
     cause = np.where(start > end, _MISSING, _DUPLICATE)
@@ -55,7 +55,7 @@ def _rate_slips(piece: PlacedLog) -> Table:
 
 
 def _missing_in_both(held: Table, new: Table) -> Table:
-    """What is missing in both of two logs, with the cause that the first of them gives; its events stay."""
+    """Return the samples missing in both logs, with the causes and the events of the first."""
     lines = [held[held[:, FIRST] == held[:, END]]]
     lines += [
         clip_table(held[held[:, END] > held[:, FIRST]], int(first), int(end))
@@ -66,12 +66,12 @@ def _missing_in_both(held: Table, new: Table) -> Table:
 
 
 def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
-    """Return the table of gaps of the joined log; what is missing in some axes only is a gap as well.
+    """Return the table of gaps of the concatenated log; a gap on some axes counts as a gap.
 
     Parameters
     ----------
     pieces : sequence of Piece
-        In the order in which they were placed.
+        Logs in the order in which they were placed.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
     if len(groups) == 1 or any(later[0] >= earlier[1] for earlier, later in pairwise(spans)):
         table = merge_neighbours(
             _merge_group(pieces, pieces[0].first, None)
-        )  # the same axes, or others at another time
+        )  # shared axes, or other axes at another time
     else:
         end = max(end for _, end in spans)
         tables = [_merge_group(group, spans[0][0], end) for group in groups]
@@ -99,7 +99,7 @@ def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
 
 
 def _merge_group(pieces: Sequence[PlacedLog], begin: int, stop_at: int | None) -> Table:
-    """Return the gaps of logs that have axes in common, from sample `begin` on and up to `stop_at` if it is given."""
+    """Return the gaps of logs that share axes, from `begin` on and up to `stop_at` if given."""
     tables: list[Table] = []
     firsts: list[int] = []
     ends: list[int] = []

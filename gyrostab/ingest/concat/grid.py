@@ -1,4 +1,4 @@
-"""One log among several: its samples, and the samples of the common grid that they take."""
+"""One of several logs: its samples, and the samples of the common grid that they take."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["LogSlice", "PlacedLog", "Source", "log_span", "read_log_slices", "ru
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A regular log as it was opened: name of the file, first stamp [ns since 1970], sampling rate [Hz], samples."""
+    """A regular log: file name, first stamp [ns since 1970], rate [Hz], number of samples."""
 
     name: str
     log: xr.Dataset
@@ -36,17 +36,17 @@ class Source:
 
     @cached_property
     def axes(self) -> list[str]:
-        """Names of the axes, in the order of the rows; looked up once, as xarray and pandas take their time over it."""
+        """Names of the axes in the order of the rows; cached, as the look-up in xarray is slow."""
         return [str(axis) for axis in self.log["axis"].values]
 
 
-#: A log, and the samples at which a stretch of it begins and ends.
+#: A log, and the samples at which a slice of it begins and ends.
 LogSlice = tuple[Source, int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedLog:
-    """A log on the common grid.
+    """A log placed on the common grid.
 
     Attributes
     ----------
@@ -56,11 +56,11 @@ class PlacedLog:
         First sample of the grid, first sample of the log, length; more than one where the log's
         rate differs from the grid's.
     off : float
-        How far its samples lie from the grid's [samples].
+        Offset of its samples from those of the grid [samples].
     clock : tuple of int
-        A stamp of its clock [ns since 1970] and the sample of the grid that has it.
+        A stamp of its clock [ns since 1970] and the corresponding sample of the grid.
     cause : int
-        Cause (number in schema.GAP_CAUSES) of the gap before it; -1 when the stamps tell the gap.
+        Cause (number in schema.GAP_CAUSES) of the gap before it; -1 if the stamps define the gap.
     """
 
     source: Source
@@ -71,16 +71,16 @@ class PlacedLog:
 
     @property
     def first(self) -> int:
-        """First sample of the grid."""
+        """First sample of the grid that it takes."""
         return int(self.runs[0, 0])
 
     @property
     def end(self) -> int:
-        """Sample of the grid after the last."""
+        """Sample of the grid after its last one."""
         return int(self.runs[-1, 0] + self.runs[-1, 2])
 
     def on_grid(self, samples: Any) -> NDArray[np.int64]:
-        """Samples of the grid that samples of the log take; beyond the ends of the log as if it went on."""
+        """Return the grid samples of log samples, extrapolated beyond the ends of the log."""
         samples = np.asarray(samples, dtype=np.int64)
         which = np.clip(
             np.searchsorted(self.runs[:, 1], samples, side="right") - 1, 0, len(self.runs) - 1
@@ -89,7 +89,7 @@ class PlacedLog:
 
 
 def read_log_slices(wanted: Iterable[LogSlice]) -> dict[LogSlice, NDArray[np.float64]]:
-    """The signals of stretches (axis, sample), read side by side; NaN beyond the ends of a log."""
+    """Read the signals of slices (axis, sample) in parallel; NaN beyond the ends of a log."""
     from dask.system import CPU_COUNT
 
     places = list(dict.fromkeys(wanted))
@@ -110,7 +110,7 @@ def _read_log_slice(place: LogSlice) -> NDArray[np.float64]:
 
 
 def source_of(log: xr.Dataset, name: str) -> Source:
-    """Take the first stamp, rate and size of a regular log."""
+    """Return a regular log with its first stamp, rate and size."""
     index = log.xindexes.get("time")
     if isinstance(index, TimeGridIndex):
         return Source(name, log, index.start, index.rate, log.sizes["time"])
@@ -120,16 +120,16 @@ def source_of(log: xr.Dataset, name: str) -> Source:
 
 
 def log_span(log: xr.Dataset) -> tuple[int, int]:
-    """First and last stamp of a regular log [ns since 1970]."""
+    """Return the first and last stamp of a regular log [ns since 1970]."""
     source = source_of(log, "")
     return source.start, source.end
 
 
 def runs_of(first: int, off: float, size: int, ratio: float) -> NDArray[np.int64]:
-    """Runs of a log whose sample n lies at ``first + off + n * ratio`` of the grid, each at the nearest sample.
+    """Return the runs of a log whose sample n lies at grid sample ``first + off + n * ratio``.
 
-    Where the log is faster than the grid (ratio < 1) a sample is left out now and then; where it is
-    slower a sample of the grid stays empty.
+    A log that is faster than the grid (ratio < 1) drops a sample now and then; a slower one leaves
+    samples of the grid empty.
 
     Examples
     --------
@@ -146,12 +146,12 @@ def runs_of(first: int, off: float, size: int, ratio: float) -> NDArray[np.int64
     way = 1 if ratio > 1.0 else -1
     at = np.ceil((shift(np.int64(0)) + way * (steps - 0.5) - off) / (ratio - 1.0)).astype(np.int64)
     at = np.clip(at, 1, size - 1)
-    at += shift(at) != shift(np.int64(0)) + way * steps  # a tie that rounds to the even side
+    at += shift(at) != shift(np.int64(0)) + way * steps  # ties round to even
     begin = np.concatenate([[0], at])
     begin = np.unique(begin[begin < size])
     end = np.append(begin[1:], size)
     if way < 0:
-        begin[1:] += 1  # its sample of the grid is taken
+        begin[1:] += 1  # the grid sample of the dropped one is taken
     kept = end > begin
     begin, end = begin[kept], end[kept]
     return np.stack([first + begin + shift(begin), begin, end - begin], axis=1)

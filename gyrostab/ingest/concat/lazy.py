@@ -1,4 +1,4 @@
-"""Samples of several arrays on one grid as a dask array: a task for each chunk, none of which holds more than its own samples."""
+"""Place samples of several arrays on one grid, as a dask array with one task for each chunk."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gyrostab.store.lazy_slices import can_read_into, read_into, with_row_reader
 
 __all__ = ["PlacedArray", "chunk_of", "place_on_grid", "read_parts_into"]
 
-#: An array (time), or (axis, time) with the row to take, and its runs: first sample of the grid,
+#: An array (time), or (axis, time) with the row to read, and its runs: first sample of the grid,
 #: first of the array, length.
 PlacedArray = tuple[Any, int | None, NDArray[np.int64]]
 
@@ -25,7 +25,7 @@ _MIN_CHUNK_SAMPLES, _MAX_CHUNK_SAMPLES = 2**16, 2**22
 
 
 def chunk_of(arrays: Sequence[Any]) -> int:
-    """Samples of a chunk: as most chunks of the arrays have them, within reason."""
+    """Return the most common chunk length of the arrays, within bounds [samples]."""
     lengths = Counter(
         length
         for array in arrays
@@ -37,7 +37,7 @@ def chunk_of(arrays: Sequence[Any]) -> int:
 def _fill_chunk(
     size: int, lead: int, blocks: list[Any], spec: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """One chunk: each line of `spec` puts a stretch of a block in its place; what an earlier line has put there stays."""
+    """Make one chunk: each line of `spec` places a slice of a block; the first counts."""
     out = np.full(size, np.nan)
     for which, row, begin, at, length, shared in spec.tolist():
         block = np.asarray(blocks[which])
@@ -51,7 +51,7 @@ def _fill_chunk(
 
 
 class _RowBlocks:
-    """Where the samples of one row of an array lie: keys of its blocks, and the runs cut at the edges of blocks."""
+    """Location of the samples of one row of an array in its dask blocks."""
 
     def __init__(self, part: PlacedArray):
         import dask.array as da
@@ -73,7 +73,7 @@ class _RowBlocks:
         self.first, self.end = int(runs[0, 0]), int(runs[-1, 0] + runs[-1, 2])
 
     def slices(self, begin: int, end: int) -> list[tuple[tuple[Any, ...], int, int, int]]:
-        """Of the samples of the grid from `begin` to `end`: key of the block, first sample in it, first of the grid, length."""
+        """Return block key, first sample in it, first grid sample and length of slices."""
         found = []
         low = np.searchsorted(self.runs[:, 0] + self.runs[:, 2], begin, side="right")
         high = np.searchsorted(self.runs[:, 0], end, side="left")
@@ -93,25 +93,25 @@ class _RowBlocks:
 def place_on_grid(
     rows: Sequence[Sequence[PlacedArray]], size: int, chunk: int, *, flat: bool = False
 ) -> Any:
-    """Put arrays on one grid, float64, NaN where none has a sample; where two have one, the first of them that is not NaN counts.
+    """Place arrays on one grid, float64, NaN where no array has a sample.
 
     Parameters
     ----------
     rows : sequence of sequence of Part
-        For each row of the result, the arrays that have samples of it, the one that counts first in
-        front.
+        Arrays with samples of each row of the result. Where they overlap, the first value that is
+        not NaN counts.
     size : int
         Samples of the grid.
     chunk : int
         Samples of a chunk of the result.
     flat : bool
-        The result has no rows: one dimension.
+        Whether the result has one dimension only.
 
     Returns
     -------
     dask.array.Array, shape (len(rows), size) or (size,)
-        Its graph has one task for each chunk, beside the tasks of the arrays.
-        `gyrostab.store.lazy_slices.read_into` reads it without them where it can read the arrays so.
+        Its graph has one task for each chunk in addition to the tasks of the arrays.
+        `gyrostab.store.lazy_slices.read_into` reads it without the graph if it can read the arrays.
     """
     import dask.array as da
     from dask.highlevelgraph import HighLevelGraph
@@ -164,7 +164,7 @@ def place_on_grid(
 def read_parts_into(
     rows: Sequence[Sequence[PlacedArray]], row: int, begin: int, out: NDArray[np.float64]
 ) -> None:
-    """Samples of one row from `begin` on, as the tasks of `place_on_grid` make them."""
+    """Read samples of one row from `begin` on into `out`, with the result of `place_on_grid`."""
     found = [
         (number, *one)
         for number, part in enumerate(rows[row])
@@ -172,7 +172,7 @@ def read_parts_into(
     ]
     ends = sorted((at, at + length) for *_, at, length in found)
     if any(stop > start for (_, stop), (start, _) in pairwise(ends)):
-        out[:] = np.nan  # what two have is filled up
+        out[:] = np.nan  # overlaps are filled where NaN
     else:
         for (_, stop), (start, _) in pairwise([(0, 0), *ends, (out.size, 0)]):
             out[stop:start] = np.nan
@@ -192,7 +192,7 @@ def read_parts_into(
 def _overlapping_runs(
     part: PlacedArray, begin: int, end: int
 ) -> list[tuple[Any, int, int, int, int]]:
-    """Of a part, what lies from `begin` to `end`: array, row, first sample of the array, first after `begin`, length."""
+    """Return array, row, first array sample, offset after `begin` and length of runs in a range."""
     array, row, runs = part
     low = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
     high = np.searchsorted(runs[:, 0], end, side="left")

@@ -1,4 +1,4 @@
-"""What is said of several files at once."""
+"""Notes on several files at once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 __all__ = ["first_notes", "merge_notes", "name_some"]
 
-_MAX_NAMED = 5  # of many events of one kind, so many are told one by one
+_MAX_NAMED = 5  # events of one kind that are listed one by one
 
 
 def name_some(names: Sequence[str], most: int = 3) -> str:
@@ -14,18 +14,19 @@ def name_some(names: Sequence[str], most: int = 3) -> str:
 
     Examples
     --------
-    >>> some(["a", "b", "c", "d", "e"])
+    >>> name_some(["a", "b", "c", "d", "e"])
     'a, b, c and 2 more'
     """
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def merge_notes(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
-    """The notes of all files, each with the file's name in front; what several files say alike is said once.
+    """Merge the notes of all files, with file names in front; equal notes appear once.
 
     Examples
     --------
-    >>> together([("a.csv", ["a.csv: 2 rows are unreadable"]), ("b.csv", ["b.csv: 2 rows are unreadable"])])
+    >>> note = "2 rows are unreadable"
+    >>> merge_notes([("a.csv", [f"a.csv: {note}"]), ("b.csv", [f"b.csv: {note}"])])
     ['a.csv, b.csv: 2 rows are unreadable']
     """
     pooled: dict[str, list[str]] = {}
@@ -36,6 +37,6 @@ def merge_notes(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
 
 
 def first_notes(notes: Sequence[str], what: str) -> list[str]:
-    """The first of many notes of one kind, and how many more there are."""
+    """Return the first of many notes of one kind, and how many more there are."""
     more = len(notes) - _MAX_NAMED
     return [*notes[:_MAX_NAMED], *([f"{more} more {what}"] if more > 0 else [])]

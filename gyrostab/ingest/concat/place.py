@@ -1,8 +1,8 @@
-"""Where the samples of each log lie on the grid of the first: by stamps, by samples that two logs share, or after a step of the clock.
+"""Place each log on the grid of the first: by stamps, by shared samples, or after a clock step.
 
-The rules are those that hold for raw rows: rows that two files hold count once, files whose clocks
-merely cover the same hours are no copies of each other, and after a step of the clock the pause is
-of unknown length, so that one sample is taken as missing.
+The rules are the same as for raw rows: rows in two files count once; files whose clocks merely
+cover the same hours are not copies of each other; after a step of the clock the length of the pause
+is unknown, and one sample is taken as missing.
 """
 
 from __future__ import annotations
@@ -23,21 +23,19 @@ from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["place_logs"]
 
-#: Distance from the grid that is not worth a word [samples].
+#: Largest distance from the grid that is not noted [samples].
 NOTED_OFFSET_SAMPLES = 0.01
-#: Samples that may lie on those of the log before, with other values, before it is taken as a step
-#: of the clock (as among raw rows).
+#: Largest overlap of different values that is not taken as a step of the clock [samples], as for
+#: raw rows.
 MAX_OVERLAP_SAMPLES = 16
-#: Samples by which the grids of two logs with common samples may be displaced: the first stamp of
-#: each has its own jitter.
+#: Largest displacement of the grids of two logs with common samples, by the jitter of their first
+#: stamps [samples].
 MAX_SHIFT_SAMPLES = 64
 
 _COMPARED_SAMPLES = 2**13  # samples at each end of an overlap whose values are compared
-_PROBED_SAMPLES = 64  # of them, so many are looked at for a displacement
-_MIN_COMMON_SAMPLES = 32  # common samples that it takes to see a displacement
-_MIN_ALIKE_SHARE = (
-    0.9  # share of the compared samples that must be alike; a copy may have been damaged
-)
+_PROBED_SAMPLES = 64  # compared samples that are tried at every displacement
+_MIN_COMMON_SAMPLES = 32  # common samples needed to find a displacement
+_MIN_ALIKE_SHARE = 0.9  # share of equal samples in a copy, which may be damaged
 _BATCH_LOGS = 50  # logs whose overlaps are read at once
 _Cache = dict[LogSlice, NDArray[np.float64]]
 _STEP, _RESTART = GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart")
@@ -45,7 +43,7 @@ _STEP, _RESTART = GAP_CAUSES.index("clock_step"), GAP_CAUSES.index("restart")
 
 @dataclass(frozen=True)
 class _Match:
-    """Samples that two logs were compared at, those that are alike, and by how many samples the later log is displaced."""
+    """Samples compared in two logs, samples that are equal, and displacement of the later log."""
 
     common: int
     same: int
@@ -57,7 +55,7 @@ class _Match:
 
 
 def _count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
-    """Number of samples (last dimension) at which both have a number on some axis (first), and at which all numbers are the same."""
+    """Count the samples known in both arrays (axis, ..., sample), and the equal ones."""
     known = np.isfinite(held) & np.isfinite(new)
     told = known.any(axis=0)
     same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~known).all(axis=0) & told
@@ -65,7 +63,7 @@ def _count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[A
 
 
 def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
-    """Compare `new` with `held`, which is `MAX_SHIFT_SAMPLES` samples longer on either side, in place or displaced by a few samples."""
+    """Compare `new` at every shift with `held`, which has a margin of `MAX_SHIFT_SAMPLES`."""
     size = new.shape[1]
     here = _Match(*_count_alike(held[:, MAX_SHIFT_SAMPLES : MAX_SHIFT_SAMPLES + size], new), 0)
     if here.alike or here.common < _MIN_COMMON_SAMPLES:
@@ -90,12 +88,12 @@ def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
 
 
 def _lag_samples(held: Source, new: Source) -> int:
-    """Sample of `held` at which `new` begins, by the clock."""
+    """Return the sample of `held` at which `new` begins according to the clock."""
     return int(np.rint(grid_index(held.start, held.rate, new.start)))
 
 
 def _overlap_ends(held: Source, new: Source, lag: int) -> list[tuple[LogSlice, LogSlice]]:
-    """The ends of the overlap in both logs, to be compared: the earlier with some more samples on either side."""
+    """Return slices at both ends of the overlap, with a margin in the earlier log."""
     low, high = max(lag, 0), min(lag + new.size, held.size)
     if high <= low:
         return []
@@ -109,7 +107,7 @@ def _overlap_ends(held: Source, new: Source, lag: int) -> list[tuple[LogSlice, L
 
 
 def _read_overlaps(sources: Sequence[Source]) -> _Cache:
-    """What it takes to compare each log with the next, read at once."""
+    """Read the slices needed to compare each log with the next, in parallel."""
     pairs = [
         pair
         for held, new in pairwise(sources)
@@ -120,7 +118,7 @@ def _read_overlaps(sources: Sequence[Source]) -> _Cache:
 
 
 def _match_logs(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
-    """Compare two logs where the clock says that both have samples: sample 0 of `new` at sample `lag` of `held`."""
+    """Compare two logs where they overlap by the clock: `new` begins at sample `lag` of `held`."""
     axes = [axis for axis in held.axes if axis in new.axes]
     pairs = _overlap_ends(held, new, lag)
     if not axes or not pairs:
@@ -133,7 +131,7 @@ def _match_logs(held: Source, new: Source, lag: int, cache: _Cache) -> _Match:
             and found[0].common >= _COMPARED_SAMPLES // 2
             and found[0].same < 0.5 * found[0].common
         ):
-            break  # no copy, whatever its end is like
+            break  # not a copy, whatever its end
         cache.update(read_log_slices(one for one in (there, here) if one not in cache))
         found.append(_find_shift(cache[there][rows_held], cache[here][rows_new]))
     surest = max(found, key=lambda match: (match.alike, match.same))
@@ -148,16 +146,16 @@ def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[Place
     Parameters
     ----------
     sources : sequence of Source
-        In the order of their first stamps.
+        Logs in the order of their first stamps.
     max_gap : float
-        A longer pause is a step of the clock [s].
+        A longer pause is taken as a step of the clock [s].
 
     Returns
     -------
     pieces : list of Piece
-        The same order; the first sample of all is sample 0.
+        The logs in the same order; the first sample of all is sample 0.
     notes : list of str
-        Sentences on logs between the samples of the grid, on overlaps and on steps of the clock.
+        Notes on logs between the samples of the grid, overlaps and steps of the clock.
     """
     rate = sources[0].rate
     pieces: list[PlacedLog] = []
@@ -197,7 +195,7 @@ def _shift_samples(piece: PlacedLog, by: int) -> PlacedLog:
 def _place_next(
     pieces: list[PlacedLog], source: Source, rate: float, max_gap: float, cache: _Cache
 ) -> tuple[PlacedLog, tuple[PlacedLog, _Match] | None]:
-    """The next log on the grid, and the log that it overlaps, if it does."""
+    """Place the next log on the grid; also return the log that it overlaps, if any."""
     ratio = rate / source.rate
     if not pieces:
         return PlacedLog(source, runs_of(0, 0.0, source.size, ratio), 0.0, (source.start, 0)), None
@@ -205,7 +203,7 @@ def _place_next(
     silent: tuple[PlacedLog, _Match] | None = None
     for held in reversed(pieces):
         if held.source.end < source.start or not set(held.source.axes) & set(source.axes):
-            continue  # other axes over the same time are no overlap
+            continue  # other axes over the same time do not overlap
         lag = _lag_samples(held.source, source)
         match = _match_logs(held.source, source, lag, cache)
         if match.alike:
@@ -237,7 +235,7 @@ def _place_next(
 
 
 def _begins_again(pieces: list[PlacedLog], source: Source) -> bool:
-    """Whether a clock that was set back began anew, rather than being corrected."""
+    """Return whether a clock that was set back restarted, rather than being corrected."""
     latest = max(piece.source.end for piece in pieces if piece.clock == pieces[-1].clock)
     elapsed = latest - pieces[-1].clock[0]
     return (
@@ -247,22 +245,25 @@ def _begins_again(pieces: list[PlacedLog], source: Source) -> bool:
 
 
 def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
-    """Sentences on logs that lie between the samples of the grid or have a slightly different rate."""
+    """Return notes on logs between the samples of the grid or with a slightly different rate."""
     notes = []
     between = [piece for piece in pieces if abs(piece.off) > NOTED_OFFSET_SAMPLES]
     if between:
         most = max(abs(piece.off) for piece in between)
         names = name_some([piece.source.name for piece in between])
         notes.append(
-            f"{names}: begin between two samples of the grid of {pieces[0].source.name}; their samples were put on the nearest ones, "
+            f"{names}: begin between two samples of the grid of {pieces[0].source.name}; their "
+            "samples were put on the nearest ones, "
             f"at most {most:.2g} of a sample ({format_duration(most / rate)}) away"
         )
     other = [piece for piece in pieces if piece.source.rate != rate]
     if other:
         most = max(abs(piece.source.rate / rate - 1) for piece in other)
         notes.append(
-            f"{name_some([piece.source.name for piece in other])}: the sampling rate is up to {1e6 * most:.3g} parts per million from the "
-            f"{rate:.10g} Hz of {pieces[0].source.name}; each sample was put on the nearest one of its grid"
+            f"{name_some([piece.source.name for piece in other])}: the sampling rate is up to "
+            f"{1e6 * most:.3g} parts per million from the "
+            f"{rate:.10g} Hz of {pieces[0].source.name}; each sample was put on the nearest one "
+            "of its grid"
         )
     return notes
 
@@ -272,7 +273,10 @@ def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float)
     first, end = max(piece.first, held.first), min(piece.end, held.end)
     if not match.alike:
         what = "hold other values" if match.common else "are missing in one of them"
-        return f"{name}: {max(end - first, 0)} samples lie on samples of {holder} and {what}; those of {holder} are kept where it has them"
+        return (
+            f"{name}: {max(end - first, 0)} samples lie on samples of {holder} and {what}; "
+            f"those of {holder} are kept where it has them"
+        )
     begin = format_stamp(int(grid_times(*held.clock[:1], rate, first - held.clock[1])))
     whole = (
         "all of it is"
@@ -284,7 +288,10 @@ def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float)
         if match.same < match.common
         else ""
     )
-    return f"{name}: {whole} in {holder} too, and counted once{differ}; the samples of {holder} are kept where it has them"
+    return (
+        f"{name}: {whole} in {holder} too, and counted once{differ}; the samples of {holder} "
+        "are kept where it has them"
+    )
 
 
 def _break_note(pieces: Sequence[PlacedLog], piece: PlacedLog) -> str:
@@ -292,7 +299,9 @@ def _break_note(pieces: Sequence[PlacedLog], piece: PlacedLog) -> str:
     jump = (piece.source.start - before) / 1e9
     what = "time restarts" if piece.cause == _RESTART else "the clock steps"
     return (
-        f"{piece.source.name}: {what}: from {format_stamp(before)} to {format_stamp(piece.source.start)}, {format_duration(abs(jump))} "
-        f"{'back' if jump < 0 else 'ahead'}; the pause is of unknown length, so the samples that follow come after one missing sample"
+        f"{piece.source.name}: {what}: from {format_stamp(before)} to "
+        f"{format_stamp(piece.source.start)}, {format_duration(abs(jump))} "
+        f"{'back' if jump < 0 else 'ahead'}; the pause is of unknown length, so the samples that "
+        "follow come after one missing sample"
         + ("" if jump < 0 else "; if the pause is real, raise max_gap")
     )

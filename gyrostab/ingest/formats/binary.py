@@ -1,8 +1,8 @@
-"""Raw binary files, by a layout that stands beside them: ``run7.bin`` with ``run7.bin.toml`` (or ``run7.toml``, or ``layout.toml``).
+"""Raw binary files with a layout file: ``run7.bin.toml``, ``run7.toml`` or ``layout.toml``.
 
-The layout names the fields of a record in their order, with units in the header's way::
+The layout names the fields of a record in order, with units as in header cells::
 
-    header_bytes = 512          # before the first record; 0 when left out
+    header_bytes = 512          # before the first record; 0 by default
     byte_order = "little"       # or "big"
     fields = [
         {name = "time [us]", type = "uint32"},
@@ -44,7 +44,7 @@ TYPES = (
 
 
 def matches(path: Path) -> bool:
-    """Whether a layout for it stands beside the file, or it is called ``.bin`` or ``.raw``."""
+    """Return whether the file has a layout file, or its suffix is ``.bin`` or ``.raw``."""
     return (
         path.is_file()
         and path.suffix.lower() != ".toml"
@@ -53,18 +53,18 @@ def matches(path: Path) -> bool:
 
 
 def has_layout(path: Path) -> bool:
-    """Whether a layout of its own stands beside a file."""
+    """Return whether a file has a layout file named after it."""
     return _layout_path(path).is_file()
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Fields, number of records, the stamps of the two ends."""
+    """Summarise fields, number of records, and first and last stamps."""
     table, notes = _make_table(path)
     return scan_tables(path, "binary", [table], options, notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a binary file; see `gyrostab.ingest.read_log`."""
+    """Return the raw log of a binary file; see `gyrostab.ingest.read_log`."""
     table, notes = _make_table(path)
     return read_tables(path, [table], options, notes=notes, limit=limit)
 
@@ -77,28 +77,36 @@ def _read_layout(path: Path) -> tuple[Path, dict[str, Any]]:
     places = [_layout_path(path), path.with_suffix(".toml"), path.with_name("layout.toml")]
     place = next((place for place in places if place.is_file()), None)
     if place is None:
-        example = 'fields = [{name = "time [us]", type = "uint32"}, {name = "gyro_x [deg/h]", type = "int32"}]'
+        example = (
+            'fields = [{name = "time [us]", type = "uint32"}, {name = "gyro_x [deg/h]", '
+            'type = "int32"}]'
+        )
         raise OptionError(
-            f"{path.name}: nothing says how its records are laid out; write {places[0].name} beside it, for instance: {example}"
+            f"{path.name}: the layout of its records is unknown; write {places[0].name} next to "
+            f"it, for instance: {example}"
         )
     try:
         return place, tomllib.loads(place.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise OptionError(f"{place.name}: this layout is no TOML ({error}); correct it") from error
+        raise OptionError(
+            f"{place.name}: this layout is not valid TOML ({error}); correct it"
+        ) from error
 
 
 def _record_type(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], int]:
-    """The type of a record, and the bytes before the first."""
+    """Return the type of a record, and the number of bytes before the first."""
     known = {"header_bytes", "byte_order", "fields"}
-    if odd := sorted(set(layout) - known):
+    if unknown := sorted(set(layout) - known):
         raise OptionError(
-            f"{place.name}: {odd[0]!r} is no part of a layout; known are {', '.join(sorted(known))}"
+            f"{place.name}: {unknown[0]!r} is not a key of a layout; known are "
+            f"{', '.join(sorted(known))}"
         )
     order = {"little": "<", "big": ">"}.get(layout.get("byte_order", "little"))
     header = layout.get("header_bytes", 0)
     if order is None or not isinstance(header, int) or header < 0:
         raise OptionError(
-            f'{place.name}: byte_order is "little" or "big", and header_bytes a whole number; correct the layout'
+            f'{place.name}: byte_order is "little" or "big", and header_bytes a whole number; '
+            "correct the layout"
         )
     names, types, offsets, size = [], [], [], 0
     for number, one in enumerate(layout.get("fields", ()), 1):
@@ -111,16 +119,17 @@ def _record_type(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], in
             size += one["skip"]
             continue
         if not isinstance(one, dict) or set(one) != {"name", "type"} or one["type"] not in TYPES:
-            what = f'is {{name = "...", type = "..."}} or {{skip = BYTES}}, the types are {", ".join(TYPES)}'
+            what = (
+                f'is {{name = "...", type = "..."}} or {{skip = BYTES}}, the types are '
+                f"{', '.join(TYPES)}"
+            )
             raise OptionError(f"{place.name}: field {number} {what}; correct the layout")
         names.append(str(one["name"]))
         types.append(np.dtype(order + np.dtype(one["type"]).str[1:]))
         offsets.append(size)
         size += types[-1].itemsize
     if not names or len(set(names)) < len(names):
-        raise OptionError(
-            f"{place.name}: a layout needs fields with names of their own; correct it"
-        )
+        raise OptionError(f"{place.name}: a layout needs fields with different names; correct it")
     return np.dtype(
         {"names": names, "formats": types, "offsets": offsets, "itemsize": size}
     ), header
@@ -133,11 +142,13 @@ def _make_table(path: Path) -> tuple[Table, list[str]]:
     if rows < 1:
         what = f"{path.stat().st_size} bytes, but {header} of header and {record.itemsize} a record"
         raise FormatError(
-            f"{path.name}: it holds no record by the layout {place.name} ({what}); copy it again, or correct the layout"
+            f"{path.name}: it holds no record by the layout {place.name} ({what}); copy it "
+            "again, or correct the layout"
         )
     notes = (
         [
-            f"the last {rest} bytes are no whole record of {record.itemsize} bytes; is the layout right?"
+            f"the last {rest} bytes are not a whole record of {record.itemsize} bytes; is the "
+            "layout right?"
         ]
         if rest
         else []

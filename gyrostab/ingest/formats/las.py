@@ -1,7 +1,7 @@
-"""LAS well logs (versions 1.2 and 2, text): a curve by its mnemonic, with the unit of its header.
+"""LAS well logs (versions 1.2 and 2, text): curves by their mnemonics, with the header's units.
 
-A curve ``TIME`` is the time; with a curve ``DATE`` in the same file (logs made in real time) it is
-the time of that day.
+A curve ``TIME`` is the time; if the file also has a curve ``DATE`` (real-time logs), ``TIME`` is
+the time of day.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]
 
-# Parts of dates, as the units of curves write them -> as `datetime.strptime` does.
+# Date fields in units of curves -> codes of `datetime.strptime`.
 _DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
 
 
 def matches(path: Path) -> bool:
-    """Whether the file is called ``.las`` and begins with a section, as well logs do and clouds of laser points do not."""
+    """Return whether the file is a ``.las`` well log, not a LAS point cloud."""
     if not path.is_file() or path.suffix.lower() != ".las":
         return False
     with path.open("rb") as file:
@@ -39,12 +39,12 @@ def matches(path: Path) -> bool:
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Curves, rows, and the stamps of the two ends."""
+    """Summarise curves, rows, and first and last stamps."""
     return scan_tables(path, "las", [_read_curves(path, options)], options)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a LAS file; see `gyrostab.ingest.read_log`."""
+    """Return the raw log of a LAS file; see `gyrostab.ingest.read_log`."""
     return read_tables(path, [_read_curves(path, options)], options, limit=limit)
 
 
@@ -52,7 +52,7 @@ def _read_curves(path: Path, options: ReadOptions) -> Table:
     lasio = library("lasio", path, extra="las")
     try:
         curves = lasio.read(str(path)).curves
-    except Exception as error:  # of many kinds on damaged files
+    except Exception as error:  # the library raises many kinds on damaged files
         raise FormatError(
             f"{path.name}: this LAS file cannot be read ({error}); it may be cut off, copy it again"
         ) from error
@@ -90,13 +90,12 @@ def _read_curves(path: Path, options: ReadOptions) -> Table:
 
 
 def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
-    """Stamps of a curve of dates and one of the time of the day.
+    """Combine a curve of dates and a curve of times of day to stamps.
 
     Raises
     ------
     FormatError
-        When it is not clear in which order day, month and year stand, or the time is neither a
-        clock's nor a number.
+        When the order of day, month and year is ambiguous.
     """
     import pandas as pd
 
@@ -108,7 +107,8 @@ def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
     if order is None:
         fix = "write the dates as 2026-03-14, or drop the curve with --map DATE=-"
         raise FormatError(
-            f"{path.name}: the order of day and month in the curve DATE ({days[0]!r}) is not clear; {fix}"
+            f"{path.name}: the order of day and month in the curve DATE ({days[0]!r}) is not "
+            f"clear; {fix}"
         )
     start = dates_to_ns(
         pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy()
@@ -129,7 +129,7 @@ def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
 
 
 def _date_order(unit: str, days: list[str]) -> str | None:
-    """The format of the dates: as the unit of the curve says (``DD/MM/YY``), or the only one that fits them."""
+    """Return the date format: that of the curve's unit, or the only one that fits."""
     said = (
         re.sub(r"(?i)y{4}|y{2}|m{3}|m{2}|d{2}", lambda part: _DATE_CODES[part[0].lower()], unit)
         if re.search(r"(?i)yy", unit)

@@ -1,4 +1,4 @@
-"""MATLAB files, version 5 and 7.3, and plain HDF5 files: vectors by name, columns of a matrix by ``name/3`` (counted from 0).
+"""MATLAB 5 and 7.3 and HDF5 files: vectors by name, matrix columns as ``name/3`` (from 0).
 
 The rows of a matrix run along its longer side. Fields of a structure are called ``name.field``.
 """
@@ -39,13 +39,13 @@ _PLAIN_ARRAYS = (
     "of a timeseries ts: s.time = ts.Time; s.data = ts.Data; save('log.mat', '-struct', 's'); "
     "of a table or timetable: writetable(T, 'log.csv') or writetimetable(T, 'log.csv')"
 )
-#: A matrix with more columns than this is no table of sensors.
+#: Most columns of a matrix that is read as a table of sensors.
 MAX_COLUMNS = 64
 
 
 @dataclass(frozen=True)
 class _Vector:
-    """One column of the file: the array that it is in, and where its numbers lie."""
+    """One column of the file: the array that contains it, and the location of its numbers."""
 
     header: str
     array: Any  # numpy array or h5py dataset
@@ -57,12 +57,12 @@ class _Vector:
 
 
 def matches(path: Path) -> bool:
-    """Whether the file is called ``.mat``, or ``.h5`` or ``.hdf5``, which is what MATLAB 7.3 writes within."""
+    """Return whether the suffix is ``.mat``, ``.h5`` or ``.hdf5`` (MATLAB 7.3 files are HDF5)."""
     return path.is_file() and path.suffix.lower() in (".mat", *HDF_SUFFIXES)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Variables and their shapes, the stamps of the two ends."""
+    """Summarise variables, shapes, and first and last stamps."""
     with ExitStack() as stack:
         vectors, plan, fetch, notes = _plan_file(path, options, stack)
         name = "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab"
@@ -70,7 +70,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a MATLAB file; see `gyrostab.ingest.read_log`."""
+    """Return the raw log of a MATLAB file; see `gyrostab.ingest.read_log`."""
     with ExitStack() as stack:
         vectors, plan, fetch, notes = _plan_file(path, options, stack)
         notes += float32_note(plan, [vector.array.dtype for vector in vectors])
@@ -104,14 +104,16 @@ def _plan_file(
     others = [vector.header for vector in found if vector.rows != rows]
     notes = (
         [
-            f"left out, as they are shorter than the {rows} rows of the longest: {', '.join(others[:20])}"
+            f"left out, as they are shorter than the {rows} rows of the longest: "
+            f"{', '.join(others[:20])}"
         ]
         if others
         else []
     )
     if objects:
         notes.append(
-            f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to keep it, {_PLAIN_ARRAYS}"
+            f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to "
+            f"keep it, {_PLAIN_ARRAYS}"
         )
     attributes = [_number_attributes(vector.array) for vector in kept]
     units, calendars = (text_attributes(attributes, name) for name in ("units", "calendar"))
@@ -129,7 +131,7 @@ def _plan_file(
 
 
 def _known_fields(headers: Sequence[str]) -> dict[int, str]:
-    """Fields of structures whose own names are ours, ``gyro_x`` of ``S.gyro_x``, where no other field has that name."""
+    """Return structure fields with known unique names, ``gyro_x`` of ``S.gyro_x``."""
     names = [header.rpartition(".")[2] for header in headers]
     times = [place for place, name in enumerate(names) if TIME_PATTERN.match(name.lower())]
     found = {
@@ -146,7 +148,7 @@ def _known_fields(headers: Sequence[str]) -> dict[int, str]:
 
 
 def _number_attributes(array: Any) -> dict[str, Any]:
-    """Return what the attributes of an HDF5 dataset say of its numbers; such a file may follow the CF conventions."""
+    """Return the CF attributes of an HDF5 dataset that define how its numbers are read."""
     attributes = getattr(array, "attrs", {})
     return {name: attributes[name] for name in ATTRIBUTES if name in attributes}
 
@@ -170,7 +172,7 @@ def _vectors_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iter
 
 
 def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
-    """Arrays of numbers by their names; what is an object of MATLAB is added to `objects`."""
+    """Yield names and arrays of numbers; descriptions of MATLAB objects are added to `objects`."""
     with path.open("rb") as file:
         head = file.read(1024)
     if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
@@ -183,7 +185,8 @@ def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[t
         content = loadmat(path, simplify_cells=False, struct_as_record=True, chars_as_strings=True)
     except Exception as error:  # scipy raises bare errors of many kinds on damaged files
         raise FormatError(
-            f"{path.name}: this MATLAB file cannot be read ({error}); it may be cut off, copy it again"
+            f"{path.name}: this MATLAB file cannot be read ({error}); it may be cut off, copy it "
+            "again"
         ) from error
     for name, value in content.items():
         if not name.startswith("__"):

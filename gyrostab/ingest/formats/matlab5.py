@@ -1,4 +1,4 @@
-"""The structure of a MATLAB 5 file, checked before scipy reads it: its compiled reader trusts the sizes in the file, and may crash.
+"""Check the structure of a MATLAB 5 file; scipy's compiled reader may crash on wrong sizes.
 
 References
 ----------
@@ -19,28 +19,28 @@ __all__ = ["check_structure"]
 
 _HEADER_BYTES = 128
 _MATRIX, _COMPRESSED = 14, 15
-#: Bytes of an item of each numeric data type.
+#: Numeric data type -> bytes of an item.
 _ITEM_BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}
 _TEXT_TYPES = (1, 2, 3, 4, 16, 17, 18)
 _CELL, _STRUCT, _OBJECT, _CHAR, _SPARSE, _OPAQUE = 1, 2, 3, 4, 5, 17
 _NUMERIC = range(6, 16)
-#: Arrays within arrays; MATLAB itself nests a few.
+#: Deepest nesting of arrays; MATLAB itself nests a few.
 _MAX_DEPTH = 50
-#: numpy takes no more dimensions.
+#: Most dimensions of a numpy array.
 _MAX_DIMS = 32
 
 
 class _Damage(Exception):
-    """What is wrong with the structure."""
+    """The structure of the file is damaged."""
 
 
 def check_structure(path: Path) -> None:
-    """Check that every data element lies within the one that holds it, and that arrays hold what their sizes say.
+    """Check that every data element fits into its parent, and that array sizes are consistent.
 
     Parameters
     ----------
     path : Path
-        The file. One that is not of level 5 passes.
+        The file. Files that are not of level 5 pass.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def _check_file(file: BinaryIO, order: str, size: int) -> None:
         file.seek(place)
         kind, length = struct.unpack(order + "II", file.read(8))
         if kind not in (_MATRIX, _COMPRESSED):
-            raise _Damage(f"at byte {place} there is an element of type {kind}, and no array")
+            raise _Damage(f"at byte {place} there is an element of type {kind}, not an array")
         place += 8 + length
         if place > size:
             raise _Damage(f"an array ends {place - size} bytes behind the file")
@@ -80,13 +80,13 @@ def _check_file(file: BinaryIO, order: str, size: int) -> None:
 
 
 class _Elements:
-    """The data elements within an array, one after the other."""
+    """The data elements within an array, in sequence."""
 
     def __init__(self, data: bytes | memoryview, order: str):
         self.data, self.order, self.place = memoryview(data), order, 0
 
     def take(self) -> tuple[int, memoryview]:
-        """Type and bytes of the next element; `_Damage` or `struct.error` when the array ends before it does."""
+        """Take type and bytes of the next element; raise `_Damage` if it is cut off."""
         word = struct.unpack_from(self.order + "I", self.data, self.place)[0]
         if word >> 16:  # a small element holds its data in the tag
             kind, length, begin, end = word & 0xFFFF, word >> 16, self.place + 4, self.place + 8
@@ -102,7 +102,7 @@ class _Elements:
         return kind, self.data[begin : begin + length]
 
     def check_array(self, depth: int) -> None:
-        """Check the array of which these are the elements."""
+        """Check the array that consists of these elements."""
         if depth > _MAX_DEPTH:
             raise _Damage(f"arrays are nested more than {_MAX_DEPTH} deep")
         if not self.data:
@@ -128,7 +128,7 @@ class _Elements:
             raise _Damage(f"there is no array of class {array}")
 
     def _take_flags(self) -> tuple[int, bool]:
-        """Class of the array, and whether it is complex."""
+        """Take the class of the array, and whether it is complex."""
         kind, flags = self.take()
         if kind != 6 or len(flags) != 8:
             raise _Damage("an array does not begin with its flags")
@@ -136,7 +136,7 @@ class _Elements:
         return word & 0xFF, bool(word & 0x800)
 
     def _check_sizes(self) -> int:
-        """Take the dimensions of the array; the number of its items."""
+        """Take the dimensions of the array and return the number of its items."""
         kind, sizes = self.take()
         if kind not in (5, 6) or len(sizes) % 4 or not 8 <= len(sizes) <= 4 * _MAX_DIMS:
             raise _Damage("the dimensions of an array are damaged")

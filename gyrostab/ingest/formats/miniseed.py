@@ -1,4 +1,4 @@
-"""miniSEED files: a channel by its code (``HJ3``), or by network, station and code where several stations have it. No units are in them.
+"""miniSEED files: channels by code (``HJ3``), or network, station and code if ambiguous; no units.
 
 Channels whose code is that of a rotation sensor (instrument code J: ``HJZ``, ``BJ1``) are gyro
 axes, named by their orientation.
@@ -27,20 +27,16 @@ __all__ = ["matches", "read", "scan"]
 
 SUFFIXES = (".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
 _HEAD = re.compile(rb"\d{6}[DRQM][ \0]|MS\x03")
-_MAX_RECORD_BYTES = (
-    2**20
-)  # longest record that is looked for [bytes]; version 2 allows more, nobody writes it
+_MAX_RECORD_BYTES = 2**20  # version 2 allows longer records, which nobody writes
 _ROTATION = re.compile(
     r"(?:^|\.)[A-Z]J([A-Z0-9])$"
 )  # band, instrument J, orientation: SEED manual, appendix A
-_MAX_START_DIFFERENCE = (
-    0.1  # channels that begin so near to each other share their stamps [samples]
-)
+_MAX_START_DIFFERENCE = 0.1  # of channels that share their stamps [samples]
 
 
 @dataclass
 class _Trace:
-    """Unbroken pieces of one channel: first stamps [ns], rate [Hz], samples, values if they are wanted."""
+    """Unbroken segments of one channel: first stamps [ns], rate [Hz], sizes, values if loaded."""
 
     name: tuple[str, ...]
     rate: float
@@ -50,7 +46,7 @@ class _Trace:
 
 
 def matches(path: Path) -> bool:
-    """Whether the file begins as miniSEED does, version 2 or 3, or is called like it."""
+    """Return whether the file begins like miniSEED 2 or 3, or has such a suffix."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -58,14 +54,14 @@ def matches(path: Path) -> bool:
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Channels, and the stamps of the records' headers."""
+    """Summarise channels and the stamps of the record headers."""
     return scan_tables(
         path, "miniseed", _group_traces(_read_traces(path, unpack=False)), options, _cut_note(path)
     )
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a miniSEED file; see `gyrostab.ingest.read_log`."""
+    """Return the raw log of a miniSEED file; see `gyrostab.ingest.read_log`."""
     return read_tables(
         path,
         _group_traces(_read_traces(path, unpack=True)),
@@ -76,7 +72,7 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
 
 
 def _cut_note(path: Path) -> list[str]:
-    """A note where the last record of version 2 is not complete: all records of such a file have the length of the first."""
+    """Return a note if the last record of a version 2 file is cut off."""
     pymseed = library("pymseed", path, extra="miniseed")
     with path.open("rb") as file:
         head = file.read(_MAX_RECORD_BYTES)
@@ -108,7 +104,7 @@ def _read_traces(path: Path, *, unpack: bool) -> list[_Trace]:
                     or piece.samprate <= 0
                     or (unpack and piece.sampletype not in ("i", "f", "d"))
                 ):
-                    continue  # texts and logs of the station
+                    continue  # text and log records of the station
                 code = pymseed.sourceid2nslc(trace.sourceid)
                 one = traces.setdefault(
                     (trace.sourceid, piece.samprate), _Trace(tuple(code), piece.samprate)
@@ -119,13 +115,14 @@ def _read_traces(path: Path, *, unpack: bool) -> list[_Trace]:
                     one.values.append(np.array(piece.np_datasamples))
     except pymseed.MiniSEEDError as error:
         raise FormatError(
-            f"{path.name}: this miniSEED file cannot be read ({error}); it may be cut off, copy it again"
+            f"{path.name}: this miniSEED file cannot be read ({error}); it may be cut off, copy "
+            "it again"
         ) from error
     return list(traces.values())
 
 
 def _group_traces(traces: list[_Trace]) -> list[Table]:
-    """Channels of one rate whose pieces begin together are one table; the last piece of some may be shorter, as in a file that is cut."""
+    """Group channels of one rate and common segments into tables; the last may be shorter."""
     groups: list[list[_Trace]] = []
     for trace in traces:
         same = [group for group in groups if _in_step(group[0], trace)]
@@ -161,7 +158,7 @@ def _in_step(one: _Trace, other: _Trace) -> bool:
 
 
 def _axis_of_code(name: str) -> str | None:
-    """The gyro axis that a channel of a rotation sensor is."""
+    """Return the gyro axis of a rotation sensor channel, None for other channels."""
     match = _ROTATION.search(name)
     return f"gyro_{match.group(1).lower()}" if match else None
 

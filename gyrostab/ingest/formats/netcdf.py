@@ -1,7 +1,7 @@
-"""NetCDF and Zarr: regular logs that gyrostab wrote (opened lazily), and foreign files of variables along one dimension.
+"""NetCDF and Zarr: regular logs (opened lazily), and foreign files of variables on one dimension.
 
-In a foreign file the columns of a two-dimensional variable are called ``name/label``, with the
-label from the coordinate of the short dimension, or ``name/0`` without one; ``gyro/x`` and
+In a foreign file the columns of a two-dimensional variable are named ``name/label``, with the label
+from the coordinate of the short dimension, or ``name/0`` without such a coordinate; ``gyro/x`` and
 ``rate/x`` are gyro axes.
 """
 
@@ -46,7 +46,7 @@ __all__ = ["matches", "read", "scan"]
 
 MAX_COLUMNS = 64
 CHECKED_BLOCKS = 33
-#: How xarray opens a file here: numbers and stamps are decoded as they are read.
+#: Options to open a file with xarray; numbers and stamps are decoded when they are read.
 _UNDECODED: dict[str, Any] = {
     "chunks": None,
     "mask_and_scale": False,
@@ -64,7 +64,7 @@ class _Column:
 
 
 def matches(path: Path) -> bool:
-    """Whether the path is a NetCDF file by name or magic, or a Zarr store."""
+    """Return whether the path is a NetCDF file, by suffix or first bytes, or a Zarr store."""
     if path.is_dir():
         return any((path / name).exists() for name in ("zarr.json", ".zgroup", ".zmetadata"))
     with path.open("rb") as file:
@@ -72,7 +72,7 @@ def matches(path: Path) -> bool:
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Variables and sizes, the stamps of the two ends."""
+    """Summarise variables, sizes, and first and last stamps."""
     log = _open_log(path, options)
     if log is not None:
         with log:
@@ -86,7 +86,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The regular log, lazily, or the raw log of a foreign file; see `gyrostab.ingest.read_log`."""
+    """Open a regular log lazily, or read the raw log of a foreign file; see `read_log`."""
     log = _open_log(path, options)
     if log is not None:
         return log
@@ -102,24 +102,23 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
 
 
 def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
-    """The file as a regular log, of gyrostab or with a stamp for each sample, or None when it is something else."""
+    """Open a regular log, of gyrostab or with a stamp for each sample; None for other files."""
     if path.is_file():
-        read_classic_header(
-            path
-        )  # before the libraries take memory for what a damaged header claims
+        read_classic_header(path)  # before the library allocates what a damaged header asks for
     content = _content_kind(path)
     if content == "log":
         return _open_own(path, options)
     if content in _OTHER_CONTENT and not options.channels_only:
         raise FormatError(
-            f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, and no log; give the log that it was made of"
+            f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, not a log; give the "
+            "log that it was made from"
         )
     stored = _open_regular(path)
     if stored is None:
         return None
     log = _as_in_memory(
         path, _chunk_variables(decode_variables(path.name, name_file_in_errors(stored, path)))
-    )  # an index would hold every stamp
+    )  # an index would load every stamp
     log.set_close(stored.close)
     check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
     try:
@@ -128,15 +127,13 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
         raise SchemaError(f"{path.name}: {error}") from error
     except TimeError:
         log.close()
-        return None  # its rows are placed by their stamps, as those of any other file
+        return None  # its rows are placed by their stamps, like those of other files
 
 
 def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
-    """Units, names of the axes and attributes as they are in memory."""
+    """Convert units, names of axes and attributes to their form in memory."""
     if path.is_dir():
-        log = log[
-            sorted(log.variables, key=str)
-        ]  # a directory keeps no order, and what is in it is looked at all at once
+        log = log[sorted(log.variables, key=str)]  # the order within a directory is arbitrary
     for name in log.variables:
         units = log[name].attrs.get("units")
         if units in ON_DISK.values():
@@ -157,7 +154,7 @@ def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
 
 
 def _open_regular(path: Path) -> xr.Dataset | None:
-    """Open a regular log of another program without decoding it, with the fill values that its format implies."""
+    """Open a regular log of another program undecoded, with its default fill values."""
     zarr_format, attributes = (
         _read_group(path) if path.is_dir() else (0, {"sampling_rate_hz": None})
     )
@@ -169,7 +166,8 @@ def _open_regular(path: Path) -> xr.Dataset | None:
         stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise FormatError(
-            f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, copy it again"
+            f"{path.name}: this {engine} file cannot be opened ({error}); it may be cut off, "
+            "copy it again"
         ) from error
     if not _is_regular(stored):
         stored.close()
@@ -178,12 +176,12 @@ def _open_regular(path: Path) -> xr.Dataset | None:
         if engine == "netcdf4":
             variable.attrs = with_default_fill(variable.attrs, variable.dtype)
         elif zarr_format == 2 and not variable.attrs.get("_FillValue", 1):
-            del variable.attrs["_FillValue"]  # 0 is what Zarr gives to arrays by default
+            del variable.attrs["_FillValue"]  # 0 is the default of Zarr
     return stored
 
 
 def _is_regular(stored: xr.Dataset) -> bool:
-    """Return whether a dataset has what a regular log has: a signal, its axes, a stamp for each sample, and the rate."""
+    """Return whether a dataset has signal, axes, stamps and sampling rate, as a regular log has."""
     has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
     has_stamps = "time" in stored.variables and names_epoch(
         str(stored.variables["time"].attrs.get("units", ""))
@@ -197,7 +195,7 @@ def _is_regular(stored: xr.Dataset) -> bool:
 
 
 def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
-    """Return format and attributes of a Zarr group; xarray opens no group of format 2 whose arrays name no dimensions."""
+    """Return format and attributes of a Zarr group, also of one that xarray cannot open."""
     import zarr
 
     with reading_of(path):
@@ -206,7 +204,7 @@ def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
 
 
 def _chunk_variables(stored: xr.Dataset) -> xr.Dataset:
-    """The dataset as arrays of dask, in the chunks of the file."""
+    """Convert the variables to dask arrays, in the chunks of the file."""
     chunks: dict[Any, int] = {}
     for variable in stored.variables.values():
         chunks |= variable.encoding.get("preferred_chunks", {})
@@ -214,7 +212,7 @@ def _chunk_variables(stored: xr.Dataset) -> xr.Dataset:
 
 
 def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
-    """The names of the axes as text; numpy holds code points that are none, and Python fails on them."""
+    """Return the names of the axes as text; damaged names may hold invalid code points."""
     values = np.atleast_1d(labels.values)
     if values.dtype.kind == "U" and values.size:
         codes = np.ascontiguousarray(values).view(
@@ -226,7 +224,7 @@ def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
 
 
 def _content_kind(path: Path) -> str:
-    """What it says that gyrostab wrote it as: log, surface or product; what is damaged as a whole, or another's, says nothing."""
+    """Return the content that gyrostab wrote: log, surface or product; "" for other files."""
     try:
         if path.is_dir():
             return str(json.loads((path / ".zattrs").read_bytes()).get("gyrostab_content", ""))
@@ -236,7 +234,7 @@ def _content_kind(path: Path) -> str:
 
 
 def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
-    """A log that gyrostab wrote."""
+    """Open a log that gyrostab wrote."""
     log = from_disk(open_stored(path, strict=options.strict), path.name)
     try:
         log = as_uniform(log)
@@ -249,10 +247,10 @@ def _open_own(path: Path, options: ReadOptions) -> xr.Dataset:
 
 
 def _with_uniform_time(log: xr.Dataset) -> xr.Dataset:
-    """The log on a computed time axis; `TimeError` when its stamps lie on none.
+    """Return the log on a computed time axis; raise `TimeError` if its stamps are not uniform.
 
-    Stamps that agree with the declared rate in `CHECKED_BLOCKS` stretches are not read in full: a
-    sample that is lost or doubled moves every stamp after it.
+    Stamps that agree with the declared rate in `CHECKED_BLOCKS` blocks are not read in full,
+    because a lost or doubled sample shifts every stamp after it.
     """
     rate, size = float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
     stored = log["time"].variable
@@ -318,7 +316,8 @@ def _plan_file(
     lines.update(max(v.dimensions, key=lambda d: sizes[d]) for v in numeric if len(v.shape) == 2)
     if not lines:
         raise FormatError(
-            f"{path.name}: there is no variable of numbers along a dimension; groups are not looked into, so put it in none"
+            f"{path.name}: there is no numeric variable on a dimension; groups are not searched, "
+            "so store variables at the top level"
         )
     dim = max(lines, key=lambda d: (sizes[d], lines[d]))
     columns: list[_Column] = []

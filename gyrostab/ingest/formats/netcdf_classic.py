@@ -1,7 +1,7 @@
-"""The header of a classic NetCDF file (CDF-1, CDF-2, CDF-5), checked against the size of the file before its library reads it.
+"""Check the header of a classic NetCDF file (CDF-1, CDF-2, CDF-5) against the size of the file.
 
-The library allocates what a damaged header asks for. Here every count is compared with the bytes
-that are left, so a header that claims too much ends in one message.
+The library would allocate whatever a damaged header asks for. Here every count is compared with the
+remaining bytes, so an excessive count ends in one message.
 
 References
 ----------
@@ -34,14 +34,14 @@ _TYPES = {
     11: ">u8",
 }
 _DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
-#: Bytes of the file that are read, more where the header is longer; the last number is room for
-#: thousands of variables.
+#: Bytes of the file that are read, tried in this order; the last has room for thousands of
+#: variables.
 _HEAD_BYTES = (2**16, 2**20, 2**24)
 
 
 @dataclass(frozen=True)
 class ClassicVariable:
-    """Where the numbers of a variable lie: type, shape, byte of the first, and bytes from one place of the first dimension to the next."""
+    """Location of a variable's numbers: type, shape, first byte, stride of the first dimension."""
 
     name: str
     dtype: np.dtype[np.generic]
@@ -51,7 +51,7 @@ class ClassicVariable:
 
 
 class _Header:
-    """Bytes of a header, taken from the front."""
+    """Bytes of a header, consumed from the front."""
 
     def __init__(self, path: Path, data: bytes, wide_count: bool, wide_begin: bool):
         self.path, self.data, self.at = path, data, 4
@@ -59,12 +59,13 @@ class _Header:
 
     def fail(self, what: str) -> FormatError:
         return FormatError(
-            f"{self.path.name}: the header of this NetCDF file is damaged or cut off ({what}); copy it again"
+            f"{self.path.name}: the header of this NetCDF file is damaged or cut off ({what}); "
+            "copy it again"
         )
 
     def take(self, size: int) -> bytes:
         if size < 0 or self.at + size > len(self.data):
-            raise self.fail(f"it claims {size:,} bytes at byte {self.at:,} of {len(self.data):,}")
+            raise self.fail(f"it asks for {size:,} bytes at byte {self.at:,} of {len(self.data):,}")
         part = self.data[self.at : self.at + size]
         self.at += -(-size // 4) * 4
         return part
@@ -79,13 +80,13 @@ class _Header:
         return self.take(self.count()).decode("utf-8", "replace")
 
     def items(self, tag: int) -> range:
-        """Return the numbers of the items of a list; each takes eight bytes at least."""
+        """Return the range of the items of a list; each takes at least eight bytes."""
         found, count = self.number(), self.count()
         if (found, count) == (0, 0):
             return range(0)
         if found != tag or 8 * count > len(self.data) - self.at:
             raise self.fail(
-                f"it claims a list of {count:,} items of kind {found} at byte {self.at:,}"
+                f"it asks for a list of {count:,} items of kind {found} at byte {self.at:,}"
             )
         return range(count)
 
@@ -102,12 +103,12 @@ class _Header:
 
 
 def read_classic_header(path: Path) -> dict[str, ClassicVariable] | None:
-    """Read where the variables of a classic NetCDF file lie; None when the file is of another format.
+    """Read the locations of the variables of a classic NetCDF file; None for other formats.
 
     Raises
     ------
     FormatError
-        When the header claims more than the file holds.
+        When the header asks for more than the file holds.
     """
     size = path.stat().st_size
     for most in _HEAD_BYTES:
@@ -144,7 +145,7 @@ def _read_header(header: _Header, size: int) -> dict[str, ClassicVariable]:
 def _take_dimensions(header: _Header, known: int) -> list[int]:
     count = header.count()
     if count > 1024:
-        raise header.fail(f"it claims a variable of {count:,} dimensions")
+        raise header.fail(f"it asks for a variable of {count:,} dimensions")
     places = [header.count() for _ in range(count)]
     if any(place >= known for place in places):
         raise header.fail("a variable has a dimension that is not there")
@@ -158,7 +159,7 @@ def _lay_out(
     lengths: list[int],
     found: list[tuple[str, np.dtype[np.generic], list[int], int]],
 ) -> dict[str, ClassicVariable]:
-    """Find the shapes and strides, and compare the last byte of each variable with the size of the file."""
+    """Find shapes and strides, and check the last byte of each variable against the file size."""
     spans = {}
     for name, dtype, places, _ in found:
         shape = [lengths[place] for place in places]
@@ -171,7 +172,7 @@ def _lay_out(
     if rows and records in (
         2**32 - 1,
         2**64 - 1,
-    ):  # written as a stream: the size of the file tells
+    ):  # written as a stream: the file size gives the number
         records = max(size - min(begins), 0) // max(stride, 1)
     for name, dtype, places, begin in found:
         is_record, span = spans[name]
@@ -189,6 +190,6 @@ def _lay_out(
 
 def _multiply(lengths: list[int]) -> int:
     total = 1
-    for length in lengths:  # numbers of any size
+    for length in lengths:  # Python integers do not overflow
         total *= length
     return total

@@ -1,4 +1,4 @@
-"""The variables of NetCDF files and Zarr stores of other programs: dimensions, attributes, and where their numbers lie."""
+"""Variables of foreign NetCDF files and Zarr stores: dimensions, attributes, location of data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gyrostab.store.rows import ChunkedRows, EvenRows, LibraryRows, Rows, hdf5_r
 
 __all__ = ["StoredVariable", "open_variables", "with_default_fill"]
 
-#: Dimension of the rows, place along the other -> column.
+#: Dimension of the rows, index along the other -> column.
 Locate = Callable[[int, int], Rows]
 
 
@@ -35,12 +35,11 @@ class StoredVariable:
     shape : tuple of int
     dtype : dtype
     attributes : mapping
-        As the file holds them, with the fill value that the format gives to a variable without its
-        own.
+        As in the file, with the default fill value of the format if the variable has none.
     values : Any
-        Gives the stored numbers when indexed, while the file is open.
+        Returns the stored numbers when indexed, while the file is open.
     locate : callable
-        Dimension of the rows and place along the other -> column.
+        Dimension of the rows, index along the other -> column.
     """
 
     name: str
@@ -101,7 +100,7 @@ def _netcdf_variable(path: Path, variable: Any, limits: Mapping[str, float]) -> 
 
 
 def _locate_directly(path: Path, found: dict[str, StoredVariable]) -> None:
-    """Find out where the numbers lie, so that they are read without the library where that is possible."""
+    """Locate the numbers, so that they can be read without the library where possible."""
     import h5py
 
     numeric = [
@@ -220,10 +219,10 @@ def _load_zarr(
 
 
 def _zarr_fill(array: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the number that means "no value".
+    """Return the number that marks missing values.
 
-    xarray keeps it as the fill value of the array in format 2, and as a coded attribute in format
-    3. A fill value of 0 is what Zarr gives to arrays by default, and means nothing.
+    xarray stores it as the fill value of the array in format 2, and as a coded attribute in format
+    3. A fill value of 0 is the default of Zarr and does not mark missing values.
     """
     if "_FillValue" in attributes:
         from xarray.backends.zarr import FillValueCoder
@@ -241,7 +240,7 @@ def _zarr_fill(array: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_default_fill(attributes: dict[str, Any], dtype: Any) -> dict[str, Any]:
-    """Add the fill value that the NetCDF library gives to a variable without its own; bytes have none (users guide)."""
+    """Add the default fill value of the NetCDF library; bytes have none (users guide)."""
     import netCDF4
 
     if (
@@ -255,6 +254,6 @@ def with_default_fill(attributes: dict[str, Any], dtype: Any) -> dict[str, Any]:
 
 def _bytes_of(chunks: Any, dtype: np.dtype[Any]) -> int:
     total = dtype.itemsize
-    for length in chunks:  # numbers of any size
+    for length in chunks:  # Python integers do not overflow
         total *= int(length)
     return total

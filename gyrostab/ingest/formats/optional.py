@@ -1,4 +1,4 @@
-"""Format libraries that are installed only where they are wanted."""
+"""Import format libraries that are optional."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["library"]
 
 
 def library(name: str, path: Path, *, extra: str) -> Any:
-    """The module of a format library.
+    """Import a format library.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How a variable's stored numbers become values: packing, fill values and valid ranges by the CF conventions.
+"""Decode stored numbers by the CF conventions: packing, fill values and valid ranges.
 
 References
 ----------
@@ -60,20 +60,20 @@ _PACKING = (
     "scale_factor",
     "add_offset",
 )
-#: Attributes of a variable that say how its numbers are read.
+#: Attributes of a variable that define how its numbers are read.
 ATTRIBUTES = (*_PACKING, "units", "calendar")
 
 
 @dataclass(frozen=True)
 class Packing:
-    """What the attributes of one variable say of its stored numbers.
+    """Packing of one variable, from its attributes.
 
     Attributes
     ----------
     dtype : dtype
-        The type that the stored bytes stand for: unsigned where ``_Unsigned`` says so.
+        Type of the stored numbers; unsigned if ``_Unsigned`` is "true".
     missing : tuple of number
-        Stored numbers that mean "no value", in `dtype`.
+        Stored numbers that mark missing values, in `dtype`.
     low, high : float
         Stored numbers outside this range are invalid.
     scale, offset : float
@@ -89,7 +89,7 @@ class Packing:
 
     @classmethod
     def from_attributes(cls, where: str, dtype: Any, attributes: Mapping[str, Any]) -> Packing:
-        """Read the attributes of a variable.
+        """Parse the attributes of a variable.
 
         Parameters
         ----------
@@ -98,7 +98,7 @@ class Packing:
         dtype : dtype
             Type of the stored numbers, in any byte order.
         attributes : mapping of str to Any
-            All attributes as the file holds them, with their types.
+            All attributes as in the file, with their types.
 
         Raises
         ------
@@ -107,7 +107,8 @@ class Packing:
 
         Examples
         --------
-        >>> packing = Packing.from_attributes("gyro_x", "i1", {"_Unsigned": "true", "scale_factor": 0.5, "_FillValue": np.int8(-1)})
+        >>> attributes = {"_Unsigned": "true", "scale_factor": 0.5, "_FillValue": np.int8(-1)}
+        >>> packing = Packing.from_attributes("gyro_x", "i1", attributes)
         >>> packing.read_values(np.array([-2, -1, 4], dtype="i1")).tolist()
         [127.0, nan, 2.0]
         """
@@ -127,7 +128,8 @@ class Packing:
         )
         if not (np.isfinite([scale, offset]).all() and scale != 0.0):
             raise FormatError(
-                f"{where}: scale_factor {scale:g} and add_offset {offset:g} are not usable; correct them"
+                f"{where}: scale_factor {scale:g} and add_offset {offset:g} are not usable; "
+                "correct them"
             )
         missing = [
             value for key in ("_FillValue", "missing_value") for value in numbers.get(key, ())
@@ -137,7 +139,7 @@ class Packing:
 
     @property
     def is_identity(self) -> bool:
-        """Whether every stored number is a value as it stands."""
+        """Whether every stored number is a valid value without conversion."""
         return self.is_plain and not self.missing and self.low == -np.inf and self.high == np.inf
 
     @property
@@ -146,7 +148,7 @@ class Packing:
         return self.scale == 1.0 and self.offset == 0.0
 
     def read_counts(self, stored: Any) -> Any:
-        """Return stored numbers in their true sign; a masked array, or NaN among floats, where there is no value."""
+        """Return stored numbers with their sign; missing ones are masked, or NaN in floats."""
         array = np.asarray(stored)
         native = array.astype(array.dtype.newbyteorder("="), copy=False)
         counts = native.view(self.dtype) if native.dtype.itemsize == self.dtype.itemsize else native
@@ -160,7 +162,7 @@ class Packing:
         )
 
     def read_values(self, stored: Any) -> NDArray[np.float64]:
-        """Return unpacked values, NaN where there is none."""
+        """Return unpacked values, NaN where missing."""
         counts = self.read_counts(stored)
         values: NDArray[np.float64] = np.ma.filled(counts.astype(np.float64), np.nan)
         return values if self.is_plain else values * self.scale + self.offset
@@ -175,7 +177,7 @@ class Packing:
 
 
 def attribute_text(value: Any) -> str | None:
-    """Return an attribute that is text, or None for others and for a missing one."""
+    """Return an attribute if it is text, otherwise None."""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     return (
         value.decode(errors="replace")
@@ -187,7 +189,7 @@ def attribute_text(value: Any) -> str | None:
 
 
 def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[int, str]:
-    """Return the text attribute `name` of those variables of several that have it, by their place."""
+    """Return the text attribute `name` of the variables that have it, by their position."""
     return {
         place: text
         for place, attrs in enumerate(attributes)
@@ -198,7 +200,7 @@ def text_attributes(attributes: Iterable[Mapping[str, Any]], name: str) -> dict[
 def _attribute_numbers(
     where: str, key: str, value: Any, stored: np.dtype[Any], *, wraps: bool
 ) -> NDArray[Any]:
-    """Return the numbers of an attribute; if `wraps`, signed ones of an unsigned variable are taken by their bits (users guide)."""
+    """Return the numbers of an attribute; with `wraps`, signed ones become unsigned."""
     array = np.atleast_1d(np.asarray(value)).ravel()
     if array.dtype.kind not in "iuf" or not array.size:
         raise FormatError(
@@ -207,8 +209,8 @@ def _attribute_numbers(
     native = array.astype(array.dtype.newbyteorder("="))
     if not wraps or native.dtype.kind == "f" or key in ("scale_factor", "add_offset"):
         return native
-    # By their bits, whatever type holds them: attributes of Zarr stores are JSON, whose whole
-    # numbers have none.
+    # Reinterpreted by value, not by type: attributes of Zarr stores are JSON, whose whole numbers
+    # have no type.
     if stored.itemsize == 8:
         return native.view(stored)
     wide, bits = native.astype(np.int64), 8 * stored.itemsize
@@ -216,7 +218,7 @@ def _attribute_numbers(
 
 
 def _representable_values(missing: Iterable[Any], stored: np.dtype[Any]) -> Iterable[Any]:
-    """Yield the numbers that a variable can hold, in its type; NaN is missing anyway."""
+    """Yield the numbers that the type of a variable can hold, except NaN."""
     for value in missing:
         with np.errstate(all="ignore"):
             own = stored.type(value) if stored.kind == "f" or _fits_type(value, stored) else None
@@ -242,14 +244,15 @@ def _valid_range(
 ) -> tuple[float, float]:
     """Return the range of valid stored numbers.
 
-    The attributes are in packed units. Only where they are floats as the scale factor is, and the
-    variable holds integers, are they in unpacked units (users guide); half a count on either side
-    is then left for rounding.
+    The attributes are in packed units, unless the variable holds integers and both the attributes
+    and the scale factor are floats: then they are in unpacked units (users guide), and half a count
+    on either side is allowed for rounding.
     """
     pair = numbers.get("valid_range")
     if pair is not None and len(pair) != 2:
         raise FormatError(
-            f"{where}: the attribute valid_range has {len(pair)} numbers, not 2; correct it or remove it"
+            f"{where}: the attribute valid_range has {len(pair)} numbers, not 2; correct it or "
+            "remove it"
         )
     ends = {"low": pair[0], "high": pair[1]} if pair is not None else {}
     ends |= {
@@ -275,22 +278,22 @@ def _valid_range(
 def fold_packing(
     plan: Plan, dtypes: Sequence[Any], attributes: Sequence[Mapping[str, Any]]
 ) -> tuple[Plan, dict[int, Decoder]]:
-    """Put the laws of packed variables into the factors of the plan, so that counts stay counts.
+    """Fold the packing of variables into the factors of the plan, so that counts stay integers.
 
     Parameters
     ----------
     plan : Plan
-        What each column is.
+        Role and unit of each column.
     dtypes, attributes : sequence of dtype, sequence of mapping
         Type and attributes of each column's variable, by the column's source.
 
     Returns
     -------
     plan : Plan
-        With factors, offsets and time units that hold for what the decoders return.
+        With factors, offsets and time units for the output of the decoders.
     decoders : dict of int to callable
-        Source -> stored numbers to counts, or to values where the law of a time variable is not one
-        of whole nanoseconds.
+        Source -> function from stored numbers to counts, or to values for a time variable whose
+        counts are not whole nanoseconds.
 
     Raises
     ------
@@ -317,7 +320,7 @@ def fold_packing(
 
 
 def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
-    """Return the unit of the counts of a packed time variable, or None when it is none of whole nanoseconds."""
+    """Return the unit of the counts of a packed time variable; None if not whole nanoseconds."""
     step, shift = unit.ns * Fraction(repr(packing.scale)), unit.ns * Fraction(repr(packing.offset))
     if (
         packing.dtype.kind == "f"
@@ -331,25 +334,25 @@ def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
 
 
 def decode_variables(name: str, stored: xr.Dataset) -> xr.Dataset:
-    """Unpack the numbers and stamps of a dataset that was opened without decoding them, as they are read.
+    """Decode the variables of an undecoded dataset lazily, when they are read.
 
     Parameters
     ----------
     name : str
         The file, for messages.
     stored : xarray.Dataset
-        Variables as they are stored, with all attributes.
+        Stored variables, with all attributes.
 
     Returns
     -------
     xarray.Dataset
-        Packed numbers as float64 with NaN for what is missing or invalid, stamps as datetime64[ns];
-        the packing of whole numbers is in the encoding.
+        Packed numbers as float64, NaN where missing or invalid; stamps as datetime64[ns]; the
+        packing of whole numbers is in the encoding.
 
     Raises
     ------
     FormatError, UnitError
-        When an attribute has no usable value, or an epoch can be read in several ways.
+        When an attribute has no usable value, or an epoch is ambiguous.
     """
     variables = {
         key: _decode_variable(name, key, variable) for key, variable in stored.variables.items()
@@ -388,7 +391,7 @@ def _decode_variable(name: str, key: Any, variable: xr.Variable) -> xr.Variable:
 
 
 class _DecodedArray(BackendArray):
-    """An array whose parts are decoded as they are read, so that a part of it never loads the rest."""
+    """An array that decodes only the parts that are read."""
 
     def __init__(self, variable: xr.Variable, decode: Decoder, dtype: Any):
         self.variable, self.decode = variable, decode

@@ -1,4 +1,4 @@
-"""Parquet logs: one column per channel, units in square brackets or in the field's metadata."""
+"""Parquet logs: one column per channel, units in square brackets or in the field metadata."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from gyrostab.store.threads import map_in_order
 
 __all__ = ["matches", "read", "scan"]
 
-#: Bytes of a column that are read at one time: without a buffer, those of a whole row group, which
-#: may be a whole log.
+#: Bytes of a column that are read at one time; without a buffer a whole row group is read, which
+#: may be the whole log.
 _BUFFER_BYTES = 2**20
 
 
 def matches(path: Path) -> bool:
-    """Whether the file begins as Parquet files do, or is called like one."""
+    """Return whether the file begins like Parquet or has such a suffix."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -40,7 +40,7 @@ def matches(path: Path) -> bool:
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Schema and row count from the footer, the stamps of the two ends."""
+    """Summarise schema and row count from the footer, and first and last stamps."""
     file, plan = _open_parquet(path, options)
 
     def fetch(source: int, start: int, stop: int) -> Any:
@@ -56,7 +56,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a Parquet file; see `gyrostab.ingest.read_log`."""
+    """Return the raw log of a Parquet file; see `gyrostab.ingest.read_log`."""
     file, plan = _open_parquet(path, options)
     names = file.schema_arrow.names
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
@@ -88,7 +88,8 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
         head = next(file.iter_batches(batch_size=50), None)
     except (pa.ArrowException, OSError) as error:
         raise FormatError(
-            f"{path.name}: this Parquet file cannot be opened ({error}); it may be cut off, copy it again"
+            f"{path.name}: this Parquet file cannot be opened ({error}); it may be cut off, copy "
+            "it again"
         ) from error
     units = {}
     for index, entry in enumerate(schema):
@@ -104,7 +105,7 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
 
 
 def _to_numpy(column: Any) -> Any:
-    """An arrow column as numpy; nulls are masked where the type has no NaN."""
+    """Convert an arrow column to numpy; nulls are masked if the type has no NaN."""
     import pyarrow as pa
 
     column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column

@@ -1,4 +1,4 @@
-"""Files that hold several tables, each with stamps of its own: the table with the gyro axes becomes the log, the others channels of it."""
+"""Files of several tables with separate stamps: gyro tables become the log, others its channels."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ ReadSlice = Callable[[int, int], Any]
 class Table:
     """Columns of one length.
 
-    `names` and `units` are those of the columns; `stamps` are in the unit `time_unit`, or dates
-    where that is None; without stamps a column of the table may hold the time. `coded` is what a
-    column is by a code of the format, in the form of ``--map``.
+    `names` and `units` are those of the columns; `stamps` are in the unit `time_unit`, or dates if
+    that is None; without stamps a column of the table may hold the time. `coded` holds targets of
+    columns by a code of the format, in the form of ``--map``.
     """
 
     rows: int
@@ -42,7 +42,7 @@ class Table:
 
 
 def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
-    """The last part of each name where that is unique, otherwise all of it, joined by dots.
+    """Return the last part of each name if that is unique, otherwise all parts joined by dots.
 
     Examples
     --------
@@ -58,15 +58,15 @@ def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:
 
 @dataclass(frozen=True)
 class _PlannedTables:
-    """The tables with the plan of all their columns; source numbers run through the tables, stamps first."""
+    """Tables with one plan; source numbers run through all tables, stamps first."""
 
     tables: list[Table]
     first: list[int]
     plan: Plan
-    main: list[int]  # tables with gyro axes; each has stamps of its own
+    main: list[int]  # tables with gyro axes, each with separate stamps
 
     def part(self, place: int) -> tuple[Plan, Any]:
-        """The plan of one table's columns, and how to fetch them."""
+        """Return the plan of one table's columns, and the function that fetches them."""
         table, begin = self.tables[place], self.first[place]
         clocks = [
             replace(column, source=begin)
@@ -92,7 +92,7 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
     kept = [table for table in tables if table.rows and table.names]
     if not kept:
         raise FormatError(
-            f"{path.name}: it holds no values; copy it again, or look at what the logger wrote"
+            f"{path.name}: it holds no values; copy it again, or check what the logger wrote"
         )
     headers: list[str] = []
     units: dict[int, str] = {}
@@ -135,7 +135,7 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
 def scan_tables(
     path: Path, form: str, tables: Sequence[Table], options: ReadOptions, notes: Sequence[str] = ()
 ) -> FileSummary:
-    """A summary, with the first and last stamps of the table of the gyro axes."""
+    """Summarise tables, with the first and last stamps of the table with the gyro axes."""
     planned = _plan_tables(path, tables, options)
     main = planned.main[0]
     plan, fetch = planned.part(main)
@@ -154,12 +154,12 @@ def read_tables(
     notes: Sequence[str] = (),
     limit: int = SPILL_BYTES,
 ) -> xr.Dataset:
-    """Return the raw log of the tables with gyro axes; channels of the other tables are on stamps of their own.
+    """Return the raw log of the tables with gyro axes; other channels keep separate stamps.
 
     Raises
     ------
     FormatError
-        When there is nothing in the tables.
+        When the tables are empty.
     """
     planned = _plan_tables(path, tables, options)
     planned.plan.check()

@@ -1,7 +1,7 @@
-"""TDMS files (LabVIEW): a channel by its name, or with its group (``imu.wx``) where several have it, with its unit.
+"""TDMS files (LabVIEW): channels by name, or group and name (``imu.wx``) if ambiguous, with units.
 
-Channels with waveform properties have stamps from these; otherwise a channel of times in the same
-group is the time.
+Stamps come from the waveform properties of channels, otherwise from a channel of dates in the same
+group.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ __all__ = ["matches", "read", "scan"]
 
 _FIRST_DATE = np.datetime64(
     "1950-01-01", "us"
-)  # LabVIEW counts from 1904, and writes that where it has no clock
+)  # LabVIEW counts from 1904, and writes 1904 if it has no clock
 
 
 def matches(path: Path) -> bool:
-    """Whether the file begins as TDMS does, or is called like it."""
+    """Return whether the file begins like TDMS or has such a suffix."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -39,26 +39,27 @@ def matches(path: Path) -> bool:
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Channels and their lengths, the stamps of the two ends."""
+    """Summarise channels, lengths, and first and last stamps."""
     with _open_tables(path) as tables:
         return scan_tables(path, "tdms", tables, options)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a TDMS file; see `gyrostab.ingest.read_log`."""
+    """Return the raw log of a TDMS file; see `gyrostab.ingest.read_log`."""
     with _open_tables(path) as tables:
         return read_tables(path, tables, options, limit=limit)
 
 
 @contextmanager
 def _open_tables(path: Path) -> Iterator[list[Table]]:
-    """Channels of one length and one clock are one table; without a clock, also of one group."""
+    """Group channels of one length and clock into tables; without a clock, of one group."""
     nptdms = library("nptdms", path, extra="tdms")
     try:
         file = nptdms.TdmsFile.open(str(path))
-    except Exception as error:  # of many kinds on damaged files
+    except Exception as error:  # the library raises many kinds on damaged files
         raise FormatError(
-            f"{path.name}: this TDMS file cannot be read ({error}); it may be cut off, copy it again"
+            f"{path.name}: this TDMS file cannot be read ({error}); it may be cut off, copy it "
+            "again"
         ) from error
     with file:
         channels = [
@@ -77,7 +78,7 @@ def _open_tables(path: Path) -> Iterator[list[Table]]:
 
 
 def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
-    """Interval [s] and start of a waveform."""
+    """Return interval [s] and start of a waveform, None without waveform properties."""
     properties = channel.properties
     step = float(properties.get("wf_increment") or 0.0)
     start = properties.get("wf_start_time")
@@ -92,7 +93,8 @@ def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
         began = int(dates_to_ns(np.array(start)))
         if began == NAT:
             raise FormatError(
-                f"{path.name}: channel {channel.name!r} begins at {start}, which is after the year 2262; correct wf_start_time"
+                f"{path.name}: channel {channel.name!r} begins at {start}, which is after the "
+                "year 2262; correct wf_start_time"
             )
         start = np.datetime64(began, "ns")
     offset = round(float(properties.get("wf_start_offset") or 0.0) * 1e9)

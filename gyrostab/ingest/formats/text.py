@@ -1,8 +1,8 @@
-"""Text logs: comma, semicolon, tab or blank separated, plain or gzipped, in one pass of bounded memory.
+"""Text logs: separated by comma, semicolon, tab or blanks, plain or gzipped, in bounded memory.
 
-Plain rows are read by a kernel, several blocks of the file side by side. From a row on that it does
-not know, a piece goes another way, and the more of them the longer it gets: a short one cell by
-cell, a long one to pyarrow, and only if that fails cell by cell.
+Plain rows are parsed by a kernel, several blocks of the file in parallel. At a row that the kernel
+does not know, a piece of text takes another path: a short piece is parsed cell by cell, a long one
+by pyarrow, and cell by cell only if that fails. Consecutive pieces grow in length.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ from gyrostab.store.threads import map_in_order
 __all__ = ["matches", "read", "read_head", "scan"]
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
-#: Bytes of the file in which the layout is looked for; more, up to the second number, where they
-#: hold fewer lines than the third.
+#: Bytes of the file in which the layout is searched; more, up to the second number, if they contain
+#: fewer lines than the third.
 HEAD_BYTES, MAX_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
 PIECE_BYTES = 2**18
@@ -62,13 +62,13 @@ COUNTED_BYTES = 2**24
 
 
 def matches(path: Path) -> bool:
-    """Whether the file has the name of a text log (gzipped or not), or holds text with figures in it whatever its name is."""
+    """Return whether the file has the suffix of a text log, or contains text with digits."""
     name = path.name.lower().removesuffix(".gz")
     return path.is_file() and (name.endswith(SUFFIXES) or _holds_text(path))
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Header, columns, first and (of plain files) last stamp, from the two ends of the file."""
+    """Summarise header, columns, and first and (of plain files) last stamp."""
     layout, plan = _plan_file(path, options)
     time, rows = plan.time, None
     head = tail = np.empty(0, np.int64)
@@ -106,7 +106,7 @@ def read(
     limit: int = SPILL_BYTES,
     stop: Callable[[], bool] | None = None,
 ) -> xr.Dataset:
-    """The raw log of a text file; see `gyrostab.ingest.read_log`. Ends with `CancelledError` where `stop` comes to be true."""
+    """Return the raw log of a text file; raise `CancelledError` once `stop` returns true."""
     layout, plan = _plan_file(path, options)
     options = options if plan.rate is None else replace(options, rate=plan.rate)
     intake = RawLogBuilder(plan.check(), options, limit=limit)
@@ -128,7 +128,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         size, head = HEAD_BYTES, _read_chunk(path, file, HEAD_BYTES, 0)
         while (
             len(head) == size and size < MAX_HEAD_BYTES and head.count(b"\n") < HEAD_LINES
-        ):  # lines of very many cells
+        ):  # very long lines
             head += _read_chunk(path, file, size, size)
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
@@ -155,7 +155,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
 
 
 def _duration_units(layout: Layout) -> dict[int, str]:
-    """The units of columns whose cells carry them, ``0.01 sec``."""
+    """Return the units of columns whose cells contain them, such as ``0.01 sec``."""
     rows = [row for row in layout.samples if len(row) == layout.width]
     found = (
         {column: unit for column, cell in enumerate(rows[0]) if (unit := unit_of_duration(cell))}
@@ -170,7 +170,7 @@ def _duration_units(layout: Layout) -> dict[int, str]:
 
 
 def _is_rising(layout: Layout, column: int) -> bool:
-    """Whether the first cells of a column that hold something rise from row to row."""
+    """Return whether the first filled cells of a column rise from row to row."""
     cells = [
         row[column] for row in layout.samples if len(row) == layout.width and row[column].strip()
     ]
@@ -192,7 +192,7 @@ def _sample_stamps(
 
 
 def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
-    """Whether a row holds a number beside its stamp."""
+    """Return whether a row holds a number in addition to its stamp."""
     others = (cell for at, cell in enumerate(row) if at != time)
     return len(row) == layout.width and (
         layout.width == 1 or any(is_number(cell, comma=layout.decimal_comma) for cell in others)
@@ -218,7 +218,7 @@ def _open_text(path: Path) -> IO[bytes]:
 
 
 def read_head(path: Path) -> str:
-    """The first characters of a text file, plain or gzipped; nothing of other files."""
+    """Return the first characters of a text file, plain or gzipped; "" for other files."""
     if not path.is_file() or not _holds_text(path):
         return ""
     with _open_text(path) as file:
@@ -226,7 +226,7 @@ def read_head(path: Path) -> str:
 
 
 def _read_chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
-    """Up to `size` bytes, short only at the end of the file."""
+    """Read up to `size` bytes; fewer only at the end of the file."""
     if isinstance(file, BufferedReader):
         return file.read(size)
     parts: list[bytes] = []
@@ -237,14 +237,20 @@ def _read_chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
             missing -= len(part)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         read = done + size - missing
-        what = f"the gzip stream is damaged or cut off; {read:,} bytes of text could be read before that ({error})"
-        rescue = f"copy the file again, or save the readable part with: gzip -dc {path.name} > rescued.csv"
+        what = (
+            f"the gzip stream is damaged or cut off; {read:,} bytes of text could be read "
+            f"before that ({error})"
+        )
+        rescue = (
+            f"copy the file again, or save the readable part with: gzip -dc {path.name} > "
+            "rescued.csv"
+        )
         raise FormatError(f"{path.name}: {what}. {rescue}") from error
     return b"".join(parts)
 
 
 def _read_blocks(path: Path, offset: int) -> Iterator[bytes]:
-    """The data rows in blocks that end at the end of a line."""
+    """Yield the data rows in blocks that end with a line."""
     with _open_text(path) as file:
         done = len(_read_chunk(path, file, offset, 0))
         rest = b""
@@ -255,7 +261,8 @@ def _read_blocks(path: Path, offset: int) -> Iterator[bytes]:
                 rest += chunk
                 if len(rest) > 4 * BLOCK_BYTES:
                     raise FormatError(
-                        f"{path.name}: a line is longer than {len(rest):,} bytes; this is no text log with line ends"
+                        f"{path.name}: a line is longer than {len(rest):,} bytes; this is not a "
+                        "text log with line ends"
                     )
                 continue
             yield b"".join((rest, memoryview(chunk)[:cut]))
@@ -265,7 +272,7 @@ def _read_blocks(path: Path, offset: int) -> Iterator[bytes]:
 
 
 class _ParsedPart(NamedTuple):
-    """Rows of a block that were read in one way, and the text, whose lines tell where a row stands."""
+    """Rows of a block that were parsed in one way, and their text, to find line numbers."""
 
     taken: ConvertedBlock
     lines: int
@@ -274,7 +281,7 @@ class _ParsedPart(NamedTuple):
 
 
 def _parse_block(block: bytes, typing: CellTypes, intake: RawLogBuilder) -> list[_ParsedPart]:
-    """Read one block."""
+    """Parse one block."""
     parts: list[_ParsedPart] = []
     start, reach, left = 0, LINE_BYTES, _count_lines(block, slice(None))
     while start < len(block):
@@ -301,7 +308,7 @@ def _count_lines(block: bytes, span: slice) -> int:
 
 
 def _parse_piece(piece: bytes, typing: CellTypes, intake: RawLogBuilder) -> _ParsedPart:
-    """Read rows of which one at least is not plain."""
+    """Parse a piece in which at least one row is not plain."""
     lines = piece.count(b"\n")
     parsed = parse_fast(piece, typing) if len(piece) > SHORT_BYTES else None
     if parsed is not None:
@@ -313,7 +320,7 @@ def _parse_piece(piece: bytes, typing: CellTypes, intake: RawLogBuilder) -> _Par
         ):
             return _ParsedPart(
                 intake.prepare(*parsed), lines, piece, slice(None)
-            )  # otherwise a stray quote has swallowed line ends
+            )  # otherwise an unmatched quote hides line ends
     values, stamps, words = parse_cells(piece, typing)
     return _ParsedPart(intake.prepare(values, stamps, words=words), lines, piece, slice(None))
 
@@ -331,7 +338,7 @@ def _line_names(part: _ParsedPart, first: int, rows: Sequence[int]) -> list[str]
 
 
 def _clean_lines(block: bytes, separator: str) -> bytes:
-    """Empty the comment lines (so that lines keep their numbers) and, where blanks separate, make each run of them one."""
+    """Blank out comment lines (line numbers stay) and, if blanks separate, reduce runs to one."""
     if b"#" in block or b"%" in block:
         block = re.sub(rb"(?m)^[ \t]*[#%][^\n]*", b"", block)
     if separator != BLANK:

@@ -1,6 +1,6 @@
-"""PX4 logs (``.ulg``): a field by its name (``gyro_rad[0]``), or with its message (``sensor_combined.gyro_rad[0]``) where several have it.
+"""PX4 logs (``.ulg``): fields by name (``gyro_rad[0]``), with the message's name if ambiguous.
 
-Stamps are microseconds since the autopilot began. The messages give no units.
+Stamps are microseconds since the start of the autopilot. The messages contain no units.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAGIC = b"ULog\x01\x12\x35"
 
 
 def matches(path: Path) -> bool:
-    """Whether the file begins as PX4 logs do, or is called like one."""
+    """Return whether the file begins like a PX4 log or has such a suffix."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -32,13 +32,13 @@ def matches(path: Path) -> bool:
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Messages and their fields, first and last stamp; the format has no table of contents, so the file is gone through."""
+    """Summarise messages, fields and stamps; reads the whole file."""
     tables, notes = _make_tables(path)
     return scan_tables(path, "ulog", tables, options, notes)
 
 
 def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Dataset:
-    """The raw log of a PX4 log; see `gyrostab.ingest.read_log`."""
+    """Return the raw log of a PX4 log; see `gyrostab.ingest.read_log`."""
     tables, notes = _make_tables(path)
     return read_tables(path, tables, options, notes=notes, limit=limit)
 
@@ -47,7 +47,7 @@ def _make_tables(path: Path) -> tuple[list[Table], list[str]]:
     pyulog = library("pyulog", path, extra="ulog")
     try:
         log = pyulog.ULog(str(path))
-    except Exception as error:  # of many kinds on damaged files
+    except Exception as error:  # the library raises many kinds on damaged files
         raise FormatError(
             f"{path.name}: this PX4 log cannot be read ({error}); it may be cut off, copy it again"
         ) from error
@@ -73,7 +73,7 @@ def _make_tables(path: Path) -> tuple[list[Table], list[str]]:
         )
     lost = [dropout.duration for dropout in log.dropouts]
     notes = (
-        [f"the logger says that it lost data {len(lost)} times, {sum(lost)} ms in all"]
+        [f"the logger reports that it lost data {len(lost)} times, {sum(lost)} ms in all"]
         if lost
         else []
     )

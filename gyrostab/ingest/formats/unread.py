@@ -1,4 +1,4 @@
-"""Formats that are recognised but not read: what they are, and what to convert them to."""
+"""Refuse formats that are recognised but not read, with advice on conversion."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ HEAD_BYTES = 4096
 _NOVATEL_TEXT = re.compile(rb"^(?:#|%)[A-Z0-9]{3,}A,[^\r\n]*;", re.MULTILINE)
 _ARDUPILOT_TEXT = re.compile(rb"^FMT, ?128, ?89, ?FMT,", re.MULTILINE)
 
-#: Name, whether the first bytes are of it, what to do.
+#: Name, test of the first bytes, advice.
 _FORMATS: list[tuple[str, Callable[[bytes], bool], str]] = [
     (
         "an ArduPilot DataFlash log",
         lambda head: head.startswith(b"\xa3\x95\x80") or bool(_ARDUPILOT_TEXT.search(head)),
-        "convert it to CSV with pymavlink: mavlogdump.py --format csv --types IMU FILE > imu.csv, and read that with "
-        "--map GyrX=gyro_x --map GyrY=gyro_y --map GyrZ=gyro_z --unit gyro=rad/s --map TimeUS=time --unit time=us",
+        "convert it to CSV with pymavlink: mavlogdump.py --format csv --types IMU FILE > "
+        "imu.csv, and read that with "
+        "--map GyrX=gyro_x --map GyrY=gyro_y --map GyrZ=gyro_z --unit gyro=rad/s --map "
+        "TimeUS=time --unit time=us",
     ),
     (
         "a WITSML document",
@@ -38,7 +40,8 @@ _FORMATS: list[tuple[str, Callable[[bytes], bool], str]] = [
         lambda head: (
             head.startswith((b"\xaa\x44\x12", b"\xaa\x44\x13")) or bool(_NOVATEL_TEXT.search(head))
         ),
-        "convert its RAWIMU or CORRIMU messages to CSV with NovAtel Convert; the scale of a count is in the manual of the IMU, "
+        "convert its RAWIMU or CORRIMU messages to CSV with NovAtel Convert; the scale of a "
+        "count is in the manual of the IMU, "
         'and is given as --unit "gyro=FACTOR deg/s"',
     ),
     (
@@ -56,7 +59,8 @@ _FORMATS: list[tuple[str, Callable[[bytes], bool], str]] = [
     (
         "an MCAP file",
         lambda head: head.startswith(b"\x89MCAP0\r\n"),
-        "convert its IMU topic to CSV or Parquet, for instance with the Python packages rosbags or mcap",
+        "convert its IMU topic to CSV or Parquet, for instance with the Python packages rosbags "
+        "or mcap",
     ),
     (
         "an SQLite database, perhaps a ROS 2 bag",
@@ -67,12 +71,12 @@ _FORMATS: list[tuple[str, Callable[[bytes], bool], str]] = [
 
 
 def refuse_unread(path: Path) -> None:
-    """Raise an error for a file of a format that is known and not read.
+    """Raise an error for a file of a format that is recognised but not read.
 
     Raises
     ------
     FormatError
-        With the name of the format and what to convert the file to.
+        With the name of the format and how to convert the file.
     """
     if not path.is_file():
         return
@@ -81,12 +85,13 @@ def refuse_unread(path: Path) -> None:
     for name, is_one, advice in _FORMATS:
         if is_one(head):
             raise FormatError(
-                f"{path.name}: this is {name}, which is not read yet; {advice.replace('FILE', path.name)}"
+                f"{path.name}: this is {name}, which is not read yet; "
+                f"{advice.replace('FILE', path.name)}"
             )
 
 
 def _decompress(head: bytes) -> bytes:
-    """The first bytes of what is compressed, or the bytes as they are."""
+    """Decompress the first bytes, or return them if they are not compressed."""
     try:
         if head.startswith(b"\x1f\x8b"):
             return zlib.decompressobj(wbits=31).decompress(head, 16)

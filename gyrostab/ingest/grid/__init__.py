@@ -1,1 +1,1 @@
-"""Raw rows to a regular log: sampling rate, place of every row, gaps."""
+"""Convert raw rows to a regular log: sampling rate, sample of every row, gaps."""

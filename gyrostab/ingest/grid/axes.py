@@ -1,4 +1,4 @@
-"""Raw logs whose axes have stamps of their own: each is put on a grid, and the grids side by side."""
+"""Regularise raw logs whose axes have separate stamps, and combine them on one grid."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ def regularise_axes(
     max_gap: str | float,
     limits: Mapping[str, float] | None,
 ) -> xr.Dataset:
-    """Put the rows of each group of axes on a grid of its own, and their samples on the grid of the first.
+    """Regularise each group of axes separately, and place the samples on the grid of the first.
 
     Parameters
     ----------
     raw : xarray.Dataset
         Raw log with the attribute ``axis_rows``: lists of axes, first row, row after the last.
     regularise : callable
-        Makes a regular log of one group.
+        Function that makes a regular log of one group.
     max_gap, limits
         As for `gyrostab.ingest.concat.concatenate_logs`.
 
     Returns
     -------
     xarray.Dataset
-        One regular log; each sample of another group is the nearest to its stamp.
+        One regular log; samples of other groups are placed on the nearest grid samples.
     """
     parts = [part.assign_attrs(notes=[]) for part in split_axes(raw)]
     logs = [regularise(part) for part in parts]
@@ -45,15 +45,15 @@ def regularise_axes(
             for label, (axes, _, _) in zip(labels, raw.attrs["axis_rows"], strict=True)
         ]
     log = concatenate_logs(logs, labels, max_gap=max_gap, limits=limits)
-    starts = [first_stamp(each) for each in logs]
-    held = []
+    starts = [first_stamp(log) for log in logs]
+    members = []
     for label, start, (axes, _, _) in zip(labels, starts, raw.attrs["axis_rows"], strict=True):
         later = (start - min(starts)) / 1e9 * log.attrs["sampling_rate_hz"]
-        held.append(
+        members.append(
             f"{', '.join(axes)} in {label}"
             + (f" (begins {later:.3g} samples later)" if start > min(starts) else "")
         )
     note = (
-        f"the axes have stamps of their own over the same time and form one log: {'; '.join(held)}"
+        f"the axes have separate stamps over the same time and form one log: {'; '.join(members)}"
     )
     return log.assign_attrs(notes=[*texts(raw, "notes"), *texts(log, "notes"), note])

@@ -1,4 +1,4 @@
-"""Samples from rows: lazy arrays on the grid, NaN where no row was placed."""
+"""Convert rows to samples: lazy arrays on the grid, NaN where no row was placed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gyrostab.time.grid import grid_times
 
 __all__ = ["MAX_PLAIN_NUMBERS", "count_present", "gather_channel", "rows_on_grid", "samples_of"]
 
-#: Numbers up to which an array is held in memory instead of being computed when needed.
+#: Largest array that is held in memory instead of being computed when needed [numbers].
 MAX_PLAIN_NUMBERS = 2_000_000
 
 
@@ -37,7 +37,7 @@ def _rows_to_samples(
     scale: float,
     unit: float | None = None,
 ) -> NDArray[np.float64]:
-    """Rows (last dimension) to samples; `runs` count samples and rows from the beginning of both."""
+    """Place rows (last dimension) on samples; `runs` count both from 0."""
     out = np.full((*rows.shape[:-1], size), np.nan)
     for sample, row, length in runs:
         out[..., sample : sample + length] = rows[..., row : row + length]
@@ -47,7 +47,7 @@ def _rows_to_samples(
 def _scale_samples(
     out: NDArray[np.float64], scale: float, unit: float | None
 ) -> NDArray[np.float64]:
-    """The samples themselves, changed: NaN where infinite, times their factor."""
+    """Scale samples in place, and set infinite ones to NaN."""
     out[np.isinf(out)] = np.nan
     if scale != 1.0:
         out[...] = out * scale if unit is None else np.rint(out / unit) * (unit * scale)
@@ -58,7 +58,7 @@ def _read_samples_into(
     rows: Any, runs: NDArray[np.int64], ends: NDArray[np.int64], scale: float, unit: float | None,
     row: int, begin: int, out: NDArray[np.float64],
 ) -> None:  # fmt: skip
-    """Samples of one row of the grid from `begin` on, as `_rows_to_samples` makes them: `gyrostab.store.lazy_slices.RowReader`."""
+    """Read samples of one axis from `begin` on into `out`, as `_rows_to_samples` does."""
     done = 0
     for sample, first, length in _clip_runs(runs, ends, begin, begin + out.size).tolist():
         out[done:sample] = np.nan
@@ -71,7 +71,7 @@ def _read_samples_into(
 def _clip_runs(
     runs: NDArray[np.int64], ends: NDArray[np.int64], begin: int, end: int
 ) -> NDArray[np.int64]:
-    """Cut out the parts of the runs that lie in the samples from `begin` to `end`."""
+    """Clip the runs to the samples from `begin` to `end`."""
     part = runs[
         np.searchsorted(ends, begin, side="right") : np.searchsorted(runs[:, 0], end, side="left")
     ]
@@ -83,7 +83,7 @@ def _clip_runs(
 def rows_on_grid(
     rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, unit: float | None = None
 ) -> Any:
-    """Turn an array by row into an array by sample, float64, NaN where there is no row and where a value is infinite.
+    """Convert an array by row to an array by sample, float64, NaN where missing or infinite.
 
     Parameters
     ----------
@@ -95,14 +95,14 @@ def rows_on_grid(
     scale : float
         Factor on the values.
     unit : float, optional
-        The values are whole multiples of this; they remain whole multiples of ``unit * scale``, to
-        the last bit.
+        Unit of which the values are whole multiples; the result has exact whole multiples of
+        ``unit * scale``.
 
     Returns
     -------
     ndarray or dask.array.Array, shape (..., n_samples)
-        A numpy array when the result is small; chunks that are nothing but gap take no memory until
-        they are computed.
+        A numpy array if the result is small; chunks without any sample take no memory until they
+        are computed.
     """
     size, lead = placement.size, rows.shape[:-1]
     if size * max(1, int(np.prod(lead))) <= MAX_PLAIN_NUMBERS:
@@ -112,7 +112,7 @@ def rows_on_grid(
     lazy = rows if isinstance(rows, da.Array) else make_lazy(np.asarray(rows), BLOCK_ROWS)
     ends = placement.runs[:, 0] + placement.runs[:, 2]
     parts, empty = [], 0
-    filled: list[tuple[int, int]] = []  # chunks that hold samples at all
+    filled: list[tuple[int, int]] = []  # chunks with at least one sample
 
     def flush() -> None:
         nonlocal empty
@@ -154,7 +154,7 @@ def rows_on_grid(
 
 
 def count_present(array: Any) -> int:
-    """Count the samples of an array on the grid that are not NaN; chunks that are nothing but gap are not looked at.
+    """Count the samples of an array on the grid that are not NaN, without chunks in gaps.
 
     Examples
     --------
@@ -174,7 +174,7 @@ def count_present(array: Any) -> int:
 
 
 def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Sample of each row, -1 where the row was not placed."""
+    """Return the sample of each row, -1 where the row was not placed."""
     runs = placement.runs[np.argsort(placement.runs[:, 1], kind="stable")]
     which = np.searchsorted(runs[:, 1], rows, side="right") - 1
     inside = (which >= 0) & (rows < runs[which, 1] + runs[which, 2])
@@ -184,7 +184,7 @@ def samples_of(placement: Placement, rows: NDArray[np.int64]) -> NDArray[np.int6
 def gather_channel(
     raw: xr.Dataset, name: str, placement: Placement, rate: float
 ) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
-    """Stamps and values of the filled rows of a slow channel; rows without a sample keep their stamp, moved with their piece."""
+    """Return stamps and values of the filled rows of a slow channel."""
     channel = raw[name].data
     clock = raw["time"].data if "time" in raw.variables else None
     breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]

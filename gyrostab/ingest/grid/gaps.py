@@ -1,4 +1,4 @@
-"""The table of gaps: which samples are missing, and which rows were dropped, moved or could not be read."""
+"""Table of gaps: missing samples, and rows that were dropped, moved or unreadable."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _MISSING, _UNREADABLE, _OUTSIDE = (
 
 
 def _missing_samples(placement: Placement, found: ScanPass) -> NDArray[np.int64]:
-    """Stretches of samples without a row, between the runs."""
+    """List the samples without a row between the runs."""
     runs, events = placement.runs, placement.events
     end, row_end = runs[:-1, 0] + runs[:-1, 2], runs[:-1, 1] + runs[:-1, 2]
     start, row_start = runs[1:, 0], runs[1:, 1]
     told = np.sort(
         events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2]
-    )  # rows whose fate is known otherwise
+    )  # rows that have a line of another cause
     skipped = (
         row_start - row_end - (np.searchsorted(told, row_start) - np.searchsorted(told, row_end))
     )
@@ -49,7 +49,7 @@ def _missing_samples(placement: Placement, found: ScanPass) -> NDArray[np.int64]
 def _unusable_cells(
     spans: NDArray[np.int64], cause: int, placement: Placement
 ) -> NDArray[np.int64]:
-    """Rows that were placed although an axis has no usable number there."""
+    """List the placed rows in which an axis has no usable number."""
     first, last = samples_of(placement, spans[:, 0]), samples_of(placement, spans[:, 1] - 1)
     kept = (first >= 0) & (last >= first)
     rows = (spans[:, 1] - spans[:, 0])[kept]
@@ -57,7 +57,7 @@ def _unusable_cells(
 
 
 def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows dropped or moved; consecutive rows of one cause are one line."""
+    """List the dropped or moved rows; consecutive rows of one cause are one line."""
     rows = events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER))]
     rows = rows[np.argsort(rows[:, 2], kind="stable")]
     if len(rows) == 0:
@@ -72,7 +72,7 @@ def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
 def find_gaps(
     placement: Placement, found: ScanPass, *, most: int = MAX_TABLE_ROWS
 ) -> NDArray[np.int64]:
-    """Make the table of gaps, in samples.
+    """Make the table of gaps in samples.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def gap_table(log: xr.Dataset) -> pd.DataFrame:
     Parameters
     ----------
     log : xarray.Dataset
-        From `regularise`, with the variables ``gap_start``, ``gap_end``, ``gap_samples``,
+        Log of `regularise`, with the variables ``gap_start``, ``gap_end``, ``gap_samples``,
         ``gap_rows``, ``gap_cause`` on ``gap``.
 
     Returns
@@ -114,14 +114,16 @@ def gap_table(log: xr.Dataset) -> pd.DataFrame:
     --------
     >>> from gyrostab.ingest.grid.regularise import regularise
     >>> time = np.array([0, 10, 20, 50, 60], dtype="datetime64[ms]").astype("datetime64[ns]")
-    >>> raw = xr.Dataset({"rate": (("axis", "row"), np.ones((1, 5)), {"units": "degree hour-1"})}, {"time": ("row", time), "axis": ["z"]})
+    >>> rate = ("axis", "row"), np.ones((1, 5)), {"units": "degree hour-1"}
+    >>> raw = xr.Dataset({"rate": rate}, {"time": ("row", time), "axis": ["z"]})
     >>> gap_table(regularise(raw))[["seconds", "samples", "rows", "cause"]]
        seconds  samples  rows    cause
     0     0.02        2     0  missing
     """
     if "gap_start" not in log.variables:
         raise SchemaError(
-            "this log has no table of gaps (gap_start, gap_end, ...); it comes with a log made by gyrostab.regularise"
+            "this log has no table of gaps (gap_start, gap_end, ...); gyrostab.regularise makes "
+            "logs with one"
         )
     start, end = log["gap_start"].values, log["gap_end"].values
     cause = np.array(GAP_CAUSES, dtype=object)[log["gap_cause"].values.astype(int)]

@@ -1,9 +1,9 @@
-"""Rows with noisy stamps: the period that explains them best, and the place of every row in order.
+"""Find the sampling period, and the most likely sequence of samples, of jittered time stamps.
 
-A stamp that is the time of arrival tells the time of its sample up to jitter, but thousands of
-stamps tell the sampling period to parts per million and the number of lost samples exactly. Rows
-stay in order; `gyrostab.kernels.grid.course` finds where samples are missing. Where rows arrive in
-packets, or a slow clock gives many rows one stamp, only one row of each group is looked at.
+A stamp that is a time of arrival gives the time of its sample only up to jitter, but thousands of
+stamps give the sampling period to parts per million and the number of lost samples exactly. Rows
+stay in order; `gyrostab.kernels.grid.course` finds where samples are missing. If rows arrive in
+packets, or a slow clock gives many rows one stamp, only one row of each group is used.
 """
 
 from __future__ import annotations
@@ -35,34 +35,31 @@ Integers = NDArray[np.int64]
 ObservedStamps = tuple[Integers, Integers]
 
 
-#: Standard deviation of the jitter that the kernel is given at least [samples].
+#: Smallest standard deviation of the jitter that is passed to the kernel [samples].
 MIN_SIGMA = 0.1
 
 
-#: Share of a deviation that the phase takes over, while the period is sought, and once it is known.
-#: A sample that is not found missing
-#: costs 1 / (4 gain sigma^2) nats before the phase has taken it over: 140 at a scatter of 0.6,
-#: against 5 for the loss and 30 for a row
-#: that has no sample.
+#: Gain with which the phase follows a deviation, in the search for the period and afterwards. An
+#: undetected loss costs 1 / (4 gain sigma^2) nats before the phase has absorbed it: 140 at a
+#: scatter of 0.6 samples, compared with 5 for a loss and 30 for a row without a sample.
 _SEARCH_GAIN, GAIN = 0.02, 0.005
 
 
-#: Beyond this scatter [samples] those are less than 80.
+#: Largest scatter [samples]; beyond it, an undetected loss costs less than 80 nats.
 _MAX_SIGMA = 0.8
 
 
-#: Share of rows without a sample, and cost of a row [nats], beyond which stamps have no course.
-#: Jitter alone costs 0.5 nats, and every
-#: second sample missing at random 2.5 more.
+#: Largest share of rows without a sample, and largest cost of a row [nats], of stamps that fit the
+#: model. Jitter alone costs 0.5 nats; every second sample missing at random costs 2.5 more.
 _MAX_DROPPED_SHARE, _MAX_NATS = 0.01, 3.0
 
 
-#: Rows that a course is sought in, candidates for its period, and those of them that are refined.
+#: Rows used in the search, candidates for the period, and candidates that are refined.
 _SEARCH_ROWS, _MAX_CANDIDATES, _MAX_REFINED = 8_000, 200, 4
 
 
-#: A period wrong by half of this share lags by a fortieth of a sample behind the phase, which
-#: follows with a gain of 0.02.
+#: Relative step of candidate periods. With half of it as error, the phase, which follows with a
+#: gain of 0.02, lags by a fortieth of a sample.
 _PERIOD_STEP = 0.001
 
 
@@ -71,7 +68,7 @@ TRACE_ROWS = 1 << 13
 
 @dataclass(frozen=True)
 class JitterModel:
-    """How noisy stamps follow the samples.
+    """Sampling period and jitter of noisy stamps.
 
     Attributes
     ----------
@@ -80,14 +77,15 @@ class JitterModel:
     sigma : float
         Standard deviation of the jitter [samples].
     observe : str
-        Rows whose stamps are looked at: ``"all"``, the ``"first"`` or the ``"last"`` of each group
-        of rows with one stamp.
+        Rows whose stamps are used: ``"all"``, the ``"first"`` or the ``"last"`` of each group of
+        rows with one stamp.
     group : float
-        Rows to one that is looked at.
+        Mean number of rows for each used stamp.
     nats : float
         Cost of a row.
     fits : bool
-        Few rows have no sample, some steps are single ones, and the cost is that of jitter.
+        Whether few rows have no sample, some steps are single samples, and the cost is that of
+        jitter.
     """
 
     period: float
@@ -99,17 +97,17 @@ class JitterModel:
 
     @property
     def code_length(self) -> float:
-        """Nats that it takes to write a stamp down: those of its course, and of its deviation to the nanosecond."""
+        """Code length of a stamp to the nanosecond, including the cost of its row [nats]."""
         return self.nats + float(np.log(max(self.sigma, MIN_SIGMA) * self.period))
 
     @classmethod
     def of_sharp(cls, period: float) -> JitterModel:
-        """Make the course of stamps that scatter by less than a tenth of a sample."""
+        """Return the model of stamps that scatter by less than a tenth of a sample."""
         return cls(period, MIN_SIGMA, "all", 1.0, 0.5)
 
 
 def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
-    """Find the rows whose stamps are looked at; of the last group of a block, the end is not known and taken to be its last row."""
+    """Select the rows whose stamps are used; the last row of a block counts as end of its group."""
     known = np.flatnonzero(stamps != NO_STAMP)
     if observe == "all" or len(known) == 0:
         return known
@@ -121,28 +119,28 @@ def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
 def fit_jitter(
     parts: list[Integers], guesses: list[float], observe: str, *, sure: float
 ) -> JitterModel | None:
-    """Find the period [ns] that explains stretches of stamps best, each row being the next sample but for rare losses.
+    """Fit the sampling period that explains stretches of stamps best, with rare lost samples.
 
     Parameters
     ----------
     parts : list of ndarray of int64
         Stretches of stamps [ns], all readable.
     guesses : list of float
-        Periods [ns] to try in addition to those of the stretches themselves.
+        Periods to try in addition to those found in the stretches [ns].
     observe : str
-        See `JitterModel`.
+        Rows to use; see `JitterModel`.
     sure : float
-        Samples over which a first estimate of the period is trusted to count.
+        Number of samples over which counting by the first estimate of the period is reliable.
 
     Returns
     -------
     Course or None
-        None where nothing explains the stamps.
+        None if no period explains the stamps.
     """
     seen = _observe_parts(parts, observe, guesses[0])
     lengths = (
         (32, 16) if observe == "all" else (8,)
-    )  # few groups in a row are whole where samples are lost
+    )  # with lost samples, only few consecutive groups are complete
     lines = next(filter(None, (_fit_lines(seen, length) for length in lengths)), None)
     if lines is None or not (lines[0] > 0).any():
         return None
@@ -168,13 +166,13 @@ def fit_jitter(
     explained = min(filter(None, found), key=lambda course: course.code_length, default=None)
     return (
         explained if explained is not None and explained.fits else None
-    )  # the best may be stamps of rows that are given twice
+    )  # the best may fit stamps of doubled rows
 
 
 def fit_jitter_near(
     parts: list[Integers], period: float, observe: str, *, sure: float
 ) -> JitterModel | None:
-    """Give the course with a period near the one given [ns], None where the stamps do not follow it."""
+    """Fit the jitter model near a given period [ns]; None if the stamps do not fit it."""
     seen = _observe_parts(parts, observe, period)
     group = _rows_per_group(seen)
     found = _refine_model(
@@ -187,7 +185,7 @@ def fit_jitter_near(
 
 
 def _rows_per_group(seen: list[ObservedStamps]) -> float:
-    """Rows to one that is looked at."""
+    """Return the mean number of rows for each used stamp."""
     return float(
         sum(count[-1] - count[0] for count, _ in seen)
         / max(1, sum(len(count) - 1 for count, _ in seen))
@@ -206,7 +204,7 @@ def _observe_parts(parts: list[Integers], observe: str, period: float) -> list[O
 def _fit_lines(
     seen: list[ObservedStamps], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Fit lines to stretches of `length` stamps: slopes [ns a row], standard deviations of the residuals [ns]."""
+    """Fit lines to stretches of `length` stamps: slopes [ns a row], residual sigma [ns]."""
     tables = []
     for count, stamps in seen:
         if len(count) >= length:
@@ -230,7 +228,7 @@ def _fit_lines(
 def _candidate_periods(
     seen: list[ObservedStamps], slope: NDArray[np.float64], group: float
 ) -> list[float]:
-    """Periods [ns] around the slopes of stretches; losses make slopes larger, so the period is among the smaller ones."""
+    """Return candidate periods [ns] near the smaller slopes; losses increase slopes."""
     longer = _fit_lines(seen, 128)
     slopes = longer[0] if longer is not None and len(longer[0]) >= 16 and group < 2 else slope
     slopes = slopes[slopes > 0.2 * np.median(slope)]
@@ -246,7 +244,7 @@ def _shorten_parts(seen: list[ObservedStamps], rows: int) -> list[ObservedStamps
 
 
 def _row_cost(seen: list[ObservedStamps], period: float, sigma_ns: float, sure: float) -> float:
-    """Cost of a row [nats] with a period [ns]."""
+    """Return the mean cost of a row [nats] for a period [ns]."""
     sigma = max(sigma_ns / period, MIN_SIGMA)
     total = sum(
         follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, TRACE_ROWS)[3]
@@ -258,7 +256,7 @@ def _row_cost(seen: list[ObservedStamps], period: float, sigma_ns: float, sure: 
 def _refine_model(
     seen: list[ObservedStamps], course: JitterModel, sure: float, *, most_off: float = 0.05
 ) -> JitterModel | None:
-    """Fit period and scatter along the course; None where it is none."""
+    """Refine period and jitter along the sequence of samples; None if the fit fails."""
     if not seen:
         return None
     period, sigma = course.period, course.sigma
@@ -294,14 +292,14 @@ def _refine_model(
 
 
 def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
-    """Whether stamps are no outliers: late rows must not pull the period."""
+    """Return which stamps are not outliers; late rows must not bias the period."""
     return np.asarray(np.abs(off) <= 4 * max(sigma, MIN_SIGMA))
 
 
 def count_samples(
     rows: Integers, stamps: Integers, course: JitterModel, longest: float
 ) -> tuple[Integers, Integers, Integers]:
-    """Stamps [ns], sample numbers and numbers of the piece of the rows of a block that are looked at, without outliers."""
+    """Return stamps [ns], sample numbers and piece numbers of the used rows of a block."""
     at = observe_rows(stamps, course.observe, course.period)
     if course.observe != "all":
         at = at[1:-1]  # the groups at both ends may be cut

@@ -1,4 +1,4 @@
-"""What regularising did to a log, in sentences."""
+"""Notes on what regularising did to a log."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from gyrostab.time.grid import grid_times
 
 __all__ = ["describe_channels", "describe_placement", "describe_rate"]
 
-_MAX_NAMED = 5  # of many events of one kind, so many are told one by one
+_MAX_NAMED = 5  # events of one kind that are listed one by one
 
 
 def describe_channels(log: xr.Dataset) -> list[str]:
-    """Sentences on channels with a time of their own that have no value while the gyro was recorded."""
+    """Return notes on channels with separate stamps without a value within the gyro record."""
     notes = []
-    start, end = log["time"][[0, -1]].values  # the time of a long gap is not held in memory
+    start, end = log["time"][[0, -1]].values  # computed, not loaded
     for name in log_channels(log):
         if f"time_{name}" not in log.coords:
             continue
@@ -36,7 +36,8 @@ def describe_channels(log: xr.Dataset) -> list[str]:
             )
             advice = "check its time column, its unit and --epoch"
             notes.append(
-                f"channel {name}: none of its {of}, lies within the log, {_format_span(start, end)}; {advice}"
+                f"channel {name}: none of its {of}, lies within the log, "
+                f"{_format_span(start, end)}; {advice}"
             )
     return notes
 
@@ -58,7 +59,7 @@ def describe_rate(
     odd: list[tuple[int, int, float]],
     placement: Placement,
 ) -> list[str]:
-    """Sentences on the sampling rate."""
+    """Return notes on the sampling rate."""
     where = file_of(raw)[0]
     notes = []
     if estimate.counted:
@@ -68,7 +69,8 @@ def describe_rate(
             else "the stamps come in bursts, as rows arrive and not as they are sampled"
         )
         reach = (
-            f"; stamps and samples differ by up to {format_duration(placement.wander / rate)} in the long run"
+            f"; stamps and samples differ by up to {format_duration(placement.wander / rate)} in "
+            "the long run"
             if placement.wander >= 1
             else ""
         )
@@ -81,35 +83,45 @@ def describe_rate(
             else "the stamps come in bursts, as rows arrive and not as they are sampled"
         )
         notes.append(
-            f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are missing where a group comes late"
+            f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are "
+            "missing where a group comes late"
         )
     elif course is not None:
         notes.append(
-            f"{where}: the stamps scatter by {format_duration(course.sigma / rate)}, {course.sigma:.2g} of a sampling interval, "
-            f"as times of arrival do: rows keep their order at {rate:.10g} Hz, and a missing sample is located to a few rows"
+            f"{where}: the stamps scatter by {format_duration(course.sigma / rate)}, "
+            f"{course.sigma:.2g} of a sampling interval, "
+            f"as times of arrival do: rows keep their order at {rate:.10g} Hz, and a missing "
+            "sample is located to a few rows"
         )
     if estimate.even is not None:
         notes.append(
-            f"{where}: the steps between stamps recur: the stamps fit {rate:.10g} Hz with a share of "
-            f"{1 - estimate.even / rate:.2g} missing, and {estimate.even:g} Hz with none; {rate:.10g} Hz is used: "
+            f"{where}: the steps between stamps recur: the stamps fit {rate:.10g} Hz with a "
+            "share of "
+            f"{1 - estimate.even / rate:.2g} missing, and {estimate.even:g} Hz with none; "
+            f"{rate:.10g} Hz is used: "
             f"if no rows are missing, give --rate {estimate.even:g}"
         )
     if estimate.finer is not None:
         notes.append(
-            f"{where}: the steps between stamps recur as if a log at {estimate.finer:g} Hz lost the same rows again and again, or as if "
-            f"rows were read in groups; they are taken for even samples at {rate:.10g} Hz: if rows are missing, "
+            f"{where}: the steps between stamps recur as if a log at {estimate.finer:g} Hz lost "
+            "the same rows again and again, or as if "
+            f"rows were read in groups; they are taken for even samples at {rate:.10g} Hz: if "
+            "rows are missing, "
             f"give --rate {estimate.finer:g}"
         )
     off = abs(estimate.raw / rate - 1)
     if off * placement.size > 1 and off > 2 * estimate.stderr / rate:
         notes.append(
-            f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million from {rate:.10g} Hz"
+            f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million "
+            f"from {rate:.10g} Hz"
         )
     for row, stamp, own in odd[:_MAX_NAMED]:
         file, local = file_of(raw, row)
         notes.append(
-            f"{file}: from about {format_stamp(stamp)} (row {local}) the samples come at {own:.6g} Hz and not at {rate:.6g} Hz; "
-            "by their stamps samples are missing or dropped there; split the log at that row and run the parts on their own"
+            f"{file}: from about {format_stamp(stamp)} (row {local}) the samples come at "
+            f"{own:.6g} Hz and not at {rate:.6g} Hz; "
+            "by their stamps samples are missing or dropped there; split the log at that row and "
+            "run the parts on their own"
         )
     return notes
 
@@ -125,13 +137,15 @@ def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
         way = "back" if jump < 0 else "ahead"
         what = "time restarts" if cause == RESTART else "the clock steps"
         notes.append(
-            f"{file}: {what} at row {local}: from {format_stamp(before)} to {format_stamp(after)}, {format_duration(abs(jump))} {way}; "
+            f"{file}: {what} at row {local}: from {format_stamp(before)} to "
+            f"{format_stamp(after)}, {format_duration(abs(jump))} {way}; "
             "the pause is of unknown length, so the rows that follow come after one missing sample"
             + ("" if jump < 0 else "; if the pause is real, raise max_gap")
         )
     if len(events) > _MAX_NAMED:
         notes.append(
-            f"{file_of(raw)[0]}: {len(events) - _MAX_NAMED} more restarts and steps of the clock are in the table of gaps"
+            f"{file_of(raw)[0]}: {len(events) - _MAX_NAMED} more restarts and steps of the clock "
+            "are in the table of gaps"
         )
     return notes
 
@@ -152,13 +166,15 @@ def _describe_missing(
         file, local = file_of(raw, row)
         since = format_stamp(int(grid_times(placement.start, rate, first)))
         notes.append(
-            f"{file}: {format_duration(samples / rate)} without samples from {since} (after row {local})"
+            f"{file}: {format_duration(samples / rate)} without samples from {since} (after row "
+            f"{local})"
         )
     if len(holes) > len(longest):
         total = int(holes[:, 2].sum())
         share = total / placement.size
         notes.append(
-            f"{file_of(raw)[0]}: missing: {_count_of(total, 'sample')} ({format_duration(total / rate)}, {100 * share:.2g} % of the log) "
+            f"{file_of(raw)[0]}: missing: {_count_of(total, 'sample')} "
+            f"({format_duration(total / rate)}, {100 * share:.2g} % of the log) "
             f"in {_count_of(len(holes), 'place')}; "
             "all are in the table of gaps"
         )
@@ -168,7 +184,7 @@ def _describe_missing(
 def describe_placement(
     raw: xr.Dataset, found: ScanPass, placement: Placement, table: NDArray[np.int64], rate: float
 ) -> list[str]:
-    """Sentences on gaps, restarts, and rows and cells that were dropped or moved."""
+    """Return notes on gaps, restarts, and rows and cells that were dropped or moved."""
     where = file_of(raw)[0]
     notes = [*_describe_breaks(raw, placement), *_describe_missing(raw, placement, table, rate)]
     events = placement.events
@@ -176,7 +192,8 @@ def describe_placement(
     if len(twice):
         file, local = file_of(raw, int(twice[:, 2].min()))
         notes.append(
-            f"{file}: dropped as their sample is taken: {_count_of(len(twice), 'row')}, first row {local}"
+            f"{file}: dropped as their sample is taken: {_count_of(len(twice), 'row')}, first "
+            f"row {local}"
         )
     late = events[events[:, 0] == OUT_OF_ORDER]
     if len(late):
@@ -195,13 +212,15 @@ def describe_placement(
     )
     if lost > 0:
         notes.append(
-            f"{where}: dropped for want of a readable time stamp: {_count_of(lost, 'row')} whose neighbours do not tell where they belong"
+            f"{where}: dropped for want of a readable time stamp: {_count_of(lost, 'row')} whose "
+            "neighbours do not tell where they belong"
         )
     infinite = int((found.infinite[:, 1] - found.infinite[:, 0]).sum())
     if infinite:
         notes.append(f"{where}: infinite values in {_count_of(infinite, 'row')}, taken as missing")
     notes += [
-        f"{where}: axis {axis} never changes its value; is the sensor dead, or the column the wrong one?"
+        f"{where}: axis {axis} never changes its value; is the sensor dead, or the column the "
+        "wrong one?"
         for axis in found.constant
     ]
     return notes

@@ -20,7 +20,7 @@ _MAX_PIECES = 200_000
 
 
 def longest_step(parts: list[NDArray[np.int64]], period: float) -> float:
-    """Step [ns] after which counting starts anew when rows are placed by count."""
+    """Return the step [ns] after which counting restarts when rows are placed by count."""
     steps = np.concatenate([np.diff(part) for part in parts])
     return float(max(SECOND, 50 * period, 10 * np.quantile(np.abs(steps), 0.99)))
 
@@ -33,7 +33,7 @@ def fit_pieces(
     longest: float,
     course: JitterModel | None = None,
 ) -> NDArray[np.float64]:
-    """Of every unbroken piece: n, mean count, mean stamp [ns from the first], sums of squares cc, ct, and of the residuals."""
+    """Sum each unbroken piece: n, mean count, mean stamp [ns], cc, ct, squared residuals."""
     table = np.empty((0, 6))
     zero: int | None = None
     work = partial(
@@ -45,7 +45,7 @@ def fit_pieces(
         zero = first[0] if zero is None else zero
         sums[:, 2] += first[1] - zero
         table = np.concatenate([table, sums])
-        if len(table) > _MAX_PIECES:  # a log in shreds: the largest pieces tell the rate
+        if len(table) > _MAX_PIECES:  # keep the largest pieces
             table = table[np.argsort(-table[:, 3], kind="stable")[: _MAX_PIECES // 2]]
             table = table[np.argsort(table[:, 2], kind="stable")]
     return table
@@ -60,7 +60,7 @@ def _piece_sums(
     longest: float,
     course: JitterModel | None,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
-    """Of one block: its first stamp, that from which the sums count, and the sums of its pieces; None where no stamp is readable."""
+    """Return first stamp, reference stamp and sums of the pieces of a block."""
     rows, block = found
     block = readable_stamps(block)
     if len(block) == 0:
@@ -74,12 +74,12 @@ def _piece_sums(
     if counted:
         known = np.flatnonzero(rows != NO_STAMP)
         piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(block)) > longest)])
-        count = known  # a row counts, with or without a stamp
+        count = known  # rows without a stamp count too
     else:
         count, piece = track(block, period, GAIN, longest)
     if (
         coarse and (tick := np.flatnonzero(np.diff(block)) + 1).size > 1
-    ):  # only there the true time is known
+    ):  # the time is exact only where the stamp changes
         block, count, piece = block[tick], count[tick], piece[tick]
     return (first, int(block[0])), piece_sums(block, count, piece, period)
 
@@ -87,7 +87,7 @@ def _piece_sums(
 def pool_pieces(
     pieces: NDArray[np.float64], period: float, counted: bool
 ) -> tuple[float, float, float]:
-    """Period [ns], its standard error [ns], and the samples of the longest joined stretch."""
+    """Pool the pieces: period [ns], standard error [ns], samples of the longest stretch."""
     n, cc, ct, rest = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
     if cc.sum() <= 0:
         return period, period, 1.0
@@ -99,7 +99,7 @@ def pool_pieces(
     if sane.any():
         period = float(ct[sane].sum() / cc[sane].sum())
     error = 3.0 * noise / np.sqrt(cc[sane].sum() if sane.any() else cc.sum())
-    if counted or not sane.any():  # no piece has the period that was begun with: nothing to join
+    if counted or not sane.any():  # no piece has the initial period: nothing to join
         return period, error, float(n.max())
     return _join_pieces(pieces[sane], period, error, noise)
 
@@ -107,7 +107,7 @@ def pool_pieces(
 def _join_pieces(
     pieces: NDArray[np.float64], period: float, error: float, noise: float
 ) -> tuple[float, float, float]:
-    """Join pieces whose distance is surely a known number of samples, and fit again."""
+    """Join pieces whose distance is reliably a whole number of samples, and fit again."""
     for _ in range(3):
         total_cc = total_ct = longest = 0.0
         n, mc, mt, cc, ct = pieces[0, :5]

@@ -1,4 +1,4 @@
-"""Which row becomes which sample: runs of rows, and what happened on the way."""
+"""Assign rows to samples by their stamps; runs of rows and events such as clock steps."""
 
 from __future__ import annotations
 
@@ -29,16 +29,19 @@ __all__ = [
 ]
 
 
-NO_STAMPS = "{where}: no row has a readable stamp; check the time column and its unit (--map), or give --rate HZ for a log without time"
+NO_STAMPS = (
+    "{where}: no row has a readable stamp; check the time column and its unit (--map), "
+    "or give --rate HZ for a log without time"
+)
 
 
-#: Rows that the placement kernel takes at a time.
+#: Rows that the placement kernel processes at one time.
 _STRETCH_ROWS = 1 << 18
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Samples of a uniform grid and the rows that fill them.
+    """Rows placed on the samples of a uniform grid.
 
     Attributes
     ----------
@@ -50,8 +53,7 @@ class Placement:
         Cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns]; sorted by
         sample.
     wander : float
-        Largest distance of a stamp's long-term course from the grid [samples]; only where rows are
-        counted.
+        Largest distance of the smoothed stamps from the grid [samples]; only for counted rows.
     """
 
     start: int
@@ -61,17 +63,17 @@ class Placement:
 
     @property
     def size(self) -> int:
-        """Samples from the first to the last row that was placed."""
+        """Number of samples from the first to the last placed row."""
         return int(self.runs[-1, 0] + self.runs[-1, 2]) if len(self.runs) else 0
 
     @property
     def placed(self) -> int:
-        """Rows that have a sample."""
+        """Number of rows that have a sample."""
         return int(self.runs[:, 2].sum())
 
     @property
     def has_late_rows(self) -> bool:
-        """Whether three rows one after the other were dropped, as rows that arrive together after a pause are."""
+        """Whether three consecutive rows were dropped, as happens after a pause."""
         rows = np.sort(self.events[np.isin(self.events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2])
         return bool((rows[2:] - rows[:-2] == 2).any())
 
@@ -89,14 +91,14 @@ def make_placement(
 def check_grid(
     raw: xr.Dataset, placement: Placement, rate: float, max_gap: float, limits: Mapping[str, float]
 ) -> None:
-    """Refuse a grid that is out of proportion to the rows, before anything is done for each of its samples.
+    """Refuse a grid with far more samples than rows, before it is allocated.
 
     Parameters
     ----------
     raw : xarray.Dataset
         Raw log.
     placement : Placement
-        Its rows on the grid.
+        Rows of the log on the grid.
     rate, max_gap : float
         Sampling rate [Hz] and longest gap [s].
     limits : mapping of str to float
@@ -105,7 +107,7 @@ def check_grid(
     Raises
     ------
     TimeError
-        With the two stamps that make the grid so long, and the options that help.
+        With the two stamps around the longest gap, and the options that help.
     """
     if not is_absurd_grid(placement.size, placement.placed, limits):
         return
@@ -123,25 +125,33 @@ def check_grid(
     ]
     gap = holes[widest] / rate
     if gap >= 1.0:
-        fix = f"correct the stamp or the unit of the time column, or give --max-gap {min(max_gap, gap) / 2:.2g}s to take it for a clock step"
+        fix = (
+            "correct the stamp or the unit of the time column, or give --max-gap "
+            f"{min(max_gap, gap) / 2:.2g}s to take it for a clock step"
+        )
     else:
-        fix = f"other stamps are {format_duration(1.0 / rate)} apart, too close for a log of that length: correct them or the unit of time"
+        fix = (
+            f"other stamps are {format_duration(1.0 / rate)} apart, too close for a log of "
+            "that length: correct them or the unit of time"
+        )
     raise TimeError(
-        f"{file_of(raw, rows[0])[0]}: from {places[0]} to {places[1]} there are {format_duration(gap)} without samples, and the grid of "
-        f"{rate:.10g} Hz would have {placement.size:.4g} samples for {placement.placed:,} rows; {fix}. If the stamps are right: "
+        f"{file_of(raw, rows[0])[0]}: from {places[0]} to {places[1]} there are "
+        f"{format_duration(gap)} without samples, and the grid of "
+        f"{rate:.10g} Hz would have {placement.size:.4g} samples for {placement.placed:,} rows; "
+        f"{fix}. If the stamps are right: "
         f"{describe_limit('grid_samples', placement.size, limits)}"
     )
 
 
 def place_without_time(rows: int, start: int) -> Placement:
-    """Rows without stamps: every row is the next sample."""
+    """Place rows without stamps: every row is the next sample."""
     return make_placement(start, [np.array([[0, 0, rows]], dtype=np.int64)], [])
 
 
 def _look_ahead_stretches(
     stamps: Stamps,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], int]]:
-    """Rows and stamps in stretches, each with `LOOK` more rows to look at than the number that is to be placed."""
+    """Yield stretches of rows and stamps with `LOOK` rows of look-ahead, and the rows to place."""
     rest_rows, rest_stamps = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     for rows, values in stamps():
         rest_rows, rest_stamps = (
@@ -166,15 +176,15 @@ def place_by_stamp(
     Parameters
     ----------
     stamps : callable
-        Gives an iterator over blocks of (row numbers, stamps [ns]); the size of the blocks makes no
-        difference.
+        Returns an iterator over blocks of (row numbers, stamps [ns]); the result does not depend
+        on the size of the blocks.
     rate : float
         Sampling rate [Hz].
     tolerance : float
-        How much further than half a sample the slow course of the stamps may depart from the grid
-        before a sample is left out [samples].
+        Largest distance of the smoothed stamps from the grid, beyond half a sample, before a sample
+        is skipped [samples].
     max_gap : float
-        A longer step ahead is a step of the clock [s].
+        A longer step ahead is taken as a step of the clock [s].
     where : str
         The file, for messages.
 

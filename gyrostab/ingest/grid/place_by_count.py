@@ -18,7 +18,7 @@ __all__ = ["place_by_count"]
 
 @dataclass
 class _Windows:
-    """Stretches of as many rows: how far the stamps are ahead of the row count [samples]."""
+    """Lead of the stamps over the row count in windows of equal length [samples]."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
@@ -28,11 +28,11 @@ class _Windows:
 
 
 def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
-    """Windows of `width` rows, and the first stamp [ns]."""
+    """Make windows of `width` rows; also return the first stamp [ns]."""
     parts: list[tuple[NDArray[np.float64], ...]] = []
     rest = np.empty(0, dtype=np.int64)
     first: int | None = None
-    last: list[float] = []  # of the window before
+    last: list[float] = []  # lead at the end of the previous window
     done = 0
 
     def summarise(values: NDArray[np.int64], before: int, zero: int) -> None:
@@ -71,7 +71,7 @@ def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, 
 
 
 def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]], float]:
-    """Lasting shifts of the lower envelope: counted row, size [samples], window, envelope before; and the wander."""
+    """Find lasting shifts of the lower envelope (row count, size, window, level) and the wander."""
     low = windows.low
     change = np.abs(np.diff(low))
     noise = 1.4826 * float(np.median(change)) if len(change) else 0.0
@@ -86,7 +86,7 @@ def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]],
             and abs(low[b] - course) > least
             and (after - course > least).all() | (after - course < -least).all()
         ):
-            # a loss late in the window before leaves that window's lowest point where it was
+            # a loss late in a window does not change the lowest point of that window
             rows = (windows.up if size > 0 else windows.down)[b - 1 : b + 1]
             tops = windows.high[b - 1] - course if size > 0 else course - low[b - 1]
             row = int(rows[0]) if size > 0 and tops > 0.7 * size else int(rows[-1])
@@ -104,18 +104,18 @@ def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]],
 def place_by_count(
     stamps: Stamps, estimate: RateEstimate, rate: float, *, max_gap: float
 ) -> Placement:
-    """Place rows by their count, where stamps only tell when they arrived; a lasting delay is a loss of samples.
+    """Place rows by their count, for stamps that are times of arrival; a lasting delay is a loss.
 
     Parameters
     ----------
     stamps : callable
-        Gives an iterator over blocks of (row numbers, stamps [ns]).
+        Returns an iterator over blocks of (row numbers, stamps [ns]).
     estimate : RateEstimate
-        How the stamps behave.
+        Sampling rate and kind of the stamps.
     rate : float
         Sampling rate [Hz].
     max_gap : float
-        A longer loss is a step of the clock [s].
+        A longer loss is taken as a step of the clock [s].
     """
     whole, fraction = period_ns(rate)
     period = whole + fraction
@@ -149,7 +149,7 @@ def place_by_count(
 
 
 def _rows_at(stamps: Stamps, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Row numbers of the rows with the given counts."""
+    """Return the row numbers of the rows with the given counts."""
     found, done = counts.copy(), 0
     for rows, _ in stamps():
         here = (counts >= done) & (counts < done + len(rows))
@@ -161,7 +161,7 @@ def _rows_at(stamps: Stamps, counts: NDArray[np.int64]) -> NDArray[np.int64]:
 def _counted_runs(
     stamps: Stamps, cuts: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> list[NDArray[np.int64]]:
-    """Make runs of rows by count, where from count ``cuts[i]`` on the sample is the count plus ``shifts[i]``."""
+    """Make runs of rows by count; from count ``cuts[i]`` on, sample = count + ``shifts[i]``."""
     runs: list[NDArray[np.int64]] = []
     done = 0
     for rows, _ in stamps():

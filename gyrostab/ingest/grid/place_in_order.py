@@ -31,12 +31,12 @@ _AHEAD_ROWS = 1 << 12
 _MAX_ROWS, _MAX_AHEAD_ROWS = 1 << 20, 1 << 18
 
 
-#: Samples that a row may be late without being taken for a clock set back.
+#: Largest delay of a row that is not taken as a clock set back [samples].
 _LATE_SAMPLES = 16.0
 
 
 class _Placer:
-    """Rows to samples, stretch by stretch."""
+    """Assign samples to rows, stretch by stretch."""
 
     def __init__(self, course: JitterModel, period: float, hold: float, max_gap_ns: float):
         self.course, self.period, self.hold, self.max_gap_ns = course, period, hold, max_gap_ns
@@ -48,7 +48,7 @@ class _Placer:
         self.events: list[Integers] = []
 
     def add(self, rows: Integers, count: Integers, stamps: Integers, n: int) -> None:
-        """Place the first `n` rows of a stretch; the others are what follows."""
+        """Place the first `n` rows of a stretch; the others are look-ahead."""
         at = observe_rows(stamps, self.course.observe, self.period)
         if len(at) == 0:
             return
@@ -84,14 +84,14 @@ class _Placer:
         )
 
     def _begin_piece(self, count: Integers, stamps: Integers, at: Integers) -> None:
-        """Begin a piece: its first row is the next sample but one, or the first of the log."""
+        """Begin a piece; its first row is the next sample but one, or the first of the log."""
         ahead = find_phase(count[at], stamps[at], self.period, self.sigma)
         self.origin = int(stamps[at[0]]) + int(np.rint(ahead * self.period))
         self.count0, self.level, self.phase, self.seen = int(count[at[0]]), 0, 0.0, 0
         self.base = int(count[at[0]] - count[0])
 
     def _set_first_sample(self, level: int) -> None:
-        """Let the piece begin with a row that has lost `level` samples."""
+        """Set the first sample of the piece, whose first row has lost `level` samples."""
         self.level = level
         self.base -= level
         if self.start is None:
@@ -109,9 +109,21 @@ class _Placer:
         levels, phases = np.empty(len(at), dtype=np.int64), np.empty(len(at))
         if len(at):
             trace(
-                count[at], stamps[at], self.count0, self.origin, self.period, self.sigma, GAIN, self.hold,
-                self.max_gap_ns / self.period, self.level, self.phase, self.seen, levels, phases,
-            )  # fmt: skip
+                count[at],
+                stamps[at],
+                self.count0,
+                self.origin,
+                self.period,
+                self.sigma,
+                GAIN,
+                self.hold,
+                self.max_gap_ns / self.period,
+                self.level,
+                self.phase,
+                self.seen,
+                levels,
+                phases,
+            )
         if begins:
             self._set_first_sample(int(levels[0]))
         nearest = np.searchsorted(
@@ -130,7 +142,7 @@ class _Placer:
         self._add_rows(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
 
     def _add_rows(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
-        """Give rows their samples; a row that comes to lie on or before the one before it has none."""
+        """Add runs of rows; a row on or before the sample of the previous row is a duplicate."""
         before = np.maximum.accumulate(np.concatenate([[self.last], sample[:-1]]))
         kept = sample > before
         if not kept.all():
@@ -149,7 +161,7 @@ class _Placer:
 
 
 def append_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integers:
-    """Make runs of rows and their samples; what continues the last run of `runs` is added to it."""
+    """Make runs of rows and samples; extend the last run of `runs` if they continue it."""
     new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
     first = np.concatenate([[0], new])
     table = np.stack([sample[first], rows[first], np.diff(np.append(first, len(rows)))], axis=1)
@@ -173,27 +185,27 @@ def place_rows(
     max_gap_ns: float,
     by_row: bool,
 ) -> tuple[int | None, list[Integers], list[Integers]]:
-    """Place rows in order along the course of their stamps.
+    """Place rows in order along the most likely sequence of samples.
 
     Parameters
     ----------
     blocks : iterator
         Blocks of (row numbers, stamps [ns]).
     course : Course
-        How the stamps follow the samples.
+        Period and jitter of the stamps.
     period : float
         Sampling period of the grid [ns].
     hold : float
-        A phase further from zero is turned into a sample left out, or a row dropped [samples].
+        Largest phase; beyond it a sample is skipped or a row dropped [samples].
     max_gap_ns : float
-        A longer step ahead is a step of the clock [ns].
+        A longer step ahead is taken as a step of the clock [ns].
     by_row : bool
-        Rows that are left out took their time all the same.
+        Whether rows that are left out occupy samples.
 
     Returns
     -------
     start : int or None
-        Stamp of sample 0 [ns]; None where no stamp is readable.
+        Stamp of sample 0 [ns]; None if no stamp is readable.
     runs, events : list of ndarray
         As in `gyrostab.ingest.grid.place.Placement`.
     """
@@ -227,16 +239,16 @@ def place_in_order(
     by_row: bool,
     where: str,
 ) -> Placement:
-    """Place rows in order where single stamps do not tell the sample: see `gyrostab.ingest.grid.jitter`.
+    """Place rows in order, for stamps with jitter: see `gyrostab.ingest.grid.jitter`.
 
     Parameters
     ----------
     stamps, rate, tolerance, max_gap, where
         As for `place_by_stamp`.
     course : Course
-        How the stamps scatter.
+        Period and jitter of the stamps.
     by_row : bool
-        Rows that `stamps` leaves out took their time all the same.
+        Whether rows that `stamps` leaves out occupy samples.
 
     Raises
     ------

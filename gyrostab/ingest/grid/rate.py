@@ -1,9 +1,9 @@
-"""The sampling rate that a file's stamps stand for.
+"""Find the sampling rate from the stamps of a file.
 
-Two hypotheses. *Lattice*: stamps lie near multiples of a period, with jitter, rounding, and rows
-missing or doubled; the row's place follows from its stamp. *Counted*: stamps tell when the rows
-arrived (in bursts) or are shared by many rows (whole seconds); only the number of rows over a long
-stretch tells the rate, and the row's place is its count.
+Two hypotheses. *Stamped*: stamps lie near multiples of a period, with jitter, rounding, and missing
+or doubled rows; the stamp of a row gives its sample. *Counted*: stamps are times of arrival (in
+bursts) or are shared by many rows (whole seconds); only the number of rows over a long stretch
+gives the rate, and the row count gives the sample.
 """
 
 from __future__ import annotations
@@ -32,20 +32,19 @@ from gyrostab.kernels.grid.stamps import NO_STAMP
 __all__ = ["RateEstimate", "deviating_stretches", "estimate_near", "estimate_rate", "is_far_worse"]
 
 
-_MAX_TRUSTED_SAMPLES = 500.0  # samples, of a long log
+_MAX_TRUSTED_SAMPLES = 500.0  # reached in a long log
 
 
-# share of steps backwards that no jitter makes: 0.12 at a scatter of 0.6 samples, 0.5 in random
-# order
+# Larger than the share of backward steps by jitter: 0.12 at a scatter of 0.6 samples; random order
+# has 0.5.
 _MAX_BACKWARD_SHARE = 0.35
 
 
-_MIN_SINGLE_SHARE = 0.1  # share of the steps that must be one sample of a rate that is given
+_MIN_SINGLE_SHARE = 0.1  # of steps that are one sample of a given rate
 
 
-#: Scatter of the steps about whole samples up to which single stamps tell the sample: jitter of
-#: 0.08 samples, so that half a sample is
-#: 6 standard deviations.
+#: Largest scatter of the steps about whole samples at which single stamps give the sample: jitter
+#: of 0.08 samples, so that half a sample is 6 standard deviations.
 _SHARP_SCATTER = 0.12
 
 
@@ -57,7 +56,7 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class RateEstimate:
-    """A sampling rate and how it was found.
+    """A sampling rate, and how it was found.
 
     Attributes
     ----------
@@ -66,20 +65,18 @@ class RateEstimate:
     stderr : float
         Its standard error [Hz].
     counted : bool
-        Rows are placed by their count, not by their stamps.
+        Whether rows are placed by their count, not by their stamps.
     coarse : bool
-        Many rows share one stamp.
+        Whether many rows share one stamp.
     raw : float
-        The rate before it was rounded to a plain number [Hz].
+        Rate before rounding to a plain number [Hz].
     even : float or None
-        Rate [Hz] that the stamps would have if no rows were missing that seem to be missing again
-        and again; None where none do.
+        Rate [Hz] if the recurring losses found in the stamps are not losses; None without such
+        losses.
     finer : float or None
-        Rate [Hz] that the stamps would have if the same rows were missing again and again; None
-        where nothing speaks for one.
-    course : Course or None
-        How the stamps scatter about the samples, where single stamps do not tell the sample but
-        many together do.
+        Rate [Hz] if the pattern of steps is due to recurring losses; None without such a pattern.
+    course : JitterModel or None
+        Jitter of the stamps, if single stamps do not give the sample but many together do.
     """
 
     rate: float
@@ -93,7 +90,7 @@ class RateEstimate:
 
 
 def _round_rate(rate: float, error: float, samples: float, counted: bool) -> float:
-    """Take a number that people would have chosen, when the estimate cannot tell it from itself."""
+    """Round a rate to a plain number within its error, if there is one."""
     room = error if counted else min(error, 0.5 * rate / max(samples, 1.0))
     candidates = [float(round(rate))] if rate > 0.5 else []
     period_ms = 1000.0 / rate
@@ -112,7 +109,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     Parameters
     ----------
     stamps : callable
-        Gives an iterator over blocks of (row numbers, stamps [ns]).
+        Returns an iterator over blocks of (row numbers, stamps [ns]).
     where : str
         The file, for messages.
 
@@ -123,11 +120,11 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     Raises
     ------
     TimeError
-        When there are not two different stamps, or time runs backwards.
+        When all stamps are equal or unreadable, or time runs backwards.
 
     Examples
     --------
-    >>> stamps = np.rint(np.arange(1000) * 1e3 / 300).astype(np.int64) * 1_000_000  # 300 Hz, written to the millisecond
+    >>> stamps = np.rint(np.arange(1000) / 0.3).astype(np.int64) * 1_000_000  # 300 Hz in ms
     >>> estimate_rate(lambda: iter([(np.arange(1000), stamps)]), where="tool.csv").rate
     300.0
     """
@@ -135,7 +132,8 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     parts = sample_stretches(stamps)
     if not parts:
         raise TimeError(
-            f"{where}: there is only one sample with a readable stamp, so no sampling rate can be found; give it with --rate HZ"
+            f"{where}: there is only one sample with a readable stamp, so no sampling rate can "
+            "be found; give it with --rate HZ"
         )
     steps = np.concatenate([np.diff(part) for part in parts])
     backwards = float((steps < 0).mean())
@@ -148,7 +146,8 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             else "all stamps are the same"
         )
         raise TimeError(
-            f"{where}: {what} throughout; check the time column and its unit, or leave it out (--map) and give --rate HZ"
+            f"{where}: {what} throughout; check the time column and its unit, or leave it out "
+            "(--map) and give --rate HZ"
         )
     period, counted, coarse = starting_period(parts)
     sure = _trusted_samples(len(steps))
@@ -174,11 +173,11 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
 def _fit_jitter(
     parts: list[NDArray[np.int64]], period: float, coarse: bool, sure: float
 ) -> JitterModel | None:
-    """Find the course of noisy stamps: of all rows, or of one row of each group.
+    """Fit the jitter of noisy stamps, of all rows or of one row of each group.
 
-    A row with the stamp of the row before is the next sample, which arrived together with it, or
-    the same sample given twice. Where few rows are of that kind, both readings are tried, and the
-    one that tells a stamp in fewer nats is right. The wrong one has a row without a sample, or a
+    A row with the stamp of the previous row is either the next sample, which arrived together with
+    it, or the same sample written twice. If there are few such rows, both hypotheses are tried, and
+    the one with the shorter code length is used. The wrong one has a row without a sample, or a
     loss, wherever two rows share a stamp, or a wrong period.
     """
     if not coarse:
@@ -195,7 +194,7 @@ def _fit_jitter(
 def _estimate_with_jitter(
     stamps: Stamps, course: JitterModel, coarse: bool, sure: float
 ) -> RateEstimate:
-    """The rate from the whole course of noisy stamps."""
+    """Estimate the rate along the sequence of samples of jittered stamps."""
     longest = sure * course.period * max(1.0, course.group)
     pieces = fit_pieces(stamps, course.period, False, False, longest, course)
     return replace(
@@ -204,7 +203,7 @@ def _estimate_with_jitter(
 
 
 def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
-    """Rows in a second, those without pauses."""
+    """Return the median number of rows a second of stretches."""
     rates = [
         SECOND * (len(part) - 1) / (part[-1] - part[0]) for part in parts if part[-1] > part[0]
     ]
@@ -212,7 +211,7 @@ def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
 
 
 def _trusted_samples(steps: int) -> float:
-    """Samples over which a first estimate of the period, from so many steps, is trusted to count."""
+    """Return the samples over which counting by a period from so many steps is reliable."""
     return min(_MAX_TRUSTED_SAMPLES, max(5.0, steps / 20))
 
 
@@ -232,11 +231,11 @@ def _estimate_pooled(
 
 
 def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
-    """The rate near a nominal one [Hz], where the stamps are samples of it of which some are missing, however regularly.
+    """Estimate the rate near a nominal one [Hz], with missing samples; None if impossible.
 
-    They can be samples of `rate` when their steps are whole numbers of its period and some are one
-    period, or when rows of that rate with lost samples and jitter explain them (see
-    `gyrostab.ingest.grid.jitter`); otherwise the answer is None.
+    It is possible if the steps are whole multiples of the period and some are one period, or if
+    rows of that rate with lost samples and jitter explain the stamps (see
+    `gyrostab.ingest.grid.jitter`).
 
     Examples
     --------
@@ -261,10 +260,10 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
 
 
 def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> bool:
-    """Tell whether a rate explains the stamps much worse than the rate found from them: by 20 nats in 100 rows, so by 2000 in 10 000.
+    """Return whether a rate explains the stamps worse than the estimated rate by 0.2 nats a row.
 
-    Both are compared along the most likely course of the stamps, also where single stamps tell the
-    sample of the rate found.
+    Both are compared along the most likely sequence of samples, also if single stamps give the
+    sample at the estimated rate.
 
     Examples
     --------
@@ -291,7 +290,7 @@ def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> boo
 def _estimate_sharp(
     stamps: Stamps, parts: list[NDArray[np.int64]], rate: float
 ) -> RateEstimate | None:
-    """The rate near a nominal one [Hz] where steps are whole numbers of its period, and some are one period."""
+    """Estimate the rate near a nominal one [Hz] if steps are whole periods, and some are single."""
     period = SECOND / rate
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
     single = steps[np.abs(steps / period - 1) < 0.25]
@@ -301,7 +300,7 @@ def _estimate_sharp(
         or rms_misfit(steps, period) > 0.15
     ):
         return None
-    if abs(np.median(single) / period - 1) > 0.02:  # another rate, not this one with rows missing
+    if abs(np.median(single) / period - 1) > 0.02:  # a different rate
         return None
     return _estimate_pooled(
         fit_pieces(stamps, period, False, False, _trusted_samples(len(steps)) * period),
@@ -314,9 +313,9 @@ def _estimate_sharp(
 def deviating_stretches(
     stamps: Stamps, period: float, *, size: int = 1024
 ) -> list[tuple[int, int, float]]:
-    """Stretches whose own rate is more than 2 % off: first row, its stamp [ns], rate [Hz].
+    """Find stretches whose rate deviates by more than 2 %: first row, its stamp [ns], rate [Hz].
 
-    Rows that are merely missing or doubled do not make a stretch odd; steps of another length do.
+    Only steps of another length count as a deviation, not missing or doubled rows.
     """
     found: list[tuple[int, int, float]] = []
     inside = False
@@ -341,7 +340,7 @@ def deviating_stretches(
 def _stretch_paces(
     values: NDArray[np.int64], size: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """First row of every stretch of `size` stamps (the last may be shorter), and how far apart its stamps are as a rule [ns]."""
+    """Return first row and median step [ns] of every stretch of `size` stamps."""
     whole = len(values) // size
     table = np.diff(values[: whole * size].reshape(whole, size)[:, ::16], axis=1)
     paces = np.median(table, axis=1) / 16 if whole else np.empty(0)

@@ -1,4 +1,4 @@
-"""Raw rows with their stamps to a regular log: uniform time, NaN at every missing sample, a table of gaps.
+"""Regularise raw rows: uniform time, NaN at every missing sample, a table of gaps.
 
 No value is ever interpolated, averaged or moved by a fraction of a sample: a sample is a row of the
 file, bit for bit, or NaN.
@@ -51,14 +51,14 @@ from gyrostab.units import HOUR
 
 __all__ = ["gap_table", "regularise"]
 
-_MAX_RATE_DIFFERENCE = 0.02  # a declared rate further off than this is a mistake
-_EVEN_ROWS = 2**18  # rows at the beginning of a log with even stamps that tell its rate
-# jitter up to which a stamp tells its sample, for all rows but one in 100; then they are tried
-# first [samples]
+_MAX_RATE_DIFFERENCE = 0.02  # relative, between declared and estimated rate
+_EVEN_ROWS = 2**18  # rows at the beginning that give the rate of a log with even stamps
+# Largest jitter at which stamps give the samples of 99 % of the rows; placing by stamp is then
+# tried first [samples].
 _SHARP_SIGMA = 0.2
-_MIN_DROPPED_ROWS = 10  # rows without a sample by their stamps, from which on their order is tried
-_LATE_SHARE = 0.9  # of those rows that the order must give a sample
-_MAX_ROUNDS = 4  # a repetition within another shows only when the latter is gone
+_MIN_DROPPED_ROWS = 10  # rows without a sample for which placing in order is tried
+_LATE_SHARE = 0.9  # share of the dropped rows that placing in order must recover
+_MAX_ROUNDS = 4  # a repetition within another is found after the latter is removed
 _OWN_ATTRIBUTES = (
     "declared_rate_hz",
     "start",
@@ -90,7 +90,8 @@ def _start_stamp(raw: xr.Dataset, notes: list[str]) -> int:
     text = raw.attrs.get("start")
     if not text:
         notes.append(
-            f"{file_of(raw)[0]}: no time in the file and no --start: the log is said to start at 1970-01-01T00:00:00"
+            f"{file_of(raw)[0]}: no time in the file and no --start: the log is said to start at "
+            "1970-01-01T00:00:00"
         )
         return 0
     return stamp_ns(text)
@@ -113,9 +114,7 @@ def _place_rows(
                 f"{where}: the file has no time column; give the sampling rate with --rate HZ"
             )
         return place_without_time(found.rows, _start_stamp(raw, notes)), declared
-    everything = (
-        found.absent <= 0.01 * found.rows
-    )  # single unreadable rows took their time all the same
+    everything = found.absent <= 0.01 * found.rows  # single unreadable rows still occupy samples
     stamps: Stamps = partial(stamp_blocks, raw, found, block=block)
     counted: Stamps = partial(stamp_blocks, raw, found, block=block, all_rows=everything)
     try:
@@ -128,19 +127,22 @@ def _place_rows(
         near = estimate_near(stamps, declared)
         named = (
             estimate.even is not None and abs(declared / estimate.even - 1) <= _MAX_RATE_DIFFERENCE
-        )  # the other reading of recurring losses
+        )  # without the recurring losses
         if (
             near is None
             or abs(declared / near.raw - 1) > _MAX_RATE_DIFFERENCE
             or (not named and is_far_worse(stamps, near, estimate))
         ):
             raise TimeError(
-                f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps say {estimate.raw:.6g} Hz, and neither "
+                f"{where}: the sampling rate given is {declared:.10g} Hz, but the time stamps "
+                f"say {estimate.raw:.6g} Hz, and neither "
                 "lost samples nor jitter explain the difference; "
-                "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of the time column"
+                "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of "
+                "the time column"
             )
         notes.append(
-            f"{where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, {declared:.10g} Hz, which is used"
+            f"{where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, "
+            f"{declared:.10g} Hz, which is used"
         )
         estimate = near
     rate = estimate.rate
@@ -148,7 +150,7 @@ def _place_rows(
         rate, estimate = (
             declared,
             replace(estimate, finer=None, even=None),
-        )  # who gives a rate has decided
+        )  # a given rate settles the question
     if estimate.counted:
         placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
         odd: list[tuple[int, int, float]] = []
@@ -162,10 +164,9 @@ def _place_rows(
 def _place_even(
     raw: xr.Dataset, found: ScanPass, place: Callable[..., tuple[Placement, float]]
 ) -> tuple[Placement, float] | None:
-    """Place the rows of a long log whose stamps are even steps of the sampling period, by a look at its beginning alone.
+    """Place the rows of a long log with evenly spaced stamps, from its beginning alone.
 
-    None where they are not, where a row has no sample, or where there is anything to be told of the
-    beginning.
+    Returns None if the stamps are not even, a row has no sample, or the beginning has notes.
     """
     line: tuple[int, int] | None = (
         getattr(raw["time"].data, "gyrostab_line", None) if "time" in raw.variables else None
@@ -197,11 +198,11 @@ def _place_even(
 
 
 class _OrderOptions(NamedTuple):
-    """What `place_in_order` takes besides."""
+    """Further options of `place_in_order`."""
 
     tolerance: float
     max_gap: float
-    by_row: bool  # unless rows are repetitions, which took no time
+    by_row: bool  # false if rows are repetitions, which occupy no samples
     where: str
 
 
@@ -213,7 +214,7 @@ def _place_stamped(
     rate: float,
     limits: _OrderOptions,
 ) -> tuple[Placement, list[tuple[int, int, float]]]:
-    """Place the rows by their stamps, or in their order where stamps scatter; and the stretches that have another rate."""
+    """Place rows by their stamps, or in order if stamps have jitter; return deviating stretches."""
     course = estimate.course
 
     def place_along(course: JitterModel) -> Placement:
@@ -238,7 +239,7 @@ def _place_stamped(
     dropped = found.rows - found.absent - found.repeated - placement.placed
     if not found.repeated and (
         dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows
-    ):  # their order may tell more than their stamps
+    ):  # placing in order may recover them
         along = place_along(course or JitterModel.of_sharp(1e9 / rate))
         if along.placed - placement.placed >= _LATE_SHARE * dropped:
             placement = along
@@ -246,7 +247,7 @@ def _place_stamped(
 
 
 def _place_once(raw: xr.Dataset, found: ScanPass, place: Callable[[], Placement]) -> Placement:
-    """Place the rows, each sample once: stretches of rows that the log holds twice are duplicates and not a restart of the clock."""
+    """Place each sample once; repeated stretches of rows are duplicates, not clock restarts."""
     placement, known = place(), np.empty((0, 3), dtype=np.int64)
     for _ in range(_MAX_ROUNDS):
         repeats = find_repeats(raw, signal_name(raw), placement)
@@ -262,7 +263,7 @@ def _place_once(raw: xr.Dataset, found: ScanPass, place: Callable[[], Placement]
 def _place_channels(
     raw: xr.Dataset, found: ScanPass, placement: Placement, rate: float, chunk: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Channels and their own time coordinates."""
+    """Return the channels on the grid, and time coordinates of slow channels."""
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {}
     for name, rows in found.filled.items():
@@ -314,7 +315,7 @@ def regularise(
     block: int = BLOCK_ROWS,
     limits: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
-    """Put the rows of a raw log on a uniform time axis, with NaN at every missing sample and a table of gaps.
+    """Place the rows of a raw log on a uniform time axis, NaN where missing, with a table of gaps.
 
     Parameters
     ----------
@@ -323,17 +324,17 @@ def regularise(
         [degree], ``time(row)``, channels. A regular log is returned as it is, or brought back onto
         its uniform time by `gyrostab.ingest.uniform.as_uniform`.
     rate : float, optional
-        Sampling rate [Hz]. Found from the stamps when not given; checked against them when given.
+        Sampling rate [Hz]; estimated from the stamps by default, and checked against them if given.
     tolerance : float
-        How much further than half a sample the slow course of the stamps may depart from the grid
-        before a sample is left out [samples].
+        Largest distance of the smoothed stamps from the grid, beyond half a sample, before a sample
+        is skipped [samples].
     max_gap : str or float
-        A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number is
-        in seconds.
+        A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number
+        is in seconds.
     chunk : int, optional
-        Samples of a chunk of the lazy arrays; about 20 minutes by default, as in a stored log.
+        Samples in a chunk of the lazy arrays; about 20 minutes by default, as in a stored log.
     block : int
-        Rows in memory at one time; the result does not depend on it.
+        Rows in memory at one time; does not affect the result.
     limits : mapping of str to float, optional
         Limits of `gyrostab.ingest.limits` with other values; ``grid_samples`` bounds the samples of
         an axis.
@@ -348,12 +349,12 @@ def regularise(
     Raises
     ------
     TimeError
-        When no sampling rate can be found, or the one given is more than 2 % from what the stamps
-        say; or when the grid has far more samples than there are rows.
+        When no sampling rate can be found, the given rate differs by more than 2 % from that of the
+        stamps, or the grid has far more samples than rows.
     FormatError
         When no row holds a number.
     OptionError, SchemaError
-        For an option or a dataset that makes no sense.
+        For invalid options or datasets.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Stretches of rows that a log holds twice: where the clock is set back and the same samples follow again."""
+"""Find repeated rows: the clock is set back, and the same samples follow again."""
 
 from __future__ import annotations
 
@@ -14,26 +14,25 @@ from gyrostab.store.lazy_slices import read_slice
 
 __all__ = ["find_repeats", "with_repeats"]
 
-_MAX_CANDIDATES = 8  # earlier rows with the stamp of a set-back that are looked at
-_MIN_ROWS = 16  # rows; fewer are told from their stamps alone
-_MIN_ALIKE_SHARE = 0.9  # share of the rows whose values must be alike; a copy may have been damaged
+_MAX_CANDIDATES = 8  # earlier rows with the stamp of a set-back that are compared
+_MIN_ROWS = 16  # shorter repetitions are found by their stamps alone
+_MIN_ALIKE_SHARE = 0.9  # share of equal rows in a copy, which may be damaged
 
 
 def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np.int64]:
-    """Look for the rows after each set-back of the clock among the rows before it.
+    """Find the rows after each set-back of the clock that repeat rows before it.
 
-    Rows are the same when stamps and values are. A clock that starts anew may well write the same
-    stamps, but the values are others; where they never change, nothing can be told, and nothing is
-    taken for a repetition.
+    Rows are equal if their stamps and values are. A clock that restarts may write the same stamps
+    again, but with other values; values that never change are not taken as a repetition.
 
     Parameters
     ----------
     raw : xarray.Dataset
         Raw log with stamps.
     name : str
-        Its signal.
+        Name of the signal.
     placement : Placement
-        Its rows on the grid, with the set-backs of the clock among the events.
+        Rows on the grid, with the set-backs of the clock among the events.
 
     Returns
     -------
@@ -61,7 +60,7 @@ def _read_stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
 
 
 def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
-    """The first few rows with a stamp."""
+    """Return the first few rows with a stamp."""
     rows: list[int] = []
     for begin in range(0, before, BLOCK_ROWS):
         rows += (
@@ -74,7 +73,7 @@ def _rows_at(raw: xr.Dataset, stamp: int, before: int) -> list[int]:
 
 
 def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
-    """How many rows from `row` on have the stamps of the rows from `source` on, up to the row itself."""
+    """Return how many rows from `row` on have the stamps of those from `source` on."""
     room = min(raw.sizes["row"] - row, row - source)
     for begin in range(0, room, BLOCK_ROWS):
         end = min(begin + BLOCK_ROWS, room)
@@ -88,7 +87,7 @@ def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
 
 
 def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int) -> bool:
-    """Whether the values are alike where both are known, and change at all."""
+    """Return whether values are equal where both are known, and not constant."""
     told = alike = 0
     changes = False
     for begin in range(0, length, BLOCK_ROWS):
@@ -107,7 +106,7 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
 
 
 def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:
-    """Add the rows that are repetitions to the events of a placement that was made without them."""
+    """Add repeated rows as duplicates to the events of a placement made without them."""
     events = [placement.events]
     for row, source, length in repeats.tolist():
         rows = np.arange(length)

@@ -1,4 +1,4 @@
-"""One pass over a raw log: which rows hold a sample, which cells are no numbers, how full the channels are."""
+"""Scan a raw log in one pass: rows with a sample, unreadable cells, filled rows of channels."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from gyrostab.store.threads import map_in_order
 
 __all__ = ["BLOCK_ROWS", "ScanPass", "file_of", "scan_rows", "stamp_blocks"]
 
-#: Rows that are held in memory at one time.
+#: Rows in memory at one time.
 BLOCK_ROWS = 1 << 20
 
 
 @dataclass
 class ScanPass:
-    """What one pass over the signal found.
+    """Findings of one pass over a raw log.
 
     Attributes
     ----------
     rows : int
         Rows of the raw log.
     present : ndarray of uint8
-        One bit a row: some axis has a number.
+        One bit a row: whether any axis has a number.
     absent : int
         Rows without any number.
     unreadable, infinite : ndarray of int64, shape (n, 2)
@@ -40,9 +40,9 @@ class ScanPass:
     constant : list of str
         Axes whose value never changes.
     filled : dict
-        Channel on ``row`` -> rows that have a number.
+        Channel on ``row`` -> number of rows with a value.
     repeated : int
-        Rows that repeat others.
+        Number of rows that repeat others.
     """
 
     rows: int
@@ -55,14 +55,14 @@ class ScanPass:
     repeated: int = 0
 
     def leave_out(self, begin: int, end: int) -> None:
-        """Take the rows `begin` to `end` for repetitions, which hold no sample of their own."""
+        """Mark the rows `begin` to `end` as repetitions, which hold no new sample."""
         bits = np.unpackbits(self.present[begin // 8 : -(-end // 8)])
         self.repeated += int(bits[begin % 8 : begin % 8 + end - begin].sum())
         bits[begin % 8 : begin % 8 + end - begin] = 0
         self.present[begin // 8 : -(-end // 8)] = np.packbits(bits)
 
     def mask(self, begin: int, end: int) -> NDArray[np.bool_]:
-        """Rows `begin` to `end` that hold a sample."""
+        """Return which of the rows `begin` to `end` hold a sample."""
         bits = np.unpackbits(self.present[begin // 8 : -(-end // 8)])
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
@@ -73,7 +73,7 @@ def _join_spans(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
         return spans
     new = np.concatenate(
         [[True], spans[1:, 0] != spans[:-1, 1]]
-    )  # a span that goes on in the next block is one span
+    )  # a span that continues in the next block is one span
     starts = np.flatnonzero(new)
     ends = np.append(starts[1:], len(spans)) - 1
     return np.stack([spans[starts, 0], spans[ends, 1]], axis=1)
@@ -92,7 +92,7 @@ def _scan_block(
 def _scan_blocks(
     raw: xr.Dataset, name: str, channels: Sequence[str], block: int
 ) -> Iterable[RowInspection]:
-    """What is in each block, as the reader found it, or else by a look at it."""
+    """Yield the findings of each block, from the reader if it has scanned it."""
     rows = raw.sizes["row"]
     seen: list[RowInspection] = getattr(raw[name].data, "gyrostab_inspections", [])
     whole = sum(one.rows for one in seen) == rows and all(one.rows % 8 == 0 for one in seen[:-1])
@@ -105,7 +105,7 @@ def _scan_blocks(
 
 
 def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPass:
-    """Look at every cell of a raw log once.
+    """Scan every cell of a raw log once.
 
     Raises
     ------
@@ -130,7 +130,8 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
             filled[key] += count
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
-            f"{_source_names(raw)}: none of the {rows} rows holds a number for any gyro axis; check the columns, the units and --map"
+            f"{_source_names(raw)}: none of the {rows} rows holds a number for any gyro axis; "
+            "check the columns, the units and --map"
         )
     axes = [str(axis) for axis in raw["axis"].values]
     still = [
@@ -147,7 +148,7 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
 def stamp_blocks(
     raw: xr.Dataset, found: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Row numbers and stamps [ns, `NO_STAMP` where unreadable] of the rows that hold a sample, block by block, fetched ahead."""
+    """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
     return map_in_order(
         _identity, _read_stamp_blocks(raw, found, block, all_rows=all_rows), workers=1
     )
@@ -178,7 +179,7 @@ def _source_names(raw: xr.Dataset) -> str:
 
 
 def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:
-    """Name the source file that a row of the raw log comes from, and the row's number in it, counted from 0."""
+    """Return the source file of a row, and the number of the row in it, from 0."""
     names = texts(raw, "source_files") or ["the raw log"]
     starts = [int(start) for start in np.atleast_1d(raw.attrs.get("row_start", 0))]
     if len(starts) != len(names):

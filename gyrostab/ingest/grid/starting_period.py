@@ -23,14 +23,14 @@ GAIN = 0.1
 
 
 SHARED_SHARE = (
-    0.05  # share of rows with the stamp of the row before from which on stamps may be shared
+    0.05  # smallest share of rows with the stamp of the previous row if stamps are shared
 )
 
 
 def _residual_range(
     parts: list[NDArray[np.int64]], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slope [ns a row] and range of the residuals [ns] of straight lines through stretches of `length` stamps."""
+    """Fit lines to stretches of `length` stamps: slopes [ns a row], residual ranges [ns]."""
     values = cut_stretches(parts, length)
     x = np.arange(length) - (length - 1) / 2
     slope = values @ x / (x @ x)
@@ -39,7 +39,7 @@ def _residual_range(
 
 
 def _has_shared_stamps(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
-    """Whether many rows share a stamp because the clock ticks slowly, and not because rows are doubled."""
+    """Return whether rows share stamps because the clock is coarse, not by doubling."""
     if np.mean(steps == 0) < SHARED_SHARE:
         return False
     tick = np.median(steps[steps > 0])
@@ -50,19 +50,19 @@ def _has_shared_stamps(parts: list[NDArray[np.int64]], steps: NDArray[np.float64
 
 
 def rms_misfit(steps: NDArray[np.float64], period: float) -> float:
-    """How far steps are from whole numbers of samples, root mean square [samples]; 0.29 says that they are anywhere."""
+    """Return the RMS distance of steps from whole samples [samples]; 0.29 for uniform phases."""
     near = steps[np.abs(steps) < 5.5 * period] / period
     return float(np.sqrt(np.mean((near - np.rint(near)) ** 2))) if len(near) else 0.5
 
 
 def step_scatter(steps: NDArray[np.float64], period: float) -> float:
-    """Robust standard deviation of the steps about whole numbers of samples [samples]; 0.37 says that they are anywhere."""
+    """Return the robust scatter of steps about whole samples [samples]; 0.37 for uniform phases."""
     near = steps[np.abs(steps) < 5.5 * period] / period
     return 1.4826 * float(np.median(np.abs(near - np.rint(near)))) if len(near) else 0.5
 
 
 def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
-    """Period of the stretches in which the row count alone predicts the stamps to less than a sample."""
+    """Return the period of stretches whose row count predicts the stamps to less than a sample."""
     length = min(16, max(len(part) for part in parts))
     slope, spread = _residual_range(parts, length)
     good = (slope > 0) & (spread < 0.95 * slope)
@@ -85,7 +85,7 @@ def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
 
 
 def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
-    """Period [ns] from stretches of stamps, to a part in a thousand or better; whether rows are counted; whether stamps are shared."""
+    """Return period [ns] to 0.1 %, whether rows are counted, whether stamps are shared."""
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
     rising = steps[steps > 0]
     if _has_shared_stamps(parts, steps):
@@ -95,7 +95,7 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
         period = refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
         if (
             rms_misfit(steps, period) > 0.2
-        ):  # with most rows missing, the median step is not one sample
+        ):  # with most rows missing, the median step is longer than one sample
             shorter = refine_period(steps, float(np.quantile(rising, 0.1)))
             period = shorter if rms_misfit(steps, shorter) < 0.15 else period
     return (
@@ -106,7 +106,7 @@ def starting_period(parts: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
 
 
 def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
-    """Whether the long steps are pauses between bursts: they do not fit the lattice of the short ones, or make up for them."""
+    """Return whether long steps are pauses between bursts, not multiples of the short ones."""
     long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
     near = steps[np.abs(steps) < 50 * period]
     if len(long) <= max(10, 0.02 * len(steps)) or near.sum() <= 1.2 * period * len(near):
@@ -120,11 +120,11 @@ def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], perio
         [(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]
     ).astype(np.float64)
     scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
-    return bool(scatter**2 < 0.2 * length * near.var())  # samples lost at random would add up
+    return bool(scatter**2 < 0.2 * length * near.var())  # random losses would accumulate
 
 
 def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
-    """Time a row takes [ns], from long stretches; with `ticks`, from the first to the last change of a shared stamp."""
+    """Return the mean time per row [ns]; with `ticks`, between changes of a shared stamp."""
     rates = []
     for part in parts:
         steps = np.diff(part).astype(np.float64)
@@ -142,10 +142,10 @@ def _time_per_row(parts: list[NDArray[np.int64]], *, ticks: bool = False) -> flo
 
 
 def _tick_steps(steps: NDArray[np.float64]) -> tuple[float, int]:
-    """Time [ns] and rows between changes of a shared stamp; changes that take three times as long a row as usual are gaps.
+    """Return time [ns] and rows between changes of a shared stamp, without gaps.
 
-    A change and the rows that share the stamp before it are kept or left out together: some stamps
-    may be shared by one row and others by five.
+    A change whose time per row exceeds three times the median is a gap. Each change is kept or left
+    out together with its rows, because some stamps may be shared by one row and others by five.
     """
     rising = np.flatnonzero(steps > 0)
     times, counts = steps[rising[1:]], np.diff(rising)

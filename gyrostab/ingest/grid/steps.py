@@ -1,4 +1,4 @@
-"""Steps between stamps: stretches of them, their common period, and patterns that recur."""
+"""Steps between stamps: their common period, and recurring patterns."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ __all__ = ["cut_stretches", "finer_period", "refine_period"]
 _PATTERN, _ROWS = (
     8,
     17,
-)  # rows after which a pattern of steps recurs at most, and those that it must hold for beside
-_WHOLE = 0.15  # samples that a step of a pattern may be off
-_LONGEST = 5.0  # samples that it may take
+)  # longest pattern of steps, and further rows in which it must recur
+_WHOLE = 0.15  # largest distance of a step of a pattern from whole samples [samples]
+_LONGEST = 5.0  # longest step of a pattern [samples]
 
 
 def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
-    """Stretches of `length` stamps, each from its first on [ns]."""
-    stride = length if sum(map(len, parts)) > 200 * length else 1  # of a short log, every stretch
+    """Return stretches of `length` stamps, relative to the first stamp of each [ns]."""
+    stride = length if sum(map(len, parts)) > 200 * length else 1  # overlap in a short log
     several = [
         np.lib.stride_tricks.sliding_window_view(part, length)[::stride]
         for part in parts
@@ -28,12 +28,12 @@ def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.flo
 
 
 def refine_period(steps: NDArray[np.float64], period: float) -> float:
-    """Period [ns] near a first guess of which the steps are whole numbers; the guess itself where there is none."""
+    """Refine a first guess of the period [ns] of which the steps are multiples, if there is one."""
     start = period
     for _ in range(30):
         near = np.abs(steps) < 5.5 * period
         count = np.rint(steps[near] / period).sum()
-        if count <= 0 or not 0.3 < period / start < 2.0:  # there is no lattice
+        if count <= 0 or not 0.3 < period / start < 2.0:  # no common period
             return start
         new = float(steps[near].sum() / count)
         if abs(new - period) < 1e-12 * period:
@@ -43,11 +43,11 @@ def refine_period(steps: NDArray[np.float64], period: float) -> float:
 
 
 def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
-    """Period [ns] of which the steps are 1, 1, 3 and again 1, 1, 3, as if of every five rows the same two were missing.
+    """Find the period [ns] of recurring steps such as 1, 1, 3, 1, 1, 3; None if there is none.
 
-    Stamps alone do not tell such a log from one whose rows are read in groups. The rounding of even
-    stamps makes patterns, too, but of steps that differ by one tick; steps by jitter do not recur;
-    and pauses between bursts are longer.
+    In such a log the same two of every five rows are missing, or rows are read in groups; stamps
+    alone cannot distinguish these. The rounding of even stamps also makes patterns, but of steps
+    that differ by one tick; steps by jitter do not recur; pauses between bursts are longer.
     """
     table = np.diff(cut_stretches(parts, _PATTERN + _ROWS))
     rising = table[table > 0]

@@ -15,14 +15,14 @@ __all__ = ["SECOND", "Stamps", "readable_stamps", "recut_blocks", "sample_stretc
 SECOND = 1e9
 
 
-#: Gives the blocks of row numbers and stamps, from the first on, as often as asked.
+#: Returns a new iterator over all blocks of row numbers and stamps at each call.
 Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
 
 
 def recut_blocks(
     stamps: Stamps, size: int
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Give the same rows and stamps in blocks of `size`, so that no result depends on how they came."""
+    """Yield rows and stamps in blocks of `size`, independent of the input blocks."""
     held: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
     waiting = 0
     for block in stamps():
@@ -42,7 +42,7 @@ def recut_blocks(
 def _concatenate_blocks(
     held: list[tuple[NDArray[np.int64], NDArray[np.int64]]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Blocks of rows and stamps one after the other; a single one, or what alone is not empty, is not copied."""
+    """Concatenate blocks of rows and stamps; a single non-empty block is not copied."""
     held = [block for block in held if len(block[0])]
     if len(held) == 1:
         return held[0]
@@ -51,7 +51,7 @@ def _concatenate_blocks(
 
 
 def readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The stamps that could be read; all of them, as nearly always, are not copied."""
+    """Return the readable stamps, without a copy if all are readable."""
     known = block != NO_STAMP
     return block if known.all() else block[known]
 
@@ -59,7 +59,7 @@ def readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
 def sample_stretches(
     stamps: Stamps, *, size: int = 8192, most: int = 64
 ) -> list[NDArray[np.int64]]:
-    """Stretches of stamps from all over the log, a few hundred thousand in all."""
+    """Return stretches of stamps from the whole log, a few hundred thousand in all."""
     found: list[NDArray[np.int64]] = []
     for _, block in stamps():
         block = readable_stamps(block)

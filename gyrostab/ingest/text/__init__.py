@@ -1,1 +1,1 @@
-"""Text logs: their layout, and cells to numbers."""
+"""Text logs: layout, and conversion of cells to numbers."""

@@ -1,4 +1,4 @@
-"""Text cells to numbers and stamps: plain rows (a kernel), odd ones (pyarrow, whole pieces) and the careful way (cell by cell)."""
+"""Parse text cells to numbers and stamps, with a kernel, with pyarrow, or cell by cell."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gyrostab.ingest.text.layout import BLANK, Layout, is_number, split_line
 
 __all__ = ["VOID_CELLS", "CellTypes", "parse_cells", "parse_fast", "parse_plain", "stamp_types"]
 
-#: Cells that mean "no value"; other words are unreadable.
+#: Cells without a value; other text is unreadable.
 VOID_CELLS = ("", "nan", "NaN", "NAN", "-nan", "null", "NULL", "NA", "N/A", "None")
 _VOID_WORDS = frozenset(word.lower() for word in VOID_CELLS)
 
@@ -25,7 +25,7 @@ Parsed = tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None]
 
 @dataclass
 class CellTypes:
-    """How the columns of one file parse; `stamp` counts through the types that are tried for the time column."""
+    """Types of the columns of one file; `stamp` is the index in `stamp_types` to try first."""
 
     layout: Layout
     plan: Plan
@@ -48,12 +48,12 @@ class CellTypes:
 
     @property
     def unit(self) -> TimeUnit | None:
-        """Unit of a numeric time column."""
+        """Unit of a numeric time column, None for ISO 8601."""
         return self.plan.time.time_unit if self.plan.time else None
 
 
 def parse_plain(block: bytes, start: int, rows: int, typing: CellTypes) -> tuple[Parsed, int]:
-    """Parse the plain rows of a block (up to `rows`) from the byte `start` on, and tell where the first begins that is not plain."""
+    """Parse up to `rows` plain rows from byte `start` on; also return where they end."""
     from gyrostab.kernels.encoding.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, read_rows
 
     layout = typing.layout
@@ -72,7 +72,7 @@ def parse_plain(block: bytes, start: int, rows: int, typing: CellTypes) -> tuple
 
 
 def _since_epoch(counts: NDArray[np.int64], typing: CellTypes) -> NDArray[np.int64]:
-    """Stamps [ns since 1970] of whole numbers of nanoseconds, or of units that are no decimal part of a second."""
+    """Convert counts of nanoseconds or of a non-decimal unit to stamps [ns since 1970]."""
     unit = typing.unit
     if unit is None:
         return counts
@@ -87,11 +87,11 @@ def _since_epoch(counts: NDArray[np.int64], typing: CellTypes) -> NDArray[np.int
 
 
 def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
-    """The pyarrow types to try for the time column, fastest first; every one is exact to the nanosecond.
+    """Return the pyarrow types to try for the time column, fastest first; all are exact.
 
-    Whole numbers are int64. Decimals are decimal128 with the digits of a nanosecond, then with more
-    of them, for texts like ``0.35000000000000003``. Without a fitting type the time column is read
-    cell by cell.
+    Whole numbers are int64. Decimals are decimal128 with digits down to a nanosecond, then with
+    more digits, for texts like ``0.35000000000000003``. Without a suitable type the time column is
+    parsed cell by cell.
     """
     import pyarrow as pa
 
@@ -113,7 +113,7 @@ def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
 
 
 def parse_fast(piece: bytes, typing: CellTypes) -> Parsed | None:
-    """Parse a block with pyarrow; None when it holds anything but numbers, voids and stamps of the expected form."""
+    """Parse a block with pyarrow; None if any cell is not a number, void or expected stamp."""
     import pyarrow as pa
 
     if typing.time is not None and not typing.stamp_types:
@@ -207,16 +207,16 @@ def _sum_fits(counts: NDArray[np.int64], zero: int) -> NDArray[np.bool_]:
 def parse_cells(
     piece: bytes, typing: CellTypes
 ) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None, int]:
-    """Read a piece of text line by line.
+    """Parse a piece of text line by line.
 
     Returns
     -------
     values : dict of int to ndarray
-        Column number -> numbers, NaN where there is none.
+        Column number -> numbers, NaN where missing.
     stamps : ndarray of int64 or None
         Stamps [ns since 1970].
     words : int
-        Cells of channels that hold something that is neither a number nor void.
+        Channel cells that are neither a number nor void.
     """
     width = typing.layout.width
     rows: list[list[str] | None] = []
@@ -247,7 +247,7 @@ def parse_cells(
 
 
 def _split_row(text: str, layout: Layout, width: int) -> list[str] | None:
-    """The cells of a row, or None when there are too few or too many."""
+    """Split a row into cells; None if there are too few or too many."""
     try:
         cells = split_line(text, layout.separator)
     except csv.Error:

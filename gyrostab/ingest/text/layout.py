@@ -1,4 +1,4 @@
-"""How a text log is laid out, from its first lines: encoding, separator, header, and where the data begin."""
+"""Find the layout of a text log from its first lines: encoding, separator, header."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ __all__ = [
     "unit_of_duration",
 ]
 
-#: Stands for any run of blanks as the separator.
+#: Separator that means any run of blanks.
 BLANK = " "
 HEAD_LINES = 200
-#: Lines that are looked at: those among which the header may be, those that follow one, and the
-#: first rows of data.
+#: Lines that are read: those that may be the header, those that follow it, and the first data rows.
 MAX_LINES = 2 * HEAD_LINES + 20
 
 _NUMBER = re.compile(r"^[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$")
@@ -38,10 +37,10 @@ _COMMENT = re.compile(r"^\s*[#%]")
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things are in a text log.
+    """Layout of a text log.
 
-    `offset` [bytes] and `line` (counted from 1) are those of the first data row; `samples` holds
-    the cells of the first few.
+    `offset` [bytes] and `line` (from 1) give the first data row; `samples` holds the cells of the
+    first few rows.
     """
 
     headers: tuple[str, ...]
@@ -55,30 +54,30 @@ class Layout:
 
     @property
     def width(self) -> int:
-        """Number of cells of a row."""
+        """Number of cells in a row."""
         return len(self.headers)
 
 
 def is_number(text: str, *, comma: bool = False) -> bool:
-    """Whether a cell holds a plain decimal number (no words, no ``nan``)."""
+    """Return whether a cell holds a plain decimal number (no words, no ``nan``)."""
     text = text.strip()
     return bool(_NUMBER.match(text.replace(",", ".") if comma else text))
 
 
 def unit_of_duration(text: str) -> str | None:
-    """The unit of a cell such as ``0.01 sec``, as MATLAB writes durations; None for other cells."""
+    """Return the unit of a duration as MATLAB writes it, ``0.01 sec``; None for other cells."""
     match = _DURATION.match(text)
     return match.group(1) if match else None
 
 
 def is_text(head: bytes) -> bool:
-    """Whether the beginning of a file looks like text: no zero byte and hardly any control codes."""
+    """Return whether the beginning of a file is text: no zero byte, at most 2 % control codes."""
     control = sum(head.count(code) for code in (*range(0, 9), *range(14, 32)))
     return b"\0" not in head and control <= 0.02 * len(head)
 
 
 def split_line(line: str, separator: str) -> list[str]:
-    """The cells of one line."""
+    """Split a line into cells."""
     if separator == BLANK:
         return line.split()
     if '"' in line:
@@ -115,7 +114,8 @@ def find_layout(
     content = list(islice(filled, MAX_LINES))
     if not content:
         raise FormatError(
-            f"{path.name}: there is no row of data, only {len(lines)} blank or comment lines; copy it again"
+            f"{path.name}: it has no data row, only {len(lines)} blank or comment lines; copy it "
+            "again"
         )
     check_columns(
         path, 1 + max(lines[index].count(mark) for index in content for mark in "\t;,"), limits
@@ -125,7 +125,8 @@ def find_layout(
     data = [lines[index] for index in content if index >= first]
     if not data:
         raise FormatError(
-            f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; copy it again"
+            f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; "
+            "copy it again"
         )
     rows = [tuple(split_line(re.split("[#%]", line)[0], separator)) for line in data[:HEAD_LINES]]
     width = max((len(row) for row in rows), key=[len(row) for row in rows].count)
@@ -137,7 +138,8 @@ def find_layout(
     skipped = [index + 1 for index in content if index < above]
     if skipped:
         notes.append(
-            f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line {skipped[0]})"
+            f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line "
+            f"{skipped[0]})"
         )
     comma = separator == ";" and _has_decimal_comma(rows)
     top = tuple(lines[:above]) if header is not None else ()
@@ -155,9 +157,10 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
         )
     if not is_text(
         head[:4096]
-    ):  # further down, junk such as a block of zeros after a loss of power spoils single rows only
+    ):  # further down, binary data such as zeros after a power loss affects single rows only
         raise FormatError(
-            f"{path.name}: this is not text but binary data; if it is a known format, give the file its right suffix"
+            f"{path.name}: this is not text but binary data; if it is a known format, give the "
+            "file its right suffix"
         )
     notes = []
     lines = head.splitlines()
@@ -168,7 +171,8 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
     except UnicodeDecodeError as error:
         number = next(index for index, line in enumerate(lines) if not _is_utf8(line)) + 1
         notes.append(
-            f"line {number} is not UTF-8 ({error.object[error.start : error.start + 1]!r}); the text was read as Latin-1"
+            f"line {number} is not UTF-8 ({error.object[error.start : error.start + 1]!r}); the "
+            "text was read as Latin-1"
         )
         text = [line.decode("latin-1") for line in lines]
     return text, notes
@@ -196,7 +200,7 @@ def _header_cells(line: str, separator: str) -> list[str]:
 
 
 def _is_data(cells: list[str], *, comma: bool) -> bool:
-    """Whether a row is data: a number or date somewhere, and no cell that looks like a name."""
+    """Return whether a row is data: it has numbers or dates, and the other cells are few."""
     void = ("", "nan", "-nan", "inf", "-inf", "null", "na", "n/a", "none")
     solid = [cell for cell in cells if cell.lower() not in void and not set(cell) <= set("*-")]
     values = [
@@ -214,7 +218,7 @@ def _is_data(cells: list[str], *, comma: bool) -> bool:
 def _find_header(
     path: Path, lines: list[str], content: list[int]
 ) -> tuple[list[str] | None, str, int, int]:
-    """Header cells (None without one), separator, index of the header line and of the first data line."""
+    """Find header cells (or None), separator, and indices of header and first data line."""
     for place, index in enumerate(content[:HEAD_LINES]):
         separator = _guess_separator(lines[index])
         cells = split_line(lines[index], separator)
@@ -235,12 +239,13 @@ def _find_header(
             return names, separator, index, index + 1
     what = f"no header row or row of numbers in the first {len(lines)} lines"
     raise FormatError(
-        f"{path.name}: {what}; if this is a gyro log, put # before the lines above its header row, or delete them"
+        f"{path.name}: {what}; if this is a gyro log, put # before the lines above its header "
+        "row, or delete them"
     )
 
 
 def _commented_header(lines: list[str], first: int, separator: str, width: int) -> list[str] | None:
-    """The header behind a ``#`` (EuRoC, numpy.savetxt), if the last comment above the data has as many cells as they have."""
+    """Return a header after ``#`` (EuRoC, numpy.savetxt): the last comment, if its width fits."""
     for line in reversed(lines[:first]):
         if not line.strip():
             continue

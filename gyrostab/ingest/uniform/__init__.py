@@ -1,4 +1,4 @@
-"""Logs on a uniform time axis: what xarray leaves of one is brought back onto its grid, or refused, and parts of one are cut out."""
+"""Restore uniform time axes after xarray operations, and cut out parts of logs."""
 
 from gyrostab.ingest.uniform.core import as_uniform as as_uniform
 from gyrostab.ingest.uniform.cut import cut_log as cut_log

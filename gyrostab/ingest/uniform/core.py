@@ -1,4 +1,4 @@
-"""A log as xarray operations leave it, brought back to what every stage expects: rate from its time, NaN where samples are missing."""
+"""Restore a log after xarray operations: sampling rate from its time, NaN at missing samples."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ __all__ = ["as_uniform", "grid_of"]
 
 
 def as_uniform(log: xr.Dataset) -> xr.Dataset:
-    """Bring a log onto the uniform time axis that its stamps lie on.
+    """Place a log on the uniform time axis of its stamps.
 
     xarray keeps attributes through every operation, and tables of gaps through most of them. This
     function trusts neither: the sampling rate comes from ``time``, and the table of gaps is
-    clipped, converted or dropped. A log whose time axis is computed (see `gyrostab.time.grid`) is
-    known to be uniform, and costs nothing. Explicit stamps are checked in blocks.
+    clipped, converted or dropped. A log with a computed time axis (see `gyrostab.time.grid`) is
+    uniform and needs no check. Explicit stamps are checked in blocks.
 
     Parameters
     ----------
@@ -42,15 +42,15 @@ def as_uniform(log: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        The same log where nothing is to be changed. Otherwise ``(axis, time)`` with a computed time
-        axis, NaN at every sample that is missing between its stamps, and attributes that are true.
+        The same log if nothing changes. Otherwise ``(axis, time)`` with a computed time axis, NaN
+        at every sample missing between its stamps, and consistent attributes.
 
     Raises
     ------
     SchemaError
-        When it is no log.
+        When it is not a log.
     TimeError
-        When its time is not in order, or not uniform.
+        When its time is not in order or not uniform.
 
     Examples
     --------
@@ -76,7 +76,7 @@ def as_uniform(log: xr.Dataset) -> xr.Dataset:
 
 
 def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid, bool]:
-    """The grid of a log's time, and whether its time axis is computed from it."""
+    """Return the grid of a log's time, and whether its time axis is computed."""
     index, size = log.xindexes.get("time"), log.sizes["time"]
     if isinstance(index, TimeGridIndex):
         if index.rate < 0:
@@ -87,7 +87,8 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
     time = log.variables["time"]
     if time.dtype.kind != "M":
         raise SchemaError(
-            f"the time of the log is of type {time.dtype}, not dates; give it datetime64 stamps: log.assign_coords(time=...)"
+            f"the time of the log is of type {time.dtype}, not dates; give it datetime64 stamps: "
+            "log.assign_coords(time=...)"
         )
 
     def read(begin: int, end: int) -> NDArray[np.int64]:
@@ -97,10 +98,11 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
 
 
 def _with_dimensions(log: Any) -> xr.Dataset:
-    """The log with its signal on ``(axis, time)``, if it has those dimensions in another order, or one axis without a dimension."""
+    """Return the log with its signal on ``(axis, time)``, from another order or a single axis."""
     if not isinstance(log, xr.Dataset):
         raise SchemaError(
-            f"this is a {type(log).__name__}, not a log (an xarray.Dataset); make one with gyrostab.make_log"
+            f"this is a {type(log).__name__}, not a log (an xarray.Dataset); make one with "
+            "gyrostab.make_log"
         )
     if "row" in log.dims:
         raise SchemaError(
@@ -138,7 +140,7 @@ def _onto_grid(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
 def _with_true_table(
     log: xr.Dataset, grid: UniformGrid, declared: float | None, *, computed: bool
 ) -> xr.Dataset:
-    """The log with a table of gaps that fits its time; without one where it cannot be known."""
+    """Return the log with a table of gaps that fits its time, or without one if that is unknown."""
     table = read_table(log, grid.start, grid.rate)
     if table is None:
         return with_table(log, None, grid.start, grid.rate)
@@ -146,7 +148,7 @@ def _with_true_table(
     if not same_rate and not (computed and declared is not None):
         return with_table(
             log, None, grid.start, grid.rate
-        )  # samples that were averaged have other gaps than those that were picked
+        )  # averaged samples have other gaps than selected ones
     fitting = table if same_rate else change_rate(table, log, declared, grid.start, grid.rate)  # type: ignore[arg-type]
     fitting = clip_table(fitting, 0, grid.size)
     if len(grid.runs) > 1:

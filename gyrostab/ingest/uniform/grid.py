@@ -1,4 +1,4 @@
-"""The uniform grid that explicit stamps lie on: its rate, and the samples that are missing."""
+"""Find the uniform grid of explicit stamps: its rate, and the missing samples."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from gyrostab.time.grid import NANOSECONDS, grid_index
 
 __all__ = ["ReadStamps", "UniformGrid", "find_grid"]
 
-#: Stamps that are held in memory at one time.
+#: Stamps in memory at one time.
 BLOCK_STAMPS = 2**20
-#: A stamp belongs to the sample of the grid that it lies within this distance of [samples]. It
-#: leaves room for stamps that were
-#: rounded, and bounds the harm of two pieces that are a fraction of a sample apart: the rate found
-#: over n samples is off by 0.1 / n.
-#: `gyrostab.regularise` copes with more, and notes it.
+#: Largest distance of a stamp from its grid sample [samples]. It allows for rounded stamps, and
+#: bounds the error of two pieces that are a fraction of a sample apart: the rate over n samples is
+#: off by 0.1 / n. `gyrostab.regularise` accepts more, with a note.
 MAX_DEPARTURE_SAMPLES = 0.1
 
 _NAT = np.iinfo(np.int64).min
-_ADVICE = "put the samples on a uniform time axis with gyrostab.from_dataarray, or interpolate them onto one with log.interp(time=...)"
+_ADVICE = (
+    "put the samples on a uniform time axis with gyrostab.from_dataarray, or interpolate "
+    "them onto one with log.interp(time=...)"
+)
 
 #: First stamp, stamp after the last one -> stamps [ns since 1970].
 ReadStamps = Callable[[int, int], NDArray[np.int64]]
 
 
 class UniformGrid(NamedTuple):
-    """Samples at ``start + round(n * 1e9 / rate)`` ns since 1970; `runs` are (first sample, first stamp, length), int64."""
+    """Samples at ``start + round(n * 1e9 / rate)`` ns; `runs`: sample, stamp, length."""
 
     start: int
     rate: float
@@ -41,7 +42,7 @@ class UniformGrid(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """What the steps between stamps are like [ns]."""
+    """Statistics of the steps between stamps [ns]."""
 
     span: int
     smallest: int
@@ -49,27 +50,26 @@ class _Steps(NamedTuple):
 
 
 def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> UniformGrid:
-    """Find the uniform grid that stamps lie on, a block of them at a time.
+    """Find the uniform grid of stamps, reading them in blocks.
 
     Parameters
     ----------
     read : callable
-        Gives the stamps from one place to another [ns since 1970].
+        First stamp, stamp after the last one -> stamps [ns since 1970].
     count : int
         Number of stamps.
     nominal : float, optional
-        Sampling rate that the log declares [Hz]. The stamps decide; the declared rate only says
-        which steps may be whole samples.
+        Sampling rate that the log declares [Hz]; only a candidate, the stamps decide.
 
     Returns
     -------
     UniformGrid
-        The slowest grid that holds every stamp.
+        The slowest grid that contains every stamp.
 
     Raises
     ------
     TimeError
-        When stamps are missing, repeated or out of order, or lie on no uniform grid.
+        When stamps are missing, repeated, out of order or not uniform.
 
     Examples
     --------
@@ -83,7 +83,8 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
     if count == 1:
         if nominal is None:
             raise TimeError(
-                "the log has one sample and no attribute 'sampling_rate_hz': its sampling rate is not known"
+                "the log has one sample and no attribute 'sampling_rate_hz': its sampling rate "
+                "is not known"
             )
         return UniformGrid(start, nominal, 1, np.array([[0, 0, 1]], dtype=np.int64))
     bases = [steps.median, float(steps.smallest)]
@@ -97,33 +98,33 @@ def find_grid(read: ReadStamps, count: int, *, nominal: float | None = None) -> 
         placed = _place_stamps(read, count, start, NANOSECONDS / period)
         if placed is None:
             continue
-        slack_ns = (
-            2 * placed[0] * period + 1
-        )  # the ends of the record say no more of the period than that
+        slack_ns = 2 * placed[0] * period + 1  # error of the period from the ends of the record
         for rate in _plain_rates(period, samples, slack_ns, nominal):
             plain = _place_stamps(read, count, start, rate)
             if plain is not None:
                 return _checked_size(UniformGrid(start, rate, samples + 1, plain[1]), count, steps)
     shortest, longest = steps.smallest / NANOSECONDS, _longest_step(read, count) / NANOSECONDS
     raise TimeError(
-        f"the time of the log is not uniform: its steps of {shortest:.9g} s to {longest:.9g} s fit no sampling rate, even with samples "
+        f"the time of the log is not uniform: its steps of {shortest:.9g} s to {longest:.9g} s "
+        "fit no sampling rate, even with samples "
         f"missing; {_ADVICE}"
     )
 
 
 def _stamp_blocks(read: ReadStamps, count: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Blocks of stamps, each with the last stamp of the block before."""
+    """Yield blocks of stamps, each with the last stamp of the previous block."""
     for begin in range(0, max(count - 1, 1), BLOCK_STAMPS):
         yield begin, read(begin, min(begin + BLOCK_STAMPS + 1, count))
 
 
 def _measure_steps(read: ReadStamps, count: int) -> _Steps:
-    """Check that the stamps rise, and measure their steps."""
+    """Check that the stamps increase, and measure their steps."""
     smallest, medians, first, last = np.iinfo(np.int64).max, [], 0, 0
     for begin, stamps in _stamp_blocks(read, count):
         if np.any(stamps == _NAT):
             raise TimeError(
-                f"sample {begin + int(np.argmax(stamps == _NAT))} of the log has no time (NaT); drop it: log.dropna('time')"
+                f"sample {begin + int(np.argmax(stamps == _NAT))} of the log has no time (NaT); "
+                "drop it: log.dropna('time')"
             )
         first = int(stamps[0]) if begin == 0 else first
         last = int(stamps[-1])
@@ -138,12 +139,16 @@ def _measure_steps(read: ReadStamps, count: int) -> _Steps:
 
 
 def _describe_disorder(place: int, before: int, after: int) -> str:
-    """Say which two samples are out of order."""
+    """Describe which two samples are out of order."""
     one, other = (str(np.datetime64(stamp, "ns")) for stamp in (before, after))
     if before == after:
-        return f"samples {place} and {place + 1} of the log have the same time, {one}; keep one of each: log.drop_duplicates('time')"
+        return (
+            f"samples {place} and {place + 1} of the log have the same time, {one}; keep one "
+            "of each: log.drop_duplicates('time')"
+        )
     return (
-        f"the time of the log runs backwards: sample {place} is at {one} and sample {place + 1} at {other}; sort it, "
+        f"the time of the log runs backwards: sample {place} is at {one} and sample {place + 1} "
+        f"at {other}; sort it, "
         "log.sortby('time'), or give overlapping logs to gyrostab.read_log, which joins them"
     )
 
@@ -153,7 +158,7 @@ def _longest_step(read: ReadStamps, count: int) -> int:
 
 
 def _fit_period(read: ReadStamps, count: int, span: int, base: float) -> tuple[float, int] | None:
-    """Period [ns] whose multiples the steps are, if `base` is near it or a fraction of it, and the samples between first and last stamp."""
+    """Fit the period [ns] near `base` or a multiple of it; return period and number of steps."""
     unit_sum = unit_count = 0
     for _, stamps in _stamp_blocks(read, count):
         steps = np.diff(stamps)
@@ -174,7 +179,7 @@ def _fit_period(read: ReadStamps, count: int, span: int, base: float) -> tuple[f
 def _place_stamps(
     read: ReadStamps, count: int, start: int, rate: float
 ) -> tuple[float, NDArray[np.int64]] | None:
-    """Largest departure from the grid [samples] and the runs of samples; None when a stamp is too far from it."""
+    """Return largest distance from the grid [samples] and runs; None if it is too large."""
     worst, firsts, samples = 0.0, [np.zeros(1, np.int64)], [np.zeros(1, np.int64)]
     for begin, stamps in _stamp_blocks(read, count):
         position = grid_index(start, rate, stamps)
@@ -193,7 +198,7 @@ def _place_stamps(
 def _plain_rates(
     period: float, samples: int, slack_ns: float, nominal: float | None
 ) -> Iterator[float]:
-    """Rates [Hz] that agree with a period over so many samples to `slack_ns`: the declared one or a fraction, plain numbers, the period."""
+    """Yield rates [Hz] that agree with a period within `slack_ns`, plain numbers first."""
     rate = NANOSECONDS / period
     candidates = [] if nominal is None else [nominal / max(1, round(nominal / rate))]
     for digits in range(1, 16):
@@ -205,11 +210,12 @@ def _plain_rates(
 
 
 def _checked_size(grid: UniformGrid, count: int, steps: _Steps) -> UniformGrid:
-    """Refuse a grid with next to no sample on it."""
+    """Refuse a grid that is almost empty."""
     if is_absurd_grid(grid.size, count):
         begin, end = (np.datetime64(stamp, "ns") for stamp in (grid.start, grid.start + steps.span))
         raise TimeError(
-            f"the log has {count} samples from {begin} to {end}, which at {grid.rate:.9g} Hz would be {grid.size}: cut it into pieces, "
+            f"the log has {count} samples from {begin} to {end}, which at {grid.rate:.9g} Hz "
+            f"would be {grid.size}: cut it into pieces, "
             f"log.sel(time=slice(...)), or {_ADVICE}"
         )
     return grid

@@ -1,4 +1,4 @@
-"""Samples of a log on another stretch of the grid: with holes where samples are missing, without those that were cut."""
+"""Place the samples of a log on another range of the grid, NaN where missing."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ __all__ = ["place_samples"]
 
 Runs = NDArray[np.int64]
 
-#: Numbers up to which a variable in memory stays in memory, whatever is added to it; 16 MB.
+#: Largest variable that stays in memory after placing [numbers]; 16 MB.
 SMALL_SIZE = 2**21
-#: Samples of a chunk of what was in memory.
+#: Chunk length of variables that were in memory [samples].
 CHUNK_SAMPLES = 2**20
 
 
 def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: int) -> xr.Dataset:
-    """Place the samples of a log on a grid, NaN where there is none; what is lazy stays lazy.
+    """Place the samples of a log on a grid, NaN where missing; lazy variables stay lazy.
 
     Parameters
     ----------
     log : xarray.Dataset
-        Its variables along ``time`` are placed; others stay.
+        Log whose variables along ``time`` are placed; others stay.
     runs : ndarray of int64, shape (n, 3)
         First sample of the grid, first sample of the log, length.
     start, rate, size : int, float, int
@@ -38,7 +38,7 @@ def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: in
     Returns
     -------
     xarray.Dataset
-        With a computed time axis. What is not numbers along ``time`` is left out with a note.
+        Log with a computed time axis. Variables without numbers are left out, with a note.
     """
     moved = {name: variable for name, variable in log.variables.items() if "time" in variable.dims}
     placed, left_out = {}, []

@@ -1,4 +1,4 @@
-"""The table of gaps of a log whose samples have been cut, thinned, or put back in their places."""
+"""Adapt the table of gaps of a log whose samples were cut, thinned or placed."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _MISSING = GAP_CAUSES.index("missing")
 
 
 def has_gap_table(log: xr.Dataset) -> bool:
-    """Whether a log has variables by gap."""
+    """Return whether a log has variables by gap."""
     return "gap" in log.dims
 
 
 def read_table(log: xr.Dataset, start: int, rate: float) -> Table | None:
-    """Table of gaps in grid samples (columns: `gyrostab.ingest.gap_table.COLUMNS`); None where an operation on the log has spoilt it."""
+    """Read the table of gaps in grid samples (`gap_table.COLUMNS`); None if it is inconsistent."""
     found = _read_columns(log)
     if found is None:
         return None
@@ -47,7 +47,7 @@ def read_table(log: xr.Dataset, start: int, rate: float) -> Table | None:
 
 
 def _read_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
-    """Stamps of the two ends [ns since 1970], samples, rows, cause."""
+    """Return stamps of both ends [ns since 1970], samples, rows, cause; None if inconsistent."""
     columns: list[NDArray[np.int64]] = []
     for name, kind in (
         ("gap_start", "M"),
@@ -65,7 +65,8 @@ def _read_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
         values = np.asarray(variable.values)
         if kind == "M" and np.isnat(values).any():
             raise SchemaError(
-                f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time must be known"
+                f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time "
+                "must be known"
             )
         columns.append(
             values.astype("datetime64[ns]").view(np.int64)
@@ -82,18 +83,18 @@ def _read_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
 
 
 def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
-    """The table for a log of which every n-th sample was picked.
+    """Convert the table for a log of which every n-th sample was selected.
 
     Parameters
     ----------
     table : ndarray of int64, shape (n, 5)
-        Table by `read_table`, on the grid of the picked samples.
+        Table of `read_table`, on the grid of the selected samples.
     log : xarray.Dataset
-        Where the exact ends of the gaps stand.
+        Log with the exact ends of the gaps.
     old_rate : float
-        Sampling rate of the log that the table was made for [Hz].
+        Sampling rate for which the table was made [Hz].
     start, rate : int, float
-        First stamp [ns since 1970] and sampling rate [Hz] now.
+        First stamp [ns since 1970] and present sampling rate [Hz].
     """
     columns = _read_columns(log)
     assert columns is not None  # read_table has read them
@@ -102,20 +103,20 @@ def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate
     for column, stamps in ((FIRST, columns[0]), (END, columns[1])):
         table[:, column] = np.ceil(
             grid_index(start, rate, stamps) - 1e-6
-        )  # the first picked sample at or after it
+        )  # the first selected sample at or after it
     length = table[:, END] - table[:, FIRST]
     share = np.divide(table[:, SAMPLES], old_length, out=np.zeros(len(table)), where=old_length > 0)
-    lost = (table[:, SAMPLES] > 0) & (length == 0)  # it lay between two samples that were picked
+    lost = (table[:, SAMPLES] > 0) & (length == 0)  # between two selected samples
     table[:, SAMPLES] = np.rint(share * length)
     table[:, ROWS] = np.minimum(table[:, ROWS], np.maximum(length, 1))
     return np.asarray(table[~lost])
 
 
 def add_holes(table: Table, runs: Table) -> Table:
-    """The table with the samples between runs that it does not list yet; their cause is "missing"."""
+    """Add the samples between runs that the table does not list, with cause "missing"."""
     first, end = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
     begin, stop = _merge_lines(table[table[:, END] > table[:, FIRST]])
-    if len(begin):  # take off what the table lists at either end, then count what it lists within
+    if len(begin):  # clip by listed gaps at either end, then count listed samples within
         which = np.maximum(np.searchsorted(begin, first, side="right") - 1, 0)
         first = np.where((begin[which] <= first) & (first < stop[which]), stop[which], first)
         which = np.minimum(np.searchsorted(stop, end, side="left"), len(stop) - 1)
@@ -134,7 +135,7 @@ def add_holes(table: Table, runs: Table) -> Table:
 
 
 def _merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First samples and ends of the stretches that the lines of a table cover together."""
+    """Return first samples and ends of the union of the lines of a table."""
     order = np.argsort(table[:, FIRST], kind="stable")
     first, end = (
         table[order, FIRST],
@@ -146,7 +147,7 @@ def _merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def add_spans(table: Table, spans: Table, cause: int) -> Table:
-    """The table with spans of samples (first, end) of one cause, in place of what it says of them."""
+    """Add spans of samples (first, end) of one cause to a table."""
     rows = [
         np.array([[first, end, end - first, 0, cause]], dtype=np.int64)
         for first, end in spans.tolist()
@@ -160,7 +161,7 @@ def _sort_table(table: Table) -> Table:
 
 
 def with_table(log: xr.Dataset, table: Table | None, start: int, rate: float) -> xr.Dataset:
-    """The log with this table of gaps in place of its own; None for no table."""
+    """Replace the table of gaps of a log; None removes it."""
     bare = log.drop_vars(
         [name for name, variable in log.variables.items() if "gap" in variable.dims]
     )

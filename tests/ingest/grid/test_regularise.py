@@ -1,4 +1,4 @@
-"""Raw rows to a regular log, against samples known from the generator and a slow placement by exact fractions."""
+"""Regularise raw rows, compared with known samples and a reference implementation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RATES = [99.3, 300.0, 1 / 7, 248.7, 100.0021]
 
 
 def slow_placement(stamps, rate):
-    """Every row to the nearest sample by exact fractions, the first one kept: no hysteresis, no state, no blocks."""
+    """Place every row at the nearest sample by exact fractions; first rows count."""
     taken, found = set(), []
     for stamp in stamps.tolist():
         sample = round((stamp - START) * Fraction(rate) / 10**9)
@@ -35,7 +35,7 @@ def slow_placement(stamps, rate):
 
 @st.composite
 def patterns(draw):
-    """Rate, true sample of every row, stamps."""
+    """Return rate, true sample of every row, stamps."""
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     rate = draw(st.sampled_from(RATES))
     n = draw(st.integers(400, 1500))
@@ -109,7 +109,7 @@ def test_restarts_append_after_one_missing_sample(pattern, pieces):
 
 @settings(max_examples=25, deadline=None)
 @given(patterns(), st.integers(64, 700))
-def test_blocks_and_chunks_make_no_difference(pattern, block):
+def test_block_and_chunk_sizes_do_not_matter(pattern, block):
     _, _, stamps, _ = pattern
     stamps = np.concatenate([stamps, stamps[:200]])
     raw = raw_log(stamps, temperature=np.where(np.arange(len(stamps)) % 7, np.nan, 20.0))
@@ -137,7 +137,7 @@ def test_lazy_arrays_equal_those_in_memory(chunk, monkeypatch):
         np.testing.assert_array_equal(log.rate[:, 44_000:61_000].values, truth[:, 44_000:61_000])
 
 
-def test_gap_of_200_hours_costs_next_to_nothing():
+def test_gap_of_200_hours_takes_almost_no_time_or_memory():
     gap = 200 * 3600 * 400
     raw = raw_log(stamps_of(np.r_[0:5000, gap : gap + 5000], 400.0))
     regularise(raw)  # compiles the kernels
@@ -211,7 +211,7 @@ def test_channels_on_time_and_slow_channels_on_their_own():
     np.testing.assert_array_equal(log.time_pressure.values, other)
 
 
-def test_rows_that_hold_a_slow_channel_only_are_no_samples():
+def test_rows_with_only_a_slow_channel_are_not_samples():
     samples = np.arange(1000)
     stamps = stamps_of(np.sort(np.r_[samples, samples[5::10] + 0.4]), 100.0)
     other = np.flatnonzero(
@@ -230,7 +230,7 @@ def test_rows_that_hold_a_slow_channel_only_are_no_samples():
     np.testing.assert_array_equal(log.time_temperature.values.astype(np.int64), stamps[other])
 
 
-def test_many_holes_are_counted_together():
+def test_many_gaps_are_merged():
     samples = np.flatnonzero(np.random.default_rng(0).random(90_000) > 0.2)
     samples -= samples[0]
     holes = int((np.diff(samples) > 1).sum())
@@ -250,7 +250,7 @@ def test_names_of_several_files():
     )
 
 
-def test_hopeless_logs_are_errors():
+def test_unusable_logs_are_errors():
     with pytest.raises(FormatError, match=r"tool\.csv"):
         regularise(raw_log(stamps_of(np.arange(10), 100.0), np.full(10, np.nan)))
     with pytest.raises(TimeError, match="only one sample"):
@@ -291,7 +291,7 @@ def test_arrays_keep_every_bit():
     assert log.rate.values.tobytes() == values.tobytes()
 
 
-def test_on_grid_of_nothing_but_one_run_is_the_array_itself():
+def test_rows_of_a_single_run_are_returned_unchanged():
     placement = place_by_stamp(
         lambda: iter([(np.arange(50), stamps_of(np.arange(50), 10.0))]),
         10.0,
@@ -304,7 +304,7 @@ def test_on_grid_of_nothing_but_one_run_is_the_array_itself():
     )
 
 
-def test_a_channel_of_another_day_is_told():
+def test_channel_of_another_day_is_noted():
     raw = raw_log(stamps_of(np.arange(100), 10.0))
     for day, told in ((0, False), (3, True)):
         stamps = raw.time.values[:5] + np.timedelta64(day, "D")

@@ -1,4 +1,4 @@
-"""Stamps that are times of arrival: every row is kept in its order, losses are found, and the rate is that of the whole record."""
+"""Stamps that are times of arrival: rows stay in order, losses and the rate are found."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.stamp_scatter import (
 
 
 def place(jitter, scatter, losses, unit, *, rate=100.0, rows=20_000, seed=0, **options):
-    """The regular log of scattered stamps, the true samples of its rows, and the samples that they were given."""
+    """Regularise scattered stamps; return the log, true samples and placed samples of its rows."""
     random = np.random.default_rng(seed)
     samples = lose_samples(losses, rows, random)
     log = regularise(
@@ -108,14 +108,14 @@ def test_jitter_at_random_in_every_way():
         ("uniform", 0.5, 400.0, "ms", 1635),
     ],
 )
-def test_a_few_rows_that_share_a_stamp_are_samples_of_their_own(jitter, scatter, rate, unit, seed):
+def test_few_rows_that_share_a_stamp_may_be_different_samples(jitter, scatter, rate, unit, seed):
     log, _, given, samples = place(jitter, scatter, "none", unit, rate=rate, rows=6000, seed=seed)
     np.testing.assert_array_equal(given, samples)
     assert log.attrs["sampling_rate_hz"] == pytest.approx(rate, rel=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.04])
-def test_a_few_rows_that_share_a_stamp_are_the_same_sample_given_twice(share):
+def test_few_rows_that_share_a_stamp_may_be_the_same_sample(share):
     random = np.random.default_rng(5)
     stamps = round_stamps(scatter_stamps(np.arange(6000), "uniform", 0.5, random), 40.0, "us")
     rows = np.sort(np.append(np.arange(6000), np.flatnonzero(random.random(6000) < share)))
@@ -138,7 +138,7 @@ def test_the_true_rate_is_accepted_whatever_the_jitter(scatter):
     assert np.isfinite(told.rate.values).sum() >= 0.999 * len(samples)
 
 
-def test_a_given_rate_wins_over_a_pattern_of_losses_and_is_noted():
+def test_given_rate_overrules_a_pattern_of_losses_and_is_noted():
     stamps = stamps_of(np.flatnonzero(np.resize([1, 1, 1, 0, 0], 6000)), 100.0)
     log = regularise(raw_log(stamps), rate=60.0)
     assert np.isfinite(log.rate.values).sum() == len(stamps)
@@ -165,7 +165,7 @@ def test_jitter_is_noted():
     )
 
 
-def test_a_clock_set_back_amid_jitter_is_a_restart():
+def test_clock_set_back_with_jitter_is_a_restart():
     random = np.random.default_rng(4)
     times = np.concatenate([np.arange(4000), np.arange(4000)]) + random.normal(0, 0.4, 8000)
     log = regularise(raw_log(round_stamps(times, 100.0, "us")))
@@ -174,7 +174,7 @@ def test_a_clock_set_back_amid_jitter_is_a_restart():
 
 
 @pytest.mark.parametrize("block", [64, 1000, 1 << 20])
-def test_blocks_make_no_difference_to_rows_with_jitter(block):
+def test_block_size_does_not_matter_with_jitter(block):
     log, *_ = place("normal", 0.4, "single", "us")
     other, *_ = place("normal", 0.4, "single", "us", block=block)
     np.testing.assert_array_equal(log.rate.values, other.rate.values)
@@ -182,7 +182,7 @@ def test_blocks_make_no_difference_to_rows_with_jitter(block):
 
 
 def test_stamps_of_a_broken_frame_make_no_gap_longer_than_allowed():
-    """A field of 16 bits with a sign that is read as 32 bits without: no course of such stamps may skip 50 days."""
+    """Signed 16-bit stamps read as unsigned 32-bit ones must not make a gap of 50 days."""
     stamps = np.arange(82) * 100_000_000
     stamps[29:] = (np.random.default_rng(3).integers(-2000, 2000, 53) % 2**32) * 1_000_000
     log = regularise(raw_log(stamps), max_gap="1h")

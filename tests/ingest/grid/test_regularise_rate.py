@@ -1,4 +1,4 @@
-"""The sampling rate from the stamps: drift, bursts, coarse ticks, declared rates, rows missing by a pattern."""
+"""Estimate the sampling rate: drift, bursts, coarse clocks, declared rates, recurring losses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.raw_rows import START, expected, raw_log, stamps_of
 
 @pytest.mark.parametrize("rate", [300.0, 99.3])
 def test_no_drift_over_200_hours(rate):
-    """One row in 64, in stretches over the whole 200 h, written to the microsecond."""
+    """Stretches with one of 64 rows of 200 h, with stamps to the microsecond."""
     last, block = int(200 * 3600 * rate), 1 << 22
     step = 1e9 / rate
 
@@ -34,9 +34,7 @@ def test_no_drift_over_200_hours(rate):
     assert estimate.rate == rate
     placement = place_by_stamp(stamps, rate, tolerance=0.25, max_gap=1e9, where="long.csv")
     assert placement.size == last + 1
-    assert np.all(
-        placement.runs[:, 0] == placement.runs[:, 1]
-    )  # rows are numbered by their true sample
+    assert np.all(placement.runs[:, 0] == placement.runs[:, 1])  # row numbers equal true samples
     exact = START + round(last * Fraction(10**9) / Fraction(repr(rate)))
     end = time_coordinate(placement.start, rate, placement.size)["time"][-1].values.astype(np.int64)
     assert abs(int(end) - exact) <= 1
@@ -94,7 +92,7 @@ def test_wrong_declared_rate_is_an_error_with_both_figures():
         regularise(raw, rate=200.0)
 
 
-def test_a_stretch_at_another_rate_is_told():
+def test_stretch_at_another_rate_is_noted():
     log = regularise(raw_log(stamps_of(np.r_[0:9000, 9000 + np.arange(4000) * 1.25], 100.0)))
     assert log.attrs["sampling_rate_hz"] == pytest.approx(100.0, rel=1e-4)
     (note,) = [note for note in log.attrs["notes"] if "split the log" in note]
@@ -119,7 +117,7 @@ def test_arrival_at_random_times_loses_no_row():
 
 @pytest.mark.parametrize(("rate", "n"), [(700.0, 2000), (700.0, 50_000), (300.0, 50_000)])
 def test_stamps_coarser_than_the_jitter_of_a_sample(rate, n):
-    """At 700 Hz and whole milliseconds, steps are 1 ms and 2 ms: neither is the period."""
+    """At 700 Hz in whole milliseconds the steps are 1 ms and 2 ms; neither is the period."""
     keep = np.random.default_rng(1).random(n) > 0.03
     keep[:50] = True
     samples = np.flatnonzero(keep)
@@ -147,13 +145,13 @@ def test_rows_missing_in_a_fixed_pattern_leave_the_declared_grid(pattern, rate, 
 @pytest.mark.parametrize("pattern", [[1, 1, 1, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0, 1, 1, 0, 0]])
 @pytest.mark.parametrize("rate", [10.0, 248.7])
 @pytest.mark.parametrize("jitter", [0.0, 0.03])
-def test_a_log_whose_steps_recur_has_the_rate_of_the_unit_step_and_names_the_other(
+def test_recurring_steps_give_the_rate_of_the_unit_step_and_a_note_on_the_other(
     pattern, rate, jitter
 ):
     samples = np.flatnonzero(np.resize(pattern, 6000))
     samples = samples[
         (np.arange(samples.size) < 40) | (np.random.default_rng(5).random(samples.size) > 0.002)
-    ]  # a few lost beside
+    ]  # a few further losses
     stamps = stamps_of(
         samples + np.random.default_rng(3).uniform(-jitter, jitter, len(samples)), rate
     )
@@ -187,11 +185,11 @@ def test_a_log_whose_steps_recur_has_the_rate_of_the_unit_step_and_names_the_oth
         ),  # even for a clock that ticks twice in three samples
     ],
 )
-def test_even_samples_have_no_steps_that_recur(stamps):
+def test_even_samples_have_no_recurring_steps(stamps):
     assert not any("recur" in note for note in regularise(raw_log(stamps)).attrs["notes"])
 
 
-def test_a_multiple_of_the_rate_is_not_taken_for_it():
+def test_multiple_of_the_rate_is_not_accepted():
     with pytest.raises(TimeError, match=r"200 Hz.*100 Hz"):
         regularise(raw_log(stamps_of(np.arange(2000), 100.0)), rate=200.0)
 
@@ -203,7 +201,7 @@ def test_a_multiple_of_the_rate_is_not_taken_for_it():
 def test_even_stamps_and_then_shared_ones(
     rows: int, share: float, group: int, period_ms: int
 ) -> None:
-    """A logger that falls behind: even stamps at first, then groups of rows that share one. The rate is the same all along."""
+    """A logger falls behind: even stamps, then groups with one stamp, at a constant rate."""
     even = round(rows * (1 - share))
     shared = even - 1 + group * (1 + np.arange(rows - even) // group)
     stamps = np.concatenate([np.arange(even), shared]) * period_ms * 1_000_000

@@ -1,4 +1,4 @@
-"""Real recordings to a regular log: every row kept, gaps and restarts where they were."""
+"""Regularise real recordings: every row is kept, gaps and restarts are found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clocks that jump or start again, and rows that are given twice."""
+"""Clock steps, restarts, and repeated rows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ REPEATED = {
 
 @pytest.mark.parametrize("rows", REPEATED.values(), ids=REPEATED)
 @pytest.mark.parametrize("block", [64, 1 << 20])
-def test_rows_given_twice_are_duplicates(rows, block):
+def test_repeated_rows_are_duplicates(rows, block):
     samples = np.r_[0:1200, 1300:3100, 3101:6101]  # with gaps, which the repetitions have too
     values = np.random.default_rng(1).standard_normal(6000)
     log = regularise(raw_log(stamps_of(samples, 300.0)[rows], values[rows]), block=block)
@@ -60,7 +60,7 @@ def test_rows_given_twice_are_duplicates(rows, block):
     )
 
 
-def test_a_damaged_copy_is_a_copy():
+def test_damaged_copy_is_recognised():
     values = np.random.default_rng(1).standard_normal(6000)
     rows = REPEATED["at once"]
     copied = values[rows]
@@ -74,7 +74,7 @@ def test_a_damaged_copy_is_a_copy():
     [np.random.default_rng(2).standard_normal(9000), np.zeros(9000)],
     ids=["other values", "values that never change"],
 )
-def test_a_clock_that_starts_again_is_no_repetition(values):
+def test_restarted_clock_is_not_a_repetition(values):
     log = regularise(raw_log(stamps_of(np.r_[0:6000, 0:3000], 300.0), values))
     assert log.sizes["time"] == 9001
     assert gap_table(log).cause.tolist() == ["restart"]

@@ -1,4 +1,4 @@
-"""Text logs: any layout, exact stamps, junk counted and named, and a clear message for every bad file."""
+"""Text logs: layouts, exact stamps, unreadable rows, and a clear message for every bad file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from gyrostab.ingest.text.layout import find_layout
 from tests.support.text_logs import PLAIN, ns, write
 
 # --- round trips
-# -------------------------------------------------------------------------------------------------
 
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False).map(lambda value: float(f"{value:.9g}"))
 VOIDS = {
@@ -71,7 +70,7 @@ def logs(draw: st.DrawFn) -> dict[str, object]:
 
 
 def render(log: dict[str, object]) -> tuple[str, list[int | None]]:
-    """The text, and for every row that it should give the index of the data row, or None for a junk row."""
+    """Return the text, and for every expected row its data row, or None if unreadable."""
     separator, holes = log["separator"], log["holes"]
     headers = {"time": "time [us]", **{axis: f"gyro_{axis} [deg/h]" for axis in log["axes"]}}
     lines = [separator.join(headers[name] for name in log["order"])]
@@ -98,7 +97,7 @@ def render(log: dict[str, object]) -> tuple[str, list[int | None]]:
 @settings(
     max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_what_is_written_is_read(tmp_path: Path, log: dict[str, object]) -> None:
+def test_written_values_are_read_back(tmp_path: Path, log: dict[str, object]) -> None:
     text, expected = render(log)
     data = gzip.compress(text.encode()) if log["gz"] else text.encode()
     path = write(tmp_path, data, "log.csv.gz" if log["gz"] else "log.csv")
@@ -137,7 +136,7 @@ def test_what_is_written_is_read(tmp_path: Path, log: dict[str, object]) -> None
 @settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_blocks_of_any_size_give_the_same(tmp_path: Path, data: st.DataObject) -> None:
+def test_block_size_does_not_matter(tmp_path: Path, data: st.DataObject) -> None:
     rows = [f"{n},{n * 0.25}" for n in range(300)]
     for at in data.draw(st.sets(st.integers(0, 299), max_size=6)):
         rows[at] = data.draw(st.sampled_from(["1,2,3", "x,y", "# c", "", f"{at},****"]))
@@ -154,7 +153,6 @@ def test_blocks_of_any_size_give_the_same(tmp_path: Path, data: st.DataObject) -
 
 
 # --- stamps
-# ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -211,7 +209,7 @@ def test_stamps_of_mixed_zones(tmp_path: Path) -> None:
     assert ns(raw) == [start, start + 10**9, start + 2 * 10**9, NAT]
 
 
-def test_the_epoch_moves_numeric_time_and_is_said_once(tmp_path: Path) -> None:
+def test_epoch_shifts_numeric_time_and_is_noted_once(tmp_path: Path) -> None:
     path = write(tmp_path, "time [s],gyro_x [deg/h]\n0,1\n0.5,2\n")
     assert (
         sum(
@@ -244,7 +242,7 @@ def test_binary_floats_convert_to_the_nearest_nanosecond(value: float, unit: str
     assert abs(found - Fraction(value) * parsed.ns) <= Fraction(1, 2) + Fraction(1, 10**6)
 
 
-def test_the_careful_way_refuses_what_is_no_number() -> None:
+def test_cell_parser_refuses_text_that_is_not_a_number() -> None:
     cells = ["1", " 2.5 ", "1_0", "0x10", "nan", "inf", "", "1e400", "1e-400"]
     assert cells_to_ns(cells, parse_time_unit("s"), 0).tolist() == [
         10**9,
@@ -262,11 +260,10 @@ def test_the_careful_way_refuses_what_is_no_number() -> None:
         parse_time_unit("fortnight")
 
 
-# --- junk
-# --------------------------------------------------------------------------------------------------------
+# --- unreadable rows
 
 
-def test_junk_is_counted_and_named_by_line(tmp_path: Path) -> None:
+def test_unreadable_rows_are_counted_and_named_by_line(tmp_path: Path) -> None:
     lines = ["# head", "time [s],gyro_x [deg/h],gyro_y [deg/h],temperature [degC]"]
     lines += [
         "0,1,1,20",
@@ -293,12 +290,12 @@ def test_junk_is_counted_and_named_by_line(tmp_path: Path) -> None:
     assert "2 gyro cells hold no number in rows that are readable otherwise: lines 4, 8" in notes
 
 
-def test_a_scratch_number_in_a_junk_row_is_no_stamp(tmp_path: Path) -> None:
+def test_number_in_an_unreadable_row_is_not_a_stamp(tmp_path: Path) -> None:
     raw = read_log(write(tmp_path, "time [s],gyro_x [deg/h]\n100,1\n101,2\n102,\n103,3\n5,\n"))
     assert ns(raw) == [100 * 10**9, 101 * 10**9, 102 * 10**9, 103 * 10**9, NAT]
 
 
-def test_a_stray_quote_swallows_no_rows(tmp_path: Path) -> None:
+def test_unmatched_quote_does_not_hide_rows(tmp_path: Path) -> None:
     rows = (
         "".join(f"{n},{n},ok\n" for n in range(20))
         .replace("7,7,ok", '7,7,"5 inch')
@@ -310,7 +307,7 @@ def test_a_stray_quote_swallows_no_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("junk", [bytes(4096), bytes(range(256)) * 20, bytes(100) + b'"'])
-def test_junk_in_the_midst_of_a_log_spoils_single_rows(tmp_path: Path, junk: bytes) -> None:
+def test_binary_data_within_a_log_affects_single_rows(tmp_path: Path, junk: bytes) -> None:
     rows = [f"{n},{n}\n".encode() for n in range(2000)]
     raw = read_log(
         write(
@@ -349,7 +346,7 @@ def test_the_head_of_a_big_file_may_end_inside_a_line() -> None:
     assert (layout.offset, layout.line) == (24, 2)
 
 
-def test_the_layout_is_that_of_the_first_lines_and_a_strange_byte_far_below_is_told() -> None:
+def test_layout_is_that_of_the_first_lines_and_a_later_bad_byte_is_noted() -> None:
     head = b"\xef\xbb\xbf# a tool\ntime [s],gyro_x [deg/h]\n" + b"".join(
         b"%d,1.5\n\n" % n for n in range(3000)
     )

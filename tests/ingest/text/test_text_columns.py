@@ -1,4 +1,4 @@
-"""Columns of text logs: layouts, headers, units, mapping, and what is said of those that cannot be understood."""
+"""Columns of text logs: layouts, headers, units, mapping, and messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from gyrostab.units import INNER
 from tests.support.text_logs import PLAIN, ns, write
 
 # --- layouts
-# -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -81,7 +80,8 @@ def test_every_gyro_unit_of_the_contract(tmp_path: Path) -> None:
 
 def test_channels_convert_by_name(tmp_path: Path) -> None:
     headers = "gyro_x [deg/h],"
-    headers += "temperature [degF],vibration [m/s^2],rotation_rate [rpm],supply_voltage [mV],pressure [bar],mag_x [gauss],ramp,mud [%]"
+    headers += "temperature [degF],vibration [m/s^2],rotation_rate [rpm],supply_voltage [mV],"
+    headers += "pressure [bar],mag_x [gauss],ramp,mud [%]"
     raw = read_log(
         write(tmp_path, headers + "\n1,212,9.80665,10,5000,2,0.5,7,3\n1,,,,,,,,\n"), rate=1
     )
@@ -99,9 +99,7 @@ def test_channels_convert_by_name(tmp_path: Path) -> None:
         assert float(raw[name][0]) == pytest.approx(value, rel=1e-12)
         assert np.isnan(raw[name][1])
         assert raw[name].attrs["units"] == units
-    assert (
-        raw.attrs["unreadable_cells"] == 0
-    )  # an empty cell of a channel is a slow sensor, no fault
+    assert raw.attrs["unreadable_cells"] == 0  # an empty cell of a channel is not a fault
 
 
 def test_angles_are_never_guessed(tmp_path: Path) -> None:
@@ -122,7 +120,6 @@ def test_angles_are_never_guessed(tmp_path: Path) -> None:
 
 
 # --- mapping and units
-# -------------------------------------------------------------------------------------------
 
 
 def test_a_mapped_unit_overrules_the_header_and_an_option_does_not(tmp_path: Path) -> None:
@@ -181,7 +178,7 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
             "time [s],gyro_x [deg/h],temperature [V]\n0,1,2\n1,2,3\n",
             {"unit": {"temperature": "mV"}},
             UnitError,
-            r"no known unit of temperature",
+            r"not a known unit of temperature",
         ),
         (
             "time,gyro_x [deg/h]\n0,1\n1,2\n",
@@ -251,7 +248,7 @@ def test_unknown_columns_are_kept_with_a_unit_and_left_out_without(tmp_path: Pat
         ("# only\n# comments\n", {}, FormatError, r"only 2 blank or comment lines"),
         (PLAIN, {}, FormatError, r"header \(line 1\) but no data row"),
         (PLAIN + "# end\n", {}, FormatError, r"no data row"),
-        (PLAIN + "0,1\n", {}, FormatError, r"one row of data only"),
+        (PLAIN + "0,1\n", {}, FormatError, r"only one row of data"),
         (b"PK\x03\x04" + bytes(range(256)) * 8, {}, FormatError, r"not text but binary"),
         ("time,gyro_x\n".encode("utf-16"), {}, FormatError, r"UTF-16.*UTF-8"),
         (
@@ -278,14 +275,13 @@ def test_a_time_column_may_be_mapped_away_or_chosen(tmp_path: Path) -> None:
     assert ns(read_log(bare, map={"clock": "time [ms]"})) == [10**6, 2 * 10**6]
 
 
-def test_a_temperature_called_t_is_no_time(tmp_path: Path) -> None:
+def test_temperature_called_t_is_not_the_time(tmp_path: Path) -> None:
     raw = read_log(write(tmp_path, "time [s],gyro_x [deg/h],T [degC]\n0,1,20\n1,2,21\n"))
     assert raw["T"].values.tolist() == [20, 21]
     assert ns(read_log(write(tmp_path, "t [s],gyro_x [deg/h]\n0,1\n1,2\n"))) == [0, 10**9]
 
 
-# --- what the page on formats says
-# ---------------------------------------------------------------------------------
+# --- statements of the page on formats
 
 
 def _page() -> str:
@@ -294,7 +290,7 @@ def _page() -> str:
 
 
 def _named_on_the_page() -> list[tuple[str, str]]:
-    """Column and unit, each with each; the names of a row and its units go in pairs where there are several groups of units."""
+    """Yield all columns and units of the page; groups of units belong to names in order."""
     pairs = []
     for row in re.findall(r"^\| (`.*)\|$", _page(), re.M):
         cells = [cell.strip() for cell in row.split("|")]

@@ -1,4 +1,4 @@
-"""`gyrostab scan FILE` without options: a look into every column, a guess, and a command that works as it is printed."""
+"""`gyrostab scan FILE` without options: inspection, guess, and a command that works as printed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DEG_PER_RAD = 180 / np.pi
 
 
 def gyro_dps(*, fine: bool = False, seed: int = 3) -> NDArray[np.float64]:
-    """Three axes at rest [deg/s]: a MEMS part (0.3 deg/sqrt(h), bias 0.4 deg/s), or a fine gyro that sees the Earth turn."""
+    """Return three axes at rest [deg/s]: MEMS (0.3 deg/sqrt(h), bias 0.4 deg/s) or a fine gyro."""
     noise = np.random.default_rng(seed).standard_normal((3, ROWS))
     if fine:
         return (
@@ -65,7 +65,7 @@ def named(names: str, columns: Sequence[NDArray[np.float64]]) -> Columns:
     return dict(zip(names.split(","), columns, strict=True))
 
 
-#: Columns, whether there is a header, the columns of the gyro and their unit.
+#: Columns, whether the file has a header, the gyro columns and their unit.
 LOGS: dict[str, tuple[Columns, bool, Sequence[NDArray[np.float64]], str]] = {
     "letters": (
         named("t,wx,wy,wz,ax,ay,az", [TIME, GX, GY, GZ, AX, AY, AZ]),
@@ -146,7 +146,7 @@ def test_the_printed_command_makes_a_product(
     np.testing.assert_allclose(found, expected, atol=5 * scatter)
 
 
-def test_a_good_log_keeps_its_plain_table_and_tells_the_next_command(
+def test_readable_log_prints_its_table_and_the_next_command(
     tmp_path: Path, monkeypatch, capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -160,7 +160,7 @@ def test_a_good_log_keeps_its_plain_table_and_tells_the_next_command(
     assert call(*words, "--quiet-progress") == 0
 
 
-def test_options_go_into_the_command_and_wrong_ones_end_with_2(
+def test_options_are_part_of_the_command_and_wrong_ones_exit_with_2(
     tmp_path: Path, monkeypatch, capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -199,7 +199,7 @@ def test_a_header_with_an_equals_sign_can_be_mapped(tmp_path: Path, monkeypatch,
     assert call(*words, "--quiet-progress") == 0
 
 
-def test_a_file_without_a_gyro_is_looked_into_all_the_same(tmp_path: Path, capsys) -> None:
+def test_file_without_a_gyro_is_inspected(tmp_path: Path, capsys) -> None:
     path = write(
         tmp_path / "weather.csv", {"time [s]": TIME, "humidity": 50 + 0.01 * TIME, "wind": AX}
     )
@@ -212,7 +212,7 @@ def test_a_file_without_a_gyro_is_looked_into_all_the_same(tmp_path: Path, capsy
     assert call("scan", tmp_path / "empty.csv") == 2
 
 
-def test_files_with_the_same_columns_are_looked_into_once(tmp_path: Path, capsys) -> None:
+def test_files_with_the_same_columns_are_inspected_once(tmp_path: Path, capsys) -> None:
     for place in range(3):
         write(tmp_path / f"run{place}.csv", {"t": TIME, "wx": GX, "wy": GY, "wz": GZ})
     assert call("scan", tmp_path / "run*.csv") == 0
@@ -234,7 +234,7 @@ def test_counts_of_a_fine_gyro_are_scaled_by_the_rotation_of_the_earth(
     assert any("guess" in warning for warning in guess.warnings)
 
 
-def test_a_look_tells_range_scatter_and_rate(tmp_path: Path) -> None:
+def test_inspection_gives_range_scatter_and_rate(tmp_path: Path) -> None:
     path = write(
         tmp_path / "log.csv",
         {
@@ -260,7 +260,7 @@ def test_a_look_tells_range_scatter_and_rate(tmp_path: Path) -> None:
     assert words.rows == 0
 
 
-def test_a_binary_and_a_matlab_file_are_looked_into(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_binary_and_matlab_files_are_inspected(tmp_path: Path, monkeypatch, capsys) -> None:
     from scipy.io import savemat
 
     monkeypatch.chdir(tmp_path)
@@ -279,7 +279,7 @@ def test_a_binary_and_a_matlab_file_are_looked_into(tmp_path: Path, monkeypatch,
 def test_the_unit_is_guessed_from_the_noise_and_the_rotation_of_the_earth(
     kind: str, unit: str
 ) -> None:
-    """Sensors of many sizes at rest, without a word on their unit: right in 89 % or more (of 4000; here 300 are drawn)."""
+    """The unit of sensors at rest is right in at least 89 % of 4000 cases; here 300 are drawn."""
     rng = np.random.default_rng(1)
     factors = {"rad/s": 3600 * DEG_PER_RAD, "deg/s": 3600.0, "deg/h": 1.0}
     right = 0
