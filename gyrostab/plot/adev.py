@@ -1,4 +1,4 @@
-"""The Allan deviation of one window with its band and the fitted terms."""
+"""The Allan deviation of one window with its confidence band and the fitted terms."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ _DASHES = ("--", "-.", ":", (0, (6, 2, 1, 2, 1, 2)), (0, (8, 3)))
 
 @literal_text
 def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
-    """Draw the Allan deviation of one window over averaging time, with its 95 % band and the fitted noise terms.
+    """Draw the Allan deviation of one window, with its 95 % band and the fitted noise terms.
 
     Parameters
     ----------
     product : xarray.Dataset
         Surface or product, ``avar`` [degree2 hour-2] and ``edf`` with dims ``(axis, time, tau)``.
     axis : str
-        The axis.
+        Axis to draw.
     when : datetime-like, optional
-        The window whose centre is nearest; when not given, the best covered window nearest to the
-        middle of the record.
+        Time of the window (the nearest window centre); by default, of the windows with the best
+        coverage, the one nearest to the middle of the record.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
     Raises
     ------
     SchemaError, OptionError
-        When it is no surface, has no such axis, or `when` is outside the record.
+        If `product` is not a surface or has no such axis, or `when` is outside the record.
     """
     check_surface(product)
     (name,) = axis_names(product, axis)
@@ -81,7 +81,7 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
         from gyrostab.allan.fit import refit
 
         estimates = refit(windows).isel(axis=0, time=0)
-        _draw_terms(panel, window, estimates, [other for other in COLOURS if other != colour])
+        _draw_terms(panel, window, estimates, [shade for shade in COLOURS if shade != colour])
     panel.set_xscale("log")
     panel.set_yscale("log")
     shown = deviation[np.isfinite(deviation) & (deviation > 0)]
@@ -109,7 +109,9 @@ def plot_adev(product: xr.Dataset, axis: str, *, when: Any = None) -> Figure:
 
 
 def band(avar: Any, edf: Any) -> tuple[NDArray[Any], NDArray[Any]]:
-    """95 % confidence limits of an Allan variance from its equivalent degrees of freedom (chi-square).
+    """Find the 95 % confidence limits of an Allan variance from its degrees of freedom.
+
+    The estimate is taken as chi-square distributed.
 
     Parameters
     ----------
@@ -160,7 +162,7 @@ def _select_window(part: xr.Dataset, when: Any) -> int:
 
 
 def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours: list[str]) -> None:
-    """Draw the fitted curve as a black line and each observed term as a broken one; name the limits of the others."""
+    """Draw the fitted curve in black and observed terms dashed; list limits in the legend."""
     tau = window["tau"].values
     total = np.zeros(tau.size)
     responses = {"N": "white_response", "Q": "quantization_response", "R": "ramp_response"}
@@ -190,7 +192,7 @@ def _draw_terms(panel: Axes, window: xr.Dataset, estimates: xr.Dataset, colours:
 
 
 def _name_curve(window: xr.Dataset) -> str:
-    """Name the fitted curve, with its misfit."""
+    """Label the fitted curve, with its misfit."""
     from gyrostab.allan.fit import is_described
 
     chi2, dof = float(window["fit_chi2"]), float(window["fit_dof"])

@@ -37,14 +37,15 @@ _NOT, _LIMIT, _SEEN = (
 
 @literal_text
 def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure:
-    """Draw Q, N, B, K and R over time, one panel each: bands are standard errors, triangles pointing down are 95 % upper limits.
+    """Draw Q, N, B, K and R over time, one panel per coefficient.
 
-    Grey stretches are those where the data cannot tell the coefficient; darker grey, on more axes.
+    Bands or bars are standard errors, triangles pointing down are 95 % upper limits. Grey spans are
+    those where the coefficient is not observable; darker grey, on more axes.
 
     Parameters
     ----------
     product : xarray.Dataset
-        Product with the coefficients ``(axis, time)``.
+        Product with coefficients by ``(axis, time)``.
     axis : str, optional
         Draw this axis only.
 
@@ -55,7 +56,7 @@ def plot_coefficients(product: xr.Dataset, *, axis: str | None = None) -> Figure
     Raises
     ------
     SchemaError, OptionError
-        When there are no coefficients, or no such axis.
+        If `product` has no coefficients or no such axis.
     """
     require_coefficients(product)
     names = axis_names(product, axis)
@@ -101,10 +102,10 @@ def _draw_axis(
     few = time.size <= 80
     marks = style | {"markersize": 3.5 if few else 2.5, "linewidth": 1.0}
     panel.plot(time, value, **(marks if few else marks | {"marker": ""}), label=name)
-    if not few:  # a point with no neighbour makes no line
+    if not few:  # a single point does not make a line
         known = np.concatenate([[False], np.isfinite(value), [False]])
-        alone = known[1:-1] & ~known[:-2] & ~known[2:]
-        panel.plot(time[alone], value[alone], **marks | {"linestyle": "none", "markersize": 2.0})
+        single = known[1:-1] & ~known[:-2] & ~known[2:]
+        panel.plot(time[single], value[single], **marks | {"linestyle": "none", "markersize": 2.0})
     if few:
         panel.errorbar(
             time,
@@ -134,7 +135,7 @@ def _draw_axis(
 
 
 def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) -> None:
-    """Log scale where the numbers span more than a decade, else linear from zero."""
+    """Use a log scale if the values span more than a decade, else a linear one from zero."""
     chosen = product.sel(axis=names)
     state = chosen["observable"].sel(term=symbol).values
     shown = (
@@ -205,6 +206,6 @@ def _time_edges(time: NDArray[Any]) -> NDArray[Any]:
 
 
 def _find_runs(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """First index of each run of True, and the index after its last."""
+    """Find the first index of each run of True, and the index after its last."""
     steps = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
     return np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)

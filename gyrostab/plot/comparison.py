@@ -1,4 +1,4 @@
-"""Two logs of the same time beside each other: what something does to a gyro, in four views."""
+"""Compare two logs of the same time, with and without an effect, in four panels."""
 
 from __future__ import annotations
 
@@ -44,26 +44,28 @@ def plot_comparison(
     difference: bool = False,
     coherency: bool = False,
 ) -> Figure:
-    """Draw what an effect does: DAVAR, window means and power spectrum of the first axis, and the first two axes together.
+    """Draw what an effect changes: DAVAR, window means, spectrum, and correlation of two axes.
+
+    The first three panels show the first axis, the last one the first two axes.
 
     Parameters
     ----------
     without, with_it : xarray.Dataset
         Two regular logs with ``rate(axis, time)`` [degree hour-1] on the same stamps, for instance
-        simulated with one seed.
+        simulated with the same seed.
     window, step : str, float or timedelta
         Windows of the dynamic Allan variance, as for `gyrostab.davar`.
     moments : sequence of float or str
-        Times since the start [s] whose Allan deviation is drawn; by default a map of the ratio over
-        time.
+        Times since the start [s] at which to draw the Allan deviation; by default, the ratio over
+        time is drawn as a map.
     driver : str
-        Channel of `with_it` to draw beside the window means.
+        Channel of `with_it` to draw behind the window means.
     difference : bool
-        Draw the window means less those of `without`: for errors of a rate that is large itself.
+        Draw the window means minus those of `without`, for errors of a large rate.
     coherency : bool
-        Draw the coherency of the two axes over frequency, in phase and in quadrature; by default
-        their Allan correlation over averaging time, ``(avar(x + y) - avar(x - y)) / 4`` by the root
-        of their variances, with what chance gives in 95 of 100.
+        Draw the coherency of the two axes over frequency, in phase and in quadrature. By default,
+        draw their Allan correlation over averaging time, ``(avar(x + y) - avar(x - y)) / 4``
+        divided by the root of the product of their variances, with its 95 % range by chance.
 
     Returns
     -------
@@ -72,15 +74,16 @@ def plot_comparison(
     Raises
     ------
     SchemaError, OptionError
-        When they are no logs of rates, differ in axes or length, have one axis only, or lack the
-        channel.
+        If the inputs are not logs of rates, differ in axes or length, have only one axis, or lack
+        the channel.
 
     Examples
     --------
     >>> from gyrostab.simulate import simulate
-    >>> quiet, loud = (simulate({"noise": {"N": n}}, duration="2min", rate=10.0).load() for n in (0.003, 0.006))
-    >>> [panel.get_title() for panel in plot_comparison(quiet, loud, window="20s").axes[:4]]
-    ['σ with / σ without, windows of 20 s', 'Window mean', 'Power spectrum', 'Allan correlation of x and y']
+    >>> logs = [simulate({"noise": {"N": n}}, duration="2min", rate=10.0) for n in (0.003, 0.006)]
+    >>> figure = plot_comparison(logs[0].load(), logs[1].load(), window="20s")
+    >>> [panel.get_title() for panel in figure.axes[:3]]
+    ['σ with / σ without, windows of 20 s', 'Window mean', 'Power spectrum']
     """
     from gyrostab.allan.davar import davar
 
@@ -88,7 +91,8 @@ def plot_comparison(
     shapes = {(signal_name(log), tuple(log["axis"].values), log.sizes["time"]) for log in logs}
     if len(shapes) > 1 or signal_name(without) != "rate" or without.sizes["axis"] < 2:
         raise OptionError(
-            f"plot_comparison needs two logs of rates with the same two axes or more, and as many samples; not {shapes}"
+            "plot_comparison needs two logs of rates with the same axes, at least two, and the "
+            f"same number of samples; not {shapes}"
         )
     if driver and driver not in with_it:
         raise OptionError(
@@ -130,7 +134,7 @@ def plot_comparison(
 
 
 def _time_since_start(log: xr.Dataset, times: Any) -> tuple[Any, str]:
-    """Times since the start of the log, and their unit: hours for long logs, else minutes."""
+    """Convert times to hours since the start for long logs, else to minutes; with the unit."""
     hour = np.timedelta64(int(HOUR) * 10**9, "ns")
     start, end = log["time"].values[[0, -1]]
     unit, word = (hour, "h") if end - start > 1.5 * hour else (hour / 60, "min")
@@ -178,7 +182,7 @@ def _draw_ratio(panel: Axes, logs: Any, pair: Any) -> None:
     bar = panel.figure.colorbar(mesh, ax=panel, extend="both", pad=0.02)
     bar.minorticks_off()
     steps = (1000, 300, 100, 30, 10, 5, 3, 2, 1.5, 1.2, 1.1, 1.05)
-    tick = next(one for one in steps if one <= reach)
+    tick = next(step for step in steps if step <= reach)
     bar.set_ticks([1 / tick, 1, tick], labels=[f"1/{tick:g}", "1", f"{tick:g}"])
 
 
@@ -205,7 +209,7 @@ def _draw_means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
             label="data lost",
         )
     panel.set(
-        title="Window mean, less that without" if difference else "Window mean",
+        title="Window mean minus that without" if difference else "Window mean",
         xlabel=f"time [{word}]",
         ylabel="[deg/h]",
     )
@@ -213,22 +217,22 @@ def _draw_means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
 
 
 def _draw_channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
-    """Dot a channel behind the window means, on a scale of its own."""
-    twin = panel.twinx()
+    """Draw a channel behind the window means, on a separate scale."""
+    overlay = panel.twinx()
     stamps, low, high = thin(log[driver], columns=400)
     times, _ = _time_since_start(log, stamps)
     if np.nanquantile(high - low, 0.8) <= 0.05 * (np.nanmax(high) - np.nanmin(low)):
-        twin.plot(times, (low + high) / 2, ":", color=COLOURS[1], lw=1.2)
+        overlay.plot(times, (low + high) / 2, ":", color=COLOURS[1], lw=1.2)
     else:  # faster than the columns of the figure
-        twin.fill_between(times, low, high, step="mid", color=COLOURS[1], alpha=0.3, lw=0.6)
-    twin.set_ylabel(
+        overlay.fill_between(times, low, high, step="mid", color=COLOURS[1], alpha=0.3, lw=0.6)
+    overlay.set_ylabel(
         f"{driver.replace('_', ' ')} {unit_label(log[driver].attrs.get('units'))}", color=COLOURS[1]
     )
-    panel.set(zorder=twin.get_zorder() + 1, facecolor="none")
+    panel.set(zorder=overlay.get_zorder() + 1, facecolor="none")
 
 
 def _interpolate_gaps(log: xr.Dataset) -> tuple[Array, Array]:
-    """The first two axes, straight across the gaps: for spectra."""
+    """Interpolate the first two axes over the gaps, for spectra."""
     rows = log["rate"].transpose("axis", "time").values[:2].astype(float)
     for row in rows:
         bad = np.isnan(row)

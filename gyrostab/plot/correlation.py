@@ -27,16 +27,16 @@ _MAX_POINTS = 3000
 def plot_correlation(
     result: xr.Dataset, *, axis: str | None = None, driver: str | None = None
 ) -> Figure:
-    """Draw every variable against the channel at its lag, one row a variable and one column an axis.
+    """Draw every variable against the channel at its lag, by variable (rows) and axis (columns).
 
-    Filled triangles up are windows in which the channel rises, open triangles down those in which
-    it falls. The band holds the slopes that the record allows, about the middle of the data; a
-    line, the sensitivity, is drawn only where a coupling is claimed.
+    Filled triangles pointing up are windows in which the channel rises, open triangles pointing
+    down those in which it falls. The band shows the interval of slopes, about the centre of the
+    data; a line, the sensitivity, is drawn only for the verdict ``coupled``.
 
     Parameters
     ----------
     result : xarray.Dataset
-        Of `gyrostab.correlate`.
+        Result of `gyrostab.correlate`.
     axis : str, optional
         Draw this axis only.
     driver : str, optional
@@ -49,17 +49,19 @@ def plot_correlation(
     Raises
     ------
     SchemaError, OptionError
-        When it is no correlation, or has no such axis.
+        If `result` is not a correlation or has no such axis.
     """
     if "coupling_verdict" not in result:
         raise SchemaError(
-            "this dataset holds no correlation; call gyrostab.correlate (or 'gyrostab correlate') first"
+            "this dataset holds no correlation; call gyrostab.correlate (or 'gyrostab correlate') "
+            "first"
         )
     names = axis_names(result, axis)
     driver = str(result["driver"].values[0]) if driver is None else driver
     if driver not in result["driver"].values:
         raise SchemaError(
-            f"the correlation has no driver {driver!r}; it has {', '.join(map(str, result['driver'].values))}"
+            f"the correlation has no driver {driver!r}; it has "
+            f"{', '.join(map(str, result['driver'].values))}"
         )
     variables = [str(name) for name in result["variable"].values]
     figure = new_figure(1.0 + 3.4 * len(names), 1.2 + 2.5 * len(variables))
@@ -127,7 +129,7 @@ def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> No
         panel.text(
             0.5,
             0.5,
-            f"{variable.replace('_', ' ')} is in no window\nabove the other noise",
+            f"{variable.replace('_', ' ')} is not observed\nin any window",
             ha="center",
             va="center",
             transform=panel.transAxes,
@@ -152,17 +154,17 @@ def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> No
 
 
 def _verdict_text(verdict: str, lag: float, p: float) -> str:
-    """What is said above a panel; a p-value only where it is one of the whole story."""
+    """Write the title of a panel; the p-value only where it is that of the verdict."""
     late = f", {lag:.3g} s late" if lag else ""
     if verdict == "cannot_tell":
         return "cannot tell"
     if verdict == "not_told_apart":
-        return f"not told apart from another cause{late}"
+        return f"coupling or another cause{late}"
     return f"{verdict.replace('_', ' ')}{late}, p {'' if p < 1e-4 else '= '}{format_p_value(p)}"
 
 
 def _shift_driver(driver: xr.DataArray, lag: float) -> tuple[Any, Any]:
-    """The driver one lag earlier at every window, and whether it rises there; NaN before the record and in holes."""
+    """Shift the driver by the lag, and find where it rises; NaN before the record and in gaps."""
     seconds = (driver["time"].values - driver["time"].values[0]) / np.timedelta64(1, "s")
     values = driver.values.astype(np.float64)
     known = np.isfinite(values)
@@ -194,6 +196,6 @@ def _legend_handles(driver: str, level: float) -> list[Any]:
             facecolor="#8c8c8c",
             alpha=0.3,
             edgecolor="black",
-            label=f"slopes the record allows ({level:.0%}); line: coupled",
+            label=f"{level:.0%} interval of the slope; line: coupled",
         ),
     ]

@@ -26,7 +26,7 @@ __all__ = ["product_figures", "save_figures"]
 
 
 def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
-    """List the figures of a product by name; each is drawn when it is called.
+    """List the figures of a product by name, as functions that draw them.
 
     Parameters
     ----------
@@ -36,14 +36,14 @@ def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
     Returns
     -------
     dict
-        ``coefficients``, ``davar``, ``davar_change``, ``temperature`` where there is one, and for
-        each axis ``adev_<axis>`` and ``davar_3d_<axis>``; the surface in three dimensions only
-        where there are two windows and two averaging times at least.
+        ``coefficients``, ``davar``, ``davar_change``, ``temperature`` if the product holds one, and
+        for each axis ``adev_<axis>`` and ``davar_3d_<axis>`` (the latter only with at least two
+        windows and two averaging times).
 
     Raises
     ------
     SchemaError
-        When it is no product.
+        If `product` is not a product.
     """
     check_product(product)
     figures: dict[str, Callable[[], Figure]] = {
@@ -65,31 +65,31 @@ def product_figures(product: xr.Dataset) -> dict[str, Callable[[], Figure]]:
 def save_figures(
     product: xr.Dataset, folder: str | os.PathLike[str], *, dpi: int = 150, overwrite: bool = False
 ) -> list[Path]:
-    """Write all the figures of a product into a folder, as PNG.
+    """Write all figures of a product into a folder, as PNG files.
 
     Parameters
     ----------
     product : xarray.Dataset
         What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens.
     folder : path-like
-        Where to write; it is made when it does not exist.
+        Folder to write to; created if it does not exist.
     dpi : int
-        Pixels per inch; 150 is enough for print.
+        Pixels per inch; 150 suffices for print.
     overwrite : bool
         Replace figures that exist.
 
     Returns
     -------
     list of pathlib.Path
-        The files, named as in `product_figures`.
+        Files, named as in `product_figures`.
 
     Raises
     ------
     SchemaError
-        When it is no product.
+        If `product` is not a product.
     OutputError
-        When a figure exists and `overwrite` is not given, or when the folder cannot be written to;
-        none is written then.
+        If a figure exists and `overwrite` is False, or the folder cannot be written to; then no
+        figure is written.
     """
     folder = Path(folder)
     figures = {

@@ -1,4 +1,4 @@
-"""The recorded signal of every axis, and the channels below."""
+"""The recorded signal of every axis, with the channels below."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def plot_signal(
     channels: Sequence[str] | None = None,
     columns: int = 1500,
 ) -> Figure:
-    """Draw the gyro signal of all axes with the channels below; gaps are grey.
+    """Draw the gyro signal of all axes, with the channels below and gaps in grey.
 
-    A long record is thinned to the smallest and largest sample of every column, so no spike is
-    lost; it is read block by block.
+    A long record is reduced to the smallest and largest sample of every column, so spikes stay
+    visible. It is read block by block.
 
     Parameters
     ----------
@@ -52,9 +52,9 @@ def plot_signal(
     axis : str, optional
         Draw this axis only.
     channels : sequence of str, optional
-        Channels to draw; all of them when not given.
+        Channels to draw; all by default.
     columns : int
-        Number of columns that a record is thinned to.
+        Number of columns to which a long record is reduced.
 
     Returns
     -------
@@ -63,13 +63,13 @@ def plot_signal(
     Raises
     ------
     OptionError
-        When the axis or a channel is not in the log.
+        If the axis or a channel is not in the log.
 
     Examples
     --------
     >>> from gyrostab.time.grid import time_coordinate
-    >>> values = np.zeros((1, 100)) + 7.0
-    >>> log = xr.Dataset({"rate": (("axis", "time"), values, {"units": "degree hour-1"})}, coords={"axis": ["x"]})
+    >>> rate = xr.DataArray(np.full((1, 100), 7.0), dims=("axis", "time"), coords={"axis": ["x"]})
+    >>> log = xr.Dataset({"rate": rate.assign_attrs(units="degree hour-1")})
     >>> plot_signal(log.assign_coords(time_coordinate(0, 100.0, 100))).axes[0].get_ylabel()
     'x [deg/h]'
     """
@@ -97,7 +97,7 @@ def plot_signal(
     _shade_gaps(list(panels), log, columns)
     what = "Rotation rate" if name == "rate" else "Rotation angle"
     rate = log.attrs.get("sampling_rate_hz")
-    figure.suptitle(f"{what} as recorded" + (f", {float(rate):g} samples a second" if rate else ""))
+    figure.suptitle(f"{what} as recorded" + (f", {float(rate):g} Hz" if rate else ""))
     time_axis(panels[-1], log["time"][[0, -1]].values)
     stack_panels(panels)
     return figure
@@ -106,19 +106,19 @@ def plot_signal(
 def thin(
     values: xr.DataArray, *, columns: int = 1500
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Smallest and largest sample of every column of a long record.
+    """Find the smallest and largest sample of every column of a long record.
 
     Parameters
     ----------
     values : xarray.DataArray
         One-dimensional, on a time axis; NaN where missing.
     columns : int
-        Number of columns; a record with fewer samples than twice that stays as it is.
+        Number of columns; a record with fewer than twice as many samples is returned unchanged.
 
     Returns
     -------
     times, low, high : ndarray
-        Time of the first sample of the column, extremes; NaN where the whole column is missing.
+        Time of the first sample of each column, and the extremes; NaN if all samples are missing.
 
     Examples
     --------
@@ -162,7 +162,7 @@ def _shade_gaps(panels: list[Axes], log: xr.Dataset, columns: int) -> None:
 
 
 def _find_gaps(log: xr.Dataset, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Start and end of the gaps: from the table when the log has one, else where a whole column is missing on all axes."""
+    """Find start and end of the gaps: from the gap table, else columns missing on all axes."""
     if "gap_start" in log.variables and "gap_end" in log.variables:
         return log["gap_start"].values, log["gap_end"].values
     signal = log[signal_name(log)]

@@ -1,4 +1,4 @@
-"""What the figures share: colours that colour-blind readers tell apart, unit labels, time axes."""
+"""What the figures share: colours safe for colour-blind readers, unit labels, time axes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ __all__ = [
 
 P = ParamSpec("P")
 
-#: Okabe and Ito's palette, without its yellow, which vanishes in print.
+#: Palette of Okabe and Ito, without its yellow, which is hard to see in print.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = ("o", "s", "D", "P", "X", "*")
 GREY = "#8c8c8c"
@@ -61,7 +61,7 @@ _LABELS = {
 
 
 def unit_label(units: Any) -> str:
-    """Give the field's spelling of a unit, in brackets; empty for a plain number.
+    """Spell a unit in the customary way, in brackets; empty for a dimensionless number.
 
     Examples
     --------
@@ -73,7 +73,7 @@ def unit_label(units: Any) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write a length of time for people.
+    """Format a length of time.
 
     Examples
     --------
@@ -87,7 +87,7 @@ def duration(seconds: float) -> str:
 
 
 def unit_of_time(seconds: float) -> tuple[float, str]:
-    """The largest unit of which a length of time holds three: its seconds, and its name.
+    """Choose the largest unit that is at most a third of a length of time: seconds and name.
 
     Examples
     --------
@@ -105,7 +105,7 @@ def unit_of_time(seconds: float) -> tuple[float, str]:
 
 
 def log_edges(values: NDArray[Any]) -> NDArray[Any]:
-    """Edges of cells around rising values on a logarithmic axis: half-way between them."""
+    """Find the edges of cells around rising values, half-way between them in the logarithm."""
     logs = np.log(values)
     inner = (logs[1:] + logs[:-1]) / 2
     first, last = (logs[1] - logs[0], logs[-1] - logs[-2]) if values.size > 1 else (1.0, 1.0)
@@ -113,7 +113,7 @@ def log_edges(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def window_text(product: xr.Dataset) -> str:
-    """How the windows lie, for a title; empty when the attributes do not say."""
+    """Describe window and step for a title; empty if the attributes are missing."""
     window, step = product.attrs.get("window_s"), product.attrs.get("step_s")
     return (
         ""
@@ -123,7 +123,7 @@ def window_text(product: xr.Dataset) -> str:
 
 
 def axis_names(dataset: xr.Dataset, axis: str | None) -> list[str]:
-    """List the axes to draw; raise `OptionError` when `axis` is not one of them."""
+    """List the axes to draw; raise `OptionError` if `axis` is not in the data."""
     names = [str(name) for name in dataset["axis"].values]
     if axis is None:
         return names
@@ -133,23 +133,26 @@ def axis_names(dataset: xr.Dataset, axis: str | None) -> list[str]:
 
 
 def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
-    """Colour and marker of an axis, the same in every figure."""
+    """Choose colour and marker of an axis, the same in every figure."""
     number = [str(name) for name in dataset["axis"].values].index(axis)
     return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 
 def new_figure(width: float, height: float, *, stacked: bool = False) -> Figure:
-    """Make an empty figure [inches] that lays itself out, or leaves that to `stack_panels`."""
+    """Make an empty figure [inches] with automatic layout, or for `stack_panels`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout=None if stacked else "constrained", dpi=_DPI)
-    FigureCanvasAgg(figure)  # attaches itself; text can be measured from now on
+    FigureCanvasAgg(figure)  # attaches to the figure, so that text can be measured
     return figure
 
 
 def literal_text(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Show the texts of the figures that a function draws as they are: names and units of a log are no formulas of matplotlib."""
+    """Decorate a drawing function so that no text of its figure is parsed as mathtext.
+
+    Names and units of a log may hold dollar signs.
+    """
 
     @functools.wraps(draw)
     def draw_literally(*arguments: P.args, **options: P.kwargs) -> Figure:
@@ -161,7 +164,7 @@ def literal_text(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def _keep_literal(artist: Any) -> None:
-    """Let no text of an artist be parsed, apart from the tick labels, which may hold powers of ten."""
+    """Turn off mathtext for an artist, except for tick labels, which may hold powers of ten."""
     from matplotlib.axis import Axis
     from matplotlib.text import Text
 
@@ -181,21 +184,21 @@ def stack_panels(
     below: float = 0.0,
     right: float = 0.2,
 ) -> None:
-    """Lay out panels that stand above each other, with their y labels in one line left of the widest tick label.
+    """Lay out panels in one column, with aligned y labels.
 
-    The margins are known beforehand, so nothing is measured but the tick labels; matplotlib's own
-    engine measures every artist, twice.
+    The margins are known, so only the tick labels are measured; the layout engine of matplotlib
+    measures every artist, twice.
 
     Parameters
     ----------
     panels : sequence of matplotlib.axes.Axes
-        All panels of a figure that was made with ``stacked=True``, their labels set.
+        All panels of a figure made with ``stacked=True``, with their labels set.
     between : float
-        Distance from one panel to the next [inches].
+        Distance between panels [inches].
     below : float
-        Room for a legend under the label of the time axis [inches].
+        Space for a legend under the label of the time axis [inches].
     right : float
-        Room to the right of the panels [inches].
+        Space to the right of the panels [inches].
     """
     from matplotlib.transforms import ScaledTranslation
 
@@ -229,7 +232,7 @@ def stack_panels(
 
 
 def label_log_axis(axis: Axis, low: float, high: float) -> None:
-    """Label a logarithmic axis that shows `low` to `high`: powers of ten, or 1, 2, 5 where these would be too few."""
+    """Label a logarithmic axis from `low` to `high` by powers of ten; 1, 2, 5 over a short span."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_minor_formatter(NullFormatter())
@@ -241,18 +244,18 @@ def label_log_axis(axis: Axis, low: float, high: float) -> None:
 def save_png(
     figure: Figure, target: str | os.PathLike[str] | IO[bytes], *, dpi: int = _DPI, colours: int = 0
 ) -> None:
-    """Write a figure as PNG in a single pass; ``figure.savefig`` makes two, and lays the figure out in each.
+    """Write a figure as PNG, drawing it once; ``figure.savefig`` draws and lays it out twice.
 
     Parameters
     ----------
     figure : matplotlib.figure.Figure
-        The figure.
+        Figure to write.
     target : path-like or binary file
-        Where to write.
+        File to write to.
     dpi : int
         Pixels per inch.
     colours : int
-        So many colours at most, 2 to 256, for a file a third as large; all of them when 0.
+        Largest number of colours, 2 to 256, for a file a third as large; 0 keeps all.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -270,7 +273,7 @@ def save_png(
 
 
 def embedded(figure: Figure, alt: str, caption: str) -> dict[str, str]:
-    """A figure for a page that is one file: its PNG in base 64, what it shows in a few words, and how to read it."""
+    """Prepare a figure for a self-contained page: PNG in base 64, short description, caption."""
     buffer = io.BytesIO()
     save_png(figure, buffer)
     return {
@@ -281,7 +284,7 @@ def embedded(figure: Figure, alt: str, caption: str) -> dict[str, str]:
 
 
 def time_axis(ax: Axes, times: NDArray[Any]) -> None:
-    """Write dates and times of day under the panel, as short as they can be told apart."""
+    """Label the time axis with dates and times, as short as is unambiguous."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
     locator = AutoDateLocator(minticks=4, maxticks=9)  # type: ignore[no-untyped-call]
@@ -301,7 +304,7 @@ def shade_spans(
     alpha: float = 0.35,
     hatch: str | None = None,
 ) -> None:
-    """Grey the stretches of time from `starts` to `ends` (datetime64) over the whole height of the panel."""
+    """Shade the spans from `starts` to `ends` (datetime64) over the full height of the panel."""
     from matplotlib.dates import date2num
 
     first, last = (np.atleast_1d(date2num(np.asarray(edge))) for edge in (starts, ends))  # type: ignore[no-untyped-call]
@@ -321,12 +324,14 @@ def shade_spans(
 
 
 def require_coefficients(product: xr.Dataset) -> None:
-    """Raise `SchemaError` when the dataset holds a surface only."""
+    """Raise `SchemaError` if the dataset has no coefficients."""
     if not isinstance(product, xr.Dataset):
         raise SchemaError(
-            f"this is a {type(product).__name__}, not a product: give what gyrostab.fit_noise returns"
+            f"this is a {type(product).__name__}, not a product: give what gyrostab.fit_noise "
+            "returns"
         )
     if "observable" not in product.variables:
         raise SchemaError(
-            "this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') first"
+            "this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') "
+            "first"
         )

@@ -1,4 +1,4 @@
-"""The dynamic Allan deviation over time and averaging time: heat map and three-dimensional surface."""
+"""The dynamic Allan deviation as heat map and three-dimensional surface."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_davar", "plot_davar_3d"]
 
 CMAP = "viridis"
-CHANGE_CMAP = "PuOr_r"  # two hues that colour-blind readers tell apart, white where nothing changes
+CHANGE_CMAP = "PuOr_r"  # safe for colour-blind readers, white where nothing changes
 _WEIGHTED = ESTIMATORS.index("weighted_clusters")
 
 
@@ -37,10 +37,10 @@ _WEIGHTED = ESTIMATORS.index("weighted_clusters")
 def plot_davar(
     product: xr.Dataset, *, axis: str | None = None, relative: bool = False, columns: int = 1500
 ) -> Figure:
-    """Draw the Allan deviation as colour over time and averaging time, one panel an axis.
+    """Draw the Allan deviation as colour over time and averaging time, one panel per axis.
 
-    Cells with no estimate are hatched grey; cells that were estimated from incomplete clusters
-    carry white dots.
+    Cells without an estimate are hatched grey; cells estimated from incomplete clusters are marked
+    with white dots.
 
     Parameters
     ----------
@@ -49,9 +49,10 @@ def plot_davar(
     axis : str, optional
         Draw this axis only.
     relative : bool
-        Draw the ratio to the median over time of the same averaging time, which shows what changes.
+        Draw the ratio to the median over time at each averaging time, to show changes.
     columns : int
-        With more windows than that, neighbouring windows are averaged in Allan variance.
+        Largest number of columns; if there are more windows, neighbouring windows are averaged in
+        Allan variance.
 
     Returns
     -------
@@ -60,7 +61,7 @@ def plot_davar(
     Raises
     ------
     SchemaError, OptionError
-        When it is no surface, or has no such axis.
+        If `product` is not a surface or has no such axis.
     """
     check_surface(product)
     from matplotlib.colors import LogNorm
@@ -113,7 +114,7 @@ def plot_davar(
             [
                 "Change of the dynamic Allan deviation" if relative else "Dynamic Allan deviation",
                 window_text(product),
-                f"mean of {merged} windows a column" if merged > 1 else "",
+                f"{merged} windows averaged per column" if merged > 1 else "",
             ],
         )
     )
@@ -133,9 +134,9 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
     product : xarray.Dataset
         Surface or product.
     axis : str, optional
-        The axis; the first one when not given.
+        Axis to draw; the first by default.
     columns : int
-        Most windows to draw; more are averaged in Allan variance.
+        Largest number of windows to draw; more are averaged in Allan variance.
 
     Returns
     -------
@@ -144,7 +145,7 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
     Raises
     ------
     SchemaError, OptionError
-        When it is no surface, or has no such axis.
+        If `product` is not a surface or has no such axis.
     """
     check_surface(product)
     from matplotlib.ticker import FuncFormatter, MaxNLocator
@@ -152,7 +153,8 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
     name = axis_names(product, axis)[0]
     if min(product.sizes["time"], product.sizes["tau"]) < 2:
         raise OptionError(
-            "a surface needs at least two windows and two averaging times; draw this product with plot_adev"
+            "a surface needs at least two windows and two averaging times; draw this product with "
+            "plot_adev"
         )
     ((deviation, _),), merged = _merge_windows(product, [name], columns)
     time = product["time"].values
@@ -183,7 +185,7 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
     for scale in (panel.yaxis, panel.zaxis):
         scale.set_major_locator(MaxNLocator(nbins=6, integer=True))
         scale.set_major_formatter(FuncFormatter(lambda power, _: f"$10^{{{power:.0f}}}$"))
-    # the steep side of short averaging times goes to the back and hides nothing
+    # the steep side of short averaging times goes to the back, where it hides nothing
     panel.invert_yaxis()
     panel.view_init(elev=30, azim=-62)
     panel.set_box_aspect((1.5, 1.15, 0.85), zoom=1.0)
@@ -196,7 +198,15 @@ def plot_davar_3d(product: xr.Dataset, *, axis: str | None = None, columns: int 
 def _merge_windows(
     product: xr.Dataset, names: list[str], columns: int
 ) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], int]:
-    """Allan deviation (time, tau) and the mark of weighted cells for each axis, and how many windows one column holds."""
+    """Average windows to at most `columns`.
+
+    Returns
+    -------
+    cells : list of (ndarray, ndarray)
+        For each axis the Allan deviation and the mask of weighted cells, shape (time, tau).
+    merged : int
+        Windows per column.
+    """
     size = product.sizes["time"]
     merged = max(1, -(-size // columns))
     edges = np.arange(0, size, merged)
@@ -209,7 +219,7 @@ def _merge_windows(
         total = np.add.reduceat(np.nan_to_num(avar, nan=0.0), edges, axis=0)
         known = (number > 0) & (
             total >= 0.0
-        )  # the recursion as printed drifts below zero where there is next to no noise
+        )  # the published recursion drifts below zero where there is almost no noise
         mean = np.divide(total, number, out=np.full_like(total, np.nan), where=known)
         cells.append((np.sqrt(mean), weighted & np.isfinite(mean)))
     return cells, merged
@@ -234,10 +244,10 @@ def _colour_limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float
 
 
 def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> None:
-    """Draw the colour bar into the room that the panels leave on the right."""
-    room = figure.subplotpars
-    place = figure.add_axes((room.right + 0.012, room.bottom, 0.025, room.top - room.bottom))
-    bar = figure.colorbar(mesh, cax=place, label=label, extend="both")
+    """Draw the colour bar to the right of the panels."""
+    margins = figure.subplotpars
+    area = (margins.right + 0.012, margins.bottom, 0.025, margins.top - margins.bottom)
+    bar = figure.colorbar(mesh, cax=figure.add_axes(area), label=label, extend="both")
     if relative:
         low, high = mesh.get_clim()
         ticks = [
@@ -250,7 +260,7 @@ def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> Non
 
 
 def _time_edges(time: NDArray[Any], merged: int, step: Any) -> NDArray[Any]:
-    """Edges of the columns: half-way between window centres."""
+    """Find the edges of the columns, half-way between window centres."""
     stamps = time.astype("datetime64[ns]").astype(np.int64)
     half = (
         int(float(step) * 5e8)
@@ -268,7 +278,7 @@ def _time_edges(time: NDArray[Any], merged: int, step: Any) -> NDArray[Any]:
 def _mark_weighted(
     panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], weighted: NDArray[Any]
 ) -> None:
-    """Put dots on the weighted cells, thinned to what the eye can separate."""
+    """Mark weighted cells with dots, thinned so that they stay distinguishable."""
     columns = np.arange(0, weighted.shape[0], max(1, weighted.shape[0] // 120))
     rows = np.arange(0, weighted.shape[1], max(1, weighted.shape[1] // 25))
     chosen = np.zeros_like(weighted)

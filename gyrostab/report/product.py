@@ -136,8 +136,8 @@ def _summarise_record(product: xr.Dataset) -> str:
     axis_text = f"{len(axes)} gyro {'axes' if len(axes) != 1 else 'axis'} ({', '.join(axes)})"
     length = duration(float((end - start) / np.timedelta64(1, "s")))
     return (
-        f"{axis_text}{speed}{origin}, {length} from {_stamp_text(start)} to {_stamp_text(end)} UTC, "
-        f"analysed in {product.sizes['time']} windows."
+        f"{axis_text}{speed}{origin}, {length} from {_stamp_text(start)} to {_stamp_text(end)} "
+        f"UTC, analysed in {product.sizes['time']} windows."
     )
 
 

@@ -401,7 +401,7 @@ def test_simulate_like_and_the_report_of_a_thinned_log(tmp_path):
     np.testing.assert_array_equal(np.isnan(like.rate), np.isnan(x[:, ::2]))
     # white noise of N deg/sqrt(h): standard deviation N * 60 * sqrt(rate)
     assert float(like.rate.std()) == pytest.approx(0.003 * 60 * np.sqrt(50.0), rel=0.05)
-    assert "50 samples a second" in gyrostab.plot_signal(thinned).get_suptitle()
+    assert "50 Hz" in gyrostab.plot_signal(thinned).get_suptitle()
     assert gyrostab.regularise(thinned).attrs["sampling_rate_hz"] == 50.0
     opened = gyrostab.open_log(gyrostab.to_zarr(thinned, tmp_path / "log.zarr"))
     check_against(opened, x[:, ::2], rate=50.0, window=400)

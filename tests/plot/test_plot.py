@@ -40,7 +40,7 @@ def test_signal_has_a_panel_with_unit_for_each_axis_and_channel():
         "pump [gal/min]",
     ]
     assert figure.axes[-1].get_xlabel() == "time (UTC)"
-    assert "300 samples a second" in figure.get_suptitle()
+    assert "300 Hz" in figure.get_suptitle()
 
 
 def test_signal_of_chosen_axis_and_channels():
