@@ -1,4 +1,4 @@
-"""The slow twins: every fast path of the package written once more, plainly, in extended precision."""
+"""Reference implementations: slow, plain versions of the fast paths, in extended precision."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def direct_surface(
     *,
     shifts: list[int] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Allan variance and number of terms of every window of a rate record, by the definition; NaN is a gap."""
+    """Allan variance and number of terms of every window of a rate record, by definition."""
     n_windows = (x.size - window) // step + 1
     avar = np.full((n_windows, len(ks)), np.nan)
     count = np.zeros((n_windows, len(ks)), dtype=np.int64)
@@ -43,7 +43,7 @@ def direct_surface(
 def direct_angle_surface(
     theta: NDArray[np.float64], window: int, step: int, ks: list[int], interval: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The same for a record of cumulative angles, `window` intervals and so ``window + 1`` angles to a window."""
+    """The same for a record of cumulative angles, with ``window + 1`` angles per window."""
     n_windows = (theta.size - 1 - window) // step + 1
     avar = np.full((n_windows, len(ks)), np.nan)
     count = np.zeros((n_windows, len(ks)), dtype=np.int64)
@@ -61,7 +61,7 @@ def direct_angle_surface(
 def cluster_cell(
     x: NDArray[np.float64], k: int, *, stride: int = 1, first: int = 0
 ) -> dict[str, float]:
-    """One cell by weighted cluster means with a matrix: a row per pair of clusters at least half full, a column per sample.
+    """One cell by weighted cluster means, from a matrix of pairs of clusters (rows) by samples.
 
     Pairs begin where ``first + m`` is a multiple of `stride`. Degrees of freedom are those under
     white noise.
@@ -106,7 +106,7 @@ def fit_window_plainly(
     factor: NDArray[np.float64],
     tables: Any,
 ) -> dict[str, NDArray[np.float64]]:
-    """Iterated non-negative generalised least squares of one window with numpy's and scipy's solvers, without any thrift.
+    """Iterated non-negative generalised least squares of one window, with numpy and scipy.
 
     Per term the squared coefficient, its standard error, its estimate free of sign, and the
     variance of that without the term, its growth with the term and with the square of the term;

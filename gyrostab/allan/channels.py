@@ -1,4 +1,4 @@
-"""The channels of a log (temperature, vibration ...) averaged over the windows of a surface."""
+"""Averages of the channels of a log (temperature, vibration ...) over the windows of a surface."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from gyrostab.units import INNER
 __all__ = ["window_channels"]
 
 TEMPERATURE_RATE = "K hour-1"
-#: Values of a channel up to which those of all windows of a part are read at once.
+#: Largest number of values of a channel that are read at once for all windows of a part.
 _MAX_VALUES_READ_AT_ONCE = 2**20
 
 
 def window_channels(
     log: xr.Dataset, window: int, step: int, groups: Sequence[slice], *, part: slice | None = None
 ) -> dict[str, xr.Variable]:
-    """Mean of every channel over each window, and the rate of change of every temperature.
+    """Average every channel over each window, and find the rate of change of every temperature.
 
     Parameters
     ----------
     log : xarray.Dataset
         Regular log; a channel lies on ``time`` or on its own ``time_<channel>``.
     window, step : int
-        Length of the windows, and from one to the next [samples of the log].
+        Length and step of the windows [samples of the log].
     groups : sequence of slice
-        Windows that are computed together, so that a long channel is never held whole; all windows,
-        in order.
+        Windows that are computed together, so that a long channel is never loaded whole; all
+        windows, in order.
     part : slice, optional
-        Only these windows, at once and in the calling thread.
+        Compute only these windows, immediately and in the calling thread.
 
     Returns
     -------
     dict of str to xarray.Variable
         ``<channel>(time)`` [unit of the channel] and, for temperatures, ``<channel>_rate(time)`` [K
-        hour-1]; dask where the channel is, and no part is asked for.
+        hour-1]; dask arrays if the channel is one and `part` is None.
     """
     out: dict[str, xr.Variable] = {}
     rate, start = float(log.attrs["sampling_rate_hz"]), first_stamp(log)
@@ -111,7 +111,7 @@ def _average_windows(
     ends: Callable[[slice], tuple[NDArray[np.int64], NDArray[np.int64]]],
     part: slice | None,
 ) -> tuple[Any, Any]:
-    """Mean and slope per window, group by group; `ends` gives the bounds of a group's windows in the channel."""
+    """Compute mean and slope of each window; `ends` gives the bounds of the windows of a group."""
     lazy = isinstance(data, da.Array) and part is None
     kept = slice(0, groups[-1].stop) if part is None else part
     chosen = [group for group in groups if group.start < kept.stop and group.stop > kept.start]
@@ -125,10 +125,10 @@ def _average_windows(
         low, high = int(a[0]), int(b[-1])
         piece = None if stamps is None else stamps[low:high]
         if lazy:
-            one = dask.delayed(_fit_trends, pure=False)(
+            trends = dask.delayed(_fit_trends, pure=False)(
                 data[low:high], piece, rate, a - low, b - low
             )
-            parts.append(da.from_delayed(one, (2, a.size), dtype=np.float64))
+            parts.append(da.from_delayed(trends, (2, a.size), dtype=np.float64))
         else:
             values = (
                 read_slice(data, low, high)

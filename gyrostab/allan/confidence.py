@@ -15,18 +15,18 @@ __all__ = ["confidence_interval"]
 
 
 def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Dataset:
-    """Interval that holds the true Allan variance of each cell.
+    """Compute the confidence interval of the Allan variance of each cell.
 
-    ``edf * avar / true`` is taken as chi-square with ``edf`` degrees of freedom. Over gaps the true
-    value is the law as seen through them (``white_response``, ``quantization_response``,
-    ``ramp_response``).
+    ``edf * avar / true`` is taken as chi-square distributed with ``edf`` degrees of freedom. In
+    windows with gaps the true value is the law times its response to the gaps (``white_response``,
+    ``quantization_response``, ``ramp_response``).
 
     Parameters
     ----------
     surface : xarray.Dataset
         Surface or product with ``avar`` [degree2 hour-2] and ``edf``.
     level : float
-        Probability, between 0 and 1.
+        Confidence level, between 0 and 1.
 
     Returns
     -------
@@ -37,9 +37,9 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     Raises
     ------
     SchemaError
-        When it is no surface.
+        If `surface` is not a surface.
     OptionError
-        When `level` is no probability.
+        If `level` is not between 0 and 1.
 
     References
     ----------
@@ -59,7 +59,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     if not 0.0 < level < 1.0:
         raise OptionError(f"level={level!r}: give a probability between 0 and 1, such as 0.95")
     out = xr.Dataset()
-    for name, side, words in (
+    for name, side, end in (
         ("avar_lower", 0.5 + level / 2, "lower"),
         ("avar_upper", 0.5 - level / 2, "upper"),
     ):
@@ -74,7 +74,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
         )
         out[name] = limit.assign_attrs(
             units=surface["avar"].attrs["units"],
-            long_name=f"{words} end of the {level:.0%} interval of the Allan variance",
+            long_name=f"{end} end of the {level:.0%} interval of the Allan variance",
         )
     return out
 

@@ -1,4 +1,4 @@
-"""Dynamic Allan variance: a log to a surface ``(axis, time, tau)``. All chunking and every dask call of it live here."""
+"""Dynamic Allan variance of a log as a surface ``(axis, time, tau)``, with all dask calls."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from gyrostab.time.grid import first_stamp, grid_times
 
 __all__ = ["davar", "davar_part", "davar_parts"]
 
-#: Variables by axis and window, in the order of the arrays that `_compute_unit` returns.
+#: Variables by axis and window, in the order in which `_compute_unit` returns them.
 _PLANE_FIELDS = ("window_mean", "window_coverage", "outlier_count")
-#: Samples of a part up to which all its axes are read together.
+#: Largest number of samples of a part of which all axes are read together.
 _MAX_SAMPLES_READ_AT_ONCE = 2**21
-#: Parts at least of a surface of so many units of work, for the threads to share.
+#: Smallest number of parts for the threads to share, if there are as many units of work.
 _MIN_PARTS = 4
-#: A part gets this share at most of the units of work that are left: two threads that share the
-#: parts then end at about the same time.
+#: Largest share of the remaining units of work in one part: two threads then end at about the same
+#: time.
 _MAX_SHARE_OF_REST = 1 / 2
 
 
@@ -59,14 +59,15 @@ def davar(
     method: str = "blocks",
     convention: str = "all",
 ) -> xr.Dataset:
-    """Dynamic overlapping Allan variance of a gyro log (improved fast DAVAR).
+    """Compute the dynamic overlapping Allan variance of a gyro log (improved fast DAVAR).
 
-    A window slides along the record; inside it the Allan variance is the mean squared second
+    A window moves along the record; in each window the Allan variance is the mean squared second
     difference of the angle,
 
-        avar(t, tau) = < (theta[m + 2k] - 2 theta[m + k] + theta[m])^2 > / (2 tau^2),   tau = k / sampling rate,
+        avar(t, tau) = < (theta[m + 2k] - 2 theta[m + k] + theta[m])^2 > / (2 tau^2),
 
-    over all ``window - 2k + 1`` positions m. Missing samples are passed over, never filled.
+    with ``tau = k / sampling rate``, over all ``window - 2k + 1`` positions m. Missing samples are
+    left out, never filled.
 
     Parameters
     ----------
@@ -74,38 +75,38 @@ def davar(
         Regular log with ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], NaN
         where a sample is missing, numpy or dask, float or integer. A dask log stays lazy and gives
         the same bits for any chunking. The sampling rate is that of ``time``: a log that was
-        thinned or averaged has its new rate, and samples that were dropped are missing. A DataArray
-        with ``attrs["units"]``, or a pandas table as for `gyrostab.from_dataframe`, is taken too.
+        thinned or averaged has its new rate, and dropped samples are missing. A DataArray with
+        ``attrs["units"]``, or a pandas table as for `gyrostab.from_dataframe`, is also accepted.
     window, step : str or timedelta
         Length and step of the window: a duration (``"10min"``), or a number of samples
         (``"2000samples"``). A bare number is refused. `step` defaults to a tenth of the window.
     taus : int, {"octave", "all"} or sequence
-        Averaging times: so many, spaced evenly in log tau; powers of two samples; every one; or a
-        list [s] (numbers, or strings such as ``"0.1s"``). Each is moved to a whole number of
-        samples and reported exactly.
+        Averaging times: a number of them, evenly spaced in log tau; powers of two samples; every
+        one; or a list [s] (numbers, or strings such as ``"0.1s"``). Each is rounded to a whole
+        number of samples and reported exactly.
     tau_max : float or str, optional
         Longest averaging time [s]; a third of the window by default (L13), at most half of it.
     axis : str or sequence of str, optional
         Axes to use; all by default.
     overlap : {"full", "octave"}
-        Use every second difference, or for ``k >= 16`` one in k/16 to k/8 of them, with k moved to
-        a multiple of a power of two: less work on long windows (1.7 times faster as measured by
+        Use every second difference, or for ``k >= 16`` one in k/16 to k/8 of them, with k rounded
+        to a multiple of a power of two: less work on long windows (1.7 times faster as measured by
         ``make bench``), with 1 % more scatter.
     gaps : {"bridge", "zero"}
-        ``"bridge"`` counts only what is there. In a rate log those are terms inside unbroken runs,
-        and, where fewer than `min_strict` of them are left, weighted cluster means (see
-        ``estimator``). In an angle log they are terms whose three angles are there. ``"zero"``
-        divides by the gap-free number instead, which lowers the surface at every gap: the "canyon"
-        of P16.
+        ``"bridge"`` uses only samples that are present. In a rate log these are the terms inside
+        unbroken runs or, if fewer than `min_strict` of them are left, weighted cluster means (see
+        ``estimator``). In an angle log they are the terms of which all three angles are present.
+        ``"zero"`` divides by the number of terms without gaps instead, which lowers the surface at
+        every gap (the gap bias of P16).
     min_strict, min_coverage : float
         Share of terms in unbroken runs below which cluster means are used; coverage below which a
         cell is NaN.
     method : {"blocks", "direct", "recursive"}
-        The default; the classical DAVAR (P16 Eq. 16); the published recursion (P16 Eq. 19-22). The
-        last two load the log and are there for comparison.
+        Block sums (default); the classical DAVAR (P16 Eq. 16); the published recursion (P16 Eq.
+        19-22). The last two load the log into memory and are provided for comparison.
     convention : {"all", "paper"}
-        With ``"paper"`` the reference methods count ``window - 2k`` terms, and leave out the last
-        window, as P16 does.
+        With ``"paper"`` the reference methods count ``window - 2k`` terms and omit the last window,
+        as P16 does.
 
     Returns
     -------
@@ -113,17 +114,16 @@ def davar(
         ``avar, count, coverage, edf, estimator, white_response, quantization_response,
         ramp_response (axis, time, tau)``, ``window_mean, window_coverage, outlier_count (axis,
         time)``, and every channel of the log averaged over each window; ``time`` is the centre of
-        the window, with ``time_bounds``; ``tau`` [s]. Units stand on the variables.
+        the window, with ``time_bounds``; ``tau`` [s]. Units are attributes of the variables.
 
     Raises
     ------
     OptionError
-        When window, step or taus do not fit the record or each other; the message says which and
-        what would.
+        If window, step or taus do not fit the record or each other; the message says which would.
     SchemaError
-        When `log` is not a regular log.
+        If `log` is not a regular log.
     TimeError
-        When its time is not in order, or not uniform.
+        If its time is not in order, or not uniform.
 
     References
     ----------
@@ -134,7 +134,8 @@ def davar(
     --------
     >>> from gyrostab.ingest.make_log import make_log
     >>> noise = np.random.default_rng(1).standard_normal(60_000)
-    >>> surface = davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min", step="30s", taus=[0.01, 1.0])
+    >>> log = make_log(noise, rate=100.0, unit="deg/h")
+    >>> surface = davar(log, window="1min", step="30s", taus=[0.01, 1.0])
     >>> surface.avar.sel(axis="x").dims, surface.sizes["time"]
     (('time', 'tau'), 19)
     >>> float(surface.avar.sel(tau=0.01).mean())  # white noise: avar = sd^2 / k
@@ -142,8 +143,9 @@ def davar(
     """
     log = as_log(log)
     plan = make_plan(
-        log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis, overlap=overlap, gaps=gaps, min_strict=min_strict,
-        min_coverage=min_coverage, method=method, convention=convention,
+        log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis, overlap=overlap,
+        gaps=gaps, min_strict=min_strict, min_coverage=min_coverage, method=method,
+        convention=convention,
     )  # fmt: skip
     if method == "blocks":
         cells, means = _run_units(plan.signal.data, plan.unit, plan.rate)
@@ -155,15 +157,17 @@ def davar(
 
 
 def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> list[slice]:
-    """Cut the windows of a surface into parts that `davar_part` computes, each of whole units of work, the last ones smaller.
+    """Divide the windows of a surface into parts for `davar_part`.
+
+    Each part consists of whole units of work; the last parts are smaller.
 
     Parameters
     ----------
     log : xarray.Dataset
         Regular log.
     samples : int
-        Samples of a part over all axes; it gets one unit of work at least. Where windows are close,
-        or units few, a part gets fewer.
+        Samples of a part over all axes; a part has at least one unit of work. With closely spaced
+        windows or few units, a part has fewer samples.
     **options
         Options of `davar`.
 
@@ -175,7 +179,8 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     Examples
     --------
     >>> from gyrostab.ingest.make_log import make_log
-    >>> davar_parts(make_log(np.zeros(10**6), rate=100.0, unit="deg/h"), samples=500_000, window="1min", step="30s")
+    >>> log = make_log(np.zeros(10**6), rate=100.0, unit="deg/h")
+    >>> davar_parts(log, samples=500_000, window="1min", step="30s")
     [slice(0, 85, None), slice(85, 170, None), slice(170, 255, None), slice(255, 332, None)]
     """
     plan = make_plan(as_log(log), **options)
@@ -200,21 +205,21 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
 def davar_part(
     log: xr.Dataset, *, part: slice, space: Workspace | None = None, **options: Any
 ) -> xr.Dataset:
-    """Some windows of the surface that `davar` makes, computed at once and in the calling thread.
+    """Compute some windows of the surface of `davar`, immediately and in the calling thread.
 
-    Only the samples of these windows are read, and dask is not asked to compute anything beside
-    that, so that many parts can be computed side by side, in threads, processes or on other
-    machines. The numbers are those of `davar`, bit for bit.
+    Only the samples of these windows are read, and dask computes nothing else, so that many parts
+    can be computed in parallel, in threads, processes or on other machines. The numbers are those
+    of `davar`, bit for bit.
 
     Parameters
     ----------
     log : xarray.Dataset
         Regular log, numpy or dask.
     part : slice
-        Windows, counted from the first window of the log: one of `davar_parts`, or any other
+        Windows, counted from the first window of the log: one of `davar_parts`, or any other slice
         without a step.
     space : gyrostab.kernels.workspace.Workspace, optional
-        Memory to work in, for parts one after the other in one thread.
+        Working memory, reused by parts that one thread computes one after the other.
     **options
         Options of `davar`, with ``method="blocks"``.
 
@@ -226,7 +231,7 @@ def davar_part(
     Raises
     ------
     OptionError
-        When the options do not fit, or another method than the block sums is asked for.
+        If the options do not fit, or the method is not that of the block sums.
 
     Examples
     --------
@@ -240,21 +245,25 @@ def davar_part(
     plan = make_plan(log, **options)
     if plan.attrs["method"] != "blocks":
         raise OptionError(
-            f"method={plan.attrs['method']!r} is for whole logs; parts are computed with method='blocks'"
+            f"method={plan.attrs['method']!r} is for whole logs; parts are computed with "
+            "method='blocks'"
         )
     data, unit = plan.signal.data, plan.unit
     tables = _cached_tables_of(plan)
     units = [
-        one
-        for one in units_of_work(data.shape[1], unit)
-        if one.start < part.stop and one.stop > part.start
+        windows
+        for windows in units_of_work(data.shape[1], unit)
+        if windows.start < part.stop and windows.stop > part.start
     ]
-    spans = [(one.start * unit.step, last_sample(one, unit)) for one in units]
+    spans = [(windows.start * unit.step, last_sample(windows, unit)) for windows in units]
     space = space or Workspace()
     done = [_compute_unit(x, unit, tables, space) for x in _read_spans(data, spans, space)]
     rows = range(0, len(done), len(units))
     cells, means = (
-        [np.concatenate([one[i] for one in done[row : row + len(units)]], axis=1) for row in rows]
+        [
+            np.concatenate([arrays[i] for arrays in done[row : row + len(units)]], axis=1)
+            for row in rows
+        ]
         for i in range(2)
     )
     kept = slice(part.start - units[0].start, part.stop - units[0].start)
@@ -270,10 +279,10 @@ def davar_part(
 def _read_spans(
     data: Any, spans: Sequence[tuple[int, int]], space: Workspace
 ) -> Iterator[NDArray[np.generic]]:
-    """The samples of each span, of one axis after the other; each is to be used before the next is asked for.
+    """Read the samples of each span, axis by axis; use each result before asking for the next.
 
-    They are read span by span where that needs no dask; what two spans share is read once. Where
-    dask must be asked, all axes are read together if they are few.
+    Without dask, spans are read one by one, and the samples that two spans share are read once.
+    With dask, all axes are read together if they are few.
     """
     begin, end = spans[0][0], spans[-1][1]
     if isinstance(data, da.Array) and can_read_into(data):
@@ -297,7 +306,10 @@ def _read_spans(
 def _compute_unit(
     x: NDArray[np.generic], unit: Unit, tables: tuple[Any, ...], space: Workspace | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Cells (9, n_windows, n_tau), the last field the degrees of freedom, and plane fields (3, n_windows) of one unit."""
+    """Compute one unit: cells (9, n_windows, n_tau) and plane fields (3, n_windows).
+
+    The last field of the cells holds the degrees of freedom.
+    """
     x = np.ascontiguousarray(x)
     if x.dtype.kind == "f" and np.isnan(x[[0, x.size // 2, -1]]).all() and np.isnan(x).all():
         cells, means = (part.copy() for part in _empty_surface(_with_tuples(unit), x.size))
@@ -314,7 +326,7 @@ def _compute_unit(
 
 
 def _cached_tables_of(plan: Plan) -> tuple[Any, ...]:
-    """`_noise_tables`, made once for all parts of a log."""
+    """Make `_noise_tables` once for all parts of a log."""
     return _cached_noise_tables(_with_tuples(plan.unit), plan.rate)
 
 
@@ -325,7 +337,7 @@ def _cached_noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
 
 @lru_cache(maxsize=4)
 def _empty_surface(unit: Unit, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what `surface_unit` makes of samples that are all missing: a long gap has many such units."""
+    """Cache the surface of a unit without any sample, because a long gap has many of them."""
     return surface_unit(np.full(size, np.nan), _with_arrays(unit), None)
 
 
@@ -340,7 +352,7 @@ def _with_arrays(unit: Unit) -> Unit:
 
 
 def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
-    """What `identify_noise` needs: columns, first weights, conversion to sample units, and the pair sums of each tau."""
+    """Make the tables of `identify_noise`: columns, weights, sample units, sums over pairs."""
     columns = avar_columns(unit.ks / rate)
     to_samples = sample_squares(rate)
     n = [int(unit.window - 2 * k + 1) for k in unit.ks]
@@ -352,7 +364,10 @@ def _noise_tables(unit: Unit, rate: float) -> tuple[Any, ...]:
 
 
 def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
-    """Run the units of work: cells (9, axis, time, tau) and plane fields (3, axis, time), dask if `data` is."""
+    """Run the units of work: cells (9, axis, time, tau), plane fields (3, axis, time).
+
+    The results are dask arrays if `data` is one.
+    """
     lazy = isinstance(data, da.Array)
     tables = _noise_tables(unit, rate)
     shared = dask.delayed(tables, pure=True, traverse=False) if lazy else tables
@@ -362,15 +377,15 @@ def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
         cells, means = [], []
         for windows in units_of_work(data.shape[1], unit):
             n = windows.stop - windows.start
-            one_cells, one_means = work(
+            unit_cells, unit_means = work(
                 data[row, windows.start * unit.step : last_sample(windows, unit)], unit, shared
             )
             cells.append(
                 da.from_delayed(
-                    one_cells, (len(CELL_FIELDS) + 1, n, unit.ks.size), dtype=np.float64
+                    unit_cells, (len(CELL_FIELDS) + 1, n, unit.ks.size), dtype=np.float64
                 )
             )
-            means.append(da.from_delayed(one_means, (len(_PLANE_FIELDS), n), dtype=np.float64))
+            means.append(da.from_delayed(unit_means, (len(_PLANE_FIELDS), n), dtype=np.float64))
         rows_cells.append(da.concatenate(cells, axis=1))
         rows_means.append(da.concatenate(means, axis=1))
     stacked = da.stack(rows_cells, axis=1), da.stack(rows_means, axis=1)
@@ -382,13 +397,14 @@ def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
 def _run_published_method(
     signal: xr.DataArray, unit: Unit, rate: float, method: str, *, paper: bool
 ) -> tuple[Any, Any]:
-    """The published algorithms, eager: cells (9, axis, time, tau) and plane fields (3, axis, time)."""
+    """Run a published algorithm in memory: cells (9, axis, time, tau), plane (3, axis, time)."""
     points = unit.window + (0 if paper and not unit.angle else 1)
     all_points = signal.sizes["time"] + (0 if unit.angle or paper else 1)
     n_windows = (all_points - points) // unit.step + (0 if paper else 1)
     if n_windows < 1:
         raise OptionError(
-            "the paper's convention leaves no window: it leaves out the last one; give a longer record"
+            "convention='paper' leaves no window, because it omits the last one; give a longer "
+            "record"
         )
     run = direct_sums if method == "direct" else recursive_sums
     tables = _noise_tables(unit, rate)
@@ -444,16 +460,18 @@ def _attach_labels(
     }
     for name, values in zip(_PLANE_FIELDS, means, strict=True):
         variables[name] = (plane, values.astype(integers.get(name, np.float64)), attributes(name))
-    # The share of degrees of freedom that the gaps leave is what a fit needs beside the responses.
+    # In addition to the responses, the fit needs the share of degrees of freedom left by the gaps.
     variables["gap_factor"] = (
         cube,
         cells[CELL_FIELDS.index("gap_factor")],
         attributes("gap_factor"),
     )
     groups = units_of_work(signal.sizes["time"], unit)
-    if part is None:  # the paper's convention leaves out the last window
+    if part is None:  # convention "paper" omits the last window
         groups = [
-            slice(one.start, min(one.stop, first.size)) for one in groups if one.start < first.size
+            slice(group.start, min(group.stop, first.size))
+            for group in groups
+            if group.start < first.size
         ]
     return xr.Dataset(
         {**variables, **window_channels(log, unit.window, unit.step, groups, part=part)},

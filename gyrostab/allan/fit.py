@@ -1,4 +1,4 @@
-"""Surface to coefficients: Q, N, B, K and R of every window, with errors, upper limits and what is observable."""
+"""Fit of Q, N, B, K and R to every window of a surface, with errors, limits and observability."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from gyrostab.time.durations import duration_seconds, thin
 
 __all__ = ["fit_noise", "fit_part", "is_described", "refit"]
 
-#: Averaging times used at most; more of them share the same information and cost the cube of their
+#: Largest number of averaging times in a fit; more add no information and cost the cube of their
 #: number.
 MOST_TAUS = 48
-#: One-sided normal quantiles: 95 % for limits, 99 % for the claim that a term is there.
+#: One-sided normal quantiles: 95 % for limits, 99 % for an observed term.
 _LIMIT_SIGMA, _OBSERVED_SIGMA = 1.6449, 2.3263
-#: The model does not fit where chance alone would make the misfit in fewer windows than this.
+#: Probability of a misfit by chance below which the model does not fit a window.
 _MISFIT_PROBABILITY = 1e-3
-#: A window that the model does not fit bounds its terms (but Q) within its longest averaging times:
-#: a decade of them.
+#: Ratio of the averaging times, from the longest down, that bound the terms (except Q) of a window
+#: that the model does not fit.
 _LIMIT_SPAN = 10.0
-#: More degrees of freedom than this are as good as infinitely many for the limit of a cell.
+#: Degrees of freedom above which the limit of a cell takes them as infinite.
 _MAX_FREEDOM = 1e6
-#: A column that the other terms imitate to all but this share cannot be told apart.
+#: Smallest share of the column of a term that the other terms must not reproduce.
 _MIN_SEPARATION = 1e-4
 
 
@@ -55,27 +55,26 @@ def fit_noise(
         avar(tau) = 3 Q^2 / tau^2 + N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 + R^2 tau^2 / 2,
 
     so they follow from non-negative generalised least squares. The covariance between averaging
-    times (overlapping estimates share data) is that of the fitted noise itself, found by iteration.
-    Where gaps forced weighted cluster means, the columns of Q, N and R are those that the mask
-    predicts.
+    times (overlapping estimates share data) is that of the fitted noise, found by iteration. Where
+    gaps required weighted cluster means, the columns of Q, N and R are predicted from the mask.
 
     Parameters
     ----------
     surface : xarray.Dataset
-        What `gyrostab.davar` returns.
+        Surface of `gyrostab.davar`.
     terms : str or iterable of str
         Terms to fit, a selection of Q, N, B, K, R; the others are taken as zero.
     method : {"gls", "adev"}
-        The default, or the fit of deviations of P15 (Eq. 3), ``sigma = sum C_n tau^(n/2)``,
-        unweighted. It adds deviations where variances add, gives no errors, and is there for
-        comparison.
+        Generalised least squares (default), or the unweighted fit of deviations of P15 (Eq. 3),
+        ``sigma = sum C_n tau^(n/2)``. The latter adds deviations although variances add, gives no
+        errors, and is provided for comparison.
     tau_min, tau_max : float or str, optional
-        Averaging times to fit [s], all by default. Start above what is no noise: a filter, a line,
-        resets of the feedback.
+        Averaging times to fit [s], all by default. Start above effects that are not noise: a
+        filter, a spectral line, resets of the feedback.
     observed_only : bool
         Give a coefficient and its standard error only where the term is observed, and NaN
-        elsewhere. With False they are the non-negative least-squares estimates of every window: for
-        the fitted curve, or to study the estimator.
+        elsewhere. With False they are the non-negative least-squares estimates of every window, for
+        the fitted curve or to study the estimator.
 
     Returns
     -------
@@ -83,16 +82,16 @@ def fit_noise(
         The surface, and per ``(axis, time)``: ``Q`` [urad], ``N`` [deg/sqrt(h)], ``B`` [deg/h],
         ``K`` [deg/h^1.5], ``R`` [deg/h^2], ``*_stderr``, ``*_upper`` (95 % upper limit where the
         term is not observed), ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``;
-        ``observable(axis, time, term)``: 0 the window cannot see the term, 1 it gives an upper
-        limit only, 2 the term is there (99 % one-sided). No term is observed in a window that the
-        five terms do not describe: see `is_described`. ``edf`` is that of the fitted noise.
+        ``observable(axis, time, term)``: 0 not observable, 1 upper limit only, 2 observed (99 %
+        one-sided). No term is observed in a window that the five terms do not describe: see
+        `is_described`. ``edf`` is that of the fitted noise.
 
     Raises
     ------
     OptionError
-        When a term or the method is unknown.
+        If a term or the method is unknown.
     SchemaError
-        When `surface` is not a surface.
+        If `surface` is not a surface.
 
     References
     ----------
@@ -101,7 +100,8 @@ def fit_noise(
     Examples
     --------
     >>> from gyrostab.ingest.make_log import make_log
-    >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)  # 6 deg/h at 100 Hz: N = 0.6 / 60 deg/sqrt(h)
+    >>> # 6 deg/h at 100 Hz: N = 0.6 / 60 deg/sqrt(h)
+    >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)
     >>> from gyrostab.allan.davar import davar
     >>> product = fit_noise(davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min"))
     >>> round(float(product.N.mean()), 3)
@@ -118,12 +118,12 @@ def fit_noise(
 
 
 def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
-    """Fit the windows of a product again, with the estimates of every term whether it is observed or not.
+    """Fit the windows of a product again, with estimates of all terms, observed or not.
 
     Parameters
     ----------
     product : xarray.Dataset
-        What `fit_noise` returns, or some windows of it.
+        Product of `fit_noise`, or some of its windows.
     **options
         Options of `fit_noise` that differ from those of the product.
 
@@ -156,7 +156,7 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
 
 
 def is_described(chi2: Any, dof: Any) -> Any:
-    """Tell whether the sum of the fitted terms describes a window.
+    """Test whether the sum of the fitted terms describes a window.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def is_described(chi2: Any, dof: Any) -> Any:
     -------
     ndarray of bool
         False where noise that the terms describe would exceed `chi2` in fewer than one window of
-        1000; True where there is no degree of freedom to tell.
+        1000; True without degrees of freedom.
 
     Examples
     --------
@@ -182,12 +182,12 @@ def is_described(chi2: Any, dof: Any) -> Any:
 
 
 def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
-    """Fit a surface in memory at once and in the calling thread: a part of a record, beside which others are fitted.
+    """Fit a part of a surface, immediately and in the calling thread.
 
     Parameters
     ----------
     surface : xarray.Dataset
-        What `gyrostab.allan.davar.davar_part` returns.
+        Surface of `gyrostab.allan.davar.davar_part`.
     **options
         Options of `fit_noise`.
 
@@ -238,20 +238,20 @@ def _fit_checked(
 
 
 def _select_taus(tau: NDArray[np.float64], tau_min: Any, tau_max: Any) -> NDArray[np.int64]:
-    """Positions of the averaging times to fit."""
+    """Find the positions of the averaging times to fit."""
     low = 0.0 if tau_min is None else duration_seconds(tau_min, "tau_min")
     high = np.inf if tau_max is None else duration_seconds(tau_max, "tau_max")
     chosen = np.flatnonzero((tau >= low * (1 - 1e-9)) & (tau <= high * (1 + 1e-9)))
     if chosen.size == 0:
-        has = f"it has {tau[0]:g} s to {tau[-1]:g} s; change --fit-from or --fit-to"
         raise OptionError(
-            f"no averaging time of the surface lies between {low:g} s and {high:g} s; {has}"
+            f"no averaging time of the surface lies between {low:g} s and {high:g} s; it has "
+            f"{tau[0]:g} s to {tau[-1]:g} s; change --fit-from or --fit-to"
         )
     return chosen
 
 
 def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], float, int]:
-    """Cells as (axis, time, tau) arrays, averaging factors, rate and window length."""
+    """Collect the cells as (axis, time, tau) arrays, averaging factors, rate and window length."""
     try:
         rate, window = (
             float(surface.attrs["sampling_rate_hz"]),
@@ -262,13 +262,14 @@ def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], floa
             f"the surface lacks the attribute {missing}; it is not what gyrostab.davar writes"
         ) from missing
     ks = np.round(np.asarray(surface["tau"].values) * rate).astype(np.int64)
-    if "ramp_response" not in surface:  # of a version that took it as 1
+    if "ramp_response" not in surface:  # written by a version that took it as 1
         surface = surface.assign(ramp_response=xr.ones_like(surface["white_response"]))
     names = ("avar", "white_response", "quantization_response", "ramp_response", "gap_factor")
     absent = [name for name in names if name not in surface]
     if absent:
         raise SchemaError(
-            f"the surface lacks {absent}, which the fit needs to account for gaps; make it with gyrostab.davar"
+            f"the surface lacks {absent}, which the fit needs to account for gaps; make it with "
+            "gyrostab.davar"
         )
     return [surface[name].data for name in names], ks, rate, window
 
@@ -312,13 +313,13 @@ def _fit_gls(
     }
     if (
         chosen.size == surface.sizes["tau"]
-    ):  # otherwise davar's own, for every averaging time, stands
+    ):  # otherwise that of davar, for every averaging time, is kept
         extra["edf"] = (("axis", "time", "tau"), fitted[..., 4 * n + 2 :], attributes("edf"))
     return _assemble_product(surface, *(parts[i * n : (i + 1) * n] for i in range(4)), extra=extra)
 
 
 class _Tables:
-    """What every window of a surface shares; made once."""
+    """Tables that all windows of a surface share."""
 
     def __init__(self, ks: NDArray[np.int64], shifts: NDArray[np.int64], rate: float, window: int):
         self.columns = avar_columns(ks / rate)
@@ -329,8 +330,8 @@ class _Tables:
             [n**2 / white_pair_sum(int(n), int(k)) for n, k in zip(terms, ks, strict=True)]
         )
         own = np.einsum("aaii,a->ai", self.pairs, self.to_samples[:STOCHASTIC] ** 2)
-        #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp has no scatter
-        #: of its own.
+        #: Degrees of freedom of a cell in which a term is alone, (term, tau); a ramp alone does not
+        #: scatter.
         self.own_dof = np.vstack(
             [2.0 * self.columns.T[:STOCHASTIC] ** 2 / own, np.full(ks.size, np.inf)]
         )
@@ -339,14 +340,15 @@ class _Tables:
 
 
 def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
-    """Lower point q at `level` of chi-square over its degrees of freedom nu, as `interpolate_quantile` reads it: start, step, ``nu ln q``.
+    """Tabulate the quantile q at `level` of chi-square over its degrees of freedom nu.
 
-    A step of 0.02 in ln nu leaves an error below 1e-9 of q.
+    Returns start, step and ``nu ln q`` for `interpolate_quantile`. A step of 0.02 in ln nu leaves a
+    relative error of q below 1e-9.
     """
     start, step = (
         np.log(0.01 * np.log(level) / np.log(0.05)),
         0.02,
-    )  # where the quantile is still a number above zero
+    )  # from here on the quantile is above zero
     freedom = np.exp(start + step * np.arange(int(np.log(1e15) / step)))
     return (
         float(start),
@@ -359,12 +361,12 @@ def _quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
 def _cached_tables(
     ks: tuple[int, ...], shifts: tuple[int, ...], rate: float, window: int
 ) -> _Tables:
-    """The same tables for every part of a record that is fitted part by part."""
+    """Make the tables once for all parts of a record."""
     return _Tables(np.array(ks, dtype=np.int64), np.array(shifts, dtype=np.int64), rate, window)
 
 
 def _thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Positions of the averaging factors to fit: all, or `MOST_TAUS` of them in even log spacing."""
+    """Choose the averaging factors to fit: all, or `MOST_TAUS` of them, evenly spaced in log."""
     if ks.size <= MOST_TAUS:
         return np.arange(ks.size)
     wanted = np.geomspace(ks[0], ks[-1], MOST_TAUS)
@@ -374,7 +376,7 @@ def _thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
 def _fit_block(
     flat: list[NDArray[np.float64]], tables: _Tables, allowed: int, observed_only: bool
 ) -> NDArray[np.float64]:
-    """Coefficients, errors, limits, observability (n_terms each), chi2, dof and edf of each window, side by side."""
+    """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns."""
     result, misfit, dof = fit_windows(
         *flat, tables.columns, tables.to_samples, tables.pairs, tables.ramps, tables.weight, allowed
     )
@@ -383,8 +385,7 @@ def _fit_block(
     fails = _widen_misfits(field, misfit)
     with np.errstate(invalid="ignore", divide="ignore"):
         value = np.sqrt(square)
-        # d(sqrt s) = ds / (2 sqrt s); near zero the root itself of the error of the square is the
-        # scale
+        # d(sqrt s) = ds / (2 sqrt s); near zero, the root of the error of the square is the scale
         stderr = np.where(
             square > error,
             error / (2.0 * value),
@@ -414,7 +415,7 @@ def _fit_block(
 def _widen_misfits(
     field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Say which windows the model does not fit, and multiply their variances in `field` by chi-square over its degrees of freedom."""
+    """Find the windows that the model does not fit, and scale their variances by chi2 / dof."""
     chi2, dof = misfit.T
     fails = ~is_described(chi2, dof)
     wider = np.where(fails, chi2 / np.maximum(dof, 1.0), 1.0)[:, None]
@@ -427,12 +428,12 @@ def _widen_misfits(
 def _limit_of_estimate(
     field: dict[str, NDArray[np.float64]], tables: _Tables
 ) -> NDArray[np.float64]:
-    """95 % upper limit of a squared coefficient from its estimate.
+    """Find the 95 % upper limit of a squared coefficient from its estimate.
 
-    The estimate free of sign has the variance ``a + b s + c s^2`` when the truth is s. The part in
-    ``s^2`` is the term's own, a chi-square with ``2 / c`` degrees of freedom, whose lower 5 % point
-    is ``q s``; the rest is taken as normal. The limit is the s at which the estimate lies that far
-    below: ``(s - e)^2 = (1 - q)^2 s^2 + z^2 (a + b s)``.
+    Without the non-negativity constraint, the estimate e has the variance ``a + b s + c s^2`` if
+    the truth is s. The part in ``s^2`` is that of the term alone, a chi-square with ``2 / c``
+    degrees of freedom whose 5 % quantile is ``q s``; the rest is taken as normal. The limit is the
+    s at which the estimate is at its 5 % quantile: ``(s - e)^2 = (1 - q)^2 s^2 + z^2 (a + b s)``.
     """
     estimate = np.maximum(field["free"], 0.0)
     a, b, c = (
@@ -454,7 +455,7 @@ def _limit_of_cell(
     dof: NDArray[np.float64],
     tables: _Tables,
 ) -> NDArray[np.float64]:
-    """95 % upper limit of a squared coefficient from the one cell that can bound it best."""
+    """Find the 95 % upper limit of a squared coefficient from the cell that bounds it best."""
     span = np.full(len(TERMS), np.inf)
     square = np.ascontiguousarray(square)
     return np.asarray(
@@ -478,12 +479,13 @@ def _limit_of_curve(
     dof: NDArray[np.float64],
     tables: _Tables,
 ) -> NDArray[np.float64]:
-    """95 % upper limit of a squared coefficient that needs no model: its part of the curve cannot be more than the whole.
+    """Find the 95 % upper limit of a squared coefficient without assuming the five-term model.
 
-    What else is in a cell, noise or not, only adds to it. What takes away is a filter, or an alias
-    that looks like a filtered noise, and that bends the curve at short averaging times; so the
-    cells are those of the last decade. Quantization, which is what the shortest times tell, is
-    bounded by all. A ramp is given the scatter of the noise that scatters most.
+    The part of a term cannot exceed the whole curve, because anything else in a cell, noise or not,
+    only adds to it. A filter, or an alias that looks like filtered noise, removes power and bends
+    the curve at short averaging times; therefore only the cells of the last decade are used.
+    Quantization, which dominates at the shortest times, is bounded by all cells. A ramp gets the
+    scatter of the noise that scatters most.
     """
     span = np.array([np.inf, *[_LIMIT_SPAN] * (len(TERMS) - 1)])
     own_dof = np.vstack([tables.own_dof[:STOCHASTIC], tables.own_dof[:STOCHASTIC].min(axis=0)])
@@ -533,7 +535,7 @@ _SQUARED_NAMES = ("N_squared", "K_squared")
 
 
 def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64]) -> xr.Dataset:
-    """P15 Eq. 3-4: least squares of the Allan deviation in half-integer powers of tau, each window on its own."""
+    """Fit the Allan deviation of each window in half-integer powers of tau (P15 Eq. 3-4)."""
     deviation = np.sqrt(np.asarray(surface["avar"].data[..., chosen], dtype=np.float64))
     members = [TERMS.index(term) for term in wanted]
     columns = np.sqrt(avar_columns(surface["tau"].values[chosen]))[:, members]

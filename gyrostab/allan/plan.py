@@ -1,4 +1,4 @@
-"""What a dynamic Allan variance is asked for, in samples, and how it is cut into units of work."""
+"""The options of a dynamic Allan variance in samples, and its division into units of work."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ __all__ = [
     "units_of_work",
 ]
 
-#: Cells (windows times averaging times) of a unit of work, and of a part of a surface over all
-#: axes, at most.
+#: Largest number of cells (windows times averaging times) of a unit of work, and of a part of a
+#: surface over all axes.
 MOST_CELLS = 2**20
-#: Windows that are chosen where none is given, the longest that fits four times into the record
-#: [s].
+#: Default windows [s]; the longest that fits four times into the record is used.
 WINDOWS_S = (600, 300, 120, 60, 30, 20, 10, 5, 2, 1)
 _METHODS = ("blocks", "direct", "recursive")
 _GAPS = ("bridge", "zero")
@@ -36,7 +35,7 @@ _CONVENTIONS = ("all", "paper")
 
 
 class Plan(NamedTuple):
-    """What davar was asked for, in samples."""
+    """Options of `davar`, in samples."""
 
     signal: xr.DataArray
     unit: Unit
@@ -45,11 +44,12 @@ class Plan(NamedTuple):
 
 
 def make_plan(
-    log: xr.Dataset, *, window: Any = None, step: Any = None, taus: Any = 40, tau_max: Any = None, axis: str | Sequence[str] | None = None,
-    overlap: str = "full", gaps: str = "bridge", min_strict: float = 0.3, min_coverage: float = 0.1, method: str = "blocks",
+    log: xr.Dataset, *, window: Any = None, step: Any = None, taus: Any = 40, tau_max: Any = None,
+    axis: str | Sequence[str] | None = None, overlap: str = "full", gaps: str = "bridge",
+    min_strict: float = 0.3, min_coverage: float = 0.1, method: str = "blocks",
     convention: str = "all",
 ) -> Plan:  # fmt: skip
-    """Check the options of `davar` against the log, as `gyrostab.ingest.convert.as_log` returns it."""
+    """Check the options of `davar` against a log of `gyrostab.ingest.convert.as_log`."""
     _check_choices(method=method, gaps=gaps, overlap=overlap, convention=convention)
     name = signal_name(log)
     signal = log[name] if axis is None else _select_axes(log[name], axis)
@@ -74,7 +74,8 @@ def make_plan(
         min_coverage,
     )
     attrs = {
-        "window_s": length / rate, "step_s": hop / rate, "window_samples": length, "step_samples": hop,
+        "window_s": length / rate, "step_s": hop / rate,
+        "window_samples": length, "step_samples": hop,
         "method": method, "overlap": overlap, "gaps": gaps, "convention": convention,
         "min_strict": min_strict, "min_coverage": min_coverage,
     }  # fmt: skip
@@ -82,7 +83,7 @@ def make_plan(
 
 
 def choose_window(log: xr.Dataset) -> str:
-    """Choose a window for a record: ten minutes, or what leaves four windows side by side in a shorter record.
+    """Choose a window for a record: ten minutes, or at most a quarter of a shorter record.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def choose_window(log: xr.Dataset) -> str:
     Returns
     -------
     str
-        A duration of `WINDOWS_S`, or a number of samples where the record is shorter than four
+        A duration of `WINDOWS_S`, or a number of samples if the record is shorter than four
         seconds.
 
     Examples
@@ -119,7 +120,8 @@ def _check_choices(*, method: str, gaps: str, overlap: str, convention: str) -> 
             raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
     if convention == "paper" and method == "blocks":
         raise OptionError(
-            "convention='paper' is for method='direct' and method='recursive'; the block sums use all terms"
+            "convention='paper' is for method='direct' and method='recursive'; the block sums use "
+            "all terms"
         )
     if overlap == "octave" and method != "blocks":
         raise OptionError(
@@ -132,10 +134,8 @@ def _select_axes(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArra
     known = [str(name) for name in signal["axis"].values]
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
-        said = ", ".join(map(repr, unknown)) or "''"
-        raise OptionError(
-            f"axis {said} is not in the log; give one that it has: {', '.join(known)}"
-        )
+        given = ", ".join(map(repr, unknown)) or "''"
+        raise OptionError(f"axis {given} is not in the log; it has {', '.join(known)}")
     return signal.sel(axis=wanted)
 
 
@@ -143,28 +143,29 @@ def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tup
     length = samples(window, rate, "window")
     if length > available:
         raise OptionError(
-            f"the window of {length / rate:g} s ({length} samples) is longer than the record of {available / rate:g} s; "
-            "give a shorter --window"
+            f"the window of {length / rate:g} s ({length} samples) is longer than the record of "
+            f"{available / rate:g} s; give a shorter --window"
         )
     if length < 4:
         raise OptionError(
-            f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at {rate:g} Hz)"
+            f"the window of {length} samples is too short; it needs at least 4 ({4 / rate:g} s at "
+            f"{rate:g} Hz)"
         )
     hop = max(1, length // 10) if step is None else samples(step, rate, "step")
     if hop > length:
         raise OptionError(
-            f"the step of {hop / rate:g} s is longer than the window of {length / rate:g} s, so samples would be left out; "
-            "give a shorter --step"
+            f"the step of {hop / rate:g} s is longer than the window of {length / rate:g} s, so "
+            "samples would be left out; give a shorter --step"
         )
     return length, hop
 
 
 def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
-    """Windows of each unit of work; they depend on the windows alone, not on any chunking."""
+    """Divide the windows into units of work, independently of any chunking."""
     points = unit.window + (1 if unit.angle else 0)
     n_windows = (n_samples - points) // unit.step + 1
-    # A unit works twice on what its last windows share with the next unit: the longer, the less of
-    # that.
+    # The samples that the last windows share with the next unit are processed twice; long units
+    # keep that share small.
     length = max(4 * unit.window, min(16 * unit.window, 2**21), 2**18)
     per_unit = max(8, min((length - unit.window) // unit.step, MOST_CELLS // unit.ks.size))
     return [
@@ -173,5 +174,5 @@ def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
 
 
 def last_sample(windows: slice, unit: Unit) -> int:
-    """One past the last sample of some windows."""
+    """Find one past the last sample of some windows."""
     return int((windows.stop - 1) * unit.step + unit.window + (1 if unit.angle else 0))

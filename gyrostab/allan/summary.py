@@ -1,4 +1,4 @@
-"""What a product says of a whole record: each noise term, how well the terms describe it, and what disturbed it."""
+"""Summaries of a product over the whole record: noise terms, misfit, outliers and motion."""
 
 from __future__ import annotations
 
@@ -24,19 +24,17 @@ __all__ = [
 ]
 
 _LIMIT, _SEEN = OBSERVABLE.index("upper_limit_only"), OBSERVABLE.index("observed")
-#: Windows, spread over the record, that are fitted again to find the averaging time from which the
-#: terms describe them.
+#: Largest number of windows that are fitted again to find the averaging time from which the terms
+#: describe the record.
 _MAX_TRIED_WINDOWS = 24
-#: A share of failing windows that is not worth a remark: a window that the terms do describe fails
-#: in 0.1 to 2 % of cases
-#: (docs/method.md), and in a record of few windows one of them is no evidence.
+#: Share of failing windows up to which nothing is reported: a window that the terms do describe
+#: fails in 0.1 to 2 % of cases (docs/method.md), and one of a few windows is not evidence.
 _MAX_FAILING_SHARE = 0.05
-#: Least ratio of longest to shortest averaging time: over a decade, the Allan variances of
-#: neighbouring terms, whose slopes
-#: differ by one, part by a factor of ten.
+#: Smallest ratio of longest to shortest averaging time: over a decade, the Allan variances of
+#: neighbouring terms, whose slopes differ by one, diverge by a factor of ten.
 _MIN_TAU_RATIO = 10.0
-#: Twice the rotation of the Earth, 15.041 deg/h: no change of attitude at rest moves the mean rate
-#: further.
+#: Twice the rotation rate of the Earth, 15.041 deg/h: the largest change of the mean rate that a
+#: change of attitude at rest can cause.
 _MAX_CHANGE_AT_REST_DPH = 30.082
 
 
@@ -49,14 +47,14 @@ class TermSummary:
     axis, symbol, unit : str
         Axis, symbol of IEEE Std 952, unit of the coefficient.
     status : str
-        ``observed`` where at least as many windows observe the term as only bound it, else
-        ``upper_limit_only``, and ``not_observable`` where no window says anything.
+        ``observed`` if at least as many windows observe the term as give only an upper limit, else
+        ``upper_limit_only``; ``not_observable`` if no window gives either.
     median, low, high : float
-        Median and 5 % and 95 % quantiles over the windows that observe the term [unit]; NaN when
-        there are none.
+        Median, 5 % and 95 % quantiles over the windows that observe the term [unit]; NaN without
+        such windows.
     limit : float
-        Median of the upper limits over the windows that only bound it [unit]; NaN when there are
-        none.
+        Median of the upper limits over the windows with an upper limit only [unit]; NaN without
+        such windows.
     observed_share, limited_share : float
         Shares of the windows [1].
     """
@@ -74,7 +72,7 @@ class TermSummary:
 
     @property
     def value(self) -> float:
-        """The median that `status` names [unit]; NaN when no window says anything."""
+        """Median of the values or upper limits, by `status` [unit]; NaN if not observable."""
         return {"observed": self.median, "upper_limit_only": self.limit}.get(self.status, np.nan)
 
 
@@ -101,7 +99,7 @@ class FitSummary:
 
     @property
     def fails(self) -> bool:
-        """Whether more windows fail than chance explains."""
+        """True if more windows fail than chance explains."""
         return self.failing_share > _MAX_FAILING_SHARE
 
 
@@ -116,19 +114,20 @@ def summarise_terms(product: xr.Dataset) -> list[TermSummary]:
     Returns
     -------
     list of TermSummary
-        Axis by axis, in the order Q, N, B, K, R.
+        By axis, in the order Q, N, B, K, R.
 
     Raises
     ------
     SchemaError
-        When it is no product.
+        If `product` is not a product.
 
     Examples
     --------
     >>> from gyrostab import davar, fit_noise, make_log
     >>> noise = 6.0 * np.random.default_rng(1).standard_normal(60_000)  # N = 0.01 deg/sqrt(h)
     >>> product = fit_noise(davar(make_log(noise, rate=100.0, unit="deg/h"), window="1min"))
-    >>> [(term.symbol, term.status, float(f"{term.value:.1g}")) for term in summarise_terms(product)][1]
+    >>> term = summarise_terms(product)[1]
+    >>> term.symbol, term.status, float(f"{term.value:.1g}")
     ('N', 'observed', 0.01)
     """
     check_product(product)
@@ -169,7 +168,7 @@ def _drop_nans(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def summarise_fit(product: xr.Dataset) -> list[FitSummary]:
-    """Say for each axis of a product how well the fitted terms describe its windows.
+    """Summarise for each axis of a product how well the fitted terms describe its windows.
 
     Parameters
     ----------
@@ -205,10 +204,10 @@ def summarise_fit(product: xr.Dataset) -> list[FitSummary]:
 
 
 def find_fit_from(product: xr.Dataset) -> float | None:
-    """Find the shortest averaging time from which the fitted terms describe the windows of a product.
+    """Find the shortest averaging time from which the fitted terms describe a product.
 
-    A filter, a line or motion bends the curve at short averaging times. Up to 24 windows, spread
-    over the record, are fitted again from each averaging time on, a factor of two apart.
+    A filter, a spectral line or motion bends the curve at short averaging times. Up to 24 windows,
+    spread over the record, are fitted again from averaging times a factor of two apart.
 
     Parameters
     ----------
@@ -218,8 +217,8 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     Returns
     -------
     float or None
-        Averaging time [s] for ``--fit-from`` (``tau_min`` of `gyrostab.fit_noise`); None when the
-        terms describe the product as it is, or when no averaging time leaves a decade to fit.
+        Averaging time [s] for ``--fit-from`` (``tau_min`` of `gyrostab.fit_noise`); None if the
+        terms describe the product as it is, or no such averaging time leaves a decade to fit.
     """
     failing = [summary.axis for summary in summarise_fit(product) if summary.fails]
     if not failing:
@@ -242,7 +241,7 @@ def find_fit_from(product: xr.Dataset) -> float | None:
 
 
 def format_product(product: xr.Dataset) -> str:
-    """Lay out a product as the text that ``gyrostab run`` prints.
+    """Format a product as the text that ``gyrostab run`` prints.
 
     Parameters
     ----------
@@ -252,11 +251,12 @@ def format_product(product: xr.Dataset) -> str:
     Returns
     -------
     str
-        A table of the terms, and a line for each thing that was found: misfit, outliers, motion.
+        A table of the terms, and one line each on misfit, outliers and motion.
     """
     windows = product.sizes["time"]
     lines = [
-        f"Noise coefficients, median over {windows} window{'s' * (windows != 1)} (<: 95 % upper limit)",
+        f"Noise coefficients, median over {windows} window{'s' * (windows != 1)} "
+        "(<: 95 % upper limit)",
         "",
     ]
     rows = [("axis", "term", "median", "5 % to 95 %", "unit", "observed in")]
@@ -286,7 +286,7 @@ def format_product(product: xr.Dataset) -> str:
 
 
 def describe_record(product: xr.Dataset) -> list[str]:
-    """Say in a few sentences how well the terms describe a product, and what disturbed the record.
+    """Describe in a few sentences the misfit of a product, its outliers and motion.
 
     Parameters
     ----------
@@ -296,7 +296,7 @@ def describe_record(product: xr.Dataset) -> list[str]:
     Returns
     -------
     list of str
-        A sentence each: misfit, and outliers and motion where there are any.
+        One sentence on the misfit, and one each on outliers and motion if there are any.
     """
     return [*_describe_misfit(product), *_describe_outliers(product), *_describe_motion(product)]
 
@@ -314,20 +314,21 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
     if not fits:
         return []
     ratios = ", ".join(f"{fit.axis} {_number_text(fit.chi2_per_dof)}" for fit in fits)
-    lines = [f"Misfit, median chi2/dof (1 is right): {ratios}."]
+    lines = [f"Misfit, median chi2/dof (1 is ideal): {ratios}."]
     failing = [
         f"{fit.axis} in {_share_text(fit.failing_share)} of its windows"
         for fit in fits
         if fit.fails
     ]
     if failing:
-        line = f"The terms do not describe {', '.join(failing)}, where no term is called observed"
+        line = f"The terms do not describe {', '.join(failing)}; no term counts as observed there"
         start = find_fit_from(product)
         remedy = (
             f"from {start:g} s on they do: fit again with --fit-from {start:g}s"
             if start
             else (
-                "no shortest averaging time of the fit changes that: look for lines, vibration or motion in the record"
+                "no --fit-from changes that: look for spectral lines, vibration or motion in the "
+                "record"
             )
         )
         lines.append(f"{line}; {remedy}.")
@@ -340,29 +341,31 @@ def _describe_outliers(product: xr.Dataset) -> list[str]:
     worst = {
         str(axis): product["outlier_count"].sel(axis=axis).values for axis in product["axis"].values
     }
-    said = [
+    affected = [
         f"{axis} in {np.count_nonzero(counts)} windows (at most {int(counts.max())} in one)"
         for axis, counts in worst.items()
         if counts.size and counts.max() > 0
     ]
     return (
-        [f"Outliers, single samples far from both neighbours: {', '.join(said)}."] if said else []
+        [f"Outliers, single samples far from both neighbours: {', '.join(affected)}."]
+        if affected
+        else []
     )
 
 
 def _describe_motion(product: xr.Dataset) -> list[str]:
-    said = []
+    moved = []
     for axis in product["axis"].values:
         mean = product["window_mean"].sel(axis=axis).values
         away = np.abs(mean - np.nanmedian(mean)) if np.isfinite(mean).any() else np.zeros(1)
         count = int(np.count_nonzero(away > _MAX_CHANGE_AT_REST_DPH))
         if count:
-            said.append(
+            moved.append(
                 f"{axis} in {count} windows (up to {_number_text(float(np.nanmax(away)))} deg/h)"
             )
-    if not said:
+    if not moved:
         return []
-    reason = "motion, or a bias that drifts; leave such times out with --exclude"
+    reason = "motion or a drifting bias; leave such times out with --exclude"
     return [
-        f"Mean rate more than twice the Earth rate from its median: {', '.join(said)}: {reason}."
+        f"Mean rate more than twice the Earth rate from its median: {', '.join(moved)}: {reason}."
     ]

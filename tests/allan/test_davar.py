@@ -1,4 +1,4 @@
-"""The improved fast DAVAR against the definition, the published algorithms, allantools and its own invariances."""
+"""The DAVAR against its definition, the published algorithms, allantools and invariances."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def log_of(x, rate=100.0, unit="deg/h", **options):
 
 @st.composite
 def records(draw):
-    """Random records with offset, scale, random walk, gaps of several kinds, window, step and averaging factors."""
+    """Draw records with offset, scale, random walk and gaps, with windows and averaging factors."""
     seed = draw(st.integers(0, 2**32 - 1))
     rng = np.random.default_rng(seed)
     n = draw(st.integers(40, 1500))
@@ -87,7 +87,7 @@ class TestAgainstTheDefinition:
 
     @given(records())
     @settings(max_examples=40, deadline=None)
-    def test_angle_records_use_every_triple_that_is_there(self, record):
+    def test_angle_records_use_every_complete_triple(self, record):
         x, window, step, ks = record
         x = x.astype(np.float64)
         window = min(window, x.size - 1)
@@ -130,7 +130,7 @@ class TestAgainstTheDefinition:
     @pytest.mark.parametrize(
         ("window", "step", "longest"), [(3000, 700, 1408), (150_000, 75_000, 20_480)]
     )
-    def test_a_unit_that_is_longer_than_the_angle_it_holds(self, window, step, longest, octave):
+    def test_unit_longer_than_the_angle_buffer(self, window, step, longest, octave):
         rng = np.random.default_rng(5)
         x = rng.standard_normal(350_000) + 7.0
         for start in rng.integers(0, x.size, 40):
@@ -162,7 +162,7 @@ class TestAgainstPeers:
             np.testing.assert_array_equal(result["count"][0, j], n)
 
     @pytest.mark.parametrize("method", ["direct", "recursive"])
-    def test_published_algorithms_agree_where_they_are_sound(self, method):
+    def test_published_algorithms_agree_without_gaps_and_shocks(self, method):
         x = np.random.default_rng(4).standard_normal((2, 6000))
         x[1, 2000:2300] = np.nan
         log = log_of(x)
@@ -172,7 +172,7 @@ class TestAgainstPeers:
         np.testing.assert_allclose(slow.avar, fast.avar, rtol=1e-8)
         np.testing.assert_allclose(slow.window_mean, fast.window_mean, rtol=1e-9, atol=1e-15)
 
-    def test_the_papers_convention_counts_fewer_terms_and_windows(self):
+    def test_convention_of_the_paper_counts_fewer_terms_and_windows(self):
         x = np.random.default_rng(5).standard_normal(6000)
         paper = davar(
             log_of(x),
@@ -195,8 +195,8 @@ class TestAgainstPeers:
         )
         np.testing.assert_allclose(recursive.avar, paper.avar, rtol=1e-9)
 
-    def test_zero_filling_makes_the_canyon_and_counting_removes_it(self):
-        """P16 divides by the gap-free number of terms: the surface sinks by the share of terms that are missing."""
+    def test_zero_filling_causes_the_gap_bias_and_counting_removes_it(self):
+        """P16 divides by the number of terms without gaps, which lowers the surface."""
         x = np.random.default_rng(6).standard_normal(40_000)
         x[20_000:20_400] = np.nan
         options = {"window": "2000samples", "step": "200samples", "taus": [0.01]}
@@ -237,7 +237,7 @@ class TestInvariance:
                 np.testing.assert_array_equal(lazy[name].values, whole[name].values, err_msg=name)
 
     @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-    def test_parts_that_share_memory_are_the_surface(self, dtype):
+    def test_parts_that_share_memory_equal_the_surface(self, dtype):
         rows = np.random.default_rng(8).standard_normal((2, 400_000)).astype(dtype)
         rows[1, 5000:9000] = np.nan
         log = log_of(rows)
@@ -253,7 +253,7 @@ class TestInvariance:
         units_together = davar_part(log, part=slice(0, whole.sizes["time"]), space=space, **options)
         xr.testing.assert_identical(units_together.avar, whole.avar)
 
-    def test_every_thread_has_a_workspace_of_its_own(self):
+    def test_every_thread_has_a_separate_workspace(self):
         spaces = Workspaces()
         with ThreadPoolExecutor(1) as pool:
             others = [pool.submit(lambda: spaces.own).result() for _ in range(2)]
@@ -279,7 +279,7 @@ class TestInvariance:
         wide = davar(log_of(x.astype(np.float64)), window="1000samples", step="100samples")
         np.testing.assert_allclose(narrow.avar, wide.avar, rtol=1e-12)
 
-    def test_integers_are_exact_however_large_their_mean(self):
+    def test_integers_with_a_large_mean_are_exact(self):
         x = np.random.default_rng(9).integers(-3, 4, 5000)
         small = davar(log_of(x), window="1000samples", step="100samples")
         large = davar(log_of(x + 2**40), window="1000samples", step="100samples")
@@ -301,7 +301,7 @@ class TestInvariance:
 
 
 class TestAccuracy:
-    def test_a_shock_of_a_million_sigma_leaves_no_trace_behind_it(self):
+    def test_shock_of_a_million_sigma_does_not_affect_later_windows(self):
         rng = np.random.default_rng(19)
         x = rng.standard_normal(60_000)
         shock = 30_000
@@ -342,7 +342,7 @@ class TestGaps:
         # white noise is seen too high, by exactly what the mask says
         assert float(result.white_response.sel(tau=1.0)) == pytest.approx(1.25, abs=0.02)
 
-    def test_a_bridged_window_is_the_same_alone(self):
+    def test_bridged_window_does_not_depend_on_its_neighbours(self):
         x = np.random.default_rng(6).standard_normal(30_000) + 3.0
         x[5000:5800] = x[20_000:20_700] = np.nan
         ks = np.array([1, 30, 200, 300])
@@ -381,7 +381,7 @@ class TestGaps:
             scatter = (surface.avar.std("axis") / law(k)) / np.sqrt(trials)
             assert np.all(np.abs(ratio - surface[response].isel(axis=0)) < 5 * scatter)
 
-    def test_an_empty_window_is_nan_not_zero(self):
+    def test_empty_window_is_nan(self):
         x = np.random.default_rng(14).standard_normal(6000)
         x[2000:4000] = np.nan
         result = davar(log_of(x), window="1000samples", step="500samples").isel(axis=0)
@@ -392,7 +392,7 @@ class TestGaps:
         assert (result["count"][empty] == 0).all()
         assert (result.estimator[empty] == ESTIMATORS.index("none")).all()
 
-    def test_thin_cells_are_blank_not_low(self):
+    def test_cells_with_low_coverage_are_nan(self):
         x = np.full(1000, np.nan)
         x[:60] = np.random.default_rng(15).standard_normal(60)
         result = davar(log_of(x), window="1000samples", min_coverage=0.1)
@@ -400,7 +400,7 @@ class TestGaps:
 
 
 class TestLabels:
-    def test_windows_say_when_they_are(self):
+    def test_windows_have_times_and_bounds(self):
         x = np.zeros((1, 3000))
         result = davar(log_of(x, rate=300.0, start="2026-01-01"), window="2s", step="1s")
         np.testing.assert_array_equal(
@@ -454,16 +454,16 @@ class TestLabels:
             ({"window": "-10s"}, "longer than zero"),
             ({"window": "10s", "taus": 0}, "above 0"),
             ({"window": "10s", "taus": ["soon"]}, "--taus 40 .how many., octave, all or 0.1s"),
-            ({"window": "10s", "axis": "q"}, "axis 'q' is not in the log; give one that it has: x"),
+            ({"window": "10s", "axis": "q"}, "axis 'q' is not in the log; it has x"),
             ({"window": "10s", "method": "magic"}, "direct"),
             ({"window": "10s", "convention": "paper"}, "method='direct'"),
         ],
     )
-    def test_options_that_make_no_sense_are_explained(self, options, words):
+    def test_wrong_options_are_explained(self, options, words):
         with pytest.raises(OptionError, match=words):
             davar(log_of(np.zeros(6000)), **options)
 
-    def test_what_is_not_a_log_is_refused(self):
+    def test_input_other_than_a_log_is_refused(self):
         with pytest.raises(SchemaError, match="rate"):
             davar(xr.Dataset({"omega": ("time", np.zeros(5))}), window="1s")
         log = log_of(np.zeros(100))
@@ -472,8 +472,8 @@ class TestLabels:
             davar(log, window="1s")
 
 
-def test_published_wavelet_variances_are_ours(recordings):
-    """The authors of the R package wv published the Haar wavelet variance, half the Allan variance, of the same record."""
+def test_published_wavelet_variances_are_reproduced(recordings):
+    """The R package wv publishes the Haar wavelet variance, half the Allan variance."""
     import pandas as pd
 
     table = pd.read_csv(recordings("reference-wavelet-variance/reference_wavelet_variance.csv.gz"))

@@ -1,4 +1,4 @@
-"""Confidence intervals and fitted coefficients against simulated truth; the statistics are claims and checked as such."""
+"""Confidence intervals and fitted coefficients against simulated truth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RATE = 100.0
 
 
 def windows_of(x, **options):
-    """Surface of independent trials, one window each, laid end to end on one axis."""
+    """Surface of independent trials, one window each, one after the other on one axis."""
     n = x.shape[1]
     return davar(
         make_log(x.reshape(-1), rate=RATE, unit="deg/h"),
@@ -53,7 +53,7 @@ def records(kind, rng, trials, n):
 @pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.1, 5)])
 @pytest.mark.parametrize("kind", ["white", "flicker", "random walk"])
 def test_95_percent_intervals_hold_the_truth(kind, share, block):
-    """2000 trials at every averaging time; the share of hits has a binomial sd of 0.5 %, and nine taus are looked at."""
+    """2000 trials at each of nine averaging times; the share of hits has a binomial sd of 0.5 %."""
     rng = np.random.default_rng([1, len(kind), block])
     x, law = records(kind, rng, 2000, 700)
     surface = windows_of(lose(rng, x, share, block), taus="octave").isel(axis=0)
@@ -83,7 +83,7 @@ def test_intervals_hold_where_tiny_gaps_raise_quantization_noise():
 
 
 def test_degrees_of_freedom_are_those_of_greenhall():
-    """allantools computes the same published tables by a different route; its white-noise case is approximate at short tau."""
+    """allantools computes the same tables, approximately for white noise at short tau."""
     from allantools.ci import edf_greenhall
 
     window = 1000
@@ -98,7 +98,7 @@ def test_degrees_of_freedom_are_those_of_greenhall():
 
 @pytest.mark.parametrize("k", [1, 2, 7, 40])
 def test_closed_form_of_the_white_pair_sum(k):
-    """Against the sum itself, the correlation taken from the weights of the second difference."""
+    """Compare with the sum, with the correlation from the weights of the second difference."""
     weights = np.concatenate([-np.ones(k), np.ones(k)])
     correlation = np.correlate(weights, weights, "full")[2 * k - 1 :] / (2 * k)
     for n in (1, 2, k, 2 * k, 100):
@@ -151,7 +151,7 @@ def test_standard_errors_are_right(share, block):
         ), term
 
 
-def test_flicker_alone_gives_b():
+def test_flicker_noise_alone_gives_b():
     rng = np.random.default_rng(5)
     product = fit_noise(windows_of(flicker(rng, 600, 2000, B=0.5), taus=20))
     z = (product.B - 0.5) / product.B_stderr
@@ -160,8 +160,8 @@ def test_flicker_alone_gives_b():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2])
-def test_what_is_not_there_is_rarely_claimed_and_its_limit_holds(share):
-    """White noise only: each absent term is called observed in about 1 % of windows; limits cover a small truth."""
+def test_absent_terms_are_rarely_observed_and_their_limits_hold(share):
+    """With white noise only, absent terms are observed in about 1 % of windows."""
     rng = np.random.default_rng([6, int(share * 10)])
     product = fit_noise(
         windows_of(lose(rng, white(rng, 2000, 2000, N=0.01, rate=RATE), share, 20), taus=20)
@@ -185,14 +185,14 @@ def test_what_is_not_there_is_rarely_claimed_and_its_limit_holds(share):
 
 
 def folded(rng, trials, n, *, N):
-    """White noise of N up to a quarter of the sampling rate and none above, as an alias or a filter leaves it."""
+    """White noise of N up to a quarter of the sampling rate only, as after a filter."""
     spectrum = np.fft.rfft(white(rng, trials, n, N=N, rate=RATE))
     spectrum[:, np.fft.rfftfreq(n) > 0.25] = 0.0
     return np.fft.irfft(spectrum, n)
 
 
 def test_limits_hold_where_the_five_terms_do_not_fit():
-    """Noise that is white below half of the band only: the five terms call it B, and from the fit alone N would be excluded."""
+    """White noise below half of the band only is fitted as B, so the fit alone would exclude N."""
     rng = np.random.default_rng(21)
     product = fit_noise(windows_of(folded(rng, 600, 2000, N=0.01), taus=30))
     assert float((product.fit_chi2 / product.fit_dof).median()) > 10
@@ -202,8 +202,8 @@ def test_limits_hold_where_the_five_terms_do_not_fit():
     assert float(product.N_upper.median()) < 0.02
 
 
-def test_what_is_added_to_the_noise_leaves_the_limits_high_enough():
-    """A tone in the middle of the averaging times: no term that is there may be excluded, seen or not."""
+def test_limits_hold_with_a_tone_on_the_noise():
+    """With a tone at medium averaging times, no term that is present may be excluded."""
     rng = np.random.default_rng(22)
     t = np.arange(2000) / RATE
     tone = 60.0 * np.sin(2 * np.pi * 1.3 * t + rng.uniform(0, 2 * np.pi, (600, 1)))
@@ -221,7 +221,7 @@ def test_what_is_added_to_the_noise_leaves_the_limits_high_enough():
 
 
 def test_no_term_is_observed_where_the_five_terms_do_not_describe_the_window():
-    """A tone of 60 deg/h on white noise: N and B are fitted with small errors, to a curve that is not theirs."""
+    """With a tone of 60 deg/h, N and B are fitted with small errors to the wrong curve."""
     rng = np.random.default_rng(24)
     t = np.arange(2000) / RATE
     tone = 60.0 * np.sin(2 * np.pi * 1.3 * t + rng.uniform(0, 2 * np.pi, (100, 1)))
@@ -238,7 +238,7 @@ def test_no_term_is_observed_where_the_five_terms_do_not_describe_the_window():
     xr.testing.assert_equal(estimates.observable, product.observable)
 
 
-def test_a_coefficient_and_its_error_are_missing_where_the_term_is_not_observed():
+def test_coefficient_and_error_are_nan_where_the_term_is_not_observed():
     product = fit_noise(
         windows_of(white(np.random.default_rng(25), 50, 2000, N=0.01, rate=RATE), taus=20)
     )
@@ -250,7 +250,7 @@ def test_a_coefficient_and_its_error_are_missing_where_the_term_is_not_observed(
     assert (product.observable == OBSERVABLE.index("upper_limit_only")).any()
 
 
-def test_errors_widen_with_the_misfit_and_only_then():
+def test_errors_widen_only_with_a_misfit():
     rng = np.random.default_rng(23)
     surface = windows_of(white(rng, 40, 2000, N=0.01, rate=RATE), taus=20)
     spoiled = surface.assign(avar=surface.avar * (1 + 0.2 * (np.arange(surface.sizes["tau"]) % 2)))
@@ -273,7 +273,7 @@ def test_errors_widen_with_the_misfit_and_only_then():
         np.testing.assert_allclose(product.N_stderr[0], expected, rtol=1e-9)
 
 
-def test_a_pure_ramp_is_r():
+def test_pure_ramp_gives_r():
     t = np.arange(20_000) / RATE / 3600
     x = 36.0 * t + 1e-3 * np.random.default_rng(8).standard_normal(20_000)
     product = fit_noise(
@@ -282,8 +282,8 @@ def test_a_pure_ramp_is_r():
     np.testing.assert_allclose(product.R, 36.0, rtol=2e-3)
 
 
-def test_gap_aware_columns_remove_the_bias_that_nominal_columns_have():
-    """20 % missing in blocks of five: nominal columns read N a quarter high, the columns of the mask do not."""
+def test_gap_aware_columns_remove_the_bias_of_nominal_columns():
+    """With 20 % missing in blocks of five, nominal columns bias N high by a quarter."""
     rng = np.random.default_rng(9)
     x = lose(rng, white(rng, 40, 20_000, N=0.01, rate=RATE), 0.2, 5)
     surface = windows_of(x, taus=24, min_strict=1.0)  # cluster means throughout
@@ -294,8 +294,8 @@ def test_gap_aware_columns_remove_the_bias_that_nominal_columns_have():
     assert float(nominal.N.mean()) > 0.0101
 
 
-def test_the_fit_of_deviations_of_the_2015_paper_is_not_additive():
-    """P15 adds deviations where variances add: with N and K together it misses both, the fit of variances neither."""
+def test_fit_of_deviations_of_the_2015_paper_is_biased():
+    """P15 adds deviations although variances add: with N and K together it misses both."""
     tau = np.geomspace(0.01, 1000, 30)
     truth = {"N": 0.01, "K": 5.0}
     surface = windows_of(np.zeros((2, 300_000)), taus=list(np.round(tau, 2)))
@@ -306,8 +306,8 @@ def test_the_fit_of_deviations_of_the_2015_paper_is_not_additive():
     assert abs(float(paper["K"][0, 0]) / truth["K"] - 1) > 0.03
 
 
-def test_averaging_times_below_a_disturbance_can_be_left_out():
-    """A tone at 5 Hz spoils tau below a second and with it N; from 2 s on the noise is as it was."""
+def test_averaging_times_with_a_disturbance_can_be_left_out():
+    """A tone at 5 Hz disturbs N at tau below one second; from 2 s on the noise is undisturbed."""
     t = np.arange(300_000) / RATE
     x = white(np.random.default_rng(17), 1, t.size, N=0.01, rate=RATE)[0] + 40 * np.sin(
         2 * np.pi * 5.013 * t
@@ -324,7 +324,7 @@ def test_averaging_times_below_a_disturbance_can_be_left_out():
         fit_noise(surface, tau_min="2h")
 
 
-def test_window_without_data_is_said_to_see_nothing():
+def test_window_without_data_is_not_observable():
     x = np.random.default_rng(10).standard_normal((3, 1000))
     x[1] = np.nan
     product = fit_noise(windows_of(x))
@@ -367,8 +367,8 @@ def test_many_averaging_times_are_thinned_for_the_fit():
     assert float(product.N.mean()) == pytest.approx(1 / 600, rel=0.05)
 
 
-def test_nonnegative_solution_beats_every_other_point():
-    """The exact solution against many random feasible points, and against scipy."""
+def test_nonnegative_solution_is_optimal():
+    """Compare with many random feasible points, and with scipy."""
     from scipy.optimize import nnls
 
     rng = np.random.default_rng(14)
@@ -388,8 +388,8 @@ def test_nonnegative_solution_beats_every_other_point():
     [{"N": 0.01}, {"Q": 0.4, "N": 0.01, "K": 200.0}, {"N": 0.01, "K": 40.0, "R": 3000.0}],
     ids="+".join,
 )
-def test_fast_fit_is_the_plain_fit(law, share, block):
-    """Against numpy and scipy, one window at a time; every number that errors and limits are made of."""
+def test_fast_fit_equals_the_reference_implementation(law, share, block):
+    """Compare all numbers behind errors and limits with numpy and scipy, window by window."""
     rng = np.random.default_rng([19, block])
     x = white(rng, 12, 3000, N=law["N"], rate=RATE) + random_walk(
         rng, 12, 3000, K=law.get("K", 0.0), rate=RATE
@@ -435,15 +435,15 @@ def shared(tables, **changed):
 
 
 def mixed_records(rng, trials):
-    """Every window another noise, so that fits side by side differ in their terms and in when they arrive."""
+    """Each window has another noise, so that fits in one vector differ in terms and convergence."""
     x = white(rng, trials, 3000, N=0.01, rate=RATE) * rng.choice([0.1, 1.0, 3.0], (trials, 1))
     x += random_walk(rng, trials, 3000, K=400.0, rate=RATE) * rng.choice([0.0, 1.0], (trials, 1))
     x += quantization(rng, trials, 3000, Q=0.4, rate=RATE) * rng.choice([0.0, 1.0], (trials, 1))
     return x + rng.choice([0.0, 3000.0], (trials, 1)) * np.arange(3000) / RATE / 3600
 
 
-def test_a_window_has_the_same_fit_in_any_place_beside_any_other():
-    """Bit for bit: among others in another order, beside windows without cells, and beside ones whose numbers overflow."""
+def test_fit_of_a_window_does_not_depend_on_other_windows():
+    """Bit for bit, in another order, with empty windows and with numbers that overflow."""
     rng = np.random.default_rng(32)
     flat, tables = cells_of(lose(rng, mixed_records(rng, 21), 0.2, 20), taus=21)
     expected = fit_windows(*flat, *shared(tables), 31)
@@ -465,7 +465,7 @@ def test_a_window_has_the_same_fit_in_any_place_beside_any_other():
 
 
 def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_must_be():
-    """Tables that are wrong by 2e-5 for random walks and right for all else; the plain fit widens window by window."""
+    """Tables are wrong by 2e-5 for random walks only."""
     rng = np.random.default_rng(33)
     walks = random_walk(rng, 20, 3000, K=400.0, rate=RATE)
     flat, tables = cells_of(
@@ -490,7 +490,7 @@ def test_a_covariance_that_is_not_positive_definite_is_widened_only_where_it_mus
     assert 2 < widened < 18
 
 
-def test_windows_are_fitted_alike_alone_and_together():
+def test_windows_have_the_same_fit_alone_and_together():
     x = np.random.default_rng(20).standard_normal((9, 2000))
     surface = windows_of(x, taus=21)
     together = fit_noise(surface)
@@ -515,10 +515,8 @@ def test_interpolated_quantile_is_that_of_scipy(quantile_curve, exponent):
 
 
 @pytest.mark.parametrize("decades", [np.inf, 10.0])
-def test_limit_of_a_cell_is_the_least_that_the_model_promises_among_all_cells(
-    quantile_curve, decades
-):
-    """Every cell tried with scipy's quantile; a term's own part cannot be more than the cell."""
+def test_limit_of_a_cell_is_the_smallest_of_all_cells(quantile_curve, decades):
+    """Try every cell with the quantile of scipy; a term cannot exceed the cell."""
     rng = np.random.default_rng(34)
     ks = np.round(np.geomspace(1, 1000, 25))
     columns = ks[:, None] ** np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -563,7 +561,7 @@ def test_limit_of_a_cell_is_the_least_that_the_model_promises_among_all_cells(
 
 
 def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
-    """Random walk alone, its covariances from the weights of the second differences on a sum of white noise."""
+    """Compare random walk with covariances from the weights of the second differences."""
     window, ks = 90, np.array([1, 3, 8, 20])
     walk = np.tril(np.ones((window, window)))
     differences = []
@@ -579,7 +577,7 @@ def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
             white_part = first @ second.T / (2.0 * ks[i] * ks[j])
             assert got[1, 1, i, j] == pytest.approx(2 * np.mean(white_part**2), rel=1e-9)
             # the average over each interval of a Brownian motion: half of the step in it, and a
-            # part of its own
+            # separate part
             ends = walk - 0.5 * np.eye(window)
             spread = ends @ ends.T + np.eye(window) / 12
             walk_part = first @ spread @ second.T / (2.0 * ks[i] * ks[j])
@@ -587,7 +585,7 @@ def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
             assert got[1, 3, i, j] == pytest.approx(2 * np.mean(white_part * walk_part), rel=1e-9)
 
 
-def test_every_number_carries_its_unit():
+def test_every_variable_has_a_unit():
     product = fit_noise(windows_of(np.random.default_rng(15).standard_normal((3, 1000))))
     for term, law in LAWS.items():
         assert product[term].units == law.units
@@ -597,7 +595,7 @@ def test_every_number_carries_its_unit():
     assert product.K_squared.units == "degree2 hour-3"
 
 
-def test_bad_calls_are_explained():
+def test_wrong_arguments_are_explained():
     surface = windows_of(np.random.default_rng(16).standard_normal((3, 1000)))
     with pytest.raises(OptionError, match="Q, N, B, K, R"):
         fit_noise(surface, terms="NX")
@@ -612,8 +610,8 @@ def test_bad_calls_are_explained():
 
 
 @pytest.mark.parametrize("block", [5, 50])
-def test_a_ramp_far_above_the_noise_fits_through_gaps(block):
-    """Lost samples move the centres of clusters apart, or together; with that in its column a ramp is one of the five terms again."""
+def test_strong_ramp_fits_in_windows_with_gaps(block):
+    """Lost samples move the centres of clusters; the ramp response accounts for that."""
     rng = np.random.default_rng([31, block])
     x = white(rng, 100, 4000, N=0.01, rate=RATE) + 3000.0 * np.arange(4000) / RATE / 3600
     surface = windows_of(lose(rng, x, 0.2, block), taus=24)

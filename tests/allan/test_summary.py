@@ -1,4 +1,4 @@
-"""What `gyrostab run` prints: the terms, the misfit, outliers and motion, and the averaging time to fit from."""
+"""The text of `gyrostab run`: terms, misfit, outliers, motion, and the time to fit from."""
 
 import re
 
@@ -32,7 +32,7 @@ def white(samples, seed):
 
 
 def filtered(samples, seed):
-    """White noise behind a boxcar of ten samples: no sum of the five terms below about 0.1 s."""
+    """White noise after a boxcar of ten samples; the terms fail below 0.1 s."""
     return np.convolve(white(samples + 9, seed), np.ones(10) / 10, mode="valid")
 
 
@@ -63,7 +63,7 @@ def test_white_noise_is_described_and_a_filter_is_not():
     assert all(term.status == "upper_limit_only" for term in summarise_terms(product))
 
 
-def test_the_proposed_averaging_time_leaves_a_fit_that_describes_the_record():
+def test_fit_from_the_proposed_averaging_time_describes_the_record():
     product = make_product(filtered(240_000, 3), window="2min")
     start = find_fit_from(product)
     assert 0.05 < start < 1.0
@@ -76,12 +76,12 @@ def test_the_proposed_averaging_time_leaves_a_fit_that_describes_the_record():
     assert (found.status, found.value) == ("observed", pytest.approx(0.01, rel=0.1))
 
 
-def test_single_outliers_are_counted_and_louder_noise_is_not():
+def test_single_outliers_are_counted_and_noisy_spans_are_not():
     rng = np.random.default_rng(4)
     values = rng.standard_normal(40_000)
     starts = np.arange(0, 40_000, 10_000)
     assert count_outliers(values, starts, 10_000).tolist() == [0, 0, 0, 0]
-    values[12_000:12_600] *= 50.0  # louder for six seconds
+    values[12_000:12_600] *= 50.0  # noisier for six seconds
     assert count_outliers(values, starts, 10_000).tolist() == [0, 0, 0, 0]
     values[[5, 9_000, 25_000, 25_004]] += [40.0, -40.0, 60.0, 60.0]
     assert count_outliers(values, starts, 10_000).tolist() == [2, 0, 2, 0]
@@ -95,13 +95,13 @@ def test_single_outliers_are_counted_and_louder_noise_is_not():
     assert count_outliers(values, starts, 10_000).tolist() == [2, 0, 2, 0]
 
 
-def test_a_slope_and_a_step_are_no_outliers():
+def test_slope_and_step_are_not_outliers():
     values = np.random.default_rng(5).standard_normal(20_000) + 100.0 * np.arange(20_000)
     values[10_000:] += 1e4
     assert count_outliers(values, np.array([0]), 20_000).tolist() == [0]
 
 
-def test_values_on_a_coarse_grid_are_no_outliers():
+def test_values_on_a_coarse_grid_are_not_outliers():
     values = np.round(np.random.default_rng(6).standard_normal(50_000) * 0.3)
     assert count_outliers(values, np.array([0]), 50_000).tolist() == [0]
 

@@ -1,7 +1,7 @@
-"""Figures look as they did: compared with small pictures in ``baseline/``, which were looked at one by one.
+"""Figures against small pictures in ``baseline/``, which were checked by eye.
 
-Make them anew, after a figure was changed on purpose, with ``python -m tests.plot.test_figures``
-(or ``make baseline``), and look at them.
+After an intended change of a figure, remake them with ``python -m tests.plot.test_figures`` (or
+``make baseline``), and check them by eye.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from gyrostab.plot.style import save_png
 from tests.support import synthetic
 
 BASELINE = Path(__file__).parent / "baseline"
-# pixels of a baseline; fonts and their hinting vanish in the downscaling, lines and colours stay
+# pixels of a baseline; downscaling removes font hinting and keeps lines and colours
 WIDTH = 240
-# root mean square difference, of 255; another hinting of the letters makes 2 to 5, a gap that is
-# filled 25
+# root mean square difference, of 255; another font hinting gives 2 to 5, a filled gap 25
 TOLERANCE = 8.0
 
 
@@ -50,7 +49,7 @@ def picture(figure: Figure) -> Image.Image:
 
 
 def difference(one: Image.Image, other: Image.Image) -> float:
-    """Root mean square difference, after a blur of three pixels that forgives a shift of a fraction of one."""
+    """Root mean square difference after a blur of three pixels, which hides subpixel shifts."""
     assert one.size == other.size
     small = [
         np.asarray(
@@ -72,11 +71,11 @@ def remake() -> None:
 
 
 @pytest.mark.parametrize("name", list(drawings()))
-def test_figure_looks_as_it_did(name):
+def test_figure_matches_its_baseline(name):
     assert difference(picture(drawings()[name]()), baseline(name)) < TOLERANCE
 
 
-def test_the_comparison_sees_a_change_of_content():
+def test_comparison_detects_a_change_of_content():
     product = synthetic.product()
     filled = product.assign(
         avar=product["avar"].where(product["estimator"] > 0, product["avar"][:, 0])
@@ -88,14 +87,14 @@ def test_the_comparison_sees_a_change_of_content():
     assert difference(picture(plot_davar(noisier)), baseline("davar")) > 2 * TOLERANCE
 
 
-def test_the_comparison_forgives_another_font():
+def test_comparison_ignores_another_font():
     import matplotlib as mpl
 
     with mpl.rc_context({"font.family": "DejaVu Serif", "text.hinting": "none"}):
         assert difference(picture(drawings()["davar"]()), baseline("davar")) < TOLERANCE
 
 
-def test_no_cell_without_estimate_no_word_of_it():
+def test_legend_omits_cells_without_estimate_if_there_are_none():
     product = synthetic.product(axes="x")
     whole = product.isel(time=slice(0, 15))
     assert not plot_davar(whole).legends
@@ -111,7 +110,7 @@ def test_no_cell_without_estimate_no_word_of_it():
 
 
 @pytest.mark.parametrize("spread", [1.0, 20.0, 1e4])
-def test_labels_stand_clear_of_the_ticks_and_every_panel_has_some(spread):
+def test_axis_labels_do_not_overlap_tick_labels(spread):
     product = synthetic.product(axes="x")
     for symbol in LAWS:  # linear scale, a log scale of little more than a decade, one of many
         product[symbol] = product[symbol] * np.geomspace(1.0, spread, product.sizes["time"])
@@ -159,7 +158,7 @@ def test_all_figures_of_a_product(tmp_path, capsys):
     assert main(["plot", source, "-o", str(target), "--overwrite"]) == 0
 
 
-def test_axes_with_odd_names_and_single_windows_are_drawn(tmp_path):
+def test_unusual_axis_names_and_single_windows_are_drawn(tmp_path):
     product = synthetic.product(axes="x").isel(time=[0]).assign_coords(axis=["gyro 1/a"])
     assert [path.name for path in save_figures(product, tmp_path, dpi=50)][3:] == [
         "temperature.png",
@@ -167,7 +166,7 @@ def test_axes_with_odd_names_and_single_windows_are_drawn(tmp_path):
     ]
 
 
-def test_refusals(tmp_path):
+def test_wrong_input_and_existing_figures_are_refused(tmp_path):
     with pytest.raises(SchemaError, match="no variable"):
         save_figures(synthetic.surface(), tmp_path)
     (tmp_path / "file").touch()

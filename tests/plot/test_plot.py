@@ -1,4 +1,4 @@
-"""Figures say what they show, in units, and lose nothing on the way."""
+"""Figures show the data with labels and units."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_davar_3d_is_logarithmic_with_units(product):
     assert ax.zaxis.get_major_formatter()(1.0) == "$10^{1}$"
 
 
-def test_coefficients_have_five_panels_in_the_units_of_the_field(product):
+def test_coefficients_have_five_panels_in_customary_units(product):
     figure = plot_coefficients(product)
     assert [ax.get_ylabel() for ax in figure.axes] == [
         "Q [urad]",
@@ -189,7 +189,7 @@ def test_coefficients_have_five_panels_in_the_units_of_the_field(product):
 
 
 @pytest.mark.parametrize("windows", [40, 200])
-def test_values_limits_and_blind_stretches_of_the_coefficients(windows):
+def test_values_limits_and_unobservable_spans_of_the_coefficients(windows):
     product = synthetic.product(windows=windows)
     figure = plot_coefficients(product, axis="y")
     part = product.sel(axis="y")
@@ -238,7 +238,7 @@ def test_band_is_the_chi_square_band(edf, avar):
     assert float(high) == pytest.approx(avar * edf / chi2.ppf(0.025, edf), rel=1e-8)
 
 
-def test_band_covers_the_truth_as_often_as_it_says(product):
+def test_band_covers_the_truth_in_95_percent(product):
     low, high = band(product.avar.values, product.edf.values)
     truth = np.stack(
         [
@@ -259,7 +259,7 @@ def _truth(axis: int, window: int, windows: int) -> dict[str, float]:
     }
 
 
-def test_adev_draws_the_window_asked_for(product):
+def test_adev_draws_the_requested_window(product):
     when = product.time.values[7]
     figure = plot_adev(product, "y", when=when)
     ax = figure.axes[0]
@@ -291,7 +291,7 @@ def test_adev_without_a_time_avoids_the_gap(product):
 @pytest.mark.parametrize(
     ("when", "words"), [("2031-01-01", "outside the record"), ("noon", "not understood")]
 )
-def test_adev_at_an_impossible_time(product, when, words):
+def test_adev_refuses_an_impossible_time(product, when, words):
     with pytest.raises(OptionError, match=words):
         plot_adev(product, "x", when=when)
 
@@ -315,7 +315,7 @@ def test_shortest_products_can_be_drawn(tmp_path, windows):
             plot_davar_3d(short)
 
 
-def test_a_product_of_nothing_but_gaps_can_be_drawn(tmp_path):
+def test_product_without_any_sample_can_be_drawn(tmp_path):
     product = synthetic.product(axes="x")
     blind = product.isel(time=slice(20, 24))
     for number, figure in enumerate(
@@ -329,7 +329,7 @@ def test_a_product_of_nothing_but_gaps_can_be_drawn(tmp_path):
         figure.savefig(tmp_path / f"{number}.png", dpi=40)
 
 
-def test_figures_leave_pyplot_alone(product):
+def test_figures_do_not_use_pyplot(product):
     import matplotlib.pyplot as plt
 
     plot_davar(product)
@@ -337,8 +337,8 @@ def test_figures_leave_pyplot_alone(product):
     assert plt.get_fignums() == []
 
 
-def test_a_variance_below_zero_has_no_deviation(product):
-    """The recursion as printed drifts there where there is next to no noise; no root is taken of it, and the cell stays blank."""
+def test_negative_variance_has_no_deviation(product):
+    """The published recursion drifts below zero almost without noise; the cell is blank."""
     spoiled = product.copy(deep=True)
     cell = {"axis": "x", "time": product.time[3], "tau": product.tau[2]}
     assert np.isfinite(product.avar.sel(cell))

@@ -1,4 +1,4 @@
-"""Small products with a lively temperature and a known coupling, made without the package's own statistics."""
+"""Small products with a changing temperature and a known coupling."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gyrostab.noise import TERMS
 from gyrostab.schema import attributes
 
 WINDOW, STEP = 60.0, 30.0  # s
-CELL = 30.0  # s; noise and temperature are made in cells, a window holds two of them
+CELL = 30.0  # s; noise and temperature are made in cells, two per window
 
 
 def temperature(kind: str, cells: int, rng: np.random.Generator) -> np.ndarray:
@@ -26,7 +26,7 @@ def temperature(kind: str, cells: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def noise(kind: str, cells: int, rng: np.random.Generator) -> np.ndarray:
-    """Cell means [deg/h]: white, with flicker (about B), with random walk (K), or with slow autoregression."""
+    """Cell means [deg/h]: white, with flicker, with random walk, or with slow autoregression."""
     white = rng.normal(size=cells)
     if kind == "flicker":
         f = np.fft.rfftfreq(4 * cells)[1:]
@@ -58,7 +58,10 @@ def product(
     gap: bool = True,
     terms: bool = True,
 ) -> xr.Dataset:
-    """A product whose x axis follows temperature by `slope` [deg/h/K] and its rate by `pace`, `lag` steps late; others follow nothing."""
+    """Make a product whose x axis follows temperature by `slope` [deg/h/K] and its rate by `pace`.
+
+    It follows `lag` steps late; the other axes do not follow temperature.
+    """
     rng = np.random.default_rng(seed)
     head = 40
     cells = windows + 1

@@ -1,4 +1,4 @@
-"""A small product with known coefficients, a log and a surface, for the tests of export, plot and report."""
+"""A small product with known coefficients, a log and a surface, for tests of files and figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COEFFICIENTS = {"Q": 0.8, "N": 0.01, "B": 0.02, "K": 0.05, "R": 0.01}
 
 
 def product(*, windows: int = 40, taus: int = 12, axes: str = "xyz", seed: int = 1) -> xr.Dataset:
-    """Allan variances of known coefficients with chi-square scatter, a gap in the third quarter and a weighted stretch after it."""
+    """Product of known coefficients with chi-square scatter, a gap, and weighted cells after it."""
     rng = np.random.default_rng(seed)
     window, step = 1800, 9000
     tau = np.unique(np.geomspace(1, 600, taus).astype(int)) / RATE

@@ -1,4 +1,4 @@
-"""Weighted cluster means against a matrix of all their terms, and their degrees of freedom against the scatter of many records."""
+"""Weighted cluster means against a matrix of their terms, and their scatter over many records."""
 
 from __future__ import annotations
 
@@ -105,8 +105,8 @@ def test_cells_equal_the_sum_over_their_terms(seed, data):
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])
-def test_few_pairs_of_clusters_find_their_samples_as_many_do(share):
-    """Few pairs take the places of the samples from the mask, many from an integral: the same bits, and those of the terms."""
+def test_few_and_many_pairs_of_clusters_give_the_same_bits(share):
+    """Few pairs locate their samples with the mask, many with an integral."""
     rng, window = np.random.default_rng(8), 6000
     x = rng.standard_normal(window + 900)
     x[rng.random(x.size) < share] = np.nan
@@ -134,7 +134,7 @@ def test_few_pairs_of_clusters_find_their_samples_as_many_do(share):
             ), name
 
 
-def test_a_short_window_uses_every_pair_and_a_long_one_as_many_as_have_something_to_add():
+def test_short_window_uses_every_pair_and_long_window_only_some():
     ks = np.array([1, 31, 32, 100, 372, 499])
     assert list(cluster_strides(1000, ks, np.zeros(6, np.int64))) == [1, 1, 2, 2, 1, 1]
     assert list(cluster_strides(120_000, ks, np.zeros(6, np.int64))) == [1, 1, 2, 4, 16, 16]
@@ -143,7 +143,7 @@ def test_a_short_window_uses_every_pair_and_a_long_one_as_many_as_have_something
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_degrees_of_freedom_are_those_of_the_mask(pattern):
-    """The share that gaps leave is found from a part of the pairs of terms; here all of them are summed."""
+    """The kernel uses only some pairs of terms; the reference uses all of them."""
     x = np.where(PATTERNS[pattern], 1.0, np.nan) * np.random.default_rng(4).standard_normal(N)
     ks = [2, 5, 16, 50, 120, 250, 330, 400, 440]
     made = surface(x, ks).isel(axis=0, time=0)
@@ -163,8 +163,8 @@ def test_degrees_of_freedom_are_those_of_the_mask(pattern):
 @pytest.mark.parametrize(
     "pattern", ["every 7th", "random, 40 %", "blocks of 60", "one block", "the end"]
 )
-def test_the_scatter_of_many_records_is_that_of_the_degrees_of_freedom(pattern):
-    """Of a cell with nu degrees of freedom the variance is ``2 mean^2 / nu``."""
+def test_scatter_of_many_records_agrees_with_the_degrees_of_freedom(pattern):
+    """A cell with nu degrees of freedom has the variance ``2 mean^2 / nu``."""
     records, ks = 1500, [1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 180, 250, 330, 400, 440]
     x = np.where(PATTERNS[pattern], np.random.default_rng(5).standard_normal((records, N)), np.nan)
     made = surface(x.ravel(), ks).isel(axis=0, tau=slice(3, None))
@@ -176,8 +176,8 @@ def test_the_scatter_of_many_records_is_that_of_the_degrees_of_freedom(pattern):
     assert (abs(np.log(claimed / scattered)) < 3.5 * error + 0.1).values[seen].all()
 
 
-def test_a_cell_that_nearly_vanishes_by_chance_does_not_claim_to_be_certain():
-    """Windows of 10 s at 100 Hz that lose their end: long averaging times use every position that is left, and know how few these are."""
+def test_cell_near_zero_by_chance_has_few_degrees_of_freedom():
+    """Windows of 10 s at 100 Hz without their end leave few positions at long averaging times."""
     x = np.random.default_rng(6).standard_normal((300, 1000))
     x[:, 890:] = np.nan
     made = (

@@ -1,4 +1,4 @@
-"""Kernels of the dynamic Allan variance one by one: the integral and its levels, several lags in one pass, memory that others have used."""
+"""Single kernels of the dynamic Allan variance: integral, thinned levels, lags, reused memory."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class TestKernels:
         used = lags[2:]
         theta = np.full(
             first + longest + 2 * used.max() + 2 * LANES, np.nan
-        )  # what no term needs may be anything
+        )  # elements that no term needs may have any value
         end = first + (sizes + 2 * used).max()
         theta[first:end] = rng.standard_normal(end - first)
         heads, tails = np.full((2, count + 4), 7.0)
@@ -78,7 +78,7 @@ class TestKernels:
             want = theta[:: 2**shift]
             np.testing.assert_array_equal(flat[place : place + want.size], want)
 
-    def test_memory_that_others_have_used_changes_no_bit(self):
+    def test_reused_memory_does_not_change_results(self):
         rng, space = np.random.default_rng(4), Workspace()
         whole, broken = rng.standard_normal((2, 30_000))
         broken[rng.random(30_000) < 0.02] = np.nan

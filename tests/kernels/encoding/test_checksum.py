@@ -26,11 +26,11 @@ def by_numcodecs(data: np.ndarray) -> int:
 @example(np.full(720, 255, np.uint8))
 @example(np.array([255, 254, 0, 1], np.uint8))  # the words add up to 65535
 @example(np.array([0, 0, 7], np.uint8))
-def test_as_numcodecs_has_it(data):
+def test_checksum_equals_that_of_numcodecs(data):
     assert fletcher32(data) == by_numcodecs(data)
 
 
 @pytest.mark.parametrize("size", [1_920_000, 1_318_481])
-def test_of_a_whole_chunk(size):
+def test_checksum_of_a_whole_chunk(size):
     data = np.random.default_rng(size).integers(0, 256, size, dtype=np.uint8)
     assert fletcher32(data) == by_numcodecs(data)

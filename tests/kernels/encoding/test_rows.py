@@ -1,4 +1,4 @@
-"""Rows of text by the kernel, against Python's own reading of the same cells."""
+"""Rows of text read by the kernel, against Python reading the same cells."""
 
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
@@ -65,7 +65,7 @@ numbers = st.one_of(
 
 @settings(deadline=None)  # the first call compiles
 @given(st.lists(numbers, min_size=1, max_size=20))
-def test_a_number_is_the_nearest_double_or_is_not_read_at_all(cells):
+def test_number_is_the_nearest_double_or_is_not_read(cells):
     for cell in cells:
         values, _, stop = rows_of(cell + "\n", [NUMBER])
         if stop:
@@ -112,14 +112,14 @@ def test_common_numbers_are_read(cell):
         "1" * 25,
     ],
 )
-def test_what_is_no_plain_number_is_left_to_others(cell):
+def test_cells_other_than_plain_numbers_are_not_read(cell):
     values, _, stop = rows_of(f"1.5\n{cell}\n2.5\n", [NUMBER])
     assert stop == 4
     assert values.tolist() == [[1.5]]
 
 
 @pytest.mark.parametrize("row", ["1", "1,2,3", "1,2,", ",,", "1;2"])
-def test_a_row_of_another_width_is_left_to_others(row):
+def test_row_of_another_width_is_not_read(row):
     assert rows_of(f"{row}\n", [NUMBER, NUMBER])[2] == 0
 
 
@@ -134,7 +134,7 @@ def test_void_cells_and_blanks_around_cells(cell, value):
     assert stamps.tolist() == [1]
 
 
-def test_lines_without_data_are_passed():
+def test_lines_without_data_are_skipped():
     values, stamps, stop = rows_of(
         "\n# said\n \r\n  % too\n1,2\n\n\n3,\n", [NUMERIC_TIME, NUMBER], digits=0
     )
@@ -143,7 +143,7 @@ def test_lines_without_data_are_passed():
     assert np.array_equal(values, [[2.0, np.nan]], equal_nan=True)
 
 
-def test_blanks_separate_in_any_number():
+def test_any_number_of_blanks_separates_cells():
     values, stamps, stop = rows_of(
         "  1.5   2\t-3 \n4 5 6\n7 8\n", [NUMBER, SKIPPED, NUMERIC_TIME], separator=" ", digits=0
     )
@@ -152,7 +152,7 @@ def test_blanks_separate_in_any_number():
     assert stop == 20
 
 
-def test_decimal_comma_and_columns_that_are_not_wanted():
+def test_decimal_comma_and_skipped_columns():
     values, _, stop = rows_of(
         "word;1,25;2,5\n", [SKIPPED, NUMBER, NUMBER], separator=";", point=","
     )
@@ -163,9 +163,10 @@ def test_decimal_comma_and_columns_that_are_not_wanted():
 
 @settings(deadline=None)
 @given(st.integers(-(10**18), 10**18), st.integers(0, 9), st.integers(0, 9))
-def test_numbers_of_time_are_exact_and_halves_go_to_even(count, decimals, digits):
+def test_numeric_times_are_exact_and_halves_round_to_even(count, decimals, digits):
     text = (
-        f"{'-' if count < 0 else ''}{abs(count) // 10**decimals}.{abs(count) % 10**decimals:0{decimals}d}"
+        f"{'-' if count < 0 else ''}{abs(count) // 10**decimals}"
+        f".{abs(count) % 10**decimals:0{decimals}d}"
         if decimals
         else str(count)
     )
@@ -204,7 +205,7 @@ def test_dates_are_those_of_the_calendar(moment, digits, between, zone):
         "2026-01-01T00:00:60",
     ],
 )
-def test_days_that_do_not_exist_are_left_to_others(text):
+def test_dates_that_do_not_exist_are_not_read(text):
     assert rows_of(f"{text}\n", [ISO])[2] == 0
     assert rows_of("\n", [ISO])[1].tolist() == []
     assert rows_of(",1\n", [ISO, NUMBER])[1].tolist() == [NAT]
@@ -218,7 +219,7 @@ def test_days_that_do_not_exist_are_left_to_others(text):
         | st.integers(-100, 100).map(float)
     )
 )
-def test_a_column_is_cleaned_as_numpy_would(values):
+def test_column_is_cleaned_as_with_numpy(values):
     column = np.array(values, dtype=np.float64)
     missing, low, high, whole = clean_column(held := column.copy(), 3.7, 0.1)
     finite = column[np.isfinite(column)]

@@ -1,4 +1,4 @@
-"""Eight problems side by side against numpy and scipy, one at a time."""
+"""Eight problems at once against numpy and scipy, one at a time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def every_operation(a, b):
     return out, out.ctypes.data
 
 
-def test_operations_are_those_of_numpy_place_by_place():
+def test_operations_equal_those_of_numpy():
     rng = np.random.default_rng(1)
     a, b = rng.normal(size=8), rng.uniform(0.1, 1.0, 8)
     a[2] = np.nan
@@ -57,7 +57,7 @@ def solve_eight(matrices, columns):
 
 
 @pytest.mark.parametrize("n", [4, 12, 40])
-def test_elimination_is_that_of_numpy_where_the_matrix_is_positive_definite(n):
+def test_elimination_of_positive_definite_matrices_equals_numpy(n):
     rng = np.random.default_rng(n)
     half = rng.normal(size=(8, n, n + 3))
     matrices, columns = half @ half.transpose(0, 2, 1), rng.normal(size=(8, n, 6))
@@ -92,7 +92,7 @@ def nonnegative_eight(normal, right, allowed, guess):
 
 
 @pytest.mark.parametrize("allowed", [31, 0b01011])
-def test_eight_nonnegative_solutions_are_those_of_scipy_whatever_is_tried_first(allowed):
+def test_nonnegative_solutions_equal_scipy_from_any_first_trial(allowed):
     rng = np.random.default_rng(allowed)
     members = [i for i in range(5) if allowed >> i & 1]
     sizes = set()

@@ -1,4 +1,4 @@
-"""The placement kernel, against samples that are known because the stamps were made from them."""
+"""The placement kernel against the samples from which the stamps were made."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PERIOD = 10_000_000.0
 
 
 def place(samples, *, max_gap=1e9, hold=0.75, pieces=None):
-    """Runs and events of rows with stamps at `samples` (may be fractions; None: no stamp)."""
+    """Place rows with stamps at `samples` (may be fractions; None: no stamp): runs and events."""
     stamps = np.array(
         [NO_STAMP if s is None else round(s * PERIOD) for s in samples], dtype=np.int64
     )
@@ -100,7 +100,7 @@ def test_jitter_of_the_first_stamp_does_not_shift_the_log():
     assert place((samples + jitter).tolist())[0] == samples.tolist()
 
 
-def test_blocks_make_no_difference():
+def test_result_does_not_depend_on_blocks():
     random = np.random.default_rng(7)
     samples = np.sort(random.choice(4000, 3000, replace=False)).astype(float)
     samples += random.uniform(-0.2, 0.2, len(samples))
@@ -129,7 +129,7 @@ def test_last_stamp_after_200_hours_at_300_hertz():
     assert state[kernel.OPEN_RUN].tolist() == [last - 1000, 1000, 1001]
 
 
-def test_samples_between_stamps_are_counted_as_a_division_rounds_them():
+def test_samples_between_stamps_are_rounded_counts():
     rng = np.random.default_rng(4)
     steps = rng.choice([0, 3, 4, 5, 6, 8, 10, 12, 14, 15, 16, 20, 25, 35, -5, -15, 400, -400], 3000)
     stamps = np.cumsum(steps)
@@ -137,7 +137,7 @@ def test_samples_between_stamps_are_counted_as_a_division_rounds_them():
         0.0,
         0.1,
         0.5,
-    ):  # without gain the phase stays on whole numbers, and many a stamp lies just between two samples
+    ):  # without gain the phase stays whole, and many stamps lie between samples
         count, piece, phase = [0], [0], 0.0
         for step in np.diff(stamps).tolist():
             new = abs(step) > 300
@@ -150,7 +150,7 @@ def test_samples_between_stamps_are_counted_as_a_division_rounds_them():
         assert found[1].tolist() == piece
 
 
-def test_count_along_a_lattice_survives_jitter_and_a_wrong_period():
+def test_sample_count_tolerates_jitter_and_a_wrong_period():
     random = np.random.default_rng(1)
     samples = np.flatnonzero(random.random(20_000) > 0.1)
     stamps = np.rint((samples + random.uniform(-0.2, 0.2, len(samples))) * PERIOD).astype(np.int64)
@@ -160,8 +160,8 @@ def test_count_along_a_lattice_survives_jitter_and_a_wrong_period():
 
 
 @pytest.mark.parametrize("off", [1e-3, -1e-3])
-def test_a_clock_that_runs_away_skips_or_drops_single_samples(off):
-    """Jitter of a fifth of a sample must not make the decision flicker."""
+def test_drifting_clock_skips_or_drops_single_samples(off):
+    """Jitter of a fifth of a sample must not change the decision back and forth."""
     random = np.random.default_rng(5)
     n = 20_000
     stamps = np.arange(n) * (1 + off) + random.uniform(-0.2, 0.2, n)

@@ -1,4 +1,4 @@
-"""Two levels by forward and backward, against the sum over all courses of a few blocks."""
+"""Two levels by the forward-backward algorithm against the sum over all level sequences."""
 
 from itertools import pairwise, product
 
@@ -13,7 +13,7 @@ from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 def enumerated(
     like: np.ndarray, low: float, high: float
 ) -> tuple[float, np.ndarray, np.ndarray, float]:
-    """Log likelihood, shares, their squares and steps up, from every course of levels over the parts of the blocks."""
+    """Sum log likelihood, shares, their squares and steps up over all level sequences."""
     blocks, parts = like.shape[0], like.shape[1] - 1
     rate = 1.0 / low + 1.0 / high
     settled = np.array([low, high]) / (low + high)
@@ -32,7 +32,7 @@ def enumerated(
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_is_the_sum_over_all_courses(parts: int) -> None:
+def test_result_is_the_sum_over_all_level_sequences(parts: int) -> None:
     rng = np.random.default_rng(parts)
     like = rng.random((2, 4, parts + 1))
     like[1, 2] = 1.0  # a block that is missing
@@ -49,7 +49,7 @@ def test_is_the_sum_over_all_courses(parts: int) -> None:
 
 @given(low=st.floats(0.3, 300.0), high=st.floats(0.3, 300.0), parts=st.integers(1, 8))
 @settings(max_examples=40, deadline=None)
-def test_tables_are_chances_and_hop_as_often_as_the_times_say(
+def test_tables_are_probabilities_with_the_given_switching_times(
     low: float, high: float, parts: int
 ) -> None:
     chance, rises = level_tables(np.array([low]), np.array([high]), parts)

@@ -1,4 +1,4 @@
-"""Smoothing takes white noise off and leaves what moves."""
+"""Smoothing removes white noise and keeps slow changes."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from gyrostab.kernels.regression.smooth import smooth_curve
 
 @given(st.integers(8, 300), st.floats(-50.0, 50.0), st.floats(-1.0, 1.0))
 @settings(max_examples=25, deadline=None)
-def test_straight_lines_stay(n, level, slope):
+def test_straight_lines_are_unchanged(n, level, slope):
     line = level + slope * np.arange(n)
     np.testing.assert_allclose(smooth_curve(line, longest=8.0), line, atol=1e-8)
 
 
-def test_curves_without_noise_stay_nearly():
+def test_curves_without_noise_are_almost_unchanged():
     curve = np.sin(np.arange(500) / 10.0)
     assert np.abs(smooth_curve(curve, longest=20.0) - curve).max() < 0.005
 
 
 @pytest.mark.parametrize("noise", [0.03, 0.3])
-def test_noise_goes_as_far_as_the_curve_allows(noise):
+def test_noise_is_reduced(noise):
     rng = np.random.default_rng(7)
     true = 5.0 * np.sin(np.arange(2000) / 60.0)
     found = smooth_curve(true + noise * rng.standard_normal(true.size), longest=40.0)
     assert np.std(found - true) < 0.5 * noise
 
 
-def test_the_penalty_is_the_sum_of_squares_that_it_says():
-    """Against the normal equations, at the only length that is tried."""
+def test_penalty_is_the_sum_of_squared_differences():
+    """Compare with the normal equations at a single length."""
     values = np.random.default_rng(2).standard_normal(30)
     D = np.diff(np.eye(30), 2, axis=0)
     expected = np.linalg.solve(np.eye(30) + 0.7**4 * D.T @ D, values)

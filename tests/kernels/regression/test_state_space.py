@@ -11,7 +11,7 @@ from gyrostab.kernels.regression.state_space import flicker_states, whiten
 
 
 def walk_covariance(edges: np.ndarray) -> np.ndarray:
-    """Covariance of the means over blocks of a Brownian motion that begins at the first edge, by integration of min(s, t)."""
+    """Covariance of block means of a Brownian motion from the first edge: integral of min(s, t)."""
     begin, end = edges[:-1] - edges[0], edges[1:] - edges[0]
     covariance = np.minimum.outer((begin + end) / 2.0, (begin + end) / 2.0)
     covariance[np.diag_indices(begin.size)] = begin + (end - begin) / 3.0
@@ -19,7 +19,7 @@ def walk_covariance(edges: np.ndarray) -> np.ndarray:
 
 
 def relaxation_covariance(edges: np.ndarray, time: float) -> np.ndarray:
-    """Covariance of the means over blocks of an Ornstein-Uhlenbeck process of unit variance: double integral of exp(-|s - t| / T)."""
+    """Covariance of block means of an Ornstein-Uhlenbeck process: integral of exp(-|s - t| / T)."""
     begin, end = edges[:-1], edges[1:]
     step = end - begin
     fall = -np.expm1(-step / time) * time / step
@@ -51,7 +51,7 @@ def dense(columns, variance, step, present, K2, ou_variance, ou_time):
     K=st.sampled_from([0.0, 0.01, 1.0]),
     processes=st.integers(0, 5),
 )
-def test_products_and_determinant_are_those_of_the_dense_covariance(seed, missing, K, processes):
+def test_products_and_determinant_equal_those_of_the_dense_covariance(seed, missing, K, processes):
     rng = np.random.default_rng(seed)
     n = 60
     step = np.full(n, 20.0) if seed % 2 else rng.uniform(1.0, 30.0, n)
@@ -76,7 +76,7 @@ def test_products_and_determinant_are_those_of_the_dense_covariance(seed, missin
     assert not whitened[~present].any()
 
 
-def test_a_constant_is_taken_out_and_nothing_else():
+def test_only_a_constant_is_removed():
     rng = np.random.default_rng(3)
     n = 50
     case = (
@@ -104,14 +104,14 @@ def test_white_noise_alone_leaves_deviations_from_the_mean():
     assert log_determinant == pytest.approx(3 * np.log(0.5) + np.log(3 / 0.5))
 
 
-def test_nothing_present_gives_nothing():
+def test_no_block_present_gives_zeros():
     case = (np.ones(5), np.ones(5), np.zeros(5, bool), np.ones(5), np.ones(1), np.ones(1))
     whitened, log_determinant = whiten(np.ones((5, 2)), *case)
     assert not whitened.any()
     assert log_determinant == 0.0
 
 
-def test_slow_and_fast_processes_keep_their_digits():
+def test_slow_and_fast_processes_keep_precision():
     rng = np.random.default_rng(5)
     n = 40
     slow_and_fast = np.ones(3), np.array([999.0, 1e6, 1e-2])
@@ -130,7 +130,7 @@ def test_slow_and_fast_processes_keep_their_digits():
 
 
 def flicker_variogram(lag: np.ndarray) -> np.ndarray:
-    """Variance of the difference of two block means of flicker noise with B = 1, `lag` blocks apart: density 1 / (2 pi f)."""
+    """Variance of the difference of two block means of flicker noise, B = 1."""
 
     def integral(x):
         return np.where(x > 0, -(x**2) / 2.0 * np.log(np.maximum(x, 1e-300)) + 0.75 * x**2, 0.0)
@@ -141,7 +141,7 @@ def flicker_variogram(lag: np.ndarray) -> np.ndarray:
     return 2.0 * (2.0 * integral(np.array(1.0)) / np.pi - covariance)
 
 
-def test_processes_make_flicker_noise():
+def test_sum_of_processes_approximates_flicker_noise():
     step, n = 20.0, 180
     variance, time, white = flicker_states(step, step * n)
     edges = np.arange(n + 1) * step

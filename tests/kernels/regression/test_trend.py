@@ -9,7 +9,7 @@ from gyrostab.kernels.regression.trend import window_trend
 
 
 def plain(values, seconds):
-    """Mean and least-squares slope of what is finite, in extended precision."""
+    """Mean and least-squares slope of finite values, in extended precision."""
     here = np.isfinite(values)
     y, t = values[here].astype(np.longdouble), seconds[here].astype(np.longdouble)
     mean, centre = y.sum() / y.size, t.sum() / t.size
@@ -17,7 +17,7 @@ def plain(values, seconds):
 
 
 @pytest.mark.parametrize("offset", [0.0, 25.0, 1e6])
-def test_means_and_slopes_are_those_of_extended_precision(offset):
+def test_means_and_slopes_agree_with_extended_precision(offset):
     rng = np.random.default_rng(1)
     seconds = 3600.0 + np.sort(rng.uniform(0.0, 1000.0, 3000))
     values = offset + 0.002 * (seconds - 4000.0) + rng.standard_normal(3000)
@@ -33,7 +33,7 @@ def test_means_and_slopes_are_those_of_extended_precision(offset):
     np.testing.assert_allclose(got[1], expected[1], rtol=1e-10, atol=1e-14 * (1.0 + offset))
 
 
-def test_windows_that_have_no_mean_or_no_slope():
+def test_windows_without_mean_or_slope():
     values, seconds = (
         np.array([np.nan, np.inf, 3.0, np.nan, 5.0]),
         np.array([0.0, 1.0, 2.0, 3.0, 2.0]),
