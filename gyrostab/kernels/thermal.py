@@ -28,14 +28,14 @@ TINY = 1e-200
 
 
 def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
-    """Modes of a winding that is heated from outside.
+    """Compute the modes of a winding that is heated from outside.
 
     Parameters
     ----------
     slowest : float
         Relaxation time of the slowest mode [s].
     count : int
-        Number of modes; the last one stands for all that are faster.
+        Number of modes; the last one represents all faster modes.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def _relax_mode(
 def relax(
     values: Array, rate: float, times: Array, weight: Array, carry: tuple[float, Array]
 ) -> tuple[Array, tuple[float, Array]]:
-    """Rate of change of samples, delayed by every mode: ``v' = (T' - v) / t``, T straight between its samples.
+    """Differentiate samples with the delay of every mode: ``v' = (T' - v) / t``, T straight.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def _follow_values(at: Array, values: Array, time: float) -> Array:
 
 
 def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
-    """Mean over intervals of what `relax` gives for one mode, from a few values of T that are joined by straight lines.
+    """Average one mode of `relax` over intervals, with T straight between few values.
 
     Parameters
     ----------
@@ -150,7 +150,8 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
 
     Examples
     --------
-    >>> mean_changes(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.01)
+    >>> t, T = np.array([5.0, 15.0]), np.array([1.0, 3.0])
+    >>> mean_changes(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.01)
     array([0.1998, 0.2   ])
     """
     at, line = _polygon_corners(known, values, begin, end)
@@ -161,7 +162,7 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
 
 
 def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
-    """Mean over intervals of what follows T with one relaxation time, ``y' = (T - y) / t``, from a few values of T on straight lines.
+    """Average over intervals what follows T with one relaxation time, ``y' = (T - y) / t``.
 
     Parameters
     ----------
@@ -175,7 +176,8 @@ def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: f
 
     Examples
     --------
-    >>> mean_followed(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.5).round(4)
+    >>> t, T = np.array([5.0, 15.0]), np.array([1.0, 3.0])
+    >>> mean_followed(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.5).round(4)
     array([0.905, 2.9  ])
     """
     at, line = _polygon_corners(known, values, begin, end)
@@ -202,7 +204,8 @@ def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
 
     Examples
     --------
-    >>> mean_rates(np.array([5.0, 15.0]), np.array([1.0, 3.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]))
+    >>> t, T = np.array([5.0, 15.0]), np.array([1.0, 3.0])
+    >>> mean_rates(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]))
     array([0.2, 0.2])
     """
     at, line = _polygon_corners(known, values, begin, end)
@@ -212,7 +215,7 @@ def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
 
 
 def _polygon_corners(known: Array, values: Array, begin: Array, end: Array) -> tuple[Array, Array]:
-    """Times and values of the polygon through the known values, with corners at the edges of intervals as well."""
+    """Find the corners of the polygon through the known values, and at the edges of intervals."""
     at = np.unique(np.concatenate([known, begin, end]))
     line = np.interp(at, known, values)
     if known.size > 1:
@@ -224,7 +227,7 @@ def _polygon_corners(known: Array, values: Array, begin: Array, end: Array) -> t
 
 @njit(**KERNEL)
 def play(values: Array, width: float, start: float) -> tuple[Array, float]:
-    """Play of half-width `width`: a slider that is dragged along by `values` and stands while they move inside of its play.
+    """Apply a dead band of half-width `width`: the output moves only when `values` pushes it.
 
     Parameters
     ----------
@@ -253,7 +256,7 @@ def play(values: Array, width: float, start: float) -> tuple[Array, float]:
 
 
 def mean_play(known: Array, values: Array, begin: Array, end: Array, width: float) -> Array:
-    """Mean over intervals of the distance of T from the slider of `play`, from a few values of T that are joined by straight lines.
+    """Average over intervals the distance of T from the output of `play`, with T straight.
 
     Parameters
     ----------
@@ -268,7 +271,8 @@ def mean_play(known: Array, values: Array, begin: Array, end: Array, width: floa
 
     Examples
     --------
-    >>> mean_play(np.array([0.0, 10.0, 20.0]), np.array([0.0, 10.0, 0.0]), np.array([0.0, 10.0]), np.array([10.0, 20.0]), 2.5).round(2)
+    >>> t, T = np.array([0.0, 10.0, 20.0]), np.array([0.0, 10.0, 0.0])
+    >>> mean_play(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]), 2.5).round(2)
     array([ 2.19, -1.25])
     """
     at, line = _polygon_corners(known, values, begin, end)

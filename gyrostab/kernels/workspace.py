@@ -1,4 +1,4 @@
-"""Memory that one unit of work after the other uses: large arrays made anew cost as much as the sums that go into them."""
+"""Memory that units of work reuse: a new large array costs as much as the sums that fill it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LINE = 64
 
 
 class Workspace:
-    """Arrays of doubles by name, for one thread at a time; an array holds until its name is asked for again.
+    """Arrays of doubles by name, for one thread; an array is valid until its name is used again.
 
     Examples
     --------
@@ -29,7 +29,7 @@ class Workspace:
         self._kept: dict[str, NDArray[np.float64]] = {}
 
     def array(self, name: str, *shape: int) -> NDArray[np.float64]:
-        """An array whose values are whatever was left there, at the beginning of a line of the cache."""
+        """Return an uninitialised array that begins at a cache line."""
         size = math.prod(shape)
         if name not in self._kept or self._kept[name].size < size:
             self._kept.pop(name, None)

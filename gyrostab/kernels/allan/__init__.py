@@ -1,1 +1,1 @@
-"""Sums of squared second differences: the dynamic Allan variance, its counts and equivalent degrees of freedom."""
+"""Dynamic Allan variance from sums of squared second differences, with degrees of freedom."""

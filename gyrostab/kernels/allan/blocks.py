@@ -40,7 +40,8 @@ _STRETCH_POINTS = 65536
 def group_factors(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
     """First averaging factor of each group that goes through the angle together, and the end.
 
-    The factors of a group have one shift; there are `MAX_LAGS` of them at most, or `CONSECUTIVE_LAGS` that
+    The factors of a group have one shift; a group has at most `MAX_LAGS` of them, or
+    `CONSECUTIVE_LAGS` that
     follow each other.
     """
     starts = np.flatnonzero(np.diff(shifts)) + 1
@@ -76,7 +77,7 @@ def _limit_terms(  # type: ignore[no-untyped-def]
     splits,
     sizes,
 ):
-    """Terms of the head and of head and tail, from `first` on, of `count` averaging factors from number i on; the most of them."""
+    """Count the terms of head, and of head and tail, of `count` factors from number i on."""
     shift = shifts[i]
     up = (1 << shift) - 1
     a = block * step
@@ -94,10 +95,14 @@ def _limit_terms(  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _add_stretch(  # type: ignore[no-untyped-def]
-    flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups, head_lengths, whole, n_windows,
+    flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups,
+    head_lengths, whole, n_windows,
     near, splits, sizes, out,
 ):  # fmt: skip
-    """Add what the blocks from `begin` to `end` have behind `tile` samples, `_STRETCH_POINTS` of each at most; `near`: the first runs in reach."""
+    """Add the terms of the blocks from `begin` to `end`, from sample `tile` of each block on.
+
+    At most `_STRETCH_POINTS` samples of each block are used; `near` holds the first runs in reach.
+    """
     heads, tails = out[0].reshape(-1), out[1].reshape(-1)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
     for g in range(groups.size - 1):
@@ -150,7 +155,7 @@ def _add_stretch(  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _move_to_front(flat, capacity, levels, by, held):  # type: ignore[no-untyped-def]
-    """Move the points from `by` to `held` of ``flat[:capacity]`` to its beginning, and those of the thinned levels behind it."""
+    """Move the points from `by` to `held` to the beginning of `flat`, on every thinned level."""
     place, size = 0, capacity
     for level in range(levels + 1):
         shift = np.int64(by >> level)
@@ -162,7 +167,7 @@ def _move_to_front(flat, capacity, levels, by, held):  # type: ignore[no-untyped
 
 
 def held_points(n_points: int, step: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> int:
-    """Points of the angle that `grouped_blocks` needs room for: what its terms reach twice over, and no more than there are."""
+    """Find how many points of the angle `grouped_blocks` keeps: twice the reach of its terms."""
     whole = 1 << int(shifts.max(initial=0))
     wanted = 4 * int(ks[-1]) + 2 * max(step, _STRETCH_POINTS) + TILE + whole
     return -(-min(wanted, n_points) // whole) * whole
@@ -170,9 +175,10 @@ def held_points(n_points: int, step: int, ks: NDArray[np.int64], shifts: NDArray
 
 @njit(**KERNEL)
 def grouped_blocks(  # type: ignore[no-untyped-def]
-    x, offset, flat, capacity, places, starts, stops, step, ks, shifts, groups, head_lengths, whole, n_windows, out
+    x, offset, flat, capacity, places, starts, stops, step, ks, shifts, groups, head_lengths,
+    whole, n_windows, out
 ):  # fmt: skip
-    """Heads and tails of every block and averaging factor, and their numbers of terms, into `out` (2 or 4, n_blocks, n_tau).
+    """Sum heads and tails of every block and averaging factor, and count their terms.
 
     The angle is integrated as the blocks need it, and of what has been integrated only so much is
     held that it stays in the cache.
@@ -229,7 +235,8 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
                 thin_pyramid(flat, capacity, levels, done + 1 - base, b + 1 - base)
                 done = b
             _add_stretch(
-                flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags, groups, head_lengths, whole, n_windows,
+                flat, places, base, starts, stops, step, begin, end, tile, ks, shifts, lags,
+                groups, head_lengths, whole, n_windows,
                 near, splits, sizes, out,
             )  # fmt: skip
     return largest
@@ -237,7 +244,7 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _sum_windows(heads, tails, length, first, stop, out):  # type: ignore[no-untyped-def]
-    """Windows of `length` whole blocks and one head, columns `first` to `stop`: per group of `length` windows two running sums."""
+    """Add windows of `length` whole blocks and one head, for the columns from `first` to `stop`."""
     n = out.shape[0]
     suffix = np.empty((length, stop - first))
     prefix = np.empty(stop - first)
@@ -259,7 +266,7 @@ def _sum_windows(heads, tails, length, first, stop, out):  # type: ignore[no-unt
 
 @njit(**KERNEL)
 def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-def]
-    """``out[j, i] = sum(heads[j : j + whole[i], i] + tails[...]) + heads[j + whole[i], i]``, additions only."""
+    """Add the blocks ``j .. j + whole[i] - 1`` and the head of the next, by additions only."""
     first = np.int64(0)
     while first < whole.size:
         stop = first + 1

@@ -1,14 +1,14 @@
-"""Weighted cluster means: the Allan variance of a rate log so full of gaps that few unbroken runs are left.
+"""Weighted cluster means: the Allan variance of a rate log with too many gaps for unbroken runs.
 
-Each cluster mean uses the samples that are there; a pair of clusters with n1 and n2 samples has
-weight n1 n2, and both must be at least half full. Random walk and flicker come out right. White and
-quantization noise come out too high by factors that the mask alone determines, and so does a ramp,
-slightly, as lost samples move the centres of the clusters; those responses are returned, so that a
-fit can use them as its columns.
+Each cluster mean uses the samples that are present; a pair of clusters with n1 and n2 samples has
+the weight n1 n2, and both must be at least half full. Random walk and flicker noise are unbiased.
+White and quantization noise are too high by factors that depend only on the mask. A ramp is
+slightly off, because lost samples move the centres of the clusters. These responses are returned,
+so that a fit can use them as its columns.
 
-What a pair of clusters adds does not depend on the window, so it is summed in blocks as the other
-terms are (see `gyrostab.kernels.allan.blocks`). Samples and runs are counted in a mask of one bit a
-sample, which stays in the cache.
+What a pair of clusters adds does not depend on the window, so pairs are summed in blocks like the
+other terms (see `gyrostab.kernels.allan.blocks`). Samples and runs are counted in a mask of one bit
+per sample, which stays in the cache.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ _BITS = np.array(
 def cluster_strides(
     window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Distance of the pairs of clusters that are used, a power of two: every `2**shift`-th, or as many as have something to add.
+    """Choose the distance of the pairs of clusters, a power of two and at least `2**shift`.
 
-    Pairs closer than k/16 add next to nothing where many of them fit the window; where 256 or fewer
+    Pairs closer than k/16 add almost no information if many of them fit the window; if 256 or fewer
     do, all are used.
     """
     largest = np.maximum(np.minimum(ks // 16, (window - 2 * ks + 1) // 256), 1)
@@ -66,20 +66,20 @@ def _sum_places(word):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _places_before(mask, row, low):  # type: ignore[no-untyped-def]
-    """Sum of the numbers of the samples that are present before a sample: those in the rows before its own, and in its row below `low`."""
+    """Sum the numbers of the samples present before a sample, in earlier rows and below `low`."""
     word = mask[row, 0] & low
     return mask[row, 4] + (np.int64(row) << 6) * _count_ones(word) + _sum_places(word)
 
 
 @njit(**INNER)
 def pack_mask(starts, stops, n):  # type: ignore[no-untyped-def]
-    """Which of n samples are present, from the runs of them, 64 to a row.
+    """Pack the runs of present samples into a mask of 64 samples per row.
 
     Returns
     -------
     int64 (n // 64 + 1, 5)
-        Samples present, and those of them that begin a run, as bits; how many there are of both
-        before these 64; sum of the numbers (0 to n - 1) of the samples present before these 64.
+        Bits of the samples present, and of those that begin a run; counts of both before this row;
+        sum of the numbers (0 to n - 1) of the samples present before this row.
     """
     mask = np.zeros((n // 64 + 1, 5), np.int64)
     one = np.int64(1)
@@ -109,7 +109,7 @@ def _count_before(mask, m):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def integrate_places(starts, stops, n):  # type: ignore[no-untyped-def]
-    """Integral of a ramp of one a sample over the present samples, as `theta` of the rate in `cluster_cells`; exact up to 2^26 samples."""
+    """Integrate a ramp of one per sample over the present samples; exact up to 2^26 samples."""
     out = np.empty(n + 1)
     total, at = 0.0, np.int64(0)
     for r in range(starts.size):
@@ -124,7 +124,7 @@ def integrate_places(starts, stops, n):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-untyped-def]
-    """Add to `row` over the pairs of clusters that begin in ``a <= m < b``: weight d^2, weight, what makes the responses, number."""
+    """Add the pairs of clusters in ``a <= m < b``: weight d^2, weight, responses, number."""
     one = np.int64(1)
     squares = weights = white = quantization = ramp = 0.0
     count = 0
@@ -179,28 +179,28 @@ def _add_pairs(theta, places, mask, a, b, k, stride, row):  # type: ignore[no-un
 
 @njit(**INNER)
 def cluster_cells(theta, places, mask, window, step, k, stride, poor):  # type: ignore[no-untyped-def]
-    """Cells of the `poor` windows of one averaging factor by weighted cluster means.
+    """Compute the cells of the `poor` windows of one averaging factor by weighted cluster means.
 
     Parameters
     ----------
     theta : float64 (n + 1,)
-        Integral of the rate over present samples, gaps adding nothing.
+        Integral of the rate over present samples; gaps add nothing.
     places : float64 (n + 1,) or (0,)
-        As from `integrate_places`, which pays where there are more pairs than samples; without it
-        the same numbers come from the mask.
+        Result of `integrate_places`, which is faster with more pairs than samples; without it, the
+        same numbers are taken from the mask.
     mask
-        As from `pack_mask`.
+        Result of `pack_mask`.
     window, step, k, stride : int
         Window, step, averaging factor and distance of the pairs of clusters [samples].
     poor : bool (n_windows,)
-        Windows that are wanted.
+        Windows to compute.
 
     Returns
     -------
     float64 (n_windows, 6)
         Weighted mean of ``(mean2 - mean1)^2 / 2`` [square of the rate's unit]; responses to unit
         white and quantization noise, relative to the gap-free laws; weight used, as a share of the
-        gap-free weight; number of pairs used, 0 where there are none or the window is not wanted;
+        gap-free weight; number of pairs used, 0 without pairs or if the window is not computed;
         response to a ramp.
     """
     length = window - 2 * k + 1
@@ -251,10 +251,10 @@ def _fill_grid(mask, begin, grid, k, places):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=_FAST, **INNER)
 def _sum_overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
-    """Sum over the terms ``first <= j < stop`` of weight times squared covariance with term i, less than k before them.
+    """Sum weight times squared covariance with term i, over terms less than k after term i.
 
-    Of the means of clusters of n1 and n2 samples, and p1 and p2 of the other term, those share
-    samples that overlap.
+    The clusters have n1 and n2 samples, those of the other term p1 and p2; only overlapping
+    clusters share samples.
     """
     a1, a2, n1, n2 = places[1, i], places[2, i], places[3, i], places[4, i]
     b0, b1, p1, p2 = (
@@ -273,7 +273,7 @@ def _sum_overlapping(places, i, first, stop):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=_FAST, **INNER)
 def _sum_touching(places, i, first, stop):  # type: ignore[no-untyped-def]
-    """The same for terms between k and 2k behind term i, whose first cluster meets only the second of that."""
+    """Sum the same for terms k to 2k after term i, which overlap only its second cluster."""
     a2, n1 = places[2, i], places[3, i]
     b0, p2, inverse = places[0, first:stop], places[4, first:stop], places[5, first:stop]
     total = 0.0
@@ -285,7 +285,7 @@ def _sum_touching(places, i, first, stop):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _add_section(places, lags, close, many, sums):  # type: ignore[no-untyped-def]
-    """Add the pairs of terms whose first is one of the first `many` of `places`: of the mask, and of a full window.
+    """Add the pairs of terms whose first is one of the first `many`, of the mask and without gaps.
 
     `sums` gets the weight, the pairs, and both of a full window; `lags` are the running sums of the
     squared correlations of a full window, and `close` of them belong to clusters that overlap their
@@ -308,7 +308,7 @@ def _add_section(places, lags, close, many, sums):  # type: ignore[no-untyped-de
 
 @njit(**INNER)
 def _pair_sums(mask, begin, end, grid, k, sums):  # type: ignore[no-untyped-def]
-    """What `_add_section` sums, over the terms at ``begin, begin + grid, ... < end``: all, or sections of them spread out."""
+    """Sum `_add_section` over the terms ``begin, begin + grid, ... < end``, or sections of them."""
     total = (end - begin + grid - 1) // grid
     lags = np.zeros(2 * k // grid + 1)
     for i in range(1, lags.size):
@@ -329,10 +329,10 @@ def _pair_sums(mask, begin, end, grid, k, sums):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def cluster_factor(mask, first, window, k, stride):  # type: ignore[no-untyped-def]
-    """Degrees of freedom of a cell under white noise, seen through its mask, as a share of the gap-free window's.
+    """Compute the degrees of freedom of a cell under white noise, relative to those without gaps.
 
-    The pairs of terms are taken on a grid of k/8 to k/4, finer where few terms fit the window or
-    all of the grid are lost. Arguments as `cluster_cells`, `first` being the first sample of the
+    The pairs of terms are on a grid of k/8 to k/4, finer if few terms fit the window or all those
+    on the grid are lost. Arguments as for `cluster_cells`; `first` is the first sample of the
     window.
     """
     end = first + window - 2 * k + 1

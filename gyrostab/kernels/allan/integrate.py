@@ -1,8 +1,7 @@
-"""From samples to the angle: which are present, their sums per block, the integral, and the integral thinned by octaves.
+"""From samples to the angle: runs of present samples, sums per block, the integral, thinned levels.
 
-Missing samples never enter an inner loop: a sum that is not finite tells that a stretch has some,
-and only then are its samples looked at one by one. After that everything works on runs of present
-samples.
+Missing samples never enter an inner loop: only if a sum is not finite are its samples checked one
+by one. After that, all work is on runs of present samples.
 """
 
 from __future__ import annotations
@@ -37,15 +36,14 @@ _LOOK = 512
 _STRIP = 64
 # Samples in which the first present one is looked for at once.
 _SEARCH = 4096
-# Largest angle, over the median change from sample to sample, up to which doubles do: cells are
-# then wrong by 2e-11 at most, and a
-# bias that drifts by ten times the noise within a unit of work does not cost the time of two
-# doubles.
+# Largest angle, relative to the median change between samples, for which one double suffices: cells
+# are then wrong by 2e-11 at most, and a bias that drifts by ten times the noise within a unit of
+# work does not need two doubles.
 _PLAIN = 1e7
 
 
 def first_present(x: NDArray[np.generic]) -> float:
-    """First finite value of `x` as double, NaN where there is none."""
+    """Find the first finite value of `x` as double; NaN without any."""
     for a in range(0, x.size, _SEARCH):
         found = np.flatnonzero(np.isfinite(x[a : a + _SEARCH]))
         if found.size:
@@ -63,7 +61,7 @@ def _sum_samples(x, base):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _sum_present(x, base):  # type: ignore[no-untyped-def]
-    """Sum of ``x - base`` over finite samples, and their number."""
+    """Sum ``x - base`` over finite samples, and count them."""
     total = 0.0
     count = 0
     for a in range(0, x.size, _LOOK):
@@ -82,7 +80,7 @@ def _sum_present(x, base):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def]
-    """Heads and tails, (n_blocks, 2) each: sum of ``x - base`` over present samples, and their number."""
+    """Sum ``x - base`` over present samples, and count them, for heads and tails (n_blocks, 2)."""
     whole = window // step
     head = window - whole * step
     heads, tails = np.zeros((n_windows + whole, 2)), np.zeros((n_windows + whole, 2))
@@ -96,7 +94,7 @@ def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def
 
 @njit(**INNER)
 def _find_runs(x, step, known, starts, stops):  # type: ignore[no-untyped-def]
-    """Number of runs of finite samples; the first of them, as many as there is room for, to `starts` and `stops`."""
+    """Count the runs of finite samples, and write as many as fit to `starts` and `stops`."""
     run = 0
     inside = False
     for block in range(known.size):
@@ -132,7 +130,7 @@ def _find_runs(x, step, known, starts, stops):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def present_runs(x, step, known):  # type: ignore[no-untyped-def]
-    """First and one-past-last index of every run of finite samples: two int64 arrays.
+    """Find first and one-past-last index of every run of finite samples, as two int64 arrays.
 
     Parameters
     ----------
@@ -141,8 +139,7 @@ def present_runs(x, step, known):  # type: ignore[no-untyped-def]
     step : int
         Samples of a block; the last one has the rest.
     known : float64 (n_blocks,)
-        Finite samples of each block, or -1 where that is not known; of a whole block none is looked
-        at.
+        Finite samples of each block, or -1 if unknown; samples of complete blocks are not checked.
     """
     runs = np.empty((2, x.size // 256 + 16), np.int64)
     count = _find_runs(x, step, known, runs[0], runs[1])
@@ -173,7 +170,7 @@ def _integrate_run(x, offset, total, theta):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _find_largest(theta):  # type: ignore[no-untyped-def]
-    """Largest magnitude; doubles without their sign are ordered as the integers of the same bits, which compare faster."""
+    """Find the largest magnitude; without sign, doubles are ordered as their bits."""
     bits = theta.view(np.int64)
     largest = np.zeros(1, np.int64)
     for i in range(bits.size):
@@ -183,7 +180,7 @@ def _find_largest(theta):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def thin_pyramid(flat, n_points, levels, a, b):  # type: ignore[no-untyped-def]
-    """Carry the points ``a <= m < b`` of ``flat[:n_points]`` to the levels behind it, each every second point of the one before."""
+    """Copy every second point of ``flat[a:b]`` to the next level, level by level."""
     place = 0
     size = n_points
     for _ in range(levels):
@@ -198,7 +195,7 @@ def thin_pyramid(flat, n_points, levels, a, b):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def integrate_tile(x, offset, starts, stops, a, b, total, run, theta):  # type: ignore[no-untyped-def]
-    """``theta[m - a] = total + sum(x[a:m] - offset)`` for ``a < m <= b``, gaps adding nothing; `run` is the first that ends after a.
+    """Integrate ``x - offset`` from a to b over the runs from number `run` on; gaps add nothing.
 
     Returns the last angle, the largest magnitude, and the first run that ends after b.
     """
@@ -218,7 +215,7 @@ def integrate_tile(x, offset, starts, stops, a, b, total, run, theta):  # type: 
 
 @njit(**KERNEL)
 def integrate(x, offset, starts, stops, theta):  # type: ignore[no-untyped-def]
-    """Angle ``theta[m] = sum(x[:m] - offset)``, (n + 1,), over the runs of present samples, gaps adding nothing; its largest magnitude."""
+    """Integrate ``x - offset`` over the runs of present samples; returns the largest magnitude."""
     theta[0] = 0.0
     total = 0.0
     largest = 0.0
@@ -234,7 +231,7 @@ def integrate(x, offset, starts, stops, theta):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyped-def]
-    """The same integral as a sum of two doubles, to about 32 digits (two-sum of Knuth): values and remainders."""
+    """Integrate to about 32 digits as a sum of two doubles (two-sum of Knuth)."""
     total = 0.0
     rest = 0.0
     high[:] = 0.0
@@ -257,7 +254,7 @@ def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyp
 
 
 def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:
-    """Whether an angle as large as `largest` is too large against the sample-to-sample noise of `x` for doubles to keep the digits."""
+    """Check whether an angle as large as `largest` costs too many digits of the noise of `x`."""
     stride = max(1, x.size // 1000)
     before = x[: x.size - 1 : stride].astype(np.float64)
     after = x[1::stride][: before.size].astype(np.float64)
@@ -270,10 +267,10 @@ def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:
 def pyramid_places(
     n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Where ``theta[:: 2**shift]`` of every shift (not falling) begins in one array, and the size of that array.
+    """Find where ``theta[:: 2**shift]`` of every shift begins in one array, and its size.
 
-    Behind the angles there is room for what `gyrostab.kernels.allan.vectors.split_sums` reads and
-    ignores: it goes as far with the longest of its lags as with the shortest.
+    The array has extra elements at its end, which `gyrostab.kernels.allan.vectors.split_sums` reads
+    and ignores: it reads as far with the longest of its lags as with the shortest.
     """
     apart = 0
     for i in range(ks.size):

@@ -1,7 +1,7 @@
-"""Block sums interval by interval, one averaging factor at a time: where the angle needs two doubles or has gaps itself.
+"""Block sums interval by interval, for angles that need two doubles or that have gaps.
 
-`gyrostab.kernels.allan.blocks` is several times faster and does the rest; both fill the same heads
-and tails.
+`gyrostab.kernels.allan.blocks` is several times faster and handles all other cases; both fill the
+same heads and tails.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 @njit(**INNER)
 def _valid_rate(starts, stops, k):  # type: ignore[no-untyped-def]
-    """Intervals of m whose 2k samples are all present; a run of samples [s, e) has the angles s..e."""
+    """List intervals of m whose 2k samples are present; a run of samples [s, e) has angles s..e."""
     keep = 0
     begin = np.empty(starts.size, np.int64)
     end = np.empty(starts.size, np.int64)
@@ -58,7 +58,7 @@ def _valid_angle(starts, stops, k):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def valid_intervals(starts, stops, k, angle):  # type: ignore[no-untyped-def]
-    """Intervals [begin, end) of m of the valid second differences, from the runs of present samples (or angles)."""
+    """List the intervals [begin, end) of m of the valid second differences, from runs."""
     if angle:
         return _valid_angle(starts, stops, k)
     return _valid_rate(starts, stops, k)
@@ -81,7 +81,7 @@ def _sum_squares(theta, a, b, k):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
-    """Second differences of an angle held as two doubles; no reassociation, the large parts cancel exactly or nearly so."""
+    """Compute second differences of an angle held as two doubles, without reassociation."""
     h0, h1, h2 = high[a:b], high[a + k : b + k], high[a + 2 * k : b + 2 * k]
     l0, l1, l2 = low[a:b], low[a + k : b + k], low[a + 2 * k : b + 2 * k]
     for i in range(h0.size):
@@ -111,7 +111,7 @@ def _energy_two(high, low, a, b, k):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _add_part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # type: ignore[no-untyped-def]
-    """Add the valid terms in ``a <= m < b`` to `sums` and `counts`; interval number `near` is the first that ends after a."""
+    """Add the valid terms in ``a <= m < b``; interval `near` is the first that ends after a."""
     up = (1 << shift) - 1
     for v in range(near, begin.size):
         if begin[v] >= b:
@@ -130,7 +130,7 @@ def _add_part(high, low, begin, end, near, a, b, k, shift, sums, counts):  # typ
 def single_blocks(  # type: ignore[no-untyped-def]
     high, low, places, starts, stops, angle, step, ks, shifts, head_lengths, whole, n_windows
 ):
-    """Heads and tails as `gyrostab.kernels.allan.blocks.grouped_blocks`; `low` is the remainder of `high`, or empty."""
+    """Sum heads and tails as `grouped_blocks`; `low` is the remainder of `high`, or empty."""
     n_blocks = n_windows + whole[0]
     heads, tails = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))
     head_counts, tail_counts = np.zeros((n_blocks, ks.size)), np.zeros((n_blocks, ks.size))

@@ -1,10 +1,10 @@
-"""Count the single samples of each window that stand far from both neighbours.
+"""Count the single samples of each window that are far from both neighbours.
 
 A sample is an outlier where it exceeds both neighbours, or falls below both, by more than
 `LIMIT_SIGMA` standard deviations of the difference of two samples, measured over its segment and
-again over the samples around it, so that noise which is louder for a while is not counted. In white
-noise both differences reach 8 standard deviations with a probability of about exp(-8**2 * 2 / 3),
-which is 3e-19: never in a record.
+again over the samples around it, so that temporarily higher noise is not counted. In white noise
+both differences reach 8 standard deviations with a probability of about exp(-8**2 * 2 / 3), which
+is 3e-19: never in a record.
 """
 
 from __future__ import annotations
@@ -17,22 +17,21 @@ from gyrostab.kernels.compiled import INNER, KERNEL
 __all__ = ["LIMIT_SIGMA", "count_outliers"]
 
 LIMIT_SIGMA = 8.0
-#: Samples of a segment, and second differences, spread over it, whose median gives its noise: to 10
-#: %, which 8 sigma bear.
+#: Samples of a segment, and second differences spread over it whose median gives its noise to 10 %,
+#: which is precise enough for 8 sigma.
 _SEGMENT_SAMPLES, _MEDIAN_OF = 8192, 128
 #: Samples on either side of an outlier that give the noise around it: several bit errors in a
-#: damaged packet leave most of
-#: them good, while noise that is louder for longer raises their median.
+#: damaged packet leave most of them intact, while longer periods of higher noise raise their
+#: median.
 _AROUND_SAMPLES = 128
 #: From the median of absolute second differences of white noise to the standard deviation of first
-#: differences:
-#: sqrt(2) / (sqrt(6) * 0.6745).
+#: differences: sqrt(2) / (sqrt(6) * 0.6745).
 _TO_DIFFERENCE = 0.8560
 
 
 @njit(**INNER)
 def _measure_noise(x, first, last, apart, room):  # type: ignore[no-untyped-def]
-    """Standard deviation of first differences from second differences, `apart` samples apart; 0 without any."""
+    """Estimate the standard deviation of first differences from second differences; 0 without."""
     count = 0
     for i in range(max(first, 1), min(last, x.size - 1), apart):
         second = abs(np.float64(x[i - 1]) - 2.0 * np.float64(x[i]) + np.float64(x[i + 1]))
@@ -44,7 +43,7 @@ def _measure_noise(x, first, last, apart, room):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _count_beyond(x, limit):  # type: ignore[no-untyped-def]
-    """Samples beyond both neighbours; a loop of its own, over slices, becomes vector instructions."""
+    """Count samples beyond both neighbours, in a separate loop over slices that vectorises."""
     found = 0
     before, here, after = x[:-2], x[1:-1], x[2:]
     for i in range(here.size):

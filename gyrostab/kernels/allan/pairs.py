@@ -1,4 +1,4 @@
-"""Sums over pairs of second differences: how many independent ones an overlapping Allan variance is worth.
+"""Sums over pairs of second differences, for the degrees of freedom of an Allan variance.
 
 For Gaussian second differences with autocorrelation ``rho(l)`` a mean of n squares has ``n^2 /
 v(n)`` equivalent degrees of freedom, ``v(n) = sum_ij rho(i - j)^2`` (Greenhall and Riley, PTTI
@@ -31,7 +31,7 @@ def _weighted_moment(n, slope, a, b):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def white_pair_sum(n, k):  # type: ignore[no-untyped-def]
-    """``sum_ij rho(i - j)^2`` over n consecutive second differences of averaging factor k, for angle random walk."""
+    """Sum ``rho(i - j)^2`` over n consecutive second differences, for angle random walk."""
     if n < 1:
         return 0.0
     near = _weighted_moment(float(n), 1.5 / k, np.int64(1), min(n - 1, k))

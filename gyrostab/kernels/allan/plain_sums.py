@@ -1,4 +1,4 @@
-"""The inner loop of the Allan variance in plain numba: the same sums as `vectors`, one lag at a time.
+"""The inner loop of the Allan variance in plain numba: the sums of `vectors`, lag by lag.
 
 Used where the vectors of `gyrostab.kernels.allan.vectors` cannot be built, and in tests, as their
 reference implementation.
@@ -20,7 +20,7 @@ MAX_LAGS, CONSECUTIVE_LAGS = 4, 8
 
 @njit(fastmath={"reassoc", "contract", "nsz"}, **KERNEL)
 def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
-    """Add squared second differences in two parts; see `gyrostab.kernels.allan.vectors.split_sums`."""
+    """Add squared second differences in two parts, as `split_sums` of `vectors`."""
     for q in range(count):
         k, split, size = lags[at + q], splits[q], sizes[q]
         early = theta[first : first + size]

@@ -1,4 +1,4 @@
-"""The published algorithms as printed: classical DAVAR and the recursive fast DAVAR, for comparison and for tests.
+"""The published algorithms: classical DAVAR and recursive fast DAVAR, for comparison and tests.
 
 Both take every window's second differences of the angle ``theta``. With the paper's convention
 theta has one point per sample and a window of W samples has ``W - 2k`` terms; otherwise W rate
@@ -25,7 +25,7 @@ __all__ = ["direct_sums", "recursive_sums", "reference_theta"]
 def reference_theta(
     x: NDArray[np.generic], *, angle: bool, paper: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64]]:
-    """Angle of a whole record, which angles are present, and how many samples are missing before each.
+    """Integrate a whole record, with the mask of present angles and the count of missing samples.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def direct_sums(
     n_windows: int,
     ks: NDArray[np.int64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Classical DAVAR (Eq. 16): every window from the beginning. Returns sums and counts, shape (n_windows, n_tau)."""
+    """Run the classical DAVAR (Eq. 16): sums and counts of every window, (n_windows, n_tau)."""
     sums = np.zeros((n_windows, ks.size))
     counts = np.zeros((n_windows, ks.size), dtype=np.int64)
     for j in range(n_windows):
@@ -86,7 +86,7 @@ def direct_sums(
 
 @njit(**INNER)
 def _second_difference(theta, present, missing, m, k):  # type: ignore[no-untyped-def]
-    """Second difference at m, zero where a point is missing (Eq. 21-22), and whether it is there."""
+    """Compute the second difference at m, and whether it is present; zero if not (Eq. 21-22)."""
     if present[m] and present[m + k] and present[m + 2 * k] and missing[m] == missing[m + 2 * k]:
         return theta[m + 2 * k] - 2.0 * theta[m + k] + theta[m], 1
     return 0.0, 0

@@ -1,4 +1,4 @@
-"""One unit of work of the improved fast DAVAR: a stretch of one axis to the cells of its windows."""
+"""One unit of work of the improved fast DAVAR: from samples of one axis to cells of windows."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _NATIVE = tuple(np.dtype(kind) for kind in (np.float64, np.float32, np.int32, np
 
 
 class Unit(NamedTuple):
-    """What every unit of work of one surface has in common.
+    """Options shared by all units of work of one surface.
 
     Attributes
     ----------
@@ -70,13 +70,13 @@ class Unit(NamedTuple):
         Averaging factors, rising, and the powers of two that thin their second differences, not
         falling.
     angle : bool
-        The samples are cumulative angles, ``window + 1`` of them to a window, instead of rates.
+        The samples are cumulative angles, ``window + 1`` per window, instead of rates.
     interval : float
         Sampling interval [s], for angles.
     zero_fill : bool
-        Divide by the gap-free number of terms, as the paper does, instead of by the number used.
+        Divide by the number of terms without gaps, as the paper does, instead of the number used.
     min_strict, min_coverage : float
-        Least share of terms in unbroken runs; least coverage of a cell that is reported.
+        Smallest share of terms in unbroken runs; smallest coverage of a reported cell.
     """
 
     window: int
@@ -92,7 +92,7 @@ class Unit(NamedTuple):
 
 @njit(**KERNEL)
 def _fill_cells(sums, counts, full, zero_fill, ks, interval, cells):  # type: ignore[no-untyped-def]
-    """Cells from sums of squares; `counts` is empty where nothing is missing. No term leaves no sum, and 0 / 0 is NaN."""
+    """Compute cells from sums of squares; `counts` is empty without gaps. No term gives NaN."""
     scale = 2.0 * (ks * interval) * (ks * interval)
     for j in range(sums.shape[0]):
         used = counts[j] if counts.size > 0 else full[j]
@@ -177,7 +177,7 @@ def _strict_sums(
     gaps: bool,
     space: Workspace,
 ) -> tuple[Floats, Floats]:
-    """Sums of squared second differences of every window and averaging factor, and numbers of terms (empty where all are there)."""
+    """Sum squared second differences of every window and factor, and count terms if any miss."""
     lengths = unit.window - 2 * unit.ks + 1
     whole = lengths // unit.step
     rest = lengths - whole * unit.step
@@ -198,7 +198,7 @@ def _rate_blocks(
     blocks: Floats,
     space: Workspace,
 ) -> None:
-    """Heads and tails of rates, from an angle that is held as far as terms reach; or, where that is too large, from one of two doubles."""
+    """Sum heads and tails of rates, with an angle of two doubles where needed."""
     starts, stops, offset = present
     ks, shifts = unit.ks, unit.shifts
     points = held_points(x.size + 1, unit.step, ks, shifts)
@@ -223,7 +223,7 @@ def _rate_blocks(
 def _angle_of(
     x: NDArray[np.generic], present: _Present, windows: Integers, unit: Unit, space: Workspace
 ) -> Floats:
-    """Angle of all samples, (n + 1,), in some windows and the block behind each of them; each stretch of windows begins at zero."""
+    """Take the angles (n + 1,) of some windows and the block behind each, each from zero on."""
     angle = space.array("angle", x.size + 1)
     begins, ends = windows * unit.step, np.minimum((windows + 1) * unit.step + unit.window, x.size)
     apart = np.flatnonzero(begins[1:] > ends[:-1])
@@ -267,18 +267,17 @@ def _to_native(x: NDArray[np.generic]) -> NDArray[np.generic]:
 def surface_unit(
     x: NDArray[np.generic], unit: Unit, space: Workspace | None = None
 ) -> tuple[Floats, Floats]:
-    """Cells and means of the windows that start in a stretch of one axis.
+    """Compute cells and means of the windows in a span of samples of one axis.
 
     Parameters
     ----------
     x : ndarray (n,)
-        Rates, or cumulative angles where ``unit.angle``; NaN marks a missing sample; integer or
-        float of any size. Windows start at samples 0, step, 2 step ... and every window lies inside
-        the stretch.
+        Rates, or cumulative angles if ``unit.angle``; NaN marks a missing sample; integer or float
+        of any size. Windows start at samples 0, step, 2 step ... and lie inside the span.
     unit : Unit
         Window, step, averaging factors and rules.
     space : Workspace, optional
-        Memory to work in, for units one after the other; what the last one returned is overwritten.
+        Working memory for consecutive units; the previous result is overwritten.
 
     Returns
     -------
@@ -349,7 +348,7 @@ def _number_of_windows(x: NDArray[np.generic], unit: Unit) -> int:
 def _average_windows(
     x: NDArray[np.generic], unit: Unit, n_windows: int
 ) -> tuple[Floats, float, Floats]:
-    """Means and coverage of the windows, mean of the stretch, number of samples present in each of its blocks (of angles: in all of it)."""
+    """Average the windows: means, coverage, overall mean, and present samples by block."""
     if unit.angle:
         return _angle_means(x, unit, n_windows), np.nan, np.array([float(np.isfinite(x).sum())])
     base = first_present(x)
@@ -381,7 +380,7 @@ def _angle_means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> Floats:
 
 
 def window_means(x: NDArray[np.generic], unit: Unit) -> Floats:
-    """Mean rate and share of present samples of each window of a stretch (arguments as `surface_unit`).
+    """Compute mean rate and share of present samples of each window.
 
     Returns
     -------

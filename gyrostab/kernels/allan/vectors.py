@@ -1,4 +1,4 @@
-"""The inner loop of the Allan variance in vectors of eight: squared second differences of several lags in one pass.
+"""The inner loop of the Allan variance in LLVM vectors of eight, several lags in one pass.
 
 Left alone, a compiler takes one lag at a time, in vectors half as wide as many processors have.
 Here several lags share the loads of ``theta[m]``, and vectors of a stated width are used whole:
@@ -127,7 +127,7 @@ def _add_square(builder: Any, place: Any, value: Any, where: Any = None) -> None
 
 
 def _add_halves(builder: Any, first: Any, second: Any, width: int) -> Any:
-    """Two vectors as one: in each group of `width` elements the halves are added, those of the two vectors side by side."""
+    """Add the halves of each group of `width` elements of two vectors, into one vector."""
     low = [at for at in range(2 * LANES) if at % width < width // 2]
     left, right = (
         builder.shuffle_vector(first, second, _shuffle_mask([at + by for at in low]))
@@ -137,7 +137,7 @@ def _add_halves(builder: Any, first: Any, second: Any, width: int) -> Any:
 
 
 def _sum_vectors(builder: Any, sums: list[list[Any]]) -> Any:
-    """Sums of all elements of eight vectors as one vector, halves first; each vector is given in parts."""
+    """Sum the elements of eight vectors into one vector, halves first; vectors come in parts."""
     vectors = []
     for parts in sums:
         vector = builder.load(parts[0])
@@ -275,7 +275,7 @@ _eight_in_a_row, _four_in_a_row = (
 
 @njit(**KERNEL)
 def split_sums(theta, first, count, lags, at, splits, sizes, heads, tails, place):  # type: ignore[no-untyped-def]
-    """Add squared second differences of one to four lags, or of eight that follow each other, from one place on, in two parts.
+    """Add squared second differences of one to four lags, or eight consecutive ones, in two parts.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ __all__ = ["fletcher32"]
 
 
 def fletcher32(data: NDArray[np.uint8]) -> int:
-    """Fletcher's checksum of 32 bits over words of two bytes, the first of them the higher, as HDF5 and numcodecs have it.
+    """Compute Fletcher's 32-bit checksum of big-endian 16-bit words, as in HDF5 and numcodecs.
 
     An odd last byte is the higher half of a word. Python's lock is let go meanwhile.
 
@@ -44,13 +44,13 @@ def fletcher32(data: NDArray[np.uint8]) -> int:
 
 
 def _half_sum(amount: int, some: int) -> int:
-    """A sum of words whose bytes are swapped; of anything but zeros it is never 0 but 65535, for it is folded, not divided."""
+    """Fold a sum of words whose bytes are swapped; nonzero input gives 65535, never 0."""
     return int(amount) * 256 % 65535 or (65535 if some else 0)
 
 
 @njit(**KERNEL)
 def _add_words(words):  # type: ignore[no-untyped-def]
-    """Sum of the words and sum of the sums after each, modulo 65535 (where swapping the bytes is times 256); whether any is not 0."""
+    """Sum the words and their running sums modulo 65535, and whether any word is not 0."""
     total, sums, some = np.int64(0), np.int64(0), np.int64(0)
     for begin in range(0, words.size, 256):
         block = words[begin : begin + 256]

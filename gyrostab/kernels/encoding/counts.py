@@ -16,7 +16,7 @@ __all__ = ["from_counts", "to_counts"]
 def to_counts(
     values: NDArray[np.floating[Any]], scale: float, dtype: Any, fill: int
 ) -> NDArray[np.integer[Any]] | None:
-    """Integers of which ``from_counts`` makes the very same values (of a zero, without its sign); None when there are none.
+    """Find integers from which ``from_counts`` makes these values (except the sign of zero).
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def from_counts(
     *,
     out: NDArray[np.floating[Any]] | None = None,
 ) -> NDArray[np.floating[Any]]:
-    """Counts times their factor, NaN for `fill`; into `out`, which is contiguous, or into a new array of doubles.
+    """Multiply counts by their factor, NaN for `fill`, into `out` or a new array of doubles.
 
     Examples
     --------

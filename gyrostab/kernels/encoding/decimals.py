@@ -1,4 +1,4 @@
-"""Columns in less room: decimals as whole numbers of 32 bits, stamps as stretches of even steps; both back bit for bit."""
+"""Compact columns: decimals as 32-bit integers, stamps as even runs; both restored bit for bit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LOOKED_AT = 256
 
 @njit(**KERNEL)
 def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
-    """Whole numbers of which division by a power of ten makes the very same values, if there are such.
+    """Find integers that give exactly these values when divided by a power of ten, if they exist.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
     Returns
     -------
     fits : bool
-        False when a value is no such decimal, or a zero below zero; the rest then says nothing.
+        False if a value is not such a decimal, or is a negative zero; the rest is then undefined.
     missing : int
         Values that are not finite.
     low, high : float
@@ -78,7 +78,7 @@ def to_decimals(values, tens, counts):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def from_decimals(counts, tens, factor, offset, values):  # type: ignore[no-untyped-def]
-    """The values that `to_decimals` took, times a factor, plus an offset (where these are not 1 and 0); NaN where missing.
+    """Restore the values of `to_decimals`, times a factor plus an offset; NaN where missing.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def from_decimals(counts, tens, factor, offset, values):  # type: ignore[no-unty
 
 
 def decimals_of(values: NDArray[np.float64]) -> float:
-    """The least power of ten with which the first values are whole numbers, as far as a double can tell; 0 where there is none.
+    """Find the smallest power of ten that makes the first values whole numbers; 0 without one.
 
     Examples
     --------
@@ -138,7 +138,7 @@ def _find_steps(stamps, table):  # type: ignore[no-untyped-def]
 
 
 def even_steps(stamps: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Stretches of stamps at even steps: first row, its stamp, and step of each, shape (n, 3); None where they would take more room.
+    """Find runs of stamps at even steps: first row, its stamp, step (n, 3); None if not smaller.
 
     Examples
     --------

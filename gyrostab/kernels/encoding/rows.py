@@ -1,4 +1,4 @@
-"""Rows of plain text to numbers and stamps: what nearly every row of nearly every log looks like, and nothing else.
+"""Read rows of plain text into numbers and stamps, in the form that nearly all logs have.
 
 Cells are decimal numbers, dates as ISO 8601 writes them, or void. The first row that holds anything
 else ends the work, and the caller reads that row in another way. Numbers are rounded as `float`
@@ -79,7 +79,7 @@ _FIVES = _powers_of_five()
 
 @intrinsic
 def _load_byte(typing, text, at):  # type: ignore[no-untyped-def]
-    """The byte at an address: arrays are counted whenever they are handed on, which would cost more than the reading."""
+    """Load the byte at an address; passing arrays would cost more than the reading."""
 
     def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return builder.load(builder.inttoptr(builder.add(*arguments), ir.IntType(8).as_pointer()))
@@ -122,7 +122,10 @@ def _multiply_words(a, b):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _nearest_double(mantissa, power):  # type: ignore[no-untyped-def]
-    """The double nearest to ``mantissa * 10**power``, and whether it was found (Lemire, Software: Practice and Experience 51, 2021)."""
+    """Find the double nearest to ``mantissa * 10**power``, if the method of Lemire finds it.
+
+    Lemire, Software: Practice and Experience 51 (2021).
+    """
     if mantissa == np.uint64(0):
         return 0.0, True
     if power < _LEAST or power > _MOST:
@@ -186,7 +189,7 @@ def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
-    """Sign, digits, decimals and end of a number without exponent; the end is negative where there is none, or a long one."""
+    """Read sign, digits, decimals and end of a number without exponent; the end is -1 if none."""
     negative = _load_byte(text, at) == _MINUS
     at += np.int64(negative) | np.int64(_load_byte(text, at) == _PLUS)
     first = at
@@ -276,13 +279,14 @@ def _days_since_1970(year, month, day):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _read_iso_stamp(text, at, size):  # type: ignore[no-untyped-def]
-    """Nanoseconds since 1970 of ``2026-01-02T03:04:05.678Z`` (or a blank for the T, no Z), and its end."""
+    """Read ``2026-01-02T03:04:05.678Z`` (or a blank for the T, no Z): nanoseconds and end."""
     none = (np.int64(0), np.int64(-1))
     if at + 19 >= size:
         return none
     year = 100 * _read_pair(text, at) + _read_pair(text, at + 2)
     month, day, hour, minute, second = (
-        _read_pair(text, at + 5), _read_pair(text, at + 8), _read_pair(text, at + 11), _read_pair(text, at + 14), _read_pair(text, at + 17),
+        _read_pair(text, at + 5), _read_pair(text, at + 8), _read_pair(text, at + 11),
+        _read_pair(text, at + 14), _read_pair(text, at + 17),
     )  # fmt: skip
     if (
         _load_byte(text, at + 4) != _MINUS
@@ -323,7 +327,7 @@ def _past_blanks(text, at, separator):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _cell_end(text, at, separator, last):  # type: ignore[no-untyped-def]
-    """Where the next cell, or line, begins after a cell that ends at `at`; negative where the row does not go on as it should."""
+    """Find the next cell, or line, after a cell that ends at `at`; negative if malformed."""
     at = _past_blanks(text, at, separator)
     if last:
         at += _load_byte(text, at) == _RETURN

@@ -1,1 +1,1 @@
-"""Covariance of Allan variances, and least squares with coefficients that cannot be negative, for many windows."""
+"""Covariance of Allan variances, and non-negative least squares for many windows at a time."""

@@ -1,4 +1,4 @@
-"""Covariance of overlapping Allan variance estimates between averaging factors, exact for Gaussian noise.
+"""Covariance of overlapping Allan variances between averaging factors, for Gaussian noise.
 
 A second difference is ``d_k[m] = theta[m + 2k] - 2 theta[m + k] + theta[m]``; its covariances
 follow from the generalised autocovariance of the angle (Greenhall and Riley, PTTI 2003), in units
@@ -37,7 +37,7 @@ _FLICKER_FACTOR = 1.0 / (2.0 * math.pi)
 
 @njit(**INNER)
 def _smooth_covariance(lag, k1, k2, logarithm, out):  # type: ignore[no-untyped-def]
-    """Covariance of d_k1[m] and d_k2[m + lag] over 2 k1 k2, for the terms N, B and K (entries 1..3 of `out`)."""
+    """Compute the covariance of d_k1[m] and d_k2[m + lag] over 2 k1 k2, for N, B and K."""
     white = 0.0
     flicker = 0.0
     walk = 0.0
@@ -57,7 +57,7 @@ def _smooth_covariance(lag, k1, k2, logarithm, out):  # type: ignore[no-untyped-
 
 @njit(**INNER)
 def _quantization_covariance(lag, k1, k2):  # type: ignore[no-untyped-def]
-    """The same for white angle noise: nonzero only where points of both second differences coincide."""
+    """Compute it for white angle noise: nonzero only where points of both differences coincide."""
     total = 0.0
     for i in range(3):
         for j in range(3):
@@ -74,7 +74,7 @@ def _count_pairs(lag, n1, n2):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _add_smooth(window, k1, k2, logarithm, products, means):  # type: ignore[no-untyped-def]
-    """Add the pairs of the terms N, B and K, whose covariances are smooth in the lag on the scale of the shorter factor."""
+    """Add the pairs of N, B and K, whose covariances are smooth in the lag."""
     n1, n2 = window - 2 * k1 + 1, window - 2 * k2 + 1
     r = np.zeros(STOCHASTIC)
     step = max(1, min(k1, k2) // _LAG_STEPS)
@@ -93,7 +93,7 @@ def _add_smooth(window, k1, k2, logarithm, products, means):  # type: ignore[no-
 
 @njit(**INNER)
 def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type: ignore[no-untyped-def]
-    """Add the pairs of white angle noise with every term: at most nine lags, met `thin` times as often by thinned terms."""
+    """Add the pairs of white angle noise with every term: at most nine lags, times `thin`."""
     n1, n2 = window - 2 * k1 + 1, window - 2 * k2 + 1
     r = np.zeros(STOCHASTIC)
     for p in range(9):
@@ -115,7 +115,7 @@ def _add_quantization(window, k1, k2, thin, logarithm, products, means):  # type
 
 @njit(**INNER)
 def _difference_covariances(k, logarithm, out):  # type: ignore[no-untyped-def]
-    """Second differences at distance k of the three autocovariances, at every whole lag; lag 0 is in the middle of `out`."""
+    """Compute second differences at distance k of three autocovariances; lag 0 is in the middle."""
     middle = out.shape[1] // 2
     for lag in range(middle + 1):
         white = 0.0
@@ -173,7 +173,7 @@ def _add_every(window, k1, k2, differences, products, means):  # type: ignore[no
 
 @njit(**INNER)
 def _sum_pairs(window, k1, k2, thin, logarithm, differences, products, means):  # type: ignore[no-untyped-def]
-    """Products ``r_a r_b`` and values ``r_a`` averaged over all pairs of terms; `differences` may be empty."""
+    """Average the products ``r_a r_b`` and values ``r_a`` over all pairs of terms."""
     products[:] = 0.0
     means[:] = 0.0
     if differences.size:
@@ -223,7 +223,7 @@ def _fill_tables(window, ks, shifts, logarithm):  # type: ignore[no-untyped-def]
 def product_tables(
     window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Covariance of Allan variances per product of squared coefficients, and per product with a ramp.
+    """Tabulate the covariance of Allan variances per product of squares, and with a ramp.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def _fill_diagonals(window, ks, shifts, logarithm):  # type: ignore[no-untyped-d
 def diagonal_products(
     window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Diagonals of `product_tables`, shape (4, 4, n_tau), and of its second part, shape (4, n_tau), without the rest."""
+    """Compute only the diagonals of `product_tables`: (4, 4, n_tau) and (4, n_tau)."""
     products, means = _fill_diagonals(window, np.asarray(ks), np.asarray(shifts), _log_lags(window))
     return np.asarray(2.0 * products), np.asarray(
         2.0 * np.asarray(ks, dtype=np.float64) ** 2 * means

@@ -1,4 +1,4 @@
-"""Dense linear algebra of eight small problems side by side: elimination, and least squares that cannot be negative.
+"""Linear algebra of eight small problems at once: elimination, non-negative least squares.
 
 Matrices and vectors are arrays of `gyrostab.kernels.fit.eights`; element (i, j) of a matrix of w
 columns is row ``w i + j``. A set of terms is one row per term: above one half in the places whose
@@ -27,7 +27,7 @@ _TERMS = 5
 
 @njit(**INNER)
 def _finish_pivot(system, width, p, end, ok):  # type: ignore[no-untyped-def]
-    """Scale row p of a group of four that ends before `end`, and take it out of those below in the group."""
+    """Scale row p of a group of four that ends before `end`, and subtract it from those below."""
     pivot = take(system, width * p + p)
     put(ok, 0, where_above(pivot, 0.0, take(ok, 0), 0.0))
     inverse = 1.0 / root(where_above(pivot, 0.0, pivot, 1.0))
@@ -50,11 +50,11 @@ def eliminate(system, n, width, ok):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     system : eights (n * width,)
-        The upper triangle of C, n a multiple of 4, and right-hand sides beside it. Four rows at a
-        time are taken out of four of those below, so that each of these is read and written once
+        The upper triangle of C, n a multiple of 4, followed by the right-hand sides. Four rows at a
+        time are subtracted from four of those below, so that each of these is read and written once
         for the four.
     ok : eights (1,)
-        One where C was positive definite, zero where the result means nothing.
+        One where C was positive definite, zero where the result is undefined.
     """
     put(ok, 0, 1.0)
     for k in range(0, n, 4):
@@ -93,7 +93,7 @@ def eliminate(system, n, width, ok):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def back_substitute(system, n, width):  # type: ignore[no-untyped-def]
-    """Replace the first five right-hand sides Y beside an upper triangle U, as `eliminate` left them, by ``U^-1 Y``."""
+    """Replace the first five right-hand sides Y of an eliminated U by ``U^-1 Y``."""
     for i in range(n - 1, -1, -1):
         at = width * i
         own = at + n
@@ -121,7 +121,7 @@ def back_substitute(system, n, width):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def scale_equations(normal, scale, scaled):  # type: ignore[no-untyped-def]
-    """Normal matrix with ones on its diagonal to `scaled`, and what it was multiplied with on each side to `scale`."""
+    """Scale the normal matrix to a unit diagonal, with the factors in `scale`."""
     for i in range(_TERMS):
         diagonal = take(normal, 6 * i)
         put(scale, i, where_above(diagonal, 0.0, 1.0 / root(diagonal), 0.0))
@@ -132,7 +132,7 @@ def scale_equations(normal, scale, scaled):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untyped-def]
-    """Solve the normal equations for a set of terms in each place; one where its terms can be told apart, else zero.
+    """Solve the normal equations for a set of terms in each place; 1 where solvable, else 0.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untype
 
 @njit(**INNER)
 def _is_optimal(scaled, right, allowed, terms, solution, ok):  # type: ignore[no-untyped-def]
-    """`ok` where the solution for `terms` is above zero and no other allowed term would improve it (Karush-Kuhn-Tucker), else zero."""
+    """Check the solution for `terms` by the Karush-Kuhn-Tucker conditions: `ok`, else zero."""
     some = ok * 0.0
     for i in range(_TERMS):
         here, slope = take(terms, i), take(right, i)

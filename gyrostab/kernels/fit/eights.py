@@ -1,12 +1,11 @@
-"""Eight float64 as one number, for kernels that do the same small problem many times: eight problems side by side.
+"""Eight float64 as one number, for kernels that solve the same small problem eight at a time.
 
-A matrix of forty rows is too small for vector code along its rows: most vectors are part filled,
-and every sum waits for the one before. With a problem in each of the eight places all vectors are
-full, nothing is added across places, and so a problem has the same result, bit for bit, whatever
-its neighbours are. Where the processor has shorter vectors, the compiler splits these.
+A matrix of forty rows is too small for vector code along its rows: most vectors are partly filled,
+and every sum waits for the one before. With a problem in each of the eight places, all vectors are
+full and nothing is added across places, so the result of a problem does not depend, bit for bit, on
+its neighbours. Where the processor has shorter vectors, the compiler splits these.
 
-Arrays of eights are float64 (n, 8), `eights` makes them; ``a[k, place]`` is one number of them, as
-always.
+Arrays of eights are float64 (n, 8), made by `eights`; ``a[k, place]`` is one of the numbers.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class _EightModel(models.PrimitiveModel):  # type: ignore[misc]
 
 @lower_cast(types.Float, _EightType)
 def _spread_number(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
-    """A plain number beside eights stands for eight of it."""
+    """Spread a plain number over all eight places."""
     wide = context.cast(builder, value, source, types.float64)
     first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), wide, ir.Constant(_SHORT, 0))
     return builder.shuffle_vector(
@@ -130,7 +129,7 @@ def put(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def number(typing_context: Any, array: Any, index: Any) -> Any:
-    """Element `index`, not negative, of a flat array: a plain number for all eight. Indexing would test for a negative index."""
+    """Load element `index` of a flat array, without the test for negative indices."""
     if not (
         isinstance(array, types.Array)
         and array.ndim == 1

@@ -3,8 +3,8 @@
 The Allan variance is linear in the squared coefficients, so a window is ``y = X s + e`` with ``s >=
 0``. Overlapping estimates at neighbouring averaging factors share data; the covariance of e follows
 from the noise itself (`gyrostab.kernels.fit.covariance`), so it is taken from the fit and iterated.
-Eight windows are fitted side by side (`gyrostab.kernels.fit.eights`); each has the same numbers
-whatever its neighbours are.
+Eight windows are fitted at once (`gyrostab.kernels.fit.eights`); the fit of a window does not
+depend on the others.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class _Cells(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Eight fits: squared coefficients, the terms above zero, and those squares that the covariance was made of."""
+    """Eight fits: squared coefficients, positive terms, and the squares behind the covariance."""
 
     squares: NDArray[np.float64]
     terms: NDArray[np.float64]
@@ -97,11 +97,10 @@ def _make_room(size):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _fit_diagonal(cells, weight, allowed, normal, right, fit, scratch):  # type: ignore[no-untyped-def]
-    """Non-negative fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise.
+    """Fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise.
 
-    No noise falls faster than quantization noise does. A cell that lies below the fall from a
-    shorter averaging time is low by chance, and must not count for as much as its own square would
-    have it.
+    No noise falls faster than quantization noise. A cell below that fall from a shorter averaging
+    time is low by chance, and must not get the weight that its square implies.
     """
     system, inverse, terms = cells.system, cells.inverse, fit.terms
     for row in range(25):
@@ -123,7 +122,7 @@ def _fit_diagonal(cells, weight, allowed, normal, right, fit, scratch):  # type:
 
 @njit(**INNER)
 def _add_equation(system, at, w, normal, right):  # type: ignore[no-untyped-def]
-    """Add a row of columns and data with weight `w` to normal equations, on and above their diagonal."""
+    """Add a row of columns and data with weight `w` to the upper triangle of normal equations."""
     y = take(system, at + DATA)
     for a in range(5):
         share = w * take(system, at + a)
@@ -144,7 +143,7 @@ def _mirror_triangle(normal):  # type: ignore[no-untyped-def]
 def identify_noise(  # type: ignore[no-untyped-def]
     avar, white, quantization, ramp, factor, columns, weight, to_samples, pairs, ramps
 ):
-    """Degrees of freedom of each cell with the noise mixture identified by a quick fit of the window.
+    """Compute the degrees of freedom of each cell from a quick fit of the noise of the window.
 
     Parameters
     ----------
@@ -215,7 +214,7 @@ def identify_noise(  # type: ignore[no-untyped-def]
 def _observe_eight(  # type: ignore[no-untyped-def]
     start, avar, white, quantization, ramp, factor, columns, to_samples, cells, valid
 ):
-    """Describe the windows from number `start` on, beyond the last ones without cells; numbers of valid cells to `valid`."""
+    """Describe the windows from number `start` on, and count their valid cells in `valid`."""
     system, seen, inverse, facts = cells
     for place in range(PLACES):
         w = min(start + place, avar.shape[0] - 1)
@@ -238,7 +237,7 @@ def _observe_eight(  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _factor_covariance(cells, fit, room, tables):  # type: ignore[no-untyped-def]
-    """Covariance of the noise `fit.basis` with columns and data beside it, eliminated; `fit.state` says where it is hopeless."""
+    """Eliminate the covariance of the noise `fit.basis` with columns and data; sets `fit.state`."""
     system, inverse, whole, state = cells.system, cells.inverse, room.whole, fit.state
     n = inverse.shape[0]
     width = n + WIDTH
@@ -267,7 +266,7 @@ def _factor_covariance(cells, fit, room, tables):  # type: ignore[no-untyped-def
 
 @njit(**INNER)
 def _normal_equations(whole, n, normal, right):  # type: ignore[no-untyped-def]
-    """Normal matrix and right-hand side from whitened columns and data beside an eliminated covariance."""
+    """Form normal matrix and right-hand side from the eliminated covariance, columns and data."""
     for row in range(25):
         put(normal, row, 0.0)
     for a in range(5):
@@ -280,7 +279,7 @@ def _normal_equations(whole, n, normal, right):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _refit_windows(allowed, cells, fit, room, tables):  # type: ignore[no-untyped-def]
-    """Refit until the covariance is that of the fitted noise. A fit that has arrived keeps its numbers, and its matrices are made anew."""
+    """Refit until the covariance is that of the fitted noise; converged fits keep their numbers."""
     squares, terms, basis, state, trial, tried = (
         fit.squares,
         fit.terms,
@@ -322,9 +321,9 @@ def _has_positive(rows, row):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _estimate_term(a, allowed, squares, terms, normal, right, scratch, row, found):  # type: ignore[no-untyped-def]
-    """Estimate of one term, free of sign beside the chosen ones; its weights on the right-hand sides to `row`.
+    """Estimate one term without the non-negativity constraint, with the chosen terms.
 
-    Everything is NaN, and the separation zero, where the term cannot be told from the chosen ones.
+    All results are NaN, and the separation is zero, if the other terms reproduce the term.
     """
     scaled, work, scale, unit, tried = (
         scratch[:25],
@@ -364,9 +363,9 @@ def _estimate_term(a, allowed, squares, terms, normal, right, scratch, row, foun
 
 @njit(**INNER)
 def _remove_term(a, squares, facts, trial):  # type: ignore[no-untyped-def]
-    """The noise if term `a` were not there and the neighbour most like it had made the same Allan variance instead.
+    """Replace term `a` by its neighbour, at the same Allan variance.
 
-    A ramp or a flicker floor is claimed only against a random walk that would reach as high at the
+    A ramp or flicker noise counts as observed only against a random walk that is as high at the
     longest averaging time, quantization against angle random walk at the shortest.
     """
     for b in range(5):
@@ -379,7 +378,7 @@ def _remove_term(a, squares, facts, trial):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _variance_growth(a, apart, cells, fit, room, tables, found):  # type: ignore[no-untyped-def]
-    """Variance of the estimate of term `a` as a polynomial in its square, to rows 3, 4 and 5 of `found`."""
+    """Expand the variance of the estimate of term `a` in its square, to rows 3 to 5 of `found`."""
     seen, inverse, units, roots, weights = (
         cells.seen,
         cells.inverse,
@@ -399,7 +398,7 @@ def _variance_growth(a, apart, cells, fit, room, tables, found):  # type: ignore
 
 @njit(**INNER)
 def _joint_growth(a, trial, cells, room, tables, parts):  # type: ignore[no-untyped-def]
-    """Quantization noise that counts as white (see `observe`) makes the terms one; the growth is that of the first unit."""
+    """Treat quantization noise that counts as white (see `observe`) as one term with the noise."""
     seen, inverse, units, roots, weights = (
         cells.seen,
         cells.inverse,
@@ -424,7 +423,7 @@ def _joint_growth(a, trial, cells, room, tables, parts):  # type: ignore[no-unty
 
 @njit(**INNER)
 def _judge_terms(allowed, cells, fit, room, tables, found, row, chi2):  # type: ignore[no-untyped-def]
-    """Estimates of all terms with their errors, separations and growing variances to `found`; chi-square."""
+    """Estimate all terms with errors, separations and variance growth; returns chi-square."""
     whole, weights, squares = room.whole, room.weights, fit.squares
     n = cells.inverse.shape[0]
     width = n + WIDTH
@@ -460,7 +459,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     avar, white, quantization, ramp, gap_factor : float64 (n_windows, n_tau)
-        Cells [degree2 hour-2], NaN where there is none, and what the gaps do to them.
+        Cells [degree2 hour-2], NaN where missing, and their responses to the gaps.
     columns : float64 (n_tau, 5)
         Allan variance per squared coefficient.
     to_samples : float64 (5,)
@@ -477,7 +476,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     result : float64 (n_windows, 7, 5)
         Rows as `FIT_FIELDS`: squared coefficient; its standard error; its estimate free of sign;
         variance of that estimate without the term, growth per unit of the square, per unit of its
-        square; separation, the share of the column that the other terms cannot imitate.
+        square; separation, the share of the column that the other terms cannot reproduce.
     misfit : float64 (n_windows, 2)
         Chi-square and degrees of freedom.
     dof : float64 (n_windows, n_tau)
@@ -539,7 +538,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _write_window(allowed, valid, place, found, fit, chi2, result, misfit, squares):  # type: ignore[no-untyped-def]
-    """Numbers of the window in one place; its squared coefficients, zero where it has none, to `squares`."""
+    """Write the numbers of one window, and its squared coefficients (zero if none) to `squares`."""
     misfit[0], misfit[1] = chi2[0, place], valid
     for a in range(5):
         squares[a] = 0.0

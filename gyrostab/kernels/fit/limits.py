@@ -1,4 +1,4 @@
-"""Upper limits of squared coefficients from single cells, and the quantile of chi-square that they need."""
+"""Upper limits of squared coefficients from single cells, and quantiles of chi-square."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["cell_limits", "interpolate_quantile"]
 
 @njit(**INNER)
 def _chi_square_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
-    """Quantile of chi-square over its degrees of freedom, by Lagrange's cubic through four nodes of ``nu ln q``."""
+    """Interpolate the quantile of chi-square over its degrees of freedom, by a cubic."""
     if not freedom > 0.0:
         return 0.0
     position = (np.log(freedom) - start) / step
@@ -51,7 +51,7 @@ def interpolate_quantile(freedom, start, step, curve):  # type: ignore[no-untype
 
 @njit(**INNER)
 def _predict_cell(columns, white, quantization, ramp, squares, seen):  # type: ignore[no-untyped-def]
-    """Allan variance of one cell under the fitted model; per squared coefficient, seen through the gaps, to `seen`."""
+    """Compute the Allan variance of one cell under the fitted model, and per square in `seen`."""
     model = 0.0
     for a in range(5):
         seen[a] = columns[a] * (
@@ -64,7 +64,7 @@ def _predict_cell(columns, white, quantization, ramp, squares, seen):  # type: i
 
 @njit(**INNER)
 def _cell_quantile(a, whole, own_dof, share, dof, most, start, step, curve):  # type: ignore[no-untyped-def]
-    """Quantile of a cell in which term `a` is alone; `whole` where nothing is missing. That of a ramp has the cell's degrees of freedom."""
+    """Find the quantile of a cell in which term `a` is alone; `whole` where nothing is missing."""
     if a == 4:
         return _chi_square_quantile(min(own_dof, most, dof), start, step, curve)
     return whole if share == 1.0 else _chi_square_quantile(min(own_dof, most), start, step, curve)
@@ -88,7 +88,7 @@ def cell_limits(  # type: ignore[no-untyped-def]
     step,
     curve,
 ):
-    """Upper limit of each squared coefficient from one cell, which cannot be less than the term's own part of it.
+    """Find the upper limit of each squared coefficient from one cell, at least its own part.
 
     The cell is the one where the fitted model promises the lowest limit, so that its own scatter
     does not choose it.

@@ -1,8 +1,8 @@
-"""Eight windows as mixtures of noises: what each cell sees of every term, and the covariance of the cells.
+"""Eight windows as mixtures of noise terms: response of each cell, and covariance of the cells.
 
-Everything here is an array of `gyrostab.kernels.fit.eights`, a window in each place. A cell that is
-missing, or that pads the averaging factors, is one without noise and without signal: zeros
-everywhere. So every window has the same shape.
+All arrays are arrays of `gyrostab.kernels.fit.eights`, with one window in each place. A cell that
+is missing, or that pads the averaging factors, has neither noise nor signal (all zeros), so that
+every window has the same shape.
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ __all__ = [
     "variance_parts",
 ]
 
-#: Products of the four stochastic terms with each other and with a ramp, which has no scatter of
-#: its own:
-#: (a, b) for a in 0..3 and b in a..4.
+#: Products of the four stochastic terms with each other and with a ramp, which does not scatter
+#: alone: (a, b) for a in 0..3 and b in a..4.
 PRODUCTS = 14
 #: Column of the data behind those of the five terms in a system of equations.
 DATA = 5
@@ -50,7 +49,7 @@ _TABLE = (
 
 @njit(**INNER)
 def combine_products(pairs, ramps, n, tables):  # type: ignore[no-untyped-def]
-    """Products of terms for cells on and above the diagonal, both orders of a pair added, to `tables`, flat (n, n, `PRODUCTS`)."""
+    """Combine the products of terms for the upper triangle of cells, flat (n, n, `PRODUCTS`)."""
     for i in range(pairs.shape[2]):
         for j in range(i, pairs.shape[2]):
             table = PRODUCTS * (i * n + j)
@@ -125,7 +124,7 @@ def observe(  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def root_units(seen, units):  # type: ignore[no-untyped-def]
-    """Square roots of what a unit of each squared coefficient is in sample units, cell by cell: row ``5 cell + term``."""
+    """Compute the roots of unit squared coefficients in sample units: row ``5 cell + term``."""
     for i in range(seen.shape[0] // 6):
         for a in range(5):
             put(units, 5 * i + a, root(take(seen, 6 * i + _SEEN[a])))
@@ -133,7 +132,7 @@ def root_units(seen, units):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def root_squares(squares, seen, units, roots):  # type: ignore[no-untyped-def]
-    """Square roots of the squared coefficients in sample units, cell by cell: row ``5 cell + term``."""
+    """Compute the roots of the squared coefficients in sample units: row ``5 cell + term``."""
     s0, s1 = take(squares, 0), take(squares, 1)
     r0, r2, r3, r4 = (
         root(s0),
@@ -151,7 +150,7 @@ def root_squares(squares, seen, units, roots):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _sum_products(tables, at, a0, a1, a2, a3, a4):  # type: ignore[no-untyped-def]
-    """Covariance of two cells without their share of degrees of freedom; the a are products of the roots of both."""
+    """Compute the covariance of two cells without their share of degrees of freedom."""
     first = (
         a0 * number(tables, at)
         + a1 * number(tables, at + 1)
@@ -227,7 +226,7 @@ def total_variance(roots, inverse, tables, weights):  # type: ignore[no-untyped-
 
 @njit(**INNER)
 def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: ignore[no-untyped-def]
-    """Variance of the cells added with `weights`, as a polynomial in the squared coefficient of `term`.
+    """Expand the variance of a weighted sum of cells in the squared coefficient of `term`.
 
     `roots` are those of the noise without the term, `units` those of `root_units`. To the rows of
     `out` go the variance without the term, its growth per unit, and per unit squared.
@@ -289,7 +288,7 @@ def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: 
 def degrees_of_freedom(  # type: ignore[no-untyped-def]
     squares, avar, white, quantization, ramp, factor, columns, to_samples, diagonal, out
 ):
-    """Equivalent degrees of freedom of each finite cell of a window under a mixture of noises, ``2 mean^2 / variance``."""
+    """Compute the degrees of freedom of each finite cell, ``2 mean^2 / variance``."""
     amounts = np.empty(5)
     for i in range(avar.size):
         if not np.isfinite(avar[i]):

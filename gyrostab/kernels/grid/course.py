@@ -1,10 +1,9 @@
-"""The most likely course of noisy stamps along a grid: which rows are the next sample, and where samples are missing.
+"""The most likely sequence of samples along noisy stamps: next samples, and missing ones.
 
 A stamp is the time of its sample plus jitter. How far the stamps are ahead of the row count, in
 samples, is then a whole number (the samples lost so far) plus jitter, plus a slow phase of the
 clock. The whole number changes rarely. `trace` finds its most likely course: hypotheses are kept
-side by side until the rows that follow decide between them (a Viterbi search), so no single stamp
-decides anything.
+until later rows decide between them (a Viterbi search), so no single stamp is decisive.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ __all__ = ["find_breaks", "find_phase", "follow", "trace"]
 
 Integers = NDArray[np.int64]
 
-#: Most hypotheses kept side by side: each row that comes late is the possible end of a loss.
+#: Largest number of simultaneous hypotheses: each late row is the possible end of a loss.
 _MOST = 64
 #: Costs, in nats. A stamp beyond 5 standard deviations (12.5 nats) is an outlier, whatever its
 #: size. One row in 150 (5 nats) comes after
@@ -29,7 +28,7 @@ _MOST = 64
 _OUTLIER_NATS, _LOSS_NATS, _DROP_NATS = 12.5, 5.0, 30.0
 #: Standard deviations within which the end of a loss is looked for.
 _REACH_SIGMA = 2.5
-#: Of 1000 outliers one after the other; more late rows are none, but come after a loss.
+#: Cost of 1000 consecutive outliers; more late rows are not outliers, but follow a loss.
 _LATE_NATS = 12_500.0
 #: Samples lost between the first rows, at most, and rows that a first phase is worth.
 _EARLY_LOSSES, _FIRST_ROWS = 3, 8
@@ -39,7 +38,7 @@ _PERSIST_ROWS = 16
 
 @njit(**INNER)
 def _keep_hypothesis(table, n, level, phase, cost, parent):  # type: ignore[no-untyped-def]
-    """Add a hypothesis to the first `n` of a table, each level once; returns how many there are then.
+    """Add a hypothesis to the first `n` of a table, each level once; returns the new number.
 
     The one with the fewest losses stays whatever it costs: while rows are late, all others are
     cheaper.
@@ -74,14 +73,14 @@ def _switch_nats(far):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _stamp_nats(off, weight):  # type: ignore[no-untyped-def]
-    """Cost of a stamp that is `off` samples from its course; of two outliers, the nearer is a little cheaper."""
+    """Compute the cost of a stamp `off` samples from its course; nearer outliers cost less."""
     nats = weight * off * off
     return nats if nats < _OUTLIER_NATS else _OUTLIER_NATS + 0.05 * np.log(nats / _OUTLIER_NATS)
 
 
 @njit(**INNER)
 def _prune_hypotheses(table, n):  # type: ignore[no-untyped-def]
-    """Drop the hypotheses that the best one could still become at less cost; returns how many remain."""
+    """Drop hypotheses that the best one can still reach at less cost; returns the number left."""
     best = np.int64(0)
     for h in range(n):
         if table[h, 2] < table[best, 2]:
@@ -99,7 +98,7 @@ def _prune_hypotheses(table, n):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _extend_hypothesis(new, kept, old, h, position, following, sigma, gain, hold, most):  # type: ignore[no-untyped-def]
-    """Add to a table what hypothesis h becomes with a row that lies at `position`, and the next at `following`; the new length."""
+    """Add the successors of hypothesis h for a row at `position`, and the next at `following`."""
     level, phase, cost = old[h, 0], old[h, 1], old[h, 2]
     weight = 0.5 / sigma**2
     if phase > hold:
@@ -127,7 +126,7 @@ def _extend_hypothesis(new, kept, old, h, position, following, sigma, gain, hold
 
 @njit(**INNER)
 def _seed_hypotheses(table, level, phase, first, most):  # type: ignore[no-untyped-def]
-    """Begin with a hypothesis; where the first row of a piece is at `first`, samples may be lost between the first rows."""
+    """Start with a hypothesis; samples may be lost between the first rows of a piece."""
     table[0, 0], table[0, 1], table[0, 2] = level, phase, 0.0
     size = np.int64(1)
     if not np.isnan(first):
@@ -274,7 +273,7 @@ def find_breaks(stamps, n, latest, reach, longest):  # type: ignore[no-untyped-d
 
 @njit(**KERNEL)
 def find_phase(count, stamps, period, sigma):  # type: ignore[no-untyped-def]
-    """Find how far the first stamps are ahead of the count of rows, from the first of them [samples].
+    """Find how far the first stamps are ahead of the row count [samples].
 
     Lost samples and late rows put stamps ahead, so of up to 33 rows those count that are least
     ahead; three of them at least, as one stamp may be damaged.
@@ -295,7 +294,7 @@ def find_phase(count, stamps, period, sigma):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def follow(count, stamps, period, sigma, gain, longest, block):  # type: ignore[no-untyped-def]
-    """Count the samples along noisy stamps, as `gyrostab.kernels.grid.stamps.track` does along sharp ones.
+    """Count the samples along noisy stamps, as `track` of `stamps` does along exact ones.
 
     Parameters
     ----------
@@ -333,7 +332,8 @@ def follow(count, stamps, period, sigma, gain, longest, block):  # type: ignore[
         phase = find_phase(count[begin:end], stamps[begin:end], period, sigma)
         level = sample[begin:end]
         total += trace(
-            count[begin:end], stamps[begin:end], count[begin], stamps[begin], period, sigma, gain, np.inf, longest / period,
+            count[begin:end], stamps[begin:end], count[begin], stamps[begin], period, sigma, gain,
+            np.inf, longest / period,
             np.int64(0), phase, np.int64(0), level, off[begin:end],
         )  # fmt: skip
         for i in range(begin, end):

@@ -1,9 +1,8 @@
 """From stamps to samples: which row belongs to which sample of a uniform grid.
 
-The rows come in blocks; all that must be remembered between two blocks is in three arrays
-(`new_state`), so the result does not depend on where a block ends. A run is a stretch of rows
-without a break that fills a stretch of the grid without a break: ``(first sample, first row,
-length)``.
+The rows come in blocks; the state between two blocks is in three arrays (`new_state`), so the
+result does not depend on where a block ends. A run is an unbroken sequence of rows that fills an
+unbroken part of the grid: ``(first sample, first row, length)``.
 """
 
 from __future__ import annotations
@@ -68,13 +67,13 @@ _NEAR = 1e-9  # samples, to the middle between two, where only the division tell
 
 
 def new_state() -> tuple[np.ndarray, np.ndarray]:
-    """Make what `place` remembers between two blocks: counters, and which of the last samples are taken."""
+    """Make the state of `place` between two blocks: counters, and the last samples taken."""
     return np.zeros(13, dtype=np.int64), np.zeros(_RING, dtype=np.bool_)
 
 
 @njit(**KERNEL)
 def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
-    """Count the samples between stamps that lie near a lattice of `period`.
+    """Count the samples between stamps that lie near multiples of `period`.
 
     The phase follows the stamps with `gain`, so that neither jitter nor a slightly wrong period
     breaks the count.
@@ -112,7 +111,7 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
         moved = step + phase
         if (
             least < moved < most
-        ):  # one sample, as nearly always: told without a division that the next stamp would wait for
+        ):  # nearly always one sample; the next stamp shows it without a division
             count[i] = count[i - 1] + 1
             phase = (1.0 - gain) * (moved - period)
             continue
@@ -191,7 +190,7 @@ def look(cells, present):  # type: ignore[no-untyped-def]
     absent : int
         Rows without any number.
     holes, infinite : int
-        Cells that are no number in other rows, and infinite cells.
+        Cells without a number in other rows, and infinite cells.
     low, high : ndarray, shape (n_axes,)
         Range of the finite values; infinite without any.
     """
@@ -220,7 +219,7 @@ def look(cells, present):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
-    """Whether the next readable stamps after row j lie where unbroken counting puts them, after `expected`."""
+    """Check whether the next readable stamps after row j agree with unbroken counting."""
     found = 0
     zero = state[_GRID0] - state[_PHASE] * _UNIT
     for m in range(j + 1, min(len(stamps), j + 1 + LOOK)):
@@ -252,7 +251,7 @@ def _stays_behind(stamps, j, n, latest):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _estimate_origin(stamps, j, period):  # type: ignore[no-untyped-def]
-    """Stamp [ns] that sample j should have had, as the stamps after it tell: its own jitter must not shift all others."""
+    """Estimate the true stamp [ns] of sample j from later stamps, so that its jitter is removed."""
     total, found = 0.0, 0
     for m in range(j, min(len(stamps), j + 32)):
         if stamps[m] == NO_STAMP:
@@ -281,7 +280,7 @@ def _is_free(ring, state, target):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _settle_rows(row, position, state, ring):  # type: ignore[no-untyped-def]
-    """Place the rows without a stamp that come just before `row`, if it leaves exactly their room."""
+    """Place the rows without a stamp just before `row`, if there is exactly space for them."""
     pending = state[_PENDING]
     state[_PENDING] = 0
     if (
@@ -369,7 +368,7 @@ def _note_event(events, n, cause, sample, row, before, stamp):  # type: ignore[n
 
 @njit(**INNER)
 def _skip_even_rows(rows, stamps, j, n, period, expected, row, stamp0):  # type: ignore[no-untyped-def]
-    """The first row from j on that is not the one after the last, or whose stamp is not exactly `expected` samples after `stamp0`.
+    """Find the first row from j on that does not follow the last one at the `expected` stamp.
 
     No row waits here for what the ones before did to the phase, which they leave at zero.
     """
@@ -385,7 +384,7 @@ def _skip_even_rows(rows, stamps, j, n, period, expected, row, stamp0):  # type:
 
 @njit(**INNER)
 def _on_time(rows, stamps, j, n, period, hold, state, ring):  # type: ignore[no-untyped-def]
-    """Place rows as long as each is the one after the last and on time for the next sample; the first that is not."""
+    """Place rows while each follows the last one on time; returns the first that does not."""
     head, row, latest, phase = state[_HEAD], state[_ROW], state[_LATEST], state[_PHASE]
     grid0, stamp0, begin = state[_GRID0], state[_STAMP0], j
     if not state[STARTED] or state[_PENDING]:

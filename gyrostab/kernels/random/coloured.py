@@ -1,9 +1,9 @@
-"""Gaussian processes of continuous time, a resonance or a band, read at the samples or averaged over them, without approximation.
+"""Gaussian processes of continuous time, sampled or averaged without approximation.
 
-A process is white noise behind second-order sections in series. Its state is known from one sample
-to the next by the matrix exponential, and so are the joint distribution of the state and of the
-mean over the interval between (Van Loan 1978). So a process far above half of the sampling rate
-folds down as it does in a logger that samples it, and needs no finer time.
+A process is white noise filtered by second-order sections in series. The matrix exponential gives
+its state from one sample to the next, and the joint distribution of the state and of the mean over
+the interval between (Van Loan 1978). A process far above half of the sampling rate therefore folds
+down as in a logger that samples it, without a finer time step.
 
 References
 ----------
@@ -53,7 +53,10 @@ class Reading(NamedTuple):
 
 
 class _Section(NamedTuple):
-    """``velocity: a s / (s^2 + a s + w^2)``, one at w; or ``position: w^2 / (s^2 + a s + w^2)``, one at zero frequency."""
+    """Second-order section: ``velocity`` is 1 at its resonance w, ``position`` at zero frequency.
+
+    ``velocity: a s / (s^2 + a s + w^2)``; ``position: w^2 / (s^2 + a s + w^2)``.
+    """
 
     omega: float
     damping: float
@@ -61,7 +64,7 @@ class _Section(NamedTuple):
 
 
 def _chain_sections(sections: Sequence[_Section]) -> tuple[Array, Array, Array]:
-    """State matrix, input of white noise and output of sections in series; two states for each, both of the same size."""
+    """Connect sections in series: state matrix, noise input, output; two states per section."""
     size = 2 * len(sections)
     a, b = np.zeros((size, size)), np.zeros(size)
     drive = np.zeros(size)
@@ -110,7 +113,7 @@ def _make_reading(a: Array, covariance: Array, c: Array, rate: float, *, average
 
 
 def oscillator(frequency: float, quality: float, rate: float, *, average: bool = True) -> Reading:
-    """The velocity of a damped oscillator shaken by white noise, of unit variance in continuous time.
+    """Describe the velocity of a damped oscillator driven by white noise, with unit variance.
 
     Parameters
     ----------
@@ -176,7 +179,7 @@ def band(
 
 
 def rest(reading: Reading, normal: Array) -> Array:
-    """A state of the stationary process, from standard normal numbers, one for each of its states."""
+    """Draw a state of the stationary process from standard normal numbers, one per state."""
     return np.asarray(reading.spread @ normal)
 
 
@@ -222,7 +225,7 @@ def march(
     return values, here
 
 
-# -------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 # the same in frequency
 
 
@@ -249,7 +252,7 @@ def band_psd(
 def folded_psd(
     density: Callable[[Array], Array], f: Array, rate: float, highest: float, *, average: bool
 ) -> Array:
-    """Two-sided density of the samples of a process: the sum over the frequencies that look the same in them.
+    """Fold the two-sided density of a process into that of its samples.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Noise as an ideal gyro gives it, sample after sample: each sample is the mean rate over its own interval.
+"""Noise of an ideal gyro: each sample is the mean rate over its interval.
 
 All processes are exact in continuous time: their means over any number of samples have the Allan
 variance of the continuous law, not of a sampled one. All go on where they stopped, bit for bit,
@@ -114,7 +114,7 @@ def ornstein_uhlenbeck(
 
 
 def _mean_moments(samples: Array) -> tuple[Array, Array, Array]:
-    """Decay over a sample, weight of both ends in its mean, and variance of the rest of the mean, for correlation times [samples]."""
+    """Compute decay over a sample, weight of both ends in its mean, and variance of the rest."""
     a = 1.0 / samples
     decay = -np.expm1(-a)
     weight = np.tanh(a / 2.0) / a
@@ -127,7 +127,7 @@ def _mean_moments(samples: Array) -> tuple[Array, Array, Array]:
 
 
 def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> tuple[Array, float]:
-    """Means over the samples of an Ornstein-Uhlenbeck (first-order Gauss-Markov) process of unit variance.
+    """Make sample means of an Ornstein-Uhlenbeck (first-order Gauss-Markov) process.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def flicker_means(
 
 
 def sinusoid_means(index: NDArray[np.int64], frequency: float, rate: float, phase: float) -> Array:
-    """Means over the samples `index` of ``sin(2 pi f t + phase)``, for `frequency` and `rate` in Hz.
+    """Average ``sin(2 pi f t + phase)`` over the samples `index`; `frequency` and `rate` in Hz.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Boxcars in white noise with a random walk and relaxing processes: matched filters at every place, in linear time.
+"""Matched filters for boxcars in white noise, random walk and relaxing processes, in linear time.
 
 For the covariance C of the series these kernels give ``C^-1 y`` (the disturbance smoother of de
 Jong) and ``x' C^-1 x`` for every boxcar x, so that the matched filter of a boxcar is a sum of
@@ -22,7 +22,7 @@ __all__ = ["boxcar_information", "filter_gains", "precision_times", "remaining_i
 
 @njit(**KERNEL)
 def filter_gains(variance, present, walk, ou_variance, decay, innovation, gain):  # type: ignore[no-untyped-def]
-    """Variance of the innovations and filtered gains of a Kalman filter whose observation is the sum of its states.
+    """Run a Kalman filter that observes the sum of its states: innovation variances and gains.
 
     Parameters
     ----------

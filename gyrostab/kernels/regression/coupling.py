@@ -1,4 +1,4 @@
-"""Regression of correlated series on lagged drivers: blocks of overlapping windows, a family of noise laws, generalised least squares."""
+"""Regression of correlated series on lagged drivers, over a family of noise laws."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _STEEPEST = 1.5  # power of the share against the p-value in the tail, at most
 
 
 class Laws(NamedTuple):
-    """Noise laws of some blocks, beside nuisance columns: factors of the covariances, and what whitens and frees from the nuisance."""
+    """Noise laws of some blocks with nuisance columns: covariance factors and whitening."""
 
     factor: Array  # (law, n, n)
     whiten: Array  # (law, n, n)
@@ -63,16 +63,16 @@ class LagFit(NamedTuple):
 def block_averages(
     block: NDArray[np.int64], time: Array, length: float, share: Array
 ) -> tuple[Any, Array, Array]:
-    """Average windows into blocks, and say how the white noise of the blocks is correlated.
+    """Average windows into blocks, with the covariance of the blocks in white noise.
 
     Parameters
     ----------
     block : int64 (n,)
-        Number of the block of each window, from 0 without a hole.
+        Number of the block of each window, consecutive from 0.
     time, length : float64 (n,), float
         Centres and length of the windows [s]. Two windows share white noise as far as they overlap.
     share : float64 (n,)
-        Share of the samples that a window holds; its white variance goes with the inverse.
+        Share of samples present in each window; its white variance is inversely proportional.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def block_averages(
 
 
 def noise_laws(centre: Array, white: Array) -> Laws:
-    """Noise laws of the blocks that are weighed, and the weight each has beforehand.
+    """Make the noise laws of the blocks, with their prior weights.
 
     White noise alone, and white noise with a slow part: an Ornstein-Uhlenbeck process, which is a
     random walk when its correlation time is longer than the record. Mixtures of several look like
@@ -121,7 +121,7 @@ def noise_laws(centre: Array, white: Array) -> Laws:
     Returns
     -------
     Laws
-        With no nuisance yet (see `project_out`).
+        Without nuisance columns (see `project_out`).
     """
     record = float(np.ptp(centre)) or 1.0
     distance = np.abs(centre[:, None] - centre[None, :]) / record
@@ -150,7 +150,7 @@ def decompose(family: list[Array], prior: Array) -> Laws:
 
 
 def project_out(laws: Laws, nuisance: Array) -> Laws:
-    """Noise laws beside nuisance columns (n, p): what is whitened is freed from them, and they count in the likelihood."""
+    """Add nuisance columns (n, p) to the noise laws; whitened series are orthogonal to them."""
     q, r = np.linalg.qr(laws.whiten @ nuisance)
     free = laws.whiten - q @ (np.swapaxes(q, 1, 2) @ laws.whiten)
     log_h = 2.0 * np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))).sum(axis=1)
@@ -169,7 +169,7 @@ def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
     Parameters
     ----------
     laws : Laws
-        Of `project_out`.
+        Result of `project_out`.
     series, driver : float64 (n, n_series), (n, n_lags)
         Columns.
 
@@ -208,14 +208,14 @@ def null_weights(fit: LagFit, series: int) -> Array:
 
 
 def mixture(fit: LagFit) -> tuple[Array, Array]:
-    """Mean and standard deviation of the slope by (series, lag), over the noise laws by their weights."""
+    """Average the slope by (series, lag) over the noise laws: mean and standard deviation."""
     weight = weights(fit)
     mean = (weight * fit.slope).sum(axis=0)
     return mean, np.sqrt((weight * (fit.stderr**2 + (fit.slope - mean) ** 2)).sum(axis=0))
 
 
 def p_values(fit: LagFit) -> Array:
-    """Two-sided p-values of the slopes by (series, lag), as if mean and standard deviation followed Student's law: see `calibrated`."""
+    """Compute two-sided p-values of the slopes from Student's law: see `calibrated`."""
     mean, spread = mixture(fit)
     return np.asarray(2.0 * stdtr(fit.freedom, -np.abs(mean / spread)))
 
@@ -223,12 +223,12 @@ def p_values(fit: LagFit) -> Array:
 def simulate_p_values(
     laws: Laws, driver: Array, weight: Array, draws: int = 300, seed: int = 20
 ) -> Array:
-    """P-values by (draw, lag) of noise that has nothing to do with the driver, and follows the laws by their weights.
+    """Simulate p-values by (draw, lag) of noise without coupling, under the weighted laws.
 
     Parameters
     ----------
     laws : Laws
-        Of `project_out`.
+        Result of `project_out`.
     driver : float64 (n, n_lags)
         Columns.
     weight : float64 (n_laws,)
@@ -257,7 +257,7 @@ def simulate_p_values(
 
 
 def calibrated(p: float, chance: Array) -> float:
-    """Share of noise that gives a p-value at most as small, from those of simulated noise; small ones by a power law."""
+    """Find the share of simulated noise with at most this p-value; small ones by a power law."""
     p, sample = max(p, 1e-300), np.sort(chance)
     edge, share, power = _lower_tail(sample)
     if p < edge:
@@ -270,7 +270,7 @@ def calibrated(p: float, chance: Array) -> float:
 
 
 def uncalibrated(share: float, chance: Array) -> float:
-    """The p-value that so great a share of simulated noise stays below: the inverse of `calibrated`."""
+    """Find the p-value below which this share of simulated noise lies: inverse of `calibrated`."""
     sample = np.sort(chance)
     edge, least, power = _lower_tail(sample)
     if share < least:
@@ -285,7 +285,7 @@ def uncalibrated(share: float, chance: Array) -> float:
 
 
 def _lower_tail(sample: Array) -> tuple[float, float, float]:
-    """The `_TAIL`-th of a sorted sample, the share up to it, and the power (Hill's) by which the share below falls off from there."""
+    """Fit the lower tail of a sorted sample: its start, the share below, and Hill's exponent."""
     count = min(_TAIL, sample.size // 2)
     edge = float(np.maximum(sample[count - 1], 1e-300))
     spread = float(np.mean(np.log(edge / np.maximum(sample[:count], 1e-300))))
@@ -295,7 +295,7 @@ def _lower_tail(sample: Array) -> tuple[float, float, float]:
 def slope_interval(
     fit: LagFit, series: int, lag: int, share: float
 ) -> tuple[float, float, float, float]:
-    """Slope, standard error and interval of one entry: the slopes against which `p_values` is at least `share`."""
+    """Find slope, standard error and interval: slopes whose `p_values` are at least `share`."""
     mean, spread = (float(part[series, lag]) for part in mixture(fit))
     reach = float(stdtrit(fit.freedom, 1.0 - 0.5 * share)) * spread
     return mean, spread, mean - reach, mean + reach

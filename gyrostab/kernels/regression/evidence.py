@@ -25,7 +25,7 @@ _NEGLIGIBLE = 40.0
 def _mixture_terms(
     base: Array, rotated: Array, constant: Array, share: Array
 ) -> tuple[Array, Array]:
-    """Logarithm of every term of the mixture less the largest of its design and record, (design, record, width x grid), and that one."""
+    """Compute the log terms of the mixture (design, record, width x grid) less their maximum."""
     designs, records, grid, p = rotated.shape
     kinds = constant.shape[1]
     out = np.empty((designs, records, kinds * grid))
@@ -55,7 +55,7 @@ def _mixture_terms(
 
 
 def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Array) -> Array:
-    """Log marginal likelihood of every design and record over grid points, and widths of the prior, of equal weight.
+    """Compute the log marginal likelihood of every design and record over a grid of laws.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Arra
 
 @njit(**KERNEL)
 def chosen_products(columns: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
-    """Products of some pairs of columns, summed over the rows: ``out[q] = columns[:, first[q]] @ columns[:, second[q]]``."""
+    """Sum products of pairs of columns, ``columns[:, first[q]] @ columns[:, second[q]]``."""
     out = np.zeros(first.size)
     for i in range(columns.shape[0]):
         for q in range(first.size):

@@ -1,7 +1,7 @@
-"""Block means of a bias that hops between two levels, as a hidden Markov model: forward and backward through many records.
+"""Block means of a bias that switches between two levels, as a hidden Markov model.
 
-The state is the level at the end of a block. A block is cut into parts, in each of which the bias
-stands on one level, so that blocks with hops inside have the laws of their means.
+The state is the level at the end of a block. A block is divided into parts with one level each, so
+that the mean of a block with a switch inside has the right distribution.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
     Examples
     --------
     >>> chance, rises = level_tables(np.array([4.0]), np.array([2.0]), 5)
-    >>> chance[0].sum(axis=(1, 2)).round(9), chance[0, :, 1].sum(axis=1).round(3)  # after a block from low, and from high
+    >>> # after a block that starts low, and after one that starts high
+    >>> chance[0].sum(axis=(1, 2)).round(9), chance[0, :, 1].sum(axis=1).round(3)
     (array([1., 1.]), array([0.176, 0.648]))
     """
     stay = np.exp(-(1.0 / low + 1.0 / high) / parts)

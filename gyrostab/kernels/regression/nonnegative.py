@@ -29,7 +29,7 @@ def _list_members(subset, members):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _solve_subset(normal, right, subset, solution, work, members):  # type: ignore[no-untyped-def]
-    """Solve the normal equations for the terms in the bit set `subset`; False when they cannot be told apart.
+    """Solve the normal equations for the terms in the bit set `subset`; False if singular.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def _solve_subset(normal, right, subset, solution, work, members):  # type: igno
 
 @njit(**INNER)
 def _is_optimal(normal, right, allowed, subset, solution):  # type: ignore[no-untyped-def]
-    """Whether the solution for `subset` is not negative, and no other allowed term would improve it (Karush-Kuhn-Tucker)."""
+    """Check the solution for `subset` by the Karush-Kuhn-Tucker conditions."""
     for i in range(right.size):
         if subset >> i & 1:
             if solution[i] <= 0.0:
@@ -84,7 +84,7 @@ def _is_optimal(normal, right, allowed, subset, solution):  # type: ignore[no-un
 
 @njit(**KERNEL)
 def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[no-untyped-def]
-    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``; returns the bit set of the terms above zero.
+    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``; returns the set of positive terms.
 
     Parameters
     ----------

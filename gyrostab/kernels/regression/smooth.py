@@ -15,7 +15,7 @@ _DIFFERENCE = (1.0, -2.0, 1.0)
 
 
 def smooth_curve(values: Array, *, longest: float) -> Array:
-    """Values without their white noise: least squares of the deviations plus a penalty times the squares of second differences.
+    """Remove white noise by least squares with a penalty on squared second differences.
 
     The penalty is the one with the least generalised cross-validation, so that a curve with little
     noise stays as it is.

@@ -23,7 +23,7 @@ LONGEST = 4.0
 
 
 def flicker_states(step: float, span: float) -> tuple[Array, Array, float]:
-    """Flicker noise with B = 1 as Ornstein-Uhlenbeck processes for means over blocks, up to a constant.
+    """Approximate flicker noise with B = 1 by Ornstein-Uhlenbeck processes, up to a constant.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def _advance_states(covariance, decay, drive):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _project_covariance(covariance, weight, first, gain):  # type: ignore[no-untyped-def]
-    """Covariances of the states with the mean to `gain`; returns the mean's variance. Both over the states from `first` on."""
+    """Project the covariance on the mean, from state `first` on; returns its variance."""
     total = 0.0
     for j in range(first, weight.size):
         gain[j] = 0.0
@@ -132,7 +132,7 @@ def whiten(
     ou_variance: Array,
     ou_time: Array,
 ) -> tuple[Array, float]:
-    """Whiten columns of block means by the covariance V of their noise, a constant of unknown size taken out.
+    """Whiten columns of block means by the covariance V of their noise, with the constant removed.
 
     Products of whitened columns a, b are ``a' W b`` with ``W = V^-1 - V^-1 1 (1' V^-1 1)^-1 1'
     V^-1`` over the blocks present.

@@ -25,7 +25,7 @@ def _sum_finite(values, seconds, origin, start):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=REORDER, **INNER)
 def _sum_products(values, seconds, mean, centre):  # type: ignore[no-untyped-def]
-    """Sums over finite values of their deviation from the mean times that of their times, and of the square of the latter."""
+    """Sum the products of deviations of values and times, and the squares of those of times."""
     covariance, variance = 0.0, 0.0
     for i in range(values.size):
         finite = np.isfinite(values[i])
@@ -51,8 +51,8 @@ def window_trend(values, seconds, first, last):  # type: ignore[no-untyped-def]
     Returns
     -------
     float64 (2, n_windows)
-        Mean [unit of the channel], NaN where nothing is there; slope [unit per s], NaN with fewer
-        than two instants.
+        Mean [unit of the channel], NaN in empty windows; slope [unit per s], NaN with fewer than
+        two times.
     """
     out = np.full((2, first.size), np.nan)
     for j in range(first.size):

@@ -1,4 +1,4 @@
-"""Expected periodograms of the noise terms in a block: what taper, mean and sampling make of their spectra."""
+"""Expected periodograms of the noise terms in a block, with taper, mean and sampling."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _second_difference(integral: Array) -> Array:
 
 
 def sample_covariance(size: int, rate: float) -> Array:
-    """Covariance of samples l apart of unit Q, N, B and K, where the samples are means over their intervals.
+    """Compute the covariance of samples l apart for unit Q, N, B and K, as means over intervals.
 
     That of B and K is one of differences: it has an unknown constant, which no block statistic
     sees.
@@ -70,7 +70,7 @@ def _plain_spectra(frequency: Array, rate: float) -> Array:
 
 
 def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
-    """Expected periodogram of every ordinate of a full block for unit strength of each term, as a two-sided density.
+    """Compute the expected periodogram of a full block for unit strength of each term, two-sided.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     --------
     >>> powers = expected_powers(np.ones(256), 1.0, 100)
     >>> plain = 1.0 / (2.0 * np.pi * np.arange(1, 101) / 256.0) ** 2
-    >>> (powers[3] / plain)[:3].round(1)  # without a taper a random walk is seen threefold, less the mean
+    >>> (powers[3] / plain)[:3].round(1)  # no taper: a random walk appears threefold
     array([2., 2., 2.])
     """
     size = weights.size

@@ -1,9 +1,9 @@
-"""How far samples stand from those about them, and which stand alone.
+"""Departures of samples from their neighbours, and single outliers.
 
-The departure of a sample is what it has beyond the median of the four samples on either side, of
-which only pairs at the same distance are taken: so a slope makes none, and a sample that jumps out
-makes none in its neighbours. At the edges of a block and of gaps, where no two pairs are, it is the
-smaller of what goes beyond the level and beyond the slope of four samples on one side.
+The departure of a sample is its difference from the median of the four samples on either side, of
+which only pairs at the same distance are used: a slope gives no departure, and an outlier gives
+none in its neighbours. At the edges of a block and of gaps, without two pairs, the departure is the
+smaller of those from the level and from the slope of four samples on one side.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ HISTOGRAM = 256
 _PAIRS = 4
 #: Variance of the median of 0, 2, 4, 6 and 8 normal numbers.
 _MEDIANS = (0.0, 0.5, 0.2982, 0.2147, 0.1682)
-_ALONE = 0.4  # of the departure, by which a sample is beyond the ones right beside it as well
-_WINDOWS = (8, 16, 64, 256)  # samples before or after that tell how loud the noise is there
-_NEAR = 16  # samples away that others jump out, about which the noise is as loud as about this one
+_ALONE = 0.4  # share of the departure by which an outlier exceeds both direct neighbours
+_WINDOWS = (8, 16, 64, 256)  # samples before or after that give the noise level there
+_NEAR = 16  # samples within which outliers share one noise level
 _MEDIAN = 0.6745  # of the absolute value of a standard normal number
 _ERROR = 1.17  # of the deviation from the median of one number
 
@@ -94,7 +94,7 @@ def _median_pairs(row, i, near):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _one_sided(row, i):  # type: ignore[no-untyped-def]
-    """Departure at an edge: the smaller of those from the level and from the slope of the four samples on one side; NaN without these."""
+    """Compute the departure at an edge from the level or slope of four samples on one side."""
     for side in (1, -1):
         if 0 <= i + _PAIRS * side < row.size:
             one, two = row[i + side], row[i + 2 * side]
@@ -113,15 +113,15 @@ def _one_sided(row, i):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def departures(x, out, histogram):  # type: ignore[no-untyped-def]
-    """How far each sample stands from those about it, as if there were always eight of them.
+    """Compute the departure of each sample from its neighbours, as if there were always eight.
 
     Parameters
     ----------
     x : ndarray, shape (block, sample)
         Values, NaN where missing.
     out : ndarray, shape (block, sample)
-        Is filled with the departures, NaN where there are none; those from fewer samples are
-        smaller, so that all scatter alike.
+        Overwritten with the departures, NaN where missing; those from fewer samples are scaled
+        down, so that all scatter equally.
     histogram : ndarray of uint32, shape (block, `HISTOGRAM`)
         The number of absolute departures by size is added to it.
     """
@@ -159,7 +159,7 @@ def departures(x, out, histogram):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _noise_level(away, low, high, room):  # type: ignore[no-untyped-def]
-    """Deviation of the departures from `low` to before `high`, less an error of it; 0 where too few samples tell."""
+    """Estimate the deviation of the departures from `low` to `high`, less its error; 0 if few."""
     count = 0
     for j in range(max(low, 0), min(high, away.size)):
         value = abs(away[j])
@@ -173,7 +173,7 @@ def _noise_level(away, low, high, room):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _largest_noise_level(away, i, room):  # type: ignore[no-untyped-def]
-    """How loud the noise right before or right after a sample is at least."""
+    """Find a lower bound of the noise level directly before or after a sample."""
     found = 0.0
     for window in _WINDOWS:
         found = max(
@@ -186,7 +186,7 @@ def _largest_noise_level(away, i, room):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _is_outlier(row, away, i, limit):  # type: ignore[no-untyped-def]
-    """Whether a sample is far beyond each of the two beside it, on the same side, and none within two samples jumps out half as far."""
+    """Check that a sample exceeds both neighbours by far, with no half as large one nearby."""
     side = 1.0 if away[i] > 0.0 else -1.0
     least = _ALONE * abs(away[i])
     for j in range(max(i - 2, 0), min(i + 3, row.size)):
@@ -200,17 +200,17 @@ def _is_outlier(row, away, i, limit):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
-    """Samples that stand alone beyond a limit, and beyond that of noise which is louder for a while.
+    """Find single samples beyond a limit that grows with the noise around them.
 
     Parameters
     ----------
     x, away : ndarray, shape (block, sample)
         Values and their `departures`.
     deviation : ndarray, shape (block,)
-        Of the departures of a block; 0 where there are none.
+        Standard deviation of the departures of a block; 0 without departures.
     limit : float
-        Deviations beyond which a departure may be a peak: of the block, and of the samples right
-        before and right after it.
+        Deviations beyond which a departure may be a peak: of the block, and of the samples directly
+        before and after it.
 
     Returns
     -------
@@ -218,9 +218,9 @@ def peaks(x, away, deviation, limit):  # type: ignore[no-untyped-def]
     size : ndarray, shape (peak,)
         Absolute departure.
     level : ndarray, shape (peak,)
-        Standard deviation of departures that the noise of the block has there at least: the largest
-        of those right before and right after it, and before and after the others that jump out
-        within 16 samples, for a burst of noise is hardly longer.
+        Lower bound of the standard deviation of departures there: the largest of those directly
+        before and after it, and before and after other outliers within 16 samples, because bursts
+        of noise are rarely longer.
     """
     count = 0
     for b in range(x.shape[0]):

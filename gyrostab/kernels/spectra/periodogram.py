@@ -1,4 +1,4 @@
-"""Periodograms of blocks with missing samples, averaged over bands, and what the samples of a block tell beside their spectrum.
+"""Periodograms of blocks with missing samples, averaged over bands, and statistics by phase.
 
 A block of L samples y with the mask m (1 where present) and the taper w has the ordinates
 
@@ -8,9 +8,9 @@ With a = w m, A = FFT(a), V = FFT(a^2) and n samples present, white noise of var
 
     E |F_k|^2 = s (V_0 - |A_k|^2 / n),    cov(F_k, F_l) = s (V_(k-l) - A_k conj(A_l) / n),
 
-and E F_k F_l follows with -l for l. So the power of a band, the sum of |F_k|^2 over the sum of
-their expectations, is unbiased with any gaps, and its variance gives the shape of the gamma
-distribution that it follows.
+and E F_k F_l follows with -l for l. The power of a band, the sum of |F_k|^2 over the sum of their
+expectations, is therefore unbiased with any gaps, and its variance gives the shape of its gamma
+distribution.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _APART = 16  # ordinates that the taper still correlates
 
 
 def taper(size: int, share: float = 0.2) -> Array:
-    """Tukey's taper: cosine slopes on `share` of the samples, half of them at either end, and 1 between.
+    """Make Tukey's taper: cosine slopes on `share` of the samples, half at either end.
 
     Examples
     --------
@@ -57,12 +57,12 @@ def taper(size: int, share: float = 0.2) -> Array:
 
 
 def ordinates(size: int) -> int:
-    """Complex ordinates of a real block of `size` samples: without frequency 0 and without half of the sampling rate."""
+    """Count the complex ordinates of a block of `size` samples, without 0 and Nyquist."""
     return (size + 1) // 2 - 1
 
 
 def band_edges(size: int, bands: int = 16) -> NDArray[np.int64]:
-    """First ordinate of about `bands` bands, evenly spaced in log frequency, and one past the last ordinate.
+    """Divide the ordinates into about `bands` bands, evenly spaced in log frequency.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
 def gap_spectra(
     present: NDArray[np.bool_], weights: Array
 ) -> tuple[Array, NDArray[np.complex128], NDArray[np.complex128]]:
-    """Expected power of each ordinate in white noise, and the spectra of the mask that it comes from.
+    """Compute the expected power of each ordinate in white noise, and the spectra of the mask.
 
     Parameters
     ----------
@@ -235,10 +235,10 @@ def shape_of_bands(mask, squared, expected, present, edges, size):  # type: igno
 
 
 def band_covariance(size: int) -> Array:
-    """Relative covariance of the powers of different bands of a whole block in white noise, (band, band); 0 on the diagonal.
+    """Compute the relative covariance of band powers of a whole block in white noise (band, band).
 
-    The taper spreads each ordinate over its neighbours, so that bands which touch have some percent
-    of their scatter in common.
+    The taper spreads each ordinate over its neighbours, so that adjacent bands share a few percent
+    of their scatter.
 
     Parameters
     ----------
@@ -300,7 +300,7 @@ def band_powers(one, other, expected, place, edges, rate):  # type: ignore[no-un
 
 @njit(**KERNEL)
 def phase_profile(centred, present, phase, low, high, sums, counts):  # type: ignore[no-untyped-def]
-    """Sum of the centred values, and number of them, by block and by phase in equal bins from `low` to `high`; both are added to.
+    """Add sum and number of the centred values by block and by phase, in equal bins.
 
     Parameters
     ----------
