@@ -109,7 +109,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
     },
     "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
     "outlier_count": {
-        "long_name": "single samples of the window that stand far from both neighbours",
+        "long_name": "single samples of the window that are far from both neighbours",
         "units": "1",
     },
     "window_coverage": {
@@ -117,7 +117,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "units": "1",
     },
     "observable": {
-        "long_name": "what the window can tell of the noise term",
+        "long_name": "whether the window shows the noise term",
         **_flag_attributes(OBSERVABLE),
     },
     "fit_chi2": {
