@@ -150,7 +150,7 @@ def describe_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> s
     --------
     >>> old = {"inputs": [{"path": "/run7/b.csv", "bytes": 120, "changed_ns": 0}], "options": {"window": "10min"}, "versions": {}}
     >>> new = {"inputs": [{"path": "/run7/b.csv", "bytes": 100, "changed_ns": 5}], "options": {"window": "5min"}, "versions": {}}
-    >>> differences(old, new)
+    >>> describe_differences(old, new)
     'run7/b.csv has changed: 100 bytes, was 120; window is 5min, was 10min'
     """
     said = _describe_input_changes(before["inputs"], now["inputs"])

@@ -1,8 +1,8 @@
-"""The working store: how the long variables of a log lie on disk in chunks, and how they are read back lazily.
+"""The working store: how long variables of a log are written in chunks and read lazily.
 
 One chunk holds about 20 minutes of one axis. What a source delivered as integers is kept as
 integers with their factor, if that gives back the same doubles. A chunk that is missing or damaged
-becomes a gap, and a warning says where; never does it in silence.
+becomes a gap, and a warning says where.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""How a dataset looks on disk by the CF conventions, and back: order of dimensions, exact times, unit strings, attributes.
+"""Encode datasets by the CF conventions, and decode them.
+
+This concerns the order of dimensions, exact times, unit strings and attributes.
 
 References
 ----------
@@ -31,7 +33,8 @@ __all__ = ["PACKING", "decode_stamps", "from_disk", "index_dim", "parse_time_gri
 
 CONVENTIONS = "CF-1.11, ACDD-1.3"
 TITLES = {
-    "product": "Dynamic Allan variance of a gyro log, with the noise coefficients Q, N, B, K and R of every window",
+    "product": "Dynamic Allan variance of a gyro log, "
+    "with the noise coefficients Q, N, B, K and R of every window",
     "surface": "Dynamic Allan variance of a gyro log",
     "log": "Gyro log on a uniform time axis",
     "dataset": "Gyro stability data",
@@ -46,9 +49,12 @@ _CALENDAR = {"calendar": "proleptic_gregorian", "units_metadata": "leap_seconds:
 PACKING = ("dtype", "scale_factor", "add_offset")
 _JSON_NAMES = "json_attributes"
 
-# Names that UDUNITS reads as we mean them. A whole power may follow; a broken one is misread
-# without a word, so it never passes.
-_SAFE_UNIT_NAMES = "degree_Celsius|standard_free_fall|degree|hour|microradian|radian|s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
+# Names that UDUNITS reads as intended. An integer power may follow; UDUNITS misreads a fractional
+# one without an error, so none passes.
+_SAFE_UNIT_NAMES = (
+    "degree_Celsius|standard_free_fall|degree|hour|microradian|radian|"
+    "s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
+)
 _SAFE_UNIT = re.compile(
     rf"(?:{_SAFE_UNIT_NAMES})(?:-?[1-9])?(?: (?:{_SAFE_UNIT_NAMES})(?:-?[1-9])?)*"
 )
@@ -63,7 +69,7 @@ def _find_kind(dataset: xr.Dataset) -> str:
 
 
 def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
-    """Lay a dataset out as the file shall hold it; `verb` goes to its history."""
+    """Encode a dataset as the file will hold it; `verb` is added to its history."""
     kind = _find_kind(dataset)
     dataset = make_names_storable(dataset)
     grids = _find_time_grids(dataset)
@@ -115,8 +121,10 @@ def to_disk(dataset: xr.Dataset, verb: str) -> xr.Dataset:
         {dim: index_dim(dim) for dim in grids if dim in stored_set.dims}
     )
     if "avar" in variables:
-        beside = [name for name in ("count", "coverage", "edf", "estimator") if name in variables]
-        stored_set["avar"].attrs["ancillary_variables"] = " ".join(beside)
+        ancillary = [
+            name for name in ("count", "coverage", "edf", "estimator") if name in variables
+        ]
+        stored_set["avar"].attrs["ancillary_variables"] = " ".join(ancillary)
     stored_set.attrs = _make_global_attributes(dataset, kind, verb)
     return stored_set
 
@@ -131,14 +139,14 @@ def _disk_order(dims: tuple[Any, ...]) -> list[Any]:
 
 
 def _make_lazy(variable: xr.Variable) -> xr.Variable:
-    """Turn a variable that still sits in another file into a dask array, so that it is copied chunk by chunk."""
+    """Make a dask array of a variable that is still in another file, to copy it chunk by chunk."""
     return (
         variable if variable._in_memory or variable.chunks is not None else variable.chunk("auto")
     )
 
 
 def _find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
-    """The rules of the time axes that are computed."""
+    """Find the rules of the computed time axes."""
     grids = {
         name: index.transform
         for name, index in dataset.xindexes.items()
@@ -158,14 +166,14 @@ def _find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
 
 
 def index_dim(dim: Any) -> str:
-    """Name in the file of a dimension whose stamps are computed: CF lets none be called ``time`` that has no stamps."""
+    """Name of a dimension with computed stamps in the file; CF reserves ``time`` for stored ones."""
     return f"{dim}_index"
 
 
 def _encode_first_stamp(
     grid: Any, attrs: dict[Any, Any], divisor: int, since: dict[str, Any]
 ) -> xr.Variable:
-    """What stands in the file for a computed time axis: its first stamp, with the rate and the exact rule as attributes."""
+    """Encode a computed time axis: its first stamp, with rate and exact rule as attributes."""
     (dim,) = grid.dims
     rule = {
         "dim": dim,
@@ -176,19 +184,20 @@ def _encode_first_stamp(
         "size": grid.size,
     }
     first = int(grid_times(grid.start, grid.rate, grid.first))
-    said = {
+    attributes = {
         "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
-        "comment": f"sample n (from 0) is at this time + n / sampling_rate_hz; {GRID} is the exact rule: "
+        "comment": "sample n (from 0) is at this time + n / sampling_rate_hz; "
+        f"{GRID} is the exact rule: "
         "start_ns + round((first + stride * n) * 1e9 / rate_hz) nanoseconds since 1970",
         "sampling_rate_hz": grid.rate / grid.stride,
         GRID: json.dumps(rule),
         **({"axis_attributes": json.dumps(dict(attrs), default=str)} if attrs else {}),
     }
-    return xr.Variable((), np.int64(first // divisor), {**said, **since})
+    return xr.Variable((), np.int64(first // divisor), {**attributes, **since})
 
 
 def _has_whole_microseconds(dataset: xr.Dataset, grids: dict[Any, Any]) -> bool:
-    """Whether microseconds hold every time in the file exactly; nanoseconds always do, but fewer programs read them."""
+    """Whether microseconds represent every time exactly; fewer programs read nanoseconds."""
     for name, variable in dataset.variables.items():
         if name in grids:
             if int(grid_times(grids[name].start, grids[name].rate, grids[name].first)) % 1000:
@@ -203,17 +212,18 @@ def _as_nanoseconds(stamps: Any) -> NDArray[np.int64]:
 
 
 def _encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.int64]:
-    """Whole microseconds or nanoseconds since 1970."""
+    """Encode times as integer microseconds or nanoseconds since 1970."""
     stamps = variable.values
     if np.isnat(stamps).any():
         raise SchemaError(
-            f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); every time must be known"
+            f"{name!r} holds {int(np.isnat(stamps).sum())} missing times (NaT); "
+            "every time must be known"
         )
     return _as_nanoseconds(stamps) // divisor
 
 
 def _encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
-    """Attributes of types that NetCDF holds, with `units` that UDUNITS reads rightly (any other unit goes to `source_units`)."""
+    """Convert attributes to NetCDF types; a unit that UDUNITS misreads goes to `source_units`."""
     if "units" in attrs:
         units = on_disk(str(attrs["units"]))
         if units in ("1", *ON_DISK.values()) or _SAFE_UNIT.fullmatch(units):
@@ -229,9 +239,8 @@ def _encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
         ):
             continue
         if not isinstance(value, np.ndarray):
-            attrs[name] = json.dumps(
-                value, default=str
-            )  # in ASCII: Octave lists no file that has any other global attribute
+            # in ASCII: Octave cannot list a file with other characters in a global attribute
+            attrs[name] = json.dumps(value, default=str)
             coded.append(name)
     if coded:
         attrs[_JSON_NAMES] = " ".join(coded)
@@ -250,10 +259,7 @@ def _make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[s
     given["history"] = "\n".join(
         [*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"]
     )
-    if given.get("title") in (
-        None,
-        *TITLES.values(),
-    ):  # a title of ours may stem from an earlier stage
+    if given.get("title") in (None, *TITLES.values()):  # also a title of an earlier stage
         given["title"] = TITLES[kind]
     names = texts(dataset, "source_files")
     source = "gyro log: " + ", ".join(names) if names else "gyro log"
@@ -266,20 +272,23 @@ def _make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[s
     }
     given.setdefault(
         "references",
-        "IEEE Std 952; Wang et al., Sensors 16 (2016) 2081 (dynamic Allan variance of gyros with missing data)",
+        "IEEE Std 952; Wang et al., Sensors 16 (2016) 2081 "
+        "(dynamic Allan variance of gyros with missing data)",
     )
     times = dataset.get("time")
     if times is not None and times.dtype.kind == "M" and times.size:
         for end, position in (("start", 0), ("end", -1)):
-            stamp = np.asarray(times[position].values).ravel()[
-                0
-            ]  # one dimension where the axis is computed
+            # one dimension when the axis is computed
+            stamp = np.asarray(times[position].values).ravel()[0]
             given[f"time_coverage_{end}"] = f"{stamp.astype('datetime64[us]')}Z"
     return _encode_attributes(given)
 
 
 def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
-    """Turn what was opened without decoding times and without indexes into the dataset it was in memory; `where` is for messages."""
+    """Decode a dataset that was opened without decoding times and without indexes.
+
+    `where` names the file in messages.
+    """
     bounds = {
         variable.attrs["bounds"]: name
         for name, variable in stored.variables.items()
@@ -292,8 +301,9 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     for name, variable in stored.variables.items():
         if name in grids:
             continue
-        own = " since " in str(variable.attrs.get("units", ""))  # as xarray may write it
-        parent = stored.variables[bounds[name]] if name in bounds and not own else variable
+        has_units = " since " in str(variable.attrs.get("units", ""))  # as xarray may write it
+        inherits = name in bounds and not has_units
+        parent = stored.variables[bounds[name]] if inherits else variable
         opened = decode_stamps(variable.copy(deep=False), parent.attrs)
         if opened.dtype.kind in "OT":
             opened = opened.astype(str)
@@ -302,14 +312,14 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
         opened.attrs = _decode_attributes(dict(opened.attrs))
         opened.dims = tuple(dims.get(dim, dim) for dim in opened.dims)
         variables[name] = opened.transpose(*_memory_order(opened.dims))
-    beside = xr.Coordinates(
+    small_coords = xr.Coordinates(
         {
             name: variables.pop(name)
             for name in list(variables)
             if name in stored.coords or name in bounds
         }
     )
-    coords, indexes = dict(beside.variables), dict(beside.xindexes)
+    coords, indexes = dict(small_coords.variables), dict(small_coords.xindexes)
     for name, axis in axes.items():
         coords |= axis.variables
         indexes |= axis.xindexes
@@ -334,16 +344,17 @@ def _memory_order(dims: tuple[Any, ...]) -> list[Any]:
 
 
 def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) -> xr.Variable:
-    """Times as datetime64[ns], by the units in `attrs` or in the variable's own; a variable without such units as it is."""
+    """Decode times to datetime64[ns], by the units in `attrs` or else of the variable.
+
+    A variable without units of time is returned unchanged.
+    """
     attrs = variable.attrs if attrs is None else attrs
     if " since " not in str(attrs.get("units", "")):
         return variable
     step = {f"microseconds since {_EPOCH}": 1000, f"nanoseconds since {_EPOCH}": 1}.get(
         attrs["units"]
     )
-    if (
-        step and variable.dtype.kind == "i"
-    ):  # as we write them; xarray comes to the same, but takes its time
+    if step and variable.dtype.kind == "i":  # as `to_disk` writes them; xarray is slower
         rest = {
             key: value for key, value in variable.attrs.items() if key not in ("units", "calendar")
         }
@@ -363,7 +374,7 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
 
 
 def parse_time_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, Any]]:
-    """The rules of the computed time axes that a file declares: name of the variable -> rule; `where` is for messages."""
+    """Parse the rules of the computed time axes that a file declares, by name of the variable."""
     declared = {
         str(name): variable.attrs[GRID]
         for name, variable in stored.variables.items()
@@ -373,12 +384,13 @@ def parse_time_grids(stored: xr.Dataset, where: object) -> dict[str, dict[str, A
         return {name: _parse_grid(text) for name, text in declared.items()}
     except (TypeError, ValueError) as error:
         raise FormatError(
-            f"{where}: the rule of its time axis, attribute {GRID!r}, is damaged ({error}); copy it again"
+            f"{where}: the rule of its time axis, attribute {GRID!r}, is damaged ({error}); "
+            "copy it again"
         ) from error
 
 
 def _parse_grid(text: Any) -> dict[str, Any]:
-    """The rule of a time axis; `ValueError` when it is not one that `to_disk` writes."""
+    """Parse the rule of a time axis; `ValueError` when `to_disk` did not write it."""
     rule = json.loads(text)
     kinds = {
         "dim": str,
@@ -416,15 +428,17 @@ def _parse_grid(text: Any) -> dict[str, Any]:
 def _make_time_axes(
     stored: xr.Dataset, grids: dict[str, dict[str, Any]], where: str
 ) -> dict[str, xr.Coordinates]:
-    """The computed time axes: name of the variable that declares one -> coordinate."""
+    """Make the coordinates of the computed time axes, by name of the declaring variable."""
     axes = {}
     for name, rule in grids.items():
         dim = rule["dim"]
         size = stored.sizes.get(index_dim(dim), 0)
         if size != rule["size"]:
             raise FormatError(
-                f"{where}: has {size} samples on {index_dim(dim)!r}, but was written with {rule['size']}: some other program has cut it, "
-                "and its times are lost; cut it in Python with gyrostab.open_log(...).isel or .sel, and write it with gyrostab.to_netcdf"
+                f"{where}: has {size} samples on {index_dim(dim)!r}, but was written with "
+                f"{rule['size']}: some other program has cut it, and its times are lost; "
+                "cut it in Python with gyrostab.open_log(...).isel or .sel, "
+                "and write it with gyrostab.to_netcdf"
             )
         axes[name] = time_coordinate(
             rule["start_ns"],

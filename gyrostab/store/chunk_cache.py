@@ -1,4 +1,4 @@
-"""The latest decoded chunks, in memory that is bounded."""
+"""A cache of decoded chunks with a bound on its memory."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ __all__ = ["ChunkCache"]
 
 
 class ChunkCache:
-    """Chunks by opening, variable and place, the latest of them.
+    """The most recently used chunks, by opening, variable and position.
 
     Parameters
     ----------
     most_bytes : int
-        Bytes of all chunks together.
+        Limit of the bytes of all chunks.
     largest_bytes : int
-        A chunk that is larger is not kept.
+        Limit of the bytes of one chunk; a larger one is not stored.
     """
 
     def __init__(self, most_bytes: int, largest_bytes: int):
-        self._most, self._largest = most_bytes, largest_bytes
-        self._held = 0
+        self._max_bytes, self._max_chunk_bytes = most_bytes, largest_bytes
+        self._bytes = 0
         self._chunks: OrderedDict[tuple[Any, ...], NDArray[Any]] = OrderedDict()
         self._lock = threading.Lock()
 
     def get(self, key: tuple[Any, ...]) -> NDArray[Any] | None:
-        """Return a chunk, or None."""
+        """Return a chunk, or None when it is not stored."""
         with self._lock:
             if key in self._chunks:
                 self._chunks.move_to_end(key)
             return self._chunks.get(key)
 
     def put(self, key: tuple[Any, ...], chunk: NDArray[Any]) -> None:
-        """Keep a chunk in place of the oldest ones."""
+        """Store a chunk, and drop the least recently used ones over the limit."""
         with self._lock:
-            if key in self._chunks or chunk.nbytes > self._largest:
+            if key in self._chunks or chunk.nbytes > self._max_chunk_bytes:
                 return
             self._chunks[key] = chunk
-            self._held += chunk.nbytes
-            while self._held > self._most:
-                self._held -= self._chunks.popitem(last=False)[1].nbytes
+            self._bytes += chunk.nbytes
+            while self._bytes > self._max_bytes:
+                self._bytes -= self._chunks.popitem(last=False)[1].nbytes

@@ -1,4 +1,4 @@
-"""Datasets of xarray whose variables name their file when a read fails, however late it comes."""
+"""Lazy datasets of xarray whose errors name the file, whenever the read fails."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["name_file_in_errors"]
 
 
 class _FileArray(BackendArray):
-    """A lazy variable whose failing reads are `gyrostab.errors.DamageError`."""
+    """A lazy variable whose failed reads raise `gyrostab.errors.DamageError`."""
 
     __slots__ = ("path", "variable")
 
@@ -44,19 +44,19 @@ class _FileArray(BackendArray):
 
 
 def name_file_in_errors(opened: xr.Dataset, path: Path) -> xr.Dataset:
-    """Let every read from a dataset that xarray opened lazily be one of `path`, so that its errors name the file.
+    """Make the errors of later reads from a lazy dataset name its file.
 
     Parameters
     ----------
     opened : xarray.Dataset
-        From `xarray.open_dataset` with ``chunks=None``: decoded or not, with no default index.
+        Result of `xarray.open_dataset` with ``chunks=None`` and without default indexes.
     path : Path
         The file.
 
     Returns
     -------
     xarray.Dataset
-        The same dataset, as lazy as it was, not loaded and not of dask.
+        The same dataset, still lazy and without dask arrays.
     """
     named = {
         name: xr.Variable(

@@ -1,8 +1,8 @@
-"""Where the chunks of a variable lie on disk, and how their bytes become numbers: NetCDF (HDF5) and Zarr (format 2).
+"""Reading chunks of variables from NetCDF (HDF5) and Zarr (format 2) files.
 
-Chunks of NetCDF files are read without its library. That holds a lock over every read, and keeps
-each chunk for as long as any handle of the file is open; the places and filters of the chunks are
-all that it takes to read them side by side, with no file left open.
+Chunks of NetCDF files are read without the library. The library holds a lock over every read, and
+keeps each chunk for as long as any handle of the file is open. Given the offsets and filters of the
+chunks, several threads read them in parallel, and no file stays open.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = [
     "read_written_chunk",
 ]  # fmt: skip
 
-#: Variables of files whose layout is remembered: some for each file of a long archive.
+#: Variables whose layout is cached: several for each file of a long archive.
 _MAX_CACHED_LAYOUTS = 2**12
 #: Numbers of the filters of HDF5 that are known here.
 _DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD = 1, 2, 3, 32015
@@ -46,7 +46,10 @@ class ChunkDamage(Exception):
 
 @dataclass(frozen=True, eq=False)
 class _Hdf5Layout:
-    """Type, filters in the order of reading, and for each chunk its byte, its size, and a bit for each filter that it went round."""
+    """Type, filters in the order of reading, and the places of the chunks.
+
+    The place of a chunk is its first byte, its size, and a mask of the filters that were skipped.
+    """
 
     dtype: np.dtype[Any]
     codecs: tuple[tuple[int, Any], ...]
@@ -62,7 +65,7 @@ class _ZarrLayout:
 
 
 def read_attribute(path: Path, name: str) -> str:
-    """Look up an attribute of a NetCDF file without opening all of it; empty when it has none, or is of an older format.
+    """Read an attribute of a NetCDF file; empty when there is none or the format is older.
 
     Raises
     ------
@@ -80,9 +83,9 @@ def read_attribute(path: Path, name: str) -> str:
 
 
 def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:
-    """Whether `read_chunk` knows the layout of a variable, with the encoding that xarray tells of it.
+    """Whether `read_chunk` can read a variable; `encoding` is that of xarray.
 
-    Any log that gyrostab wrote is known; some other program may have laid it out anew.
+    Every log that gyrostab wrote can be read; another program may have changed the layout.
     """
     if not path.is_dir():
         return not any(encoding.get(filters) for filters in ("szip", "bzip2", "blosc"))
@@ -95,7 +98,7 @@ def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:
 def read_chunk(
     path: Path, name: str, place: tuple[int, ...], *, zarr: bool, opened: str
 ) -> NDArray[Any]:
-    """Read one chunk as it lies on disk, not scaled: all samples that it has room for.
+    """Read one chunk as it is on disk, not scaled, in its full size.
 
     Parameters
     ----------
@@ -106,16 +109,16 @@ def read_chunk(
     place : tuple of int
         Number of the chunk along each dimension.
     zarr : bool
-        It is a Zarr directory.
+        Whether `path` is a Zarr directory.
     opened : str
-        Stands for one opening of the file; its layout is looked up once for each.
+        Identifier of one opening of the file; the layout is read once per opening.
 
     Raises
     ------
     ChunkDamage
         When the chunk is damaged or missing.
     FormatError
-        When there is no such file any more, or it may not be read.
+        When the file no longer exists, or may not be read.
     """
     return (
         _read_zarr_chunk(path / name, place, opened)
@@ -127,7 +130,7 @@ def read_chunk(
 def read_written_chunk(
     path: Path, name: str, place: tuple[int, ...], *, opened: str
 ) -> NDArray[Any] | None:
-    """Read one chunk of an HDF5 file as it lies on disk, or return None where nothing was written, which is no damage in general.
+    """Read one chunk of an HDF5 file as it is on disk; None if it was never written.
 
     Raises
     ------
@@ -152,9 +155,8 @@ def _read_hdf5_chunk(path: Path, name: str, place: tuple[int, ...], opened: str)
     try:
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         try:
-            if (
-                begin + size > os.fstat(handle).st_size
-            ):  # before memory is taken: a damaged index may hold any number
+            # before memory is allocated: a damaged index may hold any number
+            if begin + size > os.fstat(handle).st_size:
                 raise ChunkDamage("is missing: the file is cut short")
             data = _read_bytes(handle, begin, size)
         finally:
@@ -182,7 +184,7 @@ def _read_bytes(handle: int, begin: int, size: int) -> bytes:
 
 @lru_cache(maxsize=_MAX_CACHED_LAYOUTS)
 def _read_hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
-    """The places of the chunks; those of a damaged index that can be read."""
+    """Read the places of the chunks, or of a damaged index as many as possible."""
     import h5py
 
     places: dict[tuple[int, ...], tuple[int, int, int]] = {}
@@ -216,7 +218,7 @@ def _read_hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
 
 
 def _find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
-    """Filters as codecs, in the order of reading, each with its number in the pipeline."""
+    """Find the codecs of the filters, in the order of reading, with their numbers."""
     from numcodecs import Zlib, Zstd
 
     codecs = []
@@ -237,19 +239,19 @@ def _find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
 
 
 def has_known_filters(plist: Any) -> bool:
-    """Return whether all filters of an HDF5 dataset, given its creation property list, are known here."""
+    """Whether all filters in the creation property list of an HDF5 dataset are known."""
     known = (_DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD)
     return all(plist.get_filter(number)[0] in known for number in range(plist.get_nfilters()))
 
 
 @dataclass(frozen=True)
 class _Shuffle:
-    """Bytes of the numbers grouped by their place; what is left at the end, as of a checksum, stays as it is."""
+    """The shuffle filter; a rest of bytes at the end, as of a checksum, stays unchanged."""
 
     width: int
 
     def decode(self, data: Any) -> Any:
-        """The bytes in the order of the numbers."""
+        """Restore the order of the bytes."""
         from numcodecs import Shuffle
 
         stored = np.frombuffer(data, np.uint8)
@@ -263,10 +265,10 @@ class _Shuffle:
 
 
 class _Fletcher32:
-    """The checksum at the end of a chunk. That of numcodecs comes to the same, in five times the time and holding Python's lock."""
+    """The checksum at the end of a chunk; numcodecs takes five times as long and holds the GIL."""
 
     def decode(self, data: Any) -> NDArray[np.uint8]:
-        """The bytes before the checksum."""
+        """Verify the checksum and return the bytes before it."""
         stored = np.frombuffer(data, np.uint8)
         if stored.size < 4 or fletcher32(stored[:-4]) != int.from_bytes(
             stored[-4:].tobytes(), "little"
@@ -276,10 +278,10 @@ class _Fletcher32:
 
 
 class _Blosc:
-    """Blosc, which reads on beyond the end of what is cut short: bytes 12 to 16 of its header tell how many there must be."""
+    """Blosc, with a check of the length (bytes 12 to 16): it reads beyond a cut chunk."""
 
     def decode(self, data: Any) -> Any:
-        """The bytes that were packed."""
+        """Check the length and decompress the bytes."""
         from numcodecs import blosc
 
         if len(data) < max(int.from_bytes(data[12:16], "little"), 16):
@@ -292,9 +294,7 @@ class _UnknownFilter:
     code: int
 
     def decode(self, data: bytes) -> bytes:
-        raise ChunkDamage(
-            f"cannot be read: it went through filter {self.code} of HDF5, which gyrostab does not know"
-        )
+        raise ChunkDamage(f"cannot be read: gyrostab does not support filter {self.code} of HDF5")
 
 
 def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]:
@@ -305,7 +305,7 @@ def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray
     except FileNotFoundError as error:
         if not folder.is_dir():
             raise FormatError(
-                f"{folder}: is not there any more; has it been moved or removed?"
+                f"{folder}: no longer exists; has it been moved or removed?"
             ) from error
         raise ChunkDamage(f"is missing: no file {folder.name}/{name}") from error
     except OSError as error:
@@ -317,7 +317,7 @@ def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray
 
 @lru_cache(maxsize=_MAX_CACHED_LAYOUTS)
 def _read_zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
-    """Codecs in the order of reading, type, and what stands between the numbers in the name of a chunk."""
+    """Read codecs, type, and the separator in the names of chunks."""
     try:
         layout = json.loads((folder / ".zarray").read_bytes())
         return _ZarrLayout(
@@ -327,7 +327,7 @@ def _read_zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
         )
     except OSError as error:
         raise FormatError(
-            f"{folder}: is not there any more ({error.strerror}); has it been moved or removed?"
+            f"{folder}: no longer exists ({error.strerror}); has it been moved or removed?"
         ) from error
     except Exception as error:  # whatever json, numpy and numcodecs raise on damaged text
         raise FormatError(
@@ -336,7 +336,7 @@ def _read_zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
 
 
 def find_zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
-    """Compressor and filters of a variable as codecs, in the order of reading."""
+    """Find the codecs of a variable, in the order of reading."""
     import numcodecs
 
     known = {"fletcher32": _Fletcher32, "blosc": _Blosc}
@@ -352,12 +352,12 @@ def find_zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
 def decode_chunk(
     data: Any, codecs: Iterable[Any], dtype: np.dtype[Any], *, name: str = ""
 ) -> NDArray[Any]:
-    """Bytes of a chunk, through the codecs, as numbers.
+    """Decode the bytes of a chunk to numbers.
 
     Raises
     ------
     ChunkDamage
-        When that fails; the message begins with `name`.
+        When decoding fails; the message begins with `name`.
     """
     try:
         for codec in codecs:

@@ -1,4 +1,8 @@
-"""Samples of a lazy log straight from where they lie into the array that a kernel takes, with no task of dask in between."""
+"""Lazy reading: slices of a dask array read into memory without a task of dask.
+
+An array may carry a reader of rows along time (`read_into`, `read_slice`) or a reader of boxes in
+any dimensions (`read_box`). For one small slice, dask takes ten times as long.
+"""
 
 from __future__ import annotations
 
@@ -29,14 +33,14 @@ __all__ = [
     "with_row_reader",
 ]
 
-#: ``fill(row, begin, out)`` puts the samples of a row from `begin` on into `out`; the row of an
+#: ``read(row, begin, out)`` reads the samples of a row from `begin` on into `out`; the row of an
 #: array of one dimension is 0.
 RowReader = Callable[[int, int, NDArray[Any]], None]
 
 
-def with_row_reader(array: Any, fill: RowReader) -> Any:
-    """Let a dask array know how its samples are read directly; whatever is derived from it does not."""
-    array.gyrostab_row_reader = fill
+def with_row_reader(array: Any, reader: RowReader) -> Any:
+    """Attach a row reader to a dask array; arrays that are derived from it do not carry it."""
+    array.gyrostab_row_reader = reader
     return array
 
 
@@ -46,22 +50,22 @@ def can_read_into(array: Any) -> bool:
 
 
 def read_into(array: Any, row: int, begin: int, out: NDArray[Any]) -> None:
-    """Put samples of one row of an array into `out`, in the calling thread.
+    """Read samples of one row of an array into `out`, in the calling thread.
 
     Parameters
     ----------
     array : ndarray or dask.array.Array, shape (time,) or (row, time)
-        Where the samples are.
+        The source.
     row : int
-        The row; 0 where there is one dimension.
+        The row; 0 for an array of one dimension.
     begin : int
         First sample.
     out : ndarray
-        Filled with as many samples as there is room for.
+        Receives as many samples as it has elements.
     """
-    fill: RowReader | None = getattr(array, "gyrostab_row_reader", None)
-    if fill is not None:
-        fill(row, begin, out)
+    reader: RowReader | None = getattr(array, "gyrostab_row_reader", None)
+    if reader is not None:
+        reader(row, begin, out)
         return
     place = slice(begin, begin + out.size)
     part = array[place] if array.ndim == 1 else array[row, place]
@@ -69,11 +73,11 @@ def read_into(array: Any, row: int, begin: int, out: NDArray[Any]) -> None:
 
 
 def read_slice(array: Any, begin: int, end: int) -> NDArray[Any]:
-    """Samples from `begin` to `end` along the last dimension of an array, read in the calling thread.
+    """Read samples `begin` to `end` along the last dimension of an array, in the calling thread.
 
     Examples
     --------
-    >>> stretch(held(np.arange(10.0), 4), 3, 6)
+    >>> read_slice(make_lazy(np.arange(10.0), 4), 3, 6)
     array([3., 4., 5.])
     """
     if isinstance(array, np.ndarray):
@@ -90,7 +94,7 @@ def read_slice(array: Any, begin: int, end: int) -> NDArray[Any]:
 
 
 def make_lazy(array: NDArray[Any], chunk: int) -> Any:
-    """An array in memory as one of dask that is read directly; `dask.array.from_array` would copy all of it."""
+    """Wrap an array in memory as a dask array; `dask.array.from_array` would copy all of it."""
     import dask.array as da
 
     name, lead = f"gyrostab-held-{uuid.uuid4().hex}", array.ndim - 1
@@ -109,7 +113,10 @@ def make_lazy(array: NDArray[Any], chunk: int) -> Any:
 
 
 def concatenate_columns(columns: Sequence[Any], chunk: int) -> Any:
-    """Columns, in memory or of dask, one after the other; of dask where one of them is, and read directly where all can be."""
+    """Concatenate columns, in memory or of dask; the result is a dask array if one of them is.
+
+    It has a row reader when all columns have one.
+    """
     if all(isinstance(column, np.ndarray) for column in columns):
         return np.concatenate(columns)
     import dask.array as da
@@ -138,7 +145,7 @@ def _read_columns_into(
 
 
 def stack_rows(rows: Sequence[Any]) -> Any:
-    """Arrays of dask of one dimension as the rows of one, read directly where all can be."""
+    """Stack dask arrays of one dimension as rows, with a row reader when all have one."""
     import dask.array as da
 
     stacked = da.stack(rows)
@@ -154,7 +161,7 @@ def _read_stacked_into(rows: Sequence[Any], row: int, begin: int, out: NDArray[A
 
 
 def select_row(array: Any, row: int) -> Any:
-    """One row of an array as an array of one dimension, which is read directly where the whole can be."""
+    """Select one row of an array; the result keeps the row reader."""
     line = array[row]
     return (
         with_row_reader(line, partial(_read_selected_into, array, row))
@@ -168,7 +175,7 @@ def _read_selected_into(array: Any, row: int, _row: int, begin: int, out: NDArra
 
 
 def select_span(array: Any, begin: int, end: int) -> Any:
-    """Return samples `begin` to `end` of an array, along its last dimension, read directly where the whole can be."""
+    """Select samples `begin` to `end` along the last dimension; the result keeps the row reader."""
     part = array[..., begin:end]
     return (
         with_row_reader(part, partial(_read_span_into, array, begin))
@@ -181,49 +188,49 @@ def _read_span_into(array: Any, first: int, row: int, begin: int, out: NDArray[A
     read_into(array, row, first + begin, out)
 
 
-#: ``part(place)`` gives the values of an array at a tuple of slices, one for each dimension, each
-#: with both its ends.
+#: ``read(box)`` returns the values of an array in a box: one slice per dimension, each with start
+#: and stop.
 BoxReader = Callable[[tuple[slice, ...]], NDArray[Any]]
 
 
-def with_box_reader(array: Any, part: BoxReader) -> Any:
-    """Let a dask array know how a part of it is read directly; of what is derived from it only `transpose_lazy` does."""
-    array.gyrostab_box_reader = part
+def with_box_reader(array: Any, reader: BoxReader) -> Any:
+    """Attach a box reader to a dask array; of derived arrays only `transpose_lazy` keeps it."""
+    array.gyrostab_box_reader = reader
     return array
 
 
 def transpose_lazy(variable: xr.Variable, dims: Sequence[Any]) -> xr.Variable:
-    """A variable with its dimensions in another order; its parts are read directly if they were before."""
-    part: BoxReader | None = getattr(variable._data, "gyrostab_box_reader", None)
+    """Transpose a variable and keep its box reader."""
+    reader: BoxReader | None = getattr(variable._data, "gyrostab_box_reader", None)
     turned = variable.transpose(*dims)
-    if part is not None:
+    if reader is not None:
         with_box_reader(
             turned._data,
-            partial(_read_transposed, part, [variable.dims.index(dim) for dim in dims]),
+            partial(_read_transposed, reader, [variable.dims.index(dim) for dim in dims]),
         )
     return turned
 
 
 def _read_transposed(
-    part: BoxReader, order: Sequence[int], place: tuple[slice, ...]
+    reader: BoxReader, order: Sequence[int], box: tuple[slice, ...]
 ) -> NDArray[Any]:
-    before = dict(zip(order, place, strict=True))
-    return part(tuple(before[i] for i in range(len(order)))).transpose(order)
+    before = dict(zip(order, box, strict=True))
+    return reader(tuple(before[i] for i in range(len(order)))).transpose(order)
 
 
-def read_box(array: Any, place: Sequence[slice]) -> NDArray[Any]:
-    """Read the values of an array, in memory or of dask, at one slice for each dimension, in the calling thread.
+def read_box(array: Any, box: Sequence[slice]) -> NDArray[Any]:
+    """Read the values of an array in a box, one slice per dimension, in the calling thread.
 
     Examples
     --------
-    >>> read_part(np.arange(12).reshape(3, 4), (slice(1, 3), slice(0, 2)))
+    >>> read_box(np.arange(12).reshape(3, 4), (slice(1, 3), slice(0, 2)))
     array([[4, 5],
            [8, 9]])
     """
-    ends = tuple(slice(*one.indices(size)) for one, size in zip(place, array.shape, strict=True))
-    part: BoxReader | None = getattr(array, "gyrostab_box_reader", None)
-    if part is not None:
-        return part(ends)
+    ends = tuple(slice(*part.indices(size)) for part, size in zip(box, array.shape, strict=True))
+    reader: BoxReader | None = getattr(array, "gyrostab_box_reader", None)
+    if reader is not None:
+        return reader(ends)
     found = array[ends]
     return (
         found

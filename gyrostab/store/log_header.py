@@ -1,8 +1,8 @@
-"""What stands in a log beside its long variables, read in one look: attributes, dimensions, small variables.
+"""Fast reading of a log without its long variables: attributes, dimensions, small variables.
 
-xarray and what it has around the library below it take two to three times as long, which is felt
-where an archive has hundreds of logs. Only what gyrostab writes is understood here; for all else,
-damage included, the answer is nothing, and xarray has its say.
+xarray takes two to three times as long, which matters for archives of hundreds of logs. Only files
+that gyrostab wrote are understood. For any other file, and for a damaged one, the result is None,
+and the caller uses xarray.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MIN_LAZY_VALUES = 2**17
 
 
 class Header(NamedTuple):
-    """A log as it lies on disk.
+    """A log as it is on disk.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Header(NamedTuple):
     attrs : dict
         Attributes of the file.
     long : set of str
-        Variables along time, of which there is only shape, type and encoding.
+        Variables along time, with shape, type and encoding only.
     """
 
     variables: dict[str, xr.Variable]
@@ -43,7 +43,7 @@ class Header(NamedTuple):
 
 
 def read_header(path: Path) -> Header | None:
-    """Look at a log that gyrostab wrote; None when it is something else, or in any way not as expected."""
+    """Read the header of a log that gyrostab wrote; None for anything else or unexpected."""
     try:
         header = _read_zarr_header(path) if path.is_dir() else _read_netcdf_header(path)
     except Exception:  # whatever the libraries raise on damaged bytes
@@ -70,7 +70,7 @@ def _is_long(
 
 
 def _make_placeholder(dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Stands for values that are read later; takes no memory."""
+    """Make an array of zeros that takes no memory, in place of values that are read later."""
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
@@ -117,7 +117,7 @@ def _read_netcdf_header(path: Path) -> Header:
         file.set_auto_maskandscale(False)
         file.set_auto_chartostring(False)
         for name, stored in file.variables.items():
-            dims, shape, dtype, cut = (
+            dims, shape, dtype, chunking = (
                 stored.dimensions,
                 stored.shape,
                 stored.dtype,
@@ -126,7 +126,7 @@ def _read_netcdf_header(path: Path) -> Header:
             if not isinstance(dtype, np.dtype):
                 raise ValueError("type")
             attrs = {key: stored.getncattr(key) for key in stored.ncattrs()}
-            chunks = None if isinstance(cut, str) else tuple(cut)
+            chunks = None if isinstance(chunking, str) else tuple(chunking)
             encoding: dict[str, Any] = {"dtype": dtype}
             if _is_long(dims, attrs, dtype, chunks, shape):
                 long.add(name)
@@ -162,7 +162,7 @@ def _read_values(
 def _join_chunks(
     pieces: list[NDArray[Any]], size: int, length: int, dtype: np.dtype[Any]
 ) -> NDArray[Any]:
-    """Chunks of `length` values put together to `size`."""
+    """Concatenate chunks of `length` values to `size` values."""
     if any(piece.size != length for piece in pieces):
         raise ValueError("size")
     return np.concatenate([np.empty(0, dtype), *pieces])[:size]

@@ -1,4 +1,7 @@
-"""Large variables of a product into a NetCDF file: the library compresses one chunk after the other, here several threads do."""
+"""Parallel compression of large variables of a NetCDF file.
+
+The NetCDF library compresses one chunk after the other; here several threads do so.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,14 @@ from gyrostab.store.write import Progress
 
 __all__ = ["append_compressed", "large_variables"]
 
-#: Values from which the chunks of a variable are compressed side by side.
+#: Values from which the chunks of a variable are compressed in parallel.
 _MIN_PARALLEL_VALUES = 2**15
 
 
 def large_variables(
     stored: xr.Dataset, encoding: Mapping[Any, Mapping[str, Any]]
 ) -> dict[str, xr.Variable]:
-    """Variables of numbers that are large enough for `append_compressed`."""
+    """Find the numeric variables that are large enough for `append_compressed`."""
     data = {
         str(name): array.variable
         for name, array in stored.data_vars.items()
@@ -46,21 +49,21 @@ def append_compressed(
     *,
     progress: Progress | None = None,
 ) -> None:
-    """Add variables to a NetCDF file that holds the others, and their dimensions, already.
+    """Add variables to a NetCDF file, compressed in several threads.
 
-    The file holds what the library would have written: bytes shuffled, then deflated.
+    The result is what the library would write: bytes shuffled, then deflated.
 
     Parameters
     ----------
     path : Path
         The file.
     large : mapping of str to xarray.Variable
-        Of numbers, in memory or of dask; the latter are computed chunk by chunk.
+        Numeric variables, in memory or of dask; the latter are computed chunk by chunk.
     encoding : mapping
-        For each of them ``zlib``, ``complevel``, ``shuffle``, ``chunksizes`` and ``_FillValue``, as
+        ``zlib``, ``complevel``, ``shuffle``, ``chunksizes`` and ``_FillValue`` of each variable, as
         for xarray.
     progress : callable, optional
-        Told the share that is written.
+        Called with the share that is written.
     """
     import h5py
     import netCDF4
@@ -107,7 +110,7 @@ _ChunkOrigin = tuple[str, tuple[int, ...]]
 def _list_chunks(
     large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]]
 ) -> Iterator[_ChunkOrigin]:
-    """Name and first place of every chunk."""
+    """List the name and the first index of every chunk."""
     for name, variable in large.items():
         steps = encoding[name]["chunksizes"]
         yield from (
@@ -121,7 +124,7 @@ def _list_chunks(
 def _compress_chunk(
     large: Mapping[str, xr.Variable], encoding: Mapping[Any, Mapping[str, Any]], piece: _ChunkOrigin
 ) -> tuple[str, tuple[int, ...], int, bytes]:
-    """A chunk as it stands in the file, with its name, place and number of values."""
+    """Compress a chunk; return its name, first index, number of values and bytes."""
     name, begin = piece
     options = encoding[name]
     place = tuple(

@@ -1,4 +1,4 @@
-"""One thread at a time in the NetCDF library."""
+"""The lock that admits one thread at a time to the NetCDF library."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["library_lock"]
 
 
 def library_lock() -> Any:
-    """The lock that xarray holds too while it is in the NetCDF library."""
+    """Return the lock that xarray holds, too, while it calls the NetCDF library."""
     from xarray.backends.netCDF4_ import NETCDF4_PYTHON_LOCK
 
     return NETCDF4_PYTHON_LOCK

@@ -1,4 +1,7 @@
-"""Reading the long variables of a log lazily, chunk by chunk; a chunk that is damaged becomes a gap, and a warning says where."""
+"""Lazy reading of the long variables of a log, chunk by chunk.
+
+A damaged chunk becomes a gap, and a warning says where.
+"""
 
 from __future__ import annotations
 
@@ -28,19 +31,19 @@ from gyrostab.time.grid import grid_times
 
 __all__ = ["open_stored"]
 
-#: Bytes of the chunks together that are kept when only a part of each was wanted.
+#: Bytes of the cache of chunks of which only a part was requested.
 _CACHE_BYTES = 2**24
 
 
 def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
-    """Open a dataset as it lies on disk: times not decoded, data lazy, chunks of a log of gyrostab checked as they are read.
+    """Open a dataset as it is on disk: times not decoded, data lazy, chunks checked when read.
 
     Parameters
     ----------
     path : Path
         A NetCDF file or a Zarr directory.
     strict : bool
-        A damaged chunk of a log is a `FormatError`, not a gap.
+        Raise `FormatError` for a damaged chunk of a log instead of leaving a gap.
 
     Raises
     ------
@@ -75,13 +78,13 @@ def _open_dataset(path: Path, *, strict: bool) -> xr.Dataset:
     long = _find_long_variables(stored, path, strict=strict) if is_log else {}
     opened = _make_variables_lazy(stored, long, small=MIN_LAZY_VALUES if is_log else 0)
     if is_log:
-        # opened again where needed: no archive of any length holds more than a few files open
+        # opened again when needed: an archive of any length keeps only a few files open
         stored.close()
     return opened
 
 
 def _decode_header(header: Header) -> xr.Dataset:
-    """What xarray makes of a header: text, missing values and factors decoded, times not, no index."""
+    """Decode a header as xarray does: text, missing values and factors, but no times or indexes."""
     decoded, attrs, names = xr.conventions.decode_cf_variables(
         header.variables, header.attrs, decode_times=False
     )
@@ -97,9 +100,12 @@ def _decode_header(header: Header) -> xr.Dataset:
 def _make_variables_lazy(
     stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int
 ) -> xr.Dataset:
-    """Load what is small, and make dask arrays, by the chunks on disk, of what is not one yet: making and reading one takes its time."""
+    """Load small variables, and make dask arrays of the others, by the chunks on disk.
+
+    A dask array takes time to make and to read.
+    """
     rest = {name: stored.variables[name] for name in stored.data_vars if name not in long}
-    ready = {  # text is always small, and dask cannot tell the size of its chunks
+    ready = {  # text is always small, and dask cannot find the size of its chunks
         name: item.load()
         if item.size < small or item.dtype.kind in "OSU"
         else item.chunk(item.encoding.get("preferred_chunks") or "auto")
@@ -115,7 +121,7 @@ def _make_variables_lazy(
 
 
 def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
-    """The long variables of a log, as arrays that know about damage."""
+    """Find the long variables of a log, as arrays that handle damage."""
     import dask.array as da
 
     labels = [str(label) for label in stored.variables["axis"].values]
@@ -133,8 +139,8 @@ def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dic
             or chunks is None
         ):
             continue
-        own = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name), disk)
-        if not own or ("scale_factor" in disk and "_FillValue" not in disk):
+        is_known = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name), disk)
+        if not is_known or ("scale_factor" in disk and "_FillValue" not in disk):
             continue  # some other program has laid it out anew
         array = _ChunkedVariable(
             path=path.absolute(),
@@ -177,7 +183,7 @@ def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dic
 def _find_chunk_spans(
     stored: xr.Dataset, dim: str, length: int, path: Path
 ) -> dict[str, Any] | tuple[tuple[int, int], ...]:
-    """The rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
+    """Find the rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
     rules = {index_dim(rule["dim"]): rule for rule in parse_time_grids(stored, path).values()}
     if dim in rules:
         return rules[dim]
@@ -192,7 +198,7 @@ def _find_chunk_spans(
 
 @dataclass(frozen=True, eq=False)
 class _ChunkedVariable:
-    """One variable on disk, by rows and stretches of `length` samples, behind the few attributes that dask asks for."""
+    """A variable on disk in chunks of one row and `length` samples, as an array for dask."""
 
     path: Path
     name: str
@@ -245,7 +251,10 @@ class _ChunkedVariable:
             out[raw == self.missing] = np.nan
 
     def _stored(self, row: int, number: int, *, whole: bool) -> NDArray[Any]:
-        """One chunk as it lies on disk; the last of a row has room for more than there is. One that is not wanted `whole` is kept."""
+        """Read one chunk as it is on disk; one that is not used as a `whole` is cached.
+
+        The last chunk of a row is longer than the row.
+        """
         place = (number,) if self.ndim == 1 else (row, number)
         chunk = _CACHE.get((self.opened, self.name, place))
         if chunk is None:
@@ -257,7 +266,7 @@ class _ChunkedVariable:
         return chunk
 
     def _tell(self, row: int, number: int, damage: str) -> None:
-        """Warn of a damaged chunk, once; or stop at it."""
+        """Warn of a damaged chunk, once, or raise `FormatError`."""
         if isinstance(self.spans, dict):
             grid, end = self.spans, min((number + 1) * self.length, self.shape[-1])
             ends = grid["first"] + grid["stride"] * np.array([number * self.length, end - 1])
@@ -276,7 +285,7 @@ class _ChunkedVariable:
             _warn_once(self.opened, f"{what}. Its samples are taken as missing; copy it again")
 
 
-#: Where one part of a run ends, another begins.
+#: Chunks in which one part of a run ends and the next one begins.
 _CACHE = ChunkCache(_CACHE_BYTES, _CACHE_BYTES // 2)
 
 _WARNING_LOCK = threading.Lock()
@@ -284,7 +293,7 @@ _WARNING_LOCK = threading.Lock()
 
 @lru_cache(maxsize=2**16)
 def _warn_once(opened: str, message: str) -> None:
-    """Warn; the cache makes it once for each opening of a file. In a worker of dask.distributed the warning goes to the client."""
+    """Warn once per opening of a file; a worker of dask.distributed warns the client."""
     distributed = sys.modules.get("distributed")
     warn = getattr(distributed, "warn", warnings.warn)
     warn(message, UserWarning)

@@ -1,4 +1,4 @@
-"""What one look at a block of rows finds: which rows hold a sample, which cells are no numbers, how full the channels are."""
+"""Inspection of a block of rows: rows with samples, cells without a number, filled channels."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _NO_SPANS = np.empty((0, 2), dtype=np.int64)
 
 
 class RowInspection(NamedTuple):
-    """What a look at some rows found.
+    """Result of the inspection of some rows.
 
     Attributes
     ----------
     rows, absent : int
-        Rows, and those without any number.
+        Number of rows, and of rows without any number.
     bits : ndarray of uint8
-        One bit a row: some axis has a number.
+        One bit per row: whether some axis has a number.
     unreadable, infinite : ndarray of int64, shape (n, 2)
-        Half-open spans of present rows in which an axis is NaN, or infinite.
+        Half-open spans of present rows in which an axis is NaN or infinite.
     low, high : ndarray of float64, shape (n_axes,)
         Range of the finite values.
     filled : dict
-        Channel -> rows that have a number.
+        Number of rows with a number, by channel.
     """
 
     rows: int
@@ -45,7 +45,7 @@ class RowInspection(NamedTuple):
 def inspect_rows(
     cells: NDArray[np.float64], channels: Mapping[str, NDArray[Any]], begin: int
 ) -> RowInspection:
-    """Look at every cell of a block once.
+    """Inspect every cell of a block once.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def inspect_rows(
     channels : mapping of str to ndarray, shape (n,)
         Channels by name.
     begin : int
-        Row of the log with which the block begins.
+        Row of the log at which the block begins.
     """
     present = np.empty(cells.shape[1], dtype=bool)
     absent, holes, infinities, low, high = look(
@@ -74,6 +74,9 @@ def _find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
 
 
 def with_inspections(signal: Any, seen: list[RowInspection]) -> Any:
-    """Let a dask array (axis, row) carry what was found in its blocks, so that nobody has to look again; what is derived does not."""
+    """Attach inspections to a dask array (axis, row), to save a second one.
+
+    Arrays that are derived from it do not carry them.
+    """
     signal.gyrostab_inspections = seen
     return signal

@@ -1,8 +1,8 @@
-"""Columns of files that other programs wrote, read by ranges of rows, by several threads, without a lock or an open file.
+"""Columns of foreign files, read by ranges of rows in several threads, without a lock or open file.
 
-The libraries of NetCDF and HDF5 let one thread in at a time and keep chunks as long as the file is
-open. A column here knows where its numbers lie: at even distances (`EvenRows`), or in chunks
-(`ChunkedRows`).
+The libraries of NetCDF and HDF5 admit one thread at a time and keep chunks as long as the file is
+open. A column here holds the places of its numbers in the file: at even distances (`EvenRows`) or
+in chunks (`ChunkedRows`).
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from gyrostab.store.layout import ChunkDamage, has_known_filters, read_written_c
 
 __all__ = ["ChunkedRows", "EvenRows", "LibraryRows", "Rows", "hdf5_rows"]
 
-#: Bytes that are read at one time where other variables lie between the rows.
+#: Bytes that are read at a time when other variables lie between the rows.
 _STRIDED_READ_BYTES = 2**23
-#: Chunks of a variable whose places are remembered, at about 200 bytes each.
+#: Limit of the number of chunks of a variable; the place of each takes about 200 bytes.
 _MAX_CHUNKS = 2**19
 #: Chunks from this size on are decoded by one thread at a time.
 _LARGE_CHUNK_BYTES = 2**24
-#: Small chunks of one column that were not wanted whole: the next part of a run begins in them.
+#: Small chunks of one column that were used in part: the next part of a run begins in them.
 _EDGE_CACHE = ChunkCache(2**26, _LARGE_CHUNK_BYTES)
-#: A part of a run has up to 2**24 samples (128 MiB) of all axes, and each of two workers may find
-#: all of them in the same chunks.
+#: Chunks that several columns share. A part of a run has up to 2**24 samples (128 MiB) of all axes,
+#: and all of them may be in the same chunks, for each of two workers.
 _SHARED_CACHE = ChunkCache(3 * 2**27, 2**28)
 _LARGE_CHUNK_LOCK = threading.Lock()
 
@@ -102,17 +102,17 @@ class ChunkedRows:
     Attributes
     ----------
     load : callable
-        Number of the chunk along each dimension -> chunk (or what there is of it at the end), or
-        None where nothing was written.
+        Function of the number of the chunk along each dimension. It returns the chunk, which may
+        be shorter at the end, or None if it was never written.
     shape, chunks : tuple of int
-        Of the variable.
+        Shape of the variable and of its chunks.
     dtype : dtype
     fill : number
-        What is not written.
+        Value of samples that were never written.
     along, place : int
-        Dimension of the rows, and place along the other.
+        Dimension of the rows, and index along the other one.
     key : tuple
-        Stands for one opening of the variable.
+        Identifier of one opening of the variable.
     """
 
     load: Callable[[tuple[int, ...]], NDArray[Any] | None]
@@ -147,7 +147,7 @@ class ChunkedRows:
         return out
 
     def _chunk(self, at: tuple[int, ...], *, alone: bool, part: bool) -> NDArray[Any] | None:
-        """Return a chunk; one that will be wanted again, by another column or for its other rows, is kept."""
+        """Read a chunk; cache it if another column or a later read will use it."""
         large = math.prod(self.chunks) * self.dtype.itemsize >= _LARGE_CHUNK_BYTES
         kept, key = _EDGE_CACHE if alone and not large else _SHARED_CACHE, (*self.key, at)
         chunk = kept.get(key)
@@ -164,14 +164,14 @@ class ChunkedRows:
 
 @dataclass(frozen=True)
 class LibraryRows:
-    """Numbers that only a library knows how to read, while the file is open.
+    """Numbers that only a library can read, while the file is open.
 
     Attributes
     ----------
     variable : Any
-        Gives stored numbers when indexed.
+        Variable of the library; indexing it returns stored numbers.
     along, place : int
-        Dimension of the rows, and place along the other.
+        Dimension of the rows, and index along the other one.
     """
 
     variable: Any
@@ -190,20 +190,20 @@ class LibraryRows:
 
 
 def hdf5_rows(path: Path, variable: Any) -> Callable[[int, int], Rows] | None:
-    """Find out how the rows of an HDF5 dataset are read without the library.
+    """Find a way to read the rows of an HDF5 dataset without the library.
 
     Parameters
     ----------
     path : Path
         The file.
     variable : h5py.Dataset
-        Of one or two dimensions.
+        Dataset of one or two dimensions.
 
     Returns
     -------
     callable or None
-        Dimension of the rows and place along the other -> column; None where only the library knows
-        how to read it.
+        Function of the dimension of the rows and the index along the other one; it returns the
+        column. None if only the library can read it.
     """
     import h5py
 

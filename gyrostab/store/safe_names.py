@@ -1,4 +1,4 @@
-"""Names that a file can hold: those of other variables are stored under safe ones, and come back when the file is opened."""
+"""Safe names for variables whose own names no file can hold; they are restored on opening."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ __all__ = ["is_storable", "make_names_storable", "restore_names"]
 _STORABLE = re.compile(
     r"(?!__)[A-Za-z0-9_\x80-\ud7ff\ue000-\U0010ffff][^/\x00-\x1f\x7f\ud800-\udfff]*(?<! )"
 )
-_MAX_NAME_BYTES = (
-    200  # NetCDF allows 256, a file name 255, and a suffix for the time axis comes on top
-)
+# NetCDF allows 256, a file name 255, and a suffix for the time axis is added
+_MAX_NAME_BYTES = 200
 _ORIGINAL_NAME = "original_name"
 
 
@@ -28,8 +27,8 @@ def is_storable(name: str) -> bool:
 
     Examples
     --------
-    >>> is_storable("température 2"), is_storable("a/b"), is_storable("{{7*7}}"), is_storable(".zattrs")
-    (True, False, False, False)
+    >>> [is_storable(name) for name in ("température 2", "a/b", "{{7*7}}", ".zattrs")]
+    [True, False, False, False]
     """
     return _STORABLE.fullmatch(name) is not None and len(name.encode()) <= _MAX_NAME_BYTES
 
@@ -45,12 +44,12 @@ def _make_safe(name: str, taken: Iterable[str]) -> str:
 
 
 def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
-    """Give safe names to the variables whose own names no file can hold; a warning and ``long_name`` tell the own ones.
+    """Rename the variables whose names no file can hold; warn, and keep the names in ``long_name``.
 
     Examples
     --------
     >>> with warnings.catch_warnings(record=True):
-    ...     store_names(xr.Dataset({"{{7*7}}": 1.0}))["channel_7_7"].attrs["long_name"]
+    ...     make_names_storable(xr.Dataset({"{{7*7}}": 1.0}))["channel_7_7"].attrs["long_name"]
     '{{7*7}}'
     """
     taken = {str(name) for name in (*dataset.variables, *dataset.dims)}
@@ -72,36 +71,36 @@ def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
         }
     )
     for name, other in safe.items():
-        shown = name.encode(
-            "utf-8", "backslashreplace"
-        ).decode()  # half a character may stand in a name that was read wrongly
+        # a name that was decoded wrongly may hold half a character
+        shown = name.encode("utf-8", "backslashreplace").decode()
         renamed[other].attrs = {
             "long_name": shown,
             **renamed[other].attrs,
             _ORIGINAL_NAME: json.dumps(name),
         }
-    told = ", ".join(f"{name!a} as {other!r}" for name, other in safe.items())
+    renamings = ", ".join(f"{name!a} as {other!r}" for name, other in safe.items())
     warnings.warn(
-        f"a file cannot hold a channel of this name, so it is stored under another one: {told}",
+        "a file cannot hold a channel of this name, so it is stored under another one: "
+        f"{renamings}",
         stacklevel=4,
     )
     return renamed
 
 
 def restore_names(dataset: xr.Dataset) -> xr.Dataset:
-    """Give back the names that `make_names_storable` replaced."""
-    own: dict[Any, str] = {}
+    """Restore the names that `make_names_storable` replaced."""
+    originals: dict[Any, str] = {}
     for name, variable in dataset.variables.items():
         if _ORIGINAL_NAME in variable.attrs:
-            own[name] = json.loads(variable.attrs.pop(_ORIGINAL_NAME))
-    if not own:
+            originals[name] = json.loads(variable.attrs.pop(_ORIGINAL_NAME))
+    if not originals:
         return dataset
     return dataset.rename(
         {
-            **own,
+            **originals,
             **{
                 f"time_{name}": f"time_{other}"
-                for name, other in own.items()
+                for name, other in originals.items()
                 if f"time_{name}" in dataset.dims
             },
         }

@@ -1,4 +1,4 @@
-"""Work on many pieces in a few threads, results in the order of the pieces."""
+"""Parallel work in a few threads, with results in order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TypeVar
 
 __all__ = ["MAX_WORKERS", "map_in_order"]
 
-#: Threads at most, however many cores there are.
+#: Limit of the number of threads, for any number of cores.
 MAX_WORKERS = 4
 
 Item = TypeVar("Item")
@@ -20,20 +20,20 @@ Result = TypeVar("Result")
 def map_in_order(
     work: Callable[[Item], Result], items: Iterable[Item], *, workers: int | None = None
 ) -> Iterator[Result]:
-    """Do the work on the items, a few at a time, and give the results in the order of the items.
+    """Apply a function to items in several threads, and yield the results in order.
 
     Parameters
     ----------
     work : callable
-        Called in a thread with each item; it should spend its time where Python's lock is let go.
+        Function of one item. It should spend its time in code that releases the GIL.
     items : iterable
-        Fetched in a thread of its own, one ahead of the work.
+        Items, fetched in a separate thread, one ahead of the work.
     workers : int, optional
-        Threads; one for each core by default, `MAX_WORKERS` at most.
+        Number of threads (default: one per core, at most `MAX_WORKERS`).
 
     Examples
     --------
-    >>> list(in_order(lambda n: n * n, range(5)))
+    >>> list(map_in_order(lambda n: n * n, range(5)))
     [0, 1, 4, 9, 16]
     """
     workers = workers or min(os.cpu_count() or 1, MAX_WORKERS)
@@ -54,5 +54,5 @@ def map_in_order(
             while waiting:
                 yield waiting.popleft().result()
         finally:
-            for one in waiting:
-                one.cancel()
+            for future in waiting:
+                future.cancel()

@@ -1,4 +1,7 @@
-"""Writing the long variables of a log: counts where the source had them, in chunks of one axis and about 20 minutes."""
+"""Writing the long variables of a log in chunks of one axis and about 20 minutes.
+
+Samples that the source had as integer counts are stored as counts.
+"""
 
 from __future__ import annotations
 
@@ -28,23 +31,23 @@ __all__ = [
 ]
 
 CHUNK_SECONDS = 1200.0
-#: Bounds of the samples in one chunk, for very slow and very fast logs.
+#: Least and most samples in one chunk, for very slow and very fast logs.
 CHUNK_LIMITS = (2**16, 2**22)
-#: Size [bytes] of the doubles that are computed at one time while a lazy log is written.
+#: Size [bytes] of the doubles that are computed at a time while a lazy log is written.
 MAX_BATCH_BYTES = 2**26
 FILL_VALUES = {"int16": -32767, "int32": -2147483647}  # the defaults of NetCDF
 
 
-#: Told the share that is done.
+#: Function that is called with the share that is done.
 Progress = Callable[[float], None]
 
 
 class NotCountsError(ValueError):
-    """A variable does not consist of counts after all; `args` is its name."""
+    """A variable turns out not to consist of counts; `args` is its name."""
 
 
 def chunk_samples(rate: float) -> int:
-    """Samples in one chunk of a log of `rate` [Hz]: 20 minutes, but neither very few nor very many; 0 stands for slow.
+    """Number of samples in one chunk of a log of `rate` [Hz]: 20 minutes, within `CHUNK_LIMITS`.
 
     Examples
     --------
@@ -55,12 +58,14 @@ def chunk_samples(rate: float) -> int:
 
 
 def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
-    """Turn a variable whose encoding declares an integer dtype and a factor into counts of 16 or 32 bits; any other stays as it is.
+    """Convert a variable to counts of 16 or 32 bits if its encoding declares them.
+
+    The encoding must hold an integer dtype and a scale factor; other variables stay unchanged.
 
     Raises
     ------
     Misfit
-        When counts do not give the same doubles; for a lazy variable, only as it is computed.
+        When counts do not give the same doubles; for a lazy variable, when it is computed.
     """
     scale, declared = (
         variable.encoding.get("scale_factor"),
@@ -111,14 +116,14 @@ def _read_counts_into(
     begin: int,
     out: NDArray[np.integer[Any]],
 ) -> None:
-    """Counts of one row of `data` from `begin` on, read without dask."""
+    """Read counts of one row of `data` from `begin` on, without dask."""
     values = np.empty(out.size)
     read_into(data, row, begin, values)
     out[:] = pack(values)
 
 
 def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
-    """How the same variable of several logs is stored when they are joined: as counts, where all are counts of one factor.
+    """Find the encoding of a variable of concatenated logs: counts if all are counts of one factor.
 
     Examples
     --------
@@ -127,19 +132,19 @@ def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
     >>> common_packing([{"dtype": "i2", "scale_factor": 0.1}, {}])
     {}
     """
-    found = list(encodings)
-    scales = {encoding.get("scale_factor") for encoding in found}
+    encodings = list(encodings)
+    scales = {encoding.get("scale_factor") for encoding in encodings}
     scale = scales.pop() if len(scales) == 1 else None
-    if scale is None or not all("dtype" in encoding for encoding in found):
+    if scale is None or not all("dtype" in encoding for encoding in encodings):
         return {}
     return {
-        "dtype": np.result_type(*(np.dtype(encoding["dtype"]) for encoding in found)),
+        "dtype": np.result_type(*(np.dtype(encoding["dtype"]) for encoding in encodings)),
         "scale_factor": float(scale),
     }
 
 
 def long_variables(stored: xr.Dataset) -> dict[str, xr.Variable]:
-    """Lazy variables along time, which are written stretch by stretch."""
+    """Find the lazy variables along time, which are written in batches."""
     lazy = {
         str(name): array.variable
         for name, array in stored.data_vars.items()
@@ -163,7 +168,7 @@ def append_netcdf(
     *,
     progress: Progress | None = None,
 ) -> None:
-    """Add lazy variables to a NetCDF file that holds the others already; `encoding` as for xarray."""
+    """Add lazy variables to a NetCDF file; `encoding` as for xarray."""
     import netCDF4
 
     lock = library_lock()
@@ -205,7 +210,7 @@ def append_zarr(
     *,
     progress: Progress | None = None,
 ) -> None:
-    """Add lazy variables to a Zarr store that holds the others already, every chunk of them, and gather the metadata."""
+    """Add lazy variables to a Zarr store, every chunk of them, and consolidate the metadata."""
     import zarr
 
     group = zarr.open_group(path, mode="r+", zarr_format=2)
@@ -237,7 +242,7 @@ def _copy_variables(
     put: Callable[[str, tuple[int, ...], slice, NDArray[Any]], None],
     progress: Progress | None,
 ) -> None:
-    """Compute lazy variables a few chunks at a time, for all of them at once, and write each chunk while the next ones are computed."""
+    """Compute lazy variables in batches, and write each batch while the next one is computed."""
     import dask
     from dask.system import CPU_COUNT
 
@@ -255,9 +260,9 @@ def _copy_variables(
     with readers, ThreadPoolExecutor(1, thread_name_prefix="gyrostab-write") as pool:
         writing: Future[None] | None = None
         done, total = 0, sum(variable.size for variable in long.values())
-        rooms: tuple[_Buffers, _Buffers] = ({}, {})  # one is written while the other is filled
+        buffers: tuple[_Buffers, _Buffers] = ({}, {})  # one is written while the other is filled
         for number, parts in enumerate(_plan_batches(long, lengths)):
-            blocks = _read_blocks(long, lengths, parts, readers, rooms[number % 2])
+            blocks = _read_blocks(long, lengths, parts, readers, buffers[number % 2])
             if writing is not None:
                 writing.result()
             writing = pool.submit(write, [part[:3] for part in parts], blocks)
@@ -268,8 +273,8 @@ def _copy_variables(
             writing.result()
 
 
-#: Name, row, first sample and number of samples of a part of a variable; arrays by name and row,
-#: which stretch after stretch goes through.
+#: Name, row, first sample and number of samples of a part of a variable; arrays by name and row
+#: that every batch uses again.
 _Segment = tuple[str, tuple[int, ...], int, int]
 _Buffers = dict[tuple[str, tuple[int, ...]], NDArray[Any]]
 
@@ -279,9 +284,12 @@ def _read_blocks(
     lengths: dict[str, int],
     parts: list[_Segment],
     readers: ThreadPoolExecutor,
-    room: _Buffers,
+    buffers: _Buffers,
 ) -> list[NDArray[Any]]:
-    """Read the parts of a stretch, chunk by chunk where it is known how; dask computes the others, and walks its whole graph each time."""
+    """Read the parts of a batch, by row reader if there is one.
+
+    dask computes the others, and walks its whole graph each time.
+    """
     import dask
 
     lazy = [
@@ -290,18 +298,18 @@ def _read_blocks(
         if not can_read_into(long[name].data)
     ]
     blocks: list[NDArray[Any]] = []
-    filling: list[Future[None]] = []
+    reading: list[Future[None]] = []
     computed = iter(dask.compute(*lazy))
     for name, row, begin, span in parts:
         data = long[name].data
         if not can_read_into(data):
             blocks.append(next(computed))
             continue
-        if room.get((name, row), _NO_VALUES).size < span:
-            room[name, row] = np.empty(span, data.dtype)
-        blocks.append(room[name, row][:span])
+        if buffers.get((name, row), _NO_VALUES).size < span:
+            buffers[name, row] = np.empty(span, data.dtype)
+        blocks.append(buffers[name, row][:span])
         for at in range(0, span, lengths[name]):
-            filling.append(
+            reading.append(
                 readers.submit(
                     read_into,
                     data,
@@ -311,11 +319,11 @@ def _read_blocks(
                 )
             )
     try:
-        for one in filling:
-            one.result()
+        for future in reading:
+            future.result()
     finally:
-        for one in filling:
-            one.cancel()
+        for future in reading:
+            future.cancel()
     return blocks
 
 
@@ -325,7 +333,10 @@ _NO_VALUES = np.empty(0)
 def _plan_batches(
     long: dict[str, xr.Variable], lengths: dict[str, int]
 ) -> Iterator[list[tuple[str, tuple[int, ...], int, int]]]:
-    """Stretches of whole chunks, of all variables on one time: name, row, first sample, number of samples of each part."""
+    """Plan batches of whole chunks of all variables on one time axis.
+
+    Each part of a batch is a name, a row, the first sample and the number of samples.
+    """
     for dim in dict.fromkeys(variable.dims[-1] for variable in long.values()):
         rows = [
             (name, row)

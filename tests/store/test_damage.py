@@ -96,11 +96,11 @@ def test_a_chunk_of_a_few_bytes_is_damaged(tmp_path, content):
 
 
 @pytest.mark.parametrize("form", WRITERS)
-def test_chunks_that_are_kept_take_no_more_memory_than_they_may(tmp_path, monkeypatch, form):
+def test_the_chunk_cache_keeps_to_its_memory_limit(tmp_path, monkeypatch, form):
     """Parts of the same chunks, in turn: read once while they fit, read anew when others have taken their place."""
-    kept, chunk = ChunkCache(4 * CHUNK * 2, 4 * CHUNK), 4 * CHUNK
+    cache, chunk = ChunkCache(4 * CHUNK * 2, 4 * CHUNK), 4 * CHUNK
     decoded = []
-    monkeypatch.setattr(read_module, "_CACHE", kept)
+    monkeypatch.setattr(read_module, "_CACHE", cache)
     monkeypatch.setattr(
         read_module,
         "read_chunk",
@@ -112,7 +112,7 @@ def test_chunks_that_are_kept_take_no_more_memory_than_they_may(tmp_path, monkey
             np.testing.assert_array_equal(
                 part, counts_log().rate[1, place * CHUNK + 10 : place * CHUNK + 20]
             )
-            assert sum(one.nbytes for one in kept._chunks.values()) == kept._held <= 2 * chunk
+            assert sum(item.nbytes for item in cache._chunks.values()) == cache._bytes <= 2 * chunk
     assert [where[2] for where in decoded] == [(1, 0), (1, 1), (1, 2), (1, 0)]
 
 
@@ -165,18 +165,18 @@ def test_every_chunk_of_a_zarr_store_is_written_even_if_it_is_all_gap(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("form", "said"), [("nc", "cannot be opened again"), ("zarr", "is not there any more")]
+    ("form", "message"), [("nc", "cannot be opened again"), ("zarr", "no longer exists")]
 )
-def test_a_store_that_vanishes_is_no_gap(tmp_path, form, said):
+def test_a_vanished_store_is_an_error(tmp_path, form, message):
     path = WRITERS[form](counts_log(), tmp_path / f"log.{form}")
     with open_log(path) as log:
         path.rename(tmp_path / "away")
-        with pytest.raises(FormatError, match=f"{said}.*has it been moved"):
+        with pytest.raises(FormatError, match=f"{message}.*has it been moved"):
             log.rate.compute()
     with open_log((tmp_path / "away").rename(path)) as log:
         log.rate[:, :5].compute()
         path.rename(tmp_path / "away")
-        with pytest.raises(FormatError, match=f"{said}.*has it been moved"):
+        with pytest.raises(FormatError, match=f"{message}.*has it been moved"):
             log.rate.compute()
 
 

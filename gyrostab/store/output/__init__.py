@@ -1,4 +1,4 @@
-"""Whether a path may be written, and files that take their name only once they are complete."""
+"""Checks whether a path may be written, and writing that is complete or leaves nothing."""
 
 from gyrostab.store.output.check import check_folder, check_output, resolve_link
 from gyrostab.store.output.content import find_foreign_item

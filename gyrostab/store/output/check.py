@@ -1,4 +1,4 @@
-"""Whether a path may be written: the one decision that every command and every function that writes shares."""
+"""The decision whether a path may be written, shared by every command and function that writes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from gyrostab.store.output.inputs import match_files, protected_inputs
 
 __all__ = ["check_folder", "check_output", "check_target", "resolve_link"]
 
-_MAX_LINKS = 40  # as Linux has it (path_resolution(7)); more are taken for a loop
+_MAX_LINKS = 40  # limit of Linux (path_resolution(7)); more links are treated as a loop
 
 
 def resolve_link(path: str | os.PathLike[str]) -> Path:
-    """Follow the symbolic links at the end of a path, so that what is replaced is their target and not the link.
+    """Follow the symbolic links at the end of a path: the target is replaced, not the link.
 
     Raises
     ------
@@ -45,25 +45,25 @@ def check_output(
     inputs: Iterable[str | os.PathLike[str]] = (),
     find_foreign: FindForeign | None = None,
 ) -> Path:
-    """Make sure, before the long work starts, that a result can be written and that nothing else is lost by it.
+    """Check, before the computation starts, that a result can be written and nothing else is lost.
 
-    A symbolic link stands for its target. An output that exists is replaced with `overwrite` only,
-    and a folder only when all that it holds was made by gyrostab or belongs to a Zarr store.
+    A symbolic link means its target. An existing output is replaced only with `overwrite`, and a
+    folder only if all of its content was made by gyrostab or belongs to a Zarr store.
 
     Parameters
     ----------
     path : path-like
         File, Zarr folder or other folder to be written.
     suffixes : sequence of str
-        Endings that the stage can write, with the dot; empty for any.
+        Allowed suffixes, with the dot; empty for any.
     overwrite : bool
         Whether an existing output may be replaced.
     inputs : iterable of path-like
         Files that a lazy dataset reads, in addition to those of
         `gyrostab.store.output.protect_inputs`.
     find_foreign : callable, optional
-        Makes the output a folder: finds what it holds that must not be removed. By default the
-        output is a Zarr store when its name ends in ``.zarr``, else a file.
+        Function that finds an item that must not be removed; the output is a folder then. By
+        default the output is a Zarr store if its name ends in ``.zarr``, else a file.
 
     Returns
     -------
@@ -73,8 +73,7 @@ def check_output(
     Raises
     ------
     OptionError
-        When the name has the wrong ending, is an input, or is a folder around an input or inside
-        one.
+        When the path has a wrong suffix, is an input, contains an input or is inside one.
     OutputError
         When the output exists and may not be replaced, or its folder cannot be written to.
 
@@ -99,7 +98,7 @@ def check_output(
 def check_folder(
     folder: str | os.PathLike[str], names: Iterable[str], *, overwrite: bool = False
 ) -> Path:
-    """Make sure that files can be written into a folder, which may hold others and need not exist yet.
+    """Check that files can be written to a folder, which may hold others or not exist yet.
 
     Parameters
     ----------
@@ -126,7 +125,8 @@ def check_folder(
     present = [name for name in names if os.path.lexists(folder / name)]
     if present and not overwrite:
         raise OutputError(
-            f"output {str(folder)!r} holds {', '.join(sorted(present))} already; give --overwrite to replace, or another folder with -o"
+            f"output {str(folder)!r} holds {', '.join(sorted(present))} already; "
+            "give --overwrite to replace, or another folder with -o"
         )
     for name in present:
         check_target(folder / name, overwrite=overwrite)
@@ -144,16 +144,17 @@ def check_target(
     inputs: Iterable[str | os.PathLike[str]] = (),
     find_foreign: FindForeign | None = None,
 ) -> Path:
-    """As `check_output`, without trying whether the folder around it can be written to; what the path stands for."""
-    said = f"output {str(path)!r}"
+    """Do what `check_output` does, without a test write; return the target of the path."""
+    label = f"output {str(path)!r}"
     target = resolve_link(path)
     if not target.parent.is_dir():
         raise OutputError(
-            f"{said}: there is no directory {str(target.parent)!r}; make it first or choose another name with -o"
+            f"{label}: there is no directory {str(target.parent)!r}; "
+            "make it first or choose another name with -o"
         )
-    _check_inputs(said, target, protected_inputs(), "give another name with -o")
+    _check_inputs(label, target, protected_inputs(), "give another name with -o")
     _check_inputs(
-        said,
+        label,
         target,
         match_files(inputs),
         "load the dataset first, with its load(), or give another name",
@@ -164,42 +165,43 @@ def check_target(
         return target
     except OSError as error:
         raise OutputError(
-            f"{said} cannot be written ({error.strerror}); give another name with -o"
+            f"{label} cannot be written ({error.strerror}); give another name with -o"
         ) from error
     if find_foreign is None:
         if stat.S_ISDIR(mode):
-            raise OutputError(f"{said} is a directory; give another name with -o")
+            raise OutputError(f"{label} is a directory; give another name with -o")
         if not stat.S_ISREG(mode):
             raise OutputError(
-                f"{said} is no regular file and is not replaced; give another name with -o"
+                f"{label} is not a regular file and is not replaced; give another name with -o"
             )
     elif not stat.S_ISDIR(mode):
         raise OutputError(
-            f"{said} is a file, and a folder is to be written; give another name with -o"
+            f"{label} is a file, and a folder is to be written; give another name with -o"
         )
-    elif (foreign := _find_foreign(said, target, find_foreign)) is not None:
+    elif (foreign := _find_foreign(label, target, find_foreign)) is not None:
         raise OutputError(
-            f"{said} holds {foreign!r}, which gyrostab did not make, so it is not replaced, not even with --overwrite; "
-            "give another name with -o"
+            f"{label} holds {foreign!r}, which gyrostab did not make, "
+            "so it is not replaced, not even with --overwrite; give another name with -o"
         )
     if not overwrite:
         raise OutputError(
-            f"{said} exists already; give --overwrite (overwrite=True) to replace it, or another name with -o"
+            f"{label} exists already; "
+            "give --overwrite (overwrite=True) to replace it, or another name with -o"
         )
     return target
 
 
-def _find_foreign(said: str, target: Path, find_foreign: FindForeign) -> str | None:
+def _find_foreign(label: str, target: Path, find_foreign: FindForeign) -> str | None:
     try:
         return find_foreign(target)
     except OSError as error:
         raise OutputError(
-            f"{said}: its content cannot be listed ({error.strerror}); give another name with -o"
+            f"{label}: its content cannot be listed ({error.strerror}); give another name with -o"
         ) from error
 
 
-def _check_inputs(said: str, target: Path, inputs: Sequence[Path], advice: str) -> None:
-    """Compare by identity, which links and other spellings of a path do not change."""
+def _check_inputs(label: str, target: Path, inputs: Sequence[Path], advice: str) -> None:
+    """Compare by identity, which does not depend on links and other spellings of a path."""
     own, place = _find_status(target), _find_real_path(target)
     folder = own is not None and stat.S_ISDIR(own.st_mode)
     for item in inputs:
@@ -207,17 +209,18 @@ def _check_inputs(said: str, target: Path, inputs: Sequence[Path], advice: str) 
         if found is None:
             continue
         if own is not None and os.path.samestat(own, found):
-            raise OptionError(f"{said} is also an input and would be destroyed; {advice}")
+            raise OptionError(f"{label} is also an input and would be destroyed; {advice}")
         if folder and _find_real_path(item).startswith(os.path.join(place, "")):
             raise OptionError(
-                f"{said} is a folder around the input {str(item)!r}, which would be destroyed; {advice}"
+                f"{label} is a folder around the input {str(item)!r}, "
+                f"which would be destroyed; {advice}"
             )
         inside = stat.S_ISDIR(found.st_mode) and place.startswith(
             os.path.join(_find_real_path(item), "")
         )
         if inside and is_store(item):
             raise OptionError(
-                f"{said} lies inside the input {str(item)!r}, which would be changed; {advice}"
+                f"{label} lies inside the input {str(item)!r}, which would be changed; {advice}"
             )
 
 
@@ -227,7 +230,7 @@ def _find_real_path(path: Path) -> str:
 
 
 def _find_status(path: Path) -> os.stat_result | None:
-    """Status of what a path stands for; None when there is nothing."""
+    """Find the status of the target of a path; None when it does not exist."""
     try:
         return path.stat()
     except OSError:

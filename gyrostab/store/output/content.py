@@ -1,4 +1,4 @@
-"""What a folder holds that no Zarr store holds: only a folder without such items may be replaced."""
+"""Recognition of foreign items in a folder: only a Zarr store without them may be replaced."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from typing import Any
 
 __all__ = ["FindForeign", "find_foreign_item", "is_store", "read_json"]
 
-#: Gives the name of an item of a folder that must not be removed; None where all of the folder may
-#: go.
+#: Function that returns the name of an item of a folder that must not be removed, or None.
 FindForeign = Callable[[Path], str | None]
 
 _METADATA = {".zgroup", ".zarray", ".zattrs", ".zmetadata", "zarr.json"}
-#: Keys of chunks of formats 2 and 3, ``1.0``, ``c.1.0``, or one level of ``c/1/0``; and chunks that
-#: a killed writer left.
+#: Keys of chunks of formats 2 and 3, ``1.0``, ``c.1.0``, or one level of ``c/1/0``, and chunks that
+#: a killed process left.
 _CHUNK = re.compile(r"(c|(c\.)?\d+(\.\d+)*)(\.[0-9a-f]{32}\.partial)?")
 
 
 def read_json(path: Path) -> Any:
-    """Content of a JSON file; None when it cannot be read."""
+    """Read a JSON file; None when it cannot be read."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -30,7 +29,7 @@ def read_json(path: Path) -> Any:
 
 
 def _find_node(folder: str) -> str | None:
-    """``array`` or ``group``, by the Zarr metadata of a folder; None without any."""
+    """Find the Zarr metadata of a folder: ``array``, ``group`` or None."""
     for name, kind in ((".zarray", "array"), (".zgroup", "group"), ("zarr.json", None)):
         content = read_json(Path(folder, name))
         if isinstance(content, dict) and content.get("zarr_format") in (2, 3):
@@ -54,8 +53,8 @@ def find_foreign_item(folder: Path) -> str | None:
     Returns
     -------
     str or None
-        Path of the first such item inside the folder; None for a Zarr store with nothing else in
-        it, and for an empty folder.
+        Path of the first such item inside the folder; None for a pure Zarr store and for an empty
+        folder.
 
     Examples
     --------
@@ -70,7 +69,7 @@ def find_foreign_item(folder: Path) -> str | None:
 
 
 def _find_in_node(folder: str) -> str | None:
-    """As `find_foreign_item`, of a group or an array; the whole path."""
+    """Do the work of `find_foreign_item` for a group or an array; return the full path."""
     node = _find_node(folder)
     for entry in _list_entries(folder):
         if node is None or entry.is_symlink():

@@ -1,4 +1,7 @@
-"""The files that a command reads: no output may replace or contain one, and none may change before the output is complete."""
+"""Protection of input files.
+
+No output may replace or contain an input, and no input may change before the output is complete.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +29,17 @@ __all__ = [
     "remember_source",
 ]
 
-#: Inputs of the work under way, each with what `describe_file` said of it at first; None where a
-#: change does no harm.
+#: Inputs of the current command, each with its first `describe_file`; None where a change does not
+#: matter.
 _PROTECTED: ContextVar[dict[Path, dict[str, Any] | None] | None] = ContextVar(
     "_PROTECTED", default=None
 )
-#: Names of lazy arrays -> files that they read.
+#: Files that lazy arrays read, by name of the array.
 _SOURCES: dict[str, set[Path]] = {}
 
 
 def describe_file(path: Path) -> dict[str, Any]:
-    """Size [bytes] and time of change of a file; of a folder (Zarr) those of all its files together."""
+    """Describe a file by size [bytes] and time of change; a folder (Zarr) by those of its files."""
     try:
         if not path.is_dir():
             found = path.stat()
@@ -64,7 +67,7 @@ def _list_files(folder: str, inside: str) -> Iterator[tuple[str, int, int]]:
 
 
 def match_files(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """The files and folders that exist under a name or pattern, or several."""
+    """Find the files and folders that exist under names or patterns."""
     found: dict[Path, None] = {}
     for path in [paths] if isinstance(paths, str | os.PathLike) else paths:
         item = os.fspath(path)
@@ -81,10 +84,10 @@ def match_files(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 def protect_inputs(
     paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
 ) -> Iterator[None]:
-    """Refuse, for the length of the ``with`` block, every output that would replace one of these files or a folder around it.
+    """Refuse, in the ``with`` block, outputs that would replace an input or a folder around it.
 
-    An output is also refused where one of them has changed before the output is complete, except
-    for TOML files, which are read at once.
+    An output is also refused when an input has changed before the output is complete, except for
+    TOML files, which are read at the start.
 
     Parameters
     ----------
@@ -101,7 +104,7 @@ def protect_inputs(
     ...     with protect_inputs([log]):
     ...         check_output(log, overwrite=True)
     Traceback (most recent call last):
-    gyrostab.errors.OptionError: output '...log.nc' is also an input and would be destroyed; give another name with -o
+    gyrostab.errors.OptionError: output '...log.nc' is also an input and would be destroyed; give...
     """
     before = _PROTECTED.get() or {}
     files = {path: _describe_data(path) for path in match_files(paths) if path not in before}
@@ -113,23 +116,24 @@ def protect_inputs(
 
 
 def _describe_data(path: Path) -> dict[str, Any] | None:
-    """What to compare later of a file that is read all the while: a regular one, or a store."""
+    """Describe a regular file or a store for a later comparison; None for other paths."""
     data = path.suffix.lower() != ".toml" and (path.is_file() or is_store(path))
     return describe_file(path) if data else None
 
 
 def protected_inputs() -> list[Path]:
-    """List the inputs of the work under way."""
+    """List the inputs of the current command."""
     return list(_PROTECTED.get() or ())
 
 
 def check_unchanged() -> None:
-    """Raise `FormatError` when an input of the work under way has changed since it began."""
+    """Raise `FormatError` when an input of the current command has changed since the start."""
     for path, before in (_PROTECTED.get() or {}).items():
         if before is not None and describe_file(path) != before:
             what = "has changed" if path.exists() else "has vanished"
             raise FormatError(
-                f"{path}: {what} while it was read, so nothing was written; start again once it is complete"
+                f"{path}: {what} while it was read, so nothing was written; "
+                "start again once it is complete"
             )
 
 
@@ -139,7 +143,7 @@ def remember_source(array: Any, path: Path) -> None:
 
 
 def pass_sources(array: Any, *derived: Any) -> None:
-    """Remember that lazy arrays read what another one reads, where their graphs do not show it."""
+    """Remember the files of derived lazy arrays, if their graphs do not show them."""
     for made in derived:
         _SOURCES[made.name] = _find_array_sources(array)
 
@@ -149,7 +153,7 @@ def _find_array_sources(array: Any) -> set[Path]:
 
 
 def find_sources(dataset: Any) -> list[Path]:
-    """Find the files that a lazy `xarray.Dataset` still reads from, as far as they are known.
+    """Find the known files that a lazy `xarray.Dataset` still reads from.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Files and folders that take their name only once they are complete."""
+"""Writing files and folders under a temporary name, renamed once they are complete."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from gyrostab.store.system import exchange_paths, rename_new, sync_path
 
 __all__ = ["is_leftover", "new_folder", "new_output", "remove_leftovers", "replace_file"]
 
-#: Looks, 20 ms apart, after which what has gone stays gone: a busy machine may hold a thread up
-#: that long.
+#: Number of checks, 20 ms apart, after which a removed folder counts as gone: on a busy machine, a
+#: thread may be delayed that long before it writes again.
 _MIN_ABSENT_CHECKS = 15
 _MAX_NAME_BYTES = 255  # of one file name on the usual file systems
 _LEFTOVER = re.compile(r"\.(.*\.)?gyrostab-[0-9a-f]{8}\.part")
@@ -37,17 +37,19 @@ def new_output(
     find_foreign: FindForeign | None = None,
     inputs: Iterable[str | os.PathLike[str]] = (),
 ) -> Iterator[Path]:
-    """Give a temporary name beside `path` to write to; rename it to `path` when the block succeeds, remove it when not.
+    """Provide a temporary name to write to, and rename it to `path` if the block succeeds.
+
+    If the block fails, the temporary file is removed.
 
     Parameters
     ----------
     path : path-like
-        The final name; a symbolic link stands for its target.
+        The final name; a symbolic link means its target.
     overwrite : bool
-        Replace what has this name.
+        Replace an existing output.
     find_foreign : callable, optional
-        Makes the output a folder, and finds what an existing one holds that must not be removed;
-        see `gyrostab.store.output.check_output`.
+        Function that finds an item of an existing folder that must not be removed; the output is a
+        folder then. See `gyrostab.store.output.check_output`.
     inputs : iterable of path-like
         Files that a lazy dataset reads, which must not be replaced, in addition to those of
         `gyrostab.store.output.protect_inputs`.
@@ -60,11 +62,11 @@ def new_output(
     Raises
     ------
     OptionError
-        When `path` is an input, or a folder around one.
+        When `path` is an input or contains one.
     OutputError
         When `path` exists and may not be replaced, or when the block fails to write.
     FormatError
-        When an input has changed meanwhile.
+        When an input has changed in the meantime.
 
     Examples
     --------
@@ -83,7 +85,8 @@ def new_output(
     target = check()
     for left in _find_leftovers(target):
         warnings.warn(
-            f"{left} is being written now, or was left by a process that was killed: then delete it",
+            f"{left} is being written now, or was left by a process that was killed: "
+            "then delete it",
             stacklevel=3,
         )
     hidden = target.with_name(_hide_name(target.name))
@@ -103,7 +106,7 @@ def new_output(
 
 @contextlib.contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
-    """As `new_output`, of a file inside a folder that gyrostab made, which is replaced in any case."""
+    """Write a file inside a folder of gyrostab like `new_output`, and replace an existing one."""
     with _temporary_output(
         path, path.with_name(_hide_name(path.name)), make_folder=False
     ) as temporary:
@@ -115,14 +118,14 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def new_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
-    """Give a temporary folder to write files to; move them into `folder` when the block succeeds, and remove them when not.
+    """Provide a temporary folder, and move its files to `folder` if the block succeeds.
 
-    Whatever else `folder` holds stays as it is.
+    If the block fails, they are removed. Other files in `folder` stay unchanged.
 
     Parameters
     ----------
     folder : path-like
-        The folder; it is made, with those above it, when it does not exist.
+        The folder; it is made, with its parents, if it does not exist.
     overwrite : bool
         Replace files of the same names.
 
@@ -166,7 +169,7 @@ def new_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) -> It
 
 
 def _make_folder(folder: Path) -> list[Path]:
-    """Make a folder with those above it; those that were made, the innermost first."""
+    """Make a folder and its parents; return the ones that were made, the innermost first."""
     missing = [level for level in (folder, *folder.parents) if not level.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -179,7 +182,7 @@ def _make_folder(folder: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def _temporary_output(target: Path, temporary: Path, *, make_folder: bool) -> Iterator[Path]:
-    """Make a hidden file or folder, remove it when the block fails, and explain why the output could not be written."""
+    """Make a hidden file or folder, and remove it if the block fails; explain write errors."""
     complete = False
     try:
         if make_folder:
@@ -202,7 +205,7 @@ def _temporary_output(target: Path, temporary: Path, *, make_folder: bool) -> It
 
 
 def _hide_name(name: str) -> str:
-    """A hidden name that no other process takes, of a file or folder that is being written."""
+    """Make a unique hidden name for a file or folder that is being written."""
     mark = f".gyrostab-{secrets.token_hex(4)}.part"
     return (
         f".{name}{mark}" if name and len(os.fsencode(f".{name}{mark}")) <= _MAX_NAME_BYTES else mark
@@ -210,7 +213,7 @@ def _hide_name(name: str) -> str:
 
 
 def is_leftover(name: str) -> bool:
-    """Whether a file name is one that outputs have until they are complete.
+    """Whether a file name is that of an incomplete output.
 
     Examples
     --------
@@ -226,20 +229,22 @@ def _find_leftovers(target: Path) -> list[Path]:
 
 
 def remove_leftovers(output: Path) -> None:
-    """Remove what a killed process left of its output under a hidden name; only for a process that no other can write beside."""
+    """Remove what a killed process left under a hidden name.
+
+    Only for a process that holds the lock of the output, so that no other writes it.
+    """
     for path in _find_leftovers(output):
         _remove_tree(path)
 
 
 def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) -> None:
-    """Let a complete folder and an older one change places, and remove the older one."""
+    """Exchange a complete folder with an older one, and remove the older one."""
     if exchange_paths(temporary, target):
-        if (
-            find_foreign(temporary) is not None
-        ):  # someone has put something there since it was looked through
+        if find_foreign(temporary) is not None:  # something was added since the check
             exchange_paths(temporary, target)
             raise OutputError(
-                f"{target}: has changed while the new one was written, so it is not replaced; give another name with -o"
+                f"{target}: has changed while the new one was written, so it is not replaced; "
+                "give another name with -o"
             )
     else:
         aside = target.with_name(_hide_name(target.name))
@@ -254,23 +259,25 @@ def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) ->
     _remove_tree(temporary)
     if temporary.exists():
         warnings.warn(
-            f"{temporary}: the folder that was replaced cannot be removed; delete it", stacklevel=4
+            f"{temporary}: the folder that was replaced cannot be removed; delete it",
+            stacklevel=4,
         )
 
 
 def _rename_new(source: Path, target: Path) -> None:
-    """Rename a file or folder unless something has the name already, in one step where the system can."""
+    """Rename a file or folder unless the name is taken."""
     try:
         rename_new(source, target)
     except FileExistsError:
         raise OutputError(
-            f"output {str(target)!r} exists already: another process has made it meanwhile; give --overwrite (overwrite=True) to replace it"
+            f"output {str(target)!r} exists already: another process has made it meanwhile; "
+            "give --overwrite (overwrite=True) to replace it"
         ) from None
     sync_path(target.parent)
 
 
 def _sync_tree(path: Path) -> None:
-    """Bring a file, or a folder with all that is in it, to the disk."""
+    """Bring a file, or a folder with its content, to the disk."""
     for folder, _, names in os.walk(path):
         for name in names:
             sync_path(Path(folder, name))
@@ -280,7 +287,7 @@ def _sync_tree(path: Path) -> None:
 
 
 def _remove_until_gone(path: Path) -> None:
-    """Remove what was written; a thread that still writes its piece of a directory may bring it back, so look again."""
+    """Remove an output until it stays removed: a thread that still writes may make it again."""
     folder, gone = path.is_dir(), 0
     for _ in range(100):
         _remove_tree(path)
