@@ -1,4 +1,4 @@
-"""Reduced records with known effects, for the tests of naming: an hour of a good gyro at 10 Hz."""
+"""Block statistics with known effects, for tests of identification: an hour of 10 Hz data."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ COEFFICIENT = xr.DataArray(
 )
 _HEAT = {
     "profile": "ramps", "channel": "temperature", "unit": "degC",
-    "points": [[0, 30], [500, 30], [900, 38], [1300, 38], [2000, 52], [2600, 47], [3000, 47], [3600, 58]],
+    "points": [[0, 30], [500, 30], [900, 38], [1300, 38],
+               [2000, 52], [2600, 47], [3000, 47], [3600, 58]],
 }  # fmt: skip
 _SHAKE = {
     "profile": "vibration",
@@ -76,13 +77,13 @@ def record(
     seed: int = 1,
     drop: tuple[str, ...] = (),
 ) -> xr.Dataset:
-    """Reduced record of three axes; the same arguments give the same Dataset, which is made once."""
-    found = _made(json.dumps(effects), json.dumps(list(environment)), seed)
+    """Return cached block statistics of three axes for these arguments."""
+    found = _make_record(json.dumps(effects), json.dumps(list(environment)), seed)
     return found.drop_vars([f"channel_{name}" for name in drop])
 
 
 @cache
-def _made(effects: str, environment: str, seed: int) -> xr.Dataset:
+def _make_record(effects: str, environment: str, seed: int) -> xr.Dataset:
     model = {
         "noise": NOISE,
         "effect": json.loads(effects),
@@ -95,7 +96,7 @@ def _made(effects: str, environment: str, seed: int) -> xr.Dataset:
 def nulls(
     blocks: xr.Dataset, count: int = 80, seed: int = 3
 ) -> tuple[xr.Dataset, list[xr.Dataset]]:
-    """Baseline of a record, and records of noise alone."""
+    """Return the baseline of a record, and null records."""
     baseline = calibrate_noise(blocks)
     return baseline, list(
         null_records(blocks, baseline, count=count, rng=np.random.default_rng(seed), chunk=count)

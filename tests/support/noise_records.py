@@ -1,4 +1,4 @@
-"""Noise for tests, as an ideal sensor gives it: each sample the mean rate over its interval. Independent of the package."""
+"""Noise of an ideal sensor for tests, independent of the package: means over each sample."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 def white(
     rng: np.random.Generator, trials: int, n: int, *, N: float, rate: float
 ) -> NDArray[np.float64]:
-    """Angle random walk of N [deg/sqrt(h)] as rate [deg/h]: the angle grows by N sqrt(dt) in dt."""
+    """Return angle random walk of N [deg/sqrt(h)] as rate [deg/h]: N sqrt(dt) of angle in dt."""
     hours = 1 / rate / 3600
     return N * np.sqrt(hours) / hours * rng.standard_normal((trials, n))
 
@@ -17,7 +17,7 @@ def white(
 def quantization(
     rng: np.random.Generator, trials: int, n: int, *, Q: float, rate: float
 ) -> NDArray[np.float64]:
-    """Quantization noise of Q [urad]: an error of the angle at each end of the sample."""
+    """Return quantization noise of Q [urad]: an angle error at each end of a sample."""
     angle = np.degrees(Q * 1e-6) * rng.standard_normal((trials, n + 1))
     return np.diff(angle, axis=1) * rate * 3600
 
@@ -40,7 +40,7 @@ def random_walk(
 
 
 def flicker(rng: np.random.Generator, trials: int, n: int, *, B: float) -> NDArray[np.float64]:
-    """Bias instability of B [deg/h]: a spectrum B^2 / (2 pi f) made eight times too fast and averaged, four times too long."""
+    """Return bias instability of B [deg/h]: B^2 / (2 pi f), at eight times the rate, averaged."""
     out = np.empty((trials, n))
     fine = 8 * n
     f = np.fft.rfftfreq(4 * fine)

@@ -1,4 +1,4 @@
-"""Reduced records drawn from their laws: gamma powers, normal means, independent axes; and the baseline that knows them."""
+"""Block statistics drawn from their distributions in noise, and the baseline of this noise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RATE, BLOCK_S, PARTS = 100.0, 20.0, 8
 def frame(
     *, block_count: int = 180, missing: float = 0.0, rate: float = RATE, block_s: float = BLOCK_S
 ) -> dict[str, Any]:
-    """Bands, shapes and edges that all records share."""
+    """Return bands, shapes and edges common to all records."""
     half = int(block_s * rate / 2)
     edges = np.unique(np.round(np.geomspace(1, half, 15)).astype(int))
     edges[-1] += 1
@@ -42,7 +42,7 @@ def baseline(
     walk: float = 0.0,
     **options: Any,
 ) -> xr.Dataset:
-    """White noise of `noise` deg/sqrt(h) on every axis, flicker of `flicker` deg/h, a walk of `walk` deg/h^1.5."""
+    """White noise [deg/sqrt(h)], flicker [deg/h] and random walk [deg/h^1.5] on every axis."""
     f = frame(**options)
     level = 3600.0 * noise**2
     coefficient = np.zeros((len(axes), len(TERMS)))
@@ -68,13 +68,13 @@ def baseline(
 
 
 def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: Any) -> xr.Dataset:
-    """`count` records without any effect, by ``record``."""
+    """Draw `count` records without any effect, by ``record``."""
     f = frame(**options)
     axes, block_count = base.sizes["axis"], f["blocks"]
     spectrum, shape = base["spectrum"].values, np.broadcast_to(f["shape"], base["spectrum"].shape)
     power = spectrum * rng.gamma(np.broadcast_to(shape, (count, *shape.shape))) / shape
     pairs = [(a, b) for a in range(axes) for b in range(a + 1, axes)]
-    cross = [_cross(power[:, a], power[:, b], shape[a], rng) for a, b in pairs]
+    cross = [_draw_cross(power[:, a], power[:, b], shape[a], rng) for a, b in pairs]
     weight = np.full((axes, PARTS), block_count / PARTS)
     density = np.stack([np.interp(f["lines"], base["frequency"], row) for row in spectrum[:, 0]])
     lines = (
@@ -85,7 +85,7 @@ def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: A
     plane, cube = ("record", "axis", "block"), ("record", "axis", "block", "band")
     names = [str(axis) for axis in base["axis"].values]
     data: dict[str, Any] = {
-        "mean": (plane, _means(base, count, rng, f)),
+        "mean": (plane, _draw_means(base, count, rng, f)),
         "samples": (("axis", "block"), np.full((axes, block_count), f["samples"])),
         "power": (cube, power),
         "shape": (("axis", "block", "band"), shape),
@@ -123,13 +123,13 @@ def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: A
 def chunks(
     base: xr.Dataset, count: int, rng: np.random.Generator, *, size: int = 25, **options: Any
 ):
-    """Null records, `size` at a time."""
+    """Yield null records, `size` at a time."""
     for _ in range(count // size):
         yield records(base, size, rng, **options)
 
 
 def smallest_p(blocks: xr.Dataset, base: xr.Dataset, null: NullScores) -> np.ndarray:
-    """The chance that a null record has a score as large as the largest of a record over all views; one for each record."""
+    """Return by record the smallest p-value over all statistics."""
     p = []
     for name, statistic in null.statistics.items():
         scores = STATISTICS[name](blocks, base)
@@ -139,16 +139,18 @@ def smallest_p(blocks: xr.Dataset, base: xr.Dataset, null: NullScores) -> np.nda
     return np.asarray(np.min(p, axis=0))
 
 
-def _cross(
+def _draw_cross(
     first: np.ndarray, second: np.ndarray, shape: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Cross-periodogram of independent axes, given their powers: the coherency squared is Beta(1, n - 1)."""
+    """Draw cross-periodograms of independent axes: squared coherency is Beta(1, n - 1)."""
     squared = rng.beta(1.0, np.maximum(shape - 1.0, 1e-9), first.shape)
     return np.sqrt(first * second * squared) * np.exp(2j * np.pi * rng.random(first.shape))
 
 
-def _means(base: xr.Dataset, count: int, rng: np.random.Generator, f: dict[str, Any]) -> np.ndarray:
-    """White noise, a random walk, and flicker noise as the sum of relaxing processes over six octaves of four."""
+def _draw_means(
+    base: xr.Dataset, count: int, rng: np.random.Generator, f: dict[str, Any]
+) -> np.ndarray:
+    """Draw white noise, a random walk, and flicker from relaxing processes over many octaves."""
     axes, block_count = base.sizes["axis"], f["blocks"]
     mean = rng.normal(size=(count, axes, block_count)) * np.sqrt(base["mean_variance"].values)
     walk, flicker = (float(base["coefficient"].sel(term=term)[0]) for term in ("K", "B"))

@@ -176,7 +176,7 @@ def test_given_quiet_time_is_used_and_checked():
     ]
     with pytest.raises(
         OptionError,
-        match=r"quiet holds 0 whole blocks of 20 s, 0 samples; .* name 40 s or more within the 3600 s",
+        match=r"quiet holds 0 whole blocks of 20 s, 0 samples; .* 40 s or more within the 3600 s",
     ):
         calibrate_noise(blocks, quiet=(0.0, 15.0))
     with pytest.raises(OptionError, match="'soon' is not a date and time"):

@@ -1,4 +1,4 @@
-"""A recording against a model with lines: what the model knows is no line, and what is beyond it is one."""
+"""A recording against a model with lines: only power beyond the model is a line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filters of the logger in models: what is named simulates as it was, and a model with a filter expects it."""
+"""Logger filters in models: expected in a recording, and simulated as identified."""
 
 from __future__ import annotations
 

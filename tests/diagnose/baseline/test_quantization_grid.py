@@ -1,4 +1,4 @@
-"""A lattice of rounded rates is told from one of angle steps."""
+"""Quantization grids of rounded rates and of rounded angles are distinguished."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SCATTER = 0.003 * 60.0 * np.sqrt(10.0)  # of a sample at 10 Hz [deg/h]
 
 
-def on_lattice(
+def quantized_record(
     kind: str, steps: float, *, mean: float = 3.0, seed: int = 1, size: int = 18_000
 ) -> xr.Dataset:
-    """White noise on two axes that stands on a lattice of so many scatters of its samples."""
+    """White noise on two axes on a quantization grid, whose step is in scatters of a sample."""
     rng = np.random.default_rng(seed)
     rates = mean * np.array([[1.0], [-2.3]]) + SCATTER * rng.standard_normal((2, size))
     step = steps * SCATTER
@@ -43,14 +43,14 @@ def on_lattice(
 @pytest.mark.parametrize("mean", [3.0, 0.05])
 def test_rounded_rates_and_angles_are_distinguished(steps: float, mean: float) -> None:
     for kind, expected in (("rate", True), ("angle", False)):
-        blocks = on_lattice(kind, steps, mean=mean)
+        blocks = quantized_record(kind, steps, mean=mean)
         np.testing.assert_allclose(blocks["lattice"], steps * SCATTER, rtol=1e-6)
         assert (rounded_rates(blocks, calibrate_noise(blocks)) == expected).all(), kind
 
 
 @pytest.mark.parametrize("kind", ["rate", "angle"])
 def test_fine_steps_are_undecided(kind: str) -> None:
-    blocks = on_lattice(kind, 0.3)
+    blocks = quantized_record(kind, 0.3)
     assert (blocks["lattice"] > 0).all()
     assert not rounded_rates(blocks, calibrate_noise(blocks)).any()
 
@@ -61,7 +61,7 @@ def test_a_filtered_angle_counter_is_not_a_rounded_rate() -> None:
     step = 0.85 * SCATTER
     smooth = (
         0.8 * rates[:, 1:] + 0.2 * rates[:, :-1]
-    )  # takes more from the highest frequencies than the steps add
+    )  # removes more at the highest frequencies than the steps add
     counted = np.diff(np.floor(np.cumsum(smooth, axis=1) / step), axis=1, prepend=0.0) * step
     blocks = reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
     assert (blocks["lattice"] > 0).all()
@@ -69,7 +69,7 @@ def test_a_filtered_angle_counter_is_not_a_rounded_rate() -> None:
 
 
 def test_axes_together_decide_what_one_axis_cannot() -> None:
-    blocks = on_lattice("rate", 0.7)
+    blocks = quantized_record("rate", 0.7)
     baseline = calibrate_noise(blocks)
     alone = [
         rounded_rates(blocks.isel(axis=[number]), baseline.isel(axis=[number]))
@@ -80,7 +80,7 @@ def test_axes_together_decide_what_one_axis_cannot() -> None:
 
 
 def test_without_a_grid_no_rate_is_rounded() -> None:
-    blocks = on_lattice("rate", 2.0)
+    blocks = quantized_record("rate", 2.0)
     plain = blocks.assign(lattice=blocks["lattice"] * 0.0)
     assert not rounded_rates(plain, calibrate_noise(blocks)).any()
 
@@ -88,7 +88,7 @@ def test_without_a_grid_no_rate_is_rounded() -> None:
 def test_the_decision_does_not_depend_on_the_model() -> None:
     model = {"noise": {"N": 0.003, "Q": 0.1}, "log": {"axes": ["x", "y"]}}
     for kind, expected in (("rate", True), ("angle", False)):
-        blocks = on_lattice(kind, 2.0)
+        blocks = quantized_record(kind, 2.0)
         assert (rounded_rates(blocks, baseline_from_model(blocks, model)) == expected).all()
 
 
@@ -105,7 +105,7 @@ def test_angle_share_is_that_of_simulated_counters(mean: float, scatter: float) 
 
 @pytest.mark.parametrize(("kind", "names"), [("rate", ["rate_quantization"]), ("angle", [])])
 def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
-    blocks = on_lattice(kind, 2.0, size=9_000)
+    blocks = quantized_record(kind, 2.0, size=9_000)
     baseline, records = nulls(blocks, 40)
     found = name_effects(blocks, baseline, records)
     assert [identification.effect for identification in found.identified] == names
@@ -120,7 +120,7 @@ def cut_record(
     zone: float = 0.0,
     size: int = 24_000,
 ) -> xr.Dataset:
-    """White noise on two axes whose samples stand on a lattice, in scatters of a sample; on x a zone in which it sticks before that."""
+    """White noise of two axes on a quantization grid [scatters]; x has a dead zone before it."""
     rates = np.array(mean)[:, None] + np.random.default_rng(3).standard_normal((2, size))
     rates[0] = np.where(np.abs(rates[0]) < zone * step, 0.0, rates[0])
     return reduce_log(
@@ -165,7 +165,7 @@ def test_truncation_and_dead_zone_are_distinguished(how, zone: float, names: lis
 
 
 def test_both_names_are_given_if_the_bins_do_not_decide() -> None:
-    """Three standard deviations away a cell holds three of 15 000 samples: nothing tells whether that of zero is twice as wide."""
+    """Three deviations from 0, a bin has three of 15 000 samples: its width is unknown."""
     blocks = cut_record(np.rint, step=0.04, mean=(-3.0, 2.8), zone=0.0, size=15_000)
     assert possibly_truncated_axes(blocks).all()
     assert not truncated_axes(blocks).any()

@@ -1,4 +1,4 @@
-"""Short quiet stretches, and quiet stretches together with a simulation."""
+"""Short quiescent intervals, alone and together with a simulation."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_the_error_of_a_short_calibration_covers_the_truth():
 
 
 def test_quiet_time_scales_the_noise_of_a_model():
-    """Noise of the model 20 % too low: one factor brings it to that of the recording, effects keep their size."""
+    """The noise of the model is 20 % too low: one factor corrects it, effects keep their size."""
     recording = log(effects=[SHAKE_NOISE], environment=[SHAKEN])
     blocks = reduce_log(recording)
     model = {"noise": {name: 0.8 * size for name, size in NOISE.items()}, "effect": [SHAKE_NOISE]}
@@ -79,7 +79,7 @@ def test_quiet_time_scales_the_noise_of_a_model():
 
 
 def test_quiet_time_calibrates_with_an_active_effect():
-    """Vibration all the time: its noise is the model's, and is not taken for a higher level."""
+    """Constant vibration: its noise is in the model and does not raise the noise level."""
     shaken = {"profile": "vibration", "points": [[0, 6.0], [3600, 6.0]]}
     blocks = reduce_log(log(effects=[SHAKE_NOISE], environment=[shaken]))
     model = {"noise": {name: 0.8 * size for name, size in NOISE.items()}, "effect": [SHAKE_NOISE]}

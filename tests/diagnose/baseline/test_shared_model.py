@@ -1,4 +1,4 @@
-"""A recording against a model whose axes share an effect: expected cross-spectra, null records, and the whole way."""
+"""A recording against a model with an effect common to axes: spectra, null records, diagnosis."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def log_of(seed: int, *sizes: float, minutes: int = 30) -> xr.Dataset:
 
 
 def lossy(log: xr.Dataset, share: float) -> xr.Dataset:
-    """The log with random samples lost, others on every axis."""
+    """Lose random samples of the log, others on every axis."""
     gone = np.random.default_rng(5).random(log["rate"].shape) < share
     return log.assign(
         rate=log["rate"]

@@ -1,4 +1,4 @@
-"""Steps of the rate within a block: the power that they have there is theirs, and what is loud elsewhere is not."""
+"""Steps of the rate within a block explain its power, but not that of other blocks."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ JUMP = {
 }  # 50 standard deviations of a block's mean; blocks begin at 800 s and 820 s
 
 
-def _log(effects, seed):
+def _make_log(effects, seed):
     model = {"noise": NOISE, "effect": effects, "log": {"axes": ["x"]}}
     return simulate(model, duration="30min", rate=10.0, seed=seed).compute()
 
 
-def _diagnosed(log, effects=()):
+def _diagnose_log(log, effects=()):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return gyrostab.diagnose(
@@ -40,11 +40,11 @@ def _diagnosed(log, effects=()):
 
 @pytest.fixture(scope="module")
 def jumped():
-    return _log([JUMP], 2)
+    return _make_log([JUMP], 2)
 
 
 def test_a_jump_within_a_block_explains_its_power(jumped):
-    found = _diagnosed(jumped)
+    found = _diagnose_log(jumped)
     assert found.verdict == "explained"
     assert [effect["name"] for effect in found.effects] == ["bias_jump"]
     assert {"davar", "spectrum", "mean"} <= {
@@ -59,7 +59,7 @@ def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
     seconds = np.arange(jumped.sizes["time"]) / 10.0
     rate = jumped["rate"].transpose("axis", "time").values.copy()
     rate[:, (seconds >= 1200) & (seconds < 1300)] *= 1.4
-    found = _diagnosed(jumped.assign(rate=(("axis", "time"), rate, jumped["rate"].attrs)))
+    found = _diagnose_log(jumped.assign(rate=(("axis", "time"), rate, jumped["rate"].attrs)))
     left = [region for region in found.content["mismatches"] if not region["explained_by"]]
     assert found.verdict == "partly explained"
     start = np.datetime64(found.content["recording"]["start"].removesuffix("Z"))
@@ -75,13 +75,13 @@ def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
 
 def test_a_telegraph_leaves_no_line_against_its_own_model():
     hops = {"name": "telegraph", "step": [1.0], "low": 200.0, "high": 200.0}
-    found = _diagnosed(_log([hops], 7), [hops])
+    found = _diagnose_log(_make_log([hops], 7), [hops])
     assert (found.verdict, found.content["mismatches"]) == ("no mismatch", [])
     assert {one["name"] for one in found.content["baseline"]["expected"]} == {"telegraph"}
 
 
 def test_a_part_of_moving_blocks_has_no_lines(jumped):
-    """The core reads the log again for its lines; what is loud in blocks that are left out does not matter then."""
+    """The log is read again for its lines, without the blocks that are left out."""
     task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage)
     blocks = reduce_log(jumped)
     baseline = calibrate_noise(blocks)

@@ -1,4 +1,4 @@
-"""A bias that hops between two levels within blocks: its course in pieces of blocks, what is none, and what a diagnosis makes of it."""
+"""A bias that switches within blocks: its course in sub-blocks, look-alikes, and its diagnosis."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ WALKS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0])
 def course_of(
     rng: np.random.Generator, low: float, high: float, seconds: float, rate: float
 ) -> np.ndarray:
-    """Mean level of each sample, by the times of the hops alone."""
+    """Return the mean level of each sample, for given times of the switches."""
     level, at, area = int(rng.integers(2)), [0.0], [0.0]
     while at[-1] < seconds:
         stay = rng.exponential((low, high)[level])
@@ -32,7 +32,7 @@ def course_of(
 
 
 def frame(pieces: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
-    """Means over pieces (block, piece) as a reduced record of one axis, and a baseline of white noise with any random walk."""
+    """Return sub-block means (block, sub-block), and a baseline with any random walk."""
     begin = np.arange(BLOCKS) * STEP
     data = xr.Dataset(
         {
@@ -83,7 +83,7 @@ def test_finds_switching_within_blocks_and_its_parameters(
 
 
 def test_noise_with_the_same_spectrum_does_not_switch() -> None:
-    """Gauss-Markov noise of the variance and correlation time of the biases above, and noise that is louder than expected."""
+    """Gauss-Markov noise with the variance and correlation time of a telegraph, and high noise."""
     rng = np.random.default_rng(2)
     for time, size in [
         (2.0, 1.0),
@@ -122,7 +122,7 @@ def test_three_levels_in_turn_are_not_two_levels() -> None:
 
 @pytest.mark.parametrize("dwell", [2.0, 4.0, 10.0])
 def test_three_random_levels_are_not_two_levels(dwell: float) -> None:
-    """Two levels follow it too, hopping fast; but pieces in a row are then as long on the upper one."""
+    """Fast two-level switching fits it too, but with equal shares in consecutive sub-blocks."""
     rng, fine = np.random.default_rng(1), 20
     course = np.empty(BLOCKS * PIECES * fine)
     at, level = 0, 1
@@ -145,7 +145,7 @@ def test_switching_powers_match_those_of_the_samples() -> None:
     np.testing.assert_allclose(told[:, slow].mean(axis=0), seen[:, slow].mean(axis=0), rtol=0.05)
     np.testing.assert_allclose(
         told.mean(axis=0), seen.mean(axis=0), rtol=0.25
-    )  # the number of hops is one of chance
+    )  # the number of switches is random
     assert np.corrcoef(np.log(told[:, 1] + 1e-3), np.log(seen[:, 1] + 1e-3))[0, 1] > 0.99
 
 

@@ -1,4 +1,4 @@
-"""Held-out gains against marginal likelihoods by dense linear algebra."""
+"""Held-out evidence against marginal likelihoods by dense linear algebra."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def power_case(
 
 
 def density(y: np.ndarray, V: np.ndarray, constant: bool) -> float:
-    """Log density of y, up to a number that depends on its size only, with a free constant when asked for."""
+    """Return the log density of y, up to a number that depends only on its size."""
     if not y.size:
         return 0.0
     one, inverse = np.ones(y.size), np.linalg.inv(V)
@@ -118,7 +118,7 @@ def density(y: np.ndarray, V: np.ndarray, constant: bool) -> float:
 
 
 def dense_mean(data, baseline, design, given, subset, weights) -> float:
-    """Log evidence of one record: the factors' variance is added to the covariance."""
+    """Return the log evidence of one record, with the factors' variance in the covariance."""
     n = data.sizes["block"]
     y = (data["mean"] - baseline["known_mean"]).values[0, 0]
     present = np.isfinite(y)
@@ -132,7 +132,7 @@ def dense_mean(data, baseline, design, given, subset, weights) -> float:
     )
 
     def left(x, others):
-        """Square of x in white noise beside others with a wide prior."""
+        """Return the square of x in white noise, given other columns with a wide prior."""
         W = np.diag(1.0 / D[present])
         u = np.ones((present.sum(), 1))
         W = W - W @ u @ u.T @ W / (u.T @ W @ u)
@@ -345,7 +345,7 @@ def test_evidence_of_many_records_takes_seconds():
 
 
 def test_a_falling_spectrum_is_not_negative_quantization_noise():
-    """A mean of two neighbours takes ``4 a (1 - a) sin^2(pi f / fs)`` off, the form of Q: but the square of Q ends at zero."""
+    """A mean of two neighbours removes ``4 a (1 - a) sin^2(pi f / fs)``, like a negative Q^2."""
     raw = np.random.default_rng(12).standard_normal((1, 20_001))
     blocks = reduce_log(make_log(0.9 * raw[:, 1:] + 0.1 * raw[:, :-1], rate=10.0, unit="deg/h"))
     baseline = calibrate_noise(blocks)

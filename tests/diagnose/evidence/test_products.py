@@ -1,4 +1,4 @@
-"""Products of whitened columns: those that no design asks for are left out, and change nothing."""
+"""Products of whitened columns: those of unrelated columns may be left out."""
 
 from __future__ import annotations
 

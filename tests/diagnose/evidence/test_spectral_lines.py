@@ -1,4 +1,4 @@
-"""Lines: found where they stand out on both sides and all the time, each a claim of its own, by the plainest name."""
+"""Lines: steady, above both sides, each a separate identification with the simplest name."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def spectra(density: np.ndarray, *, records: int = 20, seed: int = 1) -> np.ndarray:
-    """Mean periodograms of noise with a density (part or 1, line), (record, 1, part, line)."""
+    """Return mean periodograms with a density (part or 1, line), as (record, 1, part, line)."""
     shape = (records, 1, 8, density.shape[-1])
     return np.random.default_rng(seed).gamma(22.0, 1.0 / 22.0, shape) * density
 
@@ -60,7 +60,7 @@ def test_a_steady_line_is_found_under_a_changing_noise_level() -> None:
 def sines(
     amplitudes: dict[float, float], *, wander: float = 0.0, size: int = 18_000, axes: int = 2
 ) -> xr.Dataset:
-    """White noise of 0.57 deg/h with sines on the first axis, the phase of which wanders by so many radians."""
+    """White noise of 0.57 deg/h with sines of wandering phase [rad] on the first axis."""
     rng = np.random.default_rng(2)
     t = np.arange(size) / 10.0
     rates = 0.57 * rng.standard_normal((axes, size))
@@ -101,7 +101,7 @@ def test_each_line_is_a_separate_identification(lines: tuple[Identification, ...
     assert all(
         {"real_motion", "supply_bias", "feedback_reset"} <= set(identification.alternatives)
         for identification in lines
-    )  # three may be a comb
+    )  # three lines may be a comb
 
 
 def test_a_line_does_not_change_the_evidence_of_means() -> None:
@@ -122,8 +122,8 @@ def test_a_line_does_not_change_the_evidence_of_means() -> None:
     assert not reusable_mean_evidence(found, state, lost)
 
 
-# ------------------------------------------------------------------------------------------------------------
-# bookkeeping
+# --------------------------------------------------------------------------------
+# merging of identifications
 
 
 def component(effect: str, statistic: str, evidence_nats: float, place: int = -1) -> Component:
@@ -203,7 +203,7 @@ def test_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
 
 @pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])
 def test_a_filter_is_undone_at_its_estimated_size(weight: float) -> None:
-    """Weights of 1 - a and a take 4 a (1 - a) of what a mean of two takes; a line stays in, and no slope is left that looks like one."""
+    """Weights of 1 - a and a remove 4 a (1 - a) of what a mean of two removes; a line remains."""
     rng = np.random.default_rng(8)
     raw = rng.standard_normal(60_001) + 0.15 * np.sin(2.0 * np.pi * 4.0 * np.arange(60_001) / 10.0)
     record = reduce_log(

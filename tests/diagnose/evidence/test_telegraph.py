@@ -1,4 +1,4 @@
-"""A bias that hops between two levels in the block means: what it gains, what else gains nothing, and what a diagnosis makes of it."""
+"""A bias that switches between two levels in the block means: evidence, look-alikes, diagnosis."""
 
 from collections.abc import Sequence
 
@@ -32,7 +32,7 @@ WALKS, FLICKERS = np.array([0.0, 0.1, 0.3, 1.0, 3.0, 10.0]), np.array([0.0, 0.05
 
 
 def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
-    """Records (record, block) as reduced data of one axis, and a baseline in which K and B are free."""
+    """Return means (record, block) as block statistics of one axis, and a baseline of free K, B."""
     begin = np.arange(mean.shape[1]) * STEP
     data = xr.Dataset(
         {
@@ -58,10 +58,10 @@ def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
     return data, baseline
 
 
-def hops(
+def telegraph_share(
     rng: np.random.Generator, low: float, high: float, block_count: int = BLOCKS
 ) -> np.ndarray:
-    """Share of each block on the upper level; times in seconds."""
+    """Return the share of each block on the upper level; times in seconds."""
     fine, t, level = np.zeros(block_count * 20), 0.0, int(rng.integers(2))
     while t < fine.size:
         stay = rng.exponential((low, high)[level])
@@ -76,7 +76,7 @@ def white(rng: np.random.Generator, records: int) -> np.ndarray:
 
 def test_finds_switches_and_their_parameters() -> None:
     rng = np.random.default_rng(1)
-    course = np.stack([hops(rng, 120.0, 240.0) for _ in range(20)])
+    course = np.stack([telegraph_share(rng, 120.0, 240.0) for _ in range(20)])
     evidence_nats, found = telegraph_evidence(*frame(0.6 * course + white(rng, 20)), axis="x")
     assert np.median(evidence_nats) > 20.0
     assert (evidence_nats > 5.0).mean() >= 0.9
@@ -91,7 +91,7 @@ def test_finds_switches_and_their_parameters() -> None:
 def test_finds_switches_in_a_random_walk() -> None:
     rng = np.random.default_rng(2)
     walk = np.cumsum(0.07 * rng.standard_normal((20, BLOCKS)), axis=1)
-    course = np.stack([hops(rng, 150.0, 150.0) for _ in range(20)])
+    course = np.stack([telegraph_share(rng, 150.0, 150.0) for _ in range(20)])
     evidence_nats, found = telegraph_evidence(
         *frame(1.5 * course + walk + white(rng, 20)), axis="x"
     )
@@ -100,7 +100,7 @@ def test_finds_switches_in_a_random_walk() -> None:
 
 
 def test_evidence_is_a_lower_bound_of_a_bayes_factor() -> None:
-    """Over records of the noise that the baseline allows, the mean Bayes factor is one."""
+    """Over records of the baseline's noise, the mean Bayes factor is one."""
     rng = np.random.default_rng(3)
     K = rng.choice(WALKS, 300) * np.sqrt(STEP / 3600.0)
     mean = white(rng, 300) + np.cumsum(K[:, None] * rng.standard_normal((300, BLOCKS)), axis=1)
@@ -136,7 +136,7 @@ def test_one_jump_and_its_return_are_not_two_levels() -> None:
 
 def test_given_columns_are_not_found_again_and_blocks_may_be_missing() -> None:
     rng = np.random.default_rng(6)
-    course = hops(rng, 150.0, 150.0)
+    course = telegraph_share(rng, 150.0, 150.0)
     ramp = np.linspace(0.0, 20.0, BLOCKS)
     data, baseline = frame((0.8 * course + ramp)[None] + white(rng, 1))
     data["mean"][:, :, 20:35] = np.nan
@@ -149,7 +149,7 @@ def test_given_columns_are_not_found_again_and_blocks_may_be_missing() -> None:
 
 def test_the_sign_of_the_bias_does_not_matter() -> None:
     rng = np.random.default_rng(7)
-    values = (hops(rng, 100.0, 300.0) + white(rng, 1)[0])[:, None]
+    values = (telegraph_share(rng, 100.0, 300.0) + white(rng, 1)[0])[:, None]
     variance, all_there, constant = (
         np.full(BLOCKS, WHITE),
         np.ones(BLOCKS, bool),
@@ -181,7 +181,7 @@ def state_of(mean: np.ndarray) -> State:
 
 def test_a_telegraph_of_three_levels_is_not_physical() -> None:
     rng = np.random.default_rng(8)
-    first, second = hops(rng, 150.0, 150.0), hops(rng, 200.0, 200.0)
+    first, second = telegraph_share(rng, 150.0, 150.0), telegraph_share(rng, 200.0, 200.0)
     two = state_of(first + white(rng, 1)[0])
     assert is_physical([component(two, first)], two)
     more = state_of(first + 0.8 * second + white(rng, 1)[0])
@@ -190,12 +190,12 @@ def test_a_telegraph_of_three_levels_is_not_physical() -> None:
 
 def test_sizes_match_those_of_the_course() -> None:
     rng = np.random.default_rng(9)
-    course = hops(rng, 100.0, 200.0)
+    course = telegraph_share(rng, 100.0, 200.0)
     state = state_of(0.5 * course + white(rng, 1)[0])
     sizes = estimate_telegraph([component(state, course)], ("x",), state)
     value, error = sizes["step"]
     assert abs(value - 0.5) < 4.0 * error
-    assert 0.015 < error < 0.06  # twice the noise of a mean over the root of the blocks
+    assert 0.015 < error < 0.06  # twice the error of a mean over all blocks
     assert sizes["low"] == (100.0, pytest.approx(100.0 / 3.0))
     assert sizes["high"] == (200.0, pytest.approx(200.0 / 3.0))
 
@@ -229,7 +229,7 @@ FOLLOWS, HOPS_FIRST = (
     [
         ("the same", 20.0, "x", FOLLOWS),  # a channel that switches, one block early
         ("another", 20.0, "x", HOPS_FIRST),
-        ("another", 60.0, "x", FOLLOWS),  # what brings more comes first
+        ("another", 60.0, "x", FOLLOWS),  # more evidence comes first
         ("the same", 60.0, "y", HOPS_FIRST),
     ],
 )
@@ -237,7 +237,7 @@ def test_an_effect_of_a_switching_channel_comes_first(
     kind: str, evidence_nats: float, axis: str, expected: list[str]
 ) -> None:
     rng = np.random.default_rng(10)
-    course = hops(rng, 120.0, 180.0)
+    course = telegraph_share(rng, 120.0, 180.0)
     state = state_of(0.6 * course + white(rng, 1)[0])
     channel = np.roll(course, 1) if kind == "the same" else np.sin(np.arange(BLOCKS) / 9.0)
     components = {
@@ -252,7 +252,7 @@ def test_an_effect_of_a_switching_channel_comes_first(
     ]
 
 
-REAL, HOP = 41, -1  # blocks: a jump of another size than the hops; and the last hop
+REAL, HOP = 41, -1  # blocks: a jump of another size than the switches; and the last switch
 
 
 @pytest.mark.parametrize(
@@ -263,9 +263,9 @@ REAL, HOP = 41, -1  # blocks: a jump of another size than the hops; and the last
 def test_switches_are_not_also_jumps(
     size: float, places: tuple[int, ...], kept: tuple[int, ...]
 ) -> None:
-    """The first hop and the last one were taken for jumps before the hops were named; a jump that is four times as large is one."""
+    """First and last switch were named as jumps; a jump four times as large is a jump."""
     rng = np.random.default_rng(12)
-    course = hops(rng, 150.0, 200.0)
+    course = telegraph_share(rng, 150.0, 200.0)
     moves = np.flatnonzero(np.abs(np.diff(course)) > 0.5) + 1
     start = state_of(0.7 * course + size * (np.arange(BLOCKS) >= REAL) + white(rng, 1)[0])
     candidate = component(start, course).candidate
@@ -315,7 +315,7 @@ def test_switches_are_not_also_jumps(
 
 
 def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Identifications:
-    """What a bias that switches between two levels, for so many blocks each, is named, beside a supply that does so with a scatter [V]."""
+    """Diagnose a telegraph with these mean times [blocks] and a supply that switches like it."""
     course = np.repeat(np.arange(len(stays)) % 2, stays).astype(float)
     rng = np.random.default_rng(seed)
     supply, noise = (
@@ -333,14 +333,14 @@ def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) ->
 
 
 def test_search_withdraws_jumps_that_are_switches(one_thread) -> None:
-    """The supply that scatters holds the hops back; so the last of them is a jump first, and the search ends without it."""
+    """A noisy supply delays the switches; their last jump is named first, then withdrawn."""
     identifications = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
     assert [identification.effect for identification in identifications.identified] == ["telegraph"]
     assert identifications.verdict == "explained"
 
 
 def test_search_names_a_switching_channel_before_a_telegraph(one_thread) -> None:
-    """Two levels bring more than a supply that is known with a scatter, and still it is the cause."""
+    """Two levels have more evidence than a noisy supply, but the supply is the cause."""
     identifications = switched([45, 14, 3, 12, 3, 10, 3, 5], 1, step=0.6, scatter=0.3)
     assert [identification.effect for identification in identifications.identified] == [
         "supply_bias"
@@ -370,7 +370,7 @@ def test_diagnosis_names_the_telegraph_with_its_parameters(found) -> None:
 def test_switching_is_in_the_model_but_not_in_its_noise(found) -> None:
     effect = next(one for one in found.model["effect"] if one["name"] == "telegraph")
     assert float(np.atleast_1d(effect["step"])[0]) == pytest.approx(0.4, rel=0.15)
-    assert found.model["noise"]["y"]["K"] < 0.3  # with the hops for noise it is above 1
+    assert found.model["noise"]["y"]["K"] < 0.3  # above 1 if the switches count as noise
     again = (
         simulate(found.model, duration="30min", rate=5.0, seed=12)["rate"]
         .coarsen(time=100)

@@ -47,7 +47,7 @@ def joined(records: list[xr.Dataset]) -> xr.Dataset:
 
 @functools.cache
 def both(lost: float) -> tuple[xr.Dataset, xr.Dataset]:
-    """Raw records, and null records with the same noise, known exactly."""
+    """Raw records, and null records with the same, exactly known noise."""
     records = [raw(seed, lost, axes="xy") for seed in range(RECORDS)]
     baseline = baseline_from_model(records[0], {"noise": NOISE})
     nulls = joined(
@@ -64,7 +64,7 @@ def both(lost: float) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def close(one: xr.DataArray, other: xr.DataArray, *, rel: float) -> None:
-    """Means and standard deviations agree within `rel` of the standard deviation."""
+    """Check that means and standard deviations agree within `rel` standard deviations."""
     scale = float(other.std())
     assert abs(float(one.mean() - other.mean())) < rel * scale
     assert float(one.std()) == pytest.approx(scale, rel=rel)
@@ -178,9 +178,7 @@ def test_blocks_with_few_samples_may_have_repeats():
     lost = np.zeros(log.sizes["time"], bool)
     for first in range(9000, 27_000, 200):  # four fifths of every block
         lost[first : first + 160] = True
-    values = (
-        np.round((log["rate"] + 2.0) / 0.2) * 0.2
-    )  # no zero in these blocks, where the mean is not known
+    values = np.round((log["rate"] + 2.0) / 0.2) * 0.2  # no zero in these blocks without a mean
     log["rate"] = values.where(~xr.DataArray(lost, dims="time")).assign_attrs(log["rate"].attrs)
     record = reduce_log(log)
     sparse = np.isnan(record["neighbours"].values[0]) & (record["samples"].values[0] > 0)
@@ -264,7 +262,7 @@ def candidates(record: xr.Dataset) -> tuple[dict, dict]:
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
 def test_largest_evidence_of_raw_logs_matches_null_records(lost):
-    """The whole way: the rank of each raw record among null records of its own calibration is uniform."""
+    """The rank of raw records among null records of their separate calibrations is uniform."""
     count, records = 29, 16
     ranks = {"mean": [], "power": []}
     for seed in range(records):

@@ -1,4 +1,4 @@
-"""What effects predict for reduced records, against logs that the simulator makes."""
+"""Predictions of effects for block statistics, against simulated logs."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_earth_rate_is_in_quadrature_between_the_cross_axes(rich):
     x, y, z = seen.values[:, good]
     assert (
         np.median(np.abs(y / x - pattern[1] / pattern[0])) < 0.01
-    )  # but for blocks with a broken number of turns
+    )  # except in blocks with a fractional number of turns
     assert np.abs(z).max() < 0.02 * np.abs(x).min()
 
 
@@ -183,9 +183,7 @@ def test_densities_of_the_noise_terms(plain):
 
 def test_gaps_mix_a_density_with_its_mean(plain):
     density = np.linspace(1.0, 2.0, plain.sizes["band"])
-    half = plain.assign(
-        neighbours=plain["neighbours"] * 0.25
-    )  # a quarter of what a block without gaps has
+    half = plain.assign(neighbours=plain["neighbours"] * 0.25)  # a quarter of that without gaps
     mixed = spread_by_gaps(density, half)
     assert np.ptp(mixed[0, 0]) == pytest.approx(0.25)
     np.testing.assert_allclose(
@@ -211,7 +209,7 @@ def test_hat_functions_add_to_one():
     )
 
 
-# -----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # cells
 
 

@@ -1,4 +1,4 @@
-"""Blocks of odd samples say nothing of the rest, neither alone nor in what two axes share."""
+"""Blocks with anomalous samples are left out of all statistics, of one axis and of two."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def spikes(axis: str) -> Component:
 
 
 def lost(found: xr.DataArray, before: xr.DataArray) -> set[tuple[str, int]]:
-    """Rows and blocks that are there no more; the bands of a block go together."""
+    """Return rows and blocks without data; the bands of a block are lost together."""
     gone = (found.isnull() & before.notnull()).transpose(
         ..., "block", *(["band"] if "band" in before.dims else [])
     )
@@ -75,7 +75,7 @@ def test_blocks_with_named_spikes_are_left_out_of_all_statistics(
         ("xz", 9),
         ("yz", 9),
     }
-    assert mask_anomalous_blocks(blocks, [spikes("x")]) is blocks  # it has none
+    assert mask_anomalous_blocks(blocks, [spikes("x")]) is blocks  # it has no spikes
 
 
 def test_blocks_with_spikes_are_left_out_in_the_next_search(blocks: xr.Dataset) -> None:

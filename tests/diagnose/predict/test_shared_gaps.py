@@ -1,4 +1,4 @@
-"""What axes share, seen through gaps of their own or of both."""
+"""Common noise of axes with different or common gaps."""
 
 from __future__ import annotations
 

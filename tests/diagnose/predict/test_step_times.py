@@ -1,4 +1,4 @@
-"""Jumps of the bias are looked for at all times, and first of all where power came back."""
+"""Jumps of the bias are searched at all times, most of all at restarts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def restarted():
     return blocks.assign(restart_begin=("restart", [_BACK - 7.0]), restart_end=("restart", [_BACK]))
 
 
-def _jumps(blocks):
+def _jump_candidates(blocks):
     return next(
         one
         for one in effect_candidates(blocks, COEFFICIENT)[0]
@@ -37,7 +37,7 @@ def _jumps(blocks):
 
 
 def test_a_restart_is_as_probable_as_all_other_times(restarted):
-    variants = _jumps(restarted).variants
+    variants = _jump_candidates(restarted).variants
     weight = np.array([one.weight for one in variants])
     known = np.array([one.values["at"] == _BACK for one in variants])
     assert known.sum() == 1
@@ -46,7 +46,7 @@ def test_a_restart_is_as_probable_as_all_other_times(restarted):
 
 
 def test_each_time_has_the_probability_of_its_interval():
-    variants = sorted(_jumps(record([])).variants, key=lambda one: one.values["at"])
+    variants = sorted(_jump_candidates(record([])).variants, key=lambda one: one.values["at"])
     at, weight = (
         np.array(several)
         for several in zip(*((one.values["at"], one.weight) for one in variants), strict=True)
@@ -76,7 +76,7 @@ def test_two_restarts_share_their_probability(restarted):
     twice = twice.assign(
         restart_begin=("restart", [900.0, _BACK]), restart_end=("restart", [905.0, _BACK + 7.0])
     )
-    variants = _jumps(twice).variants
+    variants = _jump_candidates(twice).variants
     weight = np.array([one.weight for one in variants])
     known = np.array([one.values["at"] in (905.0, _BACK + 7.0) for one in variants])
     assert known.sum() == 2
@@ -87,7 +87,7 @@ def test_a_jump_at_a_restart_needs_less_evidence(restarted):
     middle = (restarted["begin"] + restarted["end"]) / 2.0
     moved = restarted.assign(mean=restarted["mean"] + 0.08 * (middle > _BACK))
     state = initial_state(moved, calibrate_noise(moved))
-    weighed = _jumps(moved)
+    weighed = _jump_candidates(moved)
     alike = replace(weighed, variants=tuple(replace(one, weight=1.0) for one in weighed.variants))
     found = [
         compute_evidence([one], moved, state, fold_blocks(moved))[0] for one in (weighed, alike)

@@ -1,4 +1,4 @@
-"""Channels on their own stamps: laid on the grid of the gyro, or named with the reason."""
+"""Channels with their own stamps: resampled to the time grid of the gyro, or left out."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def log_of(size: int = SIZE, *, seed: int = 0) -> xr.Dataset:
 def with_channel(
     log: xr.Dataset, name: str, seconds: Any, values: Any, unit: str = "1", **attrs: Any
 ) -> xr.Dataset:
-    """Add a channel whose values are taken so many seconds after the start."""
+    """Add a channel with stamps in seconds after the start."""
     stamps = START + np.rint(np.asarray(seconds) * 1e9).astype("timedelta64[ns]")
     return log.assign_coords({f"time_{name}": stamps}).assign(
         {name: (f"time_{name}", values, {"units": unit, **attrs})}
@@ -43,7 +43,7 @@ def with_channel(
 
 @pytest.mark.parametrize("skew", [0.0, 1 / 3, -1 / 3, 0.45])
 def test_a_channel_sampled_like_the_gyro_has_the_nearest_value(skew: float):
-    """A ramp is a sawtooth: a straight line across its reset would be a phase that it never has."""
+    """Interpolation across the reset of a ramp would give a phase that never occurs."""
     seconds = (np.arange(SIZE) + skew) / RATE
     ramp = np.mod(seconds * 4.17, 1.0)
     aligned = align_channels(with_channel(log_of(), "ramp", seconds, ramp))
@@ -67,7 +67,7 @@ def test_samples_without_a_value_near_them_are_missing():
 
 
 def test_a_faster_channel_is_averaged():
-    seconds = (np.arange(4 * SIZE) - 1.5) / (4 * RATE)  # four values about each sample
+    seconds = (np.arange(4 * SIZE) - 1.5) / (4 * RATE)  # four values around each sample
     values = np.random.default_rng(1).standard_normal(seconds.size)
     aligned = align_channels(with_channel(log_of(), "accel_x", seconds, values, "g"))
     np.testing.assert_allclose(aligned.log["accel_x"].values, values.reshape(-1, 4).mean(axis=1))
@@ -103,7 +103,7 @@ def test_slow_channels_and_vibration_keep_their_stamps(name: str, period: float)
 
 @pytest.mark.parametrize("period", [0.001, 0.01, 0.03])
 def test_rotating_channels_keep_their_stamps_with_a_rotation_rate(period: float):
-    """Gravity is then a wave at the rotation, coherent with any line there; a toolface wraps and has no mean."""
+    """Gravity is a wave at the rotation, coherent with its lines; a toolface has no mean."""
     seconds = np.arange(0.0, 30.0, period)
     accel = with_channel(log_of(), "accel_x", seconds, np.sin(2 * np.pi * seconds), "g")
     turning = with_channel(
@@ -176,7 +176,7 @@ def test_a_lazy_log_gives_the_same_as_a_log_in_memory(
 
 
 def test_a_lazy_channel_is_read_chunk_by_chunk():
-    """Laying it out reads nothing; a chunk of the log then needs the values about it, and no more."""
+    """Resampling reads nothing; a chunk of the log then reads only the values around it."""
     size, read = 100_000, []
 
     def values(block_info: Any = None) -> Any:
@@ -194,12 +194,12 @@ def test_a_lazy_channel_is_read_chunk_by_chunk():
     assert min(low for low, _ in read) >= 39_000
 
 
-# ------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # the diagnosis
 
 
 def kicked(skew: float, *, size: int = 60_000) -> xr.Dataset:
-    """Ten minutes at 100 Hz with an error of 2 deg/h in the last twentieth of a ramp of 4.17 Hz, which is a channel of its own."""
+    """Ten minutes at 100 Hz, 2 deg/h in the last twentieth of a 4.17 Hz ramp with own stamps."""
     log = log_of(size)
     phase = np.mod(np.arange(size) / RATE * 4.17, 1.0)
     log["rate"] = log["rate"] + 2.0 * (phase > 0.95)
@@ -219,7 +219,7 @@ def test_a_ramp_from_another_file_is_used():
     assert "feedback_reset" not in reasons
     assert {one.statistic for one in found if one.effect == "feedback_reset"} >= {"phase_locked"}
     profile = blocks["profile"].mean("block").values[0]
-    late = 4.17 / RATE / 3.0  # turns between a sample and its value of the ramp
+    late = 4.17 / RATE / 3.0  # turns between a sample and its ramp value
     assert profile[-2:].mean() - profile[2:36].mean() == pytest.approx(
         2.0 * (1.0 - late / 0.05), abs=0.15
     )
@@ -301,7 +301,7 @@ def test_diagnosis_lists_the_channels_it_used(recwarn: pytest.WarningsRecorder):
 
 
 def test_separate_files_are_diagnosed_like_one_file(recordings: Callable[[str], Path]):
-    """The real ramp of a fibre-optic gyro, in a file of its own."""
+    """The real ramp of a fibre-optic gyro, in a separate file."""
     path, ramp = (
         recordings("fog-blueseis-ramp/FOG.mseed"),
         recordings("fog-blueseis-ramp/RAMP.mseed"),

@@ -1,4 +1,4 @@
-"""The reduction of a log to block statistics, against sums written out and against the statistics of simulated noise."""
+"""Block statistics against explicit sums and against the statistics of simulated noise."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def log_of(
 def with_gaps(
     values: np.ndarray, kind: str, rng: np.random.Generator, size: int = 400
 ) -> np.ndarray:
-    """Samples lost at random, or in one stretch of every block."""
+    """Lose samples at random, or in one interval of every block."""
     values = values.copy()
     if kind == "random":
         values[rng.random(values.shape) < 0.3] = np.nan
@@ -43,7 +43,7 @@ def with_gaps(
     return values
 
 
-# -------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # the spectrum
 
 
@@ -68,7 +68,7 @@ def test_powers_match_their_definition(seed: int, size: int, lost: float, offset
             assert np.isnan(blocks.power.values[row, number]).all()
             continue
         mean = component[row][there].mean()
-        # every ordinate is a sum c . y over the samples; the mean is in c
+        # Every Fourier coefficient is a sum c . y over the samples; c subtracts the mean.
         c = (
             angle[:, there] * weights[there]
             - (angle[:, there] @ weights[there])[:, None] / there.sum()
@@ -122,7 +122,7 @@ def test_covariance_of_bands_is_that_of_the_taper():
     scatter = np.sqrt(np.outer(np.diag(found), np.diag(found)) / block_count)
     np.fill_diagonal(found, 0.0)
     assert np.abs((found - band_covariance(size)) / scatter).max() < 4.5
-    assert np.abs(found / scatter).max() > 6.0  # there is something to see
+    assert np.abs(found / scatter).max() > 6.0  # the test can fail
 
 
 def test_full_blocks_lose_little_to_the_taper():
@@ -157,7 +157,7 @@ def test_random_gaps_mix_densities_by_the_share_of_neighbours(
     else:
         white, walk = (noise["N"] * 60.0) ** 2, (noise["K"] / 60.0) ** 2
         density += white + walk / omega**2
-        seen = fine[fine >= 0.05]  # block means are taken off
+        seen = fine[fine >= 0.05]  # block means are subtracted
         mean = white + np.sum(walk / (2 * np.pi * seen) ** 2) * (fine[1] - fine[0]) / 25.0
     share = float(blocks.neighbours.mean())
     assert share == pytest.approx(0.6, abs=0.01)
@@ -174,7 +174,7 @@ def test_a_sine_is_in_its_band_and_line():
     assert np.all(np.argmax(power, axis=1) == band)
     assert power[:, band] * width[band] * 2.0 == pytest.approx(
         2.0, rel=0.1
-    )  # a square of 2**2 / 2, less or more by the taper's shape
+    )  # power 2**2 / 2, with the error of the taper
     lines = blocks.line_power.values[0]
     assert lines.shape[0] == 8
     assert np.all(blocks.line_frequency.values[np.argmax(lines, axis=1)] == 13.0)
@@ -217,8 +217,8 @@ def test_cross_spectra_contain_common_signals(gaps: str):
     )
 
 
-# -------------------------------------------------------------------------------------------------
-# what is locked, and counts
+# --------------------------------------------------------------------------------
+# phase-locked statistics and counts
 
 
 def test_orders_are_the_amplitudes_at_the_tool_rotation():
@@ -275,7 +275,7 @@ def test_a_profile_shows_the_error_by_phase_of_the_ramp():
     assert profile == pytest.approx(np.where(blocks.phase.values > 0.75, 3.0, -1.0), abs=0.15)
 
 
-# --------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # channels and spans
 
 
@@ -306,13 +306,13 @@ def test_channels_with_any_stamps_are_averaged_over_blocks():
     centre = (blocks.begin + blocks.end).values / 2.0
     warm = blocks.channel_temperature
     assert warm.attrs["units"] == "degree_Celsius"
-    assert np.isfinite(warm.values[:-2]).all()  # the last sample of the sensor lies before the end
+    assert np.isfinite(warm.values[:-2]).all()  # the last sample of the sensor is before the end
     assert warm.values[:-2] == pytest.approx(20.0 + centre[:-2] / 30.0, abs=0.1)
     assert blocks.channel_supply_voltage.values == pytest.approx(np.where(centre < 600, 28.0, 24.0))
     assert blocks.channel_vibration.values == pytest.approx(np.sqrt(12.5))
 
 
-@pytest.mark.parametrize("own", [True, False], ids=["on stamps of its own", "with the rate"])
+@pytest.mark.parametrize("own", [True, False], ids=["with own stamps", "with the rate"])
 def test_temperatures_are_smoothed_within_blocks(own):
     rng = np.random.default_rng(4)
     log = log_of(rng.standard_normal(180_000))
@@ -335,11 +335,11 @@ def test_temperatures_are_smoothed_within_blocks(own):
     error = fine.values - true.reshape(*fine.shape, -1).mean(axis=2)
     raw = 0.1 / np.sqrt(180_000 / every / fine.size) * (1.0 if own else 10.0)
     assert error.std() < 0.6 * raw
-    assert "fine_temperature_2" not in blocks  # slower than the parts
+    assert "fine_temperature_2" not in blocks  # sampled less often than the parts
     components = true.reshape(*fine.shape, -1).mean(axis=2)
     np.testing.assert_allclose(
         blocks.fine_supply_voltage.values, components, atol=0.05
-    )  # a supply as well, but for its corners
+    )  # a supply too, except at its corners
 
 
 def test_a_channel_is_missing_in_its_long_gaps():
@@ -358,7 +358,7 @@ def test_long_gaps_and_restarts_are_listed_in_seconds():
     x[:, 10_000:10_050] = np.nan  # too short
     x[:, 20_000:20_300] = np.nan
     x[0, 30_000:32_000] = np.nan  # one axis only
-    x[:, 39_950:41_000] = np.nan  # over the edge of a block
+    x[:, 39_950:41_000] = np.nan  # across the edge of a block
     blocks = reduce_log(log_of(x), block="10s")
     assert np.stack([blocks.gap_begin, blocks.gap_end], axis=1).tolist() == [
         [200.0, 203.0],
@@ -410,8 +410,8 @@ def test_an_angle_log_gives_the_statistics_of_its_rates():
     assert other["mean"].values == pytest.approx(one["mean"].values, abs=1e-6)
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# manners
+# --------------------------------------------------------------------------------
+# options and errors
 
 
 def test_block_length_depends_on_the_record():

@@ -1,4 +1,4 @@
-"""Samples that jump out: seen from five deviations on, and not where the noise itself is loud, coarse or on the move."""
+"""Outliers: detected from five deviations, but not in nonstationary or coarse noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIZE, BLOCK, RATE = 18_000, 180, 10.0  # half an hour
 
 
 def counted(x: np.ndarray, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
-    """Peaks and outliers by block, of one axis."""
+    """Return peaks and outliers by block, of one axis."""
     values = np.ascontiguousarray(x[: x.size // block * block].reshape(-1, block))
     histogram = np.zeros((1, len(values), HISTOGRAM), np.uint32)
     number, outliers = count_outliers(histogram, [[find_peaks(values, histogram[0])]])
@@ -38,7 +38,7 @@ def spiked(rng: np.random.Generator, size: float, number: int) -> np.ndarray:
     return x
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # departures
 
 
@@ -55,7 +55,7 @@ def test_departures_are_from_the_median_of_surrounding_pairs(seed: int, lost: fl
         2: 0.2982,
         3: 0.2147,
         4: 0.1682,
-    }  # variance of the median of so many pairs of normal numbers
+    }  # variance of the median of that many pairs of normal numbers
     checked = 0
     for b, i in np.ndindex(*x.shape):
         pairs = [(x[b, i - k], x[b, i + k]) for k in range(1, 5) if i - k >= 0 and i + k < 60]
@@ -88,10 +88,10 @@ def test_departures_ignore_slopes_and_show_spikes():
     np.testing.assert_allclose(away[0], 0.0, atol=1e-9)
     np.testing.assert_array_equal(
         np.flatnonzero(np.abs(away[1]) > 20.0), [0, 50, 99]
-    )  # beside it medians are off by some steps
+    )  # next to it, medians are off by some steps
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # counts
 
 
@@ -117,8 +117,8 @@ def test_a_large_outlier_counts_three_times_anywhere_in_a_block():
 
 TIME = np.arange(SIZE) / RATE
 LIVELY = {
-    "twice as loud for a while": lambda rng: slow(rng) * np.where(TIME % 300.0 < 70.0, 2.0, 1.0),
-    "five times as loud, from within a block": lambda rng: (
+    "twice the noise for a while": lambda rng: slow(rng) * np.where(TIME % 300.0 < 70.0, 2.0, 1.0),
+    "five times the noise, from within a block": lambda rng: (
         slow(rng) * np.where(TIME % 300.0 < 77.3, 5.0, 1.0)
     ),
     "swelling within seconds": lambda rng: (

@@ -1,4 +1,4 @@
-"""What is counted in a block: samples that jump out, stand still, lie at the ends of the range or on a lattice."""
+"""Sample counts of blocks: outliers, held samples, range ends, zeros; and the quantization step."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def test_anomalous_samples_are_counted_in_their_blocks():
     y[10_200:10_220] = y[10_199]
     y[20_100:20_105] = 0.0
     y[30_000:31_000] = np.clip(y[30_000:31_000], -1.0, 50.0)
-    y[40_000:50_000] *= 30.0  # louder, and yet without outliers
+    y[40_000:50_000] *= 30.0  # noisier, but without outliers
     marked = reduce_log(log_of(y), block="10s")
     assert marked.outliers.values[0, 5] == 3
-    assert int(marked.outliers.sum()) - 3 <= 3  # the edges of the loud stretch at most
+    assert int(marked.outliers.sum()) - 3 <= 3  # at most the edges of the noisy interval
     assert marked.repeats.values[0, 10] == 20
-    assert marked.repeats.values[0, 20] == 0  # of zeros something else is told
+    assert marked.repeats.values[0, 20] == 0  # zeros are counted elsewhere
     assert marked.zeros.values[0, 20] == marked.filled.values[0, 20] == 5
     assert marked.kurtosis.values[0, 5] > 10.0
     assert marked.kurtosis.values[0, 30] < -0.3
@@ -65,7 +65,7 @@ def test_zeros_of_one_axis_are_stuck_and_common_zeros_are_filled():
 
 @pytest.mark.parametrize("axes", [1, 3])
 def test_wide_dead_zones_are_stuck_and_not_filled(axes: int):
-    """A third of the samples stick: by chance two in a row, or two axes at once."""
+    """A third of the samples stick: some coincide in time or on two axes by chance."""
     x = np.random.default_rng(11).standard_normal((axes, 60 * 1000)) + 0.1
     x[np.abs(x) < 0.43] = 0.0
     blocks = reduce_log(log_of(x), block="10s")
@@ -114,5 +114,5 @@ def test_the_quantization_step_is_found_among_spikes():
     assert quantization_step(np.concatenate([values, off])) == pytest.approx(0.1, rel=1e-9)
     half = np.where(
         np.arange(4000) < 2000, values, rng.standard_normal(4000)
-    )  # half of the values have none
+    )  # half of the values are not on a grid
     assert quantization_step(half) == 0.0

@@ -1,4 +1,4 @@
-"""Slow motion that axes share: seen where each axis takes it for its own random walk, and not where sensors wander by themselves."""
+"""Common slow motion: found below the random walk of each axis, not in independent walks."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from gyrostab.diagnose.statistics import mean
 from tests.support.reduced_records import BLOCK_S, baseline, chunks, records
 
 BLOCKS = 180
-WALK = 0.3  # deg/h^1.5: what an axis takes the waveform below for
+WALK = 0.3  # deg/h^1.5: apparent random walk of the waveform below
 TRUE = 0.02
 
 
 @pytest.fixture(scope="module")
 def base():
-    """Noise as calibrated beside the waveform."""
+    """Noise as calibrated with the waveform."""
     return baseline(walk=WALK)
 
 
@@ -38,8 +38,8 @@ def null(base):
     return null_scores(base, chunks(base, 100, np.random.default_rng(4)))
 
 
-def _waveform() -> np.ndarray:
-    """Slow rise and fall, whose steps are smaller than those of a walk of WALK."""
+def _slow_waveform() -> np.ndarray:
+    """Slow rise and fall, with steps smaller than those of a walk of WALK."""
     t = 2.0 * np.pi * np.arange(BLOCKS) / BLOCKS
     shape = sum(
         size * np.sin(turns * t + turns)
@@ -48,8 +48,8 @@ def _waveform() -> np.ndarray:
     return 0.6 * shape * WALK * np.sqrt(BLOCK_S / 3600.0 / np.square(np.diff(shape)).mean())
 
 
-def _means(noise, count: int, seed: int) -> xr.Dataset:
-    """Records of white noise and a walk, of which there is nothing but the means of the blocks."""
+def _records_of_means(noise, count: int, seed: int) -> xr.Dataset:
+    """Return records with block means of white noise and a random walk."""
     rng, walk = np.random.default_rng(seed), float(noise["coefficient"].sel(term="K")[0])
     values = rng.normal(size=(count, 3, BLOCKS)) * np.sqrt(noise["mean_variance"].values)
     values += np.cumsum(rng.normal(0.0, walk * np.sqrt(BLOCK_S / 3600.0), values.shape), axis=-1)
@@ -60,33 +60,31 @@ def _means(noise, count: int, seed: int) -> xr.Dataset:
     )
 
 
-def _quiet(count: int, seed: int) -> xr.Dataset:
-    return _means(baseline(walk=TRUE), count, seed)
+def _quiet_records(count: int, seed: int) -> xr.Dataset:
+    return _records_of_means(baseline(walk=TRUE), count, seed)
 
 
-def _with(found, shares):
+def _with_waveform(found, shares):
     return found.assign(
         mean=found["mean"]
-        + xr.DataArray(np.asarray(shares)[:, None] * _waveform(), dims=("axis", "block"))
+        + xr.DataArray(np.asarray(shares)[:, None] * _slow_waveform(), dims=("axis", "block"))
     )
 
 
-@pytest.mark.parametrize(("told", "true"), [(0.0, 0.0), (0.1, 0.1), (1.0, 0.02), (0.02, 1.0)])
+@pytest.mark.parametrize(("assumed", "true"), [(0.0, 0.0), (0.1, 0.1), (1.0, 0.02), (0.02, 1.0)])
 @pytest.mark.parametrize("missing", [0, 40])
-def test_independent_axes_have_normal_scores(told, true, missing):
-    found = _means(baseline(walk=true), 60, 3)
+def test_independent_axes_have_normal_scores(assumed, true, missing):
+    found = _records_of_means(baseline(walk=true), 60, 3)
     found["mean"][:, 1, 30 : 30 + missing] = np.nan
-    z = common.score(found, baseline(walk=told))["z"].values
-    few = z[
-        :, :-1, -1, :3
-    ]  # of each pair over the whole record, for spans that leave many averages
+    z = common.score(found, baseline(walk=assumed))["z"].values
+    few = z[:, :-1, -1, :3]  # each pair over the whole record, for spans with many averages
     assert abs(few.mean()) < 4.0 / np.sqrt(180.0)
-    assert 0.7 < few.std() < 1.2  # less where increments are taken for related that are not
+    assert 0.7 < few.std() < 1.2  # smaller if independent increments are taken as correlated
 
 
 @pytest.mark.parametrize("shares", [(1.0, 0.8, -0.9), (-0.5, 1.0, 0.7)])
 def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares):
-    found = _with(_quiet(30, 5), shares)
+    found = _with_waveform(_quiet_records(30, 5), shares)
     z = np.abs(
         np.nan_to_num(standardise(common.score(found, base), null.statistics["common_mode"]))
     )
@@ -101,7 +99,7 @@ def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares)
 )
 @settings(max_examples=15, deadline=None)
 def test_scores_do_not_depend_on_sizes_of_axes(sizes, signs):
-    noise, found = baseline(walk=WALK), _quiet(1, 9).isel(record=0)
+    noise, found = baseline(walk=WALK), _quiet_records(1, 9).isel(record=0)
     scaled = found.assign(mean=found["mean"] * xr.DataArray(np.multiply(sizes, signs), dims="axis"))
     before, after = (common.score(one, noise)["estimate"].values for one in (found, scaled))
     turned = np.array([signs[0] * signs[1], signs[0] * signs[2], signs[1] * signs[2], 1.0])[
@@ -112,12 +110,12 @@ def test_scores_do_not_depend_on_sizes_of_axes(sizes, signs):
 
 def test_score_of_all_axes_is_that_of_the_determinant():
     noise = baseline()
-    found = _means(noise, 500, 12)
+    found = _records_of_means(noise, 500, 12)
     scores = common.score(found, noise)
     assert stats.kstest(stats.norm.sf(scores["z"].values[:, -1, -1, 0]), "uniform").pvalue > 1e-3
     matrix = np.corrcoef(
         found["mean"].values[0]
-    )  # of white noise, but for the constant of the record
+    )  # of white noise, except for the constant of the record
     pairs = np.array([matrix[0, 1], matrix[0, 2], matrix[1, 2]])
     np.testing.assert_allclose(scores["estimate"].values[0, :3, -1, 0], pairs, atol=0.02)
     chi2 = -(BLOCKS - 11.0 / 6.0) * np.linalg.slogdet(matrix)[1]
@@ -128,7 +126,7 @@ def test_score_of_all_axes_is_that_of_the_determinant():
 
 def test_known_common_white_noise_is_subtracted():
     noise = baseline()
-    found = _means(noise, 40, 8)
+    found = _records_of_means(noise, 40, 8)
     rng, share = np.random.default_rng(2), 0.4
     sigma = np.sqrt(noise["mean_variance"].values[0])
     one = rng.normal(size=(40, 1, BLOCKS)) * sigma * np.sqrt(share)
@@ -145,8 +143,8 @@ def test_known_common_white_noise_is_subtracted():
 
 def test_known_means_are_subtracted(base):
     shares = np.array([1.0, 0.8, -0.9])
-    found = _with(_quiet(20, 5), shares)
-    known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _waveform()))
+    found = _with_waveform(_quiet_records(20, 5), shares)
+    known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _slow_waveform()))
     before, after = (
         np.abs(common.score(found, each)["z"].values[:, :3, -1, :3]).mean()
         for each in (base, known)
@@ -157,15 +155,15 @@ def test_known_means_are_subtracted(base):
 def test_one_axis_or_a_short_record_has_no_score():
     alone = baseline(axes="x")
     assert common.score(records(alone, 2, np.random.default_rng(1)), alone) is None
-    found = _means(baseline(), 2, 1)
+    found = _records_of_means(baseline(), 2, 1)
     assert common.score(found.isel(block=slice(0, 4)), baseline().isel(block=slice(0, 4))) is None
     assert common.score(found, baseline())["tau_min_s"].values.tolist() == [
         BLOCK_S * span for span in (1, 2, 4, 8, 16, 32)
     ]
 
 
-def _claim(statistic: str, axes: str):
-    variant = Variant({}, ("0",), np.broadcast_to(_waveform(), (1, 1, BLOCKS)))
+def _identification_of(statistic: str, axes: str):
+    variant = Variant({}, ("0",), np.broadcast_to(_slow_waveform(), (1, 1, BLOCKS)))
     components = tuple(
         Component(Candidate("cause", statistic, (), (variant,)), variant, (axis,), 10.0)
         for axis in axes
@@ -175,7 +173,9 @@ def _claim(statistic: str, axes: str):
 
 def test_common_motion_is_one_region_explained_by_its_effect(base, null):
     shares = np.array([1.0, 0.8, -0.9])
-    found = _with(records(baseline(walk=TRUE), 1, np.random.default_rng(5)), shares).isel(record=0)
+    found = _with_waveform(records(baseline(walk=TRUE), 1, np.random.default_rng(5)), shares).isel(
+        record=0
+    )
     regions = locate_mismatches(found, base, null)
     assert regions["view"].values.tolist() == ["cross_axis"]
     assert regions["what"].values.tolist() == ["slow"]
@@ -185,20 +185,20 @@ def test_common_motion_is_one_region_explained_by_its_effect(base, null):
         for name in regions.data_vars
         if regions[name].dtype.kind != "M"
     }
-    said = mismatch_statement(fields | {"axes": ["x", "y", "z"]}, BLOCKS * BLOCK_S)
-    assert said.startswith("Axes x, y and z drift together (correlation 0.")
-    assert "random walks of independent gyros" in said
-    known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _waveform()))
+    message = mismatch_statement(fields | {"axes": ["x", "y", "z"]}, BLOCKS * BLOCK_S)
+    assert message.startswith("Axes x, y and z drift together (correlation 0.")
+    assert "random walks of independent gyros" in message
+    known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _slow_waveform()))
 
-    def told(statistic, axes, after):
+    def explanation_of(statistic, axes, after):
         return attribute_mismatches(
-            regions, [_claim(statistic, axes)], found, after, null, level=0.005
+            regions, [_identification_of(statistic, axes)], found, after, null, level=0.005
         )[0]
 
-    assert told("mean", "xyz", known) == ["cause"]
-    assert told("mean", "xyz", base) == []  # is in the model and leaves the mismatch
-    assert told("wander", "xyz", base) == ["cause"]  # its covariance is in no model
-    assert told("wander", "x", base) == []
+    assert explanation_of("mean", "xyz", known) == ["cause"]
+    assert explanation_of("mean", "xyz", base) == []  # in the model, but leaves the mismatch
+    assert explanation_of("wander", "xyz", base) == ["cause"]  # its covariance is in no model
+    assert explanation_of("wander", "x", base) == []
 
 
 def test_common_motion_is_separate_from_common_noise_within_blocks():

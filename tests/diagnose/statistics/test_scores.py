@@ -1,4 +1,4 @@
-"""The views: scores that are normal without an effect, and limits where the closed forms put them."""
+"""Scores of the statistics: normal without an effect, with the detection limits of theory."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from gyrostab.noise import LAWS
 from tests.support.reduced_records import BLOCK_S, RATE, baseline, chunks, records
 
 LEVEL = 3600.0 * 0.003**2  # of white noise, (deg/h)^2/Hz
-EVENT = slice(83, 98)  # 15 blocks that no window of 15 has all of
+EVENT = slice(83, 98)  # 15 blocks that no window of 15 blocks matches
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +48,8 @@ def null(base):
     return null_scores(base, chunks(base, 200, np.random.default_rng(11)))
 
 
-def _dense(variance, present, walk, ou, decay):
-    """Covariance of the observations that the kernels stand for, written out."""
+def _dense_covariance(variance, present, walk, ou, decay):
+    """Return the covariance of the observations as a dense matrix."""
     p = decay.shape[1]
     since = np.concatenate([[0.0], np.cumsum(walk[:-1])])
     dense = np.minimum.outer(since, since) + np.diag(variance)
@@ -76,7 +76,7 @@ def test_boxcar_kernels_match_dense_algebra():
     )
     filter_gains(variance, present, walk, ou, decay, innovation, gain)
     remaining_information(innovation, gain, decay, remaining)
-    inverse = np.linalg.inv(_dense(variance, present, walk, ou, decay))
+    inverse = np.linalg.inv(_dense_covariance(variance, present, walk, ou, decay))
     series = rng.normal(size=(2, n))
     out = np.empty_like(series)
     precision_times(series, innovation, gain, decay, out)
@@ -130,18 +130,18 @@ def test_scores_are_normal_without_an_effect(missing, slow):
         assert 0.4 < share / (2 * stats.norm.sf(3.0)) < 2.0, name
 
 
-def _detected(scores, null, name, level=0.01):
+def _detection_share(scores, null, name, level=0.01):
     z = np.nan_to_num(np.abs(standardise(scores, null.statistics[name])))
     return float((z.max(axis=(1, 2, 3)) > null.critical(name, level)).mean())
 
 
-def _limits(make, limit, statistic, name, base, null):
-    """Share of records detected at three quarters and at five quarters of the closed form."""
+def _shares_around_limit(make, limit, statistic, name, base, null):
+    """Return the share of records detected at 3/4 and at 5/4 of the theoretical limit."""
     shares = []
     for factor in (0.75, 1.25):
         found = records(base, 60, np.random.default_rng(17))
         make(found, factor * limit)
-        shares.append(_detected(statistic.score(found, base), null, name))
+        shares.append(_detection_share(statistic.score(found, base), null, name))
     return shares
 
 
@@ -149,9 +149,11 @@ def test_detection_limit_of_raised_noise(base, null):
     def burst(found, epsilon):
         found["power"][:, 0, EVENT] *= 1.0 + epsilon
 
-    samples = 0.86 * 15 * BLOCK_S * RATE  # the taper leaves this many
+    samples = 0.86 * 15 * BLOCK_S * RATE  # effective number under the taper
     nats = null.critical("power", 0.01) ** 2 / 2.0
-    below, above = _limits(burst, 2.0 * np.sqrt(nats / samples), davar, "power", base, null)
+    below, above = _shares_around_limit(
+        burst, 2.0 * np.sqrt(nats / samples), davar, "power", base, null
+    )
     assert below < 0.5 < above
 
 
@@ -162,7 +164,7 @@ def test_detection_limit_of_a_mean_step(base, null):
     nats = null.critical("mean", 0.01) ** 2 / 2.0
     on, record = 15 * BLOCK_S, 180 * BLOCK_S
     limit = np.sqrt(LEVEL) * np.sqrt(2.0 * nats / (on * (1.0 - on / record)))
-    below, above = _limits(step, limit, mean, "mean", base, null)
+    below, above = _shares_around_limit(step, limit, mean, "mean", base, null)
     assert below < 0.5 < above
 
 
@@ -173,8 +175,8 @@ def test_detection_limit_of_shared_noise(base, null):
             found["cross"].values[:, place] += rho * np.sqrt(power[:, a] * power[:, b])
 
     nats = null.critical("cross_spectrum", 0.01) ** 2 / 2.0
-    limit = np.sqrt(2.0 * nats / (0.86 * 180 * BLOCK_S * RATE) / 3.0)  # three pairs alike
-    below, above = _limits(shared, limit, cross_axis, "cross_spectrum", base, null)
+    limit = np.sqrt(2.0 * nats / (0.86 * 180 * BLOCK_S * RATE) / 3.0)  # three equal pairs
+    below, above = _shares_around_limit(shared, limit, cross_axis, "cross_spectrum", base, null)
     assert below < 0.5 < above
 
 
@@ -190,19 +192,19 @@ def test_detection_limit_of_a_line(base, null):
     limit = 2.0 * np.sqrt(
         null.critical("spectral_line", 0.01) * LEVEL / (0.926 * BLOCK_S * np.sqrt(180))
     )
-    below, above = _limits(line, limit, spectrum, "spectral_line", base, null)
+    below, above = _shares_around_limit(line, limit, spectrum, "spectral_line", base, null)
     assert below < 0.5 < above
 
 
 def test_the_mean_shows_a_step_between_windows_that_davar_does_not(base, null):
     found = records(base, 40, np.random.default_rng(4))
     found["mean"][:, 0, 60:120] += 0.06
-    assert _detected(mean.score(found, base), null, "mean") > 0.9
+    assert _detection_share(mean.score(found, base), null, "mean") > 0.9
     scores = davar.score(found, base)
     scores["z"] = scores["z"].where(
         scores["stop"] - scores["first"] <= 15
-    )  # the record as a whole sees it at its longest tau
-    assert _detected(scores, null, "power") < 0.1
+    )  # the whole record shows it at its longest tau
+    assert _detection_share(scores, null, "power") < 0.1
 
 
 def test_a_step_raises_the_allan_variance_by_the_closed_form():

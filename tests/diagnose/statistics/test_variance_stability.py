@@ -1,4 +1,4 @@
-"""Noise that swells and sinks, and lines that move: seen from the closed forms on, and nothing else taken for them."""
+"""Variance fluctuation and drifting lines: detection limits, and absence of false alarms."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def null(base):
     return null_scores(base, chunks(base, 100, np.random.default_rng(31), **SMALL))
 
 
-def _some(base, count, seed):
+def _some_records(base, count, seed):
     return records(base, count, np.random.default_rng(seed), **SMALL)
 
 
-def _largest(statistic, found, base, null, row=slice(None)):
-    """Largest standardised score of each record."""
+def _largest_score(statistic, found, base, null, row=slice(None)):
+    """Return the largest standardised score of each record."""
     name = statistic.__name__.rsplit(".", 1)[1]
     z = np.nan_to_num(standardise(statistic.score(found, base), null.statistics[name]))
     return z[:, row].reshape(z.shape[0], -1).max(axis=1)
@@ -64,7 +64,7 @@ def test_moments_of_the_scatter_match_simulated_levels(count, seed):
 
 
 def test_scores_of_steady_noise_are_normal(base):
-    z = variance_stability.score(_some(base, 60, 3), base)["z"].values
+    z = variance_stability.score(_some_records(base, 60, 3), base)["z"].values
     z = z[np.isfinite(z)]
     assert abs(z.mean()) < 0.05
     assert z.std() == pytest.approx(1.0, abs=0.06)
@@ -72,7 +72,7 @@ def test_scores_of_steady_noise_are_normal(base):
 
 
 def test_detection_limit_of_variance_fluctuation(base, null):
-    shape = float(_some(base, 1, 1)["shape"].values[0, 0, 3:].sum())
+    shape = float(_some_records(base, 1, 1)["shape"].values[0, 0, 3:].sum())
     swell = np.sqrt(2.0) * np.sin(
         2.0 * np.pi * np.arange(BLOCKS) / 3.7
     )  # too fast for averages of more than one block
@@ -80,17 +80,19 @@ def test_detection_limit_of_variance_fluctuation(base, null):
     limit = np.sqrt(critical * np.sqrt(2.0 * (BLOCKS - 1)) / (BLOCKS * shape))
     shares = []
     for factor in (0.75, 1.3):
-        found = _some(base, 60, 17)
+        found = _some_records(base, 60, 17)
         found["power"][:, 0] *= np.exp(factor * limit * swell)[:, None]
-        shares.append((_largest(variance_stability, found, base, null, row=0) > critical).mean())
+        shares.append(
+            (_largest_score(variance_stability, found, base, null, row=0) > critical).mean()
+        )
     assert shares[0] < 0.5 < shares[1]
 
 
 def test_common_variance_fluctuation_is_detected_jointly(base, null):
-    found = _some(base, 30, 5)
+    found = _some_records(base, 30, 5)
     found["power"] *= np.exp(0.09 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 12.0))[:, None]
     together, alone = (
-        np.median(_largest(variance_stability, found, base, null, row=row))
+        np.median(_largest_score(variance_stability, found, base, null, row=row))
         for row in (3, slice(0, 3))
     )
     assert together > null.critical("variance_stability", 0.01) > alone
@@ -100,7 +102,7 @@ def test_common_variance_fluctuation_is_detected_jointly(base, null):
 @settings(max_examples=5, deadline=None)
 def test_scores_do_not_depend_on_the_noise_level(factor):
     base = baseline(**SMALL)
-    found = _some(base, 1, 8)
+    found = _some_records(base, 1, 8)
     louder = found.copy(deep=True)
     louder["power"][:, 1] *= factor
     kept = [
@@ -111,27 +113,28 @@ def test_scores_do_not_depend_on_the_noise_level(factor):
 
 
 def test_a_single_noisy_block_is_not_variance_fluctuation(base, null):
-    found = _some(base, 20, 6)
+    found = _some_records(base, 20, 6)
     found["power"][:, 0, 50] *= 30.0
     assert (
-        _largest(variance_stability, found, base, null) > null.critical("variance_stability", 0.01)
+        _largest_score(variance_stability, found, base, null)
+        > null.critical("variance_stability", 0.01)
     ).mean() <= 0.1
 
 
 def test_shared_noise_is_not_variance_fluctuation(base, null):
-    found = _some(base, 20, 7)
+    found = _some_records(base, 20, 7)
     found["power"][:, 1] = found["power"][:, 0]
     found["power"][:, 2] = found["power"][:, 0]
     found["cross"][:] = found["power"][:, 0].values[:, None]
     critical = null.critical("variance_stability", 0.01)
-    assert (_largest(variance_stability, found, base, null, row=3) > critical).mean() <= 0.1
+    assert (_largest_score(variance_stability, found, base, null, row=3) > critical).mean() <= 0.1
     assert (
-        _largest(variance_stability, found.drop_vars("cross"), base, null, row=3) > critical
-    ).mean() > 0.9  # were it not known
+        _largest_score(variance_stability, found.drop_vars("cross"), base, null, row=3) > critical
+    ).mean() > 0.9  # if it were not known
 
 
 def test_a_burst_with_a_region_is_not_reported_again(base, null):
-    found = _some(base, 1, 9).isel(record=0)
+    found = _some_records(base, 1, 9).isel(record=0)
     found["power"][0, 60:75] *= 1.7
     regions = locate_mismatches(found, base, null)
     assert regions["what"].values.tolist() == ["level"] or set(regions["what"].values) == {"avar"}
@@ -145,7 +148,7 @@ def test_a_burst_with_a_region_is_not_reported_again(base, null):
 
 
 def test_scaled_powers_have_the_expected_mean(base):
-    found = _some(base, 1, 10).isel(record=0)
+    found = _some_records(base, 1, 10).isel(record=0)
     found["power"][0, 10:40] *= 5.0
     flat = variance_stability.scale_to_expected(found, base, [(["x"], 200.0, 800.0)])
     ratio = flat["power"].values / base["spectrum"].values
@@ -156,7 +159,7 @@ def test_scaled_powers_have_the_expected_mean(base):
 
 
 def _moving_line(found, row, first, last, energy, bend=0.0):
-    """Add a line of so much power over the density in each block on its way between two lines, spread over the blocks of each part."""
+    """Add a line of this power over the density, moving between two lines from block to block."""
     rng = np.random.default_rng(3)
     level = float(found["line_power"].mean())
     for component in range(8):
@@ -175,13 +178,11 @@ def _moving_line(found, row, first, last, energy, bend=0.0):
     ("first", "last", "bend"), [(20, 60, 0.0), (75, 30, 0.0), (10, 50, 0.6), (25, 90, -0.6)]
 )
 def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, bend):
-    found = _some(base, 12, 12)
-    energy = 9.0 * np.sqrt(
-        abs(last - first) / (8.0 * BLOCKS)
-    )  # nine standard deviations by the closed form
+    found = _some_records(base, 12, 12)
+    energy = 9.0 * np.sqrt(abs(last - first) / (8.0 * BLOCKS))  # nine standard deviations in theory
     _moving_line(found, 1, first, last, energy, bend)
     critical = null.critical("drifting_line", 0.01)
-    assert (_largest(gliding, found, base, null) > critical).mean() > 0.5
+    assert (_largest_score(gliding, found, base, null) > critical).mean() > 0.5
     scores = gliding.score(found, base)
     best = scores["what"].values[
         np.bincount(
@@ -192,25 +193,26 @@ def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, ben
     assert begins == pytest.approx(first * 0.05, abs=0.65)
     assert ends == pytest.approx(last * 0.05, abs=0.65)
     single = null.critical("spectral_line", 0.01)
-    assert (_largest(spectrum, found, base, null) > single).mean() < 0.5
+    assert (_largest_score(spectrum, found, base, null) > single).mean() < 0.5
 
 
 def test_a_steady_line_and_a_temporary_hump_do_not_drift(base, null):
-    found = _some(base, 20, 13)
+    found = _some_records(base, 20, 13)
     found["line_power"][:, 0, :, 37] *= 50.0
     found["line_power"][:, 1, 3, 20:60] *= 3.0
     found["line_power"][:, 2, 2:6] *= 4.0
     assert (
-        _largest(gliding, found, base, null) > null.critical("drifting_line", 0.01)
+        _largest_score(gliding, found, base, null) > null.critical("drifting_line", 0.01)
     ).mean() <= 0.1
 
 
 def test_steady_noise_has_no_drifting_line(base, null):
     assert (
-        _largest(gliding, _some(base, 100, 14), base, null) > null.critical("drifting_line", 0.01)
+        _largest_score(gliding, _some_records(base, 100, 14), base, null)
+        > null.critical("drifting_line", 0.01)
     ).mean() <= 0.03
     assert (
-        _largest(variance_stability, _some(base, 100, 15), base, null)
+        _largest_score(variance_stability, _some_records(base, 100, 15), base, null)
         > null.critical("variance_stability", 0.01)
     ).mean() <= 0.03
 
@@ -223,7 +225,7 @@ def test_short_records_have_no_score(base):
         )
         is None
     )
-    found = _some(base, 2, 1)
+    found = _some_records(base, 2, 1)
     assert gliding.score(found.drop_vars("line_power"), base) is None
     found["line_weight"][:, 4:] = 0.0
     assert gliding.score(found, base) is None
@@ -245,7 +247,7 @@ def test_windows_after_the_last_average_have_no_score(block_count):
 
 
 def test_a_part_without_samples_is_skipped(base, null):
-    found = _some(base, 12, 16)
+    found = _some_records(base, 12, 16)
     _moving_line(found, 0, 20, 60, 7.0 * np.sqrt(40.0 / (8.0 * BLOCKS)))
     found["line_power"][:, :, 4], found["line_weight"][:, 4] = np.nan, 0.0
     z = gliding.score(found, base)["z"].values
@@ -313,7 +315,7 @@ def test_lines_of_null_records_leak_like_tapered_noise():
         np.abs(np.fft.rfft(rng.normal(size=(40_000, size)) * taper(size), axis=-1)[:, 1:100]) ** 2
     )
     drawn = _correlate_lines(rng.gamma(12.0, size=(40_000, 99)) / 12.0, size)
-    for wide in (4, 15, 40):  # lines that a way adds up
+    for wide in (4, 15, 40):  # lines in the sum along a path
         spread = [one[:, 20 : 20 + wide].mean(axis=1).std() / one.mean() for one in (lines, drawn)]
         alone = [one[:, 20:60].std() / one.mean() for one in (lines, drawn)]
         seen, wanted = (
