@@ -102,9 +102,9 @@ def count_outliers(
     of that of the block and of that of the block with two neighbours on either side. It is that of
     the noisier adjacent block where this is larger by half, because the noise may have risen within
     the block. It is at least a tenth of the record's, and at least that of the noise right before
-    or after the sample. If departures of 2.5 to 3.7 deviations are more frequent than in Gaussian noise, the
-    noise level fluctuates faster than that can follow. The limit is then the one that a log-normal
-    level with the same surplus exceeds `EXPECTED_FALSE_OUTLIERS` times.
+    or after the sample. If departures of 2.5 to 3.7 deviations are more frequent than in Gaussian
+    noise, the noise level fluctuates faster than that can follow. The limit is then the one that a
+    log-normal level with the same surplus exceeds `EXPECTED_FALSE_OUTLIERS` times.
 
     Parameters
     ----------
