@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,25 @@ def test_imports_go_down_only():
     )
     assert done.returncode == 0, done.stdout
     assert "0 broken" in done.stdout
+
+
+def test_page_lists_the_layers_of_the_contract():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    layers = project["tool"]["importlinter"]["contracts"][0]["layers"]
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    assert "\n\n" + "".join(f"    {layer}\n" for layer in layers) + "\n" in page
+
+
+def test_page_lists_every_package_and_root_module():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    tree = page.split("## The tree")[1].split("\n## ")[0]
+    for path in sorted((ROOT / "gyrostab").iterdir()):
+        if (path / "__init__.py").exists():
+            assert f"\n      {path.name}/ " in tree
+            for folder in path.glob("*/__init__.py"):
+                assert f" {folder.parent.name}/" in tree
+        elif path.suffix == ".py" and not path.stem.startswith("__"):
+            assert f" {path.stem} " in tree
 
 
 @pytest.mark.parametrize(
