@@ -105,7 +105,7 @@ def share(spread: Callable[..., Any], job: Callable[..., Any], records: int) -> 
 
 def count_claims(spread: Callable[..., Any], records: int) -> list[str]:
     rows = [
-        "| noise | temperature | axes | records | records with a claim |",
+        "| noise | temperature | axes | records | records with a false alarm |",
         "|---|---|---|---|---|",
     ]
     for noises, heat, axes in CLAIMS:
