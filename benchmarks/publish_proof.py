@@ -16,7 +16,7 @@ from pathlib import Path
 
 from page import renew
 
-from gyrostab.blindtest.runner.folder import TUNING
+from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 FIGURES = ("completeness", "reliability")
@@ -42,9 +42,9 @@ def publish(run: Path, docs: Path) -> None:
         )
     job = json.loads((run / "benchmark.json").read_text(encoding="utf-8"))
     seed = job["seed"]
-    if seed < TUNING:
+    if seed < FIRST_PUBLIC_SEED:
         raise SystemExit(
-            f"{run}: was made with seed {seed}; seeds below {TUNING} are for tuning, publish a run of another one"
+            f"{run}: was made with seed {seed}; seeds below {FIRST_PUBLIC_SEED} are for tuning, publish a run of another one"
         )
     page = docs / "proof.md"
     if f"Seed {seed}," not in page.read_text(encoding="utf-8"):

@@ -44,7 +44,7 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
         "names": [name],
         "strengths": [strength],
     }
-    log, truth = make_case(plan | {"gaps": 0.0, "cuts": 0, "heavy": False, "severing": None})
+    log, truth = make_case(plan | {"gaps": 0.0, "cuts": 0, "heavy": False, "degradation": None})
     reduced = reduce_log(log)
     baseline, folds = calibrate_noise(reduced), fold_blocks(reduced)
     total = np.zeros(3)

@@ -1,6 +1,6 @@
-"""The blind test of the diagnosis: recordings with hidden effects, their ground truth committed before the diagnosis sees them.
+"""Blind test of the diagnosis on generated recordings with a committed ground truth.
 
-The generator has physics of its own: it imports neither `gyrostab.physics` nor `gyrostab.simulate`,
-`gyrostab.noise` or `gyrostab.diagnose`. A diagnosis that is right about these recordings is right
-about more than its own formulas.
+The generator implements its physics independently: it does not import `gyrostab.physics`,
+`gyrostab.simulate`, `gyrostab.noise` or `gyrostab.diagnose`. A diagnosis that is right about these
+recordings does not merely reproduce its own formulas.
 """

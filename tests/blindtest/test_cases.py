@@ -12,32 +12,32 @@ import xarray as xr
 from scipy.signal import lfilter
 
 import gyrostab
-from gyrostab.blindtest.generator.catalogue import CATALOGUE, STRANGE
+from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE
 from gyrostab.blindtest.generator.detection_limits import (
     NATS,
     amplitude_for,
-    learned_gain,
+    learned_nats,
     mean_size,
     shared_size,
-    variance_gain,
+    variance_nats,
     variance_size,
 )
-from gyrostab.blindtest.generator.record import signal
-from gyrostab.blindtest.generator.scenario import AXES, draw_world, stream
-from gyrostab.blindtest.generator.shapes import following
+from gyrostab.blindtest.generator.record import make_record
+from gyrostab.blindtest.generator.scenario import AXES, draw_scenario, stream
+from gyrostab.blindtest.generator.shapes import fit_lagged_driver
 from gyrostab.blindtest.generator.wander import wander_size
 from gyrostab.blindtest.scenarios.case import make_case
 from gyrostab.blindtest.scenarios.commitment import commit_case, open_truth, truth_text
-from gyrostab.blindtest.scenarios.drivers import sever
-from gyrostab.blindtest.scenarios.injection import counts_of, inject_effect
-from gyrostab.blindtest.scenarios.plan import SEVERINGS, plan_case, plan_cases
+from gyrostab.blindtest.scenarios.drivers import degrade_driver
+from gyrostab.blindtest.scenarios.injection import inject_effect, quantization_step
+from gyrostab.blindtest.scenarios.plan import DEGRADATIONS, plan_case, plan_cases
 from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
-from gyrostab.blindtest.scoring.visibility import FAINT
+from gyrostab.blindtest.scoring.visibility import MAX_SEPARATION
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.schema import check_log
 
-EVERY = CATALOGUE | STRANGE
+EVERY = CATALOGUE | OUT_OF_CATALOGUE
 
 
 def small(
@@ -55,48 +55,50 @@ def small(
         "names": names,
         "strengths": [strength] * len(names),
     }
-    return base | {"rate": rate, "seconds": seconds, "gaps": 0.1, "severing": None} | more
+    return base | {"rate": rate, "seconds": seconds, "gaps": 0.1, "degradation": None} | more
 
 
-def white_world(*, rate: float = 10.0, seconds: float = 2000.0):
-    world = draw_world(np.random.default_rng(1), rate=rate, seconds=seconds)
+def white_scenario(*, rate: float = 10.0, seconds: float = 2000.0):
+    scenario = draw_scenario(np.random.default_rng(1), rate=rate, seconds=seconds)
     noise = tuple({"N": n, "B": 0.0, "K": 0.0, "Q": 0.0} for n in (0.003, 0.004, 0.002))
-    return replace(world, noise=noise, missing=np.zeros(world.size, dtype=bool))
+    return replace(scenario, noise=noise, missing=np.zeros(scenario.size, dtype=bool))
 
 
 def test_limit_of_a_mean_is_the_closed_form():
-    world = white_world()
-    mean = np.zeros((3, world.size))
+    scenario = white_scenario()
+    mean = np.zeros((3, scenario.size))
     mean[1, 5000:8000] = 1.0  # 300 s of 2000 s
     effective = 300 * (1 - 300 / 2000)
     smallest = 60 * 0.004 * math.sqrt(2 * NATS / effective)
-    assert mean_size(world, mean * smallest) == pytest.approx(1.0, rel=1e-6)
+    assert mean_size(scenario, mean * smallest) == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(("size", "time"), [(0.3, 80.0), (-0.05, 15.0), (2.0, 0.0)])
 def test_nearest_follower_of_a_driver_has_the_sensitivity_at_rest_and_its_lag(size, time):
-    world = replace(white_world(), missing=np.arange(20_000) % 7 < 2)
-    step = np.where(np.arange(world.temperature.size) >= 600, 1.5, 0.0)
-    since = np.maximum(np.arange(world.size) / world.rate - 600.0, 0.0)
+    scenario = replace(white_scenario(), missing=np.arange(20_000) % 7 < 2)
+    step = np.where(np.arange(scenario.temperature.size) >= 600, 1.5, 0.0)
+    since = np.maximum(np.arange(scenario.size) / scenario.rate - 600.0, 0.0)
     mean = (
         1.5 * size * (1.0 - np.exp(-since / time))
         if time
         else 1.5 * size * np.interp(since, [0, 1e-9], [0, 1])
     )
-    found = following(world, np.asarray(mean), step, axis=0)
+    found = fit_lagged_driver(scenario, np.asarray(mean), step, axis=0)
     assert found[0] == pytest.approx(size, rel=0.01)
     assert found[1] == pytest.approx(time, abs=1.5)  # the driver has one value a second
 
 
 def test_true_numbers_of_a_slow_supply_leave_next_to_nothing_of_it():
     """What follows the voltage at once leaves a tenth and more of it."""
-    world = white_world()
+    scenario = white_scenario()
     slow = [
         e
         for s in range(12)
-        if (e := CATALOGUE["supply_bias"].make(world, stream(s, "slow"), strength=4.0)).differs
+        if (
+            e := CATALOGUE["supply_bias"].make(scenario, stream(s, "slow"), strength=4.0)
+        ).form_differs
     ]
-    volt = np.repeat(world.supply, 10)[: world.size]
+    volt = np.repeat(scenario.supply, 10)[: scenario.size]
     assert len(slow) >= 4
     for effect in slow:
         for axis in effect.axes:
@@ -108,11 +110,11 @@ def test_true_numbers_of_a_slow_supply_leave_next_to_nothing_of_it():
 
 
 def test_latitude_is_that_of_the_rate_across_the_tool_wherever_it_rests():
-    world = draw_world(np.random.default_rng(3), rate=10.0, seconds=900.0)
-    turning = np.arange(world.rotation.size) * 0.1 < 300.0  # at rest for longer, at some angle
-    world = replace(world, rotation=np.where(turning, 60.0, 0.0))
+    scenario = draw_scenario(np.random.default_rng(3), rate=10.0, seconds=900.0)
+    turning = np.arange(scenario.rotation.size) * 0.1 < 300.0  # at rest for longer, at some angle
+    scenario = replace(scenario, rotation=np.where(turning, 60.0, 0.0))
     for seed in range(4):
-        effect = CATALOGUE["earth_rate"].make(world, stream(seed, "rest"), strength=4.0)
+        effect = CATALOGUE["earth_rate"].make(scenario, stream(seed, "rest"), strength=4.0)
         across = np.median(np.hypot(effect.mean[0], effect.mean[1]))
         assert math.cos(
             math.radians(effect.parameters["latitude"]["value"])
@@ -128,13 +130,13 @@ def test_latitude_is_that_of_the_rate_across_the_tool_wherever_it_rests():
     ],
 )
 def test_a_bent_response_is_not_compared_with_one_term_of_several(name, term):
-    world = draw_world(np.random.default_rng(3), rate=10.0, seconds=900.0)
-    world = replace(
-        world, rotation=np.maximum(world.rotation, 1e-3 * np.arange(world.rotation.size))
+    scenario = draw_scenario(np.random.default_rng(3), rate=10.0, seconds=900.0)
+    scenario = replace(
+        scenario, rotation=np.maximum(scenario.rotation, 1e-3 * np.arange(scenario.rotation.size))
     )
-    made = [CATALOGUE[name].make(world, stream(s, "bend"), strength=4.0) for s in range(12)]
+    made = [CATALOGUE[name].make(scenario, stream(s, "bend"), strength=4.0) for s in range(12)]
     marks = {
-        effect.differs: [one.get("unless", ()) for one in effect.parameters.values()]
+        effect.form_differs: [one.get("unless", ()) for one in effect.parameters.values()]
         for effect in made
     }
     assert any(term in one for one in marks[True])
@@ -145,36 +147,36 @@ def test_a_bent_response_is_not_compared_with_one_term_of_several(name, term):
     ("frequency", "least", "most"), [(0.5, 0.8, 1.0), (1 / 4000, 0.0, 0.2)], ids=["fast", "slow"]
 )
 def test_noise_that_is_learned_takes_in_a_slow_mean_and_no_fast_one(frequency, least, most):
-    world = white_world()
-    mean = np.zeros((3, world.size))
-    mean[1] = np.cos(2 * math.pi * frequency * np.arange(world.size) / world.rate)
-    mean *= 8.0 / mean_size(world, mean)
-    share = learned_gain(world, mean) / (NATS * 64.0)
+    scenario = white_scenario()
+    mean = np.zeros((3, scenario.size))
+    mean[1] = np.cos(2 * math.pi * frequency * np.arange(scenario.size) / scenario.rate)
+    mean *= 8.0 / mean_size(scenario, mean)
+    share = learned_nats(scenario, mean) / (NATS * 64.0)
     assert least <= share <= most
-    assert learned_gain(world, np.zeros_like(mean)) == 0.0
+    assert learned_nats(scenario, np.zeros_like(mean)) == 0.0
 
 
 def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
-    world = replace(
-        white_world(), noise=tuple({"N": 0.003, "B": 0.002, "K": 0.02, "Q": 0.0} for _ in AXES)
+    scenario = replace(
+        white_scenario(), noise=tuple({"N": 0.003, "B": 0.002, "K": 0.02, "Q": 0.0} for _ in AXES)
     )
-    t = np.arange(world.size) / world.rate
-    mean = np.zeros((3, world.size))
+    t = np.arange(scenario.size) / scenario.rate
+    mean = np.zeros((3, scenario.size))
     mean[0] = np.cos(2 * math.pi * t / 700)
-    mean *= 2.0 / mean_size(world, mean)
-    red = mean_size(world, mean, white=True)
+    mean *= 2.0 / mean_size(scenario, mean)
+    red = mean_size(scenario, mean, white=True)
     assert red > 2.05  # random walk hides a slow mean, so the same size takes more amplitude
     from scipy import fft
 
     from gyrostab.blindtest.generator.noise_floor import floor_psd
-    from gyrostab.blindtest.generator.record import base_noise
+    from gyrostab.blindtest.generator.record import draw_base_noise
 
-    f = np.arange(1, world.size) * world.rate / 2 / world.size
-    density = floor_psd(f, noise=world.noise[0], rate=world.rate) * world.rate
+    f = np.arange(1, scenario.size) * scenario.rate / 2 / scenario.size
+    density = floor_psd(f, noise=scenario.noise[0], rate=scenario.rate) * scenario.rate
     lines = fft.dct(mean[0], norm="ortho")[1:]
     ratios = []
     for seed in range(100):
-        noise = base_noise(world, np.random.default_rng(seed))[0]
+        noise = draw_base_noise(scenario, np.random.default_rng(seed))[0]
         ratios.append(
             float((lines * (fft.dct(noise, norm="ortho")[1:] + lines / 2) / density).sum())
         )
@@ -184,18 +186,18 @@ def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
 
 
 def test_limits_of_noise_are_the_closed_forms():
-    world = white_world()
-    n = world.size
-    step = np.ones((3, world.temperature.size))
+    scenario = white_scenario()
+    n = scenario.size
+    step = np.ones((3, scenario.temperature.size))
     step[0, :1000] = math.exp(
         2 * math.sqrt(NATS / n) * 2
     )  # half of the time: T_eff is a quarter of T
-    assert variance_size(world, step) == pytest.approx(1.0, rel=0.01)
+    assert variance_size(scenario, step) == pytest.approx(1.0, rel=0.01)
     always = np.full((3, 1, 10), 1.0)
     always[1] = math.exp(2 * math.sqrt(NATS / n))
-    assert variance_size(world, always) == pytest.approx(1.0, rel=1e-6)
-    assert variance_gain(world, always) == pytest.approx(NATS, rel=0.05)
-    assert shared_size(world, np.array([math.sqrt(2 * NATS / n), 0, 0])) == pytest.approx(1.0)
+    assert variance_size(scenario, always) == pytest.approx(1.0, rel=1e-6)
+    assert variance_nats(scenario, always) == pytest.approx(NATS, rel=0.05)
+    assert shared_size(scenario, np.array([math.sqrt(2 * NATS / n), 0, 0])) == pytest.approx(1.0)
     assert amplitude_for(lambda a: a**1.5, 8.0) == pytest.approx(4.0, rel=1e-3)
 
 
@@ -227,18 +229,18 @@ def test_a_case_is_the_same_again_and_another_is_not():
 
 
 def test_an_effect_on_the_mean_is_the_difference_to_the_bare_noise():
-    world = white_world(seconds=900)
-    effect = CATALOGUE["temperature_bias"].make(world, np.random.default_rng(0), strength=2.0)
-    both = signal(world, [effect], seed=3) - signal(world, [], seed=3)
+    scenario = white_scenario(seconds=900)
+    effect = CATALOGUE["temperature_bias"].make(scenario, np.random.default_rng(0), strength=2.0)
+    both = make_record(scenario, [effect], seed=3) - make_record(scenario, [], seed=3)
     np.testing.assert_allclose(both, effect.mean, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["vibration_noise", "aliased_vibration"])
 def test_shaking_adds_the_variance_that_its_size_was_reckoned_from(name):
-    world = white_world(rate=100.0, seconds=600)
-    effect = CATALOGUE[name].make(world, np.random.default_rng(2), strength=30.0)
+    scenario = white_scenario(rate=100.0, seconds=600)
+    effect = CATALOGUE[name].make(scenario, np.random.default_rng(2), strength=30.0)
     row = int(np.argmax(np.abs(effect.extra).max(axis=1)))
-    sd = 60 * world.noise[row]["N"] * 10
+    sd = 60 * scenario.noise[row]["N"] * 10
     busy = effect.extra[row] != 0
     v = np.log1p(np.mean(effect.extra[row][busy] ** 2) / sd**2)
     n = busy.sum() * (1 - busy.mean())
@@ -258,10 +260,10 @@ def test_rounding_of_the_rate_stands_alone_and_adds_its_white_noise():
 
 def test_an_angle_counter_is_noise_and_no_effect():
     """A log of angle steps stands on a lattice as well; the truth says Q of that step, and names nothing."""
-    world = draw_world(np.random.default_rng(0), rate=10.0, seconds=600.0)
-    world = replace(world, noise=tuple(noise | {"Q": 0.3} for noise in world.noise))
-    counts = signal(world, [], seed=1) / (
-        0.3 * math.degrees(1e-6) * 3600 * math.sqrt(12) * world.rate
+    scenario = draw_scenario(np.random.default_rng(0), rate=10.0, seconds=600.0)
+    scenario = replace(scenario, noise=tuple(noise | {"Q": 0.3} for noise in scenario.noise))
+    counts = make_record(scenario, [], seed=1) / (
+        0.3 * math.degrees(1e-6) * 3600 * math.sqrt(12) * scenario.rate
     )
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
 
@@ -283,45 +285,45 @@ def test_what_is_lost_on_the_way_is_shorter_than_a_power_cut_where_starts_matter
 
 
 def test_random_bias_has_the_size_that_the_spectrum_says():
-    world = replace(
-        white_world(seconds=4000),
+    scenario = replace(
+        white_scenario(seconds=4000),
         noise=tuple({"N": 0.003, "B": 0.0, "K": 0.0, "Q": 0.0} for _ in AXES),
     )
-    size, nats = wander_size(world, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.003)
-    larger, more = wander_size(world, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.006)
+    size, nats = wander_size(scenario, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.003)
+    larger, more = wander_size(scenario, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.006)
     assert larger / size == pytest.approx(
         4.0, rel=0.1
     )  # faint: the log variance goes with the square
-    f = np.arange(1, world.size) / (2 * world.seconds)
+    f = np.arange(1, scenario.size) / (2 * scenario.seconds)
     ratio = 2 * 0.003**2 * 50 / (1 + (2 * math.pi * f * 50) ** 2) / (60 * 0.003) ** 2
     assert size == pytest.approx(math.sqrt((ratio**2).sum() / 4 / NATS), rel=0.05)
     assert nats < more
 
 
 def test_buried_cases_are_seen_by_neither_eye():
-    plan = small("spectral_line", kind="buried", seconds=3600, heavy=False, strength=1.5)
+    plan = small("spectral_line", kind="sub_threshold", seconds=3600, heavy=False, strength=1.5)
     log, truth = make_case(plan)
-    assert truth["buried"]["buried"]
+    assert truth["visibility"]["sub_threshold"]
     assert truth["effects"][0]["size"] <= 1.5
     noise = truth["noise"][truth["effects"][0]["axes"][0]]["N"]
     wave = truth["effects"][0]["parameters"]["peak"]["value"] / math.sqrt(2)
-    assert wave / (60 * noise) < FAINT * 1.01 / math.sqrt(
+    assert wave / (60 * noise) < MAX_SEPARATION * 1.01 / math.sqrt(
         0.5
     )  # a mean over 1 s can only be smaller than the line itself
-    assert truth["buried"]["sample"] < FAINT
-    assert truth["buried"]["second"] < FAINT
-    assert all(share < 1 for share in truth["buried"]["allan"].values())
+    assert truth["visibility"]["sample"] < MAX_SEPARATION
+    assert truth["visibility"]["second"] < MAX_SEPARATION
+    assert all(share < 1 for share in truth["visibility"]["allan"].values())
     assert not allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30)
 
 
 def test_a_loud_effect_is_never_called_buried():
-    from gyrostab.blindtest.scoring.visibility import is_buried
+    from gyrostab.blindtest.scoring.visibility import find_visibility
 
-    world = white_world(seconds=900)
-    effect = CATALOGUE["spectral_line"].make(world, np.random.default_rng(0), strength=30.0)
-    assert not is_buried(
-        world, [effect], signal(world, [effect], seed=1), rng=np.random.default_rng(0)
-    )["buried"]
+    scenario = white_scenario(seconds=900)
+    effect = CATALOGUE["spectral_line"].make(scenario, np.random.default_rng(0), strength=30.0)
+    assert not find_visibility(
+        scenario, [effect], make_record(scenario, [effect], seed=1), rng=np.random.default_rng(0)
+    )["sub_threshold"]
 
 
 def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
@@ -329,10 +331,10 @@ def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
         *EVERY,
         "strength",
         "concealed",
-        "buried",
-        "severed",
+        "sub_threshold",
+        "degraded_driver",
         "withheld",
-        "decoy",
+        "substituted",
         "truth",
         "effect",
         "seed",
@@ -340,8 +342,8 @@ def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
     ]
     plans = [small(name, index=i) for i, name in enumerate(EVERY)] + [small(None, index=90)]
     plans += [
-        small("shupe", index=91 + i, kind="severed", severing=how)
-        for i, how in enumerate(("withheld", "decoy", "lagged", "confounded"))
+        small("shupe", index=91 + i, kind="degraded_driver", degradation=how)
+        for i, how in enumerate(("withheld", "substituted", "lagged", "confounded"))
     ]
     attributes, dimensions = set(), set()
     for plan in plans:
@@ -397,17 +399,17 @@ def test_a_sealed_recording_is_read_as_a_log(tmp_path):
         open_truth(path, sha256=digest)
 
 
-@pytest.mark.parametrize("how", SEVERINGS)
+@pytest.mark.parametrize("how", DEGRADATIONS)
 def test_severed_driver(how):
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.normal(size=1000))
-    channels = sever(
+    channels = degrade_driver(
         {"temperature": (values, 1.0), "vibration": (np.ones(1000), 1.0)},
         "temperature",
         how=how,
         rng=rng,
     )
-    assert ("temperature" in channels) == (how not in ("withheld", "decoy"))
+    assert ("temperature" in channels) == (how not in ("withheld", "substituted"))
     if how == "lagged":
         lags = [
             np.corrcoef(values[: 1000 - k], channels["temperature"][0][k:])[0, 1]
@@ -416,7 +418,7 @@ def test_severed_driver(how):
         assert np.argmax(lags) >= 30
     if how == "confounded":
         assert abs(np.corrcoef(values, channels["supply_voltage"][0])[0, 1]) > 0.8
-    if how == "decoy":
+    if how == "substituted":
         assert "supply_voltage" in channels
     if how == "noisy":
         assert 0.5 < np.corrcoef(values, channels["temperature"][0])[0, 1] < 0.9
@@ -428,7 +430,12 @@ def test_composition_of_a_benchmark():
     plans = plan_cases(400, seed=5)
     kinds = [plan["kind"] for plan in plans]
     assert kinds.count("null") == 100
-    assert kinds.count("strange") == kinds.count("severed") == kinds.count("buried") == 40
+    assert (
+        kinds.count("out_of_catalogue")
+        == kinds.count("degraded_driver")
+        == kinds.count("sub_threshold")
+        == 40
+    )
     assert (kinds.count("pair"), kinds.count("triple")) == (60, 20)
     assert {len(plan["names"]) for plan in plans if plan["kind"] == "triple"} == {3}
     assert all(len(set(plan["names"])) == len(plan["names"]) for plan in plans)
@@ -444,10 +451,10 @@ def test_composition_of_a_benchmark():
 
 
 def test_a_third_of_the_forms_are_none_of_a_fitter():
-    world = replace(white_world(seconds=600), cuts=np.array([[200.0, 220.0]]))
-    world = replace(world, light=np.linspace(1.0, 0.9, world.temperature.size))
+    scenario = replace(white_scenario(seconds=600), cuts=np.array([[200.0, 220.0]]))
+    scenario = replace(scenario, light=np.linspace(1.0, 0.9, scenario.temperature.size))
     flags = [
-        entry.make(world, stream(s, name), strength=2.0).differs
+        entry.make(scenario, stream(s, name), strength=2.0).form_differs
         for name, entry in CATALOGUE.items()
         for s in range(2)
     ]
@@ -479,16 +486,16 @@ def test_salt_on_a_log_adds_the_effect_and_leaves_the_controls_alone():
     np.testing.assert_array_equal(copies["untouched"][0].rate.values, record)
     np.testing.assert_array_equal(copies["flipped"][0].rate.values, -record)
     np.testing.assert_array_equal(copies["reversed"][0].rate.values, record[:, ::-1])
-    salted, truth = copies["salted"]
+    injected, truth = copies["injected"]
     (effect,) = truth["effects"]
-    added = salted.rate.values - record
+    added = injected.rate.values - record
     assert np.nanmax(np.abs(added)) == pytest.approx(effect["parameters"]["peak"]["value"], rel=0.1)
     for axis in AXES:
         assert (np.nanmax(np.abs(added[AXES.index(axis)])) > 0) == (axis in effect["axes"])
     for copy, told in copies.values():
         check_log(copy)
-        assert set(copy.data_vars) == set(salted.data_vars)
-        assert told["plan"]["kind"] == ("salted" if told["effects"] else "control")
+        assert set(copy.data_vars) == set(injected.data_vars)
+        assert told["plan"]["kind"] == ("injected" if told["effects"] else "control")
     with pytest.raises(OptionError, match="follows restarts"):
         inject_effect(log, "warm_up", 2.0, np.random.default_rng(0))
 
@@ -502,16 +509,16 @@ def test_salt_on_a_log_of_counts_is_counted_and_keeps_its_mean():
         8.0,
         np.random.default_rng(2),
     )
-    salted, truth = copies["salted"]
+    injected, truth = copies["injected"]
     seen = np.isfinite(counted)
-    assert counts_of(counted[0]) == pytest.approx(0.5)
+    assert quantization_step(counted[0]) == pytest.approx(0.5)
     np.testing.assert_allclose(
-        np.remainder(salted.rate.values[seen] / 0.5 + 0.25, 1.0), 0.25, atol=1e-6
+        np.remainder(injected.rate.values[seen] / 0.5 + 0.25, 1.0), 0.25, atol=1e-6
     )
     sent = {axis: np.array(values) for axis, values in truth["effects"][0]["waveform_10s"].items()}
     axis, expected = max(sent.items(), key=lambda one: np.ptp(one[1]))
-    row = list(salted.axis.values).index(axis)
-    added = np.nanmean((salted.rate.values - counted)[row].reshape(-1, 100), axis=1)
+    row = list(injected.axis.values).index(axis)
+    added = np.nanmean((injected.rate.values - counted)[row].reshape(-1, 100), axis=1)
     scatter = 0.5 / math.sqrt(12 * 100)
     assert np.nanmax(np.abs(added - expected)) < 8 * scatter
 
@@ -527,6 +534,6 @@ def test_salt_on_a_real_gyro(recordings):
     ]
     log = make_log(table[gyros].to_numpy().T, rate=100.0, unit="deg/h")
     copies = inject_effect(log, "spectral_line", 5.0, np.random.default_rng(4))
-    added = copies["salted"][0].rate.values - log.rate.values
+    added = copies["injected"][0].rate.values - log.rate.values
     assert np.abs(added).max() > 0
-    assert copies["salted"][1]["effects"][0]["name"] == "spectral_line"
+    assert copies["injected"][1]["effects"][0]["name"] == "spectral_line"

@@ -120,7 +120,7 @@ def test_dead_zone_holds_at_zero_and_is_odd():
 
 def test_mount_is_a_damped_spring():
     f = np.array([10.0, 60.0, 120.0, 400.0])
-    _, got = signal.freqz(*vibration.mount_filter(120.0, quality=8.0), worN=f, fs=vibration.FAST)
+    _, got = signal.freqz(*vibration.mount_filter(120.0, quality=8.0), worN=f, fs=vibration.FAST_HZ)
     x = f / 120.0
     expected = np.sqrt((1 + (x / 8) ** 2) / ((1 - x**2) ** 2 + (x / 8) ** 2))
     np.testing.assert_allclose(
@@ -131,11 +131,11 @@ def test_mount_is_a_damped_spring():
 @pytest.mark.parametrize(("kind", "power"), [("point", 0), ("dump", 1), ("cic2", 2), ("cic3", 3)])
 def test_a_line_above_nyquist_folds_down_with_the_factor_of_its_filter(kind, power):
     f, rate = 730.0, 400.0
-    x = np.sqrt(2) * np.sin(2 * np.pi * f * np.arange(200_000) / vibration.FAST)
+    x = np.sqrt(2) * np.sin(2 * np.pi * f * np.arange(200_000) / vibration.FAST_HZ)
     logged = vibration.decimate(x, rate=rate, kind=kind)[50:]
-    m = vibration.FAST / rate
+    m = vibration.FAST_HZ / rate
     factor = (
-        abs(math.sin(math.pi * f / rate) / (m * math.sin(math.pi * f / vibration.FAST))) ** power
+        abs(math.sin(math.pi * f / rate) / (m * math.sin(math.pi * f / vibration.FAST_HZ))) ** power
     )
     assert logged.std() == pytest.approx(factor, rel=2e-3)
     freq, density = signal.periodogram(logged, fs=rate)
@@ -222,7 +222,7 @@ def test_own_allan_variance_is_that_of_allantools():
 def test_noise_leaves_its_own_allan_band_in_one_of_a_hundred(size, bands, records):
     rate, noise = 10.0, {"N": 0.003, "B": 0.004, "K": 0.05, "Q": 0.0}
     rng = np.random.default_rng(6)
-    missing = telemetry.lose(rng, size, share=0.2, frame=10, burst=4)
+    missing = telemetry.draw_losses(rng, size, share=0.2, frame=10, burst=4)
     out = 0
     for _ in range(bands):
         band = allan_band(noise=noise, rate=rate, missing=missing, rng=rng)
@@ -248,7 +248,9 @@ def test_long_records_have_the_allan_variance_of_short_ones():
 @given(st.floats(0.02, 0.6), st.floats(1.0, 8.0))
 @settings(max_examples=15, deadline=None)
 def test_telemetry_loses_the_share_that_was_asked_for(share, burst):
-    lost = telemetry.lose(np.random.default_rng(7), 200_000, share=share, frame=5, burst=burst)
+    lost = telemetry.draw_losses(
+        np.random.default_rng(7), 200_000, share=share, frame=5, burst=burst
+    )
     assert lost.mean() == pytest.approx(share, abs=0.06)
 
 

@@ -16,10 +16,10 @@ from gyrostab.blindtest.generator.detection_limits import (
     shared_size,
     variance_size,
 )
-from gyrostab.blindtest.generator.measured_noise import _slope, line_density, own_noise
+from gyrostab.blindtest.generator.measured_noise import _fit_slope, line_density, measure_noise
 from gyrostab.blindtest.generator.record import make_log
-from gyrostab.blindtest.generator.scenario import draw_world
-from gyrostab.blindtest.scenarios.injection import inject_effect, rough_noise
+from gyrostab.blindtest.generator.scenario import draw_scenario
+from gyrostab.blindtest.scenarios.injection import estimate_noise, inject_effect
 
 RATE, SECONDS = 20.0, 1500.0
 
@@ -28,16 +28,16 @@ def white(seed: int, *, sd: float = 0.8) -> np.ndarray:
     return np.random.default_rng(seed).normal(0, sd, (3, round(RATE * SECONDS)))
 
 
-def world_of(record: np.ndarray):
-    world = draw_world(np.random.default_rng(1), rate=RATE, seconds=SECONDS)
-    noise = tuple(rough_noise(row, rate=RATE) | {"K": 0.0} for row in record)
-    return replace(world, noise=noise, missing=np.zeros(world.size, dtype=bool))
+def scenario_of(record: np.ndarray):
+    scenario = draw_scenario(np.random.default_rng(1), rate=RATE, seconds=SECONDS)
+    noise = tuple(estimate_noise(row, rate=RATE) | {"K": 0.0} for row in record)
+    return replace(scenario, noise=noise, missing=np.zeros(scenario.size, dtype=bool))
 
 
 def both(record: np.ndarray):
     """A world by five terms, and the same by what is measured."""
-    world = world_of(record)
-    return world, replace(world, own=own_noise(record, rate=RATE))
+    scenario = scenario_of(record)
+    return scenario, replace(scenario, measured=measure_noise(record, rate=RATE))
 
 
 def bursts() -> np.ndarray:
@@ -92,7 +92,7 @@ def test_the_slope_is_the_most_likely_one_also_beside_a_loud_line(loud):
     for truth in np.exp(rng.normal(0.0, 3.0, (8, 3))):
         lines = (truth[0] + truth[1] / number + truth[2] / number**2) * rng.exponential(size=60)
         lines[rng.integers(60)] *= loud
-        found = _slope(lines)(number)
+        found = _fit_slope(lines)(number)
         mine, others = (
             (np.log(density) + lines / density).sum(axis=-1) for density in (found, tried)
         )
@@ -131,7 +131,7 @@ def test_the_size_of_salt_is_that_in_the_noise_of_the_recording():
     )  # its slow noise is 50 times that of the shortest times
     log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
     made, truth = inject_effect(log, "vibration_rectification", 6.0, np.random.default_rng(6))[
-        "salted"
+        "injected"
     ]
     mean = np.asarray(made.rate.values) - record
     f = np.arange(1, record.shape[1]) * RATE / 2 / record.shape[1]
@@ -150,7 +150,7 @@ def test_a_source_that_axes_share_is_salted_with_its_signs_and_on_its_axes_only(
     two = 0
     for seed in range(12):
         made, truth = inject_effect(log, "shared_source", 8.0, np.random.default_rng(seed))[
-            "salted"
+            "injected"
         ]
         added = np.asarray(made.rate.values) - record
         has = added.std(axis=1) > 0
@@ -167,7 +167,7 @@ def test_a_source_that_axes_share_is_salted_with_its_signs_and_on_its_axes_only(
 def test_a_spike_is_salted_above_what_the_recording_throws_by_itself():
     wild = white(8)
     wild[:, ::997] += 9.0  # eleven standard deviations
-    calm, loud = (own_noise(record, rate=RATE).jump for record in (white(8), wild))
+    calm, loud = (measure_noise(record, rate=RATE).outlier_sigma for record in (white(8), wild))
     np.testing.assert_allclose(calm, 0.8, rtol=0.1)
     assert (loud > 1.8).all()
     _, truth = inject_effect(
@@ -175,5 +175,5 @@ def test_a_spike_is_salted_above_what_the_recording_throws_by_itself():
         "spikes",
         4.0,
         np.random.default_rng(9),
-    )["salted"]
+    )["injected"]
     assert truth["effects"][0]["parameters"]["spike"]["value"] > 9.0

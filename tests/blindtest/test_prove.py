@@ -18,9 +18,9 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.blindtest.runner.benchmark import Proof
-from gyrostab.blindtest.runner.folder import TUNING, case_name, read_sums
+from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, case_name, read_sums
 from gyrostab.blindtest.runner.outcome import page_text, score_rows
-from gyrostab.blindtest.runner.pool import each_in_processes
+from gyrostab.blindtest.runner.pool import run_in_processes
 from gyrostab.blindtest.scenarios.plan import plan_case
 from gyrostab.blindtest.scoring.table import score_table
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError, WorkerError
@@ -29,7 +29,7 @@ from tests.support.command_line import call
 core = importlib.import_module("gyrostab.blindtest.runner.benchmark")
 diagnosing = importlib.import_module("gyrostab.diagnose.core")
 
-SMALL = {"rate": 10.0, "seconds": 600, "gaps": 0.0, "cuts": 0, "heavy": False, "severing": None}
+SMALL = {"rate": 10.0, "seconds": 600, "gaps": 0.0, "cuts": 0, "heavy": False, "degradation": None}
 #: Effect and strength of each case, none for noise alone.
 CASES: tuple[tuple[str, float] | None, ...] = (None, ("spectral_line", 8.0))
 
@@ -69,8 +69,8 @@ def finished(tmp_path_factory) -> tuple[Path, list[str], Proof]:
 def test_the_truths_are_sealed_and_told_before_the_first_diagnosis(finished):
     folder, said, proof = finished
     sums = (folder / "SHA256SUMS").read_bytes()
-    assert proof.sealed == hashlib.sha256(sums).hexdigest()
-    assert any(proof.sealed in text and "[0 diagnosed]" in text for text in said)
+    assert proof.commitment == hashlib.sha256(sums).hexdigest()
+    assert any(proof.commitment in text and "[0 diagnosed]" in text for text in said)
     assert "--seed 5" in said[0]
     for line in sums.decode().splitlines():
         value, path = line.split("  ")
@@ -117,15 +117,17 @@ def test_every_case_is_counted(finished):
     assert bool(line["detected"])
     found = json.loads((folder / "diagnoses" / f"{line['name']}.json").read_text())
     assert line["verdict"] == found["verdict"]
-    assert [name for name, _ in json.loads(line["claims"])] == [
+    assert [name for name, _ in json.loads(line["identifications"])] == [
         effect["name"] for effect in found["effects"]
     ]
-    assert {"Allan plot", "correlation with channels"} == set(json.loads(line["naive"]))
+    assert {"Allan plot", "correlation with channels"} == set(
+        json.loads(line["baseline_detectors"])
+    )
     assert proof.failed == {}
     text = (folder / "table.md").read_text()
-    assert proof.sealed in text
+    assert proof.commitment in text
     assert "not for publication" in text
-    detected = proof.table.set_index("quantity").loc["detected at 1.5 times the limit and more"]
+    detected = proof.table.set_index("quantity").loc["detected, strength 1.5 or more"]
     assert detected["n"] == 1
     assert detected["value"] == pytest.approx(scores["detected"][1:].mean())
     for name in ("completeness.png", "reliability.png"):
@@ -140,7 +142,7 @@ def test_a_second_run_only_counts_again_and_comes_to_the_same(finished, small):
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*")} == kept
     assert (folder / "scores.csv").read_bytes() == scores
     assert again.seed == 5
-    assert again.sealed == before.sealed
+    assert again.commitment == before.commitment
 
 
 def test_a_truth_that_was_changed_is_not_opened(finished, small):
@@ -221,7 +223,7 @@ def test_a_diagnosis_that_fails_is_shown_and_tried_again(small, tmp_path, monkey
     text = (tmp_path / "proof" / "table.md").read_text()
     assert "ZeroDivisionError: division by zero" in text
     assert "its diagnosis failed" in text
-    detected = proof.table.set_index("quantity").loc["detected at 1.5 times the limit and more"]
+    detected = proof.table.set_index("quantity").loc["detected, strength 1.5 or more"]
     assert (detected["n"], detected["value"]) == (1, 0.0)
 
     class Found:
@@ -241,7 +243,7 @@ def test_a_diagnosis_that_fails_is_shown_and_tried_again(small, tmp_path, monkey
     assert again.failed == {}
     assert not list((tmp_path / "proof" / "failed").iterdir())
     assert (
-        again.table.set_index("quantity").loc["detected at 1.5 times the limit and more", "value"]
+        again.table.set_index("quantity").loc["detected, strength 1.5 or more", "value"]
         == 1.0
     )
 
@@ -275,23 +277,32 @@ def test_real_recordings_are_salted_sealed_and_told_apart(small, tmp_path, monke
             words = json.dumps([path.name, str(log.attrs), *map(str, log.variables)]).lower()
         assert not [
             word
-            for word in ("salt", "copy", "flipped", "reversed", "untouched", "mems", "laser", "fog")
+            for word in (
+                "inject",
+                "copy",
+                "flipped",
+                "reversed",
+                "untouched",
+                "mems",
+                "laser",
+                "fog",
+            )
             if word in words
         ]
     scores = pd.read_csv(tmp_path / "proof" / "scores.csv", keep_default_na=False, na_values=[""])
     assert sorted(scores["kind"].value_counts().to_dict().items()) == [
         ("control", 6),
         ("null", 1),
-        ("salted", 2),
+        ("injected", 2),
         ("single", 1),
     ]
-    assert set(scores["copy"].dropna()) == {"salted", "untouched", "flipped", "reversed"}
+    assert set(scores["copy"].dropna()) == {"injected", "untouched", "flipped", "reversed"}
     counted = proof.table.set_index("quantity")
     assert (
-        counted.loc["false alarms: a name on a null", "n"] == 1
+        counted.loc["false alarms: effect named on a null record", "n"] == 1
     )  # a copy of a real recording is no null
     page = (tmp_path / "proof" / "table.md").read_text()
-    assert "| turning the sign brings a name | 0 |" in page
+    assert "| reversing the sign adds a name | 0 |" in page
 
 
 def test_a_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
@@ -324,28 +335,28 @@ def test_wrong_names_on_noise_are_listed():
         "seconds": 600.0,
     }
     truth |= {"missing_share": 0.0}
-    claim = {
+    identification = {
         "verdict": "explained",
         "mismatches": [],
         "unexplained": [],
         "held_out": {},
         "effects": [{"name": "shupe", "alternatives": []}],
     }
-    rows = score_rows({"abc": claim}, {"abc": truth}, {"abc": {}})
+    rows = score_rows({"abc": identification}, {"abc": truth}, {"abc": {}})
     job = {
         "cases": 1,
-        "seed": TUNING + 1,
+        "seed": FIRST_PUBLIC_SEED + 1,
         "nulls": 100,
         "code": ["a", "b"],
         "begun": "now",
         "machine": "any",
     }
     table = score_table(rows)
-    text = page_text(rows, table, job=job, sealed="0" * 64, failed={})
+    text = page_text(rows, table, job=job, commitment="0" * 64, failed={})
     assert "abc (null, 10 Hz, 10 min, 0 % lost): nothing; named shupe" in text
     assert "not for publication" not in text
     assert "The code changed 1 times" in text
-    assert "false alarms: a name on a null: 1 " in text
+    assert "false alarms: effect named on a null record: 1 " in text
 
 
 # -------------------------------------------------------------------------------------------------------------------
@@ -380,7 +391,7 @@ def test_overwrite_forgets_what_was_there(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: 1 / 0)
     first = gyrostab.prove(tmp_path / "proof", cases=1, seed=1, workers=0)
     second = gyrostab.prove(tmp_path / "proof", cases=1, workers=0, overwrite=True)
-    assert second.seed >= TUNING != first.seed
+    assert second.seed >= FIRST_PUBLIC_SEED != first.seed
     assert list(read_sums(tmp_path / "proof")[0]) == [case_name(second.seed, 0)]
     assert [path.stem for path in (tmp_path / "proof" / "recordings").iterdir()] == [
         case_name(second.seed, 0)
@@ -406,7 +417,7 @@ def test_the_command_warns_of_a_tuning_seed_and_says_what_is_wrong(tmp_path, cap
     said = capfd.readouterr().err
     assert "tuning" in said
     assert "other.txt" in said
-    assert call("prove", "--cases", 1, "--seed", TUNING, "-o", tmp_path) == 2
+    assert call("prove", "--cases", 1, "--seed", FIRST_PUBLIC_SEED, "-o", tmp_path) == 2
     assert "tuning" not in capfd.readouterr().err
 
 
@@ -417,19 +428,19 @@ def test_the_command_warns_of_a_tuning_seed_and_says_what_is_wrong(tmp_path, cap
 def test_processes_keep_the_order_and_use_one_thread():
     told: list[int] = []
     before = os.environ.get("OMP_NUM_THREADS")
-    done = each_in_processes(
+    done = run_in_processes(
         os.path.join, [("a", str(number)) for number in range(5)], workers=2, told=told.append
     )
     assert done == [os.path.join("a", str(number)) for number in range(5)]
     assert told == [1, 2, 3, 4, 5]
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    assert each_in_processes(os.getenv, [(name,) for name in names], workers=1) == ["1", "1", "1"]
+    assert run_in_processes(os.getenv, [(name,) for name in names], workers=1) == ["1", "1", "1"]
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
 def test_a_process_that_dies_is_told_with_what_to_do():
     with pytest.raises(WorkerError, match="--resume"):
-        each_in_processes(os._exit, [(1,)], workers=1)
+        run_in_processes(os._exit, [(1,)], workers=1)
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks at processes in /proc")

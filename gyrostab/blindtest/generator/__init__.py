@@ -1,1 +1,1 @@
-"""An independent generator of recordings: environment, noise, effects and telemetry, with physics of its own."""
+"""Generator of recordings that shares no physics with the diagnosis."""

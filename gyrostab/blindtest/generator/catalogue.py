@@ -1,73 +1,95 @@
-"""All effects that can be drawn, what each one needs, and which names the data cannot be asked to tell apart."""
+"""Effects that can be drawn, what each one needs, and the ambiguity sets used for scoring."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gyrostab.blindtest.generator import digitisation as words
-from gyrostab.blindtest.generator import electronics, motion, wander
-from gyrostab.blindtest.generator import out_of_catalogue as strange
-from gyrostab.blindtest.generator import thermal as heat
+from gyrostab.blindtest.generator import (
+    digitisation,
+    electronics,
+    motion,
+    out_of_catalogue,
+    thermal,
+    wander,
+)
 from gyrostab.blindtest.generator.scenario import Effect
 
-__all__ = ["AMBIGUITY", "CATALOGUE", "STRANGE", "Entry", "merged"]
+__all__ = ["AMBIGUITY", "CATALOGUE", "OUT_OF_CATALOGUE", "Entry", "merge_ambiguous"]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """How to draw an effect: its maker, its channel, the power cuts that it needs at least, and what it `needs` of the world."""
+    """How to draw an effect.
+
+    `make` draws it, `channel` drives it, `cuts` is the least number of power cuts, and `needs`
+    names what the scenario must contain. `can_be_sub_threshold` is set where the effect can be
+    invisible in the raw trace and the Allan plot, yet identifiable.
+    """
 
     make: Callable[..., Effect]
     channel: str | None = None
     cuts: int = 0
     needs: str = ""
-    hidden: bool = False  # can lie below the raw trace and the Allan plot and yet be named
+    can_be_sub_threshold: bool = False
 
 
 CATALOGUE: dict[str, Entry] = {
-    "vibration_noise": Entry(motion.vibration_noise, "vibration", needs="shaking"),
+    "vibration_noise": Entry(motion.vibration_noise, "vibration", needs="vibration"),
     "vibration_rectification": Entry(
-        motion.vibration_rectification, "vibration", needs="shaking", hidden=True
+        motion.vibration_rectification, "vibration", needs="vibration", can_be_sub_threshold=True
     ),
-    "shupe": Entry(heat.shupe, "temperature", needs="heat", hidden=True),
-    "temperature_bias": Entry(heat.temperature_bias, "temperature", needs="heat", hidden=True),
-    "thermal_hysteresis": Entry(heat.thermal_hysteresis, "temperature", needs="heat", hidden=True),
-    "warm_up": Entry(heat.warm_up, cuts=2, hidden=True),
-    "temperature_noise": Entry(heat.temperature_noise, "temperature", needs="heat", hidden=True),
-    "light_power_noise": Entry(heat.light_power_noise, "light_power", needs="dips", hidden=True),
-    "ageing_noise": Entry(heat.ageing_noise, hidden=True),
-    "shared_source": Entry(electronics.shared_source, hidden=True),
-    "spectral_line": Entry(electronics.spectral_line, hidden=True),
-    "earth_rate": Entry(motion.earth_rate, "rotation_rate", needs="turning", hidden=True),
-    "rotation_line": Entry(motion.rotation_line, "rotation_rate", needs="turning", hidden=True),
-    "scale_factor": Entry(motion.scale_factor, "rotation_rate", needs="turning", hidden=True),
+    "shupe": Entry(thermal.shupe, "temperature", needs="heat", can_be_sub_threshold=True),
+    "temperature_bias": Entry(
+        heat.temperature_bias, "temperature", needs="heat", can_be_sub_threshold=True
+    ),
+    "thermal_hysteresis": Entry(
+        heat.thermal_hysteresis, "temperature", needs="heat", can_be_sub_threshold=True
+    ),
+    "warm_up": Entry(thermal.warm_up, cuts=2, can_be_sub_threshold=True),
+    "temperature_noise": Entry(
+        heat.temperature_noise, "temperature", needs="heat", can_be_sub_threshold=True
+    ),
+    "light_power_noise": Entry(
+        heat.light_power_noise, "light_power", needs="dips", can_be_sub_threshold=True
+    ),
+    "ageing_noise": Entry(thermal.ageing_noise, can_be_sub_threshold=True),
+    "shared_source": Entry(electronics.shared_source, can_be_sub_threshold=True),
+    "spectral_line": Entry(electronics.spectral_line, can_be_sub_threshold=True),
+    "earth_rate": Entry(
+        motion.earth_rate, "rotation_rate", needs="rotation", can_be_sub_threshold=True
+    ),
+    "rotation_line": Entry(
+        motion.rotation_line, "rotation_rate", needs="rotation", can_be_sub_threshold=True
+    ),
+    "scale_factor": Entry(
+        motion.scale_factor, "rotation_rate", needs="rotation", can_be_sub_threshold=True
+    ),
     "misalignment": Entry(motion.misalignment),
     "logger_filter": Entry(electronics.logger_filter),
-    "aliased_vibration": Entry(motion.aliased_vibration, "vibration", needs="shaking"),
+    "aliased_vibration": Entry(motion.aliased_vibration, "vibration", needs="vibration"),
     "spikes": Entry(electronics.spikes),
-    "held_samples": Entry(electronics.held_samples, needs="whole angle"),
-    "bias_jump": Entry(electronics.bias_jump, cuts=1, hidden=True),
-    "supply_bias": Entry(electronics.supply_bias, "supply_voltage", hidden=True),
+    "held_samples": Entry(electronics.held_samples, needs="unquantized angle"),
+    "bias_jump": Entry(electronics.bias_jump, cuts=1, can_be_sub_threshold=True),
+    "supply_bias": Entry(electronics.supply_bias, "supply_voltage", can_be_sub_threshold=True),
     "feedback_reset": Entry(electronics.feedback_reset, "ramp"),
-    "rate_quantization": Entry(words.rate_quantization, needs="whole angle"),
-    "dead_zone": Entry(words.dead_zone, needs="whole angle"),
-    "clipping": Entry(words.clipping, needs="whole angle"),
+    "rate_quantization": Entry(digitisation.rate_quantization, needs="unquantized angle"),
+    "dead_zone": Entry(digitisation.dead_zone, needs="unquantized angle"),
+    "clipping": Entry(digitisation.clipping, needs="unquantized angle"),
     "gauss_markov": Entry(wander.gauss_markov),
     "telegraph": Entry(wander.telegraph),
-    "ageing_bias": Entry(wander.ageing_bias, hidden=True),
+    "ageing_bias": Entry(wander.ageing_bias, can_be_sub_threshold=True),
 }
 
-STRANGE: dict[str, Entry] = {
-    "breathing_noise": Entry(strange.breathing_noise),
-    "chirped_line": Entry(strange.chirped_line),
-    "slow_memory": Entry(strange.slow_memory),
-    "three_levels": Entry(strange.three_levels),
-    "informative_gaps": Entry(strange.informative_gaps),
+OUT_OF_CATALOGUE: dict[str, Entry] = {
+    "breathing_noise": Entry(out_of_catalogue.breathing_noise),
+    "chirped_line": Entry(out_of_catalogue.chirped_line),
+    "slow_memory": Entry(out_of_catalogue.slow_memory),
+    "three_levels": Entry(out_of_catalogue.three_levels),
+    "informative_gaps": Entry(out_of_catalogue.informative_gaps),
 }
 
-#: Names that stand for one another where the record lacks what would tell them apart (section 1.E
-#: of the design).
+#: Effects that the data may be unable to distinguish.
 AMBIGUITY: tuple[frozenset[str], ...] = tuple(
     frozenset(names.split())
     for names in (
@@ -85,8 +107,8 @@ AMBIGUITY: tuple[frozenset[str], ...] = tuple(
 )
 
 
-def merged(name: str) -> frozenset[str]:
-    """All names that count as `name` when classes are merged by the ambiguity sets.
+def merge_ambiguous(name: str) -> frozenset[str]:
+    """List all names that count as `name` when ambiguity sets are merged.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Heat in the fibre coil: a slab of layers between its outer face and an insulated spool, wound as a quadrupole."""
+"""Heat conduction in a quadrupole-wound fibre coil on an insulated spool."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEG_PER_HOUR = math.degrees(1.0) * 3600.0  # rad/s -> deg/h
 
 
 def diffusion_time(thickness: float, diffusivity: float) -> float:
-    """Time constant [s] of the slowest mode of a slab of `thickness` [m] that is insulated on one face.
+    """Compute the slowest time constant [s] of a slab of `thickness` [m] insulated on one face.
 
     Examples
     --------
@@ -26,8 +26,10 @@ def diffusion_time(thickness: float, diffusivity: float) -> float:
     return 4.0 * thickness**2 / (math.pi**2 * diffusivity)
 
 
-def _step(layers: int, thickness: float, diffusivity: float, dt: float) -> tuple[Array, Array]:
-    """Crank-Nicolson matrices ``T' = P T + q (u + u') / 2`` of the layer temperatures T under the face temperature u."""
+def _discretise_diffusion(
+    layers: int, thickness: float, diffusivity: float, dt: float
+) -> tuple[Array, Array]:
+    """Compute P, q of ``T' = P T + q (u + u') / 2`` (Crank-Nicolson; face temperature u)."""
     h = thickness / layers
     a = diffusivity / h**2
     rate = np.diag(np.full(layers - 1, a), 1) + np.diag(np.full(layers - 1, a), -1)
@@ -47,13 +49,13 @@ def layer_temperatures(
     thickness: float = 0.012,
     diffusivity: float = 2.2e-7,
 ) -> Array:
-    """Temperature of every layer [K] under the temperature of the outer face.
+    """Compute the temperature of every layer [K] from that of the outer face.
 
     Parameters
     ----------
     face : ndarray, shape (time,)
-        Temperature of the outer face [K or degC], every `dt` seconds; the coil begins in balance
-        with it.
+        Temperature of the outer face [K or degC] every `dt` seconds; the coil starts in thermal
+        equilibrium with it.
     dt : float
         Step [s].
     layers : int
@@ -73,8 +75,8 @@ def layer_temperatures(
     >>> bool(np.allclose(after, 30.0, atol=0.01))
     True
     """
-    advance, drive = _step(layers, thickness, diffusivity, dt)
-    values, vectors = np.linalg.eigh(advance)  # symmetric, for the cells are equal
+    advance, drive = _discretise_diffusion(layers, thickness, diffusivity, dt)
+    values, vectors = np.linalg.eigh(advance)  # symmetric because the cells are equal
     face = np.asarray(face, dtype=float)
     push = np.zeros_like(face)
     push[1:] = 0.5 * (face[1:] + face[:-1]) - face[0]
@@ -90,7 +92,7 @@ def layer_temperatures(
 def layer_weights(
     layers: int, *, length: float = 500.0, trim: float = 0.0, scatter: Array | None = None
 ) -> Array:
-    """Weight ``integral of (L - 2 l) dl`` [m2] of each layer of a quadrupole winding.
+    """Compute the weight ``integral of (L - 2 l) dl`` [m2] of each layer of a quadrupole winding.
 
     Parameters
     ----------
@@ -99,16 +101,18 @@ def layer_weights(
     length : float
         Length of the fibre [m].
     trim : float
-        How far the middle of the fibre lies off the middle of the winding, as a share of the
+        Offset between the middle of the fibre and the middle of the winding, as a share of the
         length.
     scatter : ndarray, shape (layers,), optional
-        Error of each layer's length, as a share of it.
+        Relative error of each layer's length.
 
     Examples
     --------
     >>> w = layer_weights(8)
-    >>> bool(abs(w.sum()) < 1e-9), bool(abs(w @ np.arange(8)) < 0.05 * abs(w) @ np.arange(8))  # uniform heating, a gradient
-    (True, True)
+    >>> bool(abs(w.sum()) < 1e-9)  # uniform heating cancels
+    True
+    >>> bool(abs(w @ np.arange(8)) < 0.05 * abs(w) @ np.arange(8))  # so does a gradient, nearly
+    True
     """
     if layers % 4:
         raise ValueError(f"a quadrupole has a multiple of 4 layers, not {layers}")
@@ -135,7 +139,7 @@ def coil_rate(
     length: float = 500.0,
     index: float = 1.45,
 ) -> Array:
-    """Apparent rotation rate [deg/h] of a coil whose outer face has the temperature `face` [degC] every `dt` [s].
+    """Compute the apparent rotation rate [deg/h] of a coil from its outer temperature `face`.
 
     Parameters
     ----------
@@ -146,7 +150,7 @@ def coil_rate(
     weights : ndarray, shape (layers,)
         From `layer_weights` [m2].
     diameter, length : float
-        Of the coil and of its fibre [m].
+        Diameter of the coil and length of its fibre [m].
     index : float
         Refractive index.
 
@@ -154,7 +158,7 @@ def coil_rate(
     --------
     >>> ramp = 20.0 + np.arange(3000) / 60.0  # 1 K/min
     >>> rate = coil_rate(ramp, dt=1.0, weights=layer_weights(24, trim=1e-5))
-    >>> bool(abs(rate[-1] - rate[-500]) < 1e-3 * abs(rate[-1]))  # a steady ramp gives a steady error
+    >>> bool(abs(rate[-1] - rate[-500]) < 1e-3 * abs(rate[-1]))  # steady error of a steady ramp
     True
     """
     speed = np.gradient(layer_temperatures(face, dt=dt, layers=weights.size), dt, axis=1)

@@ -1,15 +1,15 @@
-"""How large an effect is, in units of the smallest that any method can see; and what knowing it is worth.
+"""Size of an effect in units of the detection limit, and the evidence expected for it.
 
-A mean that is known up to its size, in noise of known density S(f), changes the log-likelihood by
-``1/2 sum |M(f)|^2 / S(f)``; the limit is where that is `NATS`. In white noise and for a mean that
-is on for T_on of T this is ``a_min = N_s sqrt(2 c / T_eff)``. A change of the log variance by v in
-n samples is worth ``n v^2 / 4``, which gives ``2 sqrt(c / n)``; noise common to the axes ``n / 2
-sum of rho^2``.
+A mean of known shape, in noise of known density S(f), changes the log-likelihood by
+``1/2 sum |M(f)|^2 / S(f)``; the limit is where that equals `NATS`. In white noise, for a mean that
+is present for T_on of T, this gives ``a_min = N_s sqrt(2 c / T_eff)``. A change of the log variance
+by v in n samples is worth ``n v^2 / 4``, hence ``2 sqrt(c / n)``; noise common to the axes is worth
+``n / 2 sum of rho^2``.
 
-In the noise of a real recording (`World.own`) the same counts against what was measured of it: S(f)
-is its own spectrum, lines included; a change of the level, which counts as far as white noise makes
-part of each band, stands beside what the level wanders by itself; and what axes share is that much
-less of what each has.
+For a real recording (`Scenario.measured`) the measured noise takes the place of the known one: S(f)
+is its spectrum, lines included; a change of level counts only in the share of white noise in each
+band, and against the fluctuation of the level itself; and the coherence of two axes falls where
+they have more than white noise.
 """
 
 from __future__ import annotations
@@ -24,30 +24,39 @@ from scipy.optimize import minimize
 
 from gyrostab.blindtest.generator.measured_noise import BANDS
 from gyrostab.blindtest.generator.noise_floor import floor_psd, white_level
-from gyrostab.blindtest.generator.scenario import World, per_second
+from gyrostab.blindtest.generator.scenario import Scenario, count_per_second
 from gyrostab.errors import OptionError
 
 __all__ = [
-    "NATS", "amplitude_for", "band_density", "learned_gain", "line_density_of", "mean_size", "shared_size", "variance_gain",
+    "NATS",
+    "amplitude_for",
+    "band_density",
+    "learned_nats",
+    "line_density_of",
+    "mean_size",
+    "shared_size",
+    "variance_nats",
     "variance_size",
-]  # fmt: skip
+]
 
 Array = NDArray[np.float64]
 
 #: Log-likelihood at the limit.
 NATS = 5.7
-_STRETCHES = 400  # of the spectrum
+_SPECTRUM_BANDS = 400  # of the spectrum
 
 
-def mean_size(world: World, mean: Array, *, white: bool = False) -> float:
-    """Size of a mean (axis, time) [deg/h], in units of the limit; proportional to its amplitude.
+def mean_size(scenario: Scenario, mean: Array, *, white: bool = False) -> float:
+    """Compute the size of a mean (axis, time) [deg/h] in units of the limit.
+
+    The size is proportional to the amplitude of the mean.
 
     Parameters
     ----------
-    world : World
+    scenario : World
     mean : ndarray, shape (axis, time)
     white : bool
-        Leave out all noise but the white one: the limit in its simplest form.
+        Whether to count white noise only: the limit in its simplest form.
 
     Returns
     -------
@@ -55,69 +64,71 @@ def mean_size(world: World, mean: Array, *, white: bool = False) -> float:
         The square root of the expected log-likelihood over `NATS`.
     """
     nats = 0.0
-    for axis, f, power in _mean_lines(world, mean):
-        noise = world.noise[axis]
+    for axis, f, power in _mean_spectra(scenario, mean):
+        noise = scenario.noise[axis]
         density = (
-            floor_psd(f, noise={"N": noise["N"]}, rate=world.rate)
+            floor_psd(f, noise={"N": noise["N"]}, rate=scenario.rate)
             if white
-            else line_density_of(world, axis=axis)
+            else line_density_of(scenario, axis=axis)
         )
         nats += 0.5 * float((power / density).sum())
     return math.sqrt(nats / NATS)
 
 
-def line_density_of(world: World, *, axis: int) -> Array:
-    """Two-sided density [(deg/h)2/Hz] of the noise of an axis at the frequencies ``k rate / (2 size)``, k from 1: known, or measured."""
-    if world.own is not None:
-        return np.asarray(world.own.lines[axis])
-    f = np.arange(1, world.size) * world.rate / (2 * world.size)
-    return floor_psd(f, noise=world.noise[axis], rate=world.rate)
+def line_density_of(scenario: Scenario, *, axis: int) -> Array:
+    """Compute the two-sided noise density [(deg/h)2/Hz] of an axis at ``k rate / (2 size)``."""
+    if scenario.measured is not None:
+        return np.asarray(scenario.measured.lines[axis])
+    f = np.arange(1, scenario.size) * scenario.rate / (2 * scenario.size)
+    return floor_psd(f, noise=scenario.noise[axis], rate=scenario.rate)
 
 
-def band_density(world: World, *, bands: int = BANDS) -> Array:
-    """Two-sided density [(deg/h)2/Hz] of white noise and steps of the angle in equal bands (axis, band); of real noise the typical one."""
-    if world.own is not None:
-        return world.own.level
-    f = (np.arange(bands) + 0.5) * world.rate / 2 / bands
+def band_density(scenario: Scenario, *, bands: int = BANDS) -> Array:
+    """Compute the two-sided density [(deg/h)2/Hz] of N and Q in equal bands, shape (axis, band).
+
+    For the noise of a real recording, return its typical density.
+    """
+    if scenario.measured is not None:
+        return scenario.measured.level
+    f = (np.arange(bands) + 0.5) * scenario.rate / 2 / bands
     return np.stack(
-        [floor_psd(f, noise={k: n[k] for k in "NQ"}, rate=world.rate) for n in world.noise]
+        [floor_psd(f, noise={k: n[k] for k in "NQ"}, rate=scenario.rate) for n in scenario.noise]
     )
 
 
-def _mean_lines(world: World, mean: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Of every axis that a mean is on: its number, frequencies [Hz], the power there as far as it is recorded [(deg/h)2/Hz]."""
-    there = ~world.missing
+def _mean_spectra(scenario: Scenario, mean: Array) -> Iterator[tuple[int, Array, Array]]:
+    """Yield axis number, frequencies [Hz] and recorded power [(deg/h)2/Hz] of each nonzero row."""
+    present = ~scenario.missing
     for axis, values in enumerate(mean):
         whole = float(((values - values.mean()) ** 2).sum())
         if whole == 0:
             continue
         lines = fft.dct(values - values.mean(), norm="ortho")[1:]
-        f = np.arange(1, world.size) * world.rate / (2 * world.size)
-        seen = float(((values[there] - values[there].mean()) ** 2).sum()) / whole
-        yield axis, f, seen * lines**2 / world.rate
+        f = np.arange(1, scenario.size) * scenario.rate / (2 * scenario.size)
+        seen = float(((values[present] - values[present].mean()) ** 2).sum()) / whole
+        yield axis, f, seen * lines**2 / scenario.rate
 
 
-def learned_gain(world: World, mean: Array) -> float:
-    """Expected log-likelihood [nats] of a known mean (axis, time) over noise that is fitted to the same record without it.
+def learned_nats(scenario: Scenario, mean: Array) -> float:
+    """Compute the evidence expected for a known mean over noise fitted without it [nats].
 
-    Angle random walk, bias instability and rate random walk of each axis are what suits best where
-    the mean is taken for noise: a slow mean is worth a part only of what it is where the noise is
-    known beforehand.
+    The fit without the mean attributes a slow mean to angle random walk, bias instability and rate
+    random walk in part, which reduces the evidence compared with noise that is known beforehand.
 
     Parameters
     ----------
-    world : World
+    scenario : World
     mean : ndarray, shape (axis, time)
     """
     return sum(
-        _learned(f, power, world.noise[axis], world.rate)
-        for axis, f, power in _mean_lines(world, mean)
+        _fit_noise_to_mean(f, power, scenario.noise[axis], scenario.rate)
+        for axis, f, power in _mean_spectra(scenario, mean)
     )
 
 
-def _learned(f: Array, power: Array, noise: dict[str, float], rate: float) -> float:
-    """Of one axis: the divergence of noise and mean from the nearest noise, over stretches of the spectrum in which noise is one level."""
-    first = np.unique(np.geomspace(1, f.size, _STRETCHES).astype(np.int64)) - 1
+def _fit_noise_to_mean(f: Array, power: Array, noise: dict[str, float], rate: float) -> float:
+    """Compute the divergence [nats] of noise plus mean from the nearest N, B, K noise."""
+    first = np.unique(np.geomspace(1, f.size, _SPECTRUM_BANDS).astype(np.int64)) - 1
     count = np.diff(np.append(first, f.size))
     f, power = (np.add.reduceat(values, first) / count for values in (f, power))
     known = floor_psd(f, noise=noise, rate=rate)
@@ -135,7 +146,7 @@ def _learned(f: Array, power: Array, noise: dict[str, float], rate: float) -> fl
     white = known[-1] / alone[1, -1]
     meets = [
         known[place] / alone[2:, place] for place in range(0, f.size, max(1, f.size // 4))
-    ]  # either is as loud as all that is known
+    ]  # levels at which either term equals the known density
     starts = [
         np.log([white, *np.where(chosen, level, level * 1e-3)])
         for level in meets
@@ -148,31 +159,31 @@ def _learned(f: Array, power: Array, noise: dict[str, float], rate: float) -> fl
     return float(max(0.0, min(found)))
 
 
-def _weights(world: World, ratio: Array) -> Array:
-    count = per_second(world).astype(float)
+def _samples_per_second(scenario: Scenario, ratio: Array) -> Array:
+    count = count_per_second(scenario).astype(float)
     weight = count.reshape(1, -1, *(1,) * (ratio.ndim - 2))
     return weight / (ratio.shape[2] if ratio.ndim == 3 else 1)
 
 
-def variance_size(world: World, ratio: Array) -> float:
-    """Size of a change of the noise density, in units of the limit.
+def variance_size(scenario: Scenario, ratio: Array) -> float:
+    """Compute the size of a change of the noise density in units of the limit.
 
     Parameters
     ----------
-    world : World
+    scenario : World
     ratio : ndarray, shape (axis, second) or (axis, second, frequency)
-        Density with the effect over density without; frequencies share (0, rate / 2) equally. A
-        second axis of length 1 stands for a change that lasts all the time and is then compared
-        with no change; else with its own mean over time.
+        Density with the effect over density without; the frequencies divide (0, rate / 2) equally.
+        With length 1 along the second dimension the change is permanent and is compared with no
+        change; otherwise it is compared with its mean over time.
 
     Returns
     -------
     float
     """
-    if world.own is not None:
-        return math.sqrt(_own_nats(world, ratio) / NATS)
+    if scenario.measured is not None:
+        return math.sqrt(_measured_nats(scenario, ratio) / NATS)
     change = np.log(ratio)
-    weight = _weights(world, ratio)
+    weight = _samples_per_second(scenario, ratio)
     if ratio.shape[1] > 1:
         change = change - (change * weight).sum(axis=1, keepdims=True) / weight.sum(
             axis=1, keepdims=True
@@ -182,46 +193,50 @@ def variance_size(world: World, ratio: Array) -> float:
     return math.sqrt(float((weight * change**2).sum()) / 4 / NATS)
 
 
-def _own_nats(world: World, ratio: Array) -> float:
-    """Of a change that lasts for a part of the time, in real noise [nats]."""
-    assert world.own is not None
+def _measured_nats(scenario: Scenario, ratio: Array) -> float:
+    """Compute the evidence for a temporary change of level in measured noise [nats]."""
+    assert scenario.measured is not None
     if ratio.shape[1] == 1:
         raise OptionError(
-            "what a change for good is worth in real noise nobody knows: it is there in the untouched recording too"
+            "a permanent change of level cannot be sized in real noise, which may contain one "
+            "already; inject an effect that varies in time"
         )
-    if ratio.ndim == 2:  # noise can only be added, and is white
-        white = np.array([white_level(noise["N"]) ** 2 for noise in world.noise])
+    if ratio.ndim == 2:  # only white noise can be added
+        white = np.array([white_level(noise["N"]) ** 2 for noise in scenario.noise])
         more = ratio / ratio.min(axis=1, keepdims=True) - 1
-        ratio = 1 + more[:, :, None] * (white[:, None] / world.own.level)[:, None, :]
-    change = world.own.blocks(np.log(ratio))
-    return sum(world.own.change_nats(rows, axis=axis) for axis, rows in enumerate(change))
+        ratio = 1 + more[:, :, None] * (white[:, None] / scenario.measured.level)[:, None, :]
+    change = scenario.measured.blocks(np.log(ratio))
+    return sum(scenario.measured.change_nats(rows, axis=axis) for axis, rows in enumerate(change))
 
 
-def variance_gain(world: World, ratio: Array, *, quiet: bool = True) -> float:
-    """Expected log-likelihood [nats] of the truth over noise without the effect, for the `ratio` of `variance_size`.
+def variance_nats(scenario: Scenario, ratio: Array, *, quiescent: bool = True) -> float:
+    """Compute the evidence expected for a change of density over unchanged noise [nats].
 
-    Without `quiet` times, in which the noise could be seen without the effect, it is compared with
-    the mean level instead.
+    `ratio` is that of `variance_size`. Without `quiescent` times, which would show the
+    noise without the effect, the change is compared with the mean level instead.
     """
-    if world.own is not None:
-        return _own_nats(world, ratio)
-    weight = _weights(world, ratio)
+    if scenario.measured is not None:
+        return _measured_nats(scenario, ratio)
+    weight = _samples_per_second(scenario, ratio)
     if ratio.shape[1] == 1:
         weight = weight.sum(axis=1, keepdims=True)
-    elif not quiet:
+    elif not quiescent:
         ratio = (
             ratio * weight.sum(axis=1, keepdims=True) / (ratio * weight).sum(axis=1, keepdims=True)
         )
     return float((weight * (ratio - 1 - np.log(ratio))).sum()) / 2
 
 
-def shared_size(world: World, correlations: Array, *, band: float = 1.0) -> float:
-    """Size of white noise common to pairs of axes (xy, xz, yz) with these `correlations`, over a share `band` of the frequencies."""
-    n = float((~world.missing).sum()) * band
+def shared_size(scenario: Scenario, correlations: Array, *, band: float = 1.0) -> float:
+    """Compute the size of common white noise from the correlations of the pairs xy, xz, yz.
+
+    `band` is the share of the frequencies that it fills.
+    """
+    n = float((~scenario.missing).sum()) * band
     worth = np.asarray(correlations) ** 2
-    if world.own is not None:  # the coherence falls where an axis has more than white noise
-        white = np.array([white_level(noise["N"]) ** 2 for noise in world.noise])
-        part = white[:, None] / world.own.level
+    if scenario.measured is not None:  # the coherence falls where an axis has more than white noise
+        white = np.array([white_level(noise["N"]) ** 2 for noise in scenario.noise])
+        part = white[:, None] / scenario.measured.level
         worth = worth * np.array([(part[i] * part[j]).mean() for i, j in ((0, 1), (0, 2), (1, 2))])
     return math.sqrt(n * float(worth.sum()) / 2 / NATS)
 
@@ -229,7 +244,7 @@ def shared_size(world: World, correlations: Array, *, band: float = 1.0) -> floa
 def amplitude_for(
     size_of: Callable[[float], float], strength: float, *, first: float = 1.0
 ) -> float:
-    """Amplitude at which a growing `size_of` reaches `strength`, to 0.1 %.
+    """Find the amplitude at which the increasing function `size_of` reaches `strength`, to 0.1 %.
 
     Examples
     --------

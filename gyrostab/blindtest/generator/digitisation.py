@@ -1,4 +1,4 @@
-"""What the words of a log do to the rate: rounding, a stop at the end of the range, a loop that sticks at zero."""
+"""Effects of digitisation and of the range: quantization, clipping and a dead zone."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from numpy.typing import NDArray
 from gyrostab.blindtest.generator import loop
 from gyrostab.blindtest.generator.detection_limits import NATS
 from gyrostab.blindtest.generator.noise_floor import white_level
-from gyrostab.blindtest.generator.scenario import AXES, Effect, World
-from gyrostab.blindtest.generator.shapes import variance_effect
+from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
+from gyrostab.blindtest.generator.shapes import make_variance_effect
 
 __all__ = ["clipping", "dead_zone", "rate_quantization"]
 
 Array = NDArray[np.float64]
 
-#: What one sample is worth that noise alone would never give: the log of about a thousand.
-_NEVER = math.log(1e3)
+#: Evidence of one sample that noise alone cannot produce [nats].
+_NATS_PER_SAMPLE = math.log(1e3)
 
 
-def _sample_sd(world: World, axis: int) -> float:
-    return white_level(world.noise[axis]["N"]) * math.sqrt(world.rate)
+def _sample_sd(scenario: Scenario, axis: int) -> float:
+    return white_level(scenario.noise[axis]["N"]) * math.sqrt(scenario.rate)
 
 
-def rate_quantization(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """The rate is rounded to steps, or cut off towards zero; the size is that of the white noise which the steps add."""
+def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw a rate that is rounded or truncated to steps, sized by the white noise the steps add."""
     cut = rng.random() < 0.5
-    sd = np.array([_sample_sd(world, i) for i in range(len(AXES))])
-    effect, step = variance_effect(
-        world,
+    sd = np.array([_sample_sd(scenario, i) for i in range(len(AXES))])
+    effect, step = make_variance_effect(
+        scenario,
         lambda a: 1 + (a**2 / 12 / sd**2)[:, None],
         strength=strength,
         name="rate_quantization",
         axes=AXES,
         driver=None,
         form="cut off towards zero" if cut else "rounded to the nearest step",
-        differs=cut,
+        form_differs=cut,
         first=1e-3 * float(sd.min()),
-        tau=(1 / world.rate, 30.0),
+        tau=(1 / scenario.rate, 30.0),
     )
 
     def after(record: Array) -> Array:
@@ -49,24 +49,24 @@ def rate_quantization(world: World, rng: np.random.Generator, *, strength: float
     return replace(effect, after=after, parameters={"step": {"value": step, "unit": "deg/h"}})
 
 
-def _stuck(strength: float) -> int:
-    """Number of samples that noise alone would not give, for a strength."""
-    return max(2, math.ceil(NATS * strength**2 / _NEVER))
+def _count_stuck_samples(strength: float) -> int:
+    """Compute the number of impossible samples that gives an effect its strength."""
+    return max(2, math.ceil(NATS * strength**2 / _NATS_PER_SAMPLE))
 
 
-def dead_zone(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """An axis that lies at zero rate, and a loop that holds what is nearest to zero and pulls at what is near."""
+def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw a closed loop that holds rates near zero at zero, on one axis at zero mean rate."""
     axis = int(rng.integers(3))
-    number = _stuck(strength)
-    there = float((~world.missing).sum())
+    number = _count_stuck_samples(strength)
+    present = float((~scenario.missing).sum())
     width = (
-        number / there * _sample_sd(world, axis) * math.sqrt(math.pi / 2)
-    )  # so many normal samples lie within +- width
+        number / present * _sample_sd(scenario, axis) * math.sqrt(math.pi / 2)
+    )  # expected number of normal samples within +- width
 
     def after(record: Array) -> Array:
         out = record.copy()
         out[axis] = loop.dead_zone(
-            record[axis] - np.nanmean(np.where(world.missing, np.nan, record[axis])), width=width
+            record[axis] - np.nanmean(np.where(scenario.missing, np.nan, record[axis])), width=width
         )
         return out
 
@@ -75,30 +75,30 @@ def dead_zone(world: World, rng: np.random.Generator, *, strength: float) -> Eff
         axes=(AXES[axis],),
         driver=None,
         form="held at zero, and pulled softly beyond",
-        differs=True,
+        form_differs=True,
         size=strength,
         nats=NATS * strength**2,
-        tau=(1 / world.rate, 10 / world.rate),
+        tau=(1 / scenario.rate, 10 / scenario.rate),
         after=after,
         parameters={"width": {"value": width, "unit": "deg/h"}},
     )
 
 
-def clipping(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """A range that ends too soon on one side or both, hard or with a soft knee."""
+def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw a range that clips one axis on one side or both, with a hard edge or a soft knee."""
     axis = int(rng.integers(3))
-    number = _stuck(strength)
+    number = _count_stuck_samples(strength)
     both, soft = bool(rng.random() < 0.5), bool(rng.random() < 0.4)
 
     def after(record: Array) -> Array:
         out = record.copy()
-        row = np.where(world.missing, np.nan, record[axis])
+        row = np.where(scenario.missing, np.nan, record[axis])
         ends = np.nanquantile(
             row, [number / 2 / row.size, 1 - number / (2 if both else 1) / row.size]
         )
         low = ends[0] if both else -np.inf
-        if soft:  # the last tenth of a standard deviation before the stop is squeezed
-            knee = 0.1 * _sample_sd(world, axis)
+        if soft:  # compress the last tenth of a standard deviation before the limit
+            knee = 0.1 * _sample_sd(scenario, axis)
             row = np.where(
                 row > ends[1] - knee,
                 ends[1] - knee / 2 + (row - ends[1] + knee) / 2 - knee / 2,
@@ -112,9 +112,9 @@ def clipping(world: World, rng: np.random.Generator, *, strength: float) -> Effe
         axes=(AXES[axis],),
         driver=None,
         form=("on both sides" if both else "above") + (", with a soft knee" if soft else ""),
-        differs=soft,
+        form_differs=soft,
         size=strength,
         nats=NATS * strength**2,
-        tau=(1 / world.rate, 10 / world.rate),
+        tau=(1 / scenario.rate, 10 / scenario.rate),
         after=after,
     )

@@ -14,74 +14,87 @@ from gyrostab.blindtest.generator import light, loop, telemetry
 from gyrostab.blindtest.generator.detection_limits import NATS, shared_size
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.noise_floor import white_level
-from gyrostab.blindtest.generator.scenario import AXES, Effect, World, to_samples
+from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import (
-    by_axis,
-    following,
-    mean_effect,
-    named,
-    on_axes,
-    variance_effect,
+    axes_with_share,
+    draw_shares,
+    fit_lagged_driver,
+    make_mean_effect,
+    make_variance_effect,
+    scale_by_axis,
 )
 
 __all__ = [
-    "bias_jump", "feedback_reset", "held_samples", "logger_filter", "shared_source", "spectral_line", "spikes", "supply_bias",
-]  # fmt: skip
+    "bias_jump",
+    "feedback_reset",
+    "held_samples",
+    "logger_filter",
+    "shared_source",
+    "spectral_line",
+    "spikes",
+    "supply_bias",
+]
 
 Array = NDArray[np.float64]
 
 
-def spectral_line(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """A line that stands, or one whose phase wanders slowly."""
-    frequency = float(np.exp(rng.uniform(np.log(0.005), np.log(0.48)))) * world.rate
+def spectral_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw a spectral line of constant phase, or one whose phase wanders slowly."""
+    frequency = float(np.exp(rng.uniform(np.log(0.005), np.log(0.48)))) * scenario.rate
     wander = rng.random() < 0.5
-    phase = 2 * math.pi * frequency * np.arange(world.size) / world.rate
+    phase = 2 * math.pi * frequency * np.arange(scenario.size) / scenario.rate
     if wander:
         phase = phase + np.cumsum(
-            rng.normal(0, math.sqrt(1.0 / (world.seconds * world.rate)), world.size)
+            rng.normal(0, math.sqrt(1.0 / (scenario.seconds * scenario.rate)), scenario.size)
         )
-    shares = on_axes(rng)
-    effect = mean_effect(
-        world,
+    shares = draw_shares(rng)
+    effect = make_mean_effect(
+        scenario,
         np.sin(phase + rng.uniform(0, 6)),
         shares,
         strength=strength,
         name="spectral_line",
         driver=None,
         form="sine with a phase that wanders by a radian" if wander else "sine",
-        differs=wander,
-        tau=(max(1 / world.rate, 0.1 / frequency), 2 / frequency),
+        form_differs=wander,
+        tau=(max(1 / scenario.rate, 0.1 / frequency), 2 / frequency),
         parameters={
             "frequency": {
-                "value": (phase[-1] - phase[0]) / (2 * math.pi * (world.seconds - 1 / world.rate)),
+                "value": (phase[-1] - phase[0])
+                / (2 * math.pi * (scenario.seconds - 1 / scenario.rate)),
                 "unit": "Hz",
             }
         },
     )
     amplitude = float(effect.parameters["peak"]["value"])
-    effect.parameters["amplitude"] = {"values": by_axis(np.abs(shares), amplitude), "unit": "deg/h"}
+    effect.parameters["amplitude"] = {
+        "values": scale_by_axis(np.abs(shares), amplitude),
+        "unit": "deg/h",
+    }
     return effect
 
 
-def supply_bias(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """Bias that follows the supply, in half of the cases through a regulator that is slow and bends."""
+def supply_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw a bias that follows the supply, in half of the cases slowly and nonlinearly."""
     slow = rng.random() < 0.5
-    v = world.supply - world.supply.mean()
+    v = scenario.supply - scenario.supply.mean()
     shape = lag(v - 0.3 * np.minimum(v, 0) ** 2, rng.uniform(5, 120)) if slow else v
-    effect = mean_effect(
-        world,
-        to_samples(world, shape),
-        on_axes(rng),
+    effect = make_mean_effect(
+        scenario,
+        to_samples(scenario, shape),
+        draw_shares(rng),
         strength=strength,
         name="supply_bias",
         driver="supply_voltage",
         form="slow and bent" if slow else "proportional to the voltage",
-        differs=slow,
-        regressor=("voltage", to_samples(world, v), "deg/h/V"),
+        form_differs=slow,
+        regressor=("voltage", to_samples(scenario, v), "deg/h/V"),
     )
-    if slow and effect.mean is not None:  # the diagnosis follows a voltage with a lag, straight
+    if slow and effect.mean is not None:  # the diagnosis fits a linear response with a lag
         found = {
-            axis: following(world, effect.mean[AXES.index(axis)], v, axis=AXES.index(axis))
+            axis: fit_lagged_driver(
+                scenario, effect.mean[AXES.index(axis)], v, axis=AXES.index(axis)
+            )
             for axis in effect.axes
         }
         effect.parameters["voltage"] = {
@@ -95,51 +108,51 @@ def supply_bias(world: World, rng: np.random.Generator, *, strength: float) -> E
     return effect
 
 
-def bias_jump(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """A step at every start after a power cut, in half of the cases with a settling tail."""
+def bias_jump(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw a bias step after every power cut, in half of the cases with a settling tail."""
     tail = rng.random() < 0.5
-    t = np.arange(world.temperature.size, dtype=float)
+    t = np.arange(scenario.temperature.size, dtype=float)
     shape = np.zeros_like(t)
-    for _, end in world.cuts:
+    for _, end in scenario.cuts:
         jump = rng.choice([-1, 1]) * rng.uniform(0.4, 1.0)
         settle = 0.3 * np.exp(-np.maximum(t - end, 0) / 60.0) if tail else 0.0
         shape += np.where(t >= end, jump * (1 + settle), 0.0)
-    return mean_effect(
-        world,
-        to_samples(world, shape),
-        on_axes(rng),
+    return make_mean_effect(
+        scenario,
+        to_samples(scenario, shape),
+        draw_shares(rng),
         strength=strength,
         name="bias_jump",
         driver=None,
         form="step with a settling tail at every start" if tail else "step at every start",
-        differs=tail,
+        form_differs=tail,
     )
 
 
-def feedback_reset(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """A ramp that falls back by not quite 2 pi: the loop needs a share of the ramp to forget it."""
-    rate = rng.uniform(0.3, 1.0) * min(15.0, 15.0 * world.rate / 8)
+def feedback_reset(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw an error that follows every imperfect 2 pi reset of the ramp and decays with phase."""
+    rate = rng.uniform(0.3, 1.0) * min(15.0, 15.0 * scenario.rate / 8)
     axis = int(rng.integers(3))
     wander = 1 + 0.02 * np.sin(
-        2 * math.pi * np.arange(world.size) / world.rate / rng.uniform(100, 900)
+        2 * math.pi * np.arange(scenario.size) / scenario.rate / rng.uniform(100, 900)
     )
-    phase = loop.ramp_phase(rate * wander, dt=1 / world.rate, first=rng.random())
+    phase = loop.ramp_phase(rate * wander, dt=1 / scenario.rate, first=rng.random())
     settle = rng.uniform(0.03, 0.25)
     shares = np.zeros(3)
     shares[axis] = 1.0
     resets = float(loop.reset_frequency(np.array(rate)))
-    return mean_effect(
-        world,
+    return make_mean_effect(
+        scenario,
         loop.reset_error(phase, settle=settle),
         shares,
         strength=strength,
         name="feedback_reset",
         driver="ramp",
-        form=f"exponential in the phase of the ramp, {settle:.2f} of it, at {resets:.2f} resets a second",
-        differs=True,
-        tau=(1 / world.rate, 2 / resets),
+        form=f"exponential in {settle:.2f} of the ramp, at {resets:.2f} resets a second",
+        form_differs=True,
+        tau=(1 / scenario.rate, 2 / resets),
         ramp=phase,
-        beside=("dead_zone",) if rate < 0.2 else (),
+        also_accepted=("dead_zone",) if rate < 0.2 else (),
     )
 
 
@@ -152,38 +165,40 @@ def _low_passed(rng: np.random.Generator, size: int, *, corner: float) -> Array:
 
 
 def _level_below(corner: float) -> float:
-    """Level of `_low_passed` noise far below its corner, as an amplitude: what a random walk of the angle at long times has of it."""
+    """Compute the amplitude of `_low_passed` noise far below its corner, where it acts as N."""
     f = (np.arange(4000) + 0.5) / 4000
     return float(1 / np.sqrt(np.mean(1 / (1 + (f / corner) ** 4))))
 
 
-def shared_source(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """Excess noise of one source in all axes; no axis by itself shows it."""
+def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw excess noise of one source in all axes; no single axis shows it."""
     coloured = rng.random() < 0.5
     corner = rng.uniform(0.3, 0.8) if coloured else 1.0
     shares = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.6, 1.0, 3)
     if rng.random() < 0.3:
         shares[rng.integers(3)] = 0.0
     pairs = np.array([shares[0] * shares[1], shares[0] * shares[2], shares[1] * shares[2]])
-    rho = min(strength / shared_size(world, pairs), 0.8)
+    rho = min(strength / shared_size(scenario, pairs), 0.8)
     shares = shares * math.sqrt(rho)
     common = (
-        _low_passed(rng, world.size, corner=corner) if coloured else rng.standard_normal(world.size)
+        _low_passed(rng, scenario.size, corner=corner)
+        if coloured
+        else rng.standard_normal(scenario.size)
     )
     below = _level_below(corner) if coloured else 1.0
-    own = np.stack([rng.standard_normal(world.size) for _ in AXES])
-    size = shared_size(world, rho * pairs)
+    own = np.stack([rng.standard_normal(scenario.size) for _ in AXES])
+    size = shared_size(scenario, rho * pairs)
     return Effect(
         name="shared_source",
-        axes=named(shares),
+        axes=axes_with_share(shares),
         driver=None,
         form=f"common noise low-passed at {corner:.2f} of Nyquist"
         if coloured
         else "white common noise",
-        differs=coloured,
+        form_differs=coloured,
         size=size,
         nats=NATS * size**2,
-        tau=(1 / world.rate, 30.0),
+        tau=(1 / scenario.rate, 30.0),
         white=light.share_source(own, common, shares=shares),
         common=shares[:, None] * common,
         parameters={
@@ -191,7 +206,7 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
             "N": {
                 "values": {
                     a: abs(float(r)) * n["N"] * below
-                    for a, r, n in zip(AXES, shares, world.noise, strict=True)
+                    for a, r, n in zip(AXES, shares, scenario.noise, strict=True)
                     if r
                 },
                 "unit": "deg/sqrt(h)",
@@ -200,8 +215,8 @@ def shared_source(world: World, rng: np.random.Generator, *, strength: float) ->
     )
 
 
-def logger_filter(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """A short smoothing in the logger that nobody wrote down."""
+def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw an undocumented short smoothing filter in the logger."""
     kind = str(rng.choice(["three", "pole", "mean"]))
 
     def taps(a: float) -> Array:
@@ -219,10 +234,10 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
         gain = np.maximum(np.abs(response) ** 2, 1e-12)
         return np.asarray(
             np.tile(gain / np.exp(np.log(gain).mean()), (3, 1, 1))
-        )  # nobody knows the level before the filter
+        )  # the level before the filter is unknown
 
-    effect, amplitude = variance_effect(
-        world,
+    effect, amplitude = make_variance_effect(
+        scenario,
         ratio,
         strength=strength,
         name="logger_filter",
@@ -233,9 +248,9 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
             "pole": "one pole",
             "mean": "mean of two neighbours, unequal",
         }[kind],
-        differs=kind != "pole",
+        form_differs=kind != "pole",
         first=1e-4,
-        tau=(1 / world.rate, 10 / world.rate),
+        tau=(1 / scenario.rate, 10 / scenario.rate),
     )
     weights = taps(amplitude)
 
@@ -246,27 +261,27 @@ def logger_filter(world: World, rng: np.random.Generator, *, strength: float) ->
     parameters = {"weight": {"value": amplitude, "unit": "1"}}
     if kind == "pole":
         parameters["cutoff"] = {
-            "value": -math.log(min(amplitude, 0.45)) * world.rate / (2 * math.pi),
+            "value": -math.log(min(amplitude, 0.45)) * scenario.rate / (2 * math.pi),
             "unit": "Hz",
             "unless": ["length"],
         }
     return replace(effect, after=after, parameters=parameters)
 
 
-def _sample_sd(world: World, axis: int) -> float:
-    own = world.own
+def _sample_sd(scenario: Scenario, axis: int) -> float:
+    measured = scenario.measured
     return (
-        white_level(world.noise[axis]["N"]) * math.sqrt(world.rate)
-        if own is None
-        else float(own.jump[axis])
+        white_level(scenario.noise[axis]["N"]) * math.sqrt(scenario.rate)
+        if measured is None
+        else float(measured.outlier_sigma[axis])
     )
 
 
-def spikes(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """Flipped bits: sizes are powers of two of a step; a spike is worth its chi-square less the places where it could be."""
+def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw flipped bits; a spike is worth its chi-square less the log of its possible places."""
     axis = int(rng.integers(3))
-    sd = _sample_sd(world, axis)
-    n = int((~world.missing).sum())
+    sd = _sample_sd(scenario, axis)
+    n = int((~scenario.missing).sum())
     number = int(rng.integers(2, 25))
     worth = NATS * strength**2 / number + math.log(n)
     lsb = sd * math.sqrt(2 * worth) / 2**12
@@ -274,7 +289,7 @@ def spikes(world: World, rng: np.random.Generator, *, strength: float) -> Effect
 
     def after(record: Array) -> Array:
         out = record.copy()
-        gone = np.where(world.missing, np.nan, record[axis])
+        gone = np.where(scenario.missing, np.nan, record[axis])
         flipped, where = telemetry.flip_bits(
             np.random.default_rng(seed), gone, number=number, lsb=lsb, bit=12
         )
@@ -286,48 +301,48 @@ def spikes(world: World, rng: np.random.Generator, *, strength: float) -> Effect
         axes=(AXES[axis],),
         driver=None,
         form=f"{number} flips of bit 12",
-        differs=True,
+        form_differs=True,
         size=strength,
         nats=NATS * strength**2,
-        tau=(1 / world.rate, 10 / world.rate),
+        tau=(1 / scenario.rate, 10 / scenario.rate),
         after=after,
         parameters={
             "spike": {"value": lsb * 2**12, "unit": "deg/h"},
             "number": {"value": number, "unit": "1"},
-            "per_hour": {"value": number / (n / world.rate / 3600.0), "unit": "1/h"},
+            "per_hour": {"value": number / (n / scenario.rate / 3600.0), "unit": "1/h"},
         },
     )
 
 
-def held_samples(world: World, rng: np.random.Generator, *, strength: float) -> Effect:
-    """Frames that come twice, or whose last sample is held; no chance makes a repeat, so the limit is a few of them."""
-    frame = max(3, int(rng.uniform(0.05, 0.4) * world.rate))
+def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+    """Draw repeated frames or samples; few suffice, as noise alone never repeats a value."""
+    frame = max(3, int(rng.uniform(0.05, 0.4) * scenario.rate))
     hold = bool(rng.random() < 0.6)
-    number = max(1, min(round(NATS / math.log(1e3) * strength**2) + 1, world.size // frame // 8))
+    number = max(1, min(round(NATS / math.log(1e3) * strength**2) + 1, scenario.size // frame // 8))
     seed = int(rng.integers(2**31))
     pairs = number * (frame if hold else 1)
     seen = telemetry.repeat_frames(
         np.random.default_rng(seed),
-        np.zeros((1, world.size)),
+        np.zeros((1, scenario.size)),
         number=number,
         frame=frame,
         hold=hold,
     )[1]
-    seen = seen[~world.missing[seen]]
-    hours = float((~world.missing).sum()) / world.rate / 3600.0
+    seen = seen[~scenario.missing[seen]]
+    hours = float((~scenario.missing).sum()) / scenario.rate / 3600.0
     held = {
         "per_hour": {"value": seen.size / hours, "unit": "1/h"},
-        "length": {"value": frame / world.rate, "unit": "s"},
+        "length": {"value": frame / scenario.rate, "unit": "s"},
     }
     return Effect(
         name="held_samples",
         axes=AXES,
         driver=None,
         form=f"{number} frames of {frame} samples " + ("held" if hold else "sent twice"),
-        differs=not hold,
+        form_differs=not hold,
         size=strength,
         nats=float(pairs) * math.log(1e3),
-        tau=(1 / world.rate, 2 * frame / world.rate),
+        tau=(1 / scenario.rate, 2 * frame / scenario.rate),
         after=lambda record: telemetry.repeat_frames(
             np.random.default_rng(seed), record, number=number, frame=frame, hold=hold
         )[0],

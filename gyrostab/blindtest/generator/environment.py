@@ -1,4 +1,4 @@
-"""What goes on around the gyros, and how imperfect sensors see it: temperature, shaking, supply, light."""
+"""Environment of the gyros and its imperfect sensors: temperature, vibration, supply, light."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-__all__ = ["lag", "light_monitor", "sense", "shaking", "supply", "temperature"]
+__all__ = ["lag", "light_monitor", "read_sensor", "shaking", "supply", "temperature"]
 
 Array = NDArray[np.float64]
 
 
 def lag(values: Array, tau: float, *, dt: float = 1.0) -> Array:
-    """`values` every `dt` [s] as something with the time constant `tau` [s] follows them, in balance at the start.
+    """Apply a first-order lag `tau` [s] to values every `dt` [s], starting in equilibrium.
 
     Examples
     --------
@@ -28,7 +28,7 @@ def lag(values: Array, tau: float, *, dt: float = 1.0) -> Array:
 
 
 def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False) -> Array:
-    """Temperature of the housing [degC], one value a second: run in hole, circulation, plateaus, reversals.
+    """Draw the temperature of the housing [degC], one value a second: ramps, plateaus, reversals.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False
     seconds : float
         Length [s].
     still : bool
-        Whether nothing but a slow wander happens.
+        Whether there is only a slow wander.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False
 def shaking(
     rng: np.random.Generator, seconds: float, *, bursts: int, longest: float = 600.0
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Root mean square of the acceleration [g], one value a second, and where it is in a burst.
+    """Draw the rms acceleration [g], one value a second, and the mask of its bursts.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def shaking(
     seconds : float
         Length [s].
     bursts : int
-        Bursts, each of a level of its own.
+        Number of bursts, each with a separate level.
     longest : float
         Longest burst [s].
 
@@ -107,7 +107,7 @@ def shaking(
 
 
 def supply(rng: np.random.Generator, seconds: float, *, load: Array) -> Array:
-    """Voltage of the battery [V], one value a second: it sags with time and under `load` (0 to 1), and steps.
+    """Draw the battery voltage [V], one value a second; it sags with time and `load` (0 to 1).
 
     Examples
     --------
@@ -125,7 +125,7 @@ def supply(rng: np.random.Generator, seconds: float, *, load: Array) -> Array:
 
 
 def light_monitor(rng: np.random.Generator, seconds: float, *, dips: bool) -> Array:
-    """Light power, relative to its first value, one value a second: slow loss, and `dips` of connectors and bends.
+    """Draw the relative light power, one value a second: slow loss, and `dips` of connectors.
 
     Examples
     --------
@@ -144,7 +144,7 @@ def light_monitor(rng: np.random.Generator, seconds: float, *, dips: bool) -> Ar
     return np.asarray(10 ** (-loss / 10))
 
 
-def sense(
+def read_sensor(
     rng: np.random.Generator,
     values: Array,
     *,
@@ -154,7 +154,7 @@ def sense(
     tau: float = 0.0,
     dt: float = 1.0,
 ) -> Array:
-    """`values` as a sensor reports them: late by `tau` [s], noisy, in steps of `lsb`; `relative` noise is a share of the value.
+    """Apply a sensor to `values`: lag `tau` [s], additive and relative noise, steps of `lsb`.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""From light power to noise: shot, thermal and excess noise at the detector, loss of light, one source for several axes."""
+"""Noise from light: shot, thermal and excess noise, loss of light, and a shared source."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def detector_psd(
     temperature: float = 300.0,
     rin: float = 1e-12,
 ) -> dict[str, Array]:
-    """One-sided spectral densities [A2/Hz] of the current of a detector under `power` [W].
+    """Compute the one-sided densities [A2/Hz] of a detector's current under `power` [W].
 
     Parameters
     ----------
@@ -35,9 +35,9 @@ def detector_psd(
     load : float
         Load resistance [ohm].
     temperature : float
-        Of the load [K].
+        Temperature of the load [K].
     rin : float
-        Excess noise of the source, relative to its power [1/Hz]: about the coherence time.
+        Relative intensity noise of the source [1/Hz]: about its coherence time.
 
     Returns
     -------
@@ -59,15 +59,15 @@ def detector_psd(
 
 
 def relative_psd(power: Array, *, depth: float = 0.75 * math.pi, **detector: float) -> Array:
-    """Spectral density of the phase noise [rad2/Hz], one-sided, of an interferometer biased at phase `depth` [rad].
+    """Compute the one-sided phase noise [rad2/Hz] of an interferometer biased at `depth` [rad].
 
-    The signal is ``P (1 + cos(phase))``, so the slope is ``P sin(depth)`` and the light that
-    reaches the detector ``P (1 + cos(depth))``.
+    The signal is ``P (1 + cos(phase))``: its slope is ``P sin(depth)``, and the light at the
+    detector ``P (1 + cos(depth))``.
 
     Examples
     --------
     >>> strong, weak = relative_psd(np.array([1e-3, 0.5e-3]))
-    >>> bool(abs(weak / strong - 1) < 0.02)  # excess noise does not care for the power
+    >>> bool(abs(weak / strong - 1) < 0.02)  # excess noise is independent of power
     True
     """
     seen = np.asarray(power, dtype=float) * (1 + math.cos(depth))
@@ -84,7 +84,7 @@ def rate_noise(
     wavelength: float = 1.55e-6,
     **detector: float,
 ) -> Array:
-    """White level N_s of the rate [deg/h per root Hz, two-sided] at light power [W].
+    """Compute the white noise N_s of the rate [deg/h per root Hz, two-sided] at a light power [W].
 
     Examples
     --------
@@ -105,7 +105,7 @@ def loss_db(
     per_hour: float = 0.0,
     power: float = 1.0,
 ) -> Array:
-    """Light lost [dB], by temperature [degC] about 40 degC and by age [h] to a `power`.
+    """Compute the loss of light [dB] from temperature [degC], relative to 40 degC, and age [h].
 
     Examples
     --------
@@ -119,7 +119,7 @@ def loss_db(
 
 
 def share_source(own: Array, common: Array, *, shares: Array) -> Array:
-    """Replace a part of each axis's white noise by the noise of the common source; the level of no axis changes.
+    """Replace a part of each axis's white noise by that of a common source, at unchanged level.
 
     Parameters
     ----------
@@ -134,8 +134,9 @@ def share_source(own: Array, common: Array, *, shares: Array) -> Array:
     Examples
     --------
     >>> rng = np.random.default_rng(0)
-    >>> both = share_source(rng.normal(size=(2, 100_000)), rng.normal(size=100_000), shares=np.array([0.5, -0.5]))
-    >>> round(float(np.corrcoef(both)[0, 1]), 2)
+    >>> own, common = rng.normal(size=(2, 100_000)), rng.normal(size=100_000)
+    >>> noise = share_source(own, common, shares=np.array([0.5, -0.5]))
+    >>> round(float(np.corrcoef(noise)[0, 1]), 2)
     -0.25
     """
     level = own.std(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The closed loop: a serrodyne ramp that falls back by 2 pi, the error of that step, and the dead zone by crosstalk."""
+"""Closed loop: serrodyne ramp, error of its 2 pi reset, and dead zone by crosstalk."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 def reset_frequency(
     rate: Array, *, diameter: float = 0.04, index: float = 1.45, wavelength: float = 1.55e-6
 ) -> Array:
-    """Resets of the ramp per second [Hz] at a rotation rate [deg/h]: ``D w / (n lambda)``.
+    """Compute the reset frequency [Hz] at a rotation rate [deg/h]: ``D w / (n lambda)``.
 
     Examples
     --------
@@ -26,7 +26,7 @@ def reset_frequency(
 
 
 def ramp_phase(rate: Array, *, dt: float, first: float = 0.0, **coil: float) -> Array:
-    """Phase of the ramp, 0 to 1 from one reset to the next, under the rates [deg/h] every `dt` [s].
+    """Compute the phase of the ramp, 0 to 1 between resets, from rates [deg/h] every `dt` [s].
 
     Examples
     --------
@@ -39,14 +39,14 @@ def ramp_phase(rate: Array, *, dt: float, first: float = 0.0, **coil: float) -> 
 
 
 def reset_error(phase: Array, *, settle: float = 0.05) -> Array:
-    """Error of the rate after a reset by more or less than 2 pi, without unit, of mean zero.
+    """Compute the normalised rate error after a reset that differs from 2 pi; its mean is zero.
 
     Parameters
     ----------
     phase : ndarray
         From `ramp_phase`.
     settle : float
-        Share of the ramp in which the loop takes the error back.
+        Share of the ramp over which the loop removes the error.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def reset_error(phase: Array, *, settle: float = 0.05) -> Array:
 
 
 def dead_zone(rate: Array, *, width: float) -> Array:
-    """What a loop gives whose crosstalk holds it at zero below `width` [deg/h], and pulls softly above.
+    """Apply a dead zone: crosstalk holds the output at zero below `width` [deg/h].
 
     Examples
     --------

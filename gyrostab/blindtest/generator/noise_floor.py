@@ -1,4 +1,4 @@
-"""The noise that is always there: white, flicker, random walk and the steps of the angle, each by a method of this package's own."""
+"""Base noise: white, flicker, random walk and angle quantization, independent of the package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _URAD = math.degrees(1e-6) * 3600.0  # urad -> deg/h s
 
 
 def white_level(n: float) -> float:
-    """Root density [deg/h per root Hz] of an angle random walk `n` [deg/sqrt(h)].
+    """Convert an angle random walk `n` [deg/sqrt(h)] to a root density [deg/h per root Hz].
 
     Examples
     --------
@@ -28,7 +28,7 @@ def white_level(n: float) -> float:
 
 
 def floor_psd(frequency: Array, *, noise: dict[str, float], rate: float) -> Array:
-    """Two-sided density [(deg/h)2/Hz] of the noise Q [urad], N, B, K of a log of `rate` [Hz], at frequencies [Hz] above 0.
+    """Compute the two-sided density [(deg/h)2/Hz] of Q [urad], N, B and K at frequencies [Hz] > 0.
 
     Examples
     --------
@@ -48,7 +48,7 @@ def floor_psd(frequency: Array, *, noise: dict[str, float], rate: float) -> Arra
 def flicker(
     rng: np.random.Generator, size: int, *, b: float, rate: float, method: str = "spectrum"
 ) -> Array:
-    """Bias instability `b` [deg/h]: from its spectrum, or as a sum of many relaxations.
+    """Draw bias instability `b` [deg/h] from its spectrum, or as a sum of many relaxations.
 
     Parameters
     ----------
@@ -81,8 +81,7 @@ def flicker(
         fastest, slowest, math.ceil(per_decade * math.log10(slowest / fastest)) + 1
     )
     step = math.log(times[1] / times[0])
-    # equal powers on a logarithmic scale of times make 1/f; one of them adds S = 2 s2 tau / (1 + (w
-    # tau)^2)
+    # Relaxations of equal power per log time sum to 1/f; each adds S = 2 s2 tau / (1 + (w tau)^2).
     for tau in times:
         sd = math.sqrt(b**2 / (2 * math.pi) * 2 * step)
         keep = math.exp(-1 / (rate * tau))
@@ -93,7 +92,7 @@ def flicker(
 
 
 def random_walk(rng: np.random.Generator, size: int, *, k: float, rate: float) -> Array:
-    """Rate random walk `k` [deg/h^1.5], from 0.
+    """Draw a rate random walk `k` [deg/h^1.5] that starts at 0.
 
     Examples
     --------
@@ -105,18 +104,18 @@ def random_walk(rng: np.random.Generator, size: int, *, k: float, rate: float) -
 
 
 def quantize_angle(values: Array, *, q: float, rate: float, first: float = 0.0) -> Array:
-    """Rates [deg/h] as an angle counter with noise `q` [urad] gives them: differences of whole steps.
+    """Quantize rates [deg/h] like an angle counter with noise `q` [urad]: differences of steps.
 
     Parameters
     ----------
     values : ndarray, shape (time,)
         Rates [deg/h].
     q : float
-        Coefficient Q [urad]: the step of the angle over root 12.
+        Coefficient Q [urad]: angle step over root 12.
     rate : float
         Rate [Hz].
     first : float
-        Where in its step the angle begins, 0 to 1.
+        Initial position of the angle within its step, 0 to 1.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""From a world and its effects to the log that a reader would give: noise, effects, steps of the words, lost samples, channels."""
+"""Make the log of a scenario: noise, effects, digitisation, missing samples and channels."""
 
 from __future__ import annotations
 
@@ -12,20 +12,27 @@ from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import noise_floor as floor
 from gyrostab.blindtest.generator import tool
-from gyrostab.blindtest.generator.environment import sense
-from gyrostab.blindtest.generator.scenario import AXES, QUICK, Effect, World, stream, to_samples
+from gyrostab.blindtest.generator.environment import read_sensor
+from gyrostab.blindtest.generator.scenario import (
+    AXES,
+    ROTATION_STEP_S,
+    Effect,
+    Scenario,
+    stream,
+    to_samples,
+)
 from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.schema import check_log
 from gyrostab.time.grid import time_coordinate
 
 __all__ = [
-    "base_noise",
-    "channels_of",
-    "gap_columns",
-    "lost",
+    "add_channels",
+    "draw_base_noise",
+    "find_missing",
+    "make_channels",
+    "make_gap_variables",
     "make_log",
-    "signal",
-    "with_channels",
+    "make_record",
 ]
 
 Array = NDArray[np.float64]
@@ -45,32 +52,36 @@ UNITS = {
 }
 
 
-def base_noise(world: World, rng: np.random.Generator, effects: Sequence[Effect] = ()) -> Array:
-    """White noise, flicker and random walk of all axes (axis, time) [deg/h], the white one as the effects make it."""
+def draw_base_noise(
+    scenario: Scenario, rng: np.random.Generator, effects: Sequence[Effect] = ()
+) -> Array:
+    """Draw the base noise (axis, time) [deg/h], with the white noise that the effects imply."""
     rows = []
     instead = next((effect.white for effect in effects if effect.white is not None), None)
-    for i, noise in enumerate(world.noise):
-        white = rng.standard_normal(world.size)
+    for i, noise in enumerate(scenario.noise):
+        white = rng.standard_normal(scenario.size)
         white = (
             (white if instead is None else instead[i])
             * floor.white_level(noise["N"])
-            * math.sqrt(world.rate)
+            * math.sqrt(scenario.rate)
         )
         for effect in effects:
             if effect.variance is not None and np.any(effect.variance[i] != 1):
-                white = white * np.sqrt(to_samples(world, effect.variance[i]))
-        slow = floor.flicker(rng, world.size, b=noise["B"], rate=world.rate, method=world.flicker)
+                white = white * np.sqrt(to_samples(scenario, effect.variance[i]))
+        slow = floor.flicker(
+            rng, scenario.size, b=noise["B"], rate=scenario.rate, method=scenario.flicker
+        )
         rows.append(
-            white + slow + floor.random_walk(rng, world.size, k=noise["K"], rate=world.rate)
+            white + slow + floor.random_walk(rng, scenario.size, k=noise["K"], rate=scenario.rate)
         )
     return np.stack(rows)
 
 
-def signal(world: World, effects: Sequence[Effect], *, seed: int) -> Array:
-    """Rates of all axes (axis, time) [deg/h], NaN where lost; the noise is the same with and without the effects."""
-    record = base_noise(world, stream(seed, "noise"), effects) + stream(seed, "level").uniform(
-        -14, 14, (3, 1)
-    )
+def make_record(scenario: Scenario, effects: Sequence[Effect], *, seed: int) -> Array:
+    """Make the rates (axis, time) [deg/h]; for one seed the noise is the same without effects."""
+    record = draw_base_noise(scenario, stream(seed, "noise"), effects) + stream(
+        seed, "level"
+    ).uniform(-14, 14, (3, 1))
     for effect in effects:
         for part in (effect.mean, effect.extra):
             if part is not None:
@@ -81,41 +92,44 @@ def signal(world: World, effects: Sequence[Effect], *, seed: int) -> Array:
     phase = stream(seed, "angle").random(3)
     record = np.stack(
         [
-            floor.quantize_angle(row, q=n["Q"], rate=world.rate, first=p)
-            for row, n, p in zip(record, world.noise, phase, strict=True)
+            floor.quantize_angle(row, q=n["Q"], rate=scenario.rate, first=p)
+            for row, n, p in zip(record, scenario.noise, phase, strict=True)
         ]
     )
     for effect in effects:
         if effect.after is not None and effect.name != "logger_filter":
             record = effect.after(record)
-    record[:, lost(world, effects)] = np.nan
+    record[:, find_missing(scenario, effects)] = np.nan
     return record
 
 
-def lost(world: World, effects: Sequence[Effect]) -> NDArray[np.bool_]:
-    """Which samples are missing."""
-    gone = world.missing.copy()
+def find_missing(scenario: Scenario, effects: Sequence[Effect]) -> NDArray[np.bool_]:
+    """Mark the missing samples."""
+    gone = scenario.missing.copy()
     for effect in effects:
         if effect.lost is not None:
             gone |= effect.lost
     return gone
 
 
-def channels_of(
-    world: World, effects: Sequence[Effect], rng: np.random.Generator
+def make_channels(
+    scenario: Scenario, effects: Sequence[Effect], rng: np.random.Generator
 ) -> dict[str, tuple[Array, float]]:
-    """Channels as their sensors report them: name to values and rate [Hz].
+    """Make the channels as their sensors report them: name to values and rate [Hz].
 
-    Temperature and vibration are always there; the others are there by chance, whatever the effects
-    are, and where an effect needs one.
+    Temperature and vibration are always present. Other channels are present at random, independent
+    of the effects, and where an effect needs one.
     """
     needed = {effect.driver for effect in effects}
     out: dict[str, tuple[Array, float]] = {
         "temperature": (
-            sense(rng, world.temperature, noise=0.03, lsb=0.0625, tau=rng.uniform(0, 20)),
+            read_sensor(rng, scenario.temperature, noise=0.03, lsb=0.0625, tau=rng.uniform(0, 20)),
             1.0,
         ),
-        "vibration": (np.abs(sense(rng, world.vibration, relative=0.05, noise=0.002)), 1.0),
+        "vibration": (
+            np.abs(read_sensor(rng, scenario.vibration, relative=0.05, noise=0.002)),
+            1.0,
+        ),
     }
     chance = {
         name: rng.random()
@@ -123,27 +137,30 @@ def channels_of(
     }
     if "rotation_rate" in needed or chance["rotation_rate"] < 0.5:
         out["rotation_rate"] = (
-            sense(rng, world.rotation, noise=0.1, lsb=0.05, dt=QUICK),
-            1 / QUICK,
+            read_sensor(rng, scenario.rotation, noise=0.1, lsb=0.05, dt=ROTATION_STEP_S),
+            1 / ROTATION_STEP_S,
         )
     if "supply_voltage" in needed or chance["supply_voltage"] < 0.5:
-        out["supply_voltage"] = (sense(rng, world.supply, noise=0.01, lsb=0.005), 1.0)
+        out["supply_voltage"] = (read_sensor(rng, scenario.supply, noise=0.01, lsb=0.005), 1.0)
     if "light_power" in needed or chance["light_power"] < 0.5:
-        out["light_power"] = (1e-5 * sense(rng, world.light, relative=0.002), 1.0)
+        out["light_power"] = (1e-5 * read_sensor(rng, scenario.light, relative=0.002), 1.0)
     if chance["accel"] < 0.3:
-        angle = tool.toolface(world.rotation, dt=QUICK, first=rng.uniform(0, 6))
+        angle = tool.toolface(scenario.rotation, dt=ROTATION_STEP_S, first=rng.uniform(0, 6))
         parts = tool.gravity(angle, inclination=rng.uniform(2, 80))
         for axis, part in zip(AXES, parts, strict=True):
-            out[f"accel_{axis}"] = (sense(rng, part, noise=0.002, dt=QUICK), 1 / QUICK)
+            out[f"accel_{axis}"] = (
+                read_sensor(rng, part, noise=0.002, dt=ROTATION_STEP_S),
+                1 / ROTATION_STEP_S,
+            )
     phase = next((effect.ramp for effect in effects if effect.ramp is not None), None)
     if phase is not None or chance["ramp"] < 0.15:
-        idle = (rng.random() + rng.uniform(0.02, 0.1) * np.arange(world.size)) % 1.0
-        out["ramp"] = (np.floor((idle if phase is None else phase) * 32768), world.rate)
+        idle = (rng.random() + rng.uniform(0.02, 0.1) * np.arange(scenario.size)) % 1.0
+        out["ramp"] = (np.floor((idle if phase is None else phase) * 32768), scenario.rate)
     return out
 
 
-def gap_columns(missing: NDArray[np.bool_], *, start: int, rate: float) -> dict[str, Any]:
-    """The table of gaps of a log, from what is missing."""
+def make_gap_variables(missing: NDArray[np.bool_], *, start: int, rate: float) -> dict[str, Any]:
+    """Make the gap table of a log from the missing samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]))).reshape(-1, 2)
     length, none = edges[:, 1] - edges[:, 0], np.zeros(len(edges), dtype=np.int64)
     return gap_variables(np.column_stack([edges, length, none, none]), start, rate)
@@ -152,11 +169,12 @@ def gap_columns(missing: NDArray[np.bool_], *, start: int, rate: float) -> dict[
 def make_log(
     record: Array, channels: dict[str, tuple[Array, float]], *, start: int, rate: float
 ) -> xr.Dataset:
-    """A log of the contract from rates (axis, time) [deg/h] and channels; nothing in it but what an instrument knows.
+    """Make a log from rates (axis, time) [deg/h] and channels; it holds only instrument data.
 
     Examples
     --------
-    >>> log = make_log(np.zeros((3, 100)), {"temperature": (np.full(11, 20.0), 1.0)}, start=0, rate=10.0)
+    >>> channels = {"temperature": (np.full(11, 20.0), 1.0)}
+    >>> log = make_log(np.zeros((3, 100)), channels, start=0, rate=10.0)
     >>> sorted(log.sizes)
     ['axis', 'gap', 'time', 'time_temperature']
     """
@@ -168,18 +186,18 @@ def make_log(
                 record,
                 {"units": "degree hour-1", "long_name": "rotation rate"},
             ),
-            **gap_columns(missing, start=start, rate=rate),
+            **make_gap_variables(missing, start=start, rate=rate),
         },
         coords=time_coordinate(start, rate, record.shape[1]),
         attrs={"sampling_rate_hz": float(rate), "kind": "rate"},
     ).assign_coords(axis=list(AXES[: record.shape[0]]))
-    return with_channels(log, channels, start=start, rate=rate)
+    return add_channels(log, channels, start=start, rate=rate)
 
 
-def with_channels(
+def add_channels(
     log: xr.Dataset, channels: dict[str, tuple[Array, float]], *, start: int, rate: float
 ) -> xr.Dataset:
-    """Put channels, as `channels_of` gives them, into a log; each on its own times where it is slower."""
+    """Add the channels of `make_channels` to a log, slower ones with a separate time coordinate."""
     for name, (values, own) in channels.items():
         dim = "time" if own == rate and values.size == log.sizes["time"] else f"time_{name}"
         if dim != "time":

@@ -1,4 +1,4 @@
-"""The world of one case: what happens around the gyros, what the logger loses, how noisy the axes are; and what an effect adds."""
+"""Scenario of one case (environment, missing samples, noise) and the contribution of an effect."""
 
 from __future__ import annotations
 
@@ -12,26 +12,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import environment, telemetry, tool
-from gyrostab.blindtest.generator.measured_noise import OwnNoise
+from gyrostab.blindtest.generator.measured_noise import MeasuredNoise
 
-__all__ = ["AXES", "QUICK", "Effect", "World", "draw_world", "per_second", "stream", "to_samples"]
+__all__ = [
+    "AXES",
+    "ROTATION_STEP_S",
+    "STREAM_LABELS",
+    "Effect",
+    "Scenario",
+    "count_per_second",
+    "draw_scenario",
+    "stream",
+    "to_samples",
+]
 
 Array = NDArray[np.float64]
 
 AXES = ("x", "y", "z")
 
 #: Step of the rotation of the tool [s]; everything else around the gyros has one value a second.
-QUICK = 0.1
+ROTATION_STEP_S = 0.1
+
+
+#: Labels under which some streams were first drawn. They stay, so that a published seed keeps
+#: drawing the same cases.
+STREAM_LABELS = {
+    "scenario": "world",
+    "degradation": "sever",
+    "injection": "salt",
+    "injected": "salted",
+    "sub_threshold": "buried",
+    "out_of_catalogue": "strange",
+    "degraded_driver": "severed",
+}
 
 
 @dataclass(frozen=True)
-class World:
-    """What happens, without noise and without effects.
+class Scenario:
+    """Environment, losses and noise coefficients of one case, without effects.
 
     `temperature` [degC], `vibration` [g rms], `busy`, `supply` [V] and `light` (relative) hold one
-    value a second, `rotation` [deg/s] one every `QUICK`; `cuts` are power cuts [s] (number, 2);
-    `missing` tells which samples are lost; `noise` holds N, B, K, Q of every axis. Where the noise
-    is that of a real recording, `own` is what was measured of it, and limits go by that.
+    value a second, `rotation` [deg/s] one every `ROTATION_STEP_S`; `cuts` are power cuts [s]
+    (number, 2); `missing` marks missing samples; `noise` holds N, B, K, Q of every axis. For a real
+    recording, `measured` is its measured noise, which then defines the limits.
     """
 
     rate: float
@@ -47,30 +70,31 @@ class World:
     cuts: Array
     missing: NDArray[np.bool_]
     flicker: str = "spectrum"
-    own: OwnNoise | None = None
+    measured: MeasuredNoise | None = None
 
     @property
     def seconds(self) -> float:
-        """Length [s]."""
+        """Length of the record [s]."""
         return self.size / self.rate
 
 
 @dataclass(frozen=True)
 class Effect:
-    """What one effect does to the record, and what is true of it.
+    """Contribution of one effect to the record, and its ground truth.
 
     `mean` (axis, time) [deg/h] is added; `variance` (axis, second) multiplies the white noise;
-    `extra` (axis, time) [deg/h] is noise that is added; `white` (axis, time) of unit variance
-    stands in for the white noise, of which `common` is the part that axes share; `after` is done to
-    the finished record; `size` is in units of the closed-form limit; `nats` is the likelihood that
-    knowing the truth is expected to gain.
+    `extra` (axis, time) [deg/h] is added noise; `white` (axis, time), of unit variance, replaces
+    the white noise, and `common` is its part shared by the axes; `after` is applied to the finished
+    record; `size` is in units of the closed-form limit; `nats` is the evidence expected with the
+    truth known; `form_differs` is set where the diagnosis fits another form; `also_accepted` holds
+    further names that are right for this case.
     """
 
     name: str
     axes: tuple[str, ...]
     driver: str | None
     form: str
-    differs: bool
+    form_differs: bool
     size: float
     nats: float
     tau: tuple[float, float]
@@ -84,33 +108,34 @@ class Effect:
     ramp: Array | None = None
     lost: NDArray[np.bool_] | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
-    beside: tuple[str, ...] = ()
+    also_accepted: tuple[str, ...] = ()
 
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:
-    """Random numbers of their own for every purpose, so that drawing more of one kind changes none of another.
+    """Make a separate random generator for each purpose; drawing from one changes no other.
 
     Examples
     --------
-    >>> bool(stream(1, "noise").random() == stream(1, "noise").random()), bool(stream(1, "noise").random() == stream(1, "gaps").random())
-    (True, False)
+    >>> bool(stream(1, "noise").random() == stream(1, "gaps").random())
+    False
     """
-    return np.random.default_rng([seed, *(zlib.crc32(str(name).encode()) for name in names)])
+    labels = (STREAM_LABELS.get(str(name), str(name)) for name in names)
+    return np.random.default_rng([seed, *(zlib.crc32(label.encode()) for label in labels)])
 
 
-def to_samples(world: World, values: Array, *, dt: float = 1.0) -> Array:
-    """Values every `dt` [s] at the samples of the log, by straight lines."""
-    return np.interp(np.arange(world.size) / world.rate, np.arange(values.size) * dt, values)
+def to_samples(scenario: Scenario, values: Array, *, dt: float = 1.0) -> Array:
+    """Interpolate values every `dt` [s] linearly to the samples of the log."""
+    return np.interp(np.arange(scenario.size) / scenario.rate, np.arange(values.size) * dt, values)
 
 
-def per_second(world: World) -> NDArray[np.int64]:
-    """Number of samples present in every second, shape (second,)."""
-    at = (np.flatnonzero(~world.missing) / world.rate).astype(np.int64)
-    return np.bincount(at, minlength=world.temperature.size)
+def count_per_second(scenario: Scenario) -> NDArray[np.int64]:
+    """Count the samples present in every second, shape (second,)."""
+    at = (np.flatnonzero(~scenario.missing) / scenario.rate).astype(np.int64)
+    return np.bincount(at, minlength=scenario.temperature.size)
 
 
-def _noise(
-    rng: np.random.Generator, rate: float, *, heavy: bool, calm: bool
+def _draw_noise(
+    rng: np.random.Generator, rate: float, *, heavy: bool, quiescent: bool
 ) -> tuple[dict[str, float], ...]:
     base = {
         "N": 10 ** rng.uniform(-3.0, -2.0),
@@ -120,7 +145,7 @@ def _noise(
     if heavy:
         base["K"] *= rng.uniform(3, 10)
         base["B"] *= rng.uniform(1, 4)
-    if calm:
+    if quiescent:
         base["K"] *= 0.2
     share = (
         0.0 if rng.random() < 0.5 else 10 ** rng.uniform(-2.5, -1.0)
@@ -134,11 +159,11 @@ def _noise(
     return tuple(axes)
 
 
-def _missing(
+def _draw_missing(
     rng: np.random.Generator, size: int, rate: float, gaps: float, cuts: Array
 ) -> NDArray[np.bool_]:
     frame = max(1, int(rng.uniform(0.2, 4.0) * rate))
-    lost = telemetry.lose(
+    lost = telemetry.draw_losses(
         rng, size, share=gaps, frame=frame, burst=1.0 if rng.random() < 0.4 else rng.uniform(3, 30)
     )
     t = np.arange(size) / rate
@@ -149,7 +174,7 @@ def _missing(
     return lost
 
 
-def draw_world(
+def draw_scenario(
     rng: np.random.Generator,
     *,
     rate: float,
@@ -157,9 +182,9 @@ def draw_world(
     gaps: float = 0.0,
     cuts: int = 0,
     heavy: bool = False,
-    buried: bool = False,
-) -> World:
-    """Draw what happens in one case.
+    sub_threshold: bool = False,
+) -> Scenario:
+    """Draw the scenario of one case.
 
     Parameters
     ----------
@@ -169,37 +194,37 @@ def draw_world(
     seconds : float
         Length [s].
     gaps : float
-        Share of the samples that is lost, beside power cuts.
+        Share of the samples that is missing, in addition to power cuts.
     cuts : int
-        Power cuts.
+        Number of power cuts.
     heavy : bool
         Whether flicker and random walk are unusually strong.
-    buried : bool
-        Long bursts and little random walk, so that effects can be small for a long time.
+    sub_threshold : bool
+        Whether to draw long bursts and little random walk, as small, long effects need.
 
     Examples
     --------
-    >>> world = draw_world(np.random.default_rng(0), rate=10.0, seconds=600.0, gaps=0.2)
-    >>> world.size, bool(0.05 < world.missing.mean() < 0.4)
+    >>> scenario = draw_world(np.random.default_rng(0), rate=10.0, seconds=600.0, gaps=0.2)
+    >>> scenario.size, bool(0.05 < scenario.missing.mean() < 0.4)
     (6000, True)
     """
     size = round(seconds * rate)
     vibration, busy = environment.shaking(
-        rng, seconds, bursts=int(rng.integers(2, 5)), longest=2500.0 if buried else 300.0
+        rng, seconds, bursts=int(rng.integers(2, 5)), longest=2500.0 if sub_threshold else 300.0
     )
     fastest = min(rng.uniform(30, 120), 60.0 * rate / 8)
     turning = (
-        tool.rotation(rng, seconds, dt=QUICK, fastest=fastest)
+        tool.rotation(rng, seconds, dt=ROTATION_STEP_S, fastest=fastest)
         if rng.random() < 0.7
-        else np.zeros(math.ceil(seconds / QUICK) + 1)
+        else np.zeros(math.ceil(seconds / ROTATION_STEP_S) + 1)
     )
-    when = telemetry.power_cuts(rng, seconds, number=cuts) if cuts else np.zeros((0, 2))
+    when = telemetry.draw_power_cuts(rng, seconds, number=cuts) if cuts else np.zeros((0, 2))
     day = int(rng.integers(0, 1000)) * 86400 + int(rng.integers(0, 86400))
-    return World(
+    return Scenario(
         rate=rate,
         size=size,
         start=(1_700_000_000 + day) * 10**9,
-        noise=_noise(rng, rate, heavy=heavy, calm=buried),
+        noise=_draw_noise(rng, rate, heavy=heavy, quiescent=sub_threshold),
         temperature=environment.temperature(rng, seconds, still=bool(rng.random() < 0.1)),
         vibration=vibration,
         busy=busy,
@@ -207,6 +232,6 @@ def draw_world(
         supply=environment.supply(rng, seconds, load=busy.astype(float)),
         light=environment.light_monitor(rng, seconds, dips=False),
         cuts=when,
-        missing=_missing(rng, size, rate, gaps, when),
+        missing=_draw_missing(rng, size, rate, gaps, when),
         flicker="spectrum" if rng.random() < 0.5 else "relaxations",
     )

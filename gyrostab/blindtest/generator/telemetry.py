@@ -1,4 +1,4 @@
-"""What the way to the surface does to samples: lost frames, lost bursts, power cuts, flipped bits, repeated frames."""
+"""Telemetry errors: lost frames and bursts, power cuts, flipped bits and repeated frames."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["flip_bits", "lose", "power_cuts", "repeat_frames", "shortened"]
+__all__ = ["draw_losses", "draw_power_cuts", "flip_bits", "limit_losses", "repeat_frames"]
 
 Array = NDArray[np.float64]
 
-#: Shortest power cut [s]; what comes from the line alone is shorter where an effect hangs on the
-#: starts.
-SHORTEST = 6.0
+#: Shortest power cut [s]; telemetry losses are shorter where an effect depends on restarts.
+MIN_POWER_CUT_S = 6.0
 
 
-def lose(
+def draw_losses(
     rng: np.random.Generator, size: int, *, share: float, frame: int, burst: float = 1.0
 ) -> NDArray[np.bool_]:
-    """Which of `size` samples are lost, in whole frames, by a line that is good or bad.
+    """Draw which of `size` samples are lost, in whole frames and bursts of frames.
 
     Parameters
     ----------
@@ -27,11 +26,11 @@ def lose(
     size : int
         Samples.
     share : float
-        Share lost, on the average, 0 to below 1.
+        Mean share lost, 0 to below 1.
     frame : int
         Samples of a frame.
     burst : float
-        Mean number of frames lost in a row; 1 loses every frame by itself.
+        Mean number of frames lost in a row; with 1 the frames are lost independently.
 
     Examples
     --------
@@ -54,8 +53,8 @@ def lose(
     return np.asarray(np.repeat(bad, frame)[:size])
 
 
-def shortened(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
-    """The same losses, none of them longer than `longest` samples: of longer ones every so often a piece came through.
+def limit_losses(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
+    """Split losses longer than `longest` samples by restoring short pieces.
 
     Examples
     --------
@@ -71,8 +70,8 @@ def shortened(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
     return out
 
 
-def power_cuts(rng: np.random.Generator, seconds: float, *, number: int) -> Array:
-    """Begin and end [s] of `number` power cuts, each in a part of the record of its own, shape (number, 2).
+def draw_power_cuts(rng: np.random.Generator, seconds: float, *, number: int) -> Array:
+    """Draw begin and end [s] of `number` power cuts, spread over the record, shape (number, 2).
 
     Examples
     --------
@@ -82,14 +81,14 @@ def power_cuts(rng: np.random.Generator, seconds: float, *, number: int) -> Arra
     """
     part = seconds / (number + 0.5)
     begin = (np.arange(number) + rng.uniform(0.45, 0.75, number)) * part
-    off = np.maximum(rng.uniform(0.01, 0.12, number) * part, SHORTEST)
+    off = np.maximum(rng.uniform(0.01, 0.12, number) * part, MIN_POWER_CUT_S)
     return np.stack([begin, begin + off], axis=1)
 
 
 def flip_bits(
     rng: np.random.Generator, values: Array, *, number: int, lsb: float, bit: int
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Flip one bit in `number` samples; the words are two's complement in steps of `lsb`.
+    """Flip one bit in `number` samples of two's complement code in steps of `lsb`.
 
     Parameters
     ----------
@@ -99,14 +98,14 @@ def flip_bits(
     number : int
         Flips.
     lsb : float
-        Step of the words [deg/h].
+        Step of the digitisation [deg/h].
     bit : int
-        The bit, 0 for the lowest; a flip changes the sample by ``lsb * 2**bit`` up or down.
+        Number of the bit, 0 for the lowest; a flip changes the sample by ``lsb * 2**bit``.
 
     Returns
     -------
     values, where
-        The samples with flips, and which ones they are.
+        Samples after the flips, and the positions of the flips.
 
     Examples
     --------
@@ -125,27 +124,28 @@ def flip_bits(
 def repeat_frames(
     rng: np.random.Generator, values: Array, *, number: int, frame: int, hold: bool
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Send `number` frames twice, in the place of the next one, or hold their last sample through it.
+    """Overwrite `number` frames by a repeat of the previous frame, or of its last sample.
 
     Parameters
     ----------
     rng : numpy.random.Generator
     values : ndarray, shape (axis, time)
     number : int
-        Frames concerned.
+        Frames to overwrite.
     frame : int
         Samples of a frame.
     hold : bool
-        Whether the last sample is held, instead of the frame repeated.
+        Whether to hold the last sample instead of repeating the frame.
 
     Returns
     -------
     values, where
-        And the first sample of every frame that was overwritten.
+        Values after the change, and the first sample of every overwritten frame.
 
     Examples
     --------
-    >>> after, where = repeat_frames(np.random.default_rng(0), np.arange(40.0)[None], number=1, frame=5, hold=True)
+    >>> rng, values = np.random.default_rng(0), np.arange(40.0)[None]
+    >>> after, where = repeat_frames(rng, values, number=1, frame=5, hold=True)
     >>> len(set(after[0, where[0]: where[0] + 5].tolist()))
     1
     """

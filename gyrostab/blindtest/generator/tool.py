@@ -1,4 +1,4 @@
-"""A drilling tool that turns, sticks and slips: its rotation, its toolface, and what earth and gravity make of them."""
+"""Rotation of a drilling tool with stick-slip, its toolface, and projections of fixed vectors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def rotation(
     fastest: float = 120.0,
     stick_slip: bool = True,
 ) -> Array:
-    """Rotation rate [deg/s] of a tool that drills, stands and drills again.
+    """Draw the rotation rate [deg/s] of a tool that alternately drills and rests.
 
     Parameters
     ----------
@@ -33,9 +33,9 @@ def rotation(
     dt : float
         Step [s].
     fastest : float
-        Highest speed [revolutions per minute]; below it lie `dt` and the rate of the log.
+        Highest speed [revolutions per minute]; `dt` and the rate of the log must resolve it.
     stick_slip : bool
-        Whether the rate swings at 0.1-0.5 Hz in some stretches.
+        Whether the rate oscillates at 0.1-0.5 Hz in some intervals.
 
     Examples
     --------
@@ -62,7 +62,7 @@ def rotation(
 
 
 def toolface(rotation_rate: Array, *, dt: float, first: float = 0.0) -> Array:
-    """Angle of the tool about its axis [rad] under rotation rates [deg/s] every `dt` [s], by the trapezoid rule.
+    """Integrate rotation rates [deg/s] every `dt` [s] to the toolface [rad] by the trapezoid rule.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def toolface(rotation_rate: Array, *, dt: float, first: float = 0.0) -> Array:
 
 
 def cross_axis(angle: Array, *, across: float) -> tuple[Array, Array]:
-    """Parts of a vector of size `across` that stands still, seen by the turning axes x and y.
+    """Project a fixed vector of size `across` on the rotating axes x and y.
 
     Examples
     --------
@@ -86,7 +86,7 @@ def cross_axis(angle: Array, *, across: float) -> tuple[Array, Array]:
 
 
 def gravity(angle: Array, *, inclination: float) -> tuple[Array, Array, Array]:
-    """Gravity [g] along x, y, z of a tool whose axis lies `inclination` [deg] off the plumb line.
+    """Compute gravity [g] along x, y, z of a tool at an `inclination` [deg] from vertical.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Shaking at some kHz, through the mount and the logger's decimator, so that folding and rectification come out by themselves."""
+"""Vibration at 4 kHz through mount and decimator, which produces aliasing and rectification."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 __all__ = [
-    "FAST",
+    "FAST_HZ",
     "band_noise",
     "decimate",
     "decimator_taps",
@@ -20,23 +20,23 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-#: Rate at which shaking is made [Hz].
-FAST = 4000.0
+#: Rate at which vibration is generated [Hz].
+FAST_HZ = 4000.0
 
 
-def _band(low: float, high: float) -> Array:
-    return np.asarray(signal.butter(2, [low, high], btype="bandpass", fs=FAST, output="sos"))
+def _design_bandpass(low: float, high: float) -> Array:
+    return np.asarray(signal.butter(2, [low, high], btype="bandpass", fs=FAST_HZ, output="sos"))
 
 
-def _power(sos: Array, low: float) -> float:
-    """Variance of white noise of unit variance behind the filter."""
-    f = np.geomspace(low / 30, FAST / 2 - 1e-6, 4000)
-    gain = np.abs(signal.freqz_sos(sos, worN=f, fs=FAST)[1]) ** 2
-    return float(np.trapezoid(gain, f)) / (FAST / 2)
+def _filtered_variance(sos: Array, low: float) -> float:
+    """Compute the variance of filtered white noise of unit variance."""
+    f = np.geomspace(low / 30, FAST_HZ / 2 - 1e-6, 4000)
+    gain = np.abs(signal.freqz_sos(sos, worN=f, fs=FAST_HZ)[1]) ** 2
+    return float(np.trapezoid(gain, f)) / (FAST_HZ / 2)
 
 
 def band_noise(rng: np.random.Generator, size: int, *, low: float, high: float) -> Array:
-    """Random acceleration of unit rms between two frequencies [Hz], `size` samples at `FAST`.
+    """Draw acceleration of unit rms between two frequencies [Hz], `size` samples at `FAST_HZ`.
 
     Examples
     --------
@@ -44,14 +44,14 @@ def band_noise(rng: np.random.Generator, size: int, *, low: float, high: float) 
     >>> bool(abs(x.std() - 1) < 0.03)
     True
     """
-    sos = _band(low, high)
-    settle = round(2 * FAST / low)
+    sos = _design_bandpass(low, high)
+    settle = round(2 * FAST_HZ / low)
     x = signal.sosfilt(sos, rng.standard_normal(size + settle))[settle:]
-    return np.asarray(x / math.sqrt(_power(sos, low)))
+    return np.asarray(x / math.sqrt(_filtered_variance(sos, low)))
 
 
 def mount_filter(resonance: float, *, quality: float) -> tuple[Array, Array]:
-    """Digital filter (b, a) at `FAST` of a mass on a damped spring: 1 below the `resonance` [Hz], `quality` at it.
+    """Design the filter (b, a) at `FAST_HZ` of a damped mount with a `resonance` [Hz].
 
     Examples
     --------
@@ -60,21 +60,21 @@ def mount_filter(resonance: float, *, quality: float) -> tuple[Array, Array]:
     8.1
     """
     w = 2 * math.pi * resonance
-    warped = 2 * FAST * math.tan(w / (2 * FAST))
+    warped = 2 * FAST_HZ * math.tan(w / (2 * FAST_HZ))
     damping = warped / quality
-    b, a = signal.bilinear([damping, warped**2], [1.0, damping, warped**2], fs=FAST)
+    b, a = signal.bilinear([damping, warped**2], [1.0, damping, warped**2], fs=FAST_HZ)
     return np.asarray(b), np.asarray(a)
 
 
 def decimator_taps(rate: float, kind: str) -> Array:
-    """Weights of the logger's filter from `FAST` down to `rate` [Hz]; they sum to 1.
+    """Compute the weights of the decimator from `FAST_HZ` to `rate` [Hz]; they sum to 1.
 
     Parameters
     ----------
     rate : float
-        Rate of the log [Hz], a divisor of `FAST`.
+        Rate of the log [Hz], a divisor of `FAST_HZ`.
     kind : {"point", "dump", "cic2", "cic3", "fir"}
-        Take every n-th value, integrate and dump, two or three such in a row, or a short windowed
+        Every n-th value, integrate and dump, two or three of these in series, or a short windowed
         sinc.
 
     Examples
@@ -82,12 +82,12 @@ def decimator_taps(rate: float, kind: str) -> Array:
     >>> decimator_taps(400.0, "dump").size
     10
     """
-    factor = round(FAST / rate)
+    factor = round(FAST_HZ / rate)
     box = np.full(factor, 1.0 / factor)
     if kind == "point":
         return np.ones(1)
     if kind == "fir":
-        taps = np.asarray(signal.firwin(3 * factor + 1, 0.42 * rate, fs=FAST, window="hamming"))
+        taps = np.asarray(signal.firwin(3 * factor + 1, 0.42 * rate, fs=FAST_HZ, window="hamming"))
         return np.asarray(taps / taps.sum())
     taps = box
     for _ in range({"dump": 0, "cic2": 1, "cic3": 2}[kind]):
@@ -96,14 +96,14 @@ def decimator_taps(rate: float, kind: str) -> Array:
 
 
 def decimate(x: Array, *, rate: float, kind: str) -> Array:
-    """Values of `x` (at `FAST`) as the logger gives them at `rate` [Hz].
+    """Decimate `x` from `FAST_HZ` to `rate` [Hz] like the logger.
 
     Examples
     --------
     >>> decimate(np.ones(40_000), rate=100.0, kind="cic2").round(6)[[5, 500]].tolist()
     [1.0, 1.0]
     """
-    factor = round(FAST / rate)
+    factor = round(FAST_HZ / rate)
     smooth = signal.oaconvolve(x, decimator_taps(rate, kind))[: x.size]
     return np.asarray(smooth[factor - 1 :: factor])
 
@@ -117,31 +117,33 @@ def folded_psd(
     high: float,
     mount: tuple[Array, Array] | None = None,
 ) -> Array:
-    """Two-sided density [1/Hz] at `rate` [Hz] of unit-rms band noise behind mount and decimator: all aliases added.
+    """Compute the aliased two-sided density [1/Hz] of unit-rms band noise after the decimator.
 
     Examples
     --------
     >>> f = (np.arange(200) + 0.5)
     >>> flat = folded_psd(f, rate=400.0, kind="point", low=700, high=800)
-    >>> round(float(2 * flat.sum()), 1)  # all of the band is there
+    >>> round(float(2 * flat.sum()), 1)  # nothing of the band is lost
     1.0
     """
-    sos = _band(low, high)
-    level = 1.0 / (FAST * _power(sos, low))
+    sos = _design_bandpass(low, high)
+    level = 1.0 / (FAST_HZ * _filtered_variance(sos, low))
     taps = decimator_taps(rate, kind)
-    alias = (np.asarray(frequency)[None, :] + rate * np.arange(round(FAST / rate))[:, None]) % FAST
+    alias = (
+        np.asarray(frequency)[None, :] + rate * np.arange(round(FAST_HZ / rate))[:, None]
+    ) % FAST_HZ
     flat = alias.ravel()
     gain = (
-        np.abs(signal.freqz_sos(sos, worN=flat, fs=FAST)[1]) ** 2
-        * np.abs(signal.freqz(taps, worN=flat, fs=FAST)[1]) ** 2
+        np.abs(signal.freqz_sos(sos, worN=flat, fs=FAST_HZ)[1]) ** 2
+        * np.abs(signal.freqz(taps, worN=flat, fs=FAST_HZ)[1]) ** 2
     )
     if mount is not None:
-        gain = gain * np.abs(signal.freqz(*mount, worN=flat, fs=FAST)[1]) ** 2
+        gain = gain * np.abs(signal.freqz(*mount, worN=flat, fs=FAST_HZ)[1]) ** 2
     return np.asarray(level * gain.reshape(alias.shape).sum(axis=0))
 
 
 def rectify(rms: Array, *, exponent: float, saturation: float) -> Array:
-    """Shift of the mean by shaking of `rms` [g], in g to the `exponent`; beyond `saturation` [g] it grows slower.
+    """Compute the shift of the mean by vibration `rms` [g], with exponent and saturation [g].
 
     Examples
     --------

@@ -1,1 +1,1 @@
-"""The run of the blind test: draw, commit, diagnose, score, publish."""
+"""Run of the blind test: draw, commit, diagnose, score and publish."""

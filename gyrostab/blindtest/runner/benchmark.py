@@ -1,4 +1,4 @@
-"""The benchmark from the draw to the table."""
+"""Run the benchmark from the draw to the table."""
 
 from __future__ import annotations
 
@@ -9,8 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gyrostab.blindtest.runner.folder import TUNING, begin, case_name, look, read_sums, write_sums
-from gyrostab.blindtest.runner.pool import each_in_processes
+from gyrostab.blindtest.runner.folder import (
+    FIRST_PUBLIC_SEED,
+    begin_run,
+    case_name,
+    inspect_folder,
+    read_sums,
+    write_sums,
+)
+from gyrostab.blindtest.runner.pool import run_in_processes
 from gyrostab.blindtest.runner.steps import compare_case, diagnose_case, draw_case
 from gyrostab.errors import ResumeError
 from gyrostab.store.output import resolve_link
@@ -22,23 +29,23 @@ if TYPE_CHECKING:
 
 __all__ = ["Proof", "prove"]
 
-_USUAL = {"cases": 40, "nulls": 400}
+_DEFAULTS = {"cases": 40, "nulls": 400}
 
-_SALTED = 40  # drawn cases to a salted real recording, which makes four more
+_CASES_PER_INJECTION = 40  # each injection makes four more cases
 
 
 class Proof(NamedTuple):
-    """What a benchmark gave."""
+    """Result of a benchmark."""
 
-    #: Of all draws.
+    #: Seed of all draws.
     seed: int
-    #: SHA-256 of the list of sealed truths.
-    sealed: str
+    #: SHA-256 of the list of committed truths.
+    commitment: str
     #: Figures with 95 % intervals and targets.
     table: pd.DataFrame
-    #: A sentence on every target that was missed.
+    #: One sentence for each missed target.
     missed: list[str]
-    #: Name of each case whose diagnosis failed, and why.
+    #: Name of each case whose diagnosis failed -> reason.
     failed: dict[str, str]
     #: Files written.
     files: list[Path]
@@ -57,35 +64,35 @@ def prove(
     progress: Stage | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Proof:
-    """Try the diagnosis on recordings with concealed effects, and count how often it is right.
+    """Test the diagnosis blindly on recordings with known effects, and score it.
 
-    The cases are drawn by a generator that shares no physics with the diagnosis. All truths are
-    sealed by their SHA-256 before the first recording is diagnosed; each diagnosis is given one
+    The generator of the cases shares no physics with the diagnosis. The SHA-256 of all ground
+    truths is committed before the first recording is diagnosed, and each diagnosis gets one
     recording and nothing else.
 
     Parameters
     ----------
     directory : path-like
-        The folder to make: recordings, truths, diagnoses, ``scores.csv``, ``table.md`` and figures.
+        Folder to create: recordings, truths, diagnoses, ``scores.csv``, ``table.md`` and figures.
     cases : int
-        Number of cases, 40 by default; every 20 hold all kinds.
+        Number of cases, 40 by default; every 20 include all kinds.
     seed : int
-        Of the draws; a fresh one by default. Seeds below 1 000 000 are for tuning.
+        Seed of the draws; a random one by default. Seeds below 1 000 000 are for tuning.
     nulls : int
         Null records of each diagnosis, 400 by default.
     workers : int
-        Processes; as many as there are cores by default, 0 for none but this one.
+        Number of processes: one per core by default, 0 to work in this process.
     real : path-like
-        Folder of real recordings to be salted, one for every 40 cases; none are without it. See
-        `gyrostab.blindtest.scenarios.real`.
+        Folder of real recordings; one injection is made for every 40 cases. Without it there are no
+        injections. See `gyrostab.blindtest.scenarios.real`.
     resume : bool
-        Go on with what was begun in the folder; begin where nothing was.
+        Continue an interrupted run in the folder, or start one.
     overwrite : bool
-        Forget what was begun in the folder.
+        Replace an existing run in the folder.
     progress : Stage
-        Is told of the progress.
+        Progress display.
     say : callable
-        Is told the seed before the draw, and the hash before the first diagnosis.
+        Receives messages: the seed before the draw, and the hash before the first diagnosis.
 
     Returns
     -------
@@ -94,46 +101,52 @@ def prove(
     Raises
     ------
     OutputError
-        When the folder holds something, or cannot be made.
+        When the folder is not empty, or cannot be created.
     ResumeError
-        When other cases were begun in it, or another process works on it.
+        When the folder holds a run with other options, or another process uses it.
     FormatError
-        When a truth is not the one that was sealed, or a real recording cannot be read.
+        When a truth is not the one that was committed, or a real recording cannot be read.
     WorkerError
         When a process dies.
 
     Examples
     --------
-    >>> proof = gyrostab.prove("proof", cases=20)                                                         # doctest: +SKIP
-    >>> print(proof.table)                                                                                # doctest: +SKIP
+    >>> proof = gyrostab.prove("proof", cases=20)  # doctest: +SKIP
+    >>> print(proof.table)  # doctest: +SKIP
     """
     from gyrostab.jobs.job import lock_job
     from gyrostab.progress import no_stage
 
     folder, stage, tell = resolve_link(directory), progress or no_stage, say or (lambda text: None)
-    salted = 0 if real is None else (cases or _USUAL["cases"]) // _SALTED
-    fresh = {**_USUAL, "seed": TUNING + secrets.randbelow(10**9), "salted": salted}
+    injected = 0 if real is None else (cases or _DEFAULTS["cases"]) // _CASES_PER_INJECTION
+    fresh = {
+        **_DEFAULTS,
+        "seed": FIRST_PUBLIC_SEED + secrets.randbelow(10**9),
+        "injected": injected,
+    }
     wanted = {"cases": cases, "seed": seed, "nulls": nulls}
-    look(folder, wanted, fresh, resume=resume, overwrite=overwrite)
+    inspect_folder(folder, wanted, fresh, resume=resume, overwrite=overwrite)
     with lock_job(folder):
-        job = begin(folder, wanted, fresh, resume=resume, overwrite=overwrite)
-        tell(_opening(job, folder))
+        job = begin_run(folder, wanted, fresh, resume=resume, overwrite=overwrite)
+        tell(_describe_run(job, folder))
         number = (
             len(os.sched_getaffinity(0))
             if hasattr(os, "sched_getaffinity")
             else os.cpu_count() or 1
         )
         number = number if workers is None else workers
-        plans = _plans(job)
+        plans = _plan_all(job)
         names = list(plans)
-        sums, sealed = _drawn(folder, plans, number, stage, None if real is None else Path(real))
-        tell(f"sealed: {len(names)} truths, SHA-256 of their list {sealed}")
-        failed = _diagnosed(folder, job, names, number, stage)
-        return _opened(folder, job, names, sums, sealed, failed, number, stage)
+        sums, commitment = _draw_and_commit(
+            folder, plans, number, stage, None if real is None else Path(real)
+        )
+        tell(f"committed: {len(names)} truths, SHA-256 of their list {commitment}")
+        failed = _diagnose_all(folder, job, names, number, stage)
+        return _score_and_write(folder, job, names, sums, commitment, failed, number, stage)
 
 
-def _plans(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Name of each case, drawn or salted, to its plan."""
+def _plan_all(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Plan all cases, drawn and injected; return name -> plan."""
     from gyrostab.blindtest.scenarios.plan import plan_cases
     from gyrostab.blindtest.scenarios.real import plan_injections
 
@@ -143,49 +156,54 @@ def _plans(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
     }
     return drawn | {
         case_name(job["seed"], plan["index"], plan["copy"]): plan
-        for plan in plan_injections(job["salted"], seed=job["seed"])
+        for plan in plan_injections(job["injected"], seed=job["seed"])
     }
 
 
-def _opening(job: dict[str, Any], folder: Path) -> str:
-    said = f"{job['cases']} cases of seed {job['seed']}; the same again: gyrostab prove --cases {job['cases']} --seed {job['seed']}"
-    said += f" --nulls {job['nulls']}" if job["nulls"] != _USUAL["nulls"] else ""
-    if job["salted"]:
-        said += f"\nand {job['salted']} real recordings, each with salt and three times without"
+def _describe_run(job: dict[str, Any], folder: Path) -> str:
+    text = f"{job['cases']} cases of seed {job['seed']}; to repeat: "
+    text += f"gyrostab prove --cases {job['cases']} --seed {job['seed']}"
+    text += f" --nulls {job['nulls']}" if job["nulls"] != _DEFAULTS["nulls"] else ""
+    if job["injected"]:
+        text += f"\nand {job['injected']} injections into real recordings, with three controls each"
     else:
-        said += f"\nno real recordings are salted: one is for every {_SALTED} cases, where their folder is known"
+        text += (
+            "\nno injections into real recordings: there is one for every "
+            f"{_CASES_PER_INJECTION} cases if their folder is given"
+        )
     done = len(list((folder / "diagnoses").glob("*.json")))
-    return said + (f"\n{done} of them are diagnosed already" if done else "")
+    return text + (f"\n{done} cases are diagnosed already" if done else "")
 
 
-def _counter(stage: Stage, label: str, total: int, first: int = 0) -> Callable[[int], None]:
+def _count_cases(stage: Stage, label: str, total: int, first: int = 0) -> Callable[[int], None]:
     stage(label, total, first, "cases")
     return lambda done: stage(label, total, first + done, "cases")
 
 
-def _drawn(
+def _draw_and_commit(
     folder: Path, plans: dict[str, dict[str, Any]], workers: int, stage: Stage, real: Path | None
 ) -> tuple[dict[str, str], str]:
-    """Draw what is not drawn, and seal; what was sealed once is never drawn again."""
+    """Draw the missing cases and commit all truths; committed cases are never drawn again."""
     kept = read_sums(folder)
     if kept is not None:
         return kept
     if real is None and any("copy" in plan for plan in plans.values()):
         raise ResumeError(
-            f"{folder}: was begun with real recordings, which are not drawn yet; say again where they are with --real DIR"
+            f"{folder}: was begun with real recordings that are not drawn yet; "
+            "give their folder again with --real DIR"
         )
     jobs = [(folder, name, plan, real) for name, plan in plans.items()]
-    found = each_in_processes(
-        draw_case, jobs, workers=workers, told=_counter(stage, "drawing", len(jobs))
+    found = run_in_processes(
+        draw_case, jobs, workers=workers, report=_count_cases(stage, "drawing", len(jobs))
     )
     sums = dict(zip(plans, found, strict=True))
     return sums, write_sums(folder, sums)
 
 
-def _diagnosed(
+def _diagnose_all(
     folder: Path, job: dict[str, Any], names: list[str], workers: int, stage: Stage
 ) -> dict[str, str]:
-    """Diagnose what is not diagnosed; the name of each case that fails, and why."""
+    """Diagnose the remaining cases; return the name of each that fails -> reason."""
     left = [name for name in names if not (folder / "diagnoses" / f"{name}.json").exists()]
     jobs = [
         (
@@ -196,8 +214,8 @@ def _diagnosed(
         )
         for name in left
     ]
-    told = _counter(stage, "diagnosing", len(names), len(names) - len(left))
-    good = each_in_processes(diagnose_case, jobs, workers=workers, told=told)
+    report = _count_cases(stage, "diagnosing", len(names), len(names) - len(left))
+    good = run_in_processes(diagnose_case, jobs, workers=workers, report=report)
     lost = [name for name, flag in zip(left, good, strict=True) if not flag]
     return {
         name: (folder / "failed" / f"{name}.txt").read_text(encoding="utf-8").splitlines()[0]
@@ -205,27 +223,27 @@ def _diagnosed(
     }
 
 
-def _opened(
+def _score_and_write(
     folder: Path,
     job: dict[str, Any],
     names: list[str],
     sums: dict[str, str],
-    sealed: str,
+    commitment: str,
     failed: dict[str, str],
     workers: int,
     stage: Stage,
 ) -> Proof:
-    """Open the seal, count, and write."""
+    """Check the truths against the commitment, score, and write the results."""
     from gyrostab.blindtest.runner.outcome import score_rows, write_outcome
     from gyrostab.blindtest.scenarios.commitment import open_truth
-    from gyrostab.blindtest.scoring.table import missed, score_table
+    from gyrostab.blindtest.scoring.table import list_missed, score_table
 
     truths = {
         name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in names
     }
     drawn = [
         name for name in names if "copy" not in truths[name]["plan"]
-    ]  # of real noise no truth says how much it is
+    ]  # the noise level of a real recording is unknown
     jobs = [
         (
             folder / "recordings" / f"{name}.nc",
@@ -234,8 +252,8 @@ def _opened(
         )
         for name in drawn
     ]
-    naive = each_in_processes(
-        compare_case, jobs, workers=workers, told=_counter(stage, "comparing", len(drawn))
+    baseline_hits = run_in_processes(
+        compare_case, jobs, workers=workers, report=_count_cases(stage, "comparing", len(drawn))
     )
     found = {
         name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8"))
@@ -243,7 +261,7 @@ def _opened(
         if name not in failed
     }
     stage("counting", 0)
-    rows = score_rows(found, truths, dict(zip(drawn, naive, strict=True)))
+    rows = score_rows(found, truths, dict(zip(drawn, baseline_hits, strict=True)))
     table = score_table(rows)
-    files = write_outcome(folder, rows, table, job=job, sealed=sealed, failed=failed)
-    return Proof(job["seed"], sealed, table, missed(table), failed, files)
+    files = write_outcome(folder, rows, table, job=job, commitment=commitment, failed=failed)
+    return Proof(job["seed"], commitment, table, list_missed(table), failed, files)

@@ -1,4 +1,4 @@
-"""The curves of a benchmark: what is found and named against strength, and how often a name that is given is right."""
+"""Figures of a benchmark: completeness against strength, and reliability of each name."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_completeness", "draw_reliability"]
 
-_ACROSS = 5
-_POOLS = (1.5, 4.0)  # below the first: too faint to be asked for
+_COLUMNS = 5
+_POOL_LIMITS = (1.5, 4.0)  # detection is not required below the first
 _LABELS = {
     "detected": "detected",
-    "named": "named rightly (called unknown, where no catalogue holds it)",
+    "named": "named correctly (or unidentified, if out of catalogue)",
 }
 
 
 def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
-    """Prepare a panel for each effect: shares detected and named against strength, with Wilson's intervals.
+    """Plot shares detected and named against strength, one panel per effect, with intervals.
 
-    One effect has few cases of each strength, so those of like strength are pooled; the first panel
-    is of all.
+    Similar strengths of one effect are pooled because each has few cases; the first panel shows all
+    effects.
     """
     from gyrostab.plot.style import new_figure, save_png
 
     names = list(dict.fromkeys(curves["effect"])) if len(curves) else []
-    down = max(1, math.ceil(len(names) / _ACROSS))
-    figure = new_figure(2.4 * _ACROSS, 1.8 * down + 0.6)
-    panels: Any = figure.subplots(down, _ACROSS, sharex=True, sharey=True, squeeze=False)
+    down = max(1, math.ceil(len(names) / _COLUMNS))
+    figure = new_figure(2.4 * _COLUMNS, 1.8 * down + 0.6)
+    panels: Any = figure.subplots(down, _COLUMNS, sharex=True, sharey=True, squeeze=False)
     for place, panel in enumerate(panels.flat):
         if place < len(names):
             part = curves[curves["effect"] == names[place]]
-            _panel(
+            _draw_panel(
                 panel,
-                part if names[place] == "all" else _pooled(part),
+                part if names[place] == "all" else _pool_strengths(part),
                 names[place].replace("_", " "),
             )
         else:
@@ -55,15 +55,15 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
     return lambda target: save_png(figure, target, colours=64)
 
 
-def _pooled(part: pd.DataFrame) -> pd.DataFrame:
-    """The same with few strengths: each the (geometric) middle of those from one limit to the next, weighted by their cases."""
+def _pool_strengths(part: pd.DataFrame) -> pd.DataFrame:
+    """Pool strengths between limits at their weighted geometric mean."""
     import numpy as np
     import pandas as pd
 
     from gyrostab.blindtest.scoring.proportions import wilson
 
     out = []
-    for _, group in part.groupby(np.digitize(part["strength"], _POOLS)):
+    for _, group in part.groupby(np.digitize(part["strength"], _POOL_LIMITS)):
         number = int(group["n"].sum())
         line: dict[str, Any] = {
             "strength": float(np.exp(np.average(np.log(group["strength"]), weights=group["n"]))),
@@ -77,7 +77,7 @@ def _pooled(part: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def _panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
+def _draw_panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
     from gyrostab.plot.style import COLOURS, MARKERS
 
     for number, key in enumerate(("detected", "named")):
@@ -102,20 +102,28 @@ def _panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
 
 
 def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
-    """Prepare a bar for each name: the share of its claims that stand for something true, with Wilson's interval."""
+    """Plot the share of correct identifications of each name, with Wilson's interval."""
     from gyrostab.plot.style import COLOURS, new_figure, save_png
 
     figure = new_figure(6.5, 1.2 + 0.26 * max(3, len(reliability)))
     panel: Any = figure.subplots()
-    claims: list[Any] = reliability.to_dict("records")
-    for place, claim in enumerate(claims):
-        panel.barh(place, claim["right"], color=COLOURS[2], height=0.6)
-        panel.plot([claim["low"], claim["high"]], [place, place], color="black", linewidth=1.0)
+    identifications: list[Any] = reliability.to_dict("records")
+    for place, identification in enumerate(identifications):
+        panel.barh(place, identification["right"], color=COLOURS[2], height=0.6)
+        panel.plot(
+            [identification["low"], identification["high"]],
+            [place, place],
+            color="black",
+            linewidth=1.0,
+        )
     panel.set_yticks(
-        range(len(claims)),
-        [f"{claim['name'].replace('_', ' ')} ({claim['n']})" for claim in claims],
+        range(len(identifications)),
+        [
+            f"{identification['name'].replace('_', ' ')} ({identification['n']})"
+            for identification in identifications
+        ],
     )
-    panel.set_ylim(max(len(claims), 1) - 0.4, -0.6)
+    panel.set_ylim(max(len(identifications), 1) - 0.4, -0.6)
     panel.set_xlim(0, 1)
-    panel.set_xlabel("share of the claims (number) that are right,\nwith 95 % interval")
+    panel.set_xlabel("share of the identifications (number)\nthat are correct, with 95 % interval")
     return lambda target: save_png(figure, target, colours=64)

@@ -1,8 +1,7 @@
-"""The folder of a benchmark: what it was asked for, which code has worked on it, and what is finished.
+"""Folder of a benchmark: its options, the code versions used, and the finished parts.
 
-``benchmark.json`` comes first; then ``recordings/`` and ``truth/`` grow together, ``SHA256SUMS``
-seals the truths before the first file of ``diagnoses/``, and ``comparisons/`` follow once the seal
-is open.
+``benchmark.json`` is written first, then ``recordings/`` and ``truth/``. ``SHA256SUMS`` commits the
+truths before the first file of ``diagnoses/``; ``comparisons/`` follow last.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from gyrostab.blindtest.generator.scenario import STREAM_LABELS
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
 from gyrostab.jobs.job import is_lock
 from gyrostab.store.output import is_leftover, replace_file
@@ -24,22 +24,22 @@ from gyrostab.store.output.check import check_target
 from gyrostab.store.output.content import read_json
 
 __all__ = [
-    "TUNING",
-    "asked",
-    "begin",
+    "FIRST_PUBLIC_SEED",
+    "begin_run",
     "case_name",
-    "code_state",
-    "look",
+    "fingerprint_code",
+    "inspect_folder",
+    "read_request",
     "read_sums",
     "write_json",
     "write_sums",
     "write_text",
 ]
 
-#: Seeds below this one are for tuning; what is published uses others.
-TUNING = 1_000_000
+#: Seeds below this one are for tuning; published runs use others.
+FIRST_PUBLIC_SEED = 1_000_000
 
-_SCHEMA = "gyrostab.prove/2"
+_SCHEMA = "gyrostab.prove/3"
 _SUMS = "SHA256SUMS"
 _FOLDERS = ("recordings", "truth", "diagnoses", "comparisons", "failed")
 _CASE_FILE = re.compile(r"[0-9a-f]{12}\.(nc|json|txt)")
@@ -55,30 +55,31 @@ _FILES = (
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a file that has its name only once it is complete."""
+    """Write a file that gets its name once it is complete."""
     with replace_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 
 
 def write_json(path: Path, content: Any) -> Path:
-    """As `write_text`, of JSON."""
+    """Write JSON like `write_text`."""
     return write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def case_name(seed: int, index: int, copy: str = "") -> str:
-    """Name of the files of a case, or of a copy of a real recording; who does not know the seed learns nothing from it.
+    """Name the files of a case, or of a copy of a real recording, without revealing the content.
 
     Examples
     --------
-    >>> case_name(1, 0) == case_name(1, 0), case_name(1, 0) == case_name(1, 1), len(case_name(1, 0))
-    (True, False, 12)
+    >>> len(case_name(1, 0)), case_name(1, 0) == case_name(1, 1)
+    (12, False)
     """
-    return hashlib.sha256(f"name of case {index} of seed {seed}{copy}".encode()).hexdigest()[:12]
+    label = STREAM_LABELS.get(copy, copy)
+    return hashlib.sha256(f"name of case {index} of seed {seed}{label}".encode()).hexdigest()[:12]
 
 
-def code_state() -> str:
-    """Short fingerprint of the source of the package."""
+def fingerprint_code() -> str:
+    """Compute a short fingerprint of the source of the package."""
     import gyrostab
 
     root = Path(gyrostab.__file__).parent
@@ -88,24 +89,26 @@ def code_state() -> str:
     return listing.hexdigest()[:12]
 
 
-def asked(directory: Path) -> dict[str, Any] | None:
-    """What a benchmark that was begun in this folder was asked for; None when none was."""
+def read_request(directory: Path) -> dict[str, Any] | None:
+    """Read the options of the benchmark in a folder; None when there is no benchmark."""
     try:
         content = json.loads((directory / "benchmark.json").read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
         raise FormatError(
-            f"{directory / 'benchmark.json'}: cannot be read ({error}); begin again with --overwrite"
+            f"{directory / 'benchmark.json'}: cannot be read ({error}); "
+            "begin again with --overwrite"
         ) from error
     if not isinstance(content, dict) or content.get("schema") != _SCHEMA:
         raise FormatError(
-            f"{directory / 'benchmark.json'}: is no benchmark of this version; begin again in another folder with -o"
+            f"{directory / 'benchmark.json'}: is not a benchmark of this version; "
+            "begin again in another folder with -o"
         )
     return content
 
 
-def look(
+def inspect_folder(
     directory: Path,
     wanted: Mapping[str, int | None],
     usual: Mapping[str, int],
@@ -113,8 +116,8 @@ def look(
     resume: bool,
     overwrite: bool,
 ) -> tuple[dict[str, Any] | None, dict[str, int]]:
-    """What was begun in a folder and is to go on, or None, and what is to be done; see `begin`. Changes nothing."""
-    before = asked(directory) if directory.is_dir() and (resume or not overwrite) else None
+    """Find the run to continue (or None) and its options; see `begin_run`. Changes nothing."""
+    before = read_request(directory) if directory.is_dir() and (resume or not overwrite) else None
     check_target(
         directory,
         overwrite=True,
@@ -122,12 +125,13 @@ def look(
     )
     if before is None:
         chosen = dict(usual) | {name: value for name, value in wanted.items() if value is not None}
-        _check_wishes(chosen)
-        _check_content(directory, overwrite=overwrite)
+        _check_request(chosen)
+        _check_is_empty(directory, overwrite=overwrite)
         return None, chosen
     if not resume:
         raise OutputError(
-            f"{directory} holds a benchmark already: --resume goes on with it, --overwrite replaces it; or give another -o"
+            f"{directory} holds a benchmark already: --resume continues it, "
+            "--overwrite replaces it; or give another -o"
         )
     other = [
         f"{name} {before[name]}, not {value}"
@@ -136,12 +140,13 @@ def look(
     ]
     if other:
         raise ResumeError(
-            f"{directory}: was begun with {', '.join(other)}; leave that out, or begin again with --overwrite"
+            f"{directory}: was begun with {', '.join(other)}; leave that out, "
+            "or begin again with --overwrite"
         )
     return before, {name: before[name] for name in wanted}
 
 
-def begin(
+def begin_run(
     directory: Path,
     wanted: Mapping[str, int | None],
     usual: Mapping[str, int],
@@ -149,18 +154,18 @@ def begin(
     resume: bool,
     overwrite: bool,
 ) -> dict[str, Any]:
-    """Make the folder, or take up what was begun in it.
+    """Create the folder, or continue the run in it.
 
     Parameters
     ----------
     directory : pathlib.Path
-        The folder; its parent must exist.
+        Folder of the run; its parent must exist.
     wanted : mapping
-        ``cases``, ``seed`` and ``nulls``, None where it was not said.
+        ``cases``, ``seed`` and ``nulls`` as given, None where not given.
     usual : mapping
-        What stands where nothing was said; more than is in `wanted` is written down as it is.
+        Defaults; keys that are not in `wanted` are stored as they are.
     resume, overwrite : bool
-        Go on where a run stopped; forget one.
+        Continue an existing run; replace it.
 
     Returns
     -------
@@ -170,21 +175,19 @@ def begin(
     Raises
     ------
     OutputError
-        When the folder cannot be made, or holds something.
+        When the folder cannot be created, or is not empty.
     OptionError
-        When a number makes no sense.
+        When a number is out of range.
     ResumeError
-        When what was begun was asked for something else.
+        When the run in the folder has other options.
     """
-    before, chosen = look(directory, wanted, usual, resume=resume, overwrite=overwrite)
-    state = code_state()
+    before, chosen = inspect_folder(directory, wanted, usual, resume=resume, overwrite=overwrite)
+    state = fingerprint_code()
     if before is not None:
-        for left in (
-            *directory.glob(".*.part"),
-            *directory.glob("*/.*.part"),
-        ):  # of a run that was killed
-            if is_leftover(left.name):
-                _remove(left)
+        # files of a run that was killed
+        for leftover in (*directory.glob(".*.part"), *directory.glob("*/.*.part")):
+            if is_leftover(leftover.name):
+                _remove_path(leftover)
         if state != before["code"][-1]:
             before["code"].append(state)
             write_json(directory / "benchmark.json", before)
@@ -192,7 +195,7 @@ def begin(
     directory.mkdir(exist_ok=True)
     for item in directory.iterdir():
         if item.name != "lock":
-            _remove(item)
+            _remove_path(item)
     for name in _FOLDERS:
         (directory / name).mkdir()
     content = {
@@ -206,27 +209,29 @@ def begin(
     return content
 
 
-def _remove(path: Path) -> None:
+def _remove_path(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path)
     else:
         path.unlink()
 
 
-def _check_wishes(chosen: Mapping[str, int]) -> None:
+def _check_request(chosen: Mapping[str, int]) -> None:
     if chosen["cases"] < 1:
         raise OptionError(
-            f"cases={chosen['cases']}: give at least one case; 20 hold every kind, 400 give the published figures"
+            f"cases={chosen['cases']}: give at least one case; 20 include every kind, "
+            "400 give the published figures"
         )
     if chosen["seed"] < 0:
         raise OptionError(f"seed={chosen['seed']}: give a whole number from 0 up")
     if chosen["nulls"] < 100:
         raise OptionError(
-            f"nulls={chosen['nulls']}: a diagnosis needs 100 null records at least; give 400, or 200 for a quick look"
+            f"nulls={chosen['nulls']}: a diagnosis needs at least 100 null records; "
+            "give 400, or 200 for a quick look"
         )
 
 
-def _check_content(directory: Path, *, overwrite: bool) -> None:
+def _check_is_empty(directory: Path, *, overwrite: bool) -> None:
     found = (
         [item.name for item in directory.iterdir() if item.name != "lock"]
         if directory.is_dir()
@@ -234,12 +239,13 @@ def _check_content(directory: Path, *, overwrite: bool) -> None:
     )
     if found and not overwrite:
         raise OutputError(
-            f"output {str(directory)!r} is not empty; give --overwrite to replace what is in it, or another name with -o"
+            f"output {str(directory)!r} is not empty; give --overwrite to replace its content, "
+            "or another name with -o"
         )
 
 
 def find_foreign_file(directory: Path) -> str | None:
-    """Find an item in a folder that is not part of a benchmark; None for the folder of a benchmark, and for one without files."""
+    """Find an item in a folder that is not part of a benchmark; None without such an item."""
     content = read_json(directory / "benchmark.json")
     ours = isinstance(content, dict) and str(content.get("schema")).startswith("gyrostab.prove/")
     for path in sorted(directory.rglob("*")):
@@ -263,14 +269,14 @@ def _is_of_benchmark(place: Path) -> bool:
 
 
 def write_sums(directory: Path, sums: Mapping[str, str]) -> str:
-    """Seal all truths: write ``SHA256SUMS`` as ``sha256sum -c`` reads it; its own SHA-256."""
+    """Commit all truths: write ``SHA256SUMS`` for ``sha256sum -c``; return the SHA-256 of it."""
     text = "".join(f"{value}  truth/{name}.json\n" for name, value in sorted(sums.items()))
     write_text(directory / _SUMS, text)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_sums(directory: Path) -> tuple[dict[str, str], str] | None:
-    """Name of each case to the SHA-256 of its truth, and the SHA-256 of the list; None where nothing was sealed yet."""
+    """Read the SHA-256 of each truth by name, and that of the list; None when not committed yet."""
     try:
         text = (directory / _SUMS).read_text(encoding="utf-8")
     except FileNotFoundError:

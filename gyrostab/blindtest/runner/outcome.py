@@ -1,4 +1,4 @@
-"""What came out, as files that people and programs read: every score, the table, what was missed and what failed."""
+"""Write the outcome of a benchmark: scores, table, figures, and lists of misses and failures."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from typing import Any
 import pandas as pd
 
 from gyrostab.blindtest.runner.figures import draw_completeness, draw_reliability
-from gyrostab.blindtest.runner.folder import TUNING, write_text
+from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, write_text
 from gyrostab.blindtest.scoring.curves import by_effect, curves, reliability
 from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.score import score_case
-from gyrostab.blindtest.scoring.table import markdown, missed
+from gyrostab.blindtest.scoring.table import list_missed, markdown
 from gyrostab.store.output import replace_file
 
 __all__ = ["page_text", "score_rows", "write_outcome"]
 
 Rows = list[dict[str, Any]]
 
-#: Stands for the diagnosis of a case that has none: nothing was found in it.
-_NOTHING = {
+#: Diagnosis of a case whose diagnosis failed: nothing was detected.
+_EMPTY_DIAGNOSIS = {
     "verdict": "no mismatch",
     "mismatches": [],
     "effects": [],
@@ -32,19 +32,21 @@ _NOTHING = {
     "seconds": math.nan,
 }
 
-_SHOWN = 40  # cases that a list holds
+_MAX_LISTED = 40
 
 
 def score_rows(
     found: Mapping[str, dict[str, Any]],
     truths: Mapping[str, dict[str, Any]],
-    naive: Mapping[str, Mapping[str, bool]],
+    baseline_hits: Mapping[str, Mapping[str, bool]],
 ) -> Rows:
-    """All rows of `score_case` with the name of the case; a case without a diagnosis counts as nothing found."""
+    """Score all cases; a case without a diagnosis counts as "nothing detected"."""
     return [
         {"name": name, "failed": name not in found, **row}
         for name, truth in truths.items()
-        for row in score_case(found.get(name, _NOTHING), truth, naive=naive.get(name))
+        for row in score_case(
+            found.get(name, _EMPTY_DIAGNOSIS), truth, baseline_hits=baseline_hits.get(name)
+        )
     ]
 
 
@@ -54,7 +56,7 @@ def write_outcome(
     table: pd.DataFrame,
     *,
     job: Mapping[str, Any],
-    sealed: str,
+    commitment: str,
     failed: Mapping[str, str],
 ) -> list[Path]:
     """Write ``scores.csv``, ``table.md``, ``completeness.png`` and ``reliability.png``."""
@@ -69,7 +71,7 @@ def write_outcome(
         folder / name for name in ("scores.csv", "table.md", "completeness.png", "reliability.png")
     ]
     write_text(targets[0], pd.DataFrame(plain).to_csv(index=False))
-    write_text(targets[1], page_text(rows, table, job=job, sealed=sealed, failed=failed))
+    write_text(targets[1], page_text(rows, table, job=job, commitment=commitment, failed=failed))
     for target, draw in zip(
         targets[2:],
         (draw_completeness(curves(rows)), draw_reliability(reliability(rows))),
@@ -85,82 +87,90 @@ def page_text(
     table: pd.DataFrame,
     *,
     job: Mapping[str, Any],
-    sealed: str,
+    commitment: str,
     failed: Mapping[str, str],
 ) -> str:
-    """The outcome in Markdown: how it was made, the table, the targets missed, the curves, and the cases that went wrong."""
+    """Format the outcome in Markdown: run, table, missed targets, curves and failed cases."""
     shown = curves(rows)
     every = shown[shown["effect"] == "all"] if len(shown) else shown
-    drawn = [row for row in rows if row["kind"] not in ("salted", "control")]
+    drawn = [row for row in rows if row["kind"] not in ("injected", "control")]
     parts = [
-        _made(rows, job, sealed),
+        _describe_run(rows, job, commitment),
         "### Figures with 95 % intervals and targets",
-        "A target is *met* where the whole interval lies where it should, *missed* where the value does not, and else *not shown*: there "
-        "are too few cases to tell.",
+        "A target is *met* where the whole interval is in the target range, *missed* where the "
+        "value is not, and otherwise *not shown*: there are too few cases to decide.",
         markdown(table),
-        "### Targets that were missed",
-        _listed(missed(table), "none"),
+        "### Missed targets",
+        _format_list(list_missed(table), "none"),
         "### Completeness against strength",
-        "Shares of all effects of the catalogue whose channel was there; strength in units of the closed-form limit.",
+        "Shares of all catalogue effects with an undisturbed driver; strength in units of the "
+        "closed-form limit.",
         markdown(every.drop(columns="effect")) if len(every) else "no effects among these cases",
         "### Effect by effect",
-        "*n*: cases at 1.5 times the limit and more, and the shares of them that were *detected*, *named* (ambiguity sets merged) and "
-        "named *exactly*. *claims*: how often the name was given in all cases, and the share of these that stands for something true "
-        "(*right*). *numbers*: parameters that can be compared, and the share whose 95 % interval holds the truth (*held*).",
+        "*n*: cases of strength 1.5 or more, and the shares of them that were *detected*, *named* "
+        "(ambiguity sets merged) and named *exactly*. *identifications*: how often the name was "
+        "given in all cases, and the share of these that is *right*. *parameters*: parameters that "
+        "can be compared, and the share *covered* by their 95 % intervals.",
         markdown(by_effect(rows)),
         "### Wrong names",
-        _listed([_wrong(row) for row in _cases(drawn) if row["wrong"]], "none"),
-        "### Clear effects that were missed",
-        _listed(
+        _format_list(
+            [_describe_wrong_name(row) for row in _first_rows(drawn) if row["wrong"]], "none"
+        ),
+        "### Undetected effects of strength 1.5 or more",
+        _format_list(
             [
-                _silent(row)
+                _describe_miss(row)
                 for row in drawn
                 if row["effect"] and row["strength"] >= 1.5 and not row["detected"]
             ],
             "none",
         ),
-        "### Real recordings with salt",
-        *_salted(rows),
-        "### What it cost",
-        markdown(_cost(drawn)),
-        "### Diagnoses that failed",
-        _listed([f"{name}: {why}" for name, why in failed.items()], "none"),
+        "### Injections into real recordings",
+        *_describe_injections(rows),
+        "### Cost",
+        markdown(_tabulate_cost(drawn)),
+        "### Failed diagnoses",
+        _format_list([f"{name}: {why}" for name, why in failed.items()], "none"),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _salted(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     found = injection_differences(rows)
     if not found:
         return [
-            "None: the folder of the real recordings was not given to this run, or it had too few cases."
+            "None: the folder of the real recordings was not given to this run, or it had too few "
+            "cases."
         ]
     lines = [
         f"{one['recording']}, {one['effect']} at {one['strength']:g}: "
         + ("named" if one["named"] else "not named")
         + (", and so it was without salt" if one["there_before"] else "")
-        + "".join(f"; {label} {', '.join(one[key])}" for key, label in _TURNED.items() if one[key])
+        + "".join(
+            f"; {label} {', '.join(one[key])}" for key, label in _COPY_LABELS.items() if one[key]
+        )
         for one in found
     ]
     about = (
-        "An effect is added to a piece of a real recording, which holds effects of its own; so what counts is what is claimed beside that "
-        "which is claimed of the untouched piece, by the salted one and by copies of the untouched one turned in sign and in time."
+        "An effect is injected into a piece of a real recording, which contains unknown effects. "
+        "Names therefore count only if they are not found in the untouched piece. Controls are the "
+        "untouched piece, and its copies reversed in sign and in time."
     )
-    return [about, markdown(injection_table(rows)), _listed(lines, "none")]
+    return [about, markdown(injection_table(rows)), _format_list(lines, "none")]
 
 
-_TURNED = {
-    "before": "without salt",
-    "others": "salt brings",
-    "flipped": "turned in sign",
-    "reversed": "turned in time",
+_COPY_LABELS = {
+    "before": "untouched",
+    "others": "injection adds",
+    "flipped": "reversed in sign adds",
+    "reversed": "reversed in time adds",
 }
 
 
-def _cost(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Seconds that a diagnosis took, by rate and length."""
+def _tabulate_cost(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Tabulate the time of a diagnosis [s] by rate and length."""
     each = pd.DataFrame(
-        [{key: row[key] for key in ("rate", "length", "seconds")} for row in _cases(rows)]
+        [{key: row[key] for key in ("rate", "length", "seconds")} for row in _first_rows(rows)]
     )
     each["length"] = pd.cut(
         each["length"],
@@ -180,48 +190,58 @@ def _cost(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     )
 
 
-def _made(rows: Sequence[Mapping[str, Any]], job: Mapping[str, Any], sealed: str) -> str:
-    kinds = pd.Series([row["kind"] for row in _cases(rows)]).value_counts()
+def _describe_run(
+    rows: Sequence[Mapping[str, Any]], job: Mapping[str, Any], commitment: str
+) -> str:
+    kinds = pd.Series([row["kind"] for row in _first_rows(rows)]).value_counts()
     numbers = ", ".join(f"{number} {kind}" for kind, number in kinds.items())
     repeat = f"gyrostab prove --cases {job['cases']} --seed {job['seed']} --nulls {job['nulls']}"
-    said = [
-        f"{job['cases']} cases ({numbers}); begun {job['begun']}; {job['machine']}; code {' then '.join(job['code'])}.",
+    lines = [
+        f"{job['cases']} cases ({numbers}); begun {job['begun']}; {job['machine']}; "
+        f"code {' then '.join(job['code'])}.",
         f"Seed {job['seed']}, to be repeated with `{repeat}`.",
-        f"SHA-256 of the list of sealed truths, taken before the first diagnosis: `{sealed}`.",
+        "SHA-256 of the list of ground truths, committed before the first diagnosis: "
+        f"`{commitment}`.",
     ]
-    if job["seed"] < TUNING:
-        said.append(
-            f"**This seed is one for tuning (below {TUNING:,}): these figures are not for publication.**"
+    if job["seed"] < FIRST_PUBLIC_SEED:
+        lines.append(
+            f"**This is a tuning seed (below {FIRST_PUBLIC_SEED:,}): "
+            "these figures are not for publication.**"
         )
     if len(job["code"]) > 1:
-        said.append(
-            f"**The code changed {len(job['code']) - 1} times during this run: these figures are not those of one version.**"
+        lines.append(
+            f"**The code changed {len(job['code']) - 1} times during this run: "
+            "these figures are not those of one version.**"
         )
-    return "  \n".join(said)
+    return "  \n".join(lines)
 
 
-def _cases(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The first row of every case."""
+def _first_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Keep the first row of every case."""
     return list({row["name"]: row for row in reversed(rows)}.values())[::-1]
 
 
-def _about(row: Mapping[str, Any]) -> str:
-    held = f"{row['effect']} at {row['strength']:g}" if row["effect"] else "nothing"
-    severed = f", channel {row['severing']}" if row["severing"] else ""
+def _describe_case(row: Mapping[str, Any]) -> str:
+    content = f"{row['effect']} at {row['strength']:g}" if row["effect"] else "no effect"
+    driver = f", driver {row['degradation']}" if row["degradation"] else ""
     record = f"{row['rate']:g} Hz, {row['length'] / 60:.0f} min, {100 * row['missing']:.0f} % lost"
-    return f"{row['name']} ({row['kind']}{severed}, {record}): {held}"
+    return f"{row['name']} ({row['kind']}{driver}, {record}): {content}"
 
 
-def _wrong(row: Mapping[str, Any]) -> str:
-    return f"{_about(row)}; named {', '.join(row['wrong_names'])}"
+def _describe_wrong_name(row: Mapping[str, Any]) -> str:
+    return f"{_describe_case(row)}; named {', '.join(row['wrong_names'])}"
 
 
-def _silent(row: Mapping[str, Any]) -> str:
-    return f"{_about(row)}; {'its diagnosis failed' if row['failed'] else 'nothing was found'}"
+def _describe_miss(row: Mapping[str, Any]) -> str:
+    return (
+        f"{_describe_case(row)}; {'its diagnosis failed' if row['failed'] else 'nothing was detected'}"
+    )
 
 
-def _listed(lines: Sequence[str], none: str) -> str:
-    shown = [f"- {line}" for line in lines[:_SHOWN]] + (
-        [f"- and {len(lines) - _SHOWN} more, see scores.csv"] if len(lines) > _SHOWN else []
+def _format_list(lines: Sequence[str], none: str) -> str:
+    shown = [f"- {line}" for line in lines[:_MAX_LISTED]] + (
+        [f"- and {len(lines) - _MAX_LISTED} more, see scores.csv"]
+        if len(lines) > _MAX_LISTED
+        else []
     )
     return "\n".join(shown) or none

@@ -1,4 +1,4 @@
-"""Many jobs in processes of one thread each, that end with their parent."""
+"""Run jobs in single-threaded processes that end with their parent."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from typing import Any, TypeVar
 
 from gyrostab.errors import WorkerError
 
-__all__ = ["each_in_processes"]
+__all__ = ["run_in_processes"]
 
 T = TypeVar("T")
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-def each_in_processes(
+def run_in_processes(
     function: Callable[..., T],
     jobs: Sequence[tuple[Any, ...]],
     *,
     workers: int,
-    told: Callable[[int], None] | None = None,
+    report: Callable[[int], None] | None = None,
 ) -> list[T]:
-    """Call `function` with each of `jobs`; the results in the order of the jobs.
+    """Call `function` with each of `jobs`, and return the results in the order of the jobs.
 
     Parameters
     ----------
     function : callable
-        A function of a module.
+        Module-level function.
     jobs : sequence of tuple
-        Its arguments.
+        Arguments of each call.
     workers : int
-        Number of processes; 0 does the work in this one.
-    told : callable, optional
-        Is told how many jobs are done.
+        Number of processes; 0 to work in this process.
+    report : callable, optional
+        Receives the number of finished jobs.
 
     Raises
     ------
@@ -53,31 +53,32 @@ def each_in_processes(
     >>> each_in_processes(divmod, [(7, 2), (9, 4)], workers=0)
     [(3, 1), (2, 1)]
     """
-    told = told or (lambda done: None)
+    report = report or (lambda done: None)
     if workers == 0 or not jobs:
-        return [_counted(function(*job), told, done) for done, job in enumerate(jobs, 1)]
-    with _one_thread(), _executor(min(workers, len(jobs))) as executor:
+        return [_report_done(function(*job), report, done) for done, job in enumerate(jobs, 1)]
+    with _limit_threads(), _open_executor(min(workers, len(jobs))) as executor:
         places = {executor.submit(function, *job): place for place, job in enumerate(jobs)}
         results: dict[int, T] = {}
         try:
             for future in as_completed(places):
                 results[places[future]] = future.result()
-                told(len(results))
+                report(len(results))
         except BrokenProcessPool as error:
             raise WorkerError(
-                "a process that worked on a case has died, perhaps for want of memory; go on with --resume and fewer --workers"
+                "a process that worked on a case has died, perhaps for want of memory; "
+                "continue with --resume and fewer --workers"
             ) from error
     return [results[place] for place in range(len(jobs))]
 
 
-def _counted(result: T, told: Callable[[int], None], done: int) -> T:
-    told(done)
+def _report_done(result: T, report: Callable[[int], None], done: int) -> T:
+    report(done)
     return result
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let the libraries of the processes that start inside use one thread; they read this when they are loaded."""
+def _limit_threads() -> Iterator[None]:
+    """Limit libraries in processes started inside to one thread; they read this when loaded."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:
@@ -91,10 +92,10 @@ def _one_thread() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _executor(workers: int) -> Iterator[ProcessPoolExecutor]:
+def _open_executor(workers: int) -> Iterator[ProcessPoolExecutor]:
     others = set(multiprocessing.active_children())
     executor = ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare_process
     )
     try:
         yield executor
@@ -106,8 +107,8 @@ def _executor(workers: int) -> Iterator[ProcessPoolExecutor]:
     executor.shutdown()
 
 
-def _prepare() -> None:
-    """What a process does first: leave Ctrl-C to its parent, end with it, and keep dask to one thread."""
+def _prepare_process() -> None:
+    """Prepare a process: leave Ctrl-C to its parent, end with it, and keep dask to one thread."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:

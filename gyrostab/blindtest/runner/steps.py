@@ -1,4 +1,4 @@
-"""What is done to one case: draw and seal it, diagnose its recording, compare with plain detectors. Each leaves a complete file or none."""
+"""Steps of one case: draw and commit, diagnose, compare; each writes a complete file or none."""
 
 from __future__ import annotations
 
@@ -16,24 +16,27 @@ __all__ = ["compare_case", "diagnose_case", "draw_case"]
 
 
 def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | None = None) -> str:
-    """Write the recording and the truth of a plan unless both are there; the SHA-256 of the truth. `real` holds what is salted."""
+    """Write recording and truth of a plan unless they exist; return the SHA-256 of the truth.
+
+    `real` is the folder of the real recordings.
+    """
     from gyrostab.blindtest.scenarios.case import make_case
     from gyrostab.blindtest.scenarios.commitment import commit_case, fingerprint
     from gyrostab.blindtest.scenarios.real import make_injection_case
 
     truth = directory / "truth" / f"{name}.json"
-    if truth.exists():  # it is the last of the two that takes its name
+    if truth.exists():  # written after the recording
         return fingerprint(truth.read_text(encoding="utf-8"))
     part = directory / f".{name}.part"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     try:
-        log, told = (
+        log, content = (
             make_injection_case(plan, real)
             if real is not None and "copy" in plan
             else make_case(plan)
         )
-        sha256 = commit_case(log, told, part, name=name)
+        sha256 = commit_case(log, content, part, name=name)
         os.replace(part / "recordings" / f"{name}.nc", directory / "recordings" / f"{name}.nc")
         os.replace(part / "truth" / f"{name}.json", truth)
     finally:
@@ -42,14 +45,14 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
 
 
 def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bool:
-    """Diagnose a recording, of which nothing but the file is known; whether that succeeded, else `failed` says why."""
-    from gyrostab.diagnose.core import diagnose
-    from gyrostab.jobs.run import load_log
+    """Diagnose a recording; return whether that succeeded, else write the reason to `failed`."""
+    from gyrostab import diagnose
+    from gyrostab.jobs import load_log
 
     try:
         found = diagnose(load_log([recording]), nulls=nulls, seed=int(recording.stem[:7], 16))
         write_text(target, found.to_json())
-    except Exception as error:  # a case that breaks the diagnosis is a result, and is shown as one
+    except Exception as error:  # a case that breaks the diagnosis is reported as a result
         lines = traceback.format_exc() if not isinstance(error, GyrostabError) else ""
         write_text(failed, f"{type(error).__name__}: {error}\n{lines}")
         return False
@@ -58,20 +61,20 @@ def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bo
 
 
 def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[str, bool]:
-    """What plain detectors say of a recording: the Allan plot, by the true noise, and correlation with the channels."""
+    """Apply the baseline detectors: an Allan plot with known noise, and channel correlation."""
     import numpy as np
 
     from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
-    from gyrostab.jobs.run import load_log
+    from gyrostab.jobs import load_log
 
     if target.exists():
         kept: dict[str, bool] = json.loads(target.read_text(encoding="utf-8"))
         return kept
     log = load_log([recording]).compute()
     rng = np.random.default_rng(int(recording.stem[:7], 16))
-    said = {
+    hits = {
         "Allan plot": bool(allan_detector(np.asarray(log["rate"].values), truth, rng=rng)),
         "correlation with channels": bool(channel_detector(log)),
     }
-    write_json(target, said)
-    return said
+    write_json(target, hits)
+    return hits

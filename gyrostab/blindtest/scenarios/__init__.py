@@ -1,1 +1,1 @@
-"""The cases of the blind test: what is drawn, injected or withheld, and the ground truth that is committed."""
+"""Cases of the blind test: plans, recordings, injections and committed ground truths."""

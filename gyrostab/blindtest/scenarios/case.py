@@ -1,4 +1,4 @@
-"""One case: the recording that is handed over, and the truth that is not."""
+"""Make one case: the recording for the diagnosis, and its ground truth."""
 
 from __future__ import annotations
 
@@ -12,77 +12,81 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import environment, telemetry
-from gyrostab.blindtest.generator.catalogue import CATALOGUE, STRANGE, Entry
-from gyrostab.blindtest.generator.detection_limits import learned_gain
-from gyrostab.blindtest.generator.record import channels_of, lost, make_log, signal
-from gyrostab.blindtest.generator.scenario import AXES, Effect, World, draw_world, stream
-from gyrostab.blindtest.generator.telemetry import SHORTEST
-from gyrostab.blindtest.scenarios.drivers import sever
+from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE, Entry
+from gyrostab.blindtest.generator.detection_limits import learned_nats
+from gyrostab.blindtest.generator.record import find_missing, make_channels, make_log, make_record
+from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, draw_scenario, stream
+from gyrostab.blindtest.generator.telemetry import MIN_POWER_CUT_S
+from gyrostab.blindtest.scenarios.drivers import degrade_driver
 from gyrostab.blindtest.scenarios.plan import STRENGTHS
-from gyrostab.blindtest.scoring.visibility import is_buried
+from gyrostab.blindtest.scoring.visibility import find_visibility
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import grid_times
 
-__all__ = ["BLOCK", "draw_effects", "make_case", "truth_of"]
+__all__ = ["WAVEFORM_BLOCK_S", "describe_truth", "draw_effects", "make_case"]
 
-#: Length of the means that the truth holds of every waveform [s].
-BLOCK = 10.0
+#: Length of the block means of a waveform in the truth [s].
+WAVEFORM_BLOCK_S = 10.0
 
-_TRIES = 40
+_MAX_TRIES = 40
 
-#: Tries to bury an effect before it is made weaker.
-_PATIENCE = 10
+#: Tries to draw a sub-threshold effect before its strength is reduced.
+_TRIES_PER_STRENGTH = 10
 
 
-def _suits(world: World, entries: Sequence[Entry]) -> bool:
+def _is_suitable(scenario: Scenario, entries: Sequence[Entry]) -> bool:
     needs = {entry.needs for entry in entries}
-    warm = float(np.ptp(world.temperature)) > 2.0 or "heat" not in needs
-    turns = world.rotation.max() > 0 or "turning" not in needs
+    warm = float(np.ptp(scenario.temperature)) > 2.0 or "heat" not in needs
+    turns = scenario.rotation.max() > 0 or "rotation" not in needs
     return bool(warm and turns)
 
 
-def _world(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) -> World:
+def _draw_suitable(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) -> Scenario:
     cuts = max([plan["cuts"], *(entry.cuts for entry in entries)])
-    for trial in range(_TRIES):
-        rng = stream(plan["seed"], "world", plan["index"], attempt, trial)
-        buried = plan["kind"] == "buried"
-        world = draw_world(
+    for trial in range(_MAX_TRIES):
+        rng = stream(plan["seed"], "scenario", plan["index"], attempt, trial)
+        scenario = draw_scenario(
             rng,
             rate=plan["rate"],
             seconds=plan["seconds"],
             gaps=plan["gaps"],
             cuts=cuts,
             heavy=plan["heavy"],
-            buried=buried,
+            sub_threshold=plan["kind"] == "sub_threshold",
         )
         if any(entry.needs == "dips" for entry in entries):
-            world = replace(world, light=environment.light_monitor(rng, plan["seconds"], dips=True))
+            scenario = replace(
+                scenario, light=environment.light_monitor(rng, plan["seconds"], dips=True)
+            )
         if any(entry.cuts for entry in entries):
-            world = replace(world, missing=_told_from_cuts(world))
-        if any(entry.needs == "whole angle" for entry in entries):
-            world = replace(world, noise=tuple(noise | {"Q": 0.0} for noise in world.noise))
-        if _suits(world, entries):
-            return world
+            scenario = replace(scenario, missing=_shorten_losses(scenario))
+        if any(entry.needs == "unquantized angle" for entry in entries):
+            scenario = replace(
+                scenario, noise=tuple(noise | {"Q": 0.0} for noise in scenario.noise)
+            )
+        if _is_suitable(scenario, entries):
+            return scenario
     raise OptionError(
-        f"case {plan['index']} of seed {plan['seed']}: no environment with {plan['names']} in it was drawn in {_TRIES} tries"
+        f"case {plan['index']} of seed {plan['seed']}: no environment with {plan['names']} "
+        f"was drawn in {_MAX_TRIES} tries"
     )
 
 
-def _told_from_cuts(world: World) -> NDArray[np.bool_]:
-    """Losses of the line so short that nobody takes them for a power cut, where an effect hangs on the starts."""
-    t = np.arange(world.size) / world.rate
-    off = np.zeros(world.size, dtype=bool)
-    for begin, end in world.cuts:
+def _shorten_losses(scenario: Scenario) -> NDArray[np.bool_]:
+    """Shorten telemetry losses so that they cannot be mistaken for a power cut."""
+    t = np.arange(scenario.size) / scenario.rate
+    off = np.zeros(scenario.size, dtype=bool)
+    for begin, end in scenario.cuts:
         off |= (t >= begin) & (t < end)
-    longest = max(1, round((SHORTEST - 2.0) * world.rate))
+    longest = max(1, round((MIN_POWER_CUT_S - 2.0) * scenario.rate))
     return np.asarray(
-        off & world.missing | telemetry.shortened(world.missing & ~off, longest=longest)
+        off & scenario.missing | telemetry.limit_losses(scenario.missing & ~off, longest=longest)
     )
 
 
-def _weaker(plan: dict[str, Any], attempt: int) -> dict[str, Any]:
-    """A plan whose effect would not be buried in many tries, one step weaker."""
-    if plan["kind"] != "buried" or attempt == 0 or attempt % _PATIENCE:
+def _weaken_plan(plan: dict[str, Any], attempt: int) -> dict[str, Any]:
+    """Reduce the strength of a plan whose effect was not sub-threshold in many tries."""
+    if plan["kind"] != "sub_threshold" or attempt == 0 or attempt % _TRIES_PER_STRENGTH:
         return plan
     return plan | {
         "strengths": [
@@ -92,12 +96,14 @@ def _weaker(plan: dict[str, Any], attempt: int) -> dict[str, Any]:
     }
 
 
-def draw_effects(plan: dict[str, Any], world: World, *, attempt: int = 0) -> list[Effect]:
-    """The effects of a plan in a world."""
-    known = CATALOGUE | STRANGE
+def draw_effects(plan: dict[str, Any], scenario: Scenario, *, attempt: int = 0) -> list[Effect]:
+    """Draw the effects of a plan in a scenario."""
+    known = CATALOGUE | OUT_OF_CATALOGUE
     return [
         known[name].make(
-            world, stream(plan["seed"], "effect", plan["index"], attempt, name), strength=strength
+            scenario,
+            stream(plan["seed"], "effect", plan["index"], attempt, name),
+            strength=strength,
         )
         for name, strength in zip(plan["names"], plan["strengths"], strict=True)
     ]
@@ -114,92 +120,102 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
     Returns
     -------
     log : xarray.Dataset
-        A log of the contract; it holds nothing of the truth.
+        Log without any information about the truth.
     truth : dict
-        JSON-ready: ``effects`` with names, axes, intervals, averaging times, sizes, expected gains
-        and mean waveforms, ``noise`` and more.
+        JSON-ready: ``effects`` with names, axes, intervals, averaging times, sizes, expected
+        evidence and mean waveforms, ``noise`` and more.
 
     Raises
     ------
     OptionError
-        When a name is unknown, or a buried case cannot be drawn.
+        When a name is unknown, or a sub-threshold case cannot be drawn.
 
     Examples
     --------
     >>> from gyrostab.blindtest.scenarios.plan import plan_case
-    >>> plan = plan_case(0, seed=5) | {"rate": 10.0, "seconds": 600, "kind": "single", "names": ["ageing_noise"], "strengths": [4.0]}
-    >>> log, truth = make_case(plan)
+    >>> plan = plan_case(0, seed=5) | {"rate": 10.0, "seconds": 600, "kind": "single"}
+    >>> log, truth = make_case(plan | {"names": ["ageing_noise"], "strengths": [4.0]})
     >>> truth["effects"][0]["name"], log.sizes["time"]
     ('ageing_noise', 6000)
     """
-    known = CATALOGUE | STRANGE
+    known = CATALOGUE | OUT_OF_CATALOGUE
     unknown = [name for name in plan["names"] if name not in known]
     if unknown:
-        raise OptionError(f"no effect {unknown[0]!r} can be made; there are {', '.join(known)}")
+        raise OptionError(f"{unknown[0]!r} is not in the catalogue; it has {', '.join(known)}")
     entries = [known[name] for name in plan["names"]]
     seed = int(stream(plan["seed"], "case", plan["index"]).integers(2**40))
-    for attempt in range(_TRIES):
-        plan = _weaker(plan, attempt)
-        world = _world(plan, entries, attempt)
-        effects = draw_effects(plan, world, attempt=attempt)
-        record = signal(world, effects, seed=seed + attempt)
-        proof = (
-            is_buried(world, effects, record, rng=stream(seed, "band", attempt))
-            if plan["kind"] == "buried"
+    for attempt in range(_MAX_TRIES):
+        plan = _weaken_plan(plan, attempt)
+        scenario = _draw_suitable(plan, entries, attempt)
+        effects = draw_effects(plan, scenario, attempt=attempt)
+        record = make_record(scenario, effects, seed=seed + attempt)
+        visibility = (
+            find_visibility(scenario, effects, record, rng=stream(seed, "band", attempt))
+            if plan["kind"] == "sub_threshold"
             else None
         )
-        if proof is None or proof["buried"]:
+        if visibility is None or visibility["sub_threshold"]:
             break
     else:
         raise OptionError(
-            f"case {plan['index']} of seed {plan['seed']}: {plan['names']} at {plan['strengths']} cannot be buried; lower it"
+            f"case {plan['index']} of seed {plan['seed']}: {plan['names']} at {plan['strengths']} "
+            "cannot be made sub-threshold; reduce the strength"
         )
-    channels = channels_of(world, effects, stream(seed, "channels", attempt))
-    if plan["severing"]:
+    channels = make_channels(scenario, effects, stream(seed, "channels", attempt))
+    if plan["degradation"]:
         driver = entries[0].channel
-        channels = sever(
-            channels, str(driver), how=plan["severing"], rng=stream(seed, "sever", attempt)
+        channels = degrade_driver(
+            channels, str(driver), how=plan["degradation"], rng=stream(seed, "degradation", attempt)
         )
-    log = make_log(record, channels, start=world.start, rate=world.rate)
-    truth = truth_of(world, effects, strengths=plan["strengths"]) | {
+    log = make_log(record, channels, start=scenario.start, rate=scenario.rate)
+    truth = describe_truth(scenario, effects, strengths=plan["strengths"]) | {
         "plan": plan,
-        "buried": proof,
+        "visibility": visibility,
         "attempts": attempt + 1,
     }
     return log, truth
 
 
-def _iso(world: World, second: float) -> str:
-    stamp = np.datetime64(int(world.start + round(second * 1e9)), "ns")
+def _format_time(scenario: Scenario, second: float) -> str:
+    stamp = np.datetime64(int(scenario.start + round(second * 1e9)), "ns")
     return str(np.datetime_as_string(stamp, unit="ms"))
 
 
-def intervals(world: World, active: NDArray[np.bool_] | None) -> list[list[str]]:
-    """Where an effect is at work, ISO 8601; the whole record where nobody says."""
+def list_intervals(scenario: Scenario, active: NDArray[np.bool_] | None) -> list[list[str]]:
+    """List the ISO 8601 intervals in which an effect is active; without a mask the whole record."""
     if active is None:
-        return [[_iso(world, 0.0), _iso(world, world.seconds)]]
+        return [[_format_time(scenario, 0.0), _format_time(scenario, scenario.seconds)]]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]))).reshape(-1, 2)
-    return [[_iso(world, float(a)), _iso(world, min(float(b), world.seconds))] for a, b in edges]
+    return [
+        [_format_time(scenario, float(a)), _format_time(scenario, min(float(b), scenario.seconds))]
+        for a, b in edges
+    ]
 
 
-def _block_means(world: World, values: NDArray[np.float64]) -> list[float]:
-    length = round(BLOCK * world.rate)
+def _block_means(scenario: Scenario, values: NDArray[np.float64]) -> list[float]:
+    length = round(WAVEFORM_BLOCK_S * scenario.rate)
     whole = math.ceil(values.size / length) * length
     padded = np.concatenate([values, np.full(whole - values.size, np.nan)]).reshape(-1, length)
     return [float(f"{value:.6g}") for value in np.nanmean(padded, axis=1)]
 
 
-def _learned(world: World, effect: Effect) -> float:
+def _learned_nats(scenario: Scenario, effect: Effect) -> float:
     return float(
-        effect.nats if effect.mean is None else min(effect.nats, learned_gain(world, effect.mean))
+        effect.nats
+        if effect.mean is None
+        else min(effect.nats, learned_nats(scenario, effect.mean))
     )
 
 
-def _told(world: World, effect: Effect, strength: float) -> dict[str, Any]:
+def _describe_effect(scenario: Scenario, effect: Effect, strength: float) -> dict[str, Any]:
+    # Five terms do not describe real noise, so no learned noise either.
+    learned = (
+        {} if scenario.measured is not None else {"learned_nats": _learned_nats(scenario, effect)}
+    )
     waveform = {}
     if effect.mean is not None:
         waveform = {
-            axis: _block_means(world, row)
+            axis: _block_means(scenario, row)
             for axis, row in zip(AXES, effect.mean, strict=True)
             if axis in effect.axes
         }
@@ -208,43 +224,41 @@ def _told(world: World, effect: Effect, strength: float) -> dict[str, Any]:
         "axes": list(effect.axes),
         "driver": effect.driver,
         "form": effect.form,
-        "form_differs": bool(effect.differs),
+        "form_differs": bool(effect.form_differs),
         "strength": float(strength),
         "size": float(effect.size),
         "expected_nats": float(effect.nats),
-        **(
-            {} if world.own is not None else {"learned_nats": _learned(world, effect)}
-        ),  # five terms say nothing of real noise
+        **learned,
         "tau_min_s": float(effect.tau[0]),
         "tau_max_s": float(effect.tau[1]),
         "localised": effect.active is not None,
-        "intervals": intervals(world, effect.active),
+        "intervals": list_intervals(scenario, effect.active),
         "parameters": effect.parameters,
         "waveform_10s": waveform,
     }
 
 
-def truth_of(
-    world: World, effects: Sequence[Effect], *, strengths: Sequence[float]
+def describe_truth(
+    scenario: Scenario, effects: Sequence[Effect], *, strengths: Sequence[float]
 ) -> dict[str, Any]:
-    """All that is true of a case, ready for JSON."""
+    """Describe the ground truth of a case, ready for JSON."""
     return {
-        "schema": "gyrostab.concealed/1",
+        "schema": "gyrostab.blindtest/2",
         "effects": [
-            _told(world, effect, strength)
+            _describe_effect(scenario, effect, strength)
             for effect, strength in zip(effects, strengths, strict=True)
         ],
-        "accepted": sorted({name for effect in effects for name in effect.beside}),
+        "accepted": sorted({name for effect in effects for name in effect.also_accepted}),
         "in_catalogue": all(effect.name in CATALOGUE for effect in effects),
-        "noise": {axis: dict(noise) for axis, noise in zip(AXES, world.noise, strict=True)},
-        "flicker": world.flicker,
-        "sampling_rate_hz": world.rate,
+        "noise": {axis: dict(noise) for axis, noise in zip(AXES, scenario.noise, strict=True)},
+        "flicker": scenario.flicker,
+        "sampling_rate_hz": scenario.rate,
         "start": str(
             np.datetime_as_string(
-                grid_times(world.start, world.rate, 0).view("datetime64[ns]"), unit="ms"
+                grid_times(scenario.start, scenario.rate, 0).view("datetime64[ns]"), unit="ms"
             )
         ),
-        "seconds": world.seconds,
-        "missing_share": float(lost(world, effects).mean()),
-        "power_cuts": world.cuts.tolist(),
+        "seconds": scenario.seconds,
+        "missing_share": float(find_missing(scenario, effects).mean()),
+        "power_cuts": scenario.cuts.tolist(),
     }

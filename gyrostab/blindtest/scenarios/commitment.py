@@ -1,4 +1,4 @@
-"""The sealed envelope: a recording to hand over, a truth that stays behind, and the fingerprint that is shown before the run."""
+"""Commit a case: write the recording and the ground truth, and hash the truth before the run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["commit_case", "fingerprint", "open_truth", "truth_text"]
 
 
 def truth_text(truth: dict[str, Any]) -> str:
-    """The truth as the text that is sealed: JSON with sorted keys, and a random number against guessing.
+    """Format a truth as the text to commit: JSON with sorted keys, and a nonce against guessing.
 
     Examples
     --------
@@ -27,19 +27,19 @@ def truth_text(truth: dict[str, Any]) -> str:
     """
     plan = truth.get("plan") or {}
     nonce = stream(int(plan.get("seed", 0)), "nonce", int(plan.get("index", 0))).bytes(16).hex()
-    return json.dumps({"nonce": nonce, **truth}, sort_keys=True, default=_plain) + "\n"
+    return json.dumps({"nonce": nonce, **truth}, sort_keys=True, default=_to_json_type) + "\n"
 
 
-def _plain(value: Any) -> Any:
+def _to_json_type(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):
         return value.tolist()
-    raise TypeError(f"{type(value).__name__} is no part of a truth")
+    raise TypeError(f"a truth cannot hold {type(value).__name__}")
 
 
 def fingerprint(text: str) -> str:
-    """SHA-256 of a sealed text.
+    """Compute the SHA-256 of a committed text.
 
     Examples
     --------
@@ -52,23 +52,23 @@ def fingerprint(text: str) -> str:
 def commit_case(log: xr.Dataset, truth: dict[str, Any], directory: str | Path, *, name: str) -> str:
     """Write ``recordings/NAME.nc`` and ``truth/NAME.json``; return the SHA-256 of the latter.
 
-    The recording is read as any foreign NetCDF file is, with `gyrostab.read_log`.
+    `gyrostab.read_log` reads the recording like any foreign NetCDF file.
 
     Parameters
     ----------
     log : xarray.Dataset
-        The recording.
+        Recording.
     truth : dict
-        From `make_case`.
+        Ground truth from `make_case`.
     directory : path
-        Where both folders are made.
+        Parent of both folders.
     name : str
-        Of the files; say nothing with it.
+        Stem of the files; it must not reveal the content.
 
     Returns
     -------
     str
-        To be printed before anybody looks at the recording.
+        SHA-256 to publish before the recording is diagnosed.
     """
     base = Path(directory)
     for folder in ("recordings", "truth"):
@@ -96,23 +96,24 @@ def _is_time(log: xr.Dataset, key: Any) -> bool:
 
 
 def open_truth(path: str | Path, *, sha256: str) -> dict[str, Any]:
-    """Open a sealed truth.
+    """Read a committed truth.
 
     Parameters
     ----------
     path : path
-        A file of the folder ``truth``.
+        File in the folder ``truth``.
     sha256 : str
-        What `commit_case` gave.
+        Hash from `commit_case`.
 
     Raises
     ------
     FormatError
-        When the file is not the one that was sealed.
+        When the file is not the one that was committed.
     """
     text = Path(path).read_text(encoding="utf-8")
     if fingerprint(text) != sha256:
         raise FormatError(
-            f"{path}: the truth was changed after it was sealed (SHA-256 {fingerprint(text)[:12]}..., sealed as {sha256[:12]}...)"
+            f"{path}: the truth was changed after it was committed "
+            f"(SHA-256 {fingerprint(text)[:12]}..., committed as {sha256[:12]}...)"
         )
     return dict(json.loads(text))

@@ -1,4 +1,4 @@
-"""Salt for real recordings: an effect put into noise that no generator made, and three copies without it as controls."""
+"""Inject an effect into a real recording, and make three copies without it as controls."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator.catalogue import CATALOGUE
-from gyrostab.blindtest.generator.measured_noise import OwnNoise, own_noise
-from gyrostab.blindtest.generator.record import channels_of, gap_columns, with_channels
-from gyrostab.blindtest.generator.scenario import Effect, World, draw_world, to_samples
-from gyrostab.blindtest.scenarios.case import truth_of
+from gyrostab.blindtest.generator.measured_noise import MeasuredNoise, measure_noise
+from gyrostab.blindtest.generator.record import add_channels, make_channels, make_gap_variables
+from gyrostab.blindtest.generator.scenario import Effect, Scenario, draw_scenario, to_samples
+from gyrostab.blindtest.scenarios.case import describe_truth
 from gyrostab.blindtest.scoring.baseline_detectors import allan_variance, octaves
 from gyrostab.errors import OptionError
 from gyrostab.schema import check_log, signal_name
 from gyrostab.time.grid import first_stamp
 
-__all__ = ["counts_of", "inject_effect", "rough_noise"]
+__all__ = ["estimate_noise", "inject_effect", "quantization_step"]
 
 Array = NDArray[np.float64]
 
-_TRIES = 60
-_SAME, _WHOLE = 1e-9, 1e-3  # of the range, by which equal values may differ; of a step
-_FEW = 0.2  # levels for each sample, beyond which there is no lattice
+_MAX_TRIES = 60
+_EQUAL_RANGE_SHARE = 1e-9  # difference of equal values
+_MAX_STEP_ERROR = 1e-3  # of multiples of the step
+_MAX_LEVELS_PER_SAMPLE = 0.2  # more levels mean that the record is not quantized
 
 
-def rough_noise(record: Array, *, rate: float) -> dict[str, float]:
-    """N and K of a real axis (time,) [deg/h], from its Allan variance near half a second and at the longest time: for sizes only.
+def estimate_noise(record: Array, *, rate: float) -> dict[str, float]:
+    """Estimate N and K of a real axis (time,) [deg/h] from its Allan variance, for sizing only.
 
     Examples
     --------
@@ -51,67 +52,74 @@ def rough_noise(record: Array, *, rate: float) -> dict[str, float]:
     }
 
 
-def _world_of(log: xr.Dataset, record: Array, own: OwnNoise, rng: np.random.Generator) -> World:
-    """The world of a real log: its own length, gaps, noise and temperature; what it does not tell is drawn."""
+def _draw_around_log(
+    log: xr.Dataset, record: Array, measured: MeasuredNoise, rng: np.random.Generator
+) -> Scenario:
+    """Draw a scenario with the length, gaps, noise and temperature of a real log."""
     rate = float(log.attrs["sampling_rate_hz"])
-    world = draw_world(rng, rate=rate, seconds=record.shape[1] / rate, cuts=0)
-    noise = [rough_noise(row, rate=rate) for row in record]
+    scenario = draw_scenario(rng, rate=rate, seconds=record.shape[1] / rate, cuts=0)
+    noise = [estimate_noise(row, rate=rate) for row in record]
     noise += [noise[0]] * (3 - len(noise))
     gone = np.asarray(np.isnan(record).any(axis=0))
-    world = replace(
-        world,
+    scenario = replace(
+        scenario,
         size=record.shape[1],
         start=first_stamp(log),
         noise=tuple(noise[:3]),
         missing=gone,
-        own=own,
+        measured=measured,
     )
     if "temperature" in log and np.isfinite(log["temperature"].values).mean() > 0.9:
         values = np.asarray(log["temperature"].values, dtype=float)
-        at = np.linspace(0, values.size - 1, world.temperature.size)
+        at = np.linspace(0, values.size - 1, scenario.temperature.size)
         good = np.flatnonzero(np.isfinite(values))
-        world = replace(world, temperature=np.interp(at, good, values[good]))
-    return world
+        scenario = replace(scenario, temperature=np.interp(at, good, values[good]))
+    return scenario
 
 
-def _added(world: World, effect: Effect, rng: np.random.Generator) -> Array:
-    """What an effect adds to noise that is there already (3, time): a share of noise cannot be taken out of a real record."""
-    total = np.zeros((3, world.size))
+def _compute_addition(scenario: Scenario, effect: Effect, rng: np.random.Generator) -> Array:
+    """Compute what an effect adds (3, time); noise cannot be removed from a real record."""
+    total = np.zeros((3, scenario.size))
     for part in (effect.mean, effect.extra):
         if part is not None:
             total += part
-    sd = [60.0 * noise["N"] * math.sqrt(world.rate) for noise in world.noise]
+    sd = [60.0 * noise["N"] * math.sqrt(scenario.rate) for noise in scenario.noise]
     if effect.variance is not None:
         for i, ratio in enumerate(effect.variance):
-            more = np.sqrt(to_samples(world, ratio / ratio.min()) - 1 + 1e-15)
-            total[i] += more * sd[i] * rng.standard_normal(world.size) if np.ptp(ratio) else 0.0
+            more = np.sqrt(to_samples(scenario, ratio / ratio.min()) - 1 + 1e-15)
+            total[i] += more * sd[i] * rng.standard_normal(scenario.size) if np.ptp(ratio) else 0.0
     if effect.common is not None:
         total += effect.common * np.array(sd)[:, None]
     return total
 
 
-def counts_of(values: Array) -> float:
-    """Step of the lattice that values (time,) stand on, as a converter counts them; 0 where there is none.
+def quantization_step(values: Array) -> float:
+    """Find the quantization step of values (time,); 0 where they are not quantized.
 
     Examples
     --------
-    >>> counts_of(np.random.default_rng(0).integers(-9, 9, 1000) * 0.25), counts_of(np.random.default_rng(0).normal(0, 1, 1000))
-    (0.25, 0.0)
+    >>> rng = np.random.default_rng(0)
+    >>> quantization_step(rng.integers(-9, 9, 1000) * 0.25)
+    0.25
+    >>> quantization_step(rng.normal(0, 1, 1000))
+    0.0
     """
     levels = np.unique(values[np.isfinite(values)])
     gaps = np.diff(levels)
-    gaps = gaps[gaps > _SAME * max(float(np.ptp(levels)) if levels.size else 0.0, 1e-300)]
-    if gaps.size == 0 or gaps.size > _FEW * values.size:
+    gaps = gaps[
+        gaps > _EQUAL_RANGE_SHARE * max(float(np.ptp(levels)) if levels.size else 0.0, 1e-300)
+    ]
+    if gaps.size == 0 or gaps.size > _MAX_LEVELS_PER_SAMPLE * values.size:
         return 0.0
     step = float(gaps.min())
-    return step if np.abs(gaps / step - np.rint(gaps / step)).max() < _WHOLE else 0.0
+    return step if np.abs(gaps / step - np.rint(gaps / step)).max() < _MAX_STEP_ERROR else 0.0
 
 
-def _as_counted(record: Array, added: Array, rng: np.random.Generator) -> Array:
-    """Record and effect together (axis, time); counted as the record is, up or down by chance, so that the mean is that of the effect."""
+def _quantize_like(record: Array, added: Array, rng: np.random.Generator) -> Array:
+    """Add an effect to a record (axis, time), with stochastic rounding to the record's steps."""
     total = record + added
     for row, values in enumerate(record):
-        step = counts_of(values)
+        step = quantization_step(values)
         if step > 0.0:
             level = float(values[np.isfinite(values)][0])
             total[row] = level + step * np.floor(
@@ -123,111 +131,110 @@ def _as_counted(record: Array, added: Array, rng: np.random.Generator) -> Array:
 def inject_effect(
     log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator
 ) -> dict[str, tuple[xr.Dataset, dict[str, Any]]]:
-    """Put an effect into a real log, and make the controls.
+    """Inject an effect into a real log, and make the controls.
 
     Parameters
     ----------
     log : xarray.Dataset
-        A real log of rates.
+        Real log of rates.
     effect : str
-        A name of the catalogue.
+        Name in the catalogue.
     strength : float
-        Size in units of the closed-form limit, by the noise of the log itself as
-        `gyrostab.blindtest.generator.measured_noise` measures it.
+        Size in units of the closed-form limit for the noise of this log, as measured by
+        `gyrostab.blindtest.generator.measured_noise`.
     rng : numpy.random.Generator
 
     Returns
     -------
     dict
-        ``salted``, and without salt ``untouched``, ``flipped`` (the sign) and ``reversed`` (the
-        time): log and truth each. All have the same channels.
+        Log and truth of each copy: ``injected``, and the controls ``untouched``, ``flipped`` (in
+        sign) and ``reversed`` (in time). All have the same channels.
 
     Raises
     ------
     OptionError
-        When the effect is unknown, needs a restart that the log does not have, or axes that it does
-        not have.
+        When the effect is unknown, or needs restarts or axes that the log does not have.
 
     Examples
     --------
     >>> from gyrostab.blindtest.scenarios.case import make_case
     >>> from gyrostab.blindtest.scenarios.plan import plan_case
-    >>> null = {"names": [], "strengths": [], "kind": "null", "rate": 10.0, "seconds": 600, "severing": None}
-    >>> log, _ = make_case(plan_case(0, seed=5) | null)
-    >>> sorted(salt(log, "spectral_line", 4.0, np.random.default_rng(0)))
-    ['flipped', 'reversed', 'salted', 'untouched']
+    >>> null = {"kind": "null", "names": [], "strengths": [], "degradation": None}
+    >>> log, _ = make_case(plan_case(0, seed=5) | null | {"rate": 10.0, "seconds": 600})
+    >>> sorted(inject_effect(log, "spectral_line", 4.0, np.random.default_rng(0)))
+    ['flipped', 'injected', 'reversed', 'untouched']
     """
     check_log(log)
     if effect not in CATALOGUE:
-        raise OptionError(f"no effect {effect!r} can be made; there are {', '.join(CATALOGUE)}")
+        raise OptionError(f"{effect!r} is not in the catalogue; it has {', '.join(CATALOGUE)}")
     if signal_name(log) != "rate":
-        raise OptionError("salt needs a log of rates; this one holds angles")
+        raise OptionError("an injection needs a log of rates; this one holds angles")
     record = np.asarray(log["rate"].values[:3], dtype=float)
     axes = [str(name) for name in log["axis"].values[:3]]
-    world, made = _drawn(log, record, effect, strength, rng)
-    salted = _as_counted(record, _added(world, made, rng)[: len(axes)], rng)
+    scenario, made = _draw_effect(log, record, effect, strength, rng)
+    injected = _quantize_like(record, _compute_addition(scenario, made, rng)[: len(axes)], rng)
     if made.after is not None:
-        padded = np.concatenate([salted, np.zeros((3 - len(axes), world.size))])
-        salted = made.after(padded)[: len(axes)]
-        salted[np.isnan(record)] = np.nan
+        padded = np.concatenate([injected, np.zeros((3 - len(axes), scenario.size))])
+        injected = made.after(padded)[: len(axes)]
+        injected[np.isnan(record)] = np.nan
     channels = {
         name: channel
-        for name, channel in channels_of(world, [made], rng).items()
+        for name, channel in make_channels(scenario, [made], rng).items()
         if name not in log.variables
     }
     names = dict(zip("xyz", axes, strict=False))
-    told = truth_of(world, [made], strengths=[strength])
-    for one in told["effects"]:
-        one["axes"] = [names[axis] for axis in one["axes"] if axis in names]
-    bare = truth_of(world, [], strengths=[])
+    truth = describe_truth(scenario, [made], strengths=[strength])
+    for table in truth["effects"]:
+        table["axes"] = [names[axis] for axis in table["axes"] if axis in names]
+    control_truth = describe_truth(scenario, [], strengths=[])
     copies = {
-        "salted": salted,
+        "injected": injected,
         "untouched": record,
         "flipped": -record,
         "reversed": record[:, ::-1].copy(),
     }
     return {
         name: (
-            _with(log, values, channels, world),
-            (told if name == "salted" else bare)
+            _replace_record(log, values, channels, scenario),
+            (truth if name == "injected" else control_truth)
             | {
-                "plan": {"kind": "salted" if name == "salted" else "control", "copy": name},
-                "buried": None,
+                "plan": {"kind": "injected" if name == "injected" else "control", "copy": name},
+                "visibility": None,
             },
         )
         for name, values in copies.items()
     }
 
 
-def _drawn(
+def _draw_effect(
     log: xr.Dataset, record: Array, effect: str, strength: float, rng: np.random.Generator
-) -> tuple[World, Effect]:
+) -> tuple[Scenario, Effect]:
     entry = CATALOGUE[effect]
     if entry.cuts:
         raise OptionError(
-            f"{effect} follows restarts, and a real log has only its own; salt it with another effect"
+            f"{effect} follows restarts, which cannot be injected; inject another effect"
         )
     present = set("xyz"[: record.shape[0]])
-    own = own_noise(record, rate=float(log.attrs["sampling_rate_hz"]), axes=3)
-    for _ in range(_TRIES):
-        world = _world_of(log, record, own, rng)
-        if entry.needs == "turning" and world.rotation.max() == 0:
+    measured = measure_noise(record, rate=float(log.attrs["sampling_rate_hz"]), axes=3)
+    for _ in range(_MAX_TRIES):
+        scenario = _draw_around_log(log, record, measured, rng)
+        if entry.needs == "rotation" and scenario.rotation.max() == 0:
             continue
-        made = entry.make(world, rng, strength=strength)
+        made = entry.make(scenario, rng, strength=strength)
         if set(made.axes) <= present or (len(made.axes) == 3 and made.after is not None):
-            return world, made
+            return scenario, made
     raise OptionError(
-        f"{effect} needs more axes than the {record.shape[0]} of this log; salt it with another effect"
+        f"{effect} needs more axes than the {record.shape[0]} of this log; inject another effect"
     )
 
 
-def _with(
-    log: xr.Dataset, record: Array, channels: dict[str, tuple[Array, float]], world: World
+def _replace_record(
+    log: xr.Dataset, record: Array, channels: dict[str, tuple[Array, float]], scenario: Scenario
 ) -> xr.Dataset:
     gone = np.asarray(np.isnan(record).all(axis=0))
     out = log.isel(axis=slice(0, record.shape[0])).drop_dims("gap", errors="ignore")
     out = out.assign(
         rate=(("axis", "time"), record, dict(log["rate"].attrs)),
-        **gap_columns(gone, start=world.start, rate=world.rate),
+        **make_gap_variables(gone, start=scenario.start, rate=scenario.rate),
     )
-    return with_channels(out, channels, start=world.start, rate=world.rate)
+    return add_channels(out, channels, start=scenario.start, rate=scenario.rate)

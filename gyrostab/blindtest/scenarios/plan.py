@@ -1,4 +1,4 @@
-"""What is drawn: kinds of cases, effects, strengths, lengths, rates and gaps, from a seed."""
+"""Plan the cases of a seed: kinds, effects, strengths, lengths, rates and gaps."""
 
 from __future__ import annotations
 
@@ -6,24 +6,32 @@ from typing import Any
 
 import numpy as np
 
-from gyrostab.blindtest.generator.catalogue import CATALOGUE, STRANGE
+from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE
 from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.errors import OptionError
 
-__all__ = ["KINDS", "SEVERINGS", "STRENGTHS", "plan_case", "plan_cases"]
+__all__ = ["DEGRADATIONS", "KINDS", "STRENGTHS", "plan_case", "plan_cases"]
 
-#: Kind of case -> how many of 20 are of it. "single" and "buried" hold one effect, "strange" one
-#: that is in no catalogue.
-KINDS = {"null": 5, "single": 5, "buried": 2, "pair": 3, "triple": 1, "strange": 2, "severed": 2}
+#: Kind of case -> its number in 20 cases. "single", "sub_threshold", "out_of_catalogue" and
+#: "degraded_driver" hold one effect.
+KINDS = {
+    "null": 5,
+    "single": 5,
+    "sub_threshold": 2,
+    "pair": 3,
+    "triple": 1,
+    "out_of_catalogue": 2,
+    "degraded_driver": 2,
+}
 
 #: Sizes in units of the closed-form limit.
 STRENGTHS = (0.5, 1.0, 1.5, 2.5, 4.0, 8.0)
 
-#: What can be done to the channel that drives an effect.
-SEVERINGS = ("withheld", "decoy", "lagged", "confounded", "noisy", "clipped")
+#: Degradations of the channel that drives an effect; see `degrade_driver`.
+DEGRADATIONS = ("withheld", "substituted", "lagged", "confounded", "noisy", "clipped")
 
-#: Effects that are not put into one record: the one makes the limit of the other meaningless.
-_APART = (
+#: Effects that never share a record, because one makes the limit of the other meaningless.
+_INCOMPATIBLE = (
     {"logger_filter", "spikes"},
     {"rate_quantization", "dead_zone"},
     {"rate_quantization", "clipping"},
@@ -34,35 +42,38 @@ _APART = (
 )
 
 
-def _pool(kind: str) -> list[tuple[str, float]]:
-    if kind == "strange":
-        return [(name, s) for name in STRANGE for s in STRENGTHS[1:]]
-    if kind == "severed":
+def _list_options(kind: str) -> list[tuple[str, float]]:
+    if kind == "out_of_catalogue":
+        return [(name, s) for name in OUT_OF_CATALOGUE for s in STRENGTHS[1:]]
+    if kind == "degraded_driver":
         return [
             (name, s) for name, entry in CATALOGUE.items() if entry.channel for s in STRENGTHS[2:]
         ]
-    if kind == "buried":
+    if kind == "sub_threshold":
         return [
-            (name, s) for name, entry in CATALOGUE.items() if entry.hidden for s in (1.0, 1.5, 2.5)
+            (name, s)
+            for name, entry in CATALOGUE.items()
+            if entry.can_be_sub_threshold
+            for s in (1.0, 1.5, 2.5)
         ]
     return [(name, s) for name in CATALOGUE for s in STRENGTHS]
 
 
-def _dealt(seed: int, kind: str, turn: int) -> tuple[str, float]:
-    """Effect and strength of the case number `turn` of its kind: every pair once before one comes again."""
-    pool = _pool(kind)
+def _deal_effect(seed: int, kind: str, turn: int) -> tuple[str, float]:
+    """Choose effect and strength of case `turn` of its kind; each pair occurs once per round."""
+    pool = _list_options(kind)
     lap, place = divmod(turn, len(pool))
     name, strength = pool[int(stream(seed, "deal", kind, lap).permutation(len(pool))[place])]
     return name, strength
 
 
-def _shape(rng: np.random.Generator, kind: str, index: int) -> tuple[float, float]:
-    """Rate [Hz] and length [s]: many short records, few long ones, one of a day in 400."""
+def _draw_shape(rng: np.random.Generator, kind: str, index: int) -> tuple[float, float]:
+    """Draw rate [Hz] and length [s]: mostly short records, one of a day in 400."""
     draw = float(rng.random())
     rate = float(rng.choice([10.0, 100.0, 400.0], p=[0.4, 0.45, 0.15]))
     if index % 400 == 150:
         return 10.0, 86400.0
-    if kind == "buried":
+    if kind == "sub_threshold":
         rate, shortest, longest = 10.0, 3000.0, 9000.0
     elif draw < 0.03:
         rate, shortest, longest = 10.0, 7200.0, 21600.0
@@ -72,20 +83,20 @@ def _shape(rng: np.random.Generator, kind: str, index: int) -> tuple[float, floa
 
 
 def plan_case(index: int, *, seed: int) -> dict[str, Any]:
-    """Plan of one case; the same for the same index and seed, whatever else is planned.
+    """Plan one case; the plan depends on index and seed only.
 
     Parameters
     ----------
     index : int
         Number of the case, from 0.
     seed : int
-        Of the whole benchmark.
+        Seed of the whole benchmark.
 
     Returns
     -------
     dict
         ``index``, ``seed``, ``kind``, ``names``, ``strengths``, ``rate`` [Hz], ``seconds``,
-        ``gaps`` (share), ``cuts``, ``heavy``, ``severing``.
+        ``gaps`` (share), ``cuts``, ``heavy``, ``degradation``.
 
     Raises
     ------
@@ -106,21 +117,23 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
     kind = deck[int(order[place])]
     before = sum(deck[int(order[i])] == kind for i in range(place)) + lap * KINDS[kind]
     rng = stream(seed, "plan", index)
-    rate, seconds = _shape(rng, kind, index)
+    rate, seconds = _draw_shape(rng, kind, index)
     names, strengths = [], []
     if kind != "null":
-        name, strength = _dealt(seed, kind, before)
+        name, strength = _deal_effect(seed, kind, before)
         names, strengths = [name], [strength]
     for _ in range({"pair": 1, "triple": 2}.get(kind, 0)):
         others = [
             other
             for other in CATALOGUE
-            if other not in names and not any({other, name} in _APART for name in names)
+            if other not in names and not any({other, name} in _INCOMPATIBLE for name in names)
         ]
         names.append(str(rng.choice(others)))
         strengths.append(float(rng.choice(STRENGTHS)))
-    channel = (CATALOGUE | STRANGE)[names[0]].channel if names else None
-    possible = [how for how in SEVERINGS if channel != "ramp" or how in ("withheld", "decoy")]
+    channel = (CATALOGUE | OUT_OF_CATALOGUE)[names[0]].channel if names else None
+    possible = [
+        how for how in DEGRADATIONS if channel != "ramp" or how in ("withheld", "substituted")
+    ]
     return {
         "index": index,
         "seed": seed,
@@ -131,13 +144,13 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
         "seconds": seconds,
         "gaps": float(rng.uniform(0.0, 0.4)) if rng.random() < 0.5 else 0.0,
         "cuts": int(rng.integers(1, 4)) if rng.random() < 0.3 else 0,
-        "heavy": bool(rng.random() < {"null": 0.5, "buried": 0.0}.get(kind, 0.1)),
-        "severing": str(rng.choice(possible)) if kind == "severed" else None,
+        "heavy": bool(rng.random() < {"null": 0.5, "sub_threshold": 0.0}.get(kind, 0.1)),
+        "degradation": str(rng.choice(possible)) if kind == "degraded_driver" else None,
     }
 
 
 def plan_cases(number: int, *, seed: int) -> list[dict[str, Any]]:
-    """Plans of the first `number` cases of a benchmark.
+    """Plan the first `number` cases of a benchmark.
 
     Examples
     --------

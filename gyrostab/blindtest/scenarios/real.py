@@ -1,4 +1,4 @@
-"""Which real recordings are salted, with what, and how each is read."""
+"""Plan the injections into real recordings, and read the recordings."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ import xarray as xr
 from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.blindtest.scenarios.injection import inject_effect
 
-__all__ = ["COPIES", "REAL", "make_injection_case", "plan_injections"]
+__all__ = ["COPIES", "RECORDINGS", "make_injection_case", "plan_injections"]
 
-#: The salted recording, and its copies without salt.
-COPIES = ("salted", "untouched", "flipped", "reversed")
+#: The injected recording, and its controls.
+COPIES = ("injected", "untouched", "flipped", "reversed")
 
 
 @dataclass(frozen=True)
 class _Recording:
-    """File in the folder of recordings, columns and units, and the longest piece that is taken [s]."""
+    """How to read a recording, and the longest piece to take [s]."""
 
     file: str
     columns: dict[str, str]
     units: dict[str, str] = field(default_factory=dict)
     longest: float = 900.0
-    rate: float | None = None  # where the file has no times
+    rate: float | None = None  # given where the file has no times
 
 
-REAL: dict[str, _Recording] = {
+RECORDINGS: dict[str, _Recording] = {
     "fog-blueseis": _Recording(
         "fog-blueseis-ramp/fog_ramp.csv.gz", {"rate_counts": "gyro_z"}, {"gyro": "1 nrad/s"}
     ),
@@ -53,34 +53,43 @@ REAL: dict[str, _Recording] = {
     ),
 }
 
-#: Effects that can be added to noise which is there already, on one axis; and those which need
-#: three.
-_ON_ONE = (
-    "vibration_rectification", "shupe", "temperature_bias", "thermal_hysteresis", "vibration_noise", "aliased_vibration",
-    "temperature_noise", "light_power_noise", "ageing_noise", "spectral_line", "supply_bias", "spikes",
-)  # fmt: skip
-_ON_THREE = (*_ON_ONE, "shared_source", "earth_rate", "scale_factor")
+#: Effects that can be added to existing noise on one axis, and on three.
+_ONE_AXIS_EFFECTS = (
+    "vibration_rectification",
+    "shupe",
+    "temperature_bias",
+    "thermal_hysteresis",
+    "vibration_noise",
+    "aliased_vibration",
+    "temperature_noise",
+    "light_power_noise",
+    "ageing_noise",
+    "spectral_line",
+    "supply_bias",
+    "spikes",
+)
+_THREE_AXIS_EFFECTS = (*_ONE_AXIS_EFFECTS, "shared_source", "earth_rate", "scale_factor")
 
 _STRENGTHS = (1.5, 2.5, 4.0, 8.0)
 
 
 def plan_injections(number: int, *, seed: int) -> list[dict[str, Any]]:
-    """Plans of `number` salted real recordings, four for each: salted, untouched, turned in sign, turned in time.
+    """Plan `number` injections into real recordings, with four copies of each.
 
     Examples
     --------
-    >>> [plan["copy"] for plan in plan_salted(1, seed=3)]
-    ['salted', 'untouched', 'flipped', 'reversed']
+    >>> [plan["copy"] for plan in plan_injections(1, seed=3)]
+    ['injected', 'untouched', 'flipped', 'reversed']
     """
     out = []
     for index in range(number):
-        rng = stream(seed, "salted", index)
-        names = list(REAL)
-        recording = names[(int(stream(seed, "salted").integers(len(names))) + index) % len(names)]
+        rng = stream(seed, "injected", index)
+        names = list(RECORDINGS)
+        recording = names[(int(stream(seed, "injected").integers(len(names))) + index) % len(names)]
         effects = (
-            _ON_THREE
-            if sum(name.startswith("gyro") for name in REAL[recording].columns.values()) == 3
-            else _ON_ONE
+            _THREE_AXIS_EFFECTS
+            if sum(name.startswith("gyro") for name in RECORDINGS[recording].columns.values()) == 3
+            else _ONE_AXIS_EFFECTS
         )
         plan = {
             "index": index,
@@ -90,45 +99,43 @@ def plan_injections(number: int, *, seed: int) -> list[dict[str, Any]]:
         }
         plan |= {"strength": float(rng.choice(_STRENGTHS)), "part": float(rng.random())}
         out += [
-            plan | {"kind": "salted" if copy == "salted" else "control", "copy": copy}
+            plan | {"kind": "injected" if copy == "injected" else "control", "copy": copy}
             for copy in COPIES
         ]
     return out
 
 
-def _piece(recording: str, folder: Path, part: float) -> xr.Dataset:
-    from gyrostab.ingest import read_log
-    from gyrostab.ingest.grid.regularise import regularise
+def _read_piece(recording: str, folder: Path, part: float) -> xr.Dataset:
+    from gyrostab import read_log, regularise
 
-    entry = REAL[recording]
+    entry = RECORDINGS[recording]
     log = regularise(
         read_log(folder / entry.file, map=entry.columns, unit=entry.units, rate=entry.rate)
     )
     size = min(log.sizes["time"], round(entry.longest * float(log.attrs["sampling_rate_hz"])))
     first = round(part * (log.sizes["time"] - size))
     piece = log[["rate"]].isel(time=slice(first, first + size)).compute()
-    piece.attrs = {
-        name: log.attrs[name] for name in ("sampling_rate_hz", "kind")
-    }  # nothing that tells where it comes from
+    # no attribute that identifies the recording
+    piece.attrs = {name: log.attrs[name] for name in ("sampling_rate_hz", "kind")}
     return piece
 
 
 def make_injection_case(plan: dict[str, Any], folder: Path) -> tuple[xr.Dataset, dict[str, Any]]:
-    """Make one of the four logs of a salted recording and its truth.
+    """Make one of the four logs of an injection, and its truth.
 
     Parameters
     ----------
     plan : dict
-        One of `plan_injections`.
+        Plan from `plan_injections`.
     folder : pathlib.Path
-        Where the real recordings are.
+        Folder of the real recordings.
 
     Raises
     ------
     FormatError
-        When the recording is not there.
+        When the recording does not exist.
     """
-    log = _piece(plan["recording"], folder, plan["part"])
-    rng = np.random.default_rng(stream(plan["seed"], "salt", plan["index"]).integers(2**40))
+    log = _read_piece(plan["recording"], folder, plan["part"])
+    rng = np.random.default_rng(stream(plan["seed"], "injection", plan["index"]).integers(2**40))
     made, truth = inject_effect(log, plan["effect"], plan["strength"], rng)[plan["copy"]]
     return made, truth | {"plan": plan}

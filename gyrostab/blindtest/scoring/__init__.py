@@ -1,1 +1,1 @@
-"""Scores of a diagnosis against the ground truth, beside those of two baseline detectors."""
+"""Score diagnoses against the ground truth, and compare them with two baseline detectors."""

@@ -1,4 +1,4 @@
-"""Two plain detectors to compare with, and the Allan deviation that they need: a whole-record Allan plot, and correlation with channels."""
+"""Two baseline detectors: an Allan plot of the whole record, and correlation with channels."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ Array = NDArray[np.float64]
 #: Level of both detectors.
 LEVEL = 0.01
 
-#: Samples from which on a record is long, samples of a mean in it, and of the part that nulls of
-#: its short times are made of.
-_LONG, _BLOCK, _PART = 50_000, 32, 20_000
+#: A longer record is analysed from block means, and its short times from a part.
+_LONG_RECORD_SAMPLES = 50_000
+_BLOCK_SAMPLES = 32
+_PART_SAMPLES = 20_000
 
 
 def octaves(size: int) -> list[int]:
-    """Averaging factors 1, 2, 4 ... up to a tenth of a record of `size` samples.
+    """List the averaging factors 1, 2, 4 ... up to a tenth of a record of `size` samples.
 
     Examples
     --------
@@ -47,16 +48,16 @@ def octaves(size: int) -> list[int]:
 def allan_variance(
     values: Array, factors: list[int], *, counts: NDArray[np.int64] | None = None
 ) -> Array:
-    """Overlapping Allan variance of rates (time,) with NaN where lost; clusters count that are at least half full.
+    """Compute the overlapping Allan variance of rates with NaN; clusters must be half full.
 
     Parameters
     ----------
     values : ndarray, shape (time,)
         Rates [deg/h].
     factors : list of int
-        Averaging times, in samples.
+        Averaging times [samples].
     counts : ndarray of int, shape (time,), optional
-        Where the values are means themselves: of how many samples each.
+        Number of samples in each value, where the values are means.
 
     Returns
     -------
@@ -68,10 +69,10 @@ def allan_variance(
     >>> allan_variance(np.tile([1.0, -1.0], 500), [1, 2]).tolist()
     [2.0, 0.0]
     """
-    there = np.isfinite(values)
-    weight = there.astype(np.int64) if counts is None else counts * there
+    present = np.isfinite(values)
+    weight = present.astype(np.int64) if counts is None else counts * present
     full = 1 if counts is None else int(counts.max())
-    filled = np.where(there, values - values[there].mean(), 0.0) * weight
+    filled = np.where(present, values - values[present].mean(), 0.0) * weight
     total = np.concatenate([[0.0], np.cumsum(filled)])
     count = np.concatenate([[0], np.cumsum(weight)])
     out = []
@@ -85,26 +86,28 @@ def allan_variance(
     return np.asarray(out)
 
 
-def _blocks(values: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Means of `_BLOCK` samples, and of how many each is."""
-    cut = values[: values.size // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
+def _block_means(values: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Average blocks of `_BLOCK_SAMPLES`; return the means and the samples present in each."""
+    cut = values[: values.size // _BLOCK_SAMPLES * _BLOCK_SAMPLES].reshape(-1, _BLOCK_SAMPLES)
     counts = np.isfinite(cut).sum(axis=1)
     means = np.where(counts > 0, np.nansum(cut, axis=1) / np.maximum(counts, 1), np.nan)
     return means, counts
 
 
 def log_allan(values: Array) -> Array:
-    """Log of the Allan variance of rates (time,) at `octaves`; the long times of a long record from means of `_BLOCK` samples."""
+    """Compute the log Allan variance of rates at `octaves`, long times from block means."""
     factors = octaves(values.size)
-    if values.size <= _LONG:
+    if values.size <= _LONG_RECORD_SAMPLES:
         return np.asarray(np.log(allan_variance(values, factors)))
-    means, counts = _blocks(values)
-    fine = allan_variance(values, [k for k in factors if k <= _BLOCK])
-    coarse = allan_variance(means, [k // _BLOCK for k in factors if k > _BLOCK], counts=counts)
+    means, counts = _block_means(values)
+    fine = allan_variance(values, [k for k in factors if k <= _BLOCK_SAMPLES])
+    coarse = allan_variance(
+        means, [k // _BLOCK_SAMPLES for k in factors if k > _BLOCK_SAMPLES], counts=counts
+    )
     return np.asarray(np.log(np.concatenate([fine, coarse])))
 
 
-def _null(
+def _draw_null(
     rng: np.random.Generator,
     missing: NDArray[np.bool_],
     noise: dict[str, float],
@@ -121,7 +124,7 @@ def _null(
     return record
 
 
-def _null_logs(
+def _draw_null_curves(
     rng: np.random.Generator,
     missing: NDArray[np.bool_],
     noise: dict[str, float],
@@ -129,40 +132,41 @@ def _null_logs(
     flicker: str,
     nulls: int,
 ) -> tuple[Array, Array]:
-    """Logs of the Allan variance of nulls (null, factor), and by how much each factor's scatter is that of the whole record.
+    """Draw log Allan variances (null, factor), and the ratio of the record's scatter to theirs.
 
-    Of a long record the short times come from nulls of a part of it, the long ones from nulls of
-    means.
+    For a long record, short times come from nulls of a part, long times from nulls of means.
     """
     factors = octaves(missing.size)
-    if missing.size <= _LONG:
-        rows = [log_allan(_null(rng, missing, noise, rate, flicker)) for _ in range(nulls)]
+    if missing.size <= _LONG_RECORD_SAMPLES:
+        rows = [log_allan(_draw_null(rng, missing, noise, rate, flicker)) for _ in range(nulls)]
         return np.stack(rows), np.ones(len(factors))
-    short = [k for k in factors if k <= _BLOCK]
-    middle = (missing.size - _PART) // 2
+    short = [k for k in factors if k <= _BLOCK_SAMPLES]
+    middle = (missing.size - _PART_SAMPLES) // 2
     part = (
-        missing[middle : middle + _PART]
-        if not missing[middle : middle + _PART].all()
-        else missing[:_PART]
+        missing[middle : middle + _PART_SAMPLES]
+        if not missing[middle : middle + _PART_SAMPLES].all()
+        else missing[:_PART_SAMPLES]
     )
-    _, counts = _blocks(np.where(missing, np.nan, 0.0))
-    fewer = np.sqrt(_BLOCK / np.maximum(counts, 1)) - 1
+    _, counts = _block_means(np.where(missing, np.nan, 0.0))
+    fewer = np.sqrt(_BLOCK_SAMPLES / np.maximum(counts, 1)) - 1
     rows = []
     for _ in range(nulls):
-        fine = np.log(allan_variance(_null(rng, part, noise, rate, flicker), short))
-        means = _null(rng, counts == 0, noise | {"Q": 0.0}, rate / _BLOCK, "spectrum")
+        fine = np.log(allan_variance(_draw_null(rng, part, noise, rate, flicker), short))
+        means = _draw_null(rng, counts == 0, noise | {"Q": 0.0}, rate / _BLOCK_SAMPLES, "spectrum")
         means += (
             floor.white_level(noise["N"])
-            * math.sqrt(rate / _BLOCK)
+            * math.sqrt(rate / _BLOCK_SAMPLES)
             * np.sqrt((1 + fewer) ** 2 - 1)
             * rng.standard_normal(counts.size)
         )
         coarse = np.log(
-            allan_variance(means, [k // _BLOCK for k in factors if k > _BLOCK], counts=counts)
+            allan_variance(
+                means, [k // _BLOCK_SAMPLES for k in factors if k > _BLOCK_SAMPLES], counts=counts
+            )
         )
         rows.append(np.concatenate([fine, coarse]))
     smaller = math.sqrt(float((~part).sum()) / float((~missing).sum()))
-    return np.stack(rows), np.where(np.array(factors) <= _BLOCK, smaller, 1.0)
+    return np.stack(rows), np.where(np.array(factors) <= _BLOCK_SAMPLES, smaller, 1.0)
 
 
 def allan_band(
@@ -174,37 +178,37 @@ def allan_band(
     nulls: int = 60,
     flicker: str = "spectrum",
 ) -> dict[str, Any]:
-    """What the Allan variance of noise alone looks like under these gaps, and how far its largest deviation goes.
+    """Compute the 99 % band of the log Allan variance of noise alone with these gaps.
 
     Parameters
     ----------
     noise : dict
-        N, B, K, Q of the axis, known exactly.
+        True N, B, K, Q of the axis.
     rate : float
         Rate [Hz].
     missing : ndarray of bool, shape (time,)
+        Missing samples.
     rng : numpy.random.Generator
     nulls : int
-        Records of noise.
+        Number of null records.
     flicker : str
-        Method, see `floor.flicker`.
+        Method of `floor.flicker`.
 
     Returns
     -------
     dict
-        ``keep`` (which of the `octaves` can be had), ``mean`` and ``sd`` of the log variance there,
-        and ``limit``: what the largest of ``abs(z)`` stays under in 99 % of nulls.
+        ``keep`` (`octaves` with a variance), ``mean`` and ``sd`` of the log variance there, and
+        ``limit``, the 99 % quantile of the largest ``abs(z)``.
     """
-    logs, scatter_of_whole = _null_logs(rng, missing, noise, rate, flicker, nulls)
+    logs, scatter_of_whole = _draw_null_curves(rng, missing, noise, rate, flicker, nulls)
     keep = np.isfinite(logs).all(axis=0)
     logs = logs[:, keep]
     mean, sd = logs.mean(axis=0), logs.std(axis=0, ddof=1) * scatter_of_whole[keep]
     tied = np.corrcoef(logs, rowvar=False).reshape(mean.size, mean.size)
     values, vectors = np.linalg.eigh(0.98 * tied + 0.02 * np.eye(mean.size))
     normal = rng.standard_normal((20_000, mean.size)) @ (vectors * np.sqrt(np.maximum(values, 0))).T
-    scatter = np.sqrt(
-        rng.chisquare(nulls - 1, (20_000, 1)) / (nulls - 1)
-    )  # the moments come from a few records themselves
+    # the moments are estimated from few records
+    scatter = np.sqrt(rng.chisquare(nulls - 1, (20_000, 1)) / (nulls - 1))
     spread = math.sqrt(1 + 1 / nulls)
     return {
         "keep": keep,
@@ -215,7 +219,7 @@ def allan_band(
 
 
 def band_excess(values: Array, band: dict[str, Any]) -> float:
-    """The largest deviation of the Allan variance of rates (time,) from an `allan_band`, in standard deviations."""
+    """Compute the largest deviation of the Allan variance from an `allan_band` [sigma]."""
     z = (log_allan(values)[band["keep"]] - band["mean"]) / band["sd"]
     return float(np.nanmax(np.abs(z)))
 
@@ -223,17 +227,17 @@ def band_excess(values: Array, band: dict[str, Any]) -> float:
 def allan_detector(
     record: Array, truth: dict[str, Any], *, rng: np.random.Generator, nulls: int = 60
 ) -> bool:
-    """Whether the whole-record Allan deviation of any axis leaves its 99 % band, the noise being known exactly.
+    """Test whether the Allan deviation of any axis leaves its 99 % band, with the true noise known.
 
     Parameters
     ----------
     record : ndarray, shape (axis, time)
         Rates [deg/h], NaN where lost.
     truth : dict
-        Of the case: its noise is used.
+        Truth of the case, which holds its noise.
     rng : numpy.random.Generator
     nulls : int
-        Records of noise for each axis.
+        Null records for each axis.
     """
     axes = len(truth["noise"])
     for row, noise in zip(record, truth["noise"].values(), strict=True):
@@ -251,13 +255,15 @@ def allan_detector(
 
 
 def _shared_limit(limit: float, axes: int) -> float:
-    """The limit for 1 % over all `axes` from that for 1 % on one, by the tail of a normal deviate."""
+    """Convert the 1 % limit of one axis to that of all `axes`, by the tail of a normal deviate."""
     tail = 2 * float(special.ndtr(-limit)) / axes
     return float(-special.ndtri(tail / 2))
 
 
 def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> bool:
-    """Whether block means or block variances of any axis correlate with any channel, at 1 % over all pairs, blocks taken as independent.
+    """Test whether block means or variances correlate with any channel, at 1 % over all pairs.
+
+    The blocks are assumed to be independent.
 
     Parameters
     ----------
@@ -276,7 +282,7 @@ def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> bool:
         mean = np.nansum(cut, axis=2) / count
         spread = np.log(np.nansum((cut - mean[:, :, None]) ** 2, axis=2) / (count - 1))
     pairs = []
-    for name in _channels(log):
+    for name in _list_channels(log):
         values = np.asarray(log[name].values, dtype=float)
         own = values.size / (record.shape[1] / rate)
         edges = np.minimum((np.arange(number) * block * own).astype(int), values.size - 1)
@@ -289,7 +295,7 @@ def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> bool:
     return bool(found) and min(found) < LEVEL / len(found)
 
 
-def _channels(log: xr.Dataset) -> list[str]:
+def _list_channels(log: xr.Dataset) -> list[str]:
     return [
         str(name)
         for name, variable in log.data_vars.items()

@@ -1,4 +1,4 @@
-"""How detection and naming run with the strength and from effect to effect, and what a name is worth that is given."""
+"""Completeness against strength and by effect, and reliability of each name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from gyrostab.blindtest.scoring.proportions import wilson
-from gyrostab.blindtest.scoring.table import CLEAR, cases
+from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH, first_rows
 
 __all__ = ["by_effect", "curves", "reliability"]
 
@@ -16,10 +16,9 @@ Row = Mapping[str, Any]
 
 
 def curves(rows: Sequence[Row]) -> pd.DataFrame:
-    """Completeness against strength: shares detected and named, of every effect and of all, with Wilson's intervals.
+    """Compute the shares detected and named against strength, by effect and for all effects.
 
-    Of an effect of no catalogue it is right to say that it is unknown, so this counts there in the
-    place of a name.
+    For an effect out of catalogue, unidentified counts as named.
 
     Returns
     -------
@@ -30,7 +29,8 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
     here = [
         row
         for row in rows
-        if row["kind"] in ("single", "pair", "triple", "buried", "strange") and row["effect"]
+        if row["kind"] in ("single", "pair", "triple", "sub_threshold", "out_of_catalogue")
+        and row["effect"]
     ]
     out = []
     for effect in ["all", *sorted({row["effect"] for row in here})]:
@@ -39,14 +39,23 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
                 row
                 for row in here
                 if row["strength"] == strength
-                and (row["effect"] == effect or (effect == "all" and row["kind"] != "strange"))
+                and (
+                    row["effect"] == effect
+                    or (effect == "all" and row["kind"] != "out_of_catalogue")
+                )
             ]
             if not part:
                 continue
             line: dict[str, Any] = {"effect": effect, "strength": strength, "n": len(part)}
             for key in ("detected", "named"):
                 hits = sum(
-                    bool(row["unknown" if key == "named" and row["kind"] == "strange" else key])
+                    bool(
+                        row[
+                            "unknown"
+                            if key == "named" and row["kind"] == "out_of_catalogue"
+                            else key
+                        ]
+                    )
                     for row in part
                 )
                 low, high = wilson(hits, len(part))
@@ -56,13 +65,13 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def reliability(rows: Sequence[Row]) -> pd.DataFrame:
-    """Of all claims of a name, the share that stands for something true: ``name``, ``n``, ``right``, ``low``, ``high``."""
-    said: dict[str, list[bool]] = {}
-    for row in cases([row for row in rows if row["kind"] not in ("salted", "control")]):
-        for name, right in row["claims"]:
-            said.setdefault(name, []).append(right)
+    """Compute the share of correct identifications by name, with Wilson's interval."""
+    correct: dict[str, list[bool]] = {}
+    for row in first_rows([row for row in rows if row["kind"] not in ("injected", "control")]):
+        for name, right in row["identifications"]:
+            correct.setdefault(name, []).append(right)
     out = []
-    for name, flags in sorted(said.items()):
+    for name, flags in sorted(correct.items()):
         low, high = wilson(sum(flags), len(flags))
         out.append(
             {
@@ -77,44 +86,48 @@ def reliability(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def by_effect(rows: Sequence[Row]) -> pd.DataFrame:
-    """Completeness and reliability of every effect of the catalogue.
+    """Compute completeness and reliability of every effect of the catalogue.
 
     Returns
     -------
     pandas.DataFrame
-        ``effect``; ``n`` at 1.5 times the limit and more, and of these the shares ``detected``,
-        ``named`` (sets merged) and ``exactly``; ``claims`` of this name in all cases and the share
-        of them that is ``right``; ``numbers`` of it that could be compared and the share ``held``
-        of their 95 % intervals that hold the truth. None where there is nothing to count.
+        ``effect``; ``n`` of strength 1.5 or more, and the shares ``detected``, ``named`` (sets
+        merged) and ``exactly`` of these; the ``identifications`` of this name in all cases and the
+        share ``right``; the ``parameters`` that can be compared and the share ``covered`` by their
+        95 % intervals. None where there is nothing to count.
     """
-    claims = {line["name"]: line for line in reliability(rows).to_dict("records")}
+    identifications = {line["name"]: line for line in reliability(rows).to_dict("records")}
     here = [
         row
         for row in rows
-        if row["kind"] in ("single", "pair", "triple", "buried") and row["effect"]
+        if row["kind"] in ("single", "pair", "triple", "sub_threshold") and row["effect"]
     ]
     out = []
-    for effect in sorted({row["effect"] for row in here} | set(claims)):
-        clear = [row for row in here if row["effect"] == effect and row["strength"] >= CLEAR]
-        numbers = [number["held"] for row in clear for number in row["numbers"]]
+    for effect in sorted({row["effect"] for row in here} | set(identifications)):
+        clear = [
+            row for row in here if row["effect"] == effect and row["strength"] >= CLEAR_STRENGTH
+        ]
+        numbers = [number["covered"] for row in clear for number in row["parameter_scores"]]
         out.append(
             {
                 "effect": effect,
                 "n": len(clear),
-                **{key: _mean([row[mark] for row in clear]) for key, mark in _MARKS.items()},
-                "claims": claims.get(effect, {}).get("n", 0),
-                "right": claims.get(effect, {}).get("right"),
-                "numbers": len(numbers),
-                "held": _mean(numbers),
+                **{key: _share_true([row[mark] for row in clear]) for key, mark in _SHARES.items()},
+                "identifications": identifications.get(effect, {}).get("n", 0),
+                "right": identifications.get(effect, {}).get("right"),
+                "parameters": len(numbers),
+                "covered": _share_true(numbers),
             }
         )
     return pd.DataFrame(
-        out, columns=["effect", "n", *_MARKS, "claims", "right", "numbers", "held"], dtype=object
+        out,
+        columns=["effect", "n", *_SHARES, "identifications", "right", "parameters", "covered"],
+        dtype=object,
     )
 
 
-_MARKS = {"detected": "detected", "named": "named", "exactly": "named_exactly"}
+_SHARES = {"detected": "detected", "named": "named", "exactly": "named_exactly"}
 
 
-def _mean(flags: Sequence[bool]) -> float | None:
+def _share_true(flags: Sequence[bool]) -> float | None:
     return sum(map(bool, flags)) / len(flags) if flags else None

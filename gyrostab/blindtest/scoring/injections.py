@@ -1,4 +1,4 @@
-"""What salt in real recordings shows: not what is claimed, for they hold effects of their own, but what is claimed beside that."""
+"""Score injections by the difference to the untouched recording, which has unknown effects."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.blindtest.generator.catalogue import merged
+from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.scoring.proportions import share
-from gyrostab.blindtest.scoring.table import CLEAR
+from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
 __all__ = ["injection_differences", "injection_table"]
 
@@ -17,69 +17,69 @@ Row = Mapping[str, Any]
 
 
 def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """What each salted recording, and its copies turned about, are said to hold beside what the untouched copy is.
+    """Compare the names found in the injected and reversed copies with those of the untouched one.
 
     Returns
     -------
     list of dict
-        ``index``, ``recording``, ``effect``, ``strength``; ``there_before``: a name of the set of
-        the effect is given to the untouched copy already; ``named``: one is given to the salted
-        one; ``others``: other names that salt has brought; ``flipped`` and ``reversed``: names that
-        turning the sign or the time has brought, sets merged.
+        ``index``, ``recording``, ``effect``, ``strength``; ``before``: names in the untouched copy;
+        ``there_before``: the effect's ambiguity set is among them; ``named``: it is named in the
+        injected copy; ``others``: other names added by the injection; ``flipped`` and ``reversed``:
+        names added by reversing sign or time, sets merged.
     """
     groups: dict[Any, dict[str, Row]] = {}
     for row in rows:
-        if row["kind"] in ("salted", "control"):
+        if row["kind"] in ("injected", "control"):
             groups.setdefault(row["index"], {})[row["copy"]] = row
     out = []
     for index, copies in sorted(groups.items()):
-        if set(copies) != {"salted", "untouched", "flipped", "reversed"}:
+        if set(copies) != {"injected", "untouched", "flipped", "reversed"}:
             continue
-        known = _merged(copies["untouched"])
-        salted = copies["salted"]
-        mine = merged(salted["effect"])
+        known = _merged_names(copies["untouched"])
+        injected = copies["injected"]
+        mine = merge_ambiguous(injected["effect"])
         out.append(
             {
                 "index": index,
-                "recording": salted["recording"],
-                "effect": salted["effect"],
-                "strength": salted["strength"],
-                "before": sorted(_said(copies["untouched"])),
-                "there_before": bool(_said(copies["untouched"]) & mine),
-                "named": bool(_said(salted) & mine),
-                "others": sorted(_said(salted) - mine - known),
-                "flipped": sorted(_said(copies["flipped"]) - known),
-                "reversed": sorted(_said(copies["reversed"]) - known),
+                "recording": injected["recording"],
+                "effect": injected["effect"],
+                "strength": injected["strength"],
+                "before": sorted(_names_given(copies["untouched"])),
+                "there_before": bool(_names_given(copies["untouched"]) & mine),
+                "named": bool(_names_given(injected) & mine),
+                "others": sorted(_names_given(injected) - mine - known),
+                "flipped": sorted(_names_given(copies["flipped"]) - known),
+                "reversed": sorted(_names_given(copies["reversed"]) - known),
             }
         )
     return out
 
 
-def _said(row: Row) -> set[str]:
-    return {name for name, _ in row["claims"]}
+def _names_given(row: Row) -> set[str]:
+    return {name for name, _ in row["identifications"]}
 
 
-def _merged(row: Row) -> set[str]:
-    return set().union(*(merged(name) for name in _said(row)))
+def _merged_names(row: Row) -> set[str]:
+    return set().union(*(merge_ambiguous(name) for name in _names_given(row)))
 
 
 def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
-    """Shares of salted real recordings, as `score_table` gives those of drawn ones; empty where there are none.
+    """Tabulate injections like `score_table`; empty without injections.
 
-    Effects count whose name the untouched copy is not given already.
+    An effect counts as named only where the untouched copy does not have its name already.
     """
     found = injection_differences(rows)
     if not found:
         return pd.DataFrame(columns=["quantity", "value", "low", "high", "n", "target", "state"])
-    new = [one for one in found if not one["there_before"]]
+    new = [line for line in found if not line["there_before"]]
     lines = [
         share(
-            f"salt of {CLEAR:g} times the limit and more: named rightly",
-            (one["named"] for one in new if one["strength"] >= CLEAR),
+            f"injections of strength {CLEAR_STRENGTH:g} or more: named correctly",
+            (line["named"] for line in new if line["strength"] >= CLEAR_STRENGTH),
         ),
-        share("salt brings another name", (bool(one["others"]) for one in found)),
-        share("turning the sign brings a name", (bool(one["flipped"]) for one in found)),
-        share("turning the time brings a name", (bool(one["reversed"]) for one in found)),
-        share("its effect is named without salt already", (one["there_before"] for one in found)),
+        share("injection adds another name", (bool(line["others"]) for line in found)),
+        share("reversing the sign adds a name", (bool(line["flipped"]) for line in found)),
+        share("reversing time adds a name", (bool(line["reversed"]) for line in found)),
+        share("effect already named without injection", (line["there_before"] for line in found)),
     ]
     return pd.DataFrame(lines)

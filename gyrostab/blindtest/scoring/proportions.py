@@ -1,4 +1,4 @@
-"""A figure with its 95 % interval beside its target: met only where the interval says so, and not shown where it is too wide."""
+"""Figures with 95 % intervals and targets: met, missed, or not shown where cases are too few."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Line = dict[str, Any]
 
 @dataclass(frozen=True)
 class Target:
-    """Where a figure should lie, and where its interval has to for the target to be met; `text` says it.
+    """Range in which a figure should lie; the target is met if its whole interval lies there.
 
-    Without a `surely` of its own the interval has to lie where the figure should.
+    `surely`, if given, replaces `most` for the upper end of the interval; `text` states the target.
     """
 
     text: str
@@ -27,7 +27,7 @@ class Target:
     surely: float | None = None
 
     def state(self, value: float, low: float, high: float) -> str:
-        """Met, missed, or not shown by so few cases.
+        """Decide between met, missed and not shown.
 
         Examples
         --------
@@ -51,7 +51,7 @@ NO_TARGET = Target("")
 
 
 def wilson(hits: int, total: int, *, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share.
+    """Compute Wilson's 95 % interval of a share.
 
     Examples
     --------
@@ -66,7 +66,9 @@ def wilson(hits: int, total: int, *, z: float = 1.959964) -> tuple[float, float]
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def _line(name: str, value: float, low: float, high: float, number: int, target: Target) -> Line:
+def _make_line(
+    name: str, value: float, low: float, high: float, number: int, target: Target
+) -> Line:
     state = target.state(value, low, high)
     return {
         "quantity": name,
@@ -80,10 +82,10 @@ def _line(name: str, value: float, low: float, high: float, number: int, target:
 
 
 def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
-    """A share of cases, with Wilson's interval."""
+    """Make the line of a share of cases, with Wilson's interval."""
     found = [bool(flag) for flag in flags]
     hits, total = sum(found), len(found)
-    return _line(
+    return _make_line(
         name,
         hits / total if total else math.nan,
         *(wilson(hits, total) if total else (math.nan, math.nan)),
@@ -93,10 +95,10 @@ def share(name: str, flags: Iterable[bool], target: Target = NO_TARGET) -> Line:
 
 
 def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET) -> Line:
-    """A median, with its interval by the order of the values."""
+    """Make the line of a median, with its order-statistic interval."""
     found = np.sort([value for value in values if value is not None and math.isfinite(value)])
     if found.size == 0:
-        return _line(name, math.nan, math.nan, math.nan, 0, target)
+        return _make_line(name, math.nan, math.nan, math.nan, 0, target)
     reach = 0.98 * math.sqrt(found.size)
     low, high = math.floor((found.size - 1) / 2 - reach), math.ceil((found.size - 1) / 2 + reach)
     ends = (
@@ -104,19 +106,19 @@ def median(name: str, values: Iterable[float | None], target: Target = NO_TARGET
         if found.size < 6
         else (found[max(0, low)], found[min(found.size - 1, high)])
     )
-    return _line(name, float(np.median(found)), float(ends[0]), float(ends[1]), found.size, target)
+    return _make_line(
+        name, float(np.median(found)), float(ends[0]), float(ends[1]), found.size, target
+    )
 
 
 def spread(name: str, pulls: Iterable[float | None], target: Target = NO_TARGET) -> Line:
-    """How far two thirds of errors go, in units of what was said of them: 1 where that was right; few large ones do not count."""
+    """Make the line of the 68 % quantile of normalised errors, 1 where these are right."""
     found = np.abs([pull for pull in pulls if pull is not None and math.isfinite(pull)])
     if found.size == 0:
-        return _line(name, math.nan, math.nan, math.nan, 0, target)
-    value, off = (
-        float(np.quantile(found, 0.6827)),
-        0.96 / math.sqrt(found.size),
-    )  # of the share, by the binomial law
+        return _make_line(name, math.nan, math.nan, math.nan, 0, target)
+    value = float(np.quantile(found, 0.6827))
+    off = 0.96 / math.sqrt(found.size)  # 95 % interval of the share, by the binomial law
     low, high = (
         float(np.quantile(found, min(max(0.6827 + step, 0.0), 1.0))) for step in (-off, off)
     )
-    return _line(name, value, low, high, found.size, target)
+    return _make_line(name, value, low, high, found.size, target)

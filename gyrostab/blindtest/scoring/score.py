@@ -1,4 +1,4 @@
-"""What a diagnosis is worth beside the truth: one row for every true effect of a case."""
+"""Score a diagnosis against the truth: one row for every true effect of a case."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gyrostab.blindtest.generator.catalogue import merged
+from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.generator.detection_limits import NATS
 from gyrostab.errors import SchemaError
 
@@ -16,13 +16,12 @@ __all__ = ["intersection_over_union", "score_case"]
 
 Intervals = Sequence[Sequence[str]]
 
-#: Numbers of which only the size can be known: the sign of what several axes share is a matter of
-#: convention.
+#: Parameters with an arbitrary sign: that of a source which several axes share is a convention.
 _UNSIGNED = ("N",)
-_LAST_DIGITS = 1e-9  # of a number
+_RELATIVE_TOLERANCE = 1e-9
 
 
-def _seconds(intervals: Intervals) -> list[tuple[float, float]]:
+def _merge_intervals(intervals: Intervals) -> list[tuple[float, float]]:
     spans = sorted(
         tuple(
             float(np.datetime64(stamp.removesuffix("Z"), "ns").astype(np.int64)) * 1e-9
@@ -40,54 +39,61 @@ def _seconds(intervals: Intervals) -> list[tuple[float, float]]:
 
 
 def intersection_over_union(found: Intervals, true: Intervals) -> float:
-    """Time that both have, over time that either has; intervals are pairs of ISO 8601.
+    """Compute the overlap in time of two lists of ISO 8601 intervals (IoU).
 
     Examples
     --------
-    >>> intersection_over_union([["2026-01-01T00:00:00", "2026-01-01T00:00:10"]], [["2026-01-01T00:00:05Z", "2026-01-01T00:00:15Z"]])
+    >>> found = [["2026-01-01T00:00:00", "2026-01-01T00:00:10"]]
+    >>> true = [["2026-01-01T00:00:05Z", "2026-01-01T00:00:15Z"]]
+    >>> intersection_over_union(found, true)
     0.3333333333333333
     """
-    a, b = _seconds(found), _seconds(true)
+    a, b = _merge_intervals(found), _merge_intervals(true)
     both = sum(max(0.0, min(x[1], y[1]) - max(x[0], y[0])) for x in a for y in b)
     either = sum(end - begin for begin, end in (*a, *b)) - both
     return both / either if either > 0 else 0.0
 
 
-def _names(claim: Mapping[str, Any]) -> set[str]:
-    return {claim["name"], *claim["alternatives"]}
+def _ambiguity_set(identification: Mapping[str, Any]) -> set[str]:
+    return {identification["name"], *identification["alternatives"]}
 
 
-def _gain(table: Mapping[str, Any]) -> float:
+def _evidence_nats(table: Mapping[str, Any]) -> float:
     return float((table.get("held_out_gain") or {}).get("nats") or 0.0)
 
 
-def _claims(diagnosis: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Every name that is claimed once, the strongest first, with all its tables: one for every axis, or every line."""
+def _collect_identifications(diagnosis: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Collect the tables of each identified name (one per axis or line), strongest name first."""
     out: dict[str, dict[str, Any]] = {}
-    for table in sorted(diagnosis["effects"], key=_gain, reverse=True):
-        one = out.setdefault(
+    for table in sorted(diagnosis["effects"], key=_evidence_nats, reverse=True):
+        identification = out.setdefault(
             table["name"],
             {"name": table["name"], "alternatives": set(), "intervals": [], "tables": []},
         )
-        one["alternatives"] |= set(table.get("alternatives", ()))
-        one["intervals"] += table.get("intervals", ())
-        one["tables"].append(table)
+        identification["alternatives"] |= set(table.get("alternatives", ()))
+        identification["intervals"] += table.get("intervals", ())
+        identification["tables"].append(table)
     return list(out.values())
 
 
-def _numbers(claim: Mapping[str, Any], effect: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Every number that truth and claim both have: ``parameter``, ``held`` (is the truth in the 95 % interval?) and ``pull`` (z)."""
+def _score_parameters(
+    identification: Mapping[str, Any], effect: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Score the parameters in both truth and identification.
+
+    Each entry has ``parameter``, ``covered`` (truth in the 95 % interval) and ``pull`` (z).
+    """
     out = []
     for name, true in effect["parameters"].items():
         wanted = true.get("values") or {None: true["value"]}
         for axis, value in wanted.items():
             known = [
-                _entry(table, name, axis, unless=true.get("unless", ()))
-                for table in claim["tables"]
+                _find_parameter(table, name, axis, unless=true.get("unless", ()))
+                for table in identification["tables"]
             ]
             near = [
-                (_far(table, effect), entry)
-                for table, entry in zip(claim["tables"], known, strict=True)
+                (_frequency_distance(table, effect), entry)
+                for table, entry in zip(identification["tables"], known, strict=True)
                 if entry is not None
             ]
             if not near:
@@ -103,17 +109,21 @@ def _numbers(claim: Mapping[str, Any], effect: Mapping[str, Any]) -> list[dict[s
             low, high = sorted((turned * found["low"], turned * found["high"]))
             sure = found.get("value") is not None and found.get("stderr")
             pull = (turned * found["value"] - value) / found["stderr"] if sure else None
-            last = _LAST_DIGITS * abs(value)  # what is exact may differ in the last digits
+            last = _RELATIVE_TOLERANCE * abs(value)  # exact values may differ by rounding
             out.append(
-                {"parameter": name, "held": bool(low - last <= value <= high + last), "pull": pull}
+                {
+                    "parameter": name,
+                    "covered": bool(low - last <= value <= high + last),
+                    "pull": pull,
+                }
             )
     return out
 
 
-def _entry(
+def _find_parameter(
     table: Mapping[str, Any], name: str, axis: str | None, *, unless: Sequence[str]
 ) -> Mapping[str, Any] | None:
-    """The number of this name in a claim's table, for an axis or for all; none where others are beside it that change its meaning."""
+    """Find a parameter in a table of an identification; None where `unless` changes its meaning."""
     parameters, axes = table.get("parameters", {}), list(table.get("axes", ()))
     if {key.split(".")[0] for key in parameters} & set(unless) or (
         axis is not None and axis not in axes
@@ -125,8 +135,8 @@ def _entry(
     return found
 
 
-def _far(table: Mapping[str, Any], effect: Mapping[str, Any]) -> float:
-    """How far a claim's table is from an effect that has a frequency: of several lines the nearest is meant."""
+def _frequency_distance(table: Mapping[str, Any], effect: Mapping[str, Any]) -> float:
+    """Compute the distance in frequency between table and effect, to match the nearest line."""
     true, found = (
         effect["parameters"].get("frequency"),
         table.get("parameters", {}).get("frequency"),
@@ -150,7 +160,7 @@ def _tau_hit(diagnosis: Mapping[str, Any], name: str, effect: Mapping[str, Any])
     return any(low <= effect["tau_max_s"] and high >= effect["tau_min_s"] for low, high in bands)
 
 
-def _check(diagnosis: Mapping[str, Any]) -> None:
+def _check_diagnosis(diagnosis: Mapping[str, Any]) -> None:
     lacking = [
         key
         for key in ("verdict", "mismatches", "effects", "unexplained", "held_out")
@@ -166,7 +176,7 @@ def score_case(
     diagnosis: Mapping[str, Any],
     truth: Mapping[str, Any],
     *,
-    naive: Mapping[str, bool] | None = None,
+    baseline_hits: Mapping[str, bool] | None = None,
 ) -> list[dict[str, Any]]:
     """Compare a diagnosis with the truth.
 
@@ -175,39 +185,43 @@ def score_case(
     diagnosis : mapping
         Content of ``diagnosis.json``.
     truth : mapping
-        From `make_case`, or opened with `open_truth`.
-    naive : mapping, optional
-        What plain detectors said: name to whether they saw something.
+        Truth from `make_case` or `open_truth`.
+    baseline_hits : mapping, optional
+        Name of each baseline detector -> whether it detected something.
 
     Returns
     -------
     list of dict
-        A row for every true effect, or one row where there is none: ``kind``, ``effect``,
-        ``strength``, ``detected``, ``named`` (classes merged by the ambiguity sets),
-        ``named_exactly``, ``in_set``, ``set_size``, ``wrong`` (names that stand for nothing true),
-        ``unknown``, ``iou``, ``tau_hit``, ``numbers``, ``gain``, ``oracle``, ``learned`` (the
-        oracle's, where noise is learned from the record), ``seconds``, ``claims`` and more. A name
-        is counted once, on however many axes it is claimed.
+        One row for every true effect, or one row without an effect: ``kind``, ``effect``,
+        ``strength``, ``detected``, ``named`` (ambiguity sets merged), ``named_exactly``,
+        ``in_set``, ``set_size``, ``wrong`` (number of wrong names), ``unidentified``, ``iou``,
+        ``tau_hit``, ``parameter_scores``, ``gain``, ``oracle``, ``learned`` (the oracle's with
+        fitted noise), ``seconds``, ``identifications`` and more. A name counts once, on however
+        many axes it is identified.
 
     Raises
     ------
     SchemaError
         When the diagnosis lacks a key.
     """
-    _check(diagnosis)
+    _check_diagnosis(diagnosis)
     accepted = set(truth["accepted"])
-    claims = _claims(diagnosis)
+    identifications = _collect_identifications(diagnosis)
     true = [effect["name"] for effect in truth["effects"]]
-    standing = accepted.union(*(merged(name) for name in true)) if true else accepted
-    wrong = [claim["name"] for claim in claims if not _names(claim) & standing]
-    detected = diagnosis["verdict"] != "no mismatch" or bool(claims)
+    standing = accepted.union(*(merge_ambiguous(name) for name in true)) if true else accepted
+    wrong = [
+        identification["name"]
+        for identification in identifications
+        if not _ambiguity_set(identification) & standing
+    ]
+    detected = diagnosis["verdict"] != "no mismatch" or bool(identifications)
     plan = truth.get("plan") or {}
     case = {
         "index": plan.get("index"),
         "kind": plan.get("kind"),
         "recording": plan.get("recording"),
         "copy": plan.get("copy"),
-        "severing": plan.get("severing"),
+        "degradation": plan.get("degradation"),
         "rate": truth["sampling_rate_hz"],
         "length": truth["seconds"],
         "missing": truth["missing_share"],
@@ -215,18 +229,21 @@ def score_case(
         "detected": detected,
         "wrong": len(wrong),
         "wrong_names": wrong,
-        "unknown": bool(
+        "unidentified": bool(
             detected
             and not wrong
-            and (diagnosis["verdict"] in ("unknown", "partly explained") or not claims)
+            and (diagnosis["verdict"] in ("unknown", "partly explained") or not identifications)
         ),
-        "claims": [(claim["name"], bool(_names(claim) & standing)) for claim in claims],
+        "identifications": [
+            (identification["name"], bool(_ambiguity_set(identification) & standing))
+            for identification in identifications
+        ],
         "gain": float((diagnosis["held_out"] or {}).get("log_likelihood_gain") or 0.0),
         "oracle": float(sum(effect["expected_nats"] for effect in truth["effects"])),
         "learned": float(sum(effect.get("learned_nats", np.nan) for effect in truth["effects"])),
         "coverage_after": (diagnosis["held_out"] or {}).get("coverage95_after"),
         "seconds": float(diagnosis.get("seconds") or 0.0),
-        "naive": dict(naive or {}),
+        "baseline_detectors": dict(baseline_hits or {}),
     }
     if not true:
         return [
@@ -239,21 +256,35 @@ def score_case(
                 "form_differs": None,
             }
         ]
-    return [case | _row(diagnosis, claims, effect, accepted, true) for effect in truth["effects"]]
+    return [
+        case | _score_effect(diagnosis, identifications, effect, accepted, true)
+        for effect in truth["effects"]
+    ]
 
 
-def _row(
+def _score_effect(
     diagnosis: Mapping[str, Any],
-    claims: Sequence[Mapping[str, Any]],
+    identifications: Sequence[Mapping[str, Any]],
     effect: Mapping[str, Any],
     accepted: set[str],
     true: Sequence[str],
 ) -> dict[str, Any]:
     name = effect["name"]
-    others = accepted.union(*(merged(other) for other in true if other != name)) - merged(name)
-    mine = [claim for claim in claims if claim["name"] not in others]
+    others = accepted.union(
+        *(merge_ambiguous(other) for other in true if other != name)
+    ) - merge_ambiguous(name)
+    mine = [
+        identification for identification in identifications if identification["name"] not in others
+    ]
     top = mine[0] if mine else None
-    own = next((claim for claim in mine if claim["name"] in merged(name)), None)
+    own = next(
+        (
+            identification
+            for identification in mine
+            if identification["name"] in merge_ambiguous(name)
+        ),
+        None,
+    )
     row: dict[str, Any] = {
         "effect": name,
         "strength": effect["strength"],
@@ -262,19 +293,19 @@ def _row(
         else None,
         "size": effect["size"],
         "form_differs": effect["form_differs"],
-        "named": bool(top and top["name"] in merged(name)),
+        "named": bool(top and top["name"] in merge_ambiguous(name)),
         "named_exactly": bool(top and top["name"] == name),
         "in_set": None,
         "set_size": None,
         "iou": None,
         "tau_hit": None,
-        "numbers": [],
+        "parameter_scores": [],
     }
     if top is not None:
-        row["in_set"] = name in _names(top)
-        row["set_size"] = len(_names(top))
+        row["in_set"] = name in _ambiguity_set(top)
+        row["set_size"] = len(_ambiguity_set(top))
     if own is not None:
-        row["numbers"] = _numbers(own, effect) if own["name"] == name else []
+        row["parameter_scores"] = _score_parameters(own, effect) if own["name"] == name else []
         row["tau_hit"] = _tau_hit(diagnosis, own["name"], effect)
         if effect["localised"] and own["intervals"]:
             row["iou"] = intersection_over_union(own["intervals"], effect["intervals"])

@@ -1,4 +1,4 @@
-"""The table of many scores: every figure with its interval, its target, and whether that is met."""
+"""Table of scores: every figure with its interval, its target, and whether that is met."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import pandas as pd
 
 from gyrostab.blindtest.scoring.proportions import Target, median, share, spread
 
-__all__ = ["CLEAR", "cases", "markdown", "missed", "score_table"]
+__all__ = ["CLEAR_STRENGTH", "first_rows", "list_missed", "markdown", "score_table"]
 
 Row = Mapping[str, Any]
 Line = dict[str, Any]
 
-#: Strength from which on an effect ought to be seen and named.
-CLEAR = 1.5
+#: Strength from which an effect should be detected and named.
+CLEAR_STRENGTH = 1.5
 
 
-def cases(rows: Sequence[Row]) -> list[Row]:
-    """One row a case, where several effects give several."""
+def first_rows(rows: Sequence[Row]) -> list[Row]:
+    """Keep one row per case."""
     seen: dict[Any, Row] = {}
     for i, row in enumerate(rows):
         seen.setdefault(row["index"] if row["index"] is not None else ("no number", i), row)
@@ -29,159 +29,186 @@ def cases(rows: Sequence[Row]) -> list[Row]:
 
 
 def score_table(rows: Sequence[Row]) -> pd.DataFrame:
-    """The figures of a benchmark with 95 % intervals and the targets of the design.
+    """Compute the figures of a benchmark with 95 % intervals and targets.
 
     Parameters
     ----------
     rows : sequence of dict
-        All rows of `score_case`; those of salted real recordings and of their copies are left to
-        `salt_table`.
+        All rows of `score_case`; injections and their controls are left to `injection_table`.
 
     Returns
     -------
     pandas.DataFrame
         ``quantity``, ``value``, ``low``, ``high``, ``n``, ``target`` and ``state``: ``met`` where
-        the whole interval lies where it should, ``missed`` where the value does not, else ``not
-        shown``; nothing without a target.
+        the whole interval is in the target range, ``missed`` where the value is not, else ``not
+        shown``; empty without a target.
     """
-    rows = [row for row in rows if row["kind"] not in ("salted", "control")]
-    groups = (_alarms, _naming, _strangers, _severed, _numbers, _plain)
+    rows = [row for row in rows if row["kind"] not in ("injected", "control")]
+    groups = (
+        _false_alarm_lines,
+        _naming_lines,
+        _out_of_catalogue_lines,
+        _degraded_driver_lines,
+        _parameter_lines,
+        _baseline_lines,
+    )
     return pd.DataFrame([line for group in groups for line in group(rows)])
 
 
-def _here(rows: Sequence[Row], *, least: float = 0.0) -> list[Row]:
-    """Rows of effects of the catalogue whose channel is there."""
+def _catalogue_rows(rows: Sequence[Row], *, least: float = 0.0) -> list[Row]:
+    """Select rows of catalogue effects with an undisturbed driver."""
     return [
         row
         for row in rows
-        if row["kind"] in ("single", "pair", "triple", "buried")
+        if row["kind"] in ("single", "pair", "triple", "sub_threshold")
         and row["effect"]
         and row["strength"] >= least
     ]
 
 
-def _alarms(rows: Sequence[Row]) -> list[Line]:
+def _false_alarm_lines(rows: Sequence[Row]) -> list[Line]:
     nulls = [row for row in rows if row["kind"] == "null"]
     target = Target("<= 1 %, upper bound <= 2 %", most=0.01, surely=0.02)
     return [
-        share("false alarms: a name on a null", (bool(row["claims"]) for row in nulls), target),
-        share("nulls with any mismatch", (row["detected"] for row in nulls)),
+        share(
+            "false alarms: effect named on a null record",
+            (bool(row["identifications"]) for row in nulls),
+            target,
+        ),
+        share("null records with any mismatch", (row["detected"] for row in nulls)),
     ]
 
 
-def _naming(rows: Sequence[Row]) -> list[Line]:
-    clear = _here(rows, least=CLEAR)
+def _naming_lines(rows: Sequence[Row]) -> list[Line]:
+    clear = _catalogue_rows(rows, least=CLEAR_STRENGTH)
     seen = [row for row in clear if row["detected"]]
-    alone = [row for row in clear if row["kind"] in ("single", "buried")]
-    shown = [row for row in alone if (row.get("learned_strength") or 0.0) >= CLEAR]
+    alone = [row for row in clear if row["kind"] in ("single", "sub_threshold")]
+    shown = [row for row in alone if (row.get("learned_strength") or 0.0) >= CLEAR_STRENGTH]
     claimed = [row for row in clear if row["set_size"]]
     percent = Target(">= 95 %", least=0.95)
     return [
         share(
-            "effects whose form the fitter does not have",
-            (row["form_differs"] for row in _here(rows)),
+            "effects of a form that the diagnosis does not fit",
+            (row["form_differs"] for row in _catalogue_rows(rows)),
             Target(">= 33 %", least=0.33),
         ),
+        share("detected, strength 1.5 or more", (row["detected"] for row in clear), percent),
+        share("detected, single effects", (row["detected"] for row in alone)),
         share(
-            "detected at 1.5 times the limit and more", (row["detected"] for row in clear), percent
-        ),
-        share("detected, of those that were alone", (row["detected"] for row in alone)),
-        share(
-            "detected, of those that were alone and are as strong in noise learned from the record",
+            "detected, single effects of that strength with fitted noise",
             (row["detected"] for row in shown),
         ),
-        share("named rightly, of those (sets merged)", (row["named"] for row in seen), percent),
         share(
-            "named rightly, of those that were alone",
+            "named correctly, of the detected (sets merged)",
+            (row["named"] for row in seen),
+            percent,
+        ),
+        share(
+            "named correctly, single effects",
             (row["named"] for row in alone if row["detected"]),
         ),
         share(
-            "named rightly, of those in pairs and triples",
+            "named correctly, in pairs and triples",
             (row["named"] for row in seen if row["kind"] in ("pair", "triple")),
         ),
-        share("named exactly, of those", (row["named_exactly"] for row in seen)),
+        share("named exactly, of the detected", (row["named_exactly"] for row in seen)),
         share(
             "named exactly where the form differs",
             (row["named_exactly"] for row in seen if row["form_differs"]),
         ),
-        share("a wrong name beside the truth", (row["wrong"] > 0 for row in cases(clear))),
+        share("cases with a wrong name", (row["wrong"] > 0 for row in first_rows(clear))),
         share(
-            "truth in the set", (row["in_set"] for row in claimed), Target(">= 97 %", least=0.97)
+            "truth in the ambiguity set",
+            (row["in_set"] for row in claimed),
+            Target(">= 97 %", least=0.97),
         ),
         median(
-            "size of the set, median",
+            "size of the ambiguity set, median",
             (row["set_size"] for row in claimed),
             Target("<= 1.5", most=1.5),
         ),
-        share("buried: detected", (row["detected"] for row in clear if row["kind"] == "buried")),
-        share("buried: named rightly", (row["named"] for row in clear if row["kind"] == "buried")),
+        share(
+            "sub-threshold: detected",
+            (row["detected"] for row in clear if row["kind"] == "sub_threshold"),
+        ),
+        share(
+            "sub-threshold: named correctly",
+            (row["named"] for row in clear if row["kind"] == "sub_threshold"),
+        ),
     ]
 
 
-def _strangers(rows: Sequence[Row]) -> list[Line]:
-    strange = [row for row in rows if row["kind"] == "strange" and row["strength"] >= CLEAR]
+def _out_of_catalogue_lines(rows: Sequence[Row]) -> list[Line]:
+    strange = [
+        row
+        for row in rows
+        if row["kind"] == "out_of_catalogue" and row["strength"] >= CLEAR_STRENGTH
+    ]
     seen = [row for row in strange if row["detected"]]
     return [
-        share("out of the catalogue: detected", (row["detected"] for row in strange)),
+        share("out of catalogue: detected", (row["detected"] for row in strange)),
         share(
-            "out of the catalogue: unknown",
-            (row["unknown"] for row in seen),
+            "out of catalogue: unidentified",
+            (row["unidentified"] for row in seen),
             Target(">= 90 %", least=0.90),
         ),
         share(
-            "out of the catalogue: wrong name",
+            "out of catalogue: wrong name",
             (row["wrong"] > 0 for row in seen),
             Target("<= 5 %", most=0.05),
         ),
     ]
 
 
-def _severed(rows: Sequence[Row]) -> list[Line]:
+def _degraded_driver_lines(rows: Sequence[Row]) -> list[Line]:
     gone = [
-        row for row in rows if row["kind"] == "severed" and row["severing"] in ("withheld", "decoy")
+        row
+        for row in rows
+        if row["kind"] == "degraded_driver" and row["degradation"] in ("withheld", "substituted")
     ]
     bent = [
         row
         for row in rows
-        if row["kind"] == "severed" and row["severing"] not in ("withheld", "decoy")
+        if row["kind"] == "degraded_driver"
+        and row["degradation"] not in ("withheld", "substituted")
     ]
     return [
         share(
-            "channel withheld or replaced: wrong name",
+            "driver withheld or substituted: wrong name",
             (row["wrong"] > 0 for row in gone),
             Target("<= 2 %", most=0.02),
         ),
         share(
-            "channel withheld or replaced: unknown, if detected",
-            (row["unknown"] for row in gone if row["detected"]),
+            "driver withheld or substituted: unidentified, if detected",
+            (row["unidentified"] for row in gone if row["detected"]),
             Target(">= 90 %", least=0.90),
         ),
         share(
-            "channel late, noisy, clipped or confounded: wrong name",
+            "driver lagged, noisy, clipped or confounded: wrong name",
             (row["wrong"] > 0 for row in bent),
         ),
         share(
-            "channel late, noisy, clipped or confounded: named rightly",
+            "driver lagged, noisy, clipped or confounded: named correctly",
             (row["named"] for row in bent),
         ),
     ]
 
 
-def _numbers(rows: Sequence[Row]) -> list[Line]:
-    clear = _here(rows, least=CLEAR)
-    found = [(row, number) for row in clear for number in row["numbers"]]
+def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
+    clear = _catalogue_rows(rows, least=CLEAR_STRENGTH)
+    found = [(row, number) for row in clear for number in row["parameter_scores"]]
     coverage = Target("90-98 %", least=0.90, most=0.98)
     gains = [
         (row["gain"] / row["oracle"], _all_named(row, rows))
-        for row in cases(clear)
-        if row["named"] and _known_gain(row)
+        for row in first_rows(clear)
+        if row["named"] and _has_gain(row)
     ]
     learned = [
         row["gain"] / row["learned"]
-        for row in cases(clear)
-        if row["named"] and _known_gain(row) and row.get("learned", 0.0) > 0
+        for row in first_rows(clear)
+        if row["named"] and _has_gain(row) and row.get("learned", 0.0) > 0
     ]
-    others = [number["held"] for row, number in found if row["effect"] != "shared_source"]
+    others = [number["covered"] for row, number in found if row["effect"] != "shared_source"]
     return [
         median(
             "overlap in time (IoU), median",
@@ -189,59 +216,66 @@ def _numbers(rows: Sequence[Row]) -> list[Line]:
             Target(">= 0.7", least=0.7),
         ),
         share(
-            "averaging times hit", (row["tau_hit"] for row in clear if row["tau_hit"] is not None)
+            "averaging times overlap",
+            (row["tau_hit"] for row in clear if row["tau_hit"] is not None),
         ),
         share(
-            "95 % intervals that hold the truth", (number["held"] for _, number in found), coverage
+            "95 % intervals that contain the truth",
+            (number["covered"] for _, number in found),
+            coverage,
         ),
         share(
-            "of those, where the form is the fitter's",
-            (number["held"] for row, number in found if not row["form_differs"]),
+            "of those, form as fitted",
+            (number["covered"] for row, number in found if not row["form_differs"]),
         ),
-        share("of those, without the shared source", others),
+        share("of those, without shared_source", others),
         spread(
-            "errors in units of their standard error, two thirds",
+            "errors in standard errors, 68 % quantile",
             (number["pull"] for _, number in found),
             Target("0.8-1.25", 0.8, 1.25),
         ),
         median(
-            "gain over the oracle's, median",
+            "evidence relative to the oracle, median",
             (gain for gain, _ in gains),
             Target("0.9-1.2", least=0.9, most=1.2),
         ),
         median(
-            "gain over the oracle's where all was named rightly, median",
+            "evidence relative to the oracle, all effects named correctly, median",
             (gain for gain, whole in gains if whole),
         ),
+        median("evidence relative to the oracle with fitted noise, median", learned),
+        share("evidence at least 0.7 of the oracle", (gain >= 0.7 for gain, _ in gains)),
         median(
-            "gain over that of the truth where noise is learned from the record, median", learned
-        ),
-        share("gain of 0.7 of the oracle's or more", (gain >= 0.7 for gain, _ in gains)),
-        median(
-            "share of predicted cells inside the 95 % band, median",
-            (row["coverage_after"] for row in cases(rows)),
+            "held-out values inside the 95 % band, median",
+            (row["coverage_after"] for row in first_rows(rows)),
             Target("93-97 %", 0.93, 0.97),
         ),
     ]
 
 
-def _known_gain(row: Row) -> bool:
+def _has_gain(row: Row) -> bool:
     return bool(row["oracle"] > 0 and math.isfinite(row["gain"]))
 
 
 def _all_named(row: Row, rows: Sequence[Row]) -> bool:
-    """Whether every effect of a case was named rightly, and nothing else was."""
+    """Test whether exactly the effects of a case were named."""
     return not row["wrong"] and all(
         other["named"] for other in rows if other["index"] == row["index"]
     )
 
 
-def _plain(rows: Sequence[Row]) -> list[Line]:
-    """The naive detectors, and what a case costs."""
-    nulls, clear = [row for row in rows if row["kind"] == "null"], _here(rows, least=CLEAR)
-    names = sorted({name for row in rows for name in row["naive"]})
+def _baseline_lines(rows: Sequence[Row]) -> list[Line]:
+    """Make the lines of the baseline detectors and of the cost per case."""
+    nulls, clear = (
+        [row for row in rows if row["kind"] == "null"],
+        _catalogue_rows(rows, least=CLEAR_STRENGTH),
+    )
+    names = sorted({name for row in rows for name in row["baseline_detectors"]})
     lines = [
-        share(f"{told} by the {name}", (row["naive"][name] for row in part if name in row["naive"]))
+        share(
+            f"{told} by the {name}",
+            (row["baseline_detectors"][name] for row in part if name in row["baseline_detectors"]),
+        )
         for told, part in (
             ("effects at 1.5 times the limit and more seen", clear),
             ("false alarms", nulls),
@@ -251,33 +285,32 @@ def _plain(rows: Sequence[Row]) -> list[Line]:
     for rate in sorted({row["rate"] for row in rows}):
         lines.append(
             median(
-                f"seconds a case of {rate:g} Hz, median",
-                (row["seconds"] for row in cases(rows) if row["rate"] == rate),
+                f"seconds per case at {rate:g} Hz, median",
+                (row["seconds"] for row in first_rows(rows) if row["rate"] == rate),
             )
         )
     return lines
 
 
-def missed(table: pd.DataFrame) -> list[str]:
-    """Sentences on the targets that were missed, with the figures.
+def list_missed(table: pd.DataFrame) -> list[str]:
+    """List a sentence with the figures for each missed target.
 
     Examples
     --------
-    >>> line = {"quantity": "detected", "value": 0.8, "low": 0.7, "high": 0.9, "n": 50, "target": ">= 95 %", "state": "missed"}
-    >>> missed(pd.DataFrame([line]))
+    >>> line = {"quantity": "detected", "value": 0.8, "low": 0.7, "high": 0.9, "n": 50}
+    >>> list_missed(pd.DataFrame([line | {"target": ">= 95 %", "state": "missed"}]))
     ['detected: 0.8 (0.7 to 0.9, n = 50), target >= 95 %: missed']
     """
     lost = table[table["state"] == "missed"]
     return [
-        "{quantity}: {value:.3g} ({low:.3g} to {high:.3g}, n = {n}), target {target}: missed".format_map(
-            line
-        )
+        f"{line['quantity']}: {line['value']:.3g} ({line['low']:.3g} to {line['high']:.3g}, "
+        f"n = {line['n']}), target {line['target']}: missed"
         for line in lost.to_dict("records")
     ]
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """A frame as a markdown table, numbers to three digits.
+    """Format a frame as a Markdown table with three digits.
 
     Examples
     --------
@@ -288,13 +321,13 @@ def markdown(table: pd.DataFrame) -> str:
     """
     lines = ["| " + " | ".join(map(str, table.columns)) + " |", "|" + "---|" * len(table.columns)]
     lines += [
-        "| " + " | ".join(_cell(value) for value in row) + " |"
+        "| " + " | ".join(_format_cell(value) for value in row) + " |"
         for row in table.itertuples(index=False)
     ]
     return "\n".join(lines)
 
 
-def _cell(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     if value is None or value == "" or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     if isinstance(value, bool | np.bool_):

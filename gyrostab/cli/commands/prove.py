@@ -58,15 +58,15 @@ def prove(
         Continue a run that was stopped or killed; begin one where there is none.
     """
     from gyrostab.blindtest.runner.benchmark import prove as run_benchmark
-    from gyrostab.blindtest.runner.folder import TUNING
+    from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED
     from gyrostab.blindtest.scoring.table import markdown
 
     def say(text: str) -> None:
         print(text, flush=True)
 
-    if seed is not None and seed < TUNING:
+    if seed is not None and seed < FIRST_PUBLIC_SEED:
         print(
-            f"note: seed {seed} is below {TUNING}: such seeds are for tuning, and their figures are not for publication",
+            f"note: seed {seed} is below {FIRST_PUBLIC_SEED}: such seeds are for tuning, and their figures are not for publication",
             file=sys.stderr,
         )
     try:
