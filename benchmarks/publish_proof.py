@@ -1,10 +1,10 @@
-"""Put the figures of a finished `gyrostab prove` on docs/proof.md.
+"""Publish the figures of a finished `gyrostab prove` on docs/proof.md.
 
     python benchmarks/publish_proof.py proof
 
-Takes table.md between the marks of the page, and the curves to docs/figures. Refuses runs of a
-tuning seed. What stands before the marks, "What failed, and why" too, is written by hand and stays
-as it is; where it speaks of another run that is said.
+Copies table.md between the marks of the page, and the curves to docs/figures. Refuses runs of a
+tuning seed. The text before the marks, including "What failed, and why", is written by hand and
+stays as it is; a note is printed where it describes another run.
 """
 
 from __future__ import annotations
@@ -35,21 +35,23 @@ def main() -> None:
 
 
 def publish(run: Path, docs: Path) -> None:
-    """Renew the page and the figures, or say why not."""
+    """Replace the figures of the page, or exit with the reason."""
     if not (run / "table.md").exists():
         raise SystemExit(
-            f"{run}: holds no finished run; gyrostab prove --resume -o {run} finishes it"
+            f"{run}: does not hold a finished run; gyrostab prove --resume -o {run} finishes it"
         )
     job = json.loads((run / "benchmark.json").read_text(encoding="utf-8"))
     seed = job["seed"]
     if seed < FIRST_PUBLIC_SEED:
         raise SystemExit(
-            f"{run}: was made with seed {seed}; seeds below {FIRST_PUBLIC_SEED} are for tuning, publish a run of another one"
+            f"{run}: was made with seed {seed}; seeds below {FIRST_PUBLIC_SEED} are for tuning, "
+            "publish a run of another seed"
         )
     page = docs / "proof.md"
     if f"Seed {seed}," not in page.read_text(encoding="utf-8"):
         print(
-            f'{page}: "What failed, and why" was written of an earlier run; say there what failed in this one, and what was mended since'
+            f'{page}: "What failed, and why" describes an earlier run; '
+            "describe what failed in this one, and what was fixed since"
         )
     pictures = [f"![{name} of the diagnosis](figures/proof-{name}.png)" for name in FIGURES]
     for name in FIGURES:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import subprocess
 import sys
 import tomllib
@@ -10,6 +12,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+BLIND_TEST = sorted((ROOT / "gyrostab" / "blindtest").rglob("*.py"))
+PUBLIC_MODULES = ("gyrostab.errors", "gyrostab.units", "gyrostab.schema", "gyrostab.progress")
 HEAVY = ("matplotlib", "numba", "pyarrow", "netCDF4", "h5py", "pymatreader", "scipy.stats")
 
 
@@ -101,3 +105,46 @@ def test_a_file_is_written_without_loading_a_scheduler(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "False"
+
+
+def list_imports(path: Path) -> list[tuple[str, str]]:
+    """List module and name of every import of gyrostab outside of the blind test."""
+    imports = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: relative import"
+            imports += [(node.module or "", alias.name) for alias in node.names]
+        elif isinstance(node, ast.Import):
+            imports += [(alias.name, "") for alias in node.names]
+    return [
+        (module, name)
+        for module, name in imports
+        if module.split(".")[0] == "gyrostab" and not module.startswith("gyrostab.blindtest")
+    ]
+
+
+def is_public(module: str, name: str) -> bool:
+    """Test whether a name is exported by the package, a public module or a package's `__init__`."""
+    if module in PUBLIC_MODULES or module.split(".")[:2] == ["gyrostab", "time"]:
+        return True
+    package = importlib.import_module(module)
+    return hasattr(package, "__path__") and name in ("", *getattr(package, "__all__", ()))
+
+
+@pytest.mark.parametrize("path", BLIND_TEST, ids=lambda path: path.stem)
+def test_blind_test_uses_public_names_only(path):
+    assert [item for item in list_imports(path) if not is_public(*item)] == []
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "public"),
+    [
+        ("gyrostab", "diagnose", True),
+        ("gyrostab.time.grid", "grid_times", True),
+        ("gyrostab.store.output", "replace_file", True),
+        ("gyrostab.store.output", "check", False),
+        ("gyrostab.diagnose.core", "diagnose", False),
+    ],
+)
+def test_deep_modules_are_not_public(module, name, public):
+    assert is_public(module, name) == public

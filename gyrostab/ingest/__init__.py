@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gyrostab.ingest.files import read_log as read_log
     from gyrostab.ingest.files import readers as readers
     from gyrostab.ingest.files import scan_file as scan_file
+    from gyrostab.ingest.gap_table import gap_variables as gap_variables
     from gyrostab.ingest.options import ColumnSummary as ColumnSummary
     from gyrostab.ingest.options import FileSummary as FileSummary
     from gyrostab.ingest.options import ReadOptions as ReadOptions
@@ -28,6 +29,7 @@ _MODULES = {
     "ColumnSummary": "options",
     "FileSummary": "options",
     "ReadOptions": "options",
+    "gap_variables": "gap_table",
     "read_channel": "channel",
     "read_log": "files",
     "readers": "files",
@@ -38,6 +40,7 @@ __all__ = [
     "ColumnSummary",
     "FileSummary",
     "ReadOptions",
+    "gap_variables",
     "read_channel",
     "read_log",
     "readers",

@@ -1,1 +1,1 @@
-"""Physical effects in the log of a fiber-optic gyro; one module for a family of effects, found by `gyrostab.physics.registry`."""
+"""Physical effects of a fiber-optic gyro, one module per family; see `registry`."""

@@ -1,4 +1,4 @@
-"""Effects of time by itself: a bias that trends, and noise that grows."""
+"""Effects of time alone: a bias that drifts, and noise that grows."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class AgeingBias(Effect):
 
     ``b = s t + c log(1 + t / t_a)``, t since the start of the log
 
-    *DAVAR*: an apparent R of ``s + c / (t + t_a)``, the same at all times for the linear part,
-    falling as 1 / t for the other. *Window mean*: a straight line, or one that flattens.
-    *Spectrum*: nothing above the lowest band. *Axes*: each has its own sizes; no common sign.
+    *DAVAR*: an apparent R of ``s + c / (t + t_a)``: constant for the linear part, falling as 1 / t
+    for the logarithmic one. *Window mean*: a straight line, or one that flattens. *Spectrum*:
+    lowest band only. *Axes*: independent sizes and signs.
 
-    Confused with temperature_bias (a temperature that rises slowly trends as well: only where it
-    turns back do they part), with a random walk (turns back by itself) and the slow part of warm_up
-    (begins anew after each restart).
+    Confused with temperature_bias (a slowly rising temperature looks the same until it reverses),
+    with a random walk (which reverses) and the slow part of warm_up (which restarts after each
+    power-on).
 
     References
     ----------
@@ -48,7 +48,7 @@ class AgeingBias(Effect):
     )
     logarithmic: float = parameter(
         "deg/h",
-        "growth whenever t + time is e times as much",
+        "growth per factor e of t + time",
         default=0.0,
         typical=0.01,
         low=-1e3,
@@ -59,19 +59,19 @@ class AgeingBias(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample, at its middle."""
+        """Compute the rate contribution [degree hour-1] at the middle of every sample."""
         middle = chunk.seconds + 0.5 / chunk.rate
         return self.slope * (middle / DAY) + self.logarithmic * np.log1p(
             middle / (self.time * HOUR)
         ), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Where the logarithm bends: from a fraction of the record to many of it."""
+        """List times at which the logarithm bends, 0.03 to 3 times the length of the record."""
         length = (windows.end[-1] - windows.begin[0]) / HOUR
         return {"time": np.maximum(length * np.array([0.03, 0.1, 0.3, 1.0, 3.0]), 1e-3)}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means of both parts."""
+        """Predict the window means of both parts."""
         scale = self.time * HOUR
 
         def integral(t: Array) -> Array:
@@ -81,12 +81,11 @@ class AgeingBias(Effect):
         return Prediction(mean={"slope": windows.centre / DAY, "logarithmic": bend})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         terms = [self.quantity("slope", errors)] if self.slope or not self.logarithmic else []
         if self.logarithmic:
-            terms.append(
-                f"{self.quantity('logarithmic', errors)} times the logarithm of time over {self.quantity('time', errors)}"
-            )
+            size, time = self.quantity("logarithmic", errors), self.quantity("time", errors)
+            terms.append(f"{size} times the logarithm of time over {time}")
         return f"The bias ages {self.on_axes()}, by {' and '.join(terms)}."
 
 
@@ -96,23 +95,24 @@ class AgeingNoise(Effect):
 
     ``N^2(t) = N0^2 (1 + g (t / 1 h)^p)``, t since the start of the log, N0 of the model
 
-    *DAVAR*: the whole slope -1/2 rises, slowly and without turning back; longer averaging times
-    with it as long as N rules them. *Window mean*: nothing. *Spectrum*: white, with a level that
-    grows. *Axes*: all alike when the source ages, one when its coil does.
+    *DAVAR*: the slope -1/2 rises slowly and monotonically, at all averaging times that N dominates.
+    *Window mean*: no effect. *Spectrum*: white, with a growing level. *Axes*: all alike when the
+    source ages, one when its coil does.
 
     Confused with temperature_noise and light_power_noise where the temperature or the power trends
-    with time: a temperature that turns back, or a record of the light power, separates them.
+    with time: a reversal of the temperature, or a record of the light power, separates them.
 
     References
     ----------
     Jin et al. 2010, Sci. China Tech. Sci. 53, 3056 (noise of an irradiated gyro grows with the loss
     of its coil, a power law of the dose). The size is an estimate: a light path that loses 1 dB in
-    1000 h raises N^2 by 6e-4 in an hour where the detector's noise rules.
+    1000 h raises N^2 by 6e-4 in an hour where the noise of the detector dominates.
 
     Examples
     --------
-    >>> AgeingNoise(growth=0.02).say()
-    'The angle random walk ages on all axes: N^2 grows by 0.02 of itself in the first hour, with the power 1 of time.'
+    >>> print(AgeingNoise(growth=0.02).say())
+    The angle random walk ages on all axes: N^2 grows by 0.02 of itself in the first hour, with the
+    power 1 of time.
     """
 
     name: ClassVar[str] = "ageing_noise"
@@ -128,17 +128,17 @@ class AgeingNoise(Effect):
     exponent: float = parameter("1", "power of time", default=1.0, low=0.1, high=5.0)
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Squared N on every sample."""
+        """Squared N of every sample."""
         hours = (chunk.seconds + 0.5 / chunk.rate) / HOUR
         base = chunk.setup.noise["N"][:, None] ** 2
         return {"N": chunk.level["N"] + base * (self.growth * hours**self.exponent)}, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """The power of time."""
+        """List powers of time."""
         return {"exponent": np.array([0.5, 1.0, 2.0])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Growth of N^2 in every window."""
+        """Predict the growth of N^2 in every window."""
         power = self.exponent + 1.0
         begin, end = windows.begin / HOUR, windows.end / HOUR
         return Prediction(
@@ -146,7 +146,7 @@ class AgeingNoise(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         growth, power = self.quantity("growth", errors), self.quantity("exponent", errors)
         first = f"grows by {growth} of itself in the first hour, with the power {power} of time"
         return f"The angle random walk ages {self.on_axes()}: N^2 {first}."

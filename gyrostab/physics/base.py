@@ -1,8 +1,8 @@
-"""The frame of a physical effect: its parameters, and its three faces *generate*, *explain* and *say*.
+"""Base class of a physical effect, with its methods *generate*, *explain* and *say*.
 
-An effect is one frozen dataclass that inherits from `Effect`. Its fields are its parameters, made
-with `parameter`; the rest it says in class attributes. `gyrostab.physics.registry` finds it by
-itself. See docs/physics/README.md.
+An effect is one frozen dataclass that inherits from `Effect`. Its fields are its parameters,
+declared with `parameter`; class attributes hold the rest. `gyrostab.physics.registry` finds it
+automatically. See docs/physics/README.md.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = [
 
 Stage = Literal["motion", "noise", "rate", "sensor", "electronics", "sampling", "logger"]
 
-#: What happens to a signal, in the order in which it happens.
+#: Stages of the signal path, in order.
 STAGES: tuple[Stage, ...] = (
     "motion",
     "noise",
@@ -48,12 +48,12 @@ STAGES: tuple[Stage, ...] = (
 
 @dataclass(frozen=True)
 class Setup:
-    """What stays the same over a whole simulation; see `Chunk` for the meaning of what the two share.
+    """Properties that are constant over a whole simulation.
 
     Attributes
     ----------
     rate : float
-        Samples in a second at the effect's stage [Hz].
+        Sampling rate at the effect's stage [Hz].
     size : int
         Samples of the whole log at that rate.
     start : int
@@ -65,11 +65,11 @@ class Setup:
     gaps : ndarray of int64, shape (n, 2)
         All gaps of the log, [first missing sample, first sample after].
     restarts : ndarray of int64, shape (n, 2)
-        All losses of power, [sample at which it went, sample at which it came back]; the start of
-        the log is not among them.
+        All losses of power, [sample of the loss, sample of the return]; the start of the log is not
+        among them.
     oversampling : int
-        Samples that the instrument takes in one sampling interval of the log; `rate` is so much
-        higher before the stage "logger".
+        Samples of the instrument in one sampling interval of the log; `rate` is higher by this
+        factor before the stage "logger".
     """
 
     rate: float
@@ -84,12 +84,14 @@ class Setup:
 
 @dataclass(frozen=True)
 class Chunk:
-    """A stretch of time, as *generate* gets it. Sample i stands for the interval from ``seconds[i]`` to ``seconds[i] + 1 / rate``.
+    """Input of *generate* for a span of time.
+
+    Sample i covers the interval from ``seconds[i]`` to ``seconds[i] + 1 / rate``.
 
     Attributes
     ----------
     setup : Setup
-        Rate, axes, gaps and all else that does not change.
+        Constant properties: rate, axes, gaps and more.
     first : int
         Number of the first sample, counted from the start of the log.
     size : int
@@ -98,12 +100,12 @@ class Chunk:
         Channels that the effect needs, by the names of `Effect.channels`, without NaN, in the units
         given there.
     true : mapping of str to ndarray, shape (size,)
-        True rotation rate of every axis of the log [degree hour-1], also those that the effect does
-        not act on; complete after "motion".
+        True rotation rate of every axis of the log [degree hour-1], including axes that the effect
+        does not act on; complete after "motion".
     signal : ndarray, shape (axes, size)
-        What has come so far [degree hour-1]; for the stages "sensor" and later.
+        Signal before the effect [degree hour-1]; for the stages "sensor" and later.
     level : mapping of str to ndarray, shape (axes, size)
-        Squared noise coefficients by symbol so far; for the stage "noise".
+        Squared noise coefficients by symbol before the effect; for the stage "noise".
     """
 
     setup: Setup
@@ -116,7 +118,7 @@ class Chunk:
 
     @property
     def rate(self) -> float:
-        """Samples in a second [Hz]."""
+        """Sampling rate [Hz]."""
         return self.setup.rate
 
     @property
@@ -132,33 +134,31 @@ class Chunk:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """A physical effect. A subclass is a frozen dataclass (``kw_only=True``) whose fields are made with `parameter`.
+    """A physical effect; subclasses are frozen dataclasses whose fields are made with `parameter`.
 
     Class attributes
     ----------------
     name : str
         Name in models, results and documents.
     short : str
-        What it does, in a few words.
+        Description in a few words.
     stage : str
-        One of `STAGES`; it says what *generate* returns, see there.
+        One of `STAGES`; it determines what *generate* returns.
     channels : mapping of str to str
-        Channels that drive it -> the unit they must have (`gyrostab.units.INNER`).
+        Driving channel -> required unit (`gyrostab.units.INNER`).
     size_parameters : tuple of str
-        Parameters that switch the effect off when all of them are zero.
+        Parameters that disable the effect when all of them are zero.
     terms : str
-        For the stage "noise": symbols that it may change, of QNBK; all of them when it does not
-        say.
+        For the stage "noise": symbols that it may change, of QNBK; all by default.
     references : tuple of str
-        Where the equation and the sizes come from.
+        Sources of the equation and the sizes.
 
     Attributes
     ----------
     axes : tuple of str
         Axes of the log that it acts on; empty for all.
     driver : tuple of str
-        Names that its channels have in the log, in the order of `channels`; empty when they have
-        the same.
+        Names of its channels in the log, in the order of `channels`; empty if unchanged.
     """
 
     name: ClassVar[str] = ""
@@ -181,7 +181,8 @@ class Effect:
         if self.driver and len(self.driver) != len(self.channels):
             needs = ", ".join(self.channels) or "no channel"
             raise OptionError(
-                f"effect {self.name!r}: driver names {len(self.driver)} channels; it takes {needs}, in this order"
+                f"effect {self.name!r}: driver names {len(self.driver)} channels; "
+                f"it takes {needs}, in this order"
             )
         for known in self.parameters():
             if known.many and self.axes:
@@ -189,7 +190,7 @@ class Effect:
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
-        """The parameters, in the order of the class."""
+        """List the parameters in the order of the class."""
         return tuple(
             Parameter(name=item.name, **item.metadata["parameter"])
             for item in fields(cls)
@@ -198,7 +199,7 @@ class Effect:
 
     @classmethod
     def required(cls) -> tuple[str, ...]:
-        """Names of the parameters that a model must give."""
+        """List the names of the parameters that a model must give."""
         return tuple(
             item.name
             for item in fields(cls)
@@ -207,11 +208,11 @@ class Effect:
 
     @classmethod
     def example(cls, **values: Any) -> Self:
-        """The effect with its typical sizes, and `values` in place of some of them."""
+        """Make the effect with its typical sizes, except for `values`."""
         return cls(**{known.name: known.typical for known in cls.parameters()} | values)
 
     def switched_off(self) -> Self:
-        """The same effect with zero size."""
+        """Make the same effect with zero size."""
         zero: dict[str, Any] = {
             known.name: (0.0,) * len(getattr(self, known.name)) if known.many else 0.0
             for known in self.parameters()
@@ -219,15 +220,15 @@ class Effect:
         return replace(self, **{name: zero[name] for name in self.size_parameters})
 
     def needs(self) -> tuple[str, ...]:
-        """Channels (of `channels`) without which it cannot be generated with these parameters."""
+        """List the channels (of `channels`) that *generate* requires with these parameters."""
         return tuple(self.channels)
 
     def channel_names(self) -> dict[str, str]:
-        """Channel of `channels` -> its name in the log."""
+        """Map each channel of `channels` to its name in the log."""
         return dict(zip(self.channels, self.driver or self.channels, strict=True))
 
     def each(self, name: str, axes: tuple[str, ...]) -> Array:
-        """A parameter that is one number for each axis: one number given stands for all, none for zeros.
+        """Expand a parameter to one number per axis; one number applies to all, none means zeros.
 
         Raises
         ------
@@ -238,63 +239,63 @@ class Effect:
         if numbers.size not in (0, 1, len(axes)):
             given = f"{numbers.size} numbers for {len(axes)} axes"
             raise OptionError(
-                f"effect {self.name!r}, parameter {name!r}: {given}; give one number for each of the axes {list(axes)}, or one for all"
+                f"effect {self.name!r}, parameter {name!r}: {given}; give one number for each "
+                f"of the axes {list(axes)}, or one for all"
             )
         return np.array(np.broadcast_to(numbers if numbers.size else 0.0, len(axes)))
 
-    # -------------------------------------------------------------------------------------------------------
-    # three faces
+    # --------------------------------------------------------------------------------
+    # methods of an effect
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """State before the first sample; anything that can be copied. What is random keeps `rng` (or children of it) here."""
+        """Make the state before the first sample: anything copyable, including `rng` if needed."""
         return None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Any, Any]:
-        """Return what the effect does to a stretch of time, and the state after it.
+        """Compute the effect on a span of time, and the state after it.
 
-        The state given may be changed in place. The result must not depend on how time is cut into
-        chunks.
+        The state may be changed in place. The result must not depend on the division into chunks.
 
         Returns
         -------
         values
             By stage: "motion" and "rate": contribution to the rate [degree hour-1], shape (axes,
             size) or (size,). "noise": mapping of changed symbols to squared coefficients, from
-            `Chunk.level`. "sensor", "electronics", "logger": the signal afterwards, shape (axes,
-            size). "sampling": the same, or with ``size / oversampling`` samples where it picks or
-            averages the samples of the log.
+            `Chunk.level`. "sensor", "electronics", "logger": the resulting signal, shape (axes,
+            size). "sampling": the same, or ``size / oversampling`` samples where the effect
+            decimates.
         state
         """
         raise NotImplementedError
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Parameters in which the effect is not linear -> values worth a try on these data."""
+        """Map each nonlinear parameter to the values to try on these data."""
         return {}
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
-        """Points of the grid of these parameters, where not all combinations of their values make sense; empty where all do."""
+        """List the grid points of the nonlinear parameters; empty for all combinations."""
         return []
 
     def explain(self, windows: Windows) -> Prediction:
-        """Predict the reduced data, with the non-linear parameters at their values."""
+        """Predict the reduced data, with the nonlinear parameters at their current values."""
         raise NotImplementedError
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say in one sentence what it does, with its numbers and, where given, their standard errors."""
+        """Describe the effect in one sentence with its parameters and their standard errors."""
         raise NotImplementedError
 
-    # -----------------------------------------------------------------------------------------------------------
+    # --------------------------------------------------------------------------------
     # phrases
 
     def on_axes(self) -> str:
-        """``"on axis x"``, ``"on axes x and y"``, ``"on all axes"``: for sentences."""
+        """Format the axes: ``"on axis x"``, ``"on axes x and y"`` or ``"on all axes"``."""
         if not self.axes:
             return "on all axes"
         names = " and ".join(filter(None, [", ".join(self.axes[:-1]), self.axes[-1]]))
         return f"on ax{'i' if len(self.axes) == 1 else 'e'}s {names}"
 
     def quantity(self, name: str, errors: Mapping[str, float] | None = None) -> str:
-        """A parameter with its error and unit: ``"0.4 ± 0.1 deg/h"``."""
+        """Format a parameter with its error and unit: ``"0.4 ± 0.1 deg/h"``."""
         unit = next(known.unit for known in self.parameters() if known.name == name)
         value = getattr(self, name)
         text = (
@@ -306,9 +307,10 @@ class Effect:
 
 
 def driver_error(effect: Effect, channel: str, present: list[str]) -> SchemaError:
-    """The complaint that an effect's channel is not there."""
+    """Make the error for a missing channel of an effect."""
     name = effect.channel_names()[channel]
     return SchemaError(
         f"effect {effect.name!r} needs the channel {name!r} [{effect.channels[channel]}]; "
-        f"there are {', '.join(present) or 'no channels'}; add it to the environment or name another with driver = ..."
+        f"there are {', '.join(present) or 'no channels'}; add it to the environment "
+        "or name another with driver = ..."
     )

@@ -1,4 +1,4 @@
-"""Bias that changes in steps: jumps, telegraph, hops by whole fringes."""
+"""Bias that changes in steps: jumps, telegraph and fringe hops."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from gyrostab.units import HOUR
 
 __all__ = ["BiasJump", "FringeHop", "Telegraph", "step_means"]
 
-_LIGHT = 299_792_458.0  # m/s
+_LIGHT_M_PER_S = 299_792_458.0  # m/s
 _RADIAN_PER_S = math.degrees(1.0) * HOUR  # deg/h
 
 
 def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, size: int) -> Array:
-    """Mean over each sample of something that is constant but for steps.
+    """Average a piecewise constant function over each sample.
 
     Parameters
     ----------
     positions : sequence of float
-        Where it steps, rising [samples since the start of the log].
+        Increasing positions of the steps [samples since the start of the log].
     levels : sequence
         Values before the first step, after it, and so on: one more than steps. A value may be an
-        array, of rows.
+        array of rows.
     first, size : int
-        The samples asked for.
+        First sample and number of samples.
 
     Returns
     -------
@@ -54,17 +54,17 @@ def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, si
 
 @dataclass
 class _Stepping:
-    """Where a process that steps at random stands, and when it steps next [samples]."""
+    """State of a random step process: its level, and the position of its next step [samples]."""
 
     rng: np.random.Generator
     level: Any
     next: float
 
 
-def _go(
+def _run_process(
     process: _Stepping, end: float, step: Callable[[_Stepping], None]
 ) -> tuple[list[float], list[Any]]:
-    """Steps before the sample `end`; `step` changes the level and sets when it steps next."""
+    """Run a process up to sample `end`; `step` changes its level and sets its next step."""
     positions: list[float] = []
     levels = [process.level]
     while process.next < end:
@@ -74,33 +74,33 @@ def _go(
     return positions, levels
 
 
-def _wait(rng: np.random.Generator, mean: float) -> float:
-    """A random time without memory, endless where its mean is."""
+def _draw_wait(rng: np.random.Generator, mean: float) -> float:
+    """Draw an exponential waiting time; infinite if its mean is."""
     drawn = float(rng.standard_exponential())
     return math.inf if math.isinf(mean) else drawn * mean
 
 
 def _share_after(windows: Windows, instant: float) -> Array:
-    """Share of every window that lies after an instant [s]."""
+    """Compute the share of every window that lies after an instant [s]."""
     return np.clip((windows.end - instant) / (windows.end - windows.begin), 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BiasJump(Effect):
-    """Bias that jumps, at restarts, at shocks, or at a time that is given, and stays.
+    """Bias that jumps permanently at restarts, at shocks, or at a given time.
 
-    ``b = J_1 + J_2 + ...``, with normal J of the rms `restart` each time power comes back, and of
-    the rms `shock` at random times; and the step `step` at the time `at`. A shock concerns all
-    axes, with sizes of their own.
+    ``b = J_1 + J_2 + ...``, with normal J of the rms `restart` at every return of power, and of the
+    rms `shock` at random times; and the step `step` at the time `at`. A shock acts on all axes with
+    independent sizes.
 
     *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` in the windows W across a jump D, at least 2 tau from
-    their ends: an apparent ``K = D / sqrt(W)``, gone in windows wholly before or after. *Window
-    mean*: steps and stays. *Spectrum*: nothing between the jumps. *Axes*: at the same times, with
-    sizes and signs that have nothing to do with each other.
+    their ends: an apparent ``K = D / sqrt(W)``, absent in windows entirely before or after. *Window
+    mean*: a permanent step. *Spectrum*: unchanged between the jumps. *Axes*: at the same times,
+    with independent sizes and signs.
 
-    Confused with vibration_rectification (goes back when vibration ends), warm_up (decays),
-    telegraph (comes back to the same level) and K (grows within windows as well): the jump
-    coincides with a restart or a shock and does not go back.
+    Confused with vibration_rectification (reverts when vibration ends), warm_up (decays), telegraph
+    (returns to the same level) and K (grows within windows as well): the jump coincides with a
+    restart or a shock and does not revert.
 
     References
     ----------
@@ -136,7 +136,7 @@ class BiasJump(Effect):
     )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Jumps at restarts and at the time given, which are known; and the first shock."""
+        """Compute the jumps at restarts and at `at`, and draw the first shock."""
         restarts, shocks = rng.spawn(2)
         count = len(setup.axes)
         normal = restarts.standard_normal((len(setup.restarts), count))
@@ -145,25 +145,30 @@ class BiasJump(Effect):
         order = np.argsort(places, kind="stable")
         levels = np.cumsum(np.concatenate([np.zeros((1, count)), jumps[order]]), axis=0)
         mean = HOUR * setup.rate / self.shocks_per_hour if self.shocks_per_hour else math.inf
-        return places[order], levels, _Stepping(shocks, np.zeros(count), _wait(shocks, mean)), mean
+        return (
+            places[order],
+            levels,
+            _Stepping(shocks, np.zeros(count), _draw_wait(shocks, mean)),
+            mean,
+        )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         places, levels, process, mean = state
 
         def jump(process: _Stepping) -> None:
             process.level = process.level + self.shock * process.rng.standard_normal(
                 len(chunk.setup.axes)
             )
-            process.next += _wait(process.rng, mean)
+            process.next += _draw_wait(process.rng, mean)
 
         known = step_means(places, levels, chunk.first, chunk.size)
         return known + step_means(
-            *_go(process, chunk.first + chunk.size, jump), chunk.first, chunk.size
+            *_run_process(process, chunk.first + chunk.size, jump), chunk.first, chunk.size
         ), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Times of the jump: where power came back, and the edges and the middles of the windows."""
+        """List times of the jump: returns of power, and edges and centres of the windows."""
         known = windows.restarts[:, 1] if windows.restarts.size else np.empty(0)
         return {
             "at": np.unique(
@@ -172,17 +177,16 @@ class BiasJump(Effect):
         }
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: the share of every window after the jump. The sizes of random jumps are found as `step`, one after the other."""
+        """Predict the share of every window after the jump; random jumps are fitted as `step`."""
         return Prediction(mean={"step": _share_after(windows, self.at)})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         parts = [f"by {self.quantity('step', errors)} at {self.at:.6g} s"] if any(self.step) else []
         parts += [f"by {self.quantity('restart', errors)} rms at restarts"] if self.restart else []
         if self.shock:
-            parts.append(
-                f"by {self.quantity('shock', errors)} rms at shocks, {self.shocks_per_hour:.3g} in an hour"
-            )
+            size = self.quantity("shock", errors)
+            parts.append(f"by {size} rms at shocks, {self.shocks_per_hour:.3g} per hour")
         return f"The bias jumps {self.on_axes()}: {'; '.join(parts) or 'by nothing'}."
 
 
@@ -190,17 +194,17 @@ class BiasJump(Effect):
 class Telegraph(Effect):
     """Bias that switches between two levels at random times.
 
-    ``b = 0`` or ``D``; the times between switches have no memory, with the means `low` (at 0) and
-    `high` (at D).
+    ``b = 0`` or ``D``; the dwell times are exponential, with the means `low` (at 0) and `high` (at
+    D).
 
     *DAVAR*: that of a Gauss-Markov process with the variance ``D^2 p (1 - p)``, p = high / (low +
     high), and the correlation time T_c of ``1 / T_c = 1 / low + 1 / high``: a bump at 1.89 T_c;
     +1/2 before, -1/2 after it. *Window mean*: two levels, smeared where windows are longer than
     T_c. *Spectrum*: Lorentzian. *Axes*: independent.
 
-    Confused with gauss_markov, which second-order statistics cannot tell from it: the histogram of
-    short means has two peaks (negative excess kurtosis), and it takes some ten switches to see it.
-    bias_jump does not come back to the same level.
+    Confused with gauss_markov, which has the same second-order statistics: the histogram of short
+    means is bimodal (negative excess kurtosis), which needs some ten switches to show. bias_jump
+    does not return to the same level.
 
     References
     ----------
@@ -229,36 +233,38 @@ class Telegraph(Effect):
 
     @property
     def correlation_time(self) -> float:
-        """T_c [s]."""
+        """Correlation time T_c [s]."""
         return self.low * self.high / (self.low + self.high)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Every axis on one of its levels, as if it had begun long ago."""
+        """Draw the level of every axis from the stationary state."""
         rows = []
         for child in rng.spawn(len(setup.axes)):
             up = float(child.random() < self.high / (self.low + self.high))
             rows.append(
-                _Stepping(child, up, _wait(child, (self.high if up else self.low) * setup.rate))
+                _Stepping(
+                    child, up, _draw_wait(child, (self.high if up else self.low) * setup.rate)
+                )
             )
         return rows
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
 
         def switch(process: _Stepping) -> None:
             process.level = 1.0 - process.level
-            process.next += _wait(
+            process.next += _draw_wait(
                 process.rng, (self.high if process.level else self.low) * chunk.rate
             )
 
         end = chunk.first + chunk.size
         unit = np.stack(
-            [step_means(*_go(row, end, switch), chunk.first, chunk.size) for row in state]
+            [step_means(*_run_process(row, end, switch), chunk.first, chunk.size) for row in state]
         )
         return self.each("step", chunk.setup.axes)[:, None] * unit, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Mean times at both levels, from a sample to the whole record."""
+        """List mean times at both levels, from ten samples to a quarter of the record."""
         times = np.geomspace(
             10.0 / windows.rate, max(windows.end[-1] / 4.0, 20.0 / windows.rate), 6
         )
@@ -281,38 +287,40 @@ class Telegraph(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
-        times = f"for {self.quantity('high', errors)} up and {self.quantity('low', errors)} down on average"
-        return f"The bias switches by {self.quantity('step', errors)} {self.on_axes()}, {times}."
+        """Describe the effect in one sentence."""
+        high, low = self.quantity("high", errors), self.quantity("low", errors)
+        size = self.quantity("step", errors)
+        times = f"for {high} up and {low} down on average"
+        return f"The bias switches by {size} {self.on_axes()}, {times}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class FringeHop(Effect):
-    """The loop locks on another fringe: the rate steps by a whole number of fringes.
+    """Locking of the loop on another fringe: the rate steps by a whole number of fringes.
 
-    ``w_out = w + k lambda c / (L D)``, L the length and D the diameter of the coil; the index of
-    the glass does not matter. A hop by k = ``order`` comes at the time `at`, or else at random
-    times by plus or minus k, stays for a time of mean `hold`, and ends at a restart.
+    ``w_out = w + k lambda c / (L D)``, L the length and D the diameter of the coil, independent of
+    the refractive index. A fringe hop by k = ``order`` occurs at the time `at`, or else at random
+    times by plus or minus k, lasts for a time of mean `hold`, and ends at a restart.
 
-    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))`` with the huge D of a fringe: nothing else is seen in
-    windows across. *Window mean*: steps of one size, both signs. *Spectrum*: that of a few steps.
-    *Axes*: independent, the size of each from its own coil.
+    *DAVAR*: ``D^2 tau / (3 (W - 2 tau))``, where the large D of a fringe hides all else in windows
+    across a step. *Window mean*: steps of one size, both signs. *Spectrum*: that of a few steps.
+    *Axes*: independent, with the size from each coil.
 
-    Confused with bias_jump (any size), clipping (ends at the range) and bit errors (single samples,
-    powers of two): the size of the step is that of the coil, always.
+    Confused with bias_jump (any size), clipping (saturates at the range) and bit errors (single
+    samples, powers of two): the size of the step always follows from the coil.
 
     References
     ----------
     Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (unambiguous range): 500 m on 4 cm at 1550 nm
-    make 1331 deg/s. How often is an estimate.
+    give 1331 deg/s. The frequency of fringe hops is an estimate.
 
     Examples
     --------
-    >>> hop = FringeHop(order=1, length=500, diameter=0.04, at=60, axes=["z"])
-    >>> round(hop.fringe / 3600)
+    >>> effect = FringeHop(order=1, length=500, diameter=0.04, at=60, axes=["z"])
+    >>> round(effect.fringe / 3600)
     1331
-    >>> hop.say()
-    'The gyro hops by 1 fringe of 4.792e+06 deg/h on axis z, at 60 s.'
+    >>> effect.say()
+    'The rate steps by 1 fringe of 4.792e+06 deg/h on axis z, at 60 s.'
     """
 
     name: ClassVar[str] = "fringe_hop"
@@ -321,9 +329,7 @@ class FringeHop(Effect):
     size_parameters: ClassVar[tuple[str, ...]] = ("order",)
     references: ClassVar[tuple[str, ...]] = ("Lefevre 2014, The Fiber-Optic Gyroscope",)
 
-    order: float = parameter(
-        "1", "fringes of a hop, with its sign", default=1.0, low=-1000.0, high=1000.0
-    )
+    order: float = parameter("1", "signed number of fringes", default=1.0, low=-1000.0, high=1000.0)
     length: float = parameter(
         "m", "length of the coil's fibre", default=500.0, low=1.0, high=1e5, source="Lefevre 2014"
     )
@@ -333,82 +339,86 @@ class FringeHop(Effect):
     wavelength: float = parameter(
         "nm", "wavelength of the light", default=1550.0, low=100.0, high=1e4, source="Lefevre 2014"
     )
-    at: float = parameter("s", "time of the hop; inf for random ones", default=math.inf, low=0.0)
+    at: float = parameter("s", "time of the step; inf for random ones", default=math.inf, low=0.0)
     per_hour: float = parameter(
         "1/h",
-        "random hops, while on the right fringe",
+        "random steps, while on the right fringe",
         default=0.0,
         typical=60.0,
         low=0.0,
         high=1e6,
     )
     hold: float = parameter(
-        "s", "mean time until it hops back; inf for never", default=math.inf, typical=20.0, low=1e-6
+        "s", "mean time until return; inf for never", default=math.inf, typical=20.0, low=1e-6
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.order != int(self.order):
             raise OptionError(
-                f"effect {self.name!r}, parameter 'order': {self.order:g} is not a whole number of fringes; give one"
+                f"effect {self.name!r}, parameter 'order': {self.order:g} "
+                "is not a whole number of fringes; give one"
             )
 
     @property
     def fringe(self) -> float:
         """Rate of one fringe [degree hour-1]."""
-        return self.wavelength * 1e-9 * _LIGHT / (self.length * self.diameter) * _RADIAN_PER_S
+        return (
+            self.wavelength * 1e-9 * _LIGHT_M_PER_S / (self.length * self.diameter) * _RADIAN_PER_S
+        )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """On the right fringe."""
+        """Start on the right fringe, and draw the first step."""
         mean = HOUR * setup.rate / self.per_hour if self.per_hour else math.inf
         children = rng.spawn(len(setup.axes))
         if math.isfinite(self.at):
             return [_Stepping(child, 0.0, self.at * setup.rate) for child in children]
-        return [_Stepping(child, 0.0, _wait(child, mean)) for child in children]
+        return [_Stepping(child, 0.0, _draw_wait(child, mean)) for child in children]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """The signal with the hops [degree hour-1]."""
+        """Add the steps to the signal [degree hour-1]."""
         mean = (
             HOUR * chunk.rate / self.per_hour if self.per_hour and math.isinf(self.at) else math.inf
         )
         losses = chunk.setup.restarts[:, 0].astype(np.float64)
 
-        def hop(process: _Stepping) -> None:
+        def switch(process: _Stepping) -> None:
             if process.level:
                 process.level = 0.0
-                process.next += _wait(process.rng, mean)
+                process.next += _draw_wait(process.rng, mean)
                 return
             sign = 1.0 if math.isfinite(self.at) or process.rng.random() < 0.5 else -1.0
             process.level = sign
             later = losses[losses > process.next]
             process.next = min(
-                process.next + _wait(process.rng, self.hold * chunk.rate),
+                process.next + _draw_wait(process.rng, self.hold * chunk.rate),
                 float(later[0]) if later.size else math.inf,
             )
 
         end = chunk.first + chunk.size
         fringes = np.stack(
-            [step_means(*_go(row, end, hop), chunk.first, chunk.size) for row in state]
+            [step_means(*_run_process(row, end, switch), chunk.first, chunk.size) for row in state]
         )
         return chunk.signal + self.order * self.fringe * fringes, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """The time of the hop: the edges of the windows."""
+        """List times of the step: the edges of the windows."""
         return {"at": windows.begin[1:]}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: one fringe after the hop, until it hops back on average."""
+        """Predict window means of one fringe from the step until its mean return."""
         if math.isinf(self.at):
             return Prediction(mean={"order": np.zeros(windows.begin.size)})
         share = _share_after(windows, self.at) - _share_after(windows, self.at + self.hold)
         return Prediction(mean={"order": self.fringe * share})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         count = self.quantity("order", errors)
         when = (
             f"at {self.at:.6g} s"
             if math.isfinite(self.at)
-            else f"{self.per_hour:.3g} times in an hour"
+            else f"{self.per_hour:.3g} times per hour"
         )
-        return f"The gyro hops by {count} fringe{'' if self.order == 1 else 's'} of {self.fringe:.4g} deg/h {self.on_axes()}, {when}."
+        size = f"{count} fringe{'' if self.order == 1 else 's'} of {self.fringe:.4g} deg/h"
+        return f"The rate steps by {size} {self.on_axes()}, {when}."

@@ -1,4 +1,4 @@
-"""Effects with a frequency of their own, or of the rotation."""
+"""Spectral lines of constant frequency, and lines phase-locked to the rotation."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ __all__ = ["RotationLine", "SpectralLine"]
 
 @dataclass(frozen=True, kw_only=True)
 class SpectralLine(Effect):
-    """A line at a frequency that does not move: steady, or a resonance of stated quality.
+    """A line of constant frequency: steady, or a resonance of given quality.
 
     ``rate(t) = A sin(2 pi f t + phi)``; or, with a quality Q, the velocity of an oscillator of that
-    frequency shaken by white noise, of the same mean square ``A^2 / 2``, with the density ``(A^2 /
+    frequency driven by white noise, of the same mean square ``A^2 / 2``, with the density ``(A^2 /
     2) w f^2 / (pi ((f^2 - f0^2)^2 + w^2 f^2))`` and w = f0 / Q. Every sample is the mean over its
-    interval, so a line above half of the sampling rate folds down with the factor sinc(f / fs).
+    interval, so a line above half of the sampling rate is aliased with the factor sinc(f / fs).
 
     *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``: a bump of sigma = 0.725 A at tau = 0.371 / f,
     then a comb that falls with 1 / tau; a resonance has the bump without the comb. *Window mean*:
-    nothing. *Spectrum*: a line, or a peak of width f0 / Q. *Axes*: one motion, with a factor for
+    no effect. *Spectrum*: a line, or a peak of width f0 / Q. *Axes*: one motion, with a factor for
     each axis.
 
-    Confused with rotation_line and earth_rate (move with the rotation), feedback_reset (moves with
-    the gyro's own rate) and aliased_vibration (moves with the sampling rate, follows vibration):
-    see whether f moves with rotation, temperature, sampling rate.
+    Confused with rotation_line and earth_rate (frequency follows the rotation), feedback_reset
+    (follows the gyro's rate) and aliased_vibration (depends on the sampling rate, and follows
+    vibration): check whether f changes with rotation, temperature or sampling rate.
 
     References
     ----------
@@ -76,7 +76,7 @@ class SpectralLine(Effect):
     )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """The oscillator in its stationary state; nothing for a steady line."""
+        """Draw the stationary state of the oscillator; None for a steady line."""
         if math.isinf(self.quality):
             self.each("phase", setup.axes)
             return None
@@ -86,7 +86,7 @@ class SpectralLine(Effect):
         return reading, rng, rest(reading, rng.standard_normal(2))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         amplitude = self.each("amplitude", chunk.setup.axes)[:, None]
         if state is None:
             cycles = self.frequency / chunk.rate
@@ -104,12 +104,12 @@ class SpectralLine(Effect):
         return amplitude / math.sqrt(2.0) * values, (reading, rng, position)
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """The frequency, band by band, and for a resonance its quality."""
+        """List one frequency per band, and qualities of a resonance."""
         grid = {"frequency": windows.frequency}
         return grid if math.isinf(self.quality) else grid | {"quality": np.array([5.0, 15.0, 50.0])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """A spectrum, the same process on all axes; and where the line shows."""
+        """Predict a spectrum of one process on all axes, and the frequency of the line."""
         place = np.full(windows.begin.shape, float(fold(self.frequency, windows.rate)))
         if math.isinf(self.quality):
             power = 0.5 * np.sinc(self.frequency / windows.rate) ** 2
@@ -129,30 +129,32 @@ class SpectralLine(Effect):
         return Prediction(spectrum={"amplitude": spectrum}, coherent=True, line=place)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         size, place = self.quantity("amplitude", errors), self.quantity("frequency", errors)
         if math.isinf(self.quality):
             return f"There is a steady line of {size} at {place} {self.on_axes()}."
-        return f"There is a resonance of {size} at {place} with a quality of {self.quantity('quality', errors)} {self.on_axes()}."
+        quality = self.quantity("quality", errors)
+        peak = f"{size} at {place} with a quality of {quality}"
+        return f"There is a resonance of {peak} {self.on_axes()}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class RotationLine(Effect):
-    """Lines locked to the rotation of the tool, or with another driver to the strokes of a pump or the modes of stick-slip.
+    """Lines phase-locked to the rotation of the tool, or of another driver such as a pump.
 
     ``rate(t) = sum_k A k^-p cos(k (m theta(t) + phi))`` over k = 1 to `harmonics`, theta the turns
-    of the channel since the start of the log, m the `order`: lines in a turn. The phase is the
-    integral of the channel, carried on from sample to sample, and each sample is the mean over its
-    interval, so a line folds where its frequency passes half of the sampling rate.
+    of the channel since the start of the log, m the `order` in lines per turn. The phase is the
+    integral of the channel, continued from sample to sample, and each sample is the mean over its
+    interval, so a line is aliased where its frequency exceeds half of the sampling rate.
 
-    *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f wanders inside a window; it
-    moves to shorter times as the tool speeds up. *Window mean*: nothing while it turns; ``A
-    cos(phi)`` of the standing tool. *Spectrum*: a comb that follows the rotation. *Axes*: phase
-    locked, with amplitude and phase of each axis.
+    *DAVAR*: the bump of a sinusoid at 0.371 / (m f), smeared where f varies inside a window; it
+    moves to shorter times as the tool speeds up. *Window mean*: zero during rotation; ``A
+    cos(phi)`` at rest. *Spectrum*: a comb that follows the rotation. *Axes*: phase-locked, with
+    amplitude and phase of each axis.
 
     Confused with earth_rate (15 deg/h at most, quadrature between the cross axes), g_sensitivity
-    and magnetic (proportional to their channels), and spectral_line (does not move): see whether
-    the line moves with the rotation, and with which multiple.
+    and magnetic (proportional to their channels), and spectral_line (constant frequency): check
+    whether the frequency follows the rotation, and with which multiple.
 
     References
     ----------
@@ -189,26 +191,27 @@ class RotationLine(Effect):
         super().__post_init__()
         if self.harmonics != int(self.harmonics):
             raise OptionError(
-                f"effect {self.name!r}, parameter 'harmonics': {self.harmonics:g} is not a whole number of lines; give one"
+                f"effect {self.name!r}, parameter 'harmonics': {self.harmonics:g} "
+                "is not a whole number of lines; give one"
             )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Turns of the channel so far."""
+        """Start with zero turns of the channel."""
         return 0.0
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         middle, inside, state = turns_of_samples(
             self.order * chunk.drivers["rotation_rate"], chunk.rate, state
         )
-        return self._lines(
+        return self._sum_lines(
             middle, inside, chunk.setup.axes, self.each("amplitude", chunk.setup.axes)
         ), state
 
-    def _lines(
+    def _sum_lines(
         self, middle: Array, inside: Array, axes: tuple[str, ...], amplitude: Array
     ) -> Array:
-        """Sum of the lines over intervals, of amplitude one."""
+        """Sum the averaged lines of amplitude one."""
         total = np.zeros((len(axes), middle.size))
         phase = np.radians(self.each("phase", axes))[:, None]
         for k in range(1, int(self.harmonics) + 1):
@@ -216,20 +219,20 @@ class RotationLine(Effect):
         return amplitude[:, None] * total
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """The phase, half a turn of it since the amplitude has a sign, and the lines in a turn."""
+        """List phases over half a turn (the amplitude is signed), and lines per turn."""
         return {"phase": np.arange(0.0, 180.0, 30.0), "order": np.array([1.0, 2.0, 3.0, 4.0])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means where the tool all but stands; the comb; where the lines show."""
+        """Predict window means at slow rotation, the comb, and the frequencies of the lines."""
         rotation = self.order * windows.drivers["rotation_rate"]
         middle, inside = turns_of_windows(windows, rotation)
-        mean = self._lines(middle, inside, windows.axes, np.ones(len(windows.axes)))
+        mean = self._sum_lines(middle, inside, windows.axes, np.ones(len(windows.axes)))
         k = np.arange(1.0, int(self.harmonics) + 1)[:, None]
         cycles = k * np.abs(rotation) / TURN
         place = fold(cycles, windows.rate)
         power = 0.5 * (k**-self.rolloff * np.sinc(cycles / windows.rate)) ** 2
         comb = sum(
-            (line_density(windows, one, weight) for one, weight in zip(place, power, strict=True)),
+            (line_density(windows, f, weight) for f, weight in zip(place, power, strict=True)),
             np.zeros(()),
         )
         order = {"amplitude": np.ones((len(windows.axes), 3), np.complex128)}
@@ -238,7 +241,7 @@ class RotationLine(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         count, channel = int(self.harmonics), self.channel_names()["rotation_rate"]
         many = "There is a line" if count == 1 else f"There are {count} lines"
         first = "of" if count == 1 else "the first of"

@@ -1,4 +1,4 @@
-"""What the logger and the telemetry do to the samples: filters, the lattice of values, errors of bits, samples held."""
+"""Effects of logger and telemetry: filters, quantization, bit errors and held samples."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from gyrostab.units import HOUR
 __all__ = ["HeldSamples", "LoggerFilter", "RateQuantization", "Spikes"]
 
 
-def _whole(effect: Effect, name: str) -> int:
-    """A parameter that must be a whole number."""
+def _whole_number(effect: Effect, name: str) -> int:
+    """Read a parameter that must be a whole number."""
     value = float(getattr(effect, name))
     if value != int(value):
         raise OptionError(
@@ -28,22 +28,22 @@ def _whole(effect: Effect, name: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class LoggerFilter(Effect):
-    """The logger's filter, at the rate of the instrument, and how it makes the samples of the log.
+    """Filter and decimation of the logger, at the rate of the instrument.
 
-    Low-pass: Butterworth of `order` poles with half power at `cutoff`, made digital by the bilinear
-    transform. Then a moving average over `length`. Then the samples of the log: the mean of those
-    of the instrument (integrate and dump), or with ``pick = 1`` every n-th of them, n the
-    `oversampling` of the model, so that what the filter lets through above half of the log's rate
-    folds down. All are causal and remember from chunk to chunk. Where it is to explain a recording,
-    `instrument` is this n: 1 for a filter at the rate of the log, 0 for an instrument much faster
-    than it; a simulation has the model's.
+    A Butterworth low-pass of `order` poles with half power at `cutoff` (bilinear transform) is
+    followed by a moving average over `length`. A sample of the log is the mean of n samples of the
+    instrument (integrate and dump), or with ``pick = 1`` every n-th of them, where n is the
+    `oversampling` of the model; what passes the filter above half of the log's rate is then
+    aliased. All filters are causal and keep their state between chunks. To explain a recording,
+    `instrument` takes the place of n: 1 for a filter at the rate of the log, 0 for a much faster
+    instrument.
 
-    *DAVAR*: less at times below ``1 / cutoff`` or `length`, where sigma grows with tau as if of K
-    or R; nothing at long times. Picked without a filter: more white noise at all times, n times the
-    variance. *Window mean*: nothing. *Spectrum*: multiplied by ``sum_k |H(f + k fs)|^2``. *Axes*:
+    *DAVAR*: smaller at times below ``1 / cutoff`` or `length`, where sigma grows with tau like K or
+    R; unchanged at long times. Decimated without a filter: n times the white noise variance at all
+    times. *Window mean*: no effect. *Spectrum*: multiplied by ``sum_k |H(f + k fs)|^2``. *Axes*:
     all alike.
 
-    Confused with a smaller N (look at long times), negative Q, held_samples, and a wrong sampling
+    Confused with a smaller N (compare long times), negative Q, held_samples, and a wrong sampling
     rate (lines move): the spectrum up to 0.3 fs decides.
 
     References
@@ -76,35 +76,37 @@ class LoggerFilter(Effect):
         "1", "1: every n-th sample of the instrument; 0: means of n", default=0.0, low=0.0, high=1.0
     )
     instrument: float = parameter(
-        "1", "n, where it is to explain a recording; 0: many", default=0.0, low=0.0, high=1000.0
+        "1", "n, to explain a recording; 0: many", default=0.0, low=0.0, high=1000.0
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("order", "pick", "instrument"):
-            _whole(self, name)
+            _whole_number(self, name)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """The sections of the low-pass and the length of the average; no samples yet."""
+        """Design the sections of the low-pass and the length of the average."""
         sections = None
         if self.cutoff:
             from scipy.signal import butter
 
             if self.cutoff >= setup.rate / 2.0:
                 raise OptionError(
-                    f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of the instrument's {setup.rate:g} Hz; "
+                    f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of "
+                    f"the instrument's {setup.rate:g} Hz; "
                     "raise oversampling in the model's [log], or lower the cutoff"
                 )
             sections = butter(int(self.order), self.cutoff, fs=setup.rate, output="sos")
         taps = max(1, round(self.length * setup.rate))
         if taps > 10_000:
             raise OptionError(
-                f"effect {self.name!r}: a length of {self.length:g} s is {taps} samples of the instrument; give at most 10000"
+                f"effect {self.name!r}: a length of {self.length:g} s is {taps} samples "
+                "of the instrument; give at most 10000"
             )
         return sections, None, taps, None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """The signal after the filter [degree hour-1]."""
+        """Filter and decimate the signal [degree hour-1]."""
         sections, inner, taps, memory = state
         signal = chunk.signal
         if sections is not None:
@@ -126,7 +128,7 @@ class LoggerFilter(Effect):
         return signal, (sections, inner, taps, memory)
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
-        """Low-passes at the rate of the log and of fast instruments, averaged or picked, and averages; never two filters at once."""
+        """List low-passes and averages, for slow and fast instruments; one filter at a time."""
         cutoff = windows.rate * np.geomspace(0.02, 1.5, 27)
         found: list[dict[str, float]] = []
         for order in (1.0, 2.0, 4.0):
@@ -150,13 +152,13 @@ class LoggerFilter(Effect):
         return [nothing | point for point in found]
 
     def explain(self, windows: Windows) -> Prediction:
-        """By what the spectrum of white noise is multiplied."""
+        """Predict the factor on the spectrum of white noise."""
         from gyrostab.kernels.random.coloured import folded_psd
 
         if not (self.cutoff or self.length):
             return Prediction()
         if self.instrument:
-            return Prediction(response=self._digital(windows.frequency, windows.rate))
+            return Prediction(response=self._digital_response(windows.frequency, windows.rate))
         highest = min(
             20.0 * self.cutoff if self.cutoff else math.inf,
             50.0 / self.length if self.length else math.inf,
@@ -176,13 +178,14 @@ class LoggerFilter(Effect):
             )
         )
 
-    def _digital(self, frequency: Array, rate: float) -> Array:
-        """For an instrument of `instrument` samples in one of the log: all frequencies of its samples that look the same in the log."""
+    def _digital_response(self, frequency: Array, rate: float) -> Array:
+        """Sum the response over all aliases, for `instrument` samples per sample of the log."""
         n = int(self.instrument)
         fast = n * rate
         if self.cutoff >= fast / 2.0:
             raise OptionError(
-                f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of the instrument's {fast:g} Hz"
+                f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of "
+                f"the instrument's {fast:g} Hz"
             )
         f = np.asarray(frequency, np.float64)[..., None] + rate * np.arange(n)
         response = np.ones_like(f)
@@ -190,7 +193,7 @@ class LoggerFilter(Effect):
             ratio = np.tan(np.pi * f / fast) / math.tan(math.pi * self.cutoff / fast)
             response = 1.0 / (1.0 + ratio ** (2 * int(self.order)))
         for taps in (max(1, round(self.length * fast)), 1 if self.pick else n):
-            if taps > 1:  # mean of so many samples
+            if taps > 1:  # mean of `taps` samples
                 response = (
                     response
                     * (np.sin(np.pi * taps * f / fast) / (taps * np.sin(np.pi * f / fast))) ** 2
@@ -198,7 +201,7 @@ class LoggerFilter(Effect):
         return np.asarray(response.sum(axis=-1))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         parts = (
             [f"low-pass of order {int(self.order)} at {self.quantity('cutoff', errors)}"]
             if self.cutoff
@@ -212,38 +215,38 @@ class LoggerFilter(Effect):
             if self.pick
             else "means"
         )
-        return f"The logger filters {self.on_axes()}: {', '.join(parts) or 'nothing'}; its samples are {taken}."
+        filters = ", ".join(parts) or "nothing"
+        return f"The logger filters {self.on_axes()}: {filters}; its samples are {taken}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class RateQuantization(Effect):
-    """The rate is rounded to a lattice of values.
+    """Quantization of the rate in steps q.
 
-    ``out = q round(w / q)``, or with ``mode = "floor"`` the value below, with ``"zero"`` the one on
-    the side of zero.
+    ``out = q round(w / q)``, or with ``mode = "floor"`` the value below, with ``"zero"`` the value
+    towards zero.
 
-    *DAVAR*: ``q^2 / (12 k)`` more at k samples, white like N, where the noise of a sample is above
-    q / 2; where it is smaller, steps and dead bands: nothing at all, or too much. *Window mean*: -q
-    / 2 for "floor", and for "zero" q / 2 towards zero, where the value 0 stands for two steps.
-    *Spectrum*: flat. *Axes*: independent.
+    *DAVAR*: ``q^2 / (12 k)`` more at k samples, white like N, where the noise of a sample exceeds
+    q / 2; with less noise, steps and dead bands: zero, or too much. *Window mean*: -q / 2 for
+    "floor", and q / 2 towards zero for "zero", where the value 0 covers two steps. *Spectrum*:
+    flat. *Axes*: independent.
 
-    Confused with N (the same, but for the lattice) and Q, the rounding of an angle that is carried
-    on, with slope -1: look at the differences of values, which are multiples of q.
+    Confused with N (which has no quantization grid) and Q, the quantization of an accumulated
+    angle, with slope -1: the differences of values are multiples of q.
 
     References
     ----------
     Widrow and Kollar 2008, Quantization Noise (q^2 / 12). Sizes: recordings of an ADIS16405 and a
-    CH104 stand on lattices of 180 and 36 deg/h; 0.1 arcsec in 10 ms, in a common file format, is 10
-    deg/h.
+    CH104 have steps of 180 and 36 deg/h; 0.1 arcsec in 10 ms, in a common file format, is 10 deg/h.
 
     Examples
     --------
     >>> RateQuantization(step=0.5).say()
-    'The rate stands on a lattice of 0.5 deg/h on all axes.'
+    'The rate is quantized in steps of 0.5 deg/h on all axes.'
     """
 
     name: ClassVar[str] = "rate_quantization"
-    short: ClassVar[str] = "value lattice of the rate"
+    short: ClassVar[str] = "quantization grid of the rate"
     stage: ClassVar[Stage] = "logger"
     size_parameters: ClassVar[tuple[str, ...]] = ("step",)
     references: ClassVar[tuple[str, ...]] = ("Widrow and Kollar 2008, Quantization Noise",)
@@ -257,7 +260,7 @@ class RateQuantization(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """The signal on the lattice [degree hour-1]."""
+        """Quantize the signal [degree hour-1]."""
         if self.step == 0.0:
             return chunk.signal, state
         count = chunk.signal / self.step
@@ -266,34 +269,35 @@ class RateQuantization(Effect):
         ), state
 
     def explain(self, windows: Windows) -> Prediction:
-        """White noise of step^2 / 12 in every sample; half a step less on average where the value below is taken.
+        """Predict white noise of step^2 / 12 in every sample, and the offset of "floor".
 
-        Cut off towards zero the rate loses half a step as well, with its sign: a constant, as long
-        as it keeps that.
+        "zero" has an offset of half a step towards zero: a constant while the rate keeps its sign.
         """
         white = np.full((windows.begin.size, windows.frequency.size), 1.0 / (12.0 * windows.rate))
         mean = {"step": np.full(windows.begin.size, -0.5)} if self.mode == "floor" else {}
         return Prediction(mean=mean, spectrum={"step": white}, marks=("lattice",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
-        return f"The rate stands on a lattice of {self.quantity('step', errors)} {self.on_axes()}."
+        """Describe the effect in one sentence."""
+        return (
+            f"The rate is quantized in steps of {self.quantity('step', errors)} {self.on_axes()}."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spikes(Effect):
-    """Single samples that are wrong: a bit of the number, or an outlier.
+    """Single wrong samples: bit errors or outliers.
 
-    At random times, each axis by itself: ``kind = "bit"`` turns one bit, any of `bits` with equal
-    chance, of the count of `lsb` (two's complement); ``"outlier"`` adds a normal number of the rms
-    `size`.
+    At random times, independently on each axis: ``kind = "bit"`` flips one bit, any of `bits` with
+    equal probability, of the count of `lsb` (two's complement); ``"outlier"`` adds a normal number
+    of the rms `size`.
 
-    *DAVAR*: white, ``p E[d^2] / k`` more at k samples, p the chance of a sample and d the spike,
-    which the largest bits rule; windows with a spike stand out from those without. *Window mean*:
-    moved by d / n. *Spectrum*: flat. *Axes*: independent.
+    *DAVAR*: white, ``p E[d^2] / k`` more at k samples, p the probability per sample and d the
+    spike, dominated by the largest bits; windows with a spike differ clearly from others. *Window
+    mean*: shifted by d / n. *Spectrum*: flat. *Axes*: independent.
 
-    Confused with Q, N and real shocks (last longer than a sample, seen by accelerometers):
-    kurtosis; the sizes of bit errors are powers of two times the lattice.
+    Confused with Q, N and real shocks (longer than a sample, seen by accelerometers): check the
+    kurtosis; bit errors are powers of two times the quantization step.
 
     References
     ----------
@@ -302,7 +306,7 @@ class Spikes(Effect):
     Examples
     --------
     >>> Spikes(per_hour=2, lsb=0.1, bits=16).say()
-    'Now and then a sample is wrong on all axes: one of 16 bits of 0.1 deg/h, 2 times in an hour.'
+    'Single samples are wrong on all axes: one of 16 bits of 0.1 deg/h, 2 times per hour.'
     """
 
     name: ClassVar[str] = "spikes"
@@ -321,32 +325,32 @@ class Spikes(Effect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _whole(self, "bits")
+        _whole_number(self, "bits")
 
-    def _chance(self, rate: float) -> float:
-        """That a sample is wrong."""
+    def _sample_probability(self, rate: float) -> float:
+        """Compute the probability that a sample is wrong."""
         return min(1.0, self.per_hour / HOUR / rate)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """The first wrong sample of every axis."""
-        chance = self._chance(setup.rate)
+        """Draw the first wrong sample of every axis."""
+        chance = self._sample_probability(setup.rate)
         return [
             (child, int(child.geometric(chance)) - 1 if chance else None)
             for child in rng.spawn(len(setup.axes))
         ]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """The signal with the wrong samples [degree hour-1]."""
-        signal, chance, after = chunk.signal.copy(), self._chance(chunk.rate), []
+        """Corrupt samples of the signal [degree hour-1]."""
+        signal, chance, after = chunk.signal.copy(), self._sample_probability(chunk.rate), []
         for row, (child, following) in enumerate(state):
             while following is not None and following < chunk.first + chunk.size:
                 place = following - chunk.first
-                signal[row, place] = self._wrong(float(signal[row, place]), child)
+                signal[row, place] = self._corrupt_value(float(signal[row, place]), child)
                 following += int(child.geometric(chance))
             after.append((child, following))
         return signal, after
 
-    def _wrong(self, value: float, rng: np.random.Generator) -> float:
+    def _corrupt_value(self, value: float, rng: np.random.Generator) -> float:
         if self.kind == "outlier":
             return value + self.size * float(rng.standard_normal())
         bits = int(self.bits)
@@ -356,48 +360,49 @@ class Spikes(Effect):
         return value + (-weight if is_set else weight) * self.lsb
 
     def explain(self, windows: Windows) -> Prediction:
-        """White noise of the mean square of the spikes, which hides that they are few."""
+        """Predict white noise with the mean square of the spikes, and outliers."""
         bits = int(self.bits)
         name, square = (
             ("size", 1.0) if self.kind == "outlier" else ("lsb", (4.0**bits - 1.0) / (3.0 * bits))
         )
         white = np.full(
             (windows.begin.size, windows.frequency.size),
-            self._chance(windows.rate) * square / windows.rate,
+            self._sample_probability(windows.rate) * square / windows.rate,
         )
         return Prediction(spectrum={name: white}, marks=("outliers",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         bit = f"one of {int(self.bits)} bits of {self.quantity('lsb', errors)}"
         what = bit if self.kind == "bit" else f"by {self.quantity('size', errors)} rms"
         often = self.quantity("per_hour", errors).removesuffix(" 1/h")
-        return f"Now and then a sample is wrong {self.on_axes()}: {what}, {often} times in an hour."
+        return f"Single samples are wrong {self.on_axes()}: {what}, {often} times per hour."
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeldSamples(Effect):
-    """Samples that were lost and filled: with the last good one, or with zero, without a word.
+    """Lost samples that are silently replaced by the last good one, or by zero.
 
-    From random times on, all axes together, as many samples as `length` says on average (at least
-    one; without memory) are filled.
+    At random times, on all axes together, a geometric number of samples with the mean `length` (at
+    least one) is replaced.
 
-    *DAVAR*: ``repeat``: less at one sample, by the share of held ones; more at long times, where
-    one sample counts for many: N^2 grows by the factor ``1 + 2 p m^2`` for m samples with the
-    chance p. ``zero``: pulses as high as the rate. *Window mean*: pulled to zero by "zero".
-    *Spectrum*: less at the top, more below. *Axes*: the same samples.
+    *DAVAR*: ``repeat``: smaller at one sample, by the share of held ones; larger at long times,
+    where one sample counts several times: N^2 grows by the factor ``1 + 2 p m^2`` for m samples
+    with probability p. ``zero``: pulses of the size of the rate. *Window mean*: biased towards zero
+    by "zero". *Spectrum*: less at the top, more below. *Axes*: the same samples.
 
-    Confused with logger_filter and small noise (no runs), clipping (runs at the limit only), real
-    gaps: runs of equal values, which noise does not make.
+    Confused with logger_filter and small noise (no runs), clipping (runs at the limit only) and
+    real gaps: check for runs of equal values, which noise does not produce.
 
     References
     ----------
-    Wang et al. 2016, Sensors (loss of data on the way up, zeros in its place). Rates are estimates.
+    Wang et al. 2016, Sensors (data lost in telemetry, replaced by zeros). Rates are estimates.
 
     Examples
     --------
-    >>> HeldSamples(per_hour=30, length=0.5).say()
-    'Samples are lost and filled with the last one on all axes, 30 times in an hour for 0.5 s on average.'
+    >>> print(HeldSamples(per_hour=30, length=0.5).say())
+    Samples are lost and filled with the last one on all axes, 30 times per hour for 0.5 s on
+    average.
     """
 
     name: ClassVar[str] = "held_samples"
@@ -407,26 +412,28 @@ class HeldSamples(Effect):
     references: ClassVar[tuple[str, ...]] = ("Wang et al. 2016, Sensors",)
 
     per_hour: float = parameter(
-        "1/h", "losses, while there is none", typical=360.0, low=0.0, high=1e8
+        "1/h", "losses, outside of a loss", typical=360.0, low=0.0, high=1e8
     )
     length: float = parameter(
-        "s", "mean length of one; at least a sample", default=0.5, low=0.0, high=1e6
+        "s", "mean length of a loss; at least a sample", default=0.5, low=0.0, high=1e6
     )
-    fill: str = parameter("text", "what stands there", default="repeat", choices=("repeat", "zero"))
+    fill: str = parameter("text", "replacement", default="repeat", choices=("repeat", "zero"))
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """The first loss, [first sample, one past the last], and the last good sample of every axis."""
-        return rng, self._next(rng, 0, setup.rate), None
+        """Draw the first loss, [first sample, one past the last]; no good sample is known yet."""
+        return rng, self._draw_loss(rng, 0, setup.rate), None
 
-    def _next(self, rng: np.random.Generator, after: int, rate: float) -> tuple[int, int] | None:
-        """The next loss, with at least one good sample before it."""
+    def _draw_loss(
+        self, rng: np.random.Generator, after: int, rate: float
+    ) -> tuple[int, int] | None:
+        """Draw the next loss, with at least one good sample before it."""
         if self.per_hour == 0.0:
             return None
         first = after + int(rng.geometric(min(1.0, self.per_hour / HOUR / rate)))
         return first, first + int(rng.geometric(1.0 / max(1.0, self.length * rate)))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """The signal with the losses filled [degree hour-1]."""
+        """Replace lost samples of the signal [degree hour-1]."""
         rng, loss, last = state
         end = chunk.first + chunk.size
         source = np.arange(chunk.size)
@@ -437,7 +444,7 @@ class HeldSamples(Effect):
             source[low:high] = low - 1
             if loss[1] > end:
                 break
-            loss = self._next(rng, loss[1], chunk.rate)
+            loss = self._draw_loss(rng, loss[1], chunk.rate)
         if self.fill == "zero":
             return np.where(held, 0.0, chunk.signal), (rng, loss, None)
         before = chunk.signal[:, :1] if last is None else last
@@ -446,7 +453,7 @@ class HeldSamples(Effect):
         return signal, (rng, loss, signal[:, -1:].copy())
 
     def explain(self, windows: Windows) -> Prediction:
-        """More N at long times; or the window means pulled to zero."""
+        """Predict a larger N, or window means biased towards zero."""
         count = max(1.0, self.length * windows.rate)
         if self.fill == "zero":
             share = count / windows.rate / HOUR
@@ -458,10 +465,11 @@ class HeldSamples(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         what = "the last one" if self.fill == "repeat" else "zero"
         often, length = (
             self.quantity("per_hour", errors).removesuffix(" 1/h"),
             self.quantity("length", errors),
         )
-        return f"Samples are lost and filled with {what} {self.on_axes()}, {often} times in an hour for {length} on average."
+        times = f"{often} times per hour for {length} on average"
+        return f"Samples are lost and filled with {what} {self.on_axes()}, {times}."

@@ -1,4 +1,4 @@
-"""The spectrum of exponentially correlated bias in samples that are means over their intervals."""
+"""Spectrum of exponentially correlated bias in averaged samples."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ __all__ = ["lorentz_density"]
 
 
 def lorentz_density(frequency: Array, correlation_time: float, rate: float) -> Array:
-    """Two-sided density [Hz-1] of the samples of a process of unit variance and exponential correlation, folding included.
+    """Compute the aliased two-sided density [Hz-1] of a unit exponentially correlated process.
 
-    A sample is the mean over its interval, so the samples have the covariances ``c_0 = 2 (x - 1 +
-    e^-x) / x^2`` and ``c_k = ((1 - e^-x) / x)^2 e^-(k-1)x``, x the interval over the correlation
-    time; the density is their sum.
+    A sample is the mean over its interval. With x the interval over the correlation time, the
+    samples have the covariances ``c_0 = 2 (x - 1 + e^-x) / x^2`` and ``c_k = ((1 - e^-x) / x)^2
+    e^-(k-1)x``, and the density is the Fourier sum of these.
 
     Parameters
     ----------
     frequency : ndarray
-        Where [Hz].
+        Frequencies [Hz].
     correlation_time : float
         Time constant of the correlation [s].
     rate : float

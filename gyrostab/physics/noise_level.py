@@ -1,7 +1,7 @@
 """Effects of temperature, light power and vibration on the level of the noise.
 
-All of them add to the squared coefficients, each in proportion to those of the model and not to
-what the others made of them. So their order does not matter.
+Each adds to the squared coefficients in proportion to those of the model, independent of the other
+effects; their order does not matter.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from gyrostab.units import INNER
 __all__ = ["LightPowerNoise", "TemperatureNoise", "VibrationNoise", "VibrationRandomWalk"]
 
 
-#: Least N^2 of a law that is a polynomial, as a share of its value at the reference: a tenth of N.
-#: Beyond the range where such a law was
-#: measured it would cross zero, which no noise does.
+#: Least N^2 of a polynomial law, as a share of its value at the reference (a tenth of N). Outside
+#: of the range where it was measured, the polynomial could be negative.
 LEAST_SHARE = 0.01
 
 
-def _raised(effect: Effect, chunk: Chunk, share: Array) -> dict[str, Array]:
-    """Raise squared N by a share of what the model says, down to `LEAST_SHARE` of it."""
+def _raise_noise(effect: Effect, chunk: Chunk, share: Array) -> dict[str, Array]:
+    """Raise squared N by a share of the model's value, at least to `LEAST_SHARE` of it."""
     if share.size and float(share.min()) < LEAST_SHARE - 1.0:
         driver = effect.channel_names()[next(iter(chunk.drivers))]
         warnings.warn(
-            f"effect {effect.name!r}: its law gives less than {LEAST_SHARE:.0%} of N^2 at some values of {driver}, and less than nothing "
-            f"beyond; {LEAST_SHARE:.0%} is taken there. Give smaller coefficients or another reference for another law",
+            f"effect {effect.name!r}: its law gives less than {LEAST_SHARE:.0%} of N^2 at some "
+            f"values of {driver}, and negative values beyond; {LEAST_SHARE:.0%} is taken there. "
+            "Give smaller coefficients or another reference for another law",
             stacklevel=2,
         )
         share = np.maximum(share, LEAST_SHARE - 1.0)
@@ -47,13 +47,13 @@ class TemperatureNoise(Effect):
 
     ``N^2(T) = N0^2 (1 + c1 (T - T0) + c2 (T - T0)^2)``, N0 of the model; no less than 1 % of N0^2
 
-    *DAVAR*: the whole slope -1/2 shifts up and down with the temperature, at once and the same on
-    plateaus and ramps. *Window mean*: nothing. *Spectrum*: white, with a level that follows T.
-    *Axes*: all alike where the source or the detectors' supply is at work.
+    *DAVAR*: the whole slope -1/2 shifts with the temperature without delay, equally on plateaus and
+    ramps. *Window mean*: no effect. *Spectrum*: white, with a level that follows T. *Axes*: all
+    alike where the source or the supply of the detectors is the cause.
 
-    Confused with ageing_noise and light_power_noise (T trends with time, light is lost with T: see
-    whether the noise comes back with the temperature, and which of both channels it follows) and
-    vibration_noise (drilling warms and shakes at once).
+    Confused with ageing_noise and light_power_noise (T drifts with time, light is lost with T:
+    check whether the noise returns with the temperature, and which channel it follows) and
+    vibration_noise (drilling heats and shakes together).
 
     References
     ----------
@@ -62,8 +62,9 @@ class TemperatureNoise(Effect):
 
     Examples
     --------
-    >>> TemperatureNoise(linear=0.002, axes=["x"]).say()
-    'The angle random walk follows the temperature on axis x: N^2 changes by 0.002 1/degC of itself around 25 degC.'
+    >>> print(TemperatureNoise(linear=0.002, axes=["x"]).say())
+    The angle random walk follows the temperature on axis x: N^2 changes by 0.002 1/degC of itself
+    around 25 degC.
     """
 
     name: ClassVar[str] = "temperature_noise"
@@ -85,17 +86,17 @@ class TemperatureNoise(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Squared N on every sample."""
+        """Compute squared N for every sample."""
         above = chunk.drivers["temperature"] - self.reference
-        return _raised(self, chunk, above * (self.linear + above * self.quadratic)), state
+        return _raise_noise(self, chunk, above * (self.linear + above * self.quadratic)), state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Growth of N^2 in every window."""
+        """Predict the growth of N^2 in every window."""
         above = windows.drivers["temperature"] - self.reference
         return Prediction(level={("N", "linear"): above, ("N", "quadratic"): above**2})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         names = [name for name in self.size_parameters if getattr(self, name)] or ["linear"]
         terms = [self.quantity(name, errors) for name in names]
         change = f"changes by {', '.join(terms)} of itself around {self.quantity('reference')}"
@@ -107,14 +108,14 @@ class LightPowerNoise(Effect):
     """Angle random walk that follows the light power at the detector.
 
     ``N^2(P) = a_th / P^2 + a_sh / P + a_x``: noise of the detector, shot noise, and excess noise of
-    the source. The model's N is that at the nominal power P0, and the parameters are the shares of
-    the first two there; the rest is excess noise: ``N^2(P) = N0^2 (s_th (P0 / P)^2 + s_sh P0 / P +
-    1 - s_th - s_sh)``.
+    the source. The model's N applies at the nominal power P0, where the parameters are the shares
+    of the first two terms; the rest is excess noise: ``N^2(P) = N0^2 (s_th (P0 / P)^2 + s_sh P0 / P
+    + 1 - s_th - s_sh)``.
 
-    *DAVAR*: the whole slope -1/2 rises as light is lost; no more than by the shares of detector and
-    shot noise, so that N which stays while P falls means excess noise. *Window mean*: nothing.
-    *Spectrum*: white, with a level that follows P. *Axes*: all alike when the source ages, one when
-    its coil or a splice does.
+    *DAVAR*: the whole slope -1/2 rises as light is lost, by the shares of detector and shot noise
+    at most; constant N at falling P means excess noise. *Window mean*: no effect. *Spectrum*:
+    white, with a level that follows P. *Axes*: all alike when the source ages, one when its coil or
+    a splice does.
 
     Confused with temperature_noise (light is lost with temperature; the power decides),
     ageing_noise (no record of P) and a gain of the logger (scales the rate and the earth's, too).
@@ -128,8 +129,9 @@ class LightPowerNoise(Effect):
 
     Examples
     --------
-    >>> LightPowerNoise(thermal=0.2, shot=0.1).say()
-    'The angle random walk follows the light power on all axes: at 0.0001 W 0.2 of N^2 is noise of the detector and 0.1 shot noise.'
+    >>> print(LightPowerNoise(thermal=0.2, shot=0.1).say())
+    The angle random walk follows the light power on all axes: at 0.0001 W 0.2 of N^2 is noise of
+    the detector and 0.1 shot noise.
     """
 
     name: ClassVar[str] = "light_power_noise"
@@ -162,40 +164,44 @@ class LightPowerNoise(Effect):
         if self.thermal + self.shot > 1.0 + 1e-12:
             total = self.thermal + self.shot
             raise OptionError(
-                f"effect {self.name!r}: thermal + shot are {total:g} of N^2; give shares that are together 1 or less"
+                f"effect {self.name!r}: thermal + shot are {total:g} of N^2; "
+                "give shares with a sum of 1 or less"
             )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Squared N on every sample."""
+        """Compute squared N for every sample."""
         power = chunk.drivers["light_power"]
         if power.size and not float(power.min()) > 0.0:
             place = int(power.argmin())
             name, when = self.channel_names()["light_power"], chunk.seconds[place]
             raise SchemaError(
-                f"effect {self.name!r}: the channel {name!r} is {power[place]:g} W {when:.6g} s after the start; it must be above 0: "
-                "correct the channel, or leave its bad values out"
+                f"effect {self.name!r}: the channel {name!r} is {power[place]:g} W {when:.6g} s "
+                "after the start; it must be above 0: correct the channel, or leave its bad "
+                "values out"
             )
         return {
-            "N": chunk.level["N"] + chunk.setup.noise["N"][:, None] ** 2 * self._share(power)
+            "N": chunk.level["N"] + chunk.setup.noise["N"][:, None] ** 2 * self._added_share(power)
         }, state
 
-    def _share(self, power: Array) -> Array:
+    def _added_share(self, power: Array) -> Array:
         loss = self.nominal / power
         return self.thermal * (loss**2 - 1.0) + self.shot * (loss - 1.0)
 
     def explain(self, windows: Windows) -> Prediction:
-        """Growth of N^2 in every window."""
+        """Predict the growth of N^2 in every window."""
         loss = self.nominal / windows.drivers["light_power"]
         return Prediction(level={("N", "thermal"): loss**2 - 1.0, ("N", "shot"): loss - 1.0})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
-        shares = f"{self.quantity('thermal', errors)} of N^2 is noise of the detector and {self.quantity('shot', errors)} shot noise"
-        return f"The angle random walk follows the light power {self.on_axes()}: at {self.quantity('nominal')} {shares}."
+        """Describe the effect in one sentence."""
+        thermal, shot = self.quantity("thermal", errors), self.quantity("shot", errors)
+        shares = f"{thermal} of N^2 is noise of the detector and {shot} shot noise"
+        follows = f"The angle random walk follows the light power {self.on_axes()}"
+        return f"{follows}: at {self.quantity('nominal')} {shares}."
 
 
-def _excited(vibration: Array, exponent: float) -> Array:
-    """Vibration [g] to the power of the added variance."""
+def _raise_vibration(vibration: Array, exponent: float) -> Array:
+    """Raise the vibration [g] to the power of the added variance."""
     return np.asarray(np.abs(vibration) ** (2.0 * exponent))
 
 
@@ -206,15 +212,15 @@ class VibrationNoise(Effect):
     ``N^2(t) = N0^2 + s_N^2 g^2p``, ``Q^2(t) = Q0^2 + s_Q^2 g^2p``, g the rms acceleration in units
     of 1 g, p the exponent
 
-    *DAVAR*: a crest as long as the vibration, over all averaging times for the white part, with
-    slope -1 at short ones for the other. *Window mean*: nothing. *Spectrum*: more of white noise,
-    and of noise that grows with f^2. *Axes*: independent noise.
+    *DAVAR*: a ridge during the vibration, over all averaging times for the white part, with slope
+    -1 at short ones for the other. *Window mean*: no effect. *Spectrum*: more white noise, and more
+    noise that grows with f^2. *Axes*: independent noise.
 
-    Noise in a band, from a resonance or folded, is aliased_vibration, whose mount may resonate.
+    For noise in a band, resonant or aliased, see aliased_vibration.
 
-    Confused with aliased_vibration (has the edges of its band, and is one motion on all axes),
+    Confused with aliased_vibration (has band edges, and is one motion on all axes),
     temperature_noise and light_power_noise (follow other channels; several levels of vibration
-    separate), spikes (heavy tails) and vibration_random_walk (slope +1/2).
+    separate them), spikes (heavy tails) and vibration_random_walk (slope +1/2).
 
     References
     ----------
@@ -256,20 +262,20 @@ class VibrationNoise(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Squared N and Q on every sample."""
-        excited = _excited(chunk.drivers["vibration"], self.exponent)
+        """Compute squared N and Q for every sample."""
+        excited = _raise_vibration(chunk.drivers["vibration"], self.exponent)
         return {
             "N": chunk.level["N"] + self.white**2 * excited,
             "Q": chunk.level["Q"] + self.quantization**2 * excited,
         }, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """The exponent."""
+        """List exponents."""
         return {"exponent": np.array([0.5, 1.0, 2.0])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """The added spectra, of independent noise on each axis."""
-        excited = _excited(windows.drivers["vibration"], self.exponent)[:, None]
+        """Predict the added spectra of independent noise on each axis."""
+        excited = _raise_vibration(windows.drivers["vibration"], self.exponent)[:, None]
         white, rounding = (
             sampled_psd(symbol, windows.frequency, windows.rate) for symbol in ("N", "Q")
         )
@@ -281,7 +287,7 @@ class VibrationNoise(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         named = (("white", "N"), ("quantization", "Q"))
         terms = [
             f"{self.quantity(name, errors)} of {symbol}"
@@ -293,22 +299,23 @@ class VibrationNoise(Effect):
             if self.exponent == 1.0
             else f", with the power {self.quantity('exponent', errors)} of the vibration"
         )
-        return f"Vibration raises the noise {self.on_axes()}: {' and '.join(terms) or 'nothing'}, added in squares{power}."
+        size = " and ".join(terms) or "nothing"
+        return f"Vibration raises the noise {self.on_axes()}: {size}, added in squares{power}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class VibrationRandomWalk(Effect):
-    """Rate random walk that runs faster under vibration.
+    """Rate random walk that grows under vibration.
 
     ``K^2(t) = K0^2 + s^2 g^2p``, g the rms acceleration in units of 1 g, p the exponent
 
     *DAVAR*: slope +1/2 in every window inside the vibration, not only in those across its edges.
-    *Window mean*: wanders while it shakes and stays where it got to. *Spectrum*: 1 / f^2. *Axes*:
-    independent.
+    *Window mean*: wanders during vibration and keeps its last value afterwards. *Spectrum*:
+    1 / f^2. *Axes*: independent.
 
     Confused with vibration_rectification and bias_jump: a step D in a window of W hours looks like
-    ``K = D / sqrt(W)``. Windows wholly inside the vibration decide, and the mean afterwards, which
-    comes back from rectification and stays after a walk.
+    ``K = D / sqrt(W)``. Windows entirely inside the vibration decide, and the mean afterwards,
+    which reverts after rectification but not after a random walk.
 
     References
     ----------
@@ -319,7 +326,7 @@ class VibrationRandomWalk(Effect):
     Examples
     --------
     >>> VibrationRandomWalk(sensitivity=0.5, axes=["x"]).say()
-    'Vibration makes the bias walk on axis x: 0.5 deg/h^1.5/g of K, added in squares.'
+    'Vibration adds rate random walk on axis x: 0.5 deg/h^1.5/g of K, added in squares.'
     """
 
     name: ClassVar[str] = "vibration_random_walk"
@@ -341,19 +348,19 @@ class VibrationRandomWalk(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        """Squared K on every sample."""
+        """Compute squared K for every sample."""
         return {
             "K": chunk.level["K"]
-            + self.sensitivity**2 * _excited(chunk.drivers["vibration"], self.exponent)
+            + self.sensitivity**2 * _raise_vibration(chunk.drivers["vibration"], self.exponent)
         }, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """The exponent."""
+        """List exponents."""
         return {"exponent": np.array([0.5, 1.0, 2.0])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """The added spectrum: that of a random walk averaged over each sample."""
-        excited = _excited(windows.drivers["vibration"], self.exponent)[:, None]
+        """Predict the added spectrum of a random walk averaged over each sample."""
+        excited = _raise_vibration(windows.drivers["vibration"], self.exponent)[:, None]
         walk = sampled_psd("K", windows.frequency, windows.rate)
         return Prediction(
             spectrum={"sensitivity": excited * walk},
@@ -361,10 +368,12 @@ class VibrationRandomWalk(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         power = (
             ""
             if self.exponent == 1.0
             else f", with the power {self.quantity('exponent', errors)} of the vibration"
         )
-        return f"Vibration makes the bias walk {self.on_axes()}: {self.quantity('sensitivity', errors)} of K, added in squares{power}."
+        size = self.quantity("sensitivity", errors)
+        size = f"{size} of K, added in squares{power}"
+        return f"Vibration adds rate random walk {self.on_axes()}: {size}."

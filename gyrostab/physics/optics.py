@@ -1,4 +1,4 @@
-"""Effects of the optics and of the loop that is closed around them: dead zone, resets of the ramp, light common to the axes."""
+"""Effects of the optics and the closed loop: dead zone, ramp resets and a shared light source."""
 
 from __future__ import annotations
 
@@ -26,19 +26,18 @@ _HARMONICS = 40
 class DeadZone(Effect):
     """Output that sticks near zero rate.
 
-    ``out = 0`` where ``|w - c| < d``, else ``w - d sgn(w - c)`` (``edge = "offset"``) or w itself
-    (``"jump"``), with ``0`` and w counted from the centre c. The loop sticks to what it follows: w
-    is the signal below `bandwidth`, and what is faster rides on the output unchanged. Without a
-    bandwidth every sample sticks by itself, and noise above d dithers the zone away.
+    ``out = 0`` where ``|w - c| < d``, else ``w - d sgn(w - c)`` (``edge = "offset"``) or w
+    (``"jump"``), with 0 and w relative to the centre c. w is the signal below the `bandwidth` of
+    the loop; faster components pass unchanged. Without a bandwidth every sample sticks
+    independently, and noise above d removes the zone (dither).
 
     *DAVAR*: too small at all times that the loop follows, while the rate is inside. *Window mean*:
-    flat at the centre, and lines of slope one left and right of it, off by d. *Spectrum*: odd
-    harmonics of a rotation that goes through zero; less noise inside. *Axes*: each by its own rate,
-    or that of the axis whose light leaks in.
+    flat at the centre, with slope one and an offset d on both sides. *Spectrum*: odd harmonics of a
+    rotation through zero; less noise inside. *Axes*: each depends on its rate, or on that of the
+    axis whose light leaks in.
 
     Confused with rate_quantization (steps everywhere), held_samples (also far from zero) and small
-    noise: it depends on the rate, and a slow sweep through zero, or the tool turned by 180 degrees,
-    shows it.
+    noise: a slow sweep through zero, or turning the tool by 180 degrees, shows the dead zone.
 
     References
     ----------
@@ -62,7 +61,7 @@ class DeadZone(Effect):
     )
     centre: float = parameter("deg/h", "rate that it sticks to", default=0.0, low=-1e6, high=1e6)
     bandwidth: float = parameter(
-        "Hz", "what the loop follows; inf for every sample by itself", default=math.inf, low=1e-9
+        "Hz", "bandwidth of the loop; inf for independent samples", default=math.inf, low=1e-9
     )
     edge: str = parameter(
         "text",
@@ -72,7 +71,7 @@ class DeadZone(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """The signal with the zone cut out [degree hour-1]."""
+        """Apply the dead zone to the signal [degree hour-1]."""
         if self.width == 0.0:
             return chunk.signal, state
         slow = chunk.signal
@@ -91,38 +90,38 @@ class DeadZone(Effect):
         return chunk.signal + change, state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: less by the width on both sides; nothing is known inside."""
+        """Predict window means reduced by the width on both sides of the zone."""
         away = np.stack([windows.own[axis] for axis in windows.axes]) - self.centre
         outside = np.sign(away) * (np.abs(away) > 0.05 * self.width)
         return Prediction(mean={"width": -outside * (self.edge == "offset")}, marks=("stuck",))
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         size, centre = self.quantity("width", errors), self.quantity("centre", errors)
         return f"The output sticks {self.on_axes()}, while the rate is within {size} of {centre}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeedbackReset(Effect):
-    """Error tied to the 2-pi ramp of the feedback: to its resets, and to its phase.
+    """Error that is phase-locked to the 2-pi ramp of the feedback, or follows its resets.
 
-    The ramp turns once for every ``n lambda / D`` of rotation, so it resets at ``f_r = D w / (n
-    lambda)``. Each reset adds an error of angle: `kick` at once and `tail` over the time `decay`,
-    falling exponentially; with the sign of the rotation. Besides, the error ``A (1 - 2 phase)``
-    goes along the ramp, A the `sawtooth`, phase from 0 to 1. All of it is averaged exactly over
-    every sample, so resets that come faster than the samples fold as they do. The phase is that of
-    the gyro's own rate, noise and all, or with ``phase = "channel"`` that of the channel `ramp`,
-    read at the end of every sample.
+    The ramp turns once for every ``n lambda / D`` of rotation, and resets at ``f_r = D w / (n
+    lambda)``. Each reset adds an angle error with the sign of the rotation: `kick` immediately, and
+    `tail` with the exponential time constant `decay`. In addition, the error ``A (1 - 2 phase)``
+    follows the ramp, where A is the `sawtooth` and the phase goes from 0 to 1. All errors are
+    averaged exactly over every sample, so fast resets are aliased correctly. The phase follows from
+    the gyro's rate including noise, or with ``phase = "channel"`` from the channel `ramp`, read at
+    the end of every sample.
 
     *DAVAR*: a comb at the multiples of 1 / f_r, a bump at 0.371 / f_r, moving to shorter times as
-    the rate grows; at short times it hides N. *Window mean*: ``(kick + tail) f_r``, in proportion
-    to the rate, like a scale factor of ``(kick + tail) D / (n lambda)``. *Spectrum*: a comb at the
-    multiples of f_r, flat for the kick, f^-2 for tail and sawtooth, folded. *Axes*: each by its own
-    rate.
+    the rate grows; at short times it hides N. *Window mean*: ``(kick + tail) f_r``, proportional to
+    the rate, like a scale factor of ``(kick + tail) D / (n lambda)``. *Spectrum*: an aliased comb
+    at the multiples of f_r, flat for the kick, f^-2 for tail and sawtooth. *Axes*: each depends on
+    its rate.
 
-    Confused with spectral_line (does not move), rotation_line (moves with the tool), vibration and
-    Q: the frequency is proportional to the measured rate, and sorted by the phase of the ramp all
-    of it stands at one place.
+    Confused with spectral_line (constant frequency), rotation_line (follows the tool), vibration
+    and Q: the frequency is proportional to the measured rate, and the error is concentrated at one
+    phase of the ramp.
 
     References
     ----------
@@ -186,7 +185,7 @@ class FeedbackReset(Effect):
     )
     phase: str = parameter(
         "text",
-        "what moves the ramp: own rate, or the channel",
+        "source of the ramp's phase: the gyro's rate, or the channel",
         default="rate",
         choices=("rate", "channel"),
     )
@@ -198,7 +197,8 @@ class FeedbackReset(Effect):
         super().__post_init__()
         if self.full == 0.0:
             raise OptionError(
-                f"effect {self.name!r}, parameter 'full': 0 is no ramp; give the channel's reading of a full one"
+                f"effect {self.name!r}, parameter 'full': 0 is not a ramp; "
+                "give the channel's reading of a full one"
             )
 
     @property
@@ -207,16 +207,16 @@ class FeedbackReset(Effect):
         return self.index * self.wavelength / self.diameter
 
     def needs(self) -> tuple[str, ...]:
-        """The ramp, if its phase is not that of the own rate."""
+        """List the ramp, if its phase comes from the channel."""
         return ("ramp",) if self.phase == "channel" else ()
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Turns of the ramp so far (of the channel: none yet), its last reading, and the tail of every axis [degree hour-1]."""
+        """Start with zero turns, no reading of the channel, and no tail on any axis."""
         rows = 1 if self.phase == "channel" else len(setup.axes)
         return np.zeros(rows), None, np.zeros((rows, 1))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """The signal with the errors of the ramp [degree hour-1]."""
+        """Add the errors of the ramp to the signal [degree hour-1]."""
         turns, reading, tail = state
         if self.phase == "channel":
             ramp = chunk.drivers["ramp"] / self.full
@@ -229,15 +229,20 @@ class FeedbackReset(Effect):
             moves = chunk.signal / (self.turn * _NRAD_PER_S * chunk.rate)
         edges = np.cumsum(np.concatenate([turns[:, None], moves], axis=1), axis=1)
         error = self.sawtooth * _sawtooth_means(edges)
-        resets, ages = _resets(edges, self.decay * chunk.rate)
+        resets, ages = _count_resets(edges, self.decay * chunk.rate)
         error = error + self.kick * _NRAD_PER_S * chunk.rate * resets
         if self.tail:
-            added, tail = self._tail(resets, ages, tail, chunk.rate)
+            added, tail = self._average_tail(resets, ages, tail, chunk.rate)
             error = error + added
         return chunk.signal + error, (edges[:, -1], reading, tail)
 
-    def _tail(self, resets: Array, ages: Array, tail: Array, rate: float) -> tuple[Array, Array]:
-        """Means of the tails over the samples, and what is left of them at the end; `ages` sums exp(-age / decay) over resets."""
+    def _average_tail(
+        self, resets: Array, ages: Array, tail: Array, rate: float
+    ) -> tuple[Array, Array]:
+        """Average the tails over samples; return also the rest at the end.
+
+        `ages` sums exp(-age / decay) over the resets in a sample.
+        """
         from scipy.signal import lfilter
 
         samples = self.decay * rate
@@ -248,7 +253,7 @@ class FeedbackReset(Effect):
         return before * samples * -math.expm1(-1.0 / samples) + size * (resets - ages), left[:, -1:]
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Times of the tail about the sampling interval; diameters of coils, or what a recorded ramp says of it and of its sign."""
+        """List decay times near the sampling interval, and diameters (from a recorded ramp)."""
         decay = np.array([0.5, 1.0, 2.0, 4.0, 8.0]) / windows.rate
         turns = float(np.nanmean(windows.turns)) if np.isfinite(windows.turns).any() else 0.0
         rates = np.array(
@@ -262,7 +267,7 @@ class FeedbackReset(Effect):
         if turns == 0.0 or not rates.size:
             return {"diameter": np.geomspace(0.03, 0.3, 8), "decay": decay}
         diameter = self.index * self.wavelength * np.abs(turns * _NRAD_PER_S / rates)
-        known = next(one for one in self.parameters() if one.name == "diameter")
+        known = next(item for item in self.parameters() if item.name == "diameter")
         likely = diameter[(diameter >= known.low) & (diameter <= known.high)]
         full = np.unique(np.sign(turns * rates))
         return {
@@ -272,7 +277,7 @@ class FeedbackReset(Effect):
         }
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means in proportion to the rate; the comb and where its lines show, at the rate of the first axis."""
+        """Predict window means proportional to the rate, and the comb at the first axis's rate."""
         own = np.stack([windows.own[axis] for axis in windows.axes])
         resets = own / self.turn  # deg/h per nrad
         frequency = np.abs(resets[0]) / _NRAD_PER_S
@@ -294,11 +299,11 @@ class FeedbackReset(Effect):
             mean={"kick": resets, "tail": resets},
             spectrum=spectrum,
             line=place,
-            phase_locked=self._profiles(windows),
+            phase_locked=self._predict_profiles(windows),
         )
 
-    def _profiles(self, windows: Windows) -> dict[str, Array]:
-        """Error by phase of the ramp at the end of the sample: that sample holds the kick which the ramp passed its foot in."""
+    def _predict_profiles(self, windows: Windows) -> dict[str, Array]:
+        """Predict the error by phase of the ramp at the end of the sample."""
         if not windows.phase.size:
             return {}
         own = np.stack([windows.own[axis] for axis in windows.axes])
@@ -320,22 +325,21 @@ class FeedbackReset(Effect):
         return {"kick": kick, "tail": tail, "sawtooth": 1.0 - 2.0 * windows.phase}
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         parts = [self.quantity("kick", errors)] if self.kick else []
         parts += (
             [f"{self.quantity('tail', errors)} within {self.quantity('decay', errors)}"]
             if self.tail
             else []
         )
-        also = (
-            f", besides a sawtooth of {self.quantity('sawtooth', errors)}" if self.sawtooth else ""
-        )
+        also = f", and a sawtooth of {self.quantity('sawtooth', errors)}" if self.sawtooth else ""
         size = " and ".join(parts) or "nothing"
-        return f"Every reset of the ramp leaves {size} {self.on_axes()}{also}, one reset for {self.turn / 1e3:.4g} urad of rotation."
+        turn = f"one reset for {self.turn / 1e3:.4g} urad of rotation"
+        return f"Every reset of the ramp leaves {size} {self.on_axes()}{also}, {turn}."
 
 
 def _sawtooth_means(edges: Array) -> Array:
-    """Mean of ``1 - 2 phase`` between successive turns of the ramp."""
+    """Average ``1 - 2 phase`` between successive turns of the ramp."""
     phase = edges - np.floor(edges)
     area = phase * (1.0 - phase)
     moved = np.diff(edges, axis=1)
@@ -345,8 +349,8 @@ def _sawtooth_means(edges: Array) -> Array:
     )
 
 
-def _resets(edges: Array, samples: float) -> tuple[Array, Array]:
-    """Resets in every sample, counted with their sign; and the sum over them of exp(-age / samples), age counted to its end."""
+def _count_resets(edges: Array, samples: float) -> tuple[Array, Array]:
+    """Count the signed resets in every sample, and sum exp(-age / samples) at its end."""
     whole = np.floor(edges)
     resets = np.diff(whole, axis=1)
     moved = np.abs(np.diff(edges, axis=1))
@@ -363,23 +367,23 @@ def _resets(edges: Array, samples: float) -> tuple[Array, Array]:
 class SharedSource(Effect):
     """White noise of the light source that all axes share.
 
-    ``n_a = r_a n(t)``, one n for all axes and r_a the angle random walk that it makes on axis a,
-    with the sign of the modulation there; behind a low-pass of one pole at `bandwidth`, if that is
-    given. It comes on top of the model's own N.
+    ``n_a = r_a n(t)``, with one n for all axes and r_a the angle random walk on axis a, with the
+    sign of the modulation there; after a one-pole low-pass at `bandwidth`, if given. It adds to the
+    model's N.
 
-    *DAVAR*: ``r_a^2 / tau`` more, which nobody can tell from N: it shows in the cross-axis Allan
-    covariance alone, ``r_a r_b / tau`` at all times. *Window mean*: noise. *Spectrum*: flat, and so
-    is the coherence of the axes. *Axes*: ``r_a r_b``, lag zero.
+    *DAVAR*: ``r_a^2 / tau`` more, indistinguishable from N on one axis; visible only in the
+    cross-axis Allan covariance, ``r_a r_b / tau`` at all times. *Window mean*: noise. *Spectrum*:
+    flat, like the coherence of the axes. *Axes*: ``r_a r_b``, lag zero.
 
-    Confused with misalignment and real_motion (coherent at some frequencies, and only in motion),
-    common vibration (coherent with the accelerometers): broadband coherence without lag, at rest as
-    well.
+    Confused with misalignment and real_motion (coherent at some frequencies, and only in motion)
+    and common vibration (coherent with the accelerometers): the coherence is broadband without lag,
+    at rest as well.
 
     References
     ----------
     Blin et al. 2007, IEEE Photon. Technol. Lett. 19, 1520 (excess noise of the source); Cao et al.
     2025, Opt. Commun. 596, 132504 (one source for several axes). Sizes are estimates: where the
-    source limits, a correlation of tens of per cent.
+    source limits the noise, a correlation of tens of per cent.
 
     Examples
     --------
@@ -409,39 +413,39 @@ class SharedSource(Effect):
     )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Where the common noise stands."""
+        """Draw the initial value of the common noise."""
         return rng, (0.0 if math.isinf(self.bandwidth) else float(rng.standard_normal()))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         rng, position = state
         if math.isinf(self.bandwidth):
             common = math.sqrt(chunk.rate) * rng.standard_normal(chunk.size)
         else:
             from gyrostab.kernels.random.stochastic import ornstein_uhlenbeck_means
 
-            time = self._time()
+            time = self._time_constant()
             common, position = ornstein_uhlenbeck_means(
                 rng.standard_normal((chunk.size, 2)), time * chunk.rate, position
             )
             common = common / math.sqrt(2.0 * time)
         return 60.0 * self.each("N", chunk.setup.axes)[:, None] * common, (rng, position)
 
-    def _time(self) -> float:
+    def _time_constant(self) -> float:
         return 1.0 / (2.0 * math.pi * self.bandwidth)
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """No low-pass; or one within the band."""
+        """List low-passes within the band, and none."""
         return {"bandwidth": np.append(windows.rate / np.array([40.0, 20.0, 10.0, 5.0]), math.inf)}
 
     def explain(self, windows: Windows) -> Prediction:
-        """A spectrum, the same process on all axes."""
+        """Predict a spectrum of one process on all axes."""
         density = sampled_psd("N", windows.frequency, windows.rate)
         if math.isfinite(self.bandwidth):
             density = (
                 density
-                * lorentz_density(windows.frequency, self._time(), windows.rate)
-                / (2.0 * self._time())
+                * lorentz_density(windows.frequency, self._time_constant(), windows.rate)
+                / (2.0 * self._time_constant())
             )
         return Prediction(
             spectrum={"N": np.broadcast_to(density, (windows.begin.size, density.size))},
@@ -449,8 +453,9 @@ class SharedSource(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         below = (
             f", below {self.quantity('bandwidth', errors)}" if math.isfinite(self.bandwidth) else ""
         )
-        return f"The light source adds the same noise {self.on_axes()}, {self.quantity('N', errors)}{below}."
+        size = self.quantity("N", errors)
+        return f"The light source adds the same noise {self.on_axes()}, {size}{below}."

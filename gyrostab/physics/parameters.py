@@ -1,4 +1,4 @@
-"""What is known of one parameter of an effect: its unit, range, usual size and source."""
+"""Parameters of effects: unit, range, typical size and source."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ __all__ = ["Parameter", "parameter"]
 
 @dataclass(frozen=True)
 class Parameter:
-    """What is known of one parameter of an effect.
+    """Description of one parameter of an effect.
 
     Attributes
     ----------
     name : str
-        Its name in a model.
+        Name in a model.
     unit : str
-        Unit of its number as people write it ("deg/h/degC"); "text" for a word.
+        Unit of the number, for instance "deg/h/degC"; "text" for a word.
     meaning : str
-        What it is, in a few words.
+        Meaning in a few words.
     default : object
-        Value when a model does not give it; None where it must be given.
+        Value if a model does not give it; None where it must be given.
     typical : object
-        A published or estimated size, for documentation and tests.
+        Published or estimated size, for documentation and tests.
     low, high : float
         Allowed range, ends included.
     choices : tuple of str
-        Allowed words, for a parameter that is a word.
+        Allowed words of a text parameter.
     many : bool
-        One number for each of the effect's axes, or one for all of them; see `Effect.each`.
+        Whether it has one number per axis; see `Effect.each`.
     source : str
-        Where the typical size comes from: author and year, or "estimate".
+        Source of the typical size: author and year, or "estimate".
     """
 
     name: str
@@ -51,7 +51,7 @@ class Parameter:
     source: str
 
     def check(self, value: Any, effect: str) -> Any:
-        """Give `value` back as a float (a tuple of them, a word), or raise `OptionError`."""
+        """Return `value` as a float, a tuple of floats or a word, or raise `OptionError`."""
         where = f"effect {effect!r}, parameter {self.name!r}"
         if self.choices:
             if value not in self.choices:
@@ -69,7 +69,8 @@ class Parameter:
                 raise OptionError(f"{where}: {number!r} is not a number; give one in {self.unit}")
             if not self.low <= number <= self.high:
                 raise OptionError(
-                    f"{where}: {number:g} {self.unit} is outside of the allowed range {self.low:g} to {self.high:g}"
+                    f"{where}: {number:g} {self.unit} is outside of the allowed range "
+                    f"{self.low:g} to {self.high:g}"
                 )
         return tuple(float(number) for number in given) if self.many else float(value)
 
@@ -86,7 +87,7 @@ def parameter(
     many: bool = False,
     source: str = "estimate",
 ) -> Any:
-    """Declare a field of an effect; see `Parameter` for the arguments. Without a default a model must give it."""
+    """Declare a field of an effect; see `Parameter`. Without a default a model must give it."""
     known = {
         "unit": unit,
         "meaning": meaning,

@@ -1,4 +1,4 @@
-"""Phases, lines and folded frequencies: what the effects with a frequency share."""
+"""Phases, spectral lines and aliased frequencies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TURN = 360.0
 
 
 def fold(frequency: Array | float, rate: float) -> Array:
-    """Frequency at which a line shows in samples at `rate` [Hz], from 0 to half of it.
+    """Compute the aliased frequency of a line in samples at `rate` [Hz], from 0 to half of it.
 
     Examples
     --------
@@ -26,7 +26,9 @@ def fold(frequency: Array | float, rate: float) -> Array:
 
 
 def turns_of_samples(rotation: Array, rate: float, carry: float) -> tuple[Array, Array, float]:
-    """Turns at the middle of every sample and inside of it, and at the end of the last, with the rotation rate constant inside of each.
+    """Compute the turns at the middle of every sample, within it, and at the end of the last.
+
+    The rotation rate is constant within a sample.
 
     Parameters
     ----------
@@ -48,12 +50,12 @@ def turns_of_samples(rotation: Array, rate: float, carry: float) -> tuple[Array,
 
 
 def turn_means(middle: Array, inside: Array, phase: Array | float = 0.0) -> Array:
-    """Mean of ``cos(2 pi turns + phase)`` over intervals in which the turns go on evenly; `phase` in radian."""
+    """Average ``cos(2 pi turns + phase)`` over intervals of constant rotation (`phase` in rad)."""
     return np.asarray(np.sinc(inside) * np.cos(2.0 * math.pi * np.remainder(middle, 1.0) + phase))
 
 
 def turns_of_windows(windows: Windows, rotation: Array) -> tuple[Array, Array]:
-    """Turns from the start of the log to the middle of every window, and inside of it, from its mean rotation rate [degree s-1]."""
+    """Compute the turns up to the middle of every window, and within it, from its mean rate."""
     rate, centre = rotation / TURN, windows.centre
     between = (rate[1:] + rate[:-1]) / 2.0 * np.diff(centre)
     return np.cumsum(np.concatenate([rate[:1] * centre[:1], between])), rate * (
@@ -62,14 +64,16 @@ def turns_of_windows(windows: Windows, rotation: Array) -> tuple[Array, Array]:
 
 
 def line_density(windows: Windows, frequency: Array | float, power: Array | float) -> Array:
-    """Two-sided density [Hz-1 times the unit of `power`] that a line adds to the band it lies in; the bands meet halfway, in log frequency.
+    """Compute the two-sided density [unit of `power` Hz-1] that a line adds to its band.
+
+    The bands meet halfway in log frequency.
 
     Parameters
     ----------
     windows : Windows
-        Its bands.
+        Windows with their bands.
     frequency : ndarray, shape (window,)
-        Where the line shows [Hz].
+        Aliased frequency of the line [Hz].
     power : ndarray or float
         Mean square of the line.
 

@@ -1,4 +1,4 @@
-"""The reduced data that *explain* speaks about, and what an effect predicts for them."""
+"""Reduced data, and the prediction of an effect for them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Windows:
-    """The reduced data that *explain* speaks about: means over windows, and spectra in the same windows.
+    """Reduced data for which *explain* predicts means and spectra.
 
     Attributes
     ----------
@@ -26,13 +26,12 @@ class Windows:
     rate : float
         Sampling rate of the log [Hz].
     axes : tuple of str
-        The axes looked at.
+        Axes to predict.
     drivers : mapping of str to ndarray, shape (window,)
         Channels averaged over each window, by the names of `Effect.channels`; vibration as the rms
         over the window.
     fine : mapping of str to ndarray, shape (window, part)
-        Channels averaged over equal parts of each window and freed from noise, where they were
-        sampled that often.
+        Denoised channels averaged over equal parts of each window, where sampled often enough.
     own : mapping of str to ndarray, shape (window,)
         Measured rate of every axis of the log, averaged over each window [degree hour-1].
     gaps, restarts : ndarray, shape (n, 2)
@@ -40,10 +39,10 @@ class Windows:
     phase : ndarray, shape (phase,)
         Centres of the bins of the ramp's phase, from 0 to 1; empty where no ramp was recorded.
     turns : ndarray, shape (window,)
-        Turns of the ramp in a second, negative where it falls [Hz]; empty where no ramp was
+        Turns of the ramp per second, negative where it falls [Hz]; empty where no ramp was
         recorded.
     bands : mapping of str to (float, float)
-        Edges of the band [Hz] that a channel is the rms of, where the log tells.
+        Edges [Hz] of the band of which a channel is the rms, if the log states them.
     """
 
     begin: Array
@@ -66,7 +65,7 @@ class Windows:
         return (self.begin + self.end) / 2.0
 
     def course(self, *names: str) -> tuple[Array, ...]:
-        """Instants [s] and the values of channels then, as fine as all of them are known; windows that overlap have only their means."""
+        """Return times [s] and channel values at the finest common resolution."""
         if not all(name in self.fine for name in names) or (self.begin[1:] < self.end[:-1]).any():
             return self.centre, *(self.drivers[name] for name in names)
         parts = self.fine[names[0]].shape[1]
@@ -77,11 +76,10 @@ class Windows:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What an effect predicts for `Windows`; each part that it leaves empty it does not touch.
+    """Prediction of an effect for `Windows`; an empty field means no effect.
 
-    The parts are linear in the parameters named by their keys, so that a fit can solve for these; a
-    parameter in which the effect is not linear is one of `Effect.nuisance`, and is held at the
-    value of the effect that was asked.
+    The fields are linear in the parameters named by their keys, so that a fit can solve for these.
+    Nonlinear parameters, see `Effect.nuisance`, are fixed at the values of the effect.
 
     Attributes
     ----------
@@ -96,22 +94,21 @@ class Prediction:
     response : ndarray, shape (band,), or None
         Squared magnitude by which the whole spectrum is multiplied (a filter).
     coherent : bool
-        The added spectrum is one process on all axes: it fills the cross-spectra too, with one
-        factor (and sign) per axis.
+        Whether the added spectrum is one process on all axes, which then appears in the
+        cross-spectra with one signed factor per axis.
     line : ndarray, shape (window,) or (harmonic, window), or None
         Frequency of a line in every window [Hz], folded below half of the sampling rate.
     marks : tuple of str
-        What it raises in the distribution of the samples: outliers, repeats (of any value but zero
-        and the ends of the range), extremes, stuck (zeros of one axis by itself), filled (zeros of
-        all axes at once, or of a single axis in runs), lattice.
+        Kinds of anomalous samples that it causes: outliers, repeats (of any value but zero and the
+        ends of the range), extremes, stuck (zeros of one axis alone), filled (zeros of all axes at
+        once, or of a single axis in runs), lattice (a quantization grid).
     transfer : mapping of (str, str) to complex ndarray, shape (band,)
         (parameter, channel) -> transfer function from the channel to the rate, per unit [degree
-        hour-1 per unit of the channel]. The name of an axis in place of a channel stands for the
-        rate of that axis.
+        hour-1 per unit of the channel]. The channel can be an axis, whose rate is meant.
     order : mapping of str to complex ndarray, shape (axis, harmonic)
         Parameter -> pattern of the harmonics of the rotation over axes, up to one complex factor
-        (size and phase); where the parameter is one number for each axis, every axis and harmonic
-        has a factor of its own.
+        (size and phase); where the parameter has one number per axis, every axis and harmonic has a
+        separate factor.
     phase_locked : mapping of str to ndarray, shape (phase,)
         Parameter -> mean by phase of the ramp, per unit [degree hour-1 per unit].
     wander : mapping of str to (float, ndarray of shape (window,))
@@ -119,8 +116,8 @@ class Prediction:
         unit its variance [degree2 hour-2], for a walk the growth of its variance [degree2 hour-2
         s-1], in every window.
     levels : str
-        Parameter that is the step between two levels of the mean, where it hops to and fro between
-        them at random.
+        Parameter that is the step between two levels, where the mean switches between them at
+        random.
     """
 
     mean: Mapping[str, Array] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""All effects by name: every `Effect` that a module of this package defines."""
+"""Registry of the effects that the modules of this package define."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["amount", "close_to", "effect_table", "effects", "make_effect"]
 
 @cache
 def effects() -> Mapping[str, type[Effect]]:
-    """Name -> class, of every effect in the modules of `gyrostab.physics`, sorted by name.
+    """Map the name of every effect in `gyrostab.physics` to its class, sorted by name.
 
     Examples
     --------
@@ -44,7 +44,8 @@ def effects() -> Mapping[str, type[Effect]]:
                 continue
             if item.name in found:
                 raise TypeError(
-                    f"two effects have the name {item.name!r}: {found[item.name].__module__} and {home}"
+                    f"two effects have the name {item.name!r}: "
+                    f"{found[item.name].__module__} and {home}"
                 )
             found[item.name] = item
     return MappingProxyType(dict(sorted(found.items())))
@@ -71,10 +72,10 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
     --------
     >>> make_effect({"name": "temperature_bias", "sensitivity": 0.002}).reference
     25.0
-    >>> make_effect({"name": "temperature_bais"})
+    >>> make_effect({"name": "temperature_bais"})  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ...
-    gyrostab.errors.OptionError: effect: there is no effect 'temperature_bais' (did you mean 'temperature_bias'?); there are ...
+    gyrostab.errors.OptionError: effect: there is no effect 'temperature_bais' (did you mean ...
     """
     name = table.get("name")
     if name is None:
@@ -83,7 +84,8 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
         )
     if not isinstance(name, str) or name not in effects():
         raise OptionError(
-            f"{where}: there is no effect {name!r}{close_to(name, list(effects()))}; there are {', '.join(effects())}"
+            f"{where}: there is no effect {name!r}{close_to(name, list(effects()))}; "
+            f"there are {', '.join(effects())}"
         )
     kind = effects()[name]
     known = {item.name: item for item in kind.parameters()}
@@ -92,24 +94,26 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
         if key not in known and key not in ("axes", "driver"):
             listed = ", ".join(f"{item.name} [{item.unit}]" for item in known.values())
             raise OptionError(
-                f"{where}: effect {name!r} has no parameter {key!r}{close_to(key, list(known))}; it has {listed}, and axes and driver"
+                f"{where}: effect {name!r} has no parameter {key!r}{close_to(key, list(known))}; "
+                f"it has {listed}, and axes and driver"
             )
     for key in ("axes", "driver"):
         given = values.get(key, [])
         if not isinstance(given, str) and not (
-            isinstance(given, list | tuple) and all(isinstance(one, str) for one in given)
+            isinstance(given, list | tuple) and all(isinstance(entry, str) for entry in given)
         ):
             raise OptionError(f"{where}: effect {name!r}: {key} = {given!r} is not a list of names")
     for key in kind.required():
         if key not in values:
             item = known[key]
             raise OptionError(
-                f"{where}: effect {name!r} lacks the parameter {key!r} ({item.meaning}); give a number in {item.unit}, {_typical(item)}"
+                f"{where}: effect {name!r} lacks the parameter {key!r} ({item.meaning}); "
+                f"give a number in {item.unit}, for instance {item.typical}"
             )
     try:
         return kind(
             **{
-                key: _number(value, known[key]) if key in known else value
+                key: _read_value(value, known[key]) if key in known else value
                 for key, value in values.items()
             }
         )
@@ -117,12 +121,8 @@ def make_effect(table: Mapping[str, Any], *, where: str = "effect") -> Effect:
         raise OptionError(f"{where}: {error}") from error
 
 
-def _typical(item: Parameter) -> str:
-    return f"for instance {item.typical}"
-
-
 def close_to(word: Any, words: Sequence[str]) -> str:
-    """The end of a message about an unknown word: the nearest known one, or nothing."""
+    """Suggest the nearest known word for the end of a message, if there is one."""
     close = difflib.get_close_matches(str(word), words, 1)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
@@ -131,26 +131,26 @@ _SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": HOUR
 _HERTZ = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "1/min": 1 / 60}
 
 
-def _number(value: Any, item: Parameter) -> Any:
-    """A value of a model for this parameter, in its unit."""
+def _read_value(value: Any, item: Parameter) -> Any:
+    """Read a value of a model for a parameter, in its unit."""
     return value if item.choices else amount(value, item.unit, f"parameter {item.name!r}")
 
 
 def amount(value: Any, unit: str, where: str) -> Any:
-    """Read a value of a model: a number as it is, text such as ``"3 min"`` converted to `unit`, a list one by one.
+    """Read a value of a model in `unit`: a number, text such as ``"3 min"``, or a list of these.
 
     Raises
     ------
     OptionError
-        When the text is no number with a unit that fits.
+        When the text is not a number with a matching unit.
 
     Examples
     --------
-    >>> amount("3 min", "s", "lag"), amount(0.4, "deg/h", "bias"), amount("300 K", "degC", "reference")
-    (180.0, 0.4, 26.85...)
+    >>> amount("3 min", "s", "lag"), amount("300 K", "degC", "reference")
+    (180.0, 26.85...)
     """
     if isinstance(value, list | tuple):
-        return [amount(one, unit, where) for one in value]
+        return [amount(entry, unit, where) for entry in value]
     if not isinstance(value, str):
         return value
     match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*", value)
@@ -172,7 +172,7 @@ def amount(value: Any, unit: str, where: str) -> Any:
 
 
 def effect_table() -> pd.DataFrame:
-    """The reference of the effects: one row for each parameter.
+    """Tabulate the parameters of all effects.
 
     Returns
     -------
@@ -197,12 +197,12 @@ def effect_table() -> pd.DataFrame:
                     "unit": item.unit,
                     "required": item.name in must,
                 }
-                | _columns(item)
+                | _describe_parameter(item)
             )
     return pd.DataFrame(rows)
 
 
-def _columns(item: Parameter) -> dict[str, Any]:
+def _describe_parameter(item: Parameter) -> dict[str, Any]:
     return {
         key: getattr(item, key)
         for key in ("default", "typical", "low", "high", "meaning", "source")

@@ -1,4 +1,4 @@
-"""Effects of rotation: errors in proportion to it, and rotation that is real."""
+"""Effects of rotation: errors proportional to it, and real rotation."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class ScaleFactor(Effect):
 
     ``e = (S + S_T (T - T0)) w + A |w| + C w^3``
 
-    *DAVAR*: a copy of what w does: ramps give R, steps a K, stick-slip a bump; nothing while w
-    stands. *Window mean*: follows w. *Spectrum*: that of w. *Axes*: the axis of rotation only; 100
-    ppm of 180 r/min are 389 deg/h.
+    *DAVAR*: a scaled copy of w: ramps give R, steps a K, stick-slip a bump; no effect at constant
+    w. *Window mean*: follows w. *Spectrum*: that of w. *Axes*: the axis of rotation only; 100 ppm
+    of 180 r/min are 389 deg/h.
 
-    Confused with misalignment (seen on the other axes, in proportion to a foreign rate), and
-    clock_error (the same on all axes): the error turns its sign with w, but for the asymmetry, and
-    the rotation must be known by other means than the gyro (magnetometer, accelerometers).
+    Confused with misalignment (on the other axes, proportional to the rate of another axis), and
+    clock_error (the same on all axes): the error changes sign with w, except for the asymmetry, and
+    the rotation must be known independently of the gyro (magnetometer, accelerometers).
 
     References
     ----------
@@ -84,13 +84,13 @@ class ScaleFactor(Effect):
     )
 
     def needs(self) -> tuple[str, ...]:
-        """The rotation rate unless the true rate is taken, and the temperature if it matters."""
+        """List the rotation rate unless the true rate is used, and the temperature if needed."""
         return ("rotation_rate",) * (self.rotation == "channel") + ("temperature",) * bool(
             self.thermal
         )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         if self.rotation == "channel":
             rate = chunk.drivers["rotation_rate"] * HOUR
         else:
@@ -105,7 +105,10 @@ class ScaleFactor(Effect):
         return error * _PPM, state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: functions of the mean rotation rate, which is all of the mean but for asymmetry and cubic while it wanders."""
+        """Predict window means from the mean rotation rate.
+
+        This is exact except for asymmetry and cubic while the rate varies within a window.
+        """
         if self.rotation == "channel":
             rate = windows.drivers["rotation_rate"] * HOUR
         else:
@@ -116,7 +119,7 @@ class ScaleFactor(Effect):
         return Prediction(mean={name: _PPM * design for name, design in mean.items()})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         terms = [
             f"{name} {self.quantity(name, errors)}"
             for name in self.size_parameters
@@ -127,18 +130,19 @@ class ScaleFactor(Effect):
 
 @dataclass(frozen=True, kw_only=True)
 class Misalignment(Effect):
-    """The true rate of other axes leaks in.
+    """Leak of the true rate of other axes by misalignment angles.
 
-    ``e = m_x w_x + m_y w_y + m_z w_z``, without the axis's own rate, w the true rates of the log's
-    axes named x, y and z. What moves them stands in the same model: real_motion, earth_rate.
+    ``e = m_x w_x + m_y w_y + m_z w_z``, without the rate of the axis itself, where w are the true
+    rates of the log's axes x, y and z. The same model must contain their motion (real_motion,
+    earth_rate).
 
     *DAVAR*: a copy of the other axis's motion, scaled: 1 mrad of 180 r/min is 3900 deg/h. *Window
     mean*: follows the other axis. *Spectrum*: lines and motion of the other axis only. *Axes*:
     coherent with the other gyro where there is true motion, not elsewhere.
 
     Confused with scale_factor (own axis only), shared_source (broadband coherence also at rest) and
-    real_motion (accelerometers see it): the coherence has to vanish while the tool stands, and the
-    factor to be the same at all rates.
+    real_motion (accelerometers see it): the coherence must vanish at rest, and the factor must be
+    the same at all rates.
 
     References
     ----------
@@ -157,17 +161,17 @@ class Misalignment(Effect):
     references: ClassVar[tuple[str, ...]] = ("IEEE Std 952-1997",)
 
     x: float = parameter(
-        "mrad", "lean towards axis x", default=0.0, typical=0.5, low=-1e3, high=1e3
+        "mrad", "misalignment angle towards axis x", default=0.0, typical=0.5, low=-1e3, high=1e3
     )
     y: float = parameter(
-        "mrad", "lean towards axis y", default=0.0, typical=0.5, low=-1e3, high=1e3
+        "mrad", "misalignment angle towards axis y", default=0.0, typical=0.5, low=-1e3, high=1e3
     )
     z: float = parameter(
-        "mrad", "lean towards axis z", default=0.0, typical=0.5, low=-1e3, high=1e3
+        "mrad", "misalignment angle towards axis z", default=0.0, typical=0.5, low=-1e3, high=1e3
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         error = np.zeros(chunk.shape)
         for source in self.size_parameters:
             size = getattr(self, source)
@@ -175,8 +179,9 @@ class Misalignment(Effect):
                 continue
             if source not in chunk.true:
                 raise SchemaError(
-                    f"effect {self.name!r} needs the rate of axis {source!r}, which the log does not have; it has "
-                    f"{', '.join(chunk.true)}; set {source} = 0 or name the axes x, y, z"
+                    f"effect {self.name!r} needs the rate of axis {source!r}, which the log does "
+                    f"not have; it has {', '.join(chunk.true)}; "
+                    f"set {source} = 0 or name the axes x, y, z"
                 )
             for row, axis in enumerate(chunk.setup.axes):
                 if axis != source:
@@ -184,7 +189,7 @@ class Misalignment(Effect):
         return error, state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: the measured rates of the other axes."""
+        """Predict window means proportional to the measured rates of the other axes."""
         mean = {}
         for source in self.size_parameters:
             if source in windows.own and any(axis != source for axis in windows.axes):
@@ -195,13 +200,14 @@ class Misalignment(Effect):
         return Prediction(mean=mean, transfer={(source, source): flat for source in mean})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         terms = [
             f"{self.quantity(name, errors)} of {name}"
             for name in self.size_parameters
             if getattr(self, name)
         ]
-        return f"The rotation of other axes leaks in {self.on_axes()}, by {', '.join(terms) or 'nothing'}."
+        size = ", ".join(terms) or "nothing"
+        return f"The rotation of other axes leaks in {self.on_axes()}, by {size}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,17 +216,16 @@ class EarthRate(Effect):
 
     With inclination I from straight down, azimuth A and latitude L, the tool sees ``W_d = W (cos L
     sin I cos A - sin L cos I)`` along its axis, ``W_h = W (cos L cos I cos A + sin L sin I)``
-    towards the high side and ``W_r = -W cos L sin A`` to the right of it. An axis that stands at
-    `off` degrees from the tool's axis, and `around` it at the angle a from x towards y, sees
-    ``cos(off) W_d + sin(off) (W_h cos(F + a) + W_r sin(F + a))``, with the toolface F = F0 +
-    integral of the rotation rate, clockwise looking down the hole. Axes named x, y, z (or ending
-    so) stand at 90, 90, 0 degrees off and 0, 90, 0 around. Each sample is the mean over its
-    interval.
+    towards the high side and ``W_r = -W cos L sin A`` to the right of it. An axis at `off` degrees
+    from the tool's axis, and at the angle a (`around`) from x towards y, sees ``cos(off) W_d +
+    sin(off) (W_h cos(F + a) + W_r sin(F + a))``, with the toolface F = F0 + integral of the
+    rotation rate, clockwise looking down the hole. Axes with names that end in x, y, z have 90, 90,
+    0 degrees off and 0, 90, 0 around. Each sample is the mean over its interval.
 
     *DAVAR*: ``A^2 sin^4(pi f tau) / (pi f tau)^2``, a bump of sigma at tau = 0.371 / f with A of at
-    most 15.04 deg/h, smeared where f wanders; nothing while the tool stands. *Window mean*: the
-    constant part along the tool; steps between toolfaces where it stands. *Spectrum*: a line at the
-    frequency of rotation. *Axes*: quadrature between x and y, equal in size; none on z.
+    most 15.04 deg/h, smeared where f varies; no effect at rest. *Window mean*: the constant part
+    along the tool; steps between toolfaces at rest. *Spectrum*: a line at the frequency of
+    rotation. *Axes*: quadrature between x and y, equal in size; no line on z.
 
     Confused with g_sensitivity and magnetic (free amplitude, phase of gravity or field), and
     rotation_line: here amplitude and phase follow from latitude, inclination and azimuth.
@@ -232,8 +237,9 @@ class EarthRate(Effect):
 
     Examples
     --------
-    >>> EarthRate(latitude=60).say()
-    'The earth turns with 15.04 deg/h; the tool at latitude 60 deg sees 7.521 deg/h across and -13.03 deg/h along itself, on all axes.'
+    >>> print(EarthRate(latitude=60).say())
+    The earth turns with 15.04 deg/h; the tool at latitude 60 deg sees 7.521 deg/h across and -13.03
+    deg/h along itself, on all axes.
     """
 
     name: ClassVar[str] = "earth_rate"
@@ -281,7 +287,7 @@ class EarthRate(Effect):
     )
 
     def components(self) -> tuple[float, float, float]:
-        """Rate along the tool, towards its high side and to the right of it [degree hour-1]."""
+        """Compute the rate along the tool, to its high side and to the right [degree hour-1]."""
         lat, inc, azi = (
             math.radians(angle) for angle in (self.latitude, self.inclination, self.azimuth)
         )
@@ -291,31 +297,32 @@ class EarthRate(Effect):
         return along, high, -north * math.sin(azi)
 
     def directions(self, axes: tuple[str, ...]) -> tuple[Array, Array]:
-        """Angles of the axes from the tool's axis and around it [radian]."""
-        if self.off or self.around:  # across the tool unless it is said how far off
+        """Compute the angles of the axes from the tool's axis and around it [radian]."""
+        if self.off or self.around:  # across the tool by default
             off = self.each("off", axes) if self.off else np.full(len(axes), 90.0)
             return np.radians(off), np.radians(self.each("around", axes))
         known = {"x": (90.0, 0.0), "y": (90.0, 90.0), "z": (0.0, 0.0)}
         for axis in axes:
             if axis[-1:].lower() not in known:
                 raise OptionError(
-                    f"effect {self.name!r}: axis {axis!r} is not x, y or z; say where it looks with off and around [deg]"
+                    f"effect {self.name!r}: axis {axis!r} is not x, y or z; "
+                    "give its direction with off and around [deg]"
                 )
         off, around = np.radians(np.array([known[axis[-1].lower()] for axis in axes])).T
         return off, around
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Turns of the tool so far."""
+        """Check the directions, and start with zero turns of the tool."""
         self.directions(setup.axes)
         return 0.0
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """True rate [degree hour-1] on every sample."""
+        """Compute the true rate [degree hour-1] of every sample."""
         middle, inside, state = turns_of_samples(chunk.drivers["rotation_rate"], chunk.rate, state)
-        return self._seen(middle, inside, chunk.setup.axes), state
+        return self._average_rate(middle, inside, chunk.setup.axes), state
 
-    def _seen(self, middle: Array, inside: Array, axes: tuple[str, ...]) -> Array:
-        """Mean over intervals of what the axes see."""
+    def _average_rate(self, middle: Array, inside: Array, axes: tuple[str, ...]) -> Array:
+        """Average the rate on the axes over intervals."""
         along, high, right = self.components()
         off, around = self.directions(axes)
         phase = math.radians(self.toolface) + around - math.atan2(right, high)
@@ -326,13 +333,13 @@ class EarthRate(Effect):
         )
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """The toolface at the start; the rest is known to a survey."""
+        """List initial toolfaces; a survey knows the other parameters."""
         return {"toolface": np.arange(0.0, 360.0, 30.0)}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means, and where the line shows."""
+        """Predict window means, and the frequency of the line."""
         rotation = windows.drivers["rotation_rate"]
-        seen = self._seen(*turns_of_windows(windows, rotation), windows.axes)
+        seen = self._average_rate(*turns_of_windows(windows, rotation), windows.axes)
         off, around = self.directions(windows.axes)
         across = math.hypot(*self.components()[1:]) / self.rate if self.rate else 0.0
         pattern = np.zeros((len(windows.axes), 3), np.complex128)
@@ -344,35 +351,34 @@ class EarthRate(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         along, high, right = self.components()
         across = math.hypot(high, right)
-        seen = (
-            f"sees {across:.4g} deg/h across and {along:.4g} deg/h along itself, {self.on_axes()}"
-        )
-        return f"The earth turns with {self.quantity('rate', errors)}; the tool at latitude {self.quantity('latitude')} {seen}."
+        seen = f"{across:.4g} deg/h across and {along:.4g} deg/h along itself, {self.on_axes()}"
+        earth = f"The earth turns with {self.quantity('rate', errors)}"
+        return f"{earth}; the tool at latitude {self.quantity('latitude')} sees {seen}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class RealMotion(Effect):
-    """Rotation that is no error: sway, the turning of the tool, and tilt of the mounting under acceleration.
+    """Real rotation: sway, rotation of the tool, and tilt of the mounting under acceleration.
 
     ``w_a = d_a (sway(t) + spin w(t) + d/dt (c_x a_x + c_y a_y + c_z a_z))``: d_a is the share of
-    each axis (a direction); sway is the velocity of an oscillator of stated frequency and quality
-    shaken by white noise; w the rotation rate; c the tilt per acceleration, whose change in a
+    each axis (a direction); sway is the velocity of an oscillator of given frequency and quality
+    driven by white noise; w the rotation rate; c the tilt per acceleration, whose change in a
     sample is the rotation in it. All of it is true rate, which misalignment, scale_factor and
-    dead_zone see. The turning of the tool itself is in the log without this effect where the
-    channel ``rotation_rate`` names the axis in its attribute ``rotation_axis``; `spin` is for what
-    another direction sees of it.
+    dead_zone act on. The rotation of the tool is in the log without this effect where the channel
+    ``rotation_rate`` names the axis in its attribute ``rotation_axis``; `spin` is its projection on
+    another direction.
 
-    *DAVAR*: bump of the sway at 0.371 / f without a floor at long times; the turning as it is.
-    *Window mean*: the turning; sway and tilt leave nothing, because the angle stays bounded.
+    *DAVAR*: bump of the sway at 0.371 / f without a floor at long times; the rotation itself.
+    *Window mean*: the rotation; sway and tilt average to zero because the angle is bounded.
     *Spectrum*: a peak of width f / Q; tilt has f^2 times that of the accelerations. *Axes*: one
-    motion in one direction: coherence of one, with the signs of the direction.
+    motion in one direction, with coherence one and the signs of the direction.
 
-    Confused with vibration_rectification and vibration_noise (not coherent over the axes as one
-    rotation) and shared_source (broadband, also at rest): accelerometers and the fixed direction in
-    space tell.
+    Confused with vibration_rectification and vibration_noise (not one coherent rotation) and
+    shared_source (broadband, also at rest): accelerometers, and the fixed direction in space,
+    separate them.
 
     References
     ----------
@@ -433,20 +439,20 @@ class RealMotion(Effect):
     )
 
     def needs(self) -> tuple[str, ...]:
-        """The rotation rate if there is spin, and the accelerations that tilt it."""
+        """List the rotation rate if there is spin, and the accelerations that cause tilt."""
         return ("rotation_rate",) * bool(self.spin) + tuple(
             f"accel_{name}" for name in "xyz" if getattr(self, name)
         )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """The oscillator in its stationary state; no tilt yet."""
+        """Draw the stationary state of the oscillator; the tilt starts at zero."""
         from gyrostab.kernels.random.coloured import oscillator, rest
 
         reading = oscillator(self.frequency, self.quality, setup.rate)
         return reading, rng, rest(reading, rng.standard_normal(2)), None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """True rate [degree hour-1] on every sample."""
+        """Compute the true rate [degree hour-1] of every sample."""
         from gyrostab.kernels.random.coloured import march
 
         reading, rng, position, tilt = state
@@ -459,7 +465,7 @@ class RealMotion(Effect):
         bent = [name for name in "xyz" if getattr(self, name)]
         if bent:
             angle = sum(
-                (self._bend(name) * chunk.drivers[f"accel_{name}"] for name in bent),
+                (self._tilt_degrees(name) * chunk.drivers[f"accel_{name}"] for name in bent),
                 np.zeros(chunk.size),
             )
             motion += np.diff(angle, prepend=angle[0] if tilt is None else tilt) * (
@@ -473,16 +479,16 @@ class RealMotion(Effect):
             tilt,
         )
 
-    def _bend(self, name: str) -> float:
-        """Tilt per acceleration [degree g-1]."""
+    def _tilt_degrees(self, name: str) -> float:
+        """Convert a tilt per acceleration to [degree g-1]."""
         return math.degrees(getattr(self, name) * _MRAD)
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Where the sway is, and how sharp."""
+        """List frequencies and qualities of the sway."""
         return {"frequency": windows.frequency, "quality": np.array([5.0, 20.0, 80.0])}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: turning and tilt; and the spectrum of the sway, the same process on all axes."""
+        """Predict window means of rotation and tilt, and the coherent spectrum of the sway."""
         from gyrostab.kernels.random.coloured import folded_psd, oscillator_psd
 
         direction = self.each("direction", windows.axes)[:, None]
@@ -508,7 +514,7 @@ class RealMotion(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         terms = []
         if self.sway:
             terms.append(

@@ -1,4 +1,4 @@
-"""Effects of temperature on the bias: by itself, by its change, its differences and its history."""
+"""Effects of temperature on the bias: its value, its change, its differences and its history."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gyrostab.units import HOUR, INNER
 __all__ = ["Shupe", "TemperatureBias", "ThermalGradient", "ThermalHysteresis"]
 
 _MINUTE = 60.0
-_AT_ONCE = 1e-3  # s: a lag that is none
+_NO_LAG_S = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,13 +25,12 @@ class TemperatureBias(Effect):
 
     ``b = a1 (T - T0) + a2 (T - T0)^2 + a3 (T - T0)^3``
 
-    *DAVAR*: nothing while the temperature stands, an apparent R of ``|a1 dT/dt|`` at the longest
-    averaging times while it moves. *Window mean*: follows the temperature, the same on the way up
-    and down. *Spectrum*: that of the temperature. *Axes*: each has its own coefficient, of either
-    sign.
+    *DAVAR*: no effect at constant temperature, an apparent R of ``|a1 dT/dt|`` at the longest
+    averaging times while it changes. *Window mean*: follows the temperature, equally up and down.
+    *Spectrum*: that of the temperature. *Axes*: independent signed coefficients.
 
     Confused with shupe (follows dT/dt: changes sign with the direction of the ramp), with
-    ageing_bias and random walk (do not turn back with the temperature) and with supply_bias (the
+    ageing_bias and random walk (do not return with the temperature) and with supply_bias (the
     supply follows the temperature: regress on both).
 
     References
@@ -67,44 +66,45 @@ class TemperatureBias(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         above = chunk.drivers["temperature"] - self.reference
         return above * (self.sensitivity + above * (self.quadratic + above * self.cubic)), state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: the powers of the temperature."""
+        """Predict window means proportional to powers of the temperature."""
         above = windows.drivers["temperature"] - self.reference
         return Prediction(mean={"sensitivity": above, "quadratic": above**2, "cubic": above**3})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         names = [name for name in self.size_parameters if getattr(self, name)] or ["sensitivity"]
         terms = [self.quantity(name, errors) for name in names]
-        return f"The bias follows the temperature {self.on_axes()}, by {', '.join(terms)} around {self.quantity('reference')}."
+        size = f"{', '.join(terms)} around {self.quantity('reference')}"
+        return f"The bias follows the temperature {self.on_axes()}, by {size}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shupe(Effect):
-    """Bias that follows the change of the temperature as the coil feels it.
+    """Bias that follows the change of the coil temperature (Shupe effect).
 
     ``b = s h * dT/dt + r d/dt (T_outer - T_inner)``
 
-    The coil is a winding that is heated from outside (T) and insulated inside. h is how the mean of
-    the winding follows its surface: a sum of diffusion modes of the times ``lag / (2 n - 1)^2``,
-    the slowest ``lag = 4 d^2 / (pi^2 kappa)`` for the thickness d. s is what is left of the
-    winding's asymmetry, pure and elasto-optic in one; r what the outer half of the layers does
-    against the inner one, while heat is on its way. A sensor that is later than the surface by
-    ``sensor_lag`` shows it a temperature of which the surface was ``T + sensor_lag dT/dt``; layers
-    that nearly cancel do the same, for they follow the second derivative.
+    The coil is a winding that is heated from outside (T) and insulated inside. h is the response of
+    the winding's mean to its surface: a sum of diffusion modes of the times ``lag / (2 n - 1)^2``,
+    the slowest ``lag = 4 d^2 / (pi^2 kappa)`` for the thickness d. s is the residual asymmetry of
+    the winding, pure and elasto-optic together; r is the effect of the outer half of the layers
+    against the inner one, during the heat flow. With a sensor that lags the surface by
+    ``sensor_lag``, the surface temperature is ``T + sensor_lag dT/dt``; nearly cancelling layers
+    have the same effect because they follow the second derivative.
 
-    *DAVAR*: nothing at a steady ramp, for the bias is constant. Where a ramp of the rate v begins
-    or ends the bias moves by s v within the lag: K = s v / sqrt(W) in windows W much longer than
-    the lag, R of about s v / lag in short ones. *Window mean*: a plateau s v while ramping, then an
-    exponential return; odd in the direction. *Spectrum*: f^2 times that of the temperature, below
-    the lag. *Axes*: each coil has its own size and sign.
+    *DAVAR*: no effect at a steady ramp because the bias is constant. Where a ramp of the rate v
+    begins or ends the bias changes by s v within the lag: K = s v / sqrt(W) in windows W much
+    longer than the lag, R of about s v / lag in short ones. *Window mean*: a plateau s v during the
+    ramp, then an exponential return; odd in the direction. *Spectrum*: f^2 times that of the
+    temperature, below the lag. *Axes*: independent size and sign for each coil.
 
-    Confused with temperature_bias (even: the same on the way up and down), warm_up (starts with the
-    power, not with the temperature outside), thermal_hysteresis (stays on a plateau) and
+    Confused with temperature_bias (even: equal for rising and falling T), warm_up (starts with the
+    power, not with the outside temperature), thermal_hysteresis (persists on a plateau) and
     thermal_gradient (a second sensor decides). A ramp up, a plateau and a ramp down separate them,
     by regression on T and on dT/dt at several lags together.
 
@@ -119,8 +119,9 @@ class Shupe(Effect):
 
     Examples
     --------
-    >>> Shupe(sensitivity=0.05, axes=["x"]).say()
-    'The bias follows the change of the temperature on axis x, by 0.05 deg/h/(degC/min) with a lag of 265 s.'
+    >>> print(Shupe(sensitivity=0.05, axes=["x"]).say())
+    The bias follows the change of the temperature on axis x, by 0.05 deg/h/(degC/min) with a lag of
+    265 s.
     """
 
     name: ClassVar[str] = "shupe"
@@ -159,7 +160,7 @@ class Shupe(Effect):
     )
     sensor_lag: float = parameter(
         "s",
-        "by how much the sensor of the temperature is later than the surface of the winding",
+        "lag of the temperature sensor behind the surface of the winding",
         default=0.0,
         low=0.0,
         high=HOUR,
@@ -169,19 +170,21 @@ class Shupe(Effect):
         super().__post_init__()
         if self.modes != int(self.modes):
             raise OptionError(
-                f"effect {self.name!r}, parameter 'modes': {self.modes:g} is not a whole number of modes; give one"
+                f"effect {self.name!r}, parameter 'modes': {self.modes:g} "
+                "is not a whole number of modes; give one"
             )
         if self.transient and self.modes < 2:
             raise OptionError(
-                f"effect {self.name!r}: transient needs at least 2 modes, for one mode has no outer and inner half"
+                f"effect {self.name!r}: transient needs at least 2 modes, "
+                "because one mode has no outer and inner half"
             )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """No heat on its way."""
+        """Start in thermal equilibrium."""
         return None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.thermal import relax, slab
 
         temperature = chunk.drivers["temperature"]
@@ -198,19 +201,21 @@ class Shupe(Effect):
         return _MINUTE * (self.sensitivity * felt[0] + self.transient * felt[1]), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Lags from none over simple sensors to thick windings, beside sensors on the winding and off it."""
+        """List lags from none to thick windings, with sensors on the winding and off it."""
         return {
-            "lag": np.append(_AT_ONCE, np.geomspace(30.0, 3000.0, 6)),
+            "lag": np.append(_NO_LAG_S, np.geomspace(30.0, 3000.0, 6)),
             "sensor_lag": np.array([0.0, 20.0, 60.0]),
         }
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means, from the temperature as finely as it is known, joined by straight lines."""
+        """Predict window means from the temperature at its finest resolution, linearly joined."""
         from gyrostab.kernels.thermal import mean_rates, slab
 
         times, whole, halves = slab(self.lag, int(self.modes))
         at, temperature = windows.course("temperature")
-        modes = np.stack([_felt(windows, at, temperature, float(time)) for time in times])
+        modes = np.stack(
+            [_average_changes(windows, at, temperature, float(time)) for time in times]
+        )
         if self.sensor_lag:
             ahead = (self.sensor_lag / times)[:, None]
             modes = (1.0 - ahead) * modes + ahead * _MINUTE * mean_rates(
@@ -219,7 +224,7 @@ class Shupe(Effect):
         return Prediction(mean={"sensitivity": whole @ modes, "transient": halves @ modes})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         terms = (
             [self.quantity("sensitivity", errors)] if self.sensitivity or not self.transient else []
         )
@@ -238,8 +243,8 @@ class Shupe(Effect):
 
 
 def _with_lag(effect: Shupe | ThermalGradient, errors: Mapping[str, float] | None) -> str:
-    """The lag in words; one that is none is known to be short."""
-    if effect.lag > _AT_ONCE:
+    """Describe the lag, or its upper limit."""
+    if effect.lag > _NO_LAG_S:
         return f"with a lag of {effect.quantity('lag', errors)}"
     return (
         f"with a lag of {NORMAL_95 * errors['lag']:.2g} s at most"
@@ -248,8 +253,8 @@ def _with_lag(effect: Shupe | ThermalGradient, errors: Mapping[str, float] | Non
     )
 
 
-def _felt(windows: Windows, at: Array, values: Array, lag: float) -> Array:
-    """Window means of a delayed rate of change of values at instants [unit of the values min-1]."""
+def _average_changes(windows: Windows, at: Array, values: Array, lag: float) -> Array:
+    """Average a lagged rate of change over the windows [unit of the values min-1]."""
     from gyrostab.kernels.thermal import mean_changes
 
     return _MINUTE * mean_changes(at, values, windows.begin, windows.end, lag)
@@ -261,14 +266,14 @@ class ThermalGradient(Effect):
 
     ``b = s (T1 - T2) + r h * d(T1 - T2)/dt``, h a lag
 
-    *DAVAR*: nothing at a steady gradient, R while it builds up, K-like in windows longer than that.
-    *Window mean*: follows the difference: zero on plateaus, a plateau at steady ramps, with the lag
-    between both sensors. *Spectrum*: that of the difference. *Axes*: often of opposite sign on axes
-    mounted the other way round.
+    *DAVAR*: no effect at a steady gradient, R while it builds up, K-like in longer windows. *Window
+    mean*: follows the difference: zero on plateaus, a plateau at steady ramps, with the lag between
+    both sensors. *Spectrum*: that of the difference. *Axes*: often of opposite sign on axes mounted
+    in opposite directions.
 
-    Confused with shupe, which looks the same where one of the temperatures follows the other with a
-    lag: only a second sensor, and heat that comes from another side (electronics, circulation),
-    separate them. With one sensor both belong to the answer.
+    Confused with shupe, which is equivalent where one of the temperatures follows the other with a
+    lag: only a second sensor, and heat from another side (electronics, circulation), separate them.
+    With one sensor both belong to the ambiguity set.
 
     References
     ----------
@@ -279,8 +284,8 @@ class ThermalGradient(Effect):
 
     Examples
     --------
-    >>> ThermalGradient(sensitivity=0.05, axes=["x"]).say()
-    'The bias follows the difference of temperature and temperature_2 on axis x, by 0.05 deg/h/degC.'
+    >>> print(ThermalGradient(sensitivity=0.05, axes=["x"]).say())
+    The bias follows the difference of temperature and temperature_2 on axis x, by 0.05 deg/h/degC.
     """
 
     name: ClassVar[str] = "thermal_gradient"
@@ -309,11 +314,11 @@ class ThermalGradient(Effect):
     lag: float = parameter("s", "lag of that change", default=60.0, low=1e-3, high=1e6)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """No change before the start."""
+        """Start without a change."""
         return None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.thermal import relax
 
         difference = chunk.drivers["temperature"] - chunk.drivers["temperature_2"]
@@ -324,19 +329,22 @@ class ThermalGradient(Effect):
         return self.sensitivity * difference + _MINUTE * self.change * felt[0], state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Lags of the change."""
-        return {"lag": np.append(_AT_ONCE, np.geomspace(10.0, 1000.0, 5))}
+        """List lags of the change."""
+        return {"lag": np.append(_NO_LAG_S, np.geomspace(10.0, 1000.0, 5))}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means of the difference and of its change."""
+        """Predict window means of the difference and of its change."""
         difference = windows.drivers["temperature"] - windows.drivers["temperature_2"]
-        at, one, other = windows.course("temperature", "temperature_2")
+        at, first, second = windows.course("temperature", "temperature_2")
         return Prediction(
-            mean={"sensitivity": difference, "change": _felt(windows, at, one - other, self.lag)}
+            mean={
+                "sensitivity": difference,
+                "change": _average_changes(windows, at, first - second, self.lag),
+            }
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         terms = (
             [self.quantity("sensitivity", errors)] if self.sensitivity or not self.change else []
         )
@@ -344,36 +352,39 @@ class ThermalGradient(Effect):
             terms.append(
                 f"{self.quantity('change', errors)} of its change, {_with_lag(self, errors)}"
             )
-        return f"The bias follows the difference of {' and '.join(self.channel_names().values())} {self.on_axes()}, by {', '.join(terms)}."
+        names = " and ".join(self.channel_names().values())
+        size = ", ".join(terms)
+        return f"The bias follows the difference of {names} {self.on_axes()}, by {size}."
 
 
 @dataclass(frozen=True, kw_only=True)
 class ThermalHysteresis(Effect):
-    """Bias that depends on the way that the temperature came.
+    """Temperature hysteresis of the bias.
 
-    ``b = a (T - H)``, H the play of half-width w: a slider that T drags along, and that stands
-    while T moves inside of its play
+    ``b = a (T - H)``, where H follows T with a dead band of half-width w: it is constant while T
+    moves inside of the dead band, and is dragged along by T otherwise.
 
-    So b goes from -a w on the way down to a w on the way up, over the first 2 w after a turn,
-    whatever the speed; at the start it is zero.
+    After a reversal, b changes from -a w (falling T) to a w (rising T) over the first 2 w, whatever
+    the speed; at the start it is zero.
 
-    *DAVAR*: an apparent R of ``a dT/dt`` over the first 2 w after a turn and nothing beyond; in
+    *DAVAR*: an apparent R of ``a dT/dt`` over the first 2 w after a reversal, no effect beyond; in
     long windows a step of 2 a w. *Window mean*: a loop over T of the area ``2 a w (range - 2 w)``,
-    run through in one direction. *Spectrum*: that of slow steps. *Axes*: each has its own size and
-    sign.
+    always in the same direction. *Spectrum*: that of slow steps. *Axes*: independent sizes and
+    signs.
 
-    Confused with shupe (goes back on a plateau; this one stays) and ageing_bias (comes not back in
-    a closed cycle): hold the temperature, and run closed cycles at two speeds.
+    Confused with shupe (decays on a plateau; hysteresis persists) and ageing_bias (does not close
+    in a cycle): hold the temperature, and run closed cycles at two speeds.
 
     References
     ----------
     Zhou et al. 2025, Micromachines 16, 357 (hysteresis of resonator gyros over temperature). Sizes
-    are estimates: a play of 1 to 10 degC, 10 to 50 % of what the temperature does by itself.
+    are estimates: a dead band of 1 to 10 degC, 10 to 50 % of the temperature bias.
 
     Examples
     --------
-    >>> ThermalHysteresis(sensitivity=3e-4, width=4, axes=["x"]).say()
-    'The bias depends on the way the temperature came on axis x, by 0.0003 deg/h/degC within a play of 4 degC to each side.'
+    >>> print(ThermalHysteresis(sensitivity=3e-4, width=4, axes=["x"]).say())
+    The bias has a temperature hysteresis on axis x, of 0.0003 deg/h/degC within a dead band of 4
+    degC to each side.
     """
 
     name: ClassVar[str] = "thermal_hysteresis"
@@ -384,34 +395,34 @@ class ThermalHysteresis(Effect):
     references: ClassVar[tuple[str, ...]] = ("Zhou et al. 2025, Micromachines 16, 357",)
 
     sensitivity: float = parameter(
-        "deg/h/degC", "bias per degree inside of the play", typical=3e-4, low=-10.0, high=10.0
+        "deg/h/degC", "bias per degree in the dead band", typical=3e-4, low=-10.0, high=10.0
     )
-    width: float = parameter("degC", "half of the play", default=3.0, low=0.0, high=500.0)
+    width: float = parameter("degC", "half of the dead band", default=3.0, low=0.0, high=500.0)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """The slider will start at the first temperature."""
+        """Start without a position; the dead band will be centred on the first temperature."""
         return None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.thermal import play
 
         temperature = np.ascontiguousarray(chunk.drivers["temperature"])
         if not chunk.size:
             return np.zeros(0), state
-        slider, state = play(
+        follower, state = play(
             temperature, self.width, float(temperature[0]) if state is None else state
         )
-        return self.sensitivity * (temperature - slider), state
+        return self.sensitivity * (temperature - follower), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Plays up to a third of the range of the temperature."""
+        """List dead bands up to a third of the range of the temperature."""
         return {
             "width": np.ptp(windows.drivers["temperature"]) * np.array([0.01, 0.03, 0.1, 0.2, 0.33])
         }
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means, with the play run by the temperature as finely as it is known, joined by straight lines."""
+        """Predict window means from the temperature at its finest resolution, linearly joined."""
         from gyrostab.kernels.thermal import mean_play
 
         at, temperature = windows.course("temperature")
@@ -419,6 +430,7 @@ class ThermalHysteresis(Effect):
         return Prediction(mean={"sensitivity": apart})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
-        size = f"{self.quantity('sensitivity', errors)} within a play of {self.quantity('width', errors)} to each side"
-        return f"The bias depends on the way the temperature came {self.on_axes()}, by {size}."
+        """Describe the effect in one sentence."""
+        size, width = self.quantity("sensitivity", errors), self.quantity("width", errors)
+        band = f"within a dead band of {width} to each side"
+        return f"The bias has a temperature hysteresis {self.on_axes()}, of {size} {band}."

@@ -14,26 +14,26 @@ from gyrostab.units import INNER
 
 __all__ = ["AliasedVibration", "GSensitivity", "Magnetic", "VibrationRectification"]
 
-_LOWEST = 0.01  # Hz, of an edge of a band
+_MIN_EDGE_HZ = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Vector(Effect):
-    """Bias that is the scalar product of a vector channel, named ``..._x``, ``..._y``, ``..._z``, with the parameters x, y, z."""
+    """Bias that is the scalar product of a vector channel with the parameters x, y, z."""
 
     def needs(self) -> tuple[str, ...]:
-        """Only the components that it is sensitive to."""
+        """List the components with a nonzero sensitivity."""
         return tuple(channel for channel in self.channels if getattr(self, channel[-1]))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         bias = np.zeros(chunk.size)
         for channel in self.needs():
             bias += getattr(self, channel[-1]) * chunk.drivers[channel]
         return bias, state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: the components that there are."""
+        """Predict window means from the present components."""
         return Prediction(
             mean={
                 name[-1]: windows.drivers[name] for name in self.channels if name in windows.drivers
@@ -41,7 +41,7 @@ class _Vector(Effect):
         )
 
     def parts(self, errors: Mapping[str, float] | None) -> str:
-        """``"0.01 deg/h/g along x"``, for sentences."""
+        """Format the components: ``"0.01 deg/h/g along x"``."""
         named = [
             f"{self.quantity(name, errors)} along {name}"
             for name in self.size_parameters
@@ -58,12 +58,12 @@ class GSensitivity(_Vector):
 
     *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps at changes of
     the toolface (apparent K in the windows across them). *Window mean*: follows gravity in the
-    tool. *Spectrum*: a line at the frequency of rotation. *Axes*: every axis follows the same
-    accelerations with factors of its own.
+    tool. *Spectrum*: a line at the frequency of rotation. *Axes*: all follow the same accelerations
+    with separate factors.
 
-    Confused with vibration_rectification (even in g, this one is odd: turn the tool over),
-    earth_rate (known amplitude, no free factor) and magnetic (phase of the magnetic field, not of
-    gravity).
+    Confused with vibration_rectification (even in g, while g_sensitivity is odd: turn the tool
+    over), earth_rate (known amplitude, no free factor) and magnetic (phase of the magnetic field,
+    not of gravity).
 
     References
     ----------
@@ -97,14 +97,14 @@ class GSensitivity(_Vector):
     )
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: the components that there are; and the same factor at every frequency."""
+        """Predict window means from the present components, and a flat transfer function."""
         flat = np.ones(windows.frequency.size, np.complex128)
         return replace(
             super().explain(windows), transfer={(name[-1], name): flat for name in self.channels}
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         return f"The bias follows the acceleration {self.on_axes()}, by {self.parts(errors)}."
 
 
@@ -114,26 +114,26 @@ class VibrationRectification(Effect):
 
     ``b = k2 g^2 + k4 g^4``, g the rms acceleration
 
-    *DAVAR*: a step D where vibration starts or stops, and so ``D^2 tau / (3 (W - 2 tau))`` in the
-    windows W across it: an apparent ``K = D / sqrt(W)`` that is gone in windows wholly inside.
-    *Window mean*: steps up with the vibration and back with it. *Spectrum*: nothing but that of
-    ``g^2``. *Axes*: each has its own factor; the sign does not depend on the direction of the
-    vibration.
+    *DAVAR*: a step D where vibration starts or stops, which gives ``D^2 tau / (3 (W - 2 tau))`` in
+    the windows W across it: an apparent ``K = D / sqrt(W)`` that is absent in windows entirely
+    inside. *Window mean*: steps with the vibration. *Spectrum*: that of ``g^2``. *Axes*:
+    independent factors; the sign does not depend on the direction of the vibration.
 
-    Confused with g_sensitivity (odd in g; one event cannot tell g from g^2, two levels of vibration
-    can), bias_jump (does not go back when vibration ends), vibration_random_walk (grows inside the
-    windows, too) and real_motion (seen by accelerometers and by the other axes).
+    Confused with g_sensitivity (odd in g; two levels of vibration separate g from g^2), bias_jump
+    (does not revert when vibration ends), vibration_random_walk (also grows inside windows) and
+    real_motion (seen by accelerometers and by the other axes).
 
     References
     ----------
     Qin et al. 2026 (0.0118 to 0.0445 deg/h under a sine of 6 g at 30 Hz, which is 0.7e-3 to 2.5e-3
-    deg/h/g^2); Cordova 1998, US patent 5847829 (windings that bring it down). Scaled to the 13.39 g
+    deg/h/g^2); Cordova 1998, US patent 5847829 (windings that reduce it). Scaled to the 13.39 g
     of Wang et al. 2016: 0.1 to 0.4 deg/h.
 
     Examples
     --------
-    >>> VibrationRectification(sensitivity=1.5e-3, axes=["x"]).say()
-    'Vibration is rectified to a bias on axis x, of 0.0015 deg/h/g^2 times the square of the rms vibration.'
+    >>> print(VibrationRectification(sensitivity=1.5e-3, axes=["x"]).say())
+    Vibration is rectified to a bias on axis x, of 0.0015 deg/h/g^2 times the square of the rms
+    vibration.
     """
 
     name: ClassVar[str] = "vibration_rectification"
@@ -160,17 +160,17 @@ class VibrationRectification(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         square = chunk.drivers["vibration"] ** 2
         return square * (self.sensitivity + square * self.quartic), state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means: the mean square of the vibration, and its square."""
+        """Predict window means from the mean square of the vibration, and its square."""
         square = windows.drivers["vibration"] ** 2
         return Prediction(mean={"sensitivity": square, "quartic": square**2})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         terms = []
         if self.sensitivity or not self.quartic:
             terms.append(
@@ -184,26 +184,26 @@ class VibrationRectification(Effect):
 
 @dataclass(frozen=True, kw_only=True)
 class AliasedVibration(Effect):
-    """Angular vibration in a band, as the samples see it: what lies above half of the sampling rate folds down.
+    """Angular vibration in a band above half of the sampling rate, which is aliased.
 
     ``rate(t) = s g(t) v(t)``: v is noise of unit power between `low` and `high` (Butterworth, half
-    power at both), behind a mount of stated resonance, if any; g is the rms of the vibration. A
+    power at both), after a mount with a resonance, if given; g is the rms of the vibration. A
     sample is v at its beginning (``"point"``) or the mean of v over its interval (``"average"``,
-    integrate and dump). So the samples have the density ``sum_k S(f + k fs) |H(f + k fs)|^2`` with
-    H = 1 or sinc(f / fs), because they are drawn from the process in continuous time, not because
-    it is put in. Where the model makes the instrument sample faster than the log, this is about the
-    instrument, and the logger's own filter decides the rest.
+    integrate and dump). The samples are drawn from the process in continuous time, and therefore
+    have the density ``sum_k S(f + k fs) |H(f + k fs)|^2`` with H = 1 or sinc(f / fs). Where the
+    instrument of the model samples faster than the log, fs is the rate of the instrument, and the
+    filter of the logger follows.
 
     *DAVAR*: point samples raise sigma at all averaging times, like N, where the band folds onto
     zero frequency (the 700 to 800 Hz of Wang et al. 2016 at 400 Hz fills 0 to 100 Hz: 8 times at
     2.5 ms, 19 times from 40 ms on with 50 deg/h and N = 0.0031); integrate and dump has its zeros
     there and raises short times only, like Q (1.3, 1.4, 1.1 times at 2.5, 10, 40 ms). *Window
-    mean*: nothing, and no bias. *Spectrum*: the folded band. *Axes*: one rigid motion, with a
-    factor for each axis.
+    mean*: no effect. *Spectrum*: the aliased band. *Axes*: one rigid motion, with a factor for each
+    axis.
 
-    Confused with vibration_noise (flat, no cross-spectrum), with Q (not tied to vibration) and
-    spikes (heavy tails). What separates them is the edge of the folded band, coherence of the axes,
-    and another sampling rate, at which the band folds elsewhere.
+    Confused with vibration_noise (flat, no cross-spectrum), with Q (independent of vibration) and
+    spikes (heavy tails). The edge of the aliased band, the coherence of the axes, and another
+    sampling rate, which moves the band, separate them.
 
     References
     ----------
@@ -213,8 +213,9 @@ class AliasedVibration(Effect):
 
     Examples
     --------
-    >>> AliasedVibration(sensitivity=4.0, low=700, high=800).say()
-    'Vibration at 700 to 800 Hz folds into the samples on all axes, with 4 deg/h/g; each sample is a point of it.'
+    >>> print(AliasedVibration(sensitivity=4.0, low=700, high=800).say())
+    Vibration at 700 to 800 Hz folds into the samples on all axes, with 4 deg/h/g; each sample is a
+    point of it.
     """
 
     name: ClassVar[str] = "aliased_vibration"
@@ -234,7 +235,7 @@ class AliasedVibration(Effect):
         "Hz",
         "lower edge of the band",
         default=700.0,
-        low=_LOWEST,
+        low=_MIN_EDGE_HZ,
         high=1e5,
         source="Wang et al. 2016",
     )
@@ -242,7 +243,7 @@ class AliasedVibration(Effect):
         "Hz",
         "upper edge of the band",
         default=800.0,
-        low=_LOWEST,
+        low=_MIN_EDGE_HZ,
         high=1e5,
         source="Wang et al. 2016",
     )
@@ -258,11 +259,12 @@ class AliasedVibration(Effect):
         super().__post_init__()
         if not self.low < self.high:
             raise OptionError(
-                f"effect {self.name!r}: the band from low = {self.low:g} to high = {self.high:g} Hz is empty; low must be below high"
+                f"effect {self.name!r}: the band from low = {self.low:g} "
+                f"to high = {self.high:g} Hz is empty; low must be below high"
             )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """The process at rest in its stationary state."""
+        """Draw the stationary state of the process."""
         from gyrostab.kernels.random.coloured import band, rest
 
         average = self.sampling == "average"
@@ -282,7 +284,7 @@ class AliasedVibration(Effect):
         )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1] on every sample."""
+        """Compute the rate contribution [degree hour-1] of every sample."""
         from gyrostab.kernels.random.coloured import march
 
         reading, rng, position, sensitivity = state
@@ -296,13 +298,13 @@ class AliasedVibration(Effect):
         )
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
-        """Points and averages of the band that the log tells of its vibration; of the usual band where it tells none."""
+        """List point samples and averages of the band of the vibration channel, if known."""
         low, high = windows.bands.get("vibration", (self.low, self.high))
-        edges = {"low": max(low, _LOWEST), "high": max(high, 2.0 * _LOWEST)}
+        edges = {"low": max(low, _MIN_EDGE_HZ), "high": max(high, 2.0 * _MIN_EDGE_HZ)}
         return [edges | {"sampling": taken} for taken in ("point", "average")]
 
     def explain(self, windows: Windows) -> Prediction:
-        """The folded spectrum, the same process on all axes."""
+        """Predict the aliased spectrum of one process on all axes."""
         from gyrostab.kernels.random.coloured import band_psd, folded_psd
 
         def density(f: Array) -> Array:
@@ -316,7 +318,7 @@ class AliasedVibration(Effect):
         return Prediction(spectrum={"sensitivity": power[:, None] * folded}, coherent=True)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         mount = (
             f", behind a mount with a resonance at {self.quantity('resonance', errors)}"
             if self.resonance
@@ -325,7 +327,8 @@ class AliasedVibration(Effect):
         taken = "a point of it" if self.sampling == "point" else "its mean over the interval"
         size = self.quantity("sensitivity", errors)
         band = f"{self.low:.4g} to {self.high:.4g} Hz"
-        return f"Vibration at {band} folds into the samples {self.on_axes()}, with {size}{mount}; each sample is {taken}."
+        folds = f"Vibration at {band} folds into the samples {self.on_axes()}"
+        return f"{folds}, with {size}{mount}; each sample is {taken}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,8 +339,7 @@ class Magnetic(_Vector):
 
     *DAVAR*: the bump of a sinusoid at 0.371 / f while the tool rotates with f; steps where the tool
     turns or passes casing. *Window mean*: follows the field. *Spectrum*: a line at the frequency of
-    rotation, with the phase of the field. *Axes*: every axis follows the same field with factors of
-    its own.
+    rotation, with the phase of the field. *Axes*: all follow the same field with separate factors.
 
     Confused with earth_rate (known amplitude, quadrature between the cross axes) and g_sensitivity
     (phase of gravity): the angle between field and gravity in the tool separates them, best at two
@@ -375,5 +377,5 @@ class Magnetic(_Vector):
     )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         return f"The bias follows the magnetic field {self.on_axes()}, by {self.parts(errors)}."

@@ -1,4 +1,4 @@
-"""The bias of a gyro that gets warm after it was switched on."""
+"""Warm-up of a gyro after power-on."""
 
 from __future__ import annotations
 
@@ -19,28 +19,27 @@ __all__ = ["WarmUp"]
 
 @dataclass(frozen=True, kw_only=True)
 class WarmUp(Effect):
-    """Bias that dies away after every power-on.
+    """Bias that decays after every power-on.
 
     ``b = A q exp(-(t - t_on) / t_w) + A2 q2 exp(-(t - t_on) / t_2)``
 
     t_on is the start of the log, the end of every restart, and of every gap of at least `gap`. q is
-    one for a cold gyro; with a time of `cooling` a short loss of power brings back only what it had
-    time to cool by: ``q = 1 - (1 - left) exp(-t_off / cooling)``.
+    one for a cold gyro; with a time constant of `cooling`, a short loss of power restores only a
+    part: ``q = 1 - (1 - left) exp(-t_off / cooling)``.
 
     *DAVAR*: an apparent R of ``(A / t_w) exp(-(t - t_on) / t_w)`` at long averaging times, a ridge
     that fades after every restart, and a step across it. *Window mean*: an exponential after each.
-    *Spectrum*: nothing but the lowest bands. *Axes*: all at once, with sizes and signs of their
-    own.
+    *Spectrum*: lowest bands only. *Axes*: simultaneous, with independent sizes and signs.
 
-    Confused with shupe and temperature_bias (the gyro warms itself: a temperature inside shows
-    both), bias_jump (stays) and a random walk (does not repeat): stack what follows the restarts;
-    it is the same curve after equally long breaks.
+    Confused with shupe and temperature_bias (the gyro heats itself: an internal temperature shows
+    both), bias_jump (permanent) and a random walk (does not repeat): stack the data after restarts;
+    equally long breaks give the same curve.
 
     References
     ----------
     Lefevre 2014, The Fiber-Optic Gyroscope, 2nd ed. (thermal transients). Sizes are estimates: 0.01
-    to 0.5 deg/h for a gyro of 0.03 deg/h, 0.3 to 5 for one of 1 to 10 deg/h; 1 to 30 min, often two
-    times at once.
+    to 0.5 deg/h for a gyro of 0.03 deg/h, 0.3 to 5 for one of 1 to 10 deg/h; 1 to 30 min, often
+    with two time constants.
 
     Examples
     --------
@@ -63,7 +62,7 @@ class WarmUp(Effect):
     )
     slow_time: float = parameter("s", "its time constant", default=HOUR, low=1e-3, high=1e7)
     cooling: float = parameter(
-        "s", "time constant of cooling without power; 0 for at once", default=0.0, low=0.0, high=1e6
+        "s", "time constant of cooling without power; 0 for none", default=0.0, low=0.0, high=1e6
     )
     gap: float = parameter(
         "s",
@@ -79,20 +78,20 @@ class WarmUp(Effect):
         high=1.0,
     )
 
-    def _parts(self) -> tuple[tuple[str, float, float], ...]:
+    def _list_parts(self) -> tuple[tuple[str, float, float], ...]:
         return ("amplitude", self.amplitude, self.time), (
             "slow_amplitude",
             self.slow_amplitude,
             self.slow_time,
         )
 
-    def _losses(self, gaps: NDArray[Any], restarts: NDArray[Any], second: float) -> Array:
-        """Losses of power [s] from the tables of gaps and restarts, in which a second is `second`."""
+    def _list_losses(self, gaps: NDArray[Any], restarts: NDArray[Any], second: float) -> Array:
+        """List losses of power [s] from gaps and restarts in units of 1 / `second` s."""
         long = (gaps[:, 1] - gaps[:, 0]) >= self.gap * second * (1.0 - 1e-9)
-        return _merged(np.concatenate([restarts, gaps[long]])) / second
+        return _merge_spans(np.concatenate([restarts, gaps[long]])) / second
 
-    def _shares(self, losses: Array, time: float) -> Array:
-        """Share of the full amplitude at the start of the log and after every loss of power, for a part with this time constant."""
+    def _initial_shares(self, losses: Array, time: float) -> Array:
+        """Compute the share of the amplitude at the start and after every loss of power."""
         on, share, found = 0.0, self.cold, [self.cold]
         for gone, back in losses.tolist():
             left = share * math.exp(-(gone - on) / time)
@@ -104,14 +103,14 @@ class WarmUp(Effect):
         return np.array(found)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Times of power-on, and where each part starts then."""
-        losses = self._losses(setup.gaps, setup.restarts, setup.rate)
+        """Compute the times of power-on, and the initial share of each part."""
+        losses = self._list_losses(setup.gaps, setup.restarts, setup.rate)
         return np.concatenate([[0.0], losses[:, 1]]), [
-            self._shares(losses, time) for _, _, time in self._parts()
+            self._initial_shares(losses, time) for _, _, time in self._list_parts()
         ]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Rate contribution [degree hour-1], averaged over every sample."""
+        """Compute the rate contribution [degree hour-1], averaged over every sample."""
         on, shares = state
         which = (
             np.searchsorted(
@@ -121,7 +120,7 @@ class WarmUp(Effect):
         )
         since = chunk.seconds - on[which]
         bias = np.zeros(chunk.size)
-        for (_, amplitude, time), share in zip(self._parts(), shares, strict=True):
+        for (_, amplitude, time), share in zip(self._list_parts(), shares, strict=True):
             if not amplitude:
                 continue
             inside = 1.0 / (chunk.rate * time)
@@ -131,7 +130,7 @@ class WarmUp(Effect):
         return bias, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """Time constants of the gyro and of its cooling."""
+        """List time constants of the gyro and of its cooling."""
         slow = {"slow_time": np.geomspace(1800.0, 14400.0, 4)} if self.slow_amplitude else {}
         return {
             "time": np.geomspace(60.0, 1800.0, 6),
@@ -139,38 +138,41 @@ class WarmUp(Effect):
         } | slow
 
     def explain(self, windows: Windows) -> Prediction:
-        """Window means over the time in which there are data."""
-        losses = self._losses(windows.gaps, windows.restarts, 1.0)
-        holes = _merged(np.concatenate([windows.gaps, windows.restarts]))
+        """Predict window means over the time with data."""
+        losses = self._list_losses(windows.gaps, windows.restarts, 1.0)
+        holes = _merge_spans(np.concatenate([windows.gaps, windows.restarts]))
         begin, end = np.concatenate([[0.0], holes[:, 1]]), np.concatenate([holes[:, 0], [np.inf]])
         on = np.concatenate([[0.0], losses[:, 1]])
         which = np.searchsorted(on, begin, side="right") - 1
-        present = _over(windows, begin, end, lambda row, t: t - begin[row])
+        present = _integrate_windows(windows, begin, end, lambda row, t: t - begin[row])
         mean = {}
-        for name, _, time in self._parts():
-            share = self._shares(losses, time)[which]
-            total = _over(
+        for name, _, time in self._list_parts():
+            share = self._initial_shares(losses, time)[which]
+            total = _integrate_windows(
                 windows,
                 begin,
                 end,
-                partial(_decay, time=time, size=share, since=begin - on[which], begin=begin),
+                partial(
+                    _integrate_decay, time=time, size=share, since=begin - on[which], begin=begin
+                ),
             )
             mean[name] = np.divide(total, present, out=np.zeros_like(total), where=present > 0)
         return Prediction(mean=mean)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        """Say it in one sentence."""
+        """Describe the effect in one sentence."""
         size, time = self.quantity("amplitude", errors), self.quantity("time", errors)
-        slow = (
-            f", and {self.quantity('slow_amplitude', errors)} with {self.quantity('slow_time', errors)}"
-            if self.slow_amplitude
-            else ""
-        )
-        return f"The bias starts {size} off {self.on_axes()} after every power-on and settles with {time}{slow}."
+        settles = f"settles with {time}"
+        if self.slow_amplitude:
+            slow, slow_time = (
+                self.quantity(f"slow_{name}", errors) for name in ("amplitude", "time")
+            )
+            settles += f", and {slow} with {slow_time}"
+        return f"The bias starts {size} off {self.on_axes()} after every power-on and {settles}."
 
 
-def _merged(spans: NDArray[Any]) -> Array:
-    """Spans in order, those that meet made one."""
+def _merge_spans(spans: NDArray[Any]) -> Array:
+    """Sort spans, and merge those that touch."""
     rows: list[list[float]] = []
     for begin, end in sorted(spans.tolist()):
         if rows and begin <= rows[-1][1]:
@@ -180,19 +182,19 @@ def _merged(spans: NDArray[Any]) -> Array:
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 
-def _decay(
+def _integrate_decay(
     row: NDArray[np.int64], t: Array, *, time: float, size: Array, since: Array, begin: Array
 ) -> Array:
-    """Integral of an exponential from the beginning of a stretch, `since` after its power-on, to t."""
+    """Integrate an exponential from the begin of a span, `since` after its power-on, to t."""
     return np.asarray(
         time * size[row] * np.exp(-since[row] / time) * -np.expm1(-(t - begin[row]) / time)
     )
 
 
-def _over(
+def _integrate_windows(
     windows: Windows, begin: Array, end: Array, part: Callable[[NDArray[np.int64], Array], Array]
 ) -> Array:
-    """Integral over every window of what is given in the stretches `begin` to `end`; ``part(row, t)`` is that from begin[row] to t."""
+    """Integrate over every window; ``part(row, t)`` is the integral from begin[row] to t."""
     until = np.maximum(np.minimum(end, windows.end.max()), begin)
     before = np.concatenate([[0.0], np.cumsum(part(np.arange(begin.size), until))])
 

@@ -13,9 +13,13 @@ from gyrostab.plot.comparison import plot_comparison
 from gyrostab.plot.correlation import plot_correlation
 from gyrostab.plot.figures import save_figures
 from gyrostab.plot.signal import plot_signal
+from gyrostab.plot.style import COLOURS, MARKERS, new_figure, save_png
 from gyrostab.plot.surface import plot_davar, plot_davar_3d
 
 __all__ = [
+    "COLOURS",
+    "MARKERS",
+    "new_figure",
     "plot_adev",
     "plot_coefficients",
     "plot_comparison",
@@ -24,4 +28,5 @@ __all__ = [
     "plot_davar_3d",
     "plot_signal",
     "save_figures",
+    "save_png",
 ]

@@ -1,4 +1,4 @@
-"""Cases: repeatable, sized as they say, buried where they say so, and nothing of the truth in what is handed over."""
+"""Cases: reproducible, of the stated size and visibility, with recordings free of the truth."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def white_scenario(*, rate: float = 10.0, seconds: float = 2000.0):
     return replace(scenario, noise=noise, missing=np.zeros(scenario.size, dtype=bool))
 
 
-def test_limit_of_a_mean_is_the_closed_form():
+def test_limit_of_a_mean_matches_closed_form():
     scenario = white_scenario()
     mean = np.zeros((3, scenario.size))
     mean[1, 5000:8000] = 1.0  # 300 s of 2000 s
@@ -74,7 +74,7 @@ def test_limit_of_a_mean_is_the_closed_form():
 
 
 @pytest.mark.parametrize(("size", "time"), [(0.3, 80.0), (-0.05, 15.0), (2.0, 0.0)])
-def test_nearest_follower_of_a_driver_has_the_sensitivity_at_rest_and_its_lag(size, time):
+def test_lagged_driver_fit_recovers_static_sensitivity_and_lag(size, time):
     scenario = replace(white_scenario(), missing=np.arange(20_000) % 7 < 2)
     step = np.where(np.arange(scenario.temperature.size) >= 600, 1.5, 0.0)
     since = np.maximum(np.arange(scenario.size) / scenario.rate - 600.0, 0.0)
@@ -88,8 +88,8 @@ def test_nearest_follower_of_a_driver_has_the_sensitivity_at_rest_and_its_lag(si
     assert found[1] == pytest.approx(time, abs=1.5)  # the driver has one value a second
 
 
-def test_true_numbers_of_a_slow_supply_leave_next_to_nothing_of_it():
-    """What follows the voltage at once leaves a tenth and more of it."""
+def test_true_parameters_of_a_slow_supply_bias_explain_it():
+    """An instantaneous response would leave a tenth or more unexplained."""
     scenario = white_scenario()
     slow = [
         e
@@ -109,9 +109,9 @@ def test_true_numbers_of_a_slow_supply_leave_next_to_nothing_of_it():
             assert np.var(seen - size * followed) < 0.05 * np.var(seen)
 
 
-def test_latitude_is_that_of_the_rate_across_the_tool_wherever_it_rests():
+def test_latitude_follows_from_the_cross_axis_earth_rate():
     scenario = draw_scenario(np.random.default_rng(3), rate=10.0, seconds=900.0)
-    turning = np.arange(scenario.rotation.size) * 0.1 < 300.0  # at rest for longer, at some angle
+    turning = np.arange(scenario.rotation.size) * 0.1 < 300.0  # at rest longer than turning
     scenario = replace(scenario, rotation=np.where(turning, 60.0, 0.0))
     for seed in range(4):
         effect = CATALOGUE["earth_rate"].make(scenario, stream(seed, "rest"), strength=4.0)
@@ -129,7 +129,7 @@ def test_latitude_is_that_of_the_rate_across_the_tool_wherever_it_rests():
         ("scale_factor", "cubic"),
     ],
 )
-def test_a_bent_response_is_not_compared_with_one_term_of_several(name, term):
+def test_nonlinear_response_is_not_compared_with_a_single_term(name, term):
     scenario = draw_scenario(np.random.default_rng(3), rate=10.0, seconds=900.0)
     scenario = replace(
         scenario, rotation=np.maximum(scenario.rotation, 1e-3 * np.arange(scenario.rotation.size))
@@ -146,7 +146,7 @@ def test_a_bent_response_is_not_compared_with_one_term_of_several(name, term):
 @pytest.mark.parametrize(
     ("frequency", "least", "most"), [(0.5, 0.8, 1.0), (1 / 4000, 0.0, 0.2)], ids=["fast", "slow"]
 )
-def test_noise_that_is_learned_takes_in_a_slow_mean_and_no_fast_one(frequency, least, most):
+def test_fitted_noise_absorbs_a_slow_mean_only(frequency, least, most):
     scenario = white_scenario()
     mean = np.zeros((3, scenario.size))
     mean[1] = np.cos(2 * math.pi * frequency * np.arange(scenario.size) / scenario.rate)
@@ -156,7 +156,7 @@ def test_noise_that_is_learned_takes_in_a_slow_mean_and_no_fast_one(frequency, l
     assert learned_nats(scenario, np.zeros_like(mean)) == 0.0
 
 
-def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
+def test_limit_of_a_mean_matches_simulated_likelihoods():
     scenario = replace(
         white_scenario(), noise=tuple({"N": 0.003, "B": 0.002, "K": 0.02, "Q": 0.0} for _ in AXES)
     )
@@ -164,8 +164,8 @@ def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
     mean = np.zeros((3, scenario.size))
     mean[0] = np.cos(2 * math.pi * t / 700)
     mean *= 2.0 / mean_size(scenario, mean)
-    red = mean_size(scenario, mean, white=True)
-    assert red > 2.05  # random walk hides a slow mean, so the same size takes more amplitude
+    white_size = mean_size(scenario, mean, white=True)
+    assert white_size > 2.05  # random walk hides a slow mean: equal size needs more amplitude
     from scipy import fft
 
     from gyrostab.blindtest.generator.noise_floor import floor_psd
@@ -185,13 +185,13 @@ def test_limit_of_a_mean_is_the_likelihood_that_noise_shows():
     assert np.var(ratios) == pytest.approx(2 * nats, rel=0.5)
 
 
-def test_limits_of_noise_are_the_closed_forms():
+def test_limits_of_noise_effects_match_closed_forms():
     scenario = white_scenario()
     n = scenario.size
     step = np.ones((3, scenario.temperature.size))
     step[0, :1000] = math.exp(
         2 * math.sqrt(NATS / n) * 2
-    )  # half of the time: T_eff is a quarter of T
+    )  # for half of the time T_eff is a quarter of T
     assert variance_size(scenario, step) == pytest.approx(1.0, rel=0.01)
     always = np.full((3, 1, 10), 1.0)
     always[1] = math.exp(2 * math.sqrt(NATS / n))
@@ -202,7 +202,7 @@ def test_limits_of_noise_are_the_closed_forms():
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_every_effect_makes_a_case_of_its_strength(name):
+def test_every_effect_gives_a_case_of_its_strength(name):
     log, truth = make_case(small(name))
     check_log(log)
     (effect,) = truth["effects"]
@@ -218,7 +218,7 @@ def test_every_effect_makes_a_case_of_its_strength(name):
         assert EVERY[name].channel in log
 
 
-def test_a_case_is_the_same_again_and_another_is_not():
+def test_case_is_reproducible_and_differs_from_others():
     plan = small("shupe")
     (one, truth), (again, same) = make_case(plan), make_case(plan)
     xr.testing.assert_identical(one, again)
@@ -228,7 +228,7 @@ def test_a_case_is_the_same_again_and_another_is_not():
     )
 
 
-def test_an_effect_on_the_mean_is_the_difference_to_the_bare_noise():
+def test_effect_is_the_difference_to_the_record_without_it():
     scenario = white_scenario(seconds=900)
     effect = CATALOGUE["temperature_bias"].make(scenario, np.random.default_rng(0), strength=2.0)
     both = make_record(scenario, [effect], seed=3) - make_record(scenario, [], seed=3)
@@ -236,7 +236,7 @@ def test_an_effect_on_the_mean_is_the_difference_to_the_bare_noise():
 
 
 @pytest.mark.parametrize("name", ["vibration_noise", "aliased_vibration"])
-def test_shaking_adds_the_variance_that_its_size_was_reckoned_from(name):
+def test_vibration_adds_the_variance_of_its_size(name):
     scenario = white_scenario(rate=100.0, seconds=600)
     effect = CATALOGUE[name].make(scenario, np.random.default_rng(2), strength=30.0)
     row = int(np.argmax(np.abs(effect.extra).max(axis=1)))
@@ -247,10 +247,10 @@ def test_shaking_adds_the_variance_that_its_size_was_reckoned_from(name):
     alone = math.sqrt(n * v**2 / 4 / NATS)
     assert (
         0.3 < alone / effect.size < 1.1
-    )  # a flat density is the weakest of all of this power, and other axes may add
+    )  # a flat density has the smallest size for its power, and other axes may add to it
 
 
-def test_rounding_of_the_rate_stands_alone_and_adds_its_white_noise():
+def test_quantized_rate_has_multiples_of_the_step_and_no_q():
     log, truth = make_case(small("rate_quantization", strength=20.0))
     step = truth["effects"][0]["parameters"]["step"]["value"]
     counts = log.rate.values / step
@@ -258,8 +258,8 @@ def test_rounding_of_the_rate_stands_alone_and_adds_its_white_noise():
     assert all(noise["Q"] == 0 for noise in truth["noise"].values())
 
 
-def test_an_angle_counter_is_noise_and_no_effect():
-    """A log of angle steps stands on a lattice as well; the truth says Q of that step, and names nothing."""
+def test_angle_quantization_is_noise_and_not_an_effect():
+    """A log of angle increments is quantized as well; its truth holds Q and no effect."""
     scenario = draw_scenario(np.random.default_rng(0), rate=10.0, seconds=600.0)
     scenario = replace(scenario, noise=tuple(noise | {"Q": 0.3} for noise in scenario.noise))
     counts = make_record(scenario, [], seed=1) / (
@@ -268,23 +268,23 @@ def test_an_angle_counter_is_noise_and_no_effect():
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
 
 
-def test_a_dead_zone_leaves_zeros_and_a_stop_leaves_ends():
+def test_dead_zone_leaves_zeros_and_clipping_leaves_extremes():
     log, truth = make_case(small("dead_zone", strength=6.0))
     row = log.rate.sel(axis=truth["effects"][0]["axes"][0]).values
-    assert 10 <= (row == 0).sum() <= 90  # 30 are wanted
+    assert 10 <= (row == 0).sum() <= 90  # expected are 30
     log, truth = make_case(small("clipping", strength=6.0))
     row = log.rate.sel(axis=truth["effects"][0]["axes"][0]).values
     assert (row == np.nanmax(row)).sum() >= 10
 
 
-def test_what_is_lost_on_the_way_is_shorter_than_a_power_cut_where_starts_matter():
+def test_telemetry_losses_are_shorter_than_power_cuts_where_restarts_matter():
     log, truth = make_case(small("warm_up", gaps=0.4, cuts=2))
     gaps = gap_table(log)
     long = gaps["samples"] / truth["sampling_rate_hz"] >= 5.0
     assert long.sum() == len(truth["power_cuts"]) == 2
 
 
-def test_random_bias_has_the_size_that_the_spectrum_says():
+def test_size_of_a_random_bias_matches_its_spectrum():
     scenario = replace(
         white_scenario(seconds=4000),
         noise=tuple({"N": 0.003, "B": 0.0, "K": 0.0, "Q": 0.0} for _ in AXES),
@@ -293,14 +293,14 @@ def test_random_bias_has_the_size_that_the_spectrum_says():
     larger, more = wander_size(scenario, np.array([1.0, 0.0, 0.0]), time=50.0, rms=0.006)
     assert larger / size == pytest.approx(
         4.0, rel=0.1
-    )  # faint: the log variance goes with the square
+    )  # for small changes the log variance grows with the square
     f = np.arange(1, scenario.size) / (2 * scenario.seconds)
     ratio = 2 * 0.003**2 * 50 / (1 + (2 * math.pi * f * 50) ** 2) / (60 * 0.003) ** 2
     assert size == pytest.approx(math.sqrt((ratio**2).sum() / 4 / NATS), rel=0.05)
     assert nats < more
 
 
-def test_buried_cases_are_seen_by_neither_eye():
+def test_sub_threshold_cases_are_invisible_in_trace_and_allan_plot():
     plan = small("spectral_line", kind="sub_threshold", seconds=3600, heavy=False, strength=1.5)
     log, truth = make_case(plan)
     assert truth["visibility"]["sub_threshold"]
@@ -309,14 +309,14 @@ def test_buried_cases_are_seen_by_neither_eye():
     wave = truth["effects"][0]["parameters"]["peak"]["value"] / math.sqrt(2)
     assert wave / (60 * noise) < MAX_SEPARATION * 1.01 / math.sqrt(
         0.5
-    )  # a mean over 1 s can only be smaller than the line itself
+    )  # a mean over 1 s is smaller than the line itself
     assert truth["visibility"]["sample"] < MAX_SEPARATION
     assert truth["visibility"]["second"] < MAX_SEPARATION
     assert all(share < 1 for share in truth["visibility"]["allan"].values())
     assert not allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30)
 
 
-def test_a_loud_effect_is_never_called_buried():
+def test_strong_effect_is_not_sub_threshold():
     from gyrostab.blindtest.scoring.visibility import find_visibility
 
     scenario = white_scenario(seconds=900)
@@ -326,8 +326,8 @@ def test_a_loud_effect_is_never_called_buried():
     )["sub_threshold"]
 
 
-def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
-    words = [
+def test_recordings_hold_nothing_of_the_truth(tmp_path):
+    forbidden_words = [
         *EVERY,
         "strength",
         "concealed",
@@ -338,7 +338,7 @@ def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
         "truth",
         "effect",
         "seed",
-        "sealed",
+        "commitment",
     ]
     plans = [small(name, index=i) for i, name in enumerate(EVERY)] + [small(None, index=90)]
     plans += [
@@ -359,8 +359,8 @@ def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
         dimensions |= set(map(str, log.variables))
     assert attributes == {("kind", "sampling_rate_hz")}
     for path in (tmp_path / "recordings").iterdir():
-        held = path.read_bytes().lower() + path.name.encode()
-        assert [word for word in words if word.encode() in held] == [], path
+        content = path.read_bytes().lower() + path.name.encode()
+        assert [word for word in forbidden_words if word.encode() in content] == [], path
     known = {
         "axis",
         "time",
@@ -378,14 +378,14 @@ def test_nothing_that_is_handed_over_holds_the_truth(tmp_path):
     }
 
 
-def test_channels_of_nulls_are_those_of_effects():
-    """Every channel that an effect needs is there in nulls too, so its presence says nothing."""
+def test_null_records_have_the_same_channels_as_others():
+    """The presence of a channel must not reveal an effect."""
     names = [set(make_case(small(None, index=i, seconds=600))[0].data_vars) for i in range(30)]
     for channel in ("rotation_rate", "supply_voltage", "light_power", "ramp", "accel_x"):
         assert 0 < sum(channel in held for held in names) < 30
 
 
-def test_a_sealed_recording_is_read_as_a_log(tmp_path):
+def test_committed_recording_is_read_as_a_log(tmp_path):
     log, truth = make_case(small("vibration_rectification"))
     digest = commit_case(log, truth, tmp_path, name="a")
     again = gyrostab.regularise(gyrostab.read_log(tmp_path / "recordings" / "a.nc"))
@@ -395,12 +395,12 @@ def test_a_sealed_recording_is_read_as_a_log(tmp_path):
     assert again.vibration.attrs["units"] == log.vibration.attrs["units"] == "g"
     path = tmp_path / "truth" / "a.json"
     path.write_text(path.read_text().replace("vibration_rectification", "shupe"))
-    with pytest.raises(FormatError, match="changed after it was sealed"):
+    with pytest.raises(FormatError, match="changed after it was committed"):
         open_truth(path, sha256=digest)
 
 
 @pytest.mark.parametrize("how", DEGRADATIONS)
-def test_severed_driver(how):
+def test_degraded_driver(how):
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.normal(size=1000))
     channels = degrade_driver(
@@ -450,7 +450,7 @@ def test_composition_of_a_benchmark():
     assert plan_case(17, seed=5) == plans[17]
 
 
-def test_a_third_of_the_forms_are_none_of_a_fitter():
+def test_a_third_of_the_forms_differ_from_those_fitted():
     scenario = replace(white_scenario(seconds=600), cuts=np.array([[200.0, 220.0]]))
     scenario = replace(scenario, light=np.linspace(1.0, 0.9, scenario.temperature.size))
     flags = [
@@ -461,14 +461,14 @@ def test_a_third_of_the_forms_are_none_of_a_fitter():
     assert np.mean(flags) > 1 / 3
 
 
-def test_unknown_effect_and_negative_case_are_explained():
-    with pytest.raises(OptionError, match="no effect 'gremlin' can be made"):
+def test_unknown_effect_and_negative_case_are_refused():
+    with pytest.raises(OptionError, match="'gremlin' is not in the catalogue"):
         make_case(small("shupe") | {"names": ["gremlin"]})
     with pytest.raises(OptionError, match="counted from 0"):
         plan_case(-1, seed=0)
 
 
-def test_naive_detectors_see_what_is_loud_and_little_else():
+def test_baseline_detectors_see_strong_effects_only():
     log, truth = make_case(small("vibration_noise", strength=120.0, seconds=1800))
     assert allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30)
     assert channel_detector(log)
@@ -479,7 +479,7 @@ def test_naive_detectors_see_what_is_loud_and_little_else():
     assert seen <= 2
 
 
-def test_salt_on_a_log_adds_the_effect_and_leaves_the_controls_alone():
+def test_injection_adds_the_effect_and_leaves_controls_unchanged():
     log, _ = make_case(small(None))
     copies = inject_effect(log, "vibration_rectification", 6.0, np.random.default_rng(2))
     record = log.rate.values
@@ -492,15 +492,16 @@ def test_salt_on_a_log_adds_the_effect_and_leaves_the_controls_alone():
     assert np.nanmax(np.abs(added)) == pytest.approx(effect["parameters"]["peak"]["value"], rel=0.1)
     for axis in AXES:
         assert (np.nanmax(np.abs(added[AXES.index(axis)])) > 0) == (axis in effect["axes"])
-    for copy, told in copies.values():
+    for copy, copy_truth in copies.values():
         check_log(copy)
         assert set(copy.data_vars) == set(injected.data_vars)
-        assert told["plan"]["kind"] == ("injected" if told["effects"] else "control")
+        kind = "injected" if copy_truth["effects"] else "control"
+        assert copy_truth["plan"]["kind"] == kind
     with pytest.raises(OptionError, match="follows restarts"):
         inject_effect(log, "warm_up", 2.0, np.random.default_rng(0))
 
 
-def test_salt_on_a_log_of_counts_is_counted_and_keeps_its_mean():
+def test_injection_into_a_quantized_log_keeps_step_and_mean():
     log, _ = make_case(small(None, rate=10.0, seconds=1200))
     counted = np.rint(log.rate.values / 0.5) * 0.5
     copies = inject_effect(
@@ -523,7 +524,7 @@ def test_salt_on_a_log_of_counts_is_counted_and_keeps_its_mean():
     assert np.nanmax(np.abs(added - expected)) < 8 * scatter
 
 
-def test_salt_on_a_real_gyro(recordings):
+def test_injection_into_a_real_gyro_log(recordings):
     import pandas as pd
 
     from gyrostab.ingest.make_log import make_log

@@ -1,4 +1,4 @@
-"""The physics of the concealed effects against closed forms."""
+"""Physics of the generator against closed forms."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gyrostab.blindtest.scoring.baseline_detectors import (
 
 
 @pytest.mark.parametrize(("thickness", "diffusivity"), [(0.012, 2.2e-7), (0.007, 3e-7)])
-def test_coil_forgets_a_step_with_the_slowest_mode(thickness, diffusivity):
+def test_coil_step_response_decays_with_the_slowest_mode(thickness, diffusivity):
     tau = coil.diffusion_time(thickness, diffusivity)
     face = np.r_[20.0, np.full(round(8 * tau), 30.0)]
     inner = coil.layer_temperatures(
@@ -34,7 +34,7 @@ def test_coil_forgets_a_step_with_the_slowest_mode(thickness, diffusivity):
     assert -1 / slope == pytest.approx(tau, rel=5e-3)
 
 
-def test_coil_lags_behind_a_steady_ramp_by_a_parabola():
+def test_coil_lags_a_steady_ramp_by_a_parabola():
     d, kappa, speed, layers = 0.012, 2.2e-7, 1 / 60, 48
     layer = coil.layer_temperatures(
         speed * np.arange(4000.0), dt=1.0, layers=layers, thickness=d, diffusivity=kappa
@@ -44,7 +44,7 @@ def test_coil_lags_behind_a_steady_ramp_by_a_parabola():
     np.testing.assert_allclose(speed * 3999 - layer, behind, rtol=0.01, atol=2e-3)
 
 
-def test_heat_that_enters_a_coil_is_the_heat_that_it_holds():
+def test_coil_conserves_heat():
     d, kappa, layers = 0.012, 2.2e-7, 24
     face = 20 + 5 * np.sin(np.arange(2000) / 150.0)
     layer = coil.layer_temperatures(face, dt=1.0, layers=layers, thickness=d, diffusivity=kappa)
@@ -55,7 +55,7 @@ def test_heat_that_enters_a_coil_is_the_heat_that_it_holds():
     assert entered == pytest.approx((layer[:, -1] - layer[:, 0]).sum() * d / layers, rel=1e-9)
 
 
-def test_quadrupole_cancels_what_a_trim_error_lets_in():
+def test_quadrupole_cancels_shupe_except_for_trim_error():
     ramp = 20 + np.arange(3000) / 60.0
     even = coil.coil_rate(ramp, dt=1.0, weights=coil.layer_weights(24))[-1]
     trimmed = coil.coil_rate(ramp, dt=1.0, weights=coil.layer_weights(24, trim=1e-3))[-1]
@@ -67,7 +67,7 @@ def test_quadrupole_cancels_what_a_trim_error_lets_in():
     assert trimmed == pytest.approx(expected, rel=1e-3)
 
 
-def test_each_part_of_the_detector_noise_has_its_own_power_law():
+def test_detector_noise_terms_have_their_power_laws():
     power = np.array([1e-6, 4e-6])
     shot = light.relative_psd(power, rin=0.0, load=1e12)
     thermal = light.relative_psd(power, rin=0.0, load=1.0)
@@ -80,7 +80,7 @@ def test_each_part_of_the_detector_noise_has_its_own_power_law():
     )
 
 
-def test_shot_limited_level_is_the_textbook_one():
+def test_shot_noise_level_matches_textbook():
     power, depth = 20e-6, math.pi / 2
     seen = power * (1 + math.cos(depth))
     phase = (
@@ -96,7 +96,7 @@ def test_shot_limited_level_is_the_textbook_one():
 
 @given(st.lists(st.floats(-0.9, 0.9), min_size=2, max_size=3))
 @settings(max_examples=20, deadline=None)
-def test_shared_source_changes_no_axis_by_itself(shares):
+def test_shared_source_keeps_the_level_of_each_axis(shares):
     rng = np.random.default_rng(1)
     own, common = rng.normal(size=(len(shares), 20_000)) * 3.0, rng.normal(size=20_000)
     both = light.share_source(own, common, shares=np.array(shares))
@@ -104,7 +104,7 @@ def test_shared_source_changes_no_axis_by_itself(shares):
     assert np.corrcoef(both)[0, 1] == pytest.approx(shares[0] * shares[1], abs=0.04)
 
 
-def test_resets_come_as_often_as_the_rate_says():
+def test_reset_count_follows_the_rate():
     rate, seconds, dt = 22.0, 500.0, 0.01
     phase = loop.ramp_phase(np.full(round(seconds / dt), rate), dt=dt)
     expected = 0.04 * math.radians(rate / 3600) / (1.45 * 1.55e-6) * seconds
@@ -118,7 +118,7 @@ def test_dead_zone_holds_at_zero_and_is_odd():
     np.testing.assert_allclose(out, -out[::-1], atol=1e-7)
 
 
-def test_mount_is_a_damped_spring():
+def test_mount_has_the_response_of_a_damped_spring():
     f = np.array([10.0, 60.0, 120.0, 400.0])
     _, got = signal.freqz(*vibration.mount_filter(120.0, quality=8.0), worN=f, fs=vibration.FAST_HZ)
     x = f / 120.0
@@ -129,7 +129,7 @@ def test_mount_is_a_damped_spring():
 
 
 @pytest.mark.parametrize(("kind", "power"), [("point", 0), ("dump", 1), ("cic2", 2), ("cic3", 3)])
-def test_a_line_above_nyquist_folds_down_with_the_factor_of_its_filter(kind, power):
+def test_line_above_nyquist_is_aliased_with_the_gain_of_the_filter(kind, power):
     f, rate = 730.0, 400.0
     x = np.sqrt(2) * np.sin(2 * np.pi * f * np.arange(200_000) / vibration.FAST_HZ)
     logged = vibration.decimate(x, rate=rate, kind=kind)[50:]
@@ -142,7 +142,7 @@ def test_a_line_above_nyquist_folds_down_with_the_factor_of_its_filter(kind, pow
     assert freq[np.argmax(density)] == pytest.approx(800.0 - f, abs=0.1)
 
 
-def test_folded_density_is_what_the_decimator_gives():
+def test_folded_density_matches_the_decimator():
     rng = np.random.default_rng(2)
     mount = vibration.mount_filter(650.0, quality=6.0)
     x = signal.lfilter(*mount, vibration.band_noise(rng, 800_000, low=600, high=800))
@@ -193,7 +193,7 @@ def test_noise_floor_has_the_allan_deviation_of_its_coefficients(method):
         )
 
 
-def test_steps_of_the_angle_have_the_quantization_law():
+def test_angle_quantization_has_the_allan_variance_of_q():
     rate, q = 10.0, 2.0
     rng = np.random.default_rng(4)
     out = floor.quantize_angle(rng.normal(20.0, 8.0, 100_000), q=q, rate=rate)
@@ -204,14 +204,14 @@ def test_steps_of_the_angle_have_the_quantization_law():
     np.testing.assert_allclose(dev**2 - base**2, 3 * (q * urad) ** 2 / tau**2, rtol=0.15)
 
 
-def test_floor_density_adds_up_to_the_variance_of_its_steps():
+def test_floor_density_integrates_to_the_variance_of_q():
     f = (np.arange(20_000) + 0.5) / 20_000 * 5.0
     q = 1.5 * math.degrees(1e-6) * 3600
     density = floor.floor_psd(f, noise={"Q": 1.5}, rate=10.0)
     assert 2 * density.mean() * 5.0 == pytest.approx(2 * q**2 * 100.0, rel=1e-6)
 
 
-def test_own_allan_variance_is_that_of_allantools():
+def test_allan_variance_matches_allantools():
     x = np.cumsum(np.random.default_rng(5).normal(size=5000))
     factors = octaves(x.size)
     expected = allantools.oadev(x, rate=1.0, data_type="freq", taus=factors)[1] ** 2
@@ -219,7 +219,7 @@ def test_own_allan_variance_is_that_of_allantools():
 
 
 @pytest.mark.parametrize(("size", "bands", "records"), [(2000, 8, 100), (60_000, 2, 50)])
-def test_noise_leaves_its_own_allan_band_in_one_of_a_hundred(size, bands, records):
+def test_noise_exceeds_its_allan_band_in_one_percent(size, bands, records):
     rate, noise = 10.0, {"N": 0.003, "B": 0.004, "K": 0.05, "Q": 0.0}
     rng = np.random.default_rng(6)
     missing = telemetry.draw_losses(rng, size, share=0.2, frame=10, burst=4)
@@ -238,7 +238,7 @@ def test_noise_leaves_its_own_allan_band_in_one_of_a_hundred(size, bands, record
     )  # the tail of a chi-square is longer than normal
 
 
-def test_long_records_have_the_allan_variance_of_short_ones():
+def test_log_allan_of_long_records_matches_the_direct_one():
     x = np.random.default_rng(7).normal(size=60_000)
     x[::7] = np.nan
     direct = allan_variance(x, octaves(x.size))
@@ -247,14 +247,14 @@ def test_long_records_have_the_allan_variance_of_short_ones():
 
 @given(st.floats(0.02, 0.6), st.floats(1.0, 8.0))
 @settings(max_examples=15, deadline=None)
-def test_telemetry_loses_the_share_that_was_asked_for(share, burst):
+def test_telemetry_loses_the_given_share(share, burst):
     lost = telemetry.draw_losses(
         np.random.default_rng(7), 200_000, share=share, frame=5, burst=burst
     )
     assert lost.mean() == pytest.approx(share, abs=0.06)
 
 
-def test_toolface_turns_earth_and_gravity_together():
+def test_earth_and_gravity_rotate_together():
     angle = tool.toolface(tool.rotation(np.random.default_rng(8), 600.0, dt=0.1), dt=0.1)
     x, y = tool.cross_axis(angle, across=9.0)
     np.testing.assert_allclose(np.hypot(x, y), 9.0)
@@ -263,7 +263,7 @@ def test_toolface_turns_earth_and_gravity_together():
 
 
 @pytest.mark.parametrize("corner", [0.3, 0.8])
-def test_level_below_a_low_pass_is_what_long_means_of_it_have(corner):
+def test_level_below_a_low_pass_matches_long_means(corner):
     common = electronics._low_passed(np.random.default_rng(1), 400_000, corner=corner)
     means = common.reshape(-1, 50).mean(axis=1) * np.sqrt(50.0)
     assert means.std() == pytest.approx(electronics._level_below(corner), rel=0.03)

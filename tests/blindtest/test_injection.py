@@ -1,4 +1,4 @@
-"""Salt: sized by the noise that the real recording has, not by five terms of it."""
+"""Injections are sized by the measured noise of the recording, not by five terms."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def scenario_of(record: np.ndarray):
     return replace(scenario, noise=noise, missing=np.zeros(scenario.size, dtype=bool))
 
 
-def both(record: np.ndarray):
-    """A world by five terms, and the same by what is measured."""
+def draw_both(record: np.ndarray):
+    """Draw a scenario with five noise terms, and the same with measured noise."""
     scenario = scenario_of(record)
     return scenario, replace(scenario, measured=measure_noise(record, rate=RATE))
 
@@ -46,8 +46,8 @@ def bursts() -> np.ndarray:
     return ratio
 
 
-def test_in_white_noise_the_measured_limits_are_the_closed_ones():
-    plain, real = both(white(0))
+def test_measured_limits_match_closed_forms_in_white_noise():
+    plain, real = draw_both(white(0))
     mean = np.zeros((3, plain.size))
     mean[1, 5000:9000] = 0.1
     assert mean_size(real, mean) == pytest.approx(mean_size(plain, mean), rel=0.25)
@@ -60,11 +60,11 @@ def test_in_white_noise_the_measured_limits_are_the_closed_ones():
 
 
 @pytest.mark.parametrize("frequency", [0.05, 1.0, 8.0])
-def test_a_wave_in_coloured_noise_is_worth_its_power_over_the_density_there(frequency):
+def test_size_of_a_wave_in_coloured_noise_is_its_power_over_the_density(frequency):
     record = lfilter(
         [1.0, -0.9], [1.0], white(1)
-    )  # steps of an angle, nearly: hundreds of times louder at the end of the band
-    _, real = both(record)
+    )  # nearly angle quantization: hundreds of times stronger at the end of the band
+    _, real = draw_both(record)
     wave = np.zeros((3, real.size))
     wave[0] = 0.05 * np.sin(2 * math.pi * frequency * np.arange(real.size) / RATE)
     density = 0.8**2 / RATE * abs(1 - 0.9 * np.exp(-2j * math.pi * frequency / RATE)) ** 2
@@ -73,16 +73,16 @@ def test_a_wave_in_coloured_noise_is_worth_its_power_over_the_density_there(freq
     )
 
 
-def test_slow_noise_counts_at_its_slowest_lines():
+def test_line_density_is_right_at_the_lowest_lines():
     steps = np.random.default_rng(2).normal(0, 0.01, (200, 4000))
     found = np.mean([line_density(np.cumsum(row), rate=1.0)[:4] for row in steps], axis=0)
     k = np.arange(1, 5)
     np.testing.assert_allclose(found, 0.01**2 / (2 * math.pi * k / 8000) ** 2, rtol=0.5)
 
 
-@pytest.mark.parametrize("loud", [1.0, 1e2, 1e4])
-def test_the_slope_is_the_most_likely_one_also_beside_a_loud_line(loud):
-    """No white noise, flicker and random walk of a fine grid suit the lines better."""
+@pytest.mark.parametrize("strong", [1.0, 1e2, 1e4])
+def test_slope_fit_is_the_likelihood_maximum_with_a_strong_line(strong):
+    """No combination of white noise, flicker and random walk on a fine grid fits better."""
     rng = np.random.default_rng(2)
     number = np.arange(1.0, 61.0)
     sizes = np.stack(
@@ -91,7 +91,7 @@ def test_the_slope_is_the_most_likely_one_also_beside_a_loud_line(loud):
     tried = sizes @ np.stack([number**0, 1.0 / number, number**-2])
     for truth in np.exp(rng.normal(0.0, 3.0, (8, 3))):
         lines = (truth[0] + truth[1] / number + truth[2] / number**2) * rng.exponential(size=60)
-        lines[rng.integers(60)] *= loud
+        lines[rng.integers(60)] *= strong
         found = _fit_slope(lines)(number)
         mine, others = (
             (np.log(density) + lines / density).sum(axis=-1) for density in (found, tried)
@@ -99,11 +99,11 @@ def test_the_slope_is_the_most_likely_one_also_beside_a_loud_line(loud):
         assert mine < others.min() + 1e-6
 
 
-def test_a_level_that_wanders_by_itself_hides_the_slow_change_and_not_the_quick_one():
+def test_fluctuating_level_hides_slow_changes_only():
     t = np.arange(round(RATE * SECONDS)) / RATE
     rng = np.random.default_rng(3)
     walk = np.cumsum(rng.normal(0, 0.03, math.ceil(SECONDS) + 1))
-    plain, real = both(white(3) * np.exp(0.5 * np.interp(t, np.arange(walk.size), walk)))
+    plain, real = draw_both(white(3) * np.exp(0.5 * np.interp(t, np.arange(walk.size), walk)))
     quick = np.ones((3, walk.size))
     quick[1] = np.where(np.arange(walk.size) // 40 % 2 == 0, 1.2, 1.0)
     slow = np.ones_like(quick)
@@ -112,23 +112,23 @@ def test_a_level_that_wanders_by_itself_hides_the_slow_change_and_not_the_quick_
     assert lost[0] < 0.25 < 0.6 < lost[1]
 
 
-def test_noise_that_is_added_counts_where_the_recording_is_quiet_only():
+def test_added_noise_counts_only_in_quiet_bands():
     record = white(4)
-    loud = np.zeros_like(record)
-    for row in range(3):  # a tenth of the band is a hundred times louder
+    strong = np.zeros_like(record)
+    for row in range(3):  # a tenth of the band is a hundred times stronger
         lines = fft.rfft(np.random.default_rng(row).normal(0, 8.0, record.shape[1]))
         lines[: lines.size * 9 // 10] = 0.0
-        loud[row] = fft.irfft(lines, record.shape[1])
-    (plain, _), (_, real) = both(record), both(record + loud)
+        strong[row] = fft.irfft(lines, record.shape[1])
+    (plain, _), (_, real) = draw_both(record), draw_both(record + strong)
     assert variance_size(replace(real, noise=plain.noise), bursts()) == pytest.approx(
         math.sqrt(0.9) * variance_size(plain, bursts()), rel=0.2
     )
 
 
-def test_the_size_of_salt_is_that_in_the_noise_of_the_recording():
+def test_size_of_an_injection_refers_to_the_noise_of_the_recording():
     record = lfilter(
         [1.0], [1.0, -0.98], white(5)
-    )  # its slow noise is 50 times that of the shortest times
+    )  # slow noise 50 times that at the shortest times
     log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
     made, truth = inject_effect(log, "vibration_rectification", 6.0, np.random.default_rng(6))[
         "injected"
@@ -144,7 +144,7 @@ def test_the_size_of_salt_is_that_in_the_noise_of_the_recording():
     assert truth["effects"][0]["size"] == 6.0
 
 
-def test_a_source_that_axes_share_is_salted_with_its_signs_and_on_its_axes_only():
+def test_injected_shared_source_has_its_signs_and_axes():
     record = white(7)
     log = make_log(record, {}, start=1_700_000_000 * 10**9, rate=RATE)
     two = 0
@@ -164,12 +164,12 @@ def test_a_source_that_axes_share_is_salted_with_its_signs_and_on_its_axes_only(
     assert two > 0
 
 
-def test_a_spike_is_salted_above_what_the_recording_throws_by_itself():
+def test_injected_spike_exceeds_outliers_of_the_recording():
     wild = white(8)
     wild[:, ::997] += 9.0  # eleven standard deviations
-    calm, loud = (measure_noise(record, rate=RATE).outlier_sigma for record in (white(8), wild))
-    np.testing.assert_allclose(calm, 0.8, rtol=0.1)
-    assert (loud > 1.8).all()
+    usual, strong = (measure_noise(record, rate=RATE).outlier_sigma for record in (white(8), wild))
+    np.testing.assert_allclose(usual, 0.8, rtol=0.1)
+    assert (strong > 1.8).all()
     _, truth = inject_effect(
         make_log(wild, {}, start=1_700_000_000 * 10**9, rate=RATE),
         "spikes",

@@ -1,4 +1,4 @@
-"""The benchmark runs, seals before it looks, goes on where it stopped, and counts what is on the disk."""
+"""The benchmark commits truths before diagnoses, resumes, and scores the files on disk."""
 
 from __future__ import annotations
 
@@ -54,24 +54,24 @@ def small(monkeypatch):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> tuple[Path, list[str], Proof]:
-    """A benchmark of two small cases, and what was said and present at each moment."""
-    folder, said = tmp_path_factory.mktemp("finished") / "proof", []
+    """Run a benchmark of two small cases; return its folder, messages and result."""
+    folder, messages = tmp_path_factory.mktemp("finished") / "proof", []
 
     def say(text: str) -> None:
-        said.append(f"{text} [{len(list((folder / 'diagnoses').glob('*.json')))} diagnosed]")
+        messages.append(f"{text} [{len(list((folder / 'diagnoses').glob('*.json')))} diagnosed]")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
         proof = gyrostab.prove(folder, cases=2, seed=5, nulls=100, workers=0, say=say)
-    return folder, said, proof
+    return folder, messages, proof
 
 
-def test_the_truths_are_sealed_and_told_before_the_first_diagnosis(finished):
-    folder, said, proof = finished
+def test_truths_are_committed_before_the_first_diagnosis(finished):
+    folder, messages, proof = finished
     sums = (folder / "SHA256SUMS").read_bytes()
     assert proof.commitment == hashlib.sha256(sums).hexdigest()
-    assert any(proof.commitment in text and "[0 diagnosed]" in text for text in said)
-    assert "--seed 5" in said[0]
+    assert any(proof.commitment in text and "[0 diagnosed]" in text for text in messages)
+    assert "--seed 5" in messages[0]
     for line in sums.decode().splitlines():
         value, path = line.split("  ")
         assert hashlib.sha256((folder / path).read_bytes()).hexdigest() == value
@@ -80,7 +80,7 @@ def test_the_truths_are_sealed_and_told_before_the_first_diagnosis(finished):
     assert (folder / "SHA256SUMS").stat().st_mtime_ns < min(written)
 
 
-def test_nothing_of_the_truth_is_in_name_or_content_of_a_recording(finished):
+def test_recording_reveals_nothing_of_the_truth(finished):
     folder, *_ = finished
     recordings = sorted((folder / "recordings").iterdir())
     assert sorted(path.stem for path in recordings) == sorted(
@@ -88,7 +88,7 @@ def test_nothing_of_the_truth_is_in_name_or_content_of_a_recording(finished):
     )
     for path in recordings:
         with xr.open_dataset(path) as log:
-            said = json.dumps(
+            content = json.dumps(
                 [
                     str(log.attrs),
                     *(str(log[name].attrs) for name in log.variables),
@@ -105,10 +105,10 @@ def test_nothing_of_the_truth_is_in_name_or_content_of_a_recording(finished):
             "concealed",
             "plan",
         ):
-            assert word not in said.lower()
+            assert word not in content.lower()
 
 
-def test_every_case_is_counted(finished):
+def test_every_case_is_scored(finished):
     folder, _, proof = finished
     scores = pd.read_csv(folder / "scores.csv", keep_default_na=False, na_values=[""])
     assert list(scores["kind"]) == ["null", "single"]
@@ -134,7 +134,7 @@ def test_every_case_is_counted(finished):
         assert (folder / name).read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_second_run_only_counts_again_and_comes_to_the_same(finished, small):
+def test_resumed_finished_run_repeats_the_scores(finished, small):
     folder, _, before = finished
     kept = {path: path.stat().st_mtime_ns for path in folder.glob("*/*")}
     scores = (folder / "scores.csv").read_bytes()
@@ -145,20 +145,20 @@ def test_a_second_run_only_counts_again_and_comes_to_the_same(finished, small):
     assert again.commitment == before.commitment
 
 
-def test_a_truth_that_was_changed_is_not_opened(finished, small):
+def test_changed_truth_is_refused(finished, small):
     folder, *_ = finished
     name = case_name(5, 1)
     path = folder / "truth" / f"{name}.json"
     text = path.read_text()
     try:
         path.write_text(text.replace('"strength": 8.0', '"strength": 4.0'))
-        with pytest.raises(FormatError, match="changed after it was sealed"):
+        with pytest.raises(FormatError, match="changed after it was committed"):
             gyrostab.prove(folder, workers=0, resume=True)
     finally:
         path.write_text(text)
 
 
-def test_what_was_begun_is_neither_lost_nor_mixed(finished):
+def test_existing_run_is_neither_lost_nor_mixed(finished):
     folder, *_ = finished
     with pytest.raises(OutputError, match="--resume"):
         gyrostab.prove(folder)
@@ -173,16 +173,12 @@ class Stopped(Exception):
     pass
 
 
-def test_a_stopped_run_goes_on_and_comes_to_what_an_unbroken_one_does(
-    finished, small, tmp_path, monkeypatch
-):
+def test_resumed_run_equals_an_uninterrupted_one(finished, small, tmp_path, monkeypatch):
     unbroken, _, _ = finished
     folder, calls = tmp_path / "proof", []
 
     def real(recording, target, failed, nulls):
-        shutil.copy(
-            unbroken / "diagnoses" / target.name, target
-        )  # the same recording, so the same diagnosis
+        shutil.copy(unbroken / "diagnoses" / target.name, target)  # same recording, same diagnosis
         return True
 
     def stop_at_the_second(*job):
@@ -216,7 +212,7 @@ def test_a_stopped_run_goes_on_and_comes_to_what_an_unbroken_one_does(
     assert (folder / "scores.csv").read_bytes() == (unbroken / "scores.csv").read_bytes()
 
 
-def test_a_diagnosis_that_fails_is_shown_and_tried_again(small, tmp_path, monkeypatch):
+def test_failed_diagnosis_is_reported_and_retried(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: 1 / 0)
     proof = gyrostab.prove(tmp_path / "proof", cases=2, seed=9, nulls=100, workers=0)
     assert set(proof.failed) == {case_name(9, 0), case_name(9, 1)}
@@ -242,10 +238,7 @@ def test_a_diagnosis_that_fails_is_shown_and_tried_again(small, tmp_path, monkey
     again = gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
     assert again.failed == {}
     assert not list((tmp_path / "proof" / "failed").iterdir())
-    assert (
-        again.table.set_index("quantity").loc["detected, strength 1.5 or more", "value"]
-        == 1.0
-    )
+    assert again.table.set_index("quantity").loc["detected, strength 1.5 or more", "value"] == 1.0
 
 
 class NothingFound:
@@ -261,15 +254,15 @@ class NothingFound:
         )
 
 
-def test_real_recordings_are_salted_sealed_and_told_apart(small, tmp_path, monkeypatch, recordings):
+def test_injections_are_committed_and_scored_separately(small, tmp_path, monkeypatch, recordings):
     real = recordings("mems-static-53min/ch104.csv.gz").parents[1]
-    monkeypatch.setattr(core, "_SALTED", 1)
+    monkeypatch.setattr(core, "_CASES_PER_INJECTION", 1)
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
-    said: list[str] = []
+    messages: list[str] = []
     proof = gyrostab.prove(
-        tmp_path / "proof", cases=2, seed=8, nulls=100, workers=0, real=real, say=said.append
+        tmp_path / "proof", cases=2, seed=8, nulls=100, workers=0, real=real, say=messages.append
     )
-    assert "2 real recordings" in said[0]
+    assert "2 injections into real recordings" in messages[0]
     sums, _ = read_sums(tmp_path / "proof")
     assert len(sums) == 2 + 2 * 4
     for path in (tmp_path / "proof" / "recordings").iterdir():
@@ -292,41 +285,41 @@ def test_real_recordings_are_salted_sealed_and_told_apart(small, tmp_path, monke
     scores = pd.read_csv(tmp_path / "proof" / "scores.csv", keep_default_na=False, na_values=[""])
     assert sorted(scores["kind"].value_counts().to_dict().items()) == [
         ("control", 6),
-        ("null", 1),
         ("injected", 2),
+        ("null", 1),
         ("single", 1),
     ]
     assert set(scores["copy"].dropna()) == {"injected", "untouched", "flipped", "reversed"}
     counted = proof.table.set_index("quantity")
     assert (
         counted.loc["false alarms: effect named on a null record", "n"] == 1
-    )  # a copy of a real recording is no null
+    )  # a copy of a real recording is not a null record
     page = (tmp_path / "proof" / "table.md").read_text()
     assert "| reversing the sign adds a name | 0 |" in page
 
 
-def test_a_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
+def test_run_without_real_recordings_says_so(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NothingFound())
-    said: list[str] = []
-    gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, say=said.append)
-    assert "no real recordings are salted" in said[0]
+    messages: list[str] = []
+    gyrostab.prove(tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, say=messages.append)
+    assert "no injections into real recordings" in messages[0]
     assert (
         "the folder of the real recordings was not given"
         in (tmp_path / "proof" / "table.md").read_text()
     )
 
 
-def test_real_recordings_that_went_away_before_the_draw(small, tmp_path, monkeypatch):
-    monkeypatch.setattr(core, "_SALTED", 1)
+def test_missing_real_recordings_are_reported(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(core, "_CASES_PER_INJECTION", 1)
     with pytest.raises(FormatError, match="nowhere"):
         gyrostab.prove(
             tmp_path / "proof", cases=1, seed=8, nulls=100, workers=0, real=tmp_path / "nowhere"
         )
-    with pytest.raises(ResumeError, match="say again where they are"):
+    with pytest.raises(ResumeError, match="give their folder again"):
         gyrostab.prove(tmp_path / "proof", workers=0, resume=True)
 
 
-def test_wrong_names_on_noise_are_listed():
+def test_wrong_names_on_null_records_are_listed():
     truth = {
         "effects": [],
         "accepted": [],
@@ -353,17 +346,17 @@ def test_wrong_names_on_noise_are_listed():
     }
     table = score_table(rows)
     text = page_text(rows, table, job=job, commitment="0" * 64, failed={})
-    assert "abc (null, 10 Hz, 10 min, 0 % lost): nothing; named shupe" in text
+    assert "abc (null, 10 Hz, 10 min, 0 % lost): no effect; named shupe" in text
     assert "not for publication" not in text
     assert "The code changed 1 times" in text
     assert "false alarms: effect named on a null record: 1 " in text
 
 
-# -------------------------------------------------------------------------------------------------------------------
-# manners
+# -----------------------------------------------------------------------------------------------
+# options and folders
 
 
-def test_options_that_make_no_sense_leave_nothing_behind(tmp_path):
+def test_invalid_options_leave_nothing_behind(tmp_path):
     for options, complaint in (
         ({"cases": 0}, "cases=0"),
         ({"seed": -1}, "seed=-1"),
@@ -379,7 +372,7 @@ def test_options_that_make_no_sense_leave_nothing_behind(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_folder_with_other_things_is_never_emptied(tmp_path):
+def test_folder_with_foreign_files_is_never_emptied(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     for options in ({}, {"overwrite": True}, {"resume": True}):
         with pytest.raises(OutputError, match=r"thesis\.tex"):
@@ -387,7 +380,7 @@ def test_a_folder_with_other_things_is_never_emptied(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_overwrite_forgets_what_was_there(small, tmp_path, monkeypatch):
+def test_overwrite_replaces_the_run(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: 1 / 0)
     first = gyrostab.prove(tmp_path / "proof", cases=1, seed=1, workers=0)
     second = gyrostab.prove(tmp_path / "proof", cases=1, workers=0, overwrite=True)
@@ -398,8 +391,8 @@ def test_overwrite_forgets_what_was_there(small, tmp_path, monkeypatch):
     ]
 
 
-def test_only_one_run_works_in_a_folder(small, tmp_path):
-    from gyrostab.jobs.job import lock_job
+def test_folder_is_locked_by_one_run(small, tmp_path):
+    from gyrostab.jobs import lock_job
 
     (tmp_path / "proof").mkdir()
     code = f"import gyrostab; gyrostab.prove({str(tmp_path / 'proof')!r}, cases=1, seed=1)"
@@ -411,42 +404,42 @@ def test_only_one_run_works_in_a_folder(small, tmp_path):
     assert [path.name for path in (tmp_path / "proof").iterdir()] == ["lock"]
 
 
-def test_the_command_warns_of_a_tuning_seed_and_says_what_is_wrong(tmp_path, capfd):
+def test_command_warns_of_a_tuning_seed(tmp_path, capfd):
     (tmp_path / "other.txt").write_text("")
     assert call("prove", "--cases", 1, "--seed", 3, "-o", tmp_path) == 2
-    said = capfd.readouterr().err
-    assert "tuning" in said
-    assert "other.txt" in said
+    messages = capfd.readouterr().err
+    assert "seeds are for tuning" in messages
+    assert "other.txt" in messages
     assert call("prove", "--cases", 1, "--seed", FIRST_PUBLIC_SEED, "-o", tmp_path) == 2
-    assert "tuning" not in capfd.readouterr().err
+    assert "seeds are for tuning" not in capfd.readouterr().err
 
 
-# -----------------------------------------------------------------------------------------------------------------
+# ---------------------------------------------------------------------------------------------
 # processes
 
 
-def test_processes_keep_the_order_and_use_one_thread():
-    told: list[int] = []
+def test_processes_keep_order_and_use_one_thread():
+    counts: list[int] = []
     before = os.environ.get("OMP_NUM_THREADS")
     done = run_in_processes(
-        os.path.join, [("a", str(number)) for number in range(5)], workers=2, told=told.append
+        os.path.join, [("a", str(number)) for number in range(5)], workers=2, report=counts.append
     )
     assert done == [os.path.join("a", str(number)) for number in range(5)]
-    assert told == [1, 2, 3, 4, 5]
+    assert counts == [1, 2, 3, 4, 5]
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     assert run_in_processes(os.getenv, [(name,) for name in names], workers=1) == ["1", "1", "1"]
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
-def test_a_process_that_dies_is_told_with_what_to_do():
+def test_dead_process_raises_worker_error():
     with pytest.raises(WorkerError, match="--resume"):
         run_in_processes(os._exit, [(1,)], workers=1)
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks at processes in /proc")
-def test_no_process_outlives_a_killed_parent():
-    work = "each_in_processes(time.sleep, [(300,), (300,)], workers=2)"
-    code = f"import time\nfrom gyrostab.blindtest.runner.pool import each_in_processes\n{work}\n"
+def test_no_process_outlives_its_parent():
+    work = "run_in_processes(time.sleep, [(300,), (300,)], workers=2)"
+    code = f"import time\nfrom gyrostab.blindtest.runner.pool import run_in_processes\n{work}\n"
     parent = subprocess.Popen(
         [
             sys.executable,
@@ -463,7 +456,7 @@ def test_no_process_outlives_a_killed_parent():
 
 
 def working(parent: int) -> list[int]:
-    """Its two working processes, once both have loaded what they need and sleep."""
+    """List the two worker processes of a parent once both are sleeping."""
     children = [
         int(number) for number in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
     ]

@@ -1,7 +1,7 @@
-"""A small benchmark with a seed that nobody has seen: what must hold of any cases whatever.
+"""A small benchmark with a random seed: properties that hold for any cases.
 
 The seed is printed; `GYROSTAB_PROVE_SEED=... python -m pytest tests/blindtest/test_prove_fresh.py`
-does the same again.
+repeats the run.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NUMBER = 5
 
 
 def short_plans(number: int, *, seed: int) -> list[dict]:
-    """The drawn cases, each as it is but short and slow; a buried effect needs a record that is long enough to bury it in."""
+    """Plan the drawn cases with short records; a sub-threshold effect needs a longer one."""
     plans = [plan_case(index, seed=seed) for index in range(number)]
     return [
         plan | {"rate": 10.0, "seconds": 3000.0 if plan["kind"] == "sub_threshold" else 600.0}
@@ -33,13 +33,13 @@ def short_plans(number: int, *, seed: int) -> list[dict]:
 
 
 @pytest.mark.timeout(1800)
-def test_any_cases_are_diagnosed_sealed_and_counted(tmp_path, monkeypatch, capsys):
+def test_random_cases_are_committed_diagnosed_and_scored(tmp_path, monkeypatch, capsys):
     seed = int(
         os.environ.get("GYROSTAB_PROVE_SEED") or FIRST_PUBLIC_SEED + secrets.randbelow(10**9)
     )
     with capsys.disabled():
         print(f"\nfresh cases of seed {seed}: GYROSTAB_PROVE_SEED={seed} draws them again")
-    monkeypatch.setattr("gyrostab.blindtest.plan_cases", short_plans)
+    monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", short_plans)
     folder = tmp_path / "proof"
     proof = gyrostab.prove(folder, cases=NUMBER, seed=seed, nulls=100, workers=0)
 
@@ -73,10 +73,13 @@ def test_any_cases_are_diagnosed_sealed_and_counted(tmp_path, monkeypatch, capsy
 
     assert list(proof.table["quantity"][:10]) == list(
         score_table([])["quantity"][:10]
-    )  # every figure has its line
+    )  # every figure has a line
     assert set(proof.table["state"]) <= {"", "met", "missed", "not shown"}
     counted = proof.table.set_index("quantity")
-    assert counted.loc["false alarms: effect named on a null record", "n"] == (rows["kind"] == "null").sum()
+    assert (
+        counted.loc["false alarms: effect named on a null record", "n"]
+        == (rows["kind"] == "null").sum()
+    )
     page = (folder / "table.md").read_text()
     assert str(seed) in page
     assert proof.commitment in page

@@ -1,4 +1,4 @@
-"""What is published of a benchmark: its figures between the marks of the page, and nothing else of the page."""
+"""Publishing a benchmark replaces the figures between the marks of the page and nothing else."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ def run(folder: Path, docs: Path, *, seed: int = 2_000_003) -> subprocess.Comple
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_figures_are_renewed_and_what_is_written_by_hand_stays(tmp_path, docs):
+def test_figures_are_replaced_and_handwritten_text_stays(tmp_path, docs):
     before = (docs / "proof.md").read_text(encoding="utf-8")
-    told = run(tmp_path / "proof", docs)
-    assert told.returncode == 0, told.stderr
+    done = run(tmp_path / "proof", docs)
+    assert done.returncode == 0, done.stderr
     after = (docs / "proof.md").read_text(encoding="utf-8")
     by_hand = before.split("<!-- proof: begin -->")[0]
     assert "## What failed, and why" in by_hand
     assert after.startswith(by_hand)
     assert "| detected | 0.123 |" in after
     assert (docs / "figures" / "proof-completeness.png").read_bytes() == b"completeness"
-    assert "What failed, and why" in told.stdout  # it speaks of another run
+    assert "What failed, and why" in done.stdout  # which describes another run
     again = run(tmp_path / "proof", docs)
     assert (docs / "proof.md").read_text(encoding="utf-8") == after
     assert again.stdout == ""
 
 
-def test_a_tuning_seed_is_refused_and_nothing_is_changed(tmp_path, docs):
+def test_tuning_seed_is_refused_without_changes(tmp_path, docs):
     before = (docs / "proof.md").read_bytes()
-    told = run(tmp_path / "proof", docs, seed=7)
-    assert told.returncode != 0
-    assert "for tuning" in told.stderr
+    done = run(tmp_path / "proof", docs, seed=7)
+    assert done.returncode != 0
+    assert "for tuning" in done.stderr
     assert (docs / "proof.md").read_bytes() == before
     assert not list((docs / "figures").iterdir())

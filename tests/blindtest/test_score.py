@@ -1,4 +1,4 @@
-"""The scorer on diagnoses made by hand, whose marks can be counted on fingers."""
+"""Scores of hand-written diagnoses."""
 
 from __future__ import annotations
 
@@ -97,12 +97,12 @@ def truth(
     }
 
 
-def one(*args, **kwargs) -> dict:
+def score_one(*args, **kwargs) -> dict:
     (row,) = score_case(*args, **kwargs)
     return row
 
 
-def test_a_right_claim_earns_every_mark():
+def test_correct_identification_scores_in_every_column():
     band = {"tau_min_s": 5.0, "tau_max_s": 50.0, "explained_by": ["vibration_rectification"]}
     parameters = {
         "sensitivity": {"value": 0.48, "stderr": 0.05, "low": 0.4, "high": 0.6, "unit": "deg/h/g^2"}
@@ -113,7 +113,7 @@ def test_a_right_claim_earns_every_mark():
         intervals=[(150, 200)],
         parameters=parameters,
     )
-    row = one(diagnosis(found, mismatches=[band], gain=9.0), truth("vibration_rectification"))
+    row = score_one(diagnosis(found, mismatches=[band], gain=9.0), truth("vibration_rectification"))
     assert row["detected"]
     assert row["named"]
     assert row["named_exactly"]
@@ -128,14 +128,14 @@ def test_a_right_claim_earns_every_mark():
     assert (row["gain"], row["oracle"], row["learned"]) == (9.0, 10.0, 4.5)
     assert row["learned_strength"] == pytest.approx(math.sqrt(4.5 / 5.7))
     missing = parameters | {"sensitivity": parameters["sensitivity"] | {"low": 0.55}}
-    (number,) = one(
+    (number,) = score_one(
         diagnosis(identification("vibration_rectification", parameters=missing)),
         truth("vibration_rectification"),
     )["parameter_scores"]
     assert number["covered"] is False
     other_unit = {"sensitivity": parameters["sensitivity"] | {"unit": "deg/h/g"}}
     assert (
-        one(
+        score_one(
             diagnosis(identification("vibration_rectification", parameters=other_unit)),
             truth("vibration_rectification"),
         )["parameter_scores"]
@@ -153,40 +153,42 @@ def number(value: float, *, stderr: float = 0.1, unit: str = "deg/h") -> dict:
     }
 
 
-def test_a_name_on_three_axes_is_one_claim_with_a_number_for_each():
-    told = truth("shupe")
-    told["effects"][0]["parameters"] = {
+def test_name_on_three_axes_counts_once_with_a_parameter_for_each():
+    known_truth = truth("shupe")
+    known_truth["effects"][0]["parameters"] = {
         "sensitivity": {"values": {"x": 0.5, "y": -0.5, "z": 0.1}, "unit": "deg/h"}
     }
     tables = [
         identification("shupe", axes=(axis,), parameters={"sensitivity": number(size)})
         for axis, size in (("x", 0.45), ("y", -0.9), ("z", 0.1))
     ]
-    row = one(diagnosis(*tables), told)
+    row = score_one(diagnosis(*tables), known_truth)
     assert row["identifications"] == [("shupe", True)]
     assert [entry["covered"] for entry in row["parameter_scores"]] == [True, False, True]
-    row = one(diagnosis(*tables), truth("spikes"))
+    row = score_one(diagnosis(*tables), truth("spikes"))
     assert (row["wrong"], row["wrong_names"]) == (1, ["shupe"])
 
 
-def test_numbers_by_axis_in_one_table_and_signs_that_nobody_can_know():
-    told = truth("shared_source")
-    told["effects"][0]["parameters"] = {"N": {"values": {"x": 0.5, "y": 0.4}, "unit": "deg/h"}}
+def test_parameters_by_axis_are_compared_without_arbitrary_signs():
+    known_truth = truth("shared_source")
+    known_truth["effects"][0]["parameters"] = {
+        "N": {"values": {"x": 0.5, "y": 0.4}, "unit": "deg/h"}
+    }
     table = identification(
         "shared_source",
         axes=("x", "y"),
         parameters={"N.x": number(0.52), "N.y": number(-0.35), "N.z": number(9.0)},
     )
-    row = one(diagnosis(table), told)
+    row = score_one(diagnosis(table), known_truth)
     assert [(entry["covered"], round(entry["pull"], 6)) for entry in row["parameter_scores"]] == [
         (True, 0.2),
         (True, -0.5),
     ]
 
 
-def test_of_several_lines_the_nearest_is_meant():
-    told = truth("spectral_line")
-    told["effects"][0]["parameters"] = {
+def test_nearest_of_several_lines_is_compared():
+    known_truth = truth("spectral_line")
+    known_truth["effects"][0]["parameters"] = {
         "frequency": {"value": 3.0, "unit": "Hz"},
         "amplitude": {"values": {"x": 0.5}, "unit": "deg/h", "unless": ["quality"]},
     }
@@ -198,24 +200,32 @@ def test_of_several_lines_the_nearest_is_meant():
         )
         for nats, frequency, size in ((50, 7.0, 2.0), (20, 3.05, 0.5))
     ]
-    assert [entry["covered"] for entry in one(diagnosis(*tables), told)["parameter_scores"]] == [True, True]
-    for table in tables:
-        table["parameters"]["quality"] = number(30.0, unit="1")  # a resonance has another amplitude
-    assert [entry["parameter"] for entry in one(diagnosis(*tables), told)["parameter_scores"]] == [
-        "frequency"
+    assert [
+        entry["covered"] for entry in score_one(diagnosis(*tables), known_truth)["parameter_scores"]
+    ] == [
+        True,
+        True,
     ]
+    for table in tables:
+        table["parameters"]["quality"] = number(
+            30.0, unit="1"
+        )  # the amplitude of a resonance is another quantity
+    assert [
+        entry["parameter"]
+        for entry in score_one(diagnosis(*tables), known_truth)["parameter_scores"]
+    ] == ["frequency"]
 
 
-def test_a_name_of_the_same_set_is_named_but_not_exactly():
-    row = one(diagnosis(identification("g_sensitivity")), truth("vibration_rectification"))
+def test_name_of_the_same_set_is_named_but_not_exactly():
+    row = score_one(diagnosis(identification("g_sensitivity")), truth("vibration_rectification"))
     assert row["named"]
     assert not row["named_exactly"]
     assert not row["in_set"]
     assert row["wrong"] == 0
 
 
-def test_the_strongest_claim_is_the_one_that_names():
-    row = one(
+def test_strongest_identification_decides_the_name():
+    row = score_one(
         diagnosis(identification("shupe", nats=8), identification("spikes", nats=30)),
         truth("shupe"),
     )
@@ -224,7 +234,7 @@ def test_the_strongest_claim_is_the_one_that_names():
     assert row["wrong_names"] == ["spikes"]
 
 
-def test_each_effect_of_a_pair_is_looked_for_beside_the_other():
+def test_each_effect_of_a_pair_is_scored_separately():
     rows = score_case(
         diagnosis(identification("spikes", nats=30), identification("shupe", nats=8)),
         truth("shupe", "spikes", kind="pair"),
@@ -234,8 +244,8 @@ def test_each_effect_of_a_pair_is_looked_for_beside_the_other():
     assert [row["named"] for row in rows] == [False, True]
 
 
-def test_what_stands_beside_an_effect_is_no_false_name():
-    row = one(
+def test_accepted_name_in_addition_is_not_wrong():
+    row = score_one(
         diagnosis(identification("real_motion", nats=90), identification("misalignment")),
         truth("misalignment", accepted=["real_motion"]),
     )
@@ -252,23 +262,23 @@ def test_what_stands_beside_an_effect_is_no_false_name():
         (diagnosis(), False, 0),
     ],
 )
-def test_what_no_catalogue_holds_should_be_unknown(found, unknown, wrong):
-    row = one(found, truth("chirped_line", kind="out_of_catalogue"))
+def test_effect_out_of_catalogue_should_be_unidentified(found, unknown, wrong):
+    row = score_one(found, truth("chirped_line", kind="out_of_catalogue"))
     assert (row["unidentified"], row["wrong"]) == (unknown, wrong)
 
 
-def test_a_null_is_one_row_and_any_name_a_false_alarm():
-    quiet, loud = (
-        one(diagnosis(), truth(kind="null")),
-        one(diagnosis(identification("shupe")), truth(kind="null")),
+def test_null_record_is_one_row_and_any_name_a_false_alarm():
+    silent, alarm = (
+        score_one(diagnosis(), truth(kind="null")),
+        score_one(diagnosis(identification("shupe")), truth(kind="null")),
     )
-    assert not quiet["detected"]
-    assert loud["identifications"] == [("shupe", False)]
-    table = score_table([quiet | {"index": 1}, loud | {"index": 2}]).set_index("quantity")
+    assert not silent["detected"]
+    assert alarm["identifications"] == [("shupe", False)]
+    table = score_table([silent | {"index": 1}, alarm | {"index": 2}]).set_index("quantity")
     assert table.loc["false alarms: effect named on a null record", "value"] == 0.5
 
 
-def test_a_table_of_known_marks():
+def test_table_of_known_scores():
     rows = []
     for i in range(20):
         found = (
@@ -292,10 +302,13 @@ def test_a_table_of_known_marks():
             truth("chirped_line", kind="out_of_catalogue", index=600 + i),
         )
     ]
-    severed = truth("shupe", kind="degraded_driver", degradation="withheld", index=700)
-    rows += score_case(diagnosis(identification("supply_bias")), severed)
+    withheld = truth("shupe", kind="degraded_driver", degradation="withheld", index=700)
+    rows += score_case(diagnosis(identification("supply_bias")), withheld)
     table = score_table(rows).set_index("quantity")
-    assert table.loc["false alarms: effect named on a null record", ["value", "n"]].tolist() == [0.0, 400]
+    assert table.loc["false alarms: effect named on a null record", ["value", "n"]].tolist() == [
+        0.0,
+        400,
+    ]
     assert table.loc["false alarms: effect named on a null record", "state"] == "met"
     assert table.loc["detected, strength 1.5 or more", "value"] == pytest.approx(0.9)
     assert table.loc["detected, strength 1.5 or more", "state"] == "missed"
@@ -303,20 +316,18 @@ def test_a_table_of_known_marks():
     assert table.loc["out of catalogue: unidentified", ["value", "state"]].tolist() == [
         1.0,
         "not shown",
-    ]  # ten cases cannot
+    ]  # too few cases
     assert table.loc["driver withheld or substituted: wrong name", "value"] == 1.0
     assert table.loc["overlap in time (IoU), median", "value"] == 1.0
     assert table.loc["evidence relative to the oracle, median", "value"] == pytest.approx(0.95)
-    learned = table.loc[
-        "evidence relative to the oracle with fitted noise, median", "value"
-    ]
+    learned = table.loc["evidence relative to the oracle with fitted noise, median", "value"]
     assert learned == pytest.approx(0.95 * 10.0 / 4.5)
     strong = table.loc[
         "detected, single effects of that strength with fitted noise",
         ["value", "n"],
     ]
     assert strong["n"] == 0
-    louder = score_table([row | {"learned_strength": 2.0} for row in rows]).set_index("quantity")
+    stronger = score_table([row | {"learned_strength": 2.0} for row in rows]).set_index("quantity")
     alone = table.loc["named correctly, single effects", "n"] + sum(
         row["kind"] in ("single", "sub_threshold")
         and row["strength"] >= 1.5
@@ -324,20 +335,17 @@ def test_a_table_of_known_marks():
         for row in rows
     )
     assert (
-        louder.loc[
+        stronger.loc[
             "detected, single effects of that strength with fitted noise",
             "n",
         ]
         == alone
         > 0
     )
-    assert (
-        table.loc["detected by the plain Allan plot, strength 1.5 or more", "value"]
-        == 0.25
-    )
-    said = list_missed(score_table(rows))
-    assert any(line.startswith("detected, strength 1.5") for line in said)
-    assert not any(line.startswith("false alarms") for line in said)
+    assert table.loc["detected by the plain Allan plot, strength 1.5 or more", "value"] == 0.25
+    sentences = list_missed(score_table(rows))
+    assert any(line.startswith("detected, strength 1.5") for line in sentences)
+    assert not any(line.startswith("false alarms") for line in sentences)
     assert "| driver withheld or substituted: wrong name | 1 |" in markdown(score_table(rows))
 
 
@@ -362,7 +370,7 @@ def test_curves_and_reliability():
     assert right.loc["spikes", ["right", "n"]].tolist() == [0.0, 11]
 
 
-def test_nothing_counted_is_neither_met_nor_missed():
+def test_target_without_cases_is_neither_met_nor_missed():
     table = score_table(score_case(diagnosis(), truth(kind="null")))
     empty = table[table["n"] == 0]
     assert len(empty) > 5
@@ -374,14 +382,14 @@ def test_nothing_counted_is_neither_met_nor_missed():
     assert list_missed(table[table["n"] == 0]) == []
 
 
-def test_every_effect_has_its_line():
+def test_by_effect_has_a_line_for_every_effect():
     rows = []
     for i in range(4):
         found = diagnosis(identification("shupe")) if i else diagnosis(identification("spikes"))
         rows += score_case(found, truth("shupe", index=i, strength=0.5 if i == 3 else 2.0))
     table = by_effect(rows).set_index("effect")
     assert table.loc[
-        "shupe", ["n", "detected", "identifications", "right", "parameter_scores"]
+        "shupe", ["n", "detected", "identifications", "right", "parameters"]
     ].tolist() == [
         3,
         1.0,
@@ -394,7 +402,7 @@ def test_every_effect_has_its_line():
     assert table.loc["spikes", "named"] is None
 
 
-def test_two_thirds_of_normal_errors_are_within_one():
+def test_68_percent_of_normal_errors_are_within_one_sigma():
     line = spread(
         "errors", np.random.default_rng(0).normal(0, 1, 2000), Target("0.8-1.25", 0.8, 1.25)
     )
@@ -405,26 +413,26 @@ def test_two_thirds_of_normal_errors_are_within_one():
     )
 
 
-def salted_rows(*, injected=(), untouched=(), flipped=(), turned=()) -> list[dict]:
+def injection_rows(*, injected=(), untouched=(), flipped=(), turned=()) -> list[dict]:
     rows = []
-    for one_copy, names in (
+    for copy_name, names in (
         ("injected", injected),
         ("untouched", untouched),
         ("flipped", flipped),
         ("reversed", turned),
     ):
-        told = truth(
-            *(["shupe"] if one_copy == "injected" else []),
-            kind="injected" if one_copy == "injected" else "control",
+        known_truth = truth(
+            *(["shupe"] if copy_name == "injected" else []),
+            kind="injected" if copy_name == "injected" else "control",
         )
-        told["plan"] |= {"copy": one_copy, "recording": "a gyro"}
-        rows += score_case(diagnosis(*map(identification, names)), told)
+        known_truth["plan"] |= {"copy": copy_name, "recording": "a gyro"}
+        rows += score_case(diagnosis(*map(identification, names)), known_truth)
     return rows
 
 
-def test_of_salted_recordings_only_what_salt_brings_counts():
+def test_only_names_added_by_an_injection_count():
     (one_group,) = injection_differences(
-        salted_rows(
+        injection_rows(
             injected=["shupe", "spectral_line"], untouched=["spectral_line"], turned=["spikes"]
         )
     )
@@ -435,24 +443,26 @@ def test_of_salted_recordings_only_what_salt_brings_counts():
         ["spikes"],
     )
     (again,) = injection_differences(
-        salted_rows(
+        injection_rows(
             injected=["warm_up", "spikes"], untouched=["ageing_bias"], flipped=["temperature_bias"]
         )
     )
-    assert again["there_before"]  # one of the set was named without salt
+    assert again["there_before"]  # a name of its set was found without the injection
     assert (again["others"], again["flipped"]) == (["spikes"], [])
-    table = injection_table(salted_rows(injected=["shupe"])).set_index("quantity")
+    table = injection_table(injection_rows(injected=["shupe"])).set_index("quantity")
     assert table.loc[
         "injections of strength 1.5 or more: named correctly", ["value", "n"]
     ].tolist() == [1.0, 1]
     assert injection_table([]).empty
-    main = score_table(salted_rows(injected=["shupe"], untouched=["spikes"])).set_index("quantity")
-    assert set(main["n"]) == {0}  # they are in no other figure
+    main = score_table(injection_rows(injected=["shupe"], untouched=["spikes"])).set_index(
+        "quantity"
+    )
+    assert set(main["n"]) == {0}  # excluded from all other figures
 
 
 @settings(deadline=None)
 @given(st.integers(0, 60), st.integers(1, 60))
-def test_wilson_is_that_of_scipy(hits, total):
+def test_wilson_matches_scipy(hits, total):
     hits = min(hits, total)
     expected = stats.binomtest(hits, total).proportion_ci(method="wilson")
     np.testing.assert_allclose(wilson(hits, total), (expected.low, expected.high), atol=1e-6)
@@ -463,7 +473,7 @@ def test_wilson_is_that_of_scipy(hits, total):
     st.lists(st.tuples(st.integers(0, 300), st.integers(1, 60)), min_size=1, max_size=4),
     st.integers(-200, 200),
 )
-def test_overlap_is_that_of_seconds_counted_one_by_one(spans, shift):
+def test_overlap_matches_counted_seconds(spans, shift):
     a = [(begin, begin + length) for begin, length in spans]
     b = [(begin + shift, end + shift) for begin, end in a]
     seconds = [set().union(*(range(x, y) for x, y in part)) for part in (a, b)]
@@ -473,7 +483,7 @@ def test_overlap_is_that_of_seconds_counted_one_by_one(spans, shift):
     assert intersection_over_union(iso[0], iso[0]) == pytest.approx(1.0)
 
 
-def test_sets_are_symmetric_and_the_catalogue_is_that_of_the_contract():
+def test_ambiguity_sets_are_symmetric_and_cover_the_catalogue():
     for group in AMBIGUITY:
         for name in group:
             assert group <= merge_ambiguous(name)
@@ -483,21 +493,21 @@ def test_sets_are_symmetric_and_the_catalogue_is_that_of_the_contract():
     assert set(CATALOGUE) <= contract
 
 
-def test_what_is_no_diagnosis_is_refused():
+def test_invalid_diagnosis_is_refused():
     broken = copy.deepcopy(diagnosis())
     del broken["verdict"]
     with pytest.raises(SchemaError, match="has no 'verdict'"):
         score_case(broken, truth("shupe"))
 
 
-def test_a_claim_without_a_gain_comes_last():
+def test_identification_without_evidence_comes_last():
     bare = identification("spikes") | {"held_out_gain": None}
-    row = one(diagnosis(bare, identification("shupe", nats=6.0)), truth("shupe"))
+    row = score_one(diagnosis(bare, identification("shupe", nats=6.0)), truth("shupe"))
     assert row["named"]
     assert math.isfinite(row["gain"])
 
 
-def test_what_was_alone_what_was_named_whole_and_what_is_no_shared_source_are_counted_apart():
+def test_single_effects_and_shared_source_have_separate_lines():
     number = {"value": 0.5, "stderr": 0.1, "unit": "deg/h/g^2"}
     sure, off = number | {"low": 0.3, "high": 0.7}, number | {"low": 0.1, "high": 0.3}
     alone = score_case(diagnosis(), truth("shupe", index=1))

@@ -41,17 +41,17 @@ CATALOGUE: dict[str, Entry] = {
     ),
     "shupe": Entry(thermal.shupe, "temperature", needs="heat", can_be_sub_threshold=True),
     "temperature_bias": Entry(
-        heat.temperature_bias, "temperature", needs="heat", can_be_sub_threshold=True
+        thermal.temperature_bias, "temperature", needs="heat", can_be_sub_threshold=True
     ),
     "thermal_hysteresis": Entry(
-        heat.thermal_hysteresis, "temperature", needs="heat", can_be_sub_threshold=True
+        thermal.thermal_hysteresis, "temperature", needs="heat", can_be_sub_threshold=True
     ),
     "warm_up": Entry(thermal.warm_up, cuts=2, can_be_sub_threshold=True),
     "temperature_noise": Entry(
-        heat.temperature_noise, "temperature", needs="heat", can_be_sub_threshold=True
+        thermal.temperature_noise, "temperature", needs="heat", can_be_sub_threshold=True
     ),
     "light_power_noise": Entry(
-        heat.light_power_noise, "light_power", needs="dips", can_be_sub_threshold=True
+        thermal.light_power_noise, "light_power", needs="dips", can_be_sub_threshold=True
     ),
     "ageing_noise": Entry(thermal.ageing_noise, can_be_sub_threshold=True),
     "shared_source": Entry(electronics.shared_source, can_be_sub_threshold=True),
@@ -112,7 +112,7 @@ def merge_ambiguous(name: str) -> frozenset[str]:
 
     Examples
     --------
-    >>> sorted(merged("gauss_markov")), sorted(merged("logger_filter"))
+    >>> sorted(merge_ambiguous("gauss_markov")), sorted(merge_ambiguous("logger_filter"))
     (['gauss_markov', 'telegraph'], ['logger_filter'])
     """
     return frozenset({name}).union(*(group for group in AMBIGUITY if name in group))

@@ -135,7 +135,7 @@ def _fit_noise_to_mean(f: Array, power: Array, noise: dict[str, float], rate: fl
     alone = np.stack(
         [
             floor_psd(f, noise={"Q": noise.get("Q", 0.0)}, rate=rate),
-            *(floor_psd(f, noise={one: 1.0}, rate=rate) for one in "NBK"),
+            *(floor_psd(f, noise={term: 1.0}, rate=rate) for term in "NBK"),
         ]
     )
 

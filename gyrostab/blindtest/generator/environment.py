@@ -158,7 +158,7 @@ def read_sensor(
 
     Examples
     --------
-    >>> seen = sense(np.random.default_rng(0), np.full(1000, 20.0), noise=0.03, lsb=0.0625)
+    >>> seen = read_sensor(np.random.default_rng(0), np.full(1000, 20.0), noise=0.03, lsb=0.0625)
     >>> bool(np.allclose(seen / 0.0625, np.rint(seen / 0.0625)))
     True
     """

@@ -176,9 +176,9 @@ def _block_powers(values: Array, *, rate: float, block: int) -> Array:
     mean = np.nansum(cut, axis=1, keepdims=True) / np.maximum(present.sum(axis=1, keepdims=True), 1)
     window = signal.windows.hann(2 * block, sym=False)
     weight = (present * window**2).sum(axis=1, keepdims=True)
-    lines = np.abs(fft.rfft(np.where(present, (cut - mean) * window, 0.0), axis=1)[:, 1:-1]) ** 2 / (
-        rate * np.maximum(weight, 1e-9)
-    )
+    lines = np.abs(
+        fft.rfft(np.where(present, (cut - mean) * window, 0.0), axis=1)[:, 1:-1]
+    ) ** 2 / (rate * np.maximum(weight, 1e-9))
     edges = np.linspace(0, block - 1, BANDS + 1).astype(int)
     power = np.add.reduceat(lines, edges[:-1], axis=1) / np.diff(edges)
     return np.where(
@@ -211,7 +211,7 @@ def measure_noise(record: Array, *, rate: float, axes: int | None = None) -> Mea
 
     Examples
     --------
-    >>> found = own_noise(np.random.default_rng(0).normal(0, 1.8, (1, 100_000)), rate=100.0)
+    >>> found = measure_noise(np.random.default_rng(0).normal(0, 1.8, (1, 100_000)), rate=100.0)
     >>> bool(abs(np.median(found.level[0]) / 0.0324 - 1) < 0.02)
     True
     >>> bool(abs(found.outlier_sigma[0] / 1.8 - 1) < 0.05)

@@ -21,7 +21,7 @@ from gyrostab.blindtest.generator.scenario import (
     stream,
     to_samples,
 )
-from gyrostab.ingest.gap_table import gap_variables
+from gyrostab.ingest import gap_variables
 from gyrostab.schema import check_log
 from gyrostab.time.grid import time_coordinate
 

@@ -204,7 +204,7 @@ def draw_scenario(
 
     Examples
     --------
-    >>> scenario = draw_world(np.random.default_rng(0), rate=10.0, seconds=600.0, gaps=0.2)
+    >>> scenario = draw_scenario(np.random.default_rng(0), rate=10.0, seconds=600.0, gaps=0.2)
     >>> scenario.size, bool(0.05 < scenario.missing.mean() < 0.4)
     (6000, True)
     """

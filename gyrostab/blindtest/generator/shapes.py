@@ -73,10 +73,10 @@ def fit_lagged_driver(
 
     Examples
     --------
-    >>> from gyrostab.blindtest.generator.scenario import draw_world
-    >>> scenario = draw_world(np.random.default_rng(0), rate=10.0, seconds=900.0)
+    >>> from gyrostab.blindtest.generator.scenario import draw_scenario
+    >>> scenario = draw_scenario(np.random.default_rng(0), rate=10.0, seconds=900.0)
     >>> mean = to_samples(scenario, 0.2 * lag(scenario.supply, 40.0))
-    >>> [round(number, 2) for number in following(scenario, mean, scenario.supply, axis=0)]
+    >>> [round(number, 2) for number in fit_lagged_driver(scenario, mean, scenario.supply, axis=0)]
     [0.2, 40.0]
     """
 

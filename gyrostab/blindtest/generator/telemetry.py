@@ -34,7 +34,7 @@ def draw_losses(
 
     Examples
     --------
-    >>> lost = lose(np.random.default_rng(1), 400_000, share=0.2, frame=10, burst=5.0)
+    >>> lost = draw_losses(np.random.default_rng(1), 400_000, share=0.2, frame=10, burst=5.0)
     >>> bool(abs(lost.mean() - 0.2) < 0.02)
     True
     """
@@ -58,7 +58,7 @@ def limit_losses(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
 
     Examples
     --------
-    >>> shortened(np.ones(10, bool), longest=4).astype(int).tolist()
+    >>> limit_losses(np.ones(10, bool), longest=4).astype(int).tolist()
     [1, 1, 1, 1, 0, 1, 1, 1, 1, 0]
     """
     out = lost.copy()
@@ -75,7 +75,7 @@ def draw_power_cuts(rng: np.random.Generator, seconds: float, *, number: int) ->
 
     Examples
     --------
-    >>> cuts = power_cuts(np.random.default_rng(1), 3600.0, number=3)
+    >>> cuts = draw_power_cuts(np.random.default_rng(1), 3600.0, number=3)
     >>> bool((np.diff(cuts.ravel()) > 0).all())
     True
     """

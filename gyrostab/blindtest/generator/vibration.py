@@ -56,7 +56,7 @@ def mount_filter(resonance: float, *, quality: float) -> tuple[Array, Array]:
     Examples
     --------
     >>> b, a = mount_filter(120.0, quality=8.0)
-    >>> round(float(abs(signal.freqz(b, a, worN=[120.0], fs=FAST)[1][0])), 1)  # root(1 + Q^2)
+    >>> round(float(abs(signal.freqz(b, a, worN=[120.0], fs=FAST_HZ)[1][0])), 1)  # root(1 + Q^2)
     8.1
     """
     w = 2 * math.pi * resonance

@@ -27,7 +27,7 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
     Similar strengths of one effect are pooled because each has few cases; the first panel shows all
     effects.
     """
-    from gyrostab.plot.style import new_figure, save_png
+    from gyrostab.plot import new_figure, save_png
 
     names = list(dict.fromkeys(curves["effect"])) if len(curves) else []
     down = max(1, math.ceil(len(names) / _COLUMNS))
@@ -78,7 +78,7 @@ def _pool_strengths(part: pd.DataFrame) -> pd.DataFrame:
 
 
 def _draw_panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
-    from gyrostab.plot.style import COLOURS, MARKERS
+    from gyrostab.plot import COLOURS, MARKERS
 
     for number, key in enumerate(("detected", "named")):
         share = part[key].to_numpy()
@@ -103,7 +103,7 @@ def _draw_panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
 
 def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
     """Plot the share of correct identifications of each name, with Wilson's interval."""
-    from gyrostab.plot.style import COLOURS, new_figure, save_png
+    from gyrostab.plot import COLOURS, new_figure, save_png
 
     figure = new_figure(6.5, 1.2 + 0.26 * max(3, len(reliability)))
     panel: Any = figure.subplots()

@@ -18,10 +18,8 @@ from typing import Any
 
 from gyrostab.blindtest.generator.scenario import STREAM_LABELS
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
-from gyrostab.jobs.job import is_lock
-from gyrostab.store.output import is_leftover, replace_file
-from gyrostab.store.output.check import check_target
-from gyrostab.store.output.content import read_json
+from gyrostab.jobs import is_lock
+from gyrostab.store.output import check_target, is_leftover, read_json, replace_file
 
 __all__ = [
     "FIRST_PUBLIC_SEED",

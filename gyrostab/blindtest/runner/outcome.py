@@ -143,13 +143,13 @@ def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             "cases."
         ]
     lines = [
-        f"{one['recording']}, {one['effect']} at {one['strength']:g}: "
-        + ("named" if one["named"] else "not named")
-        + (", and so it was without salt" if one["there_before"] else "")
+        f"{line['recording']}, {line['effect']} at {line['strength']:g}: "
+        + ("named" if line["named"] else "not named")
+        + (", as in the untouched copy" if line["there_before"] else "")
         + "".join(
-            f"; {label} {', '.join(one[key])}" for key, label in _COPY_LABELS.items() if one[key]
+            f"; {label} {', '.join(line[key])}" for key, label in _COPY_LABELS.items() if line[key]
         )
-        for one in found
+        for line in found
     ]
     about = (
         "An effect is injected into a piece of a real recording, which contains unknown effects. "
@@ -233,9 +233,8 @@ def _describe_wrong_name(row: Mapping[str, Any]) -> str:
 
 
 def _describe_miss(row: Mapping[str, Any]) -> str:
-    return (
-        f"{_describe_case(row)}; {'its diagnosis failed' if row['failed'] else 'nothing was detected'}"
-    )
+    reason = "its diagnosis failed" if row["failed"] else "nothing was detected"
+    return f"{_describe_case(row)}; {reason}"
 
 
 def _format_list(lines: Sequence[str], none: str) -> str:

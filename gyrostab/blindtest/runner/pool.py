@@ -50,7 +50,7 @@ def run_in_processes(
 
     Examples
     --------
-    >>> each_in_processes(divmod, [(7, 2), (9, 4)], workers=0)
+    >>> run_in_processes(divmod, [(7, 2), (9, 4)], workers=0)
     [(3, 1), (2, 1)]
     """
     report = report or (lambda done: None)

@@ -38,8 +38,9 @@ def degrade_driver(
         Name to values and rate [Hz].
     driver : str
         Channel that drives the effect.
-    how : {"withheld", "substituted", "lagged", "confounded", "noisy", "clipped"}
-        Left out; replaced by a similar channel with other times; delayed by 30 to 180 s;
+    how : str
+        One of "withheld", "substituted", "lagged", "confounded", "noisy" and "clipped":
+        left out; replaced by a similar channel with other times; delayed by 30 to 180 s;
         accompanied by another channel that moves with it; with noise of its standard deviation;
         clipped at the middle of its range.
     rng : numpy.random.Generator
@@ -52,7 +53,8 @@ def degrade_driver(
     Examples
     --------
     >>> channels = {"temperature": (np.arange(100.0), 1.0)}
-    >>> sorted(sever(channels, "temperature", how="confounded", rng=np.random.default_rng(0)))
+    >>> rng = np.random.default_rng(0)
+    >>> sorted(degrade_driver(channels, "temperature", how="confounded", rng=rng))
     ['supply_voltage', 'temperature']
     """
     left = dict(channels)

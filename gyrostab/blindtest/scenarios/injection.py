@@ -31,11 +31,12 @@ _MAX_LEVELS_PER_SAMPLE = 0.2  # more levels mean that the record is not quantize
 
 
 def estimate_noise(record: Array, *, rate: float) -> dict[str, float]:
-    """Estimate N and K of a real axis (time,) [deg/h] from its Allan variance, for sizing only.
+    """Estimate N and K of a real axis (time,) [deg/h] roughly, from its Allan variance.
 
     Examples
     --------
-    >>> rough_noise(np.random.default_rng(0).normal(0, 1.8, 100_000), rate=100.0)["N"].__round__(4)
+    >>> record = np.random.default_rng(0).normal(0, 1.8, 100_000)
+    >>> round(estimate_noise(record, rate=100.0)["N"], 4)
     0.003
     """
     factors = octaves(record.size)

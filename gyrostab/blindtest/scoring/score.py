@@ -49,9 +49,9 @@ def intersection_over_union(found: Intervals, true: Intervals) -> float:
     0.3333333333333333
     """
     a, b = _merge_intervals(found), _merge_intervals(true)
-    both = sum(max(0.0, min(x[1], y[1]) - max(x[0], y[0])) for x in a for y in b)
-    either = sum(end - begin for begin, end in (*a, *b)) - both
-    return both / either if either > 0 else 0.0
+    overlap = sum(max(0.0, min(x[1], y[1]) - max(x[0], y[0])) for x in a for y in b)
+    either = sum(end - begin for begin, end in (*a, *b)) - overlap
+    return overlap / either if either > 0 else 0.0
 
 
 def _ambiguity_set(identification: Mapping[str, Any]) -> set[str]:

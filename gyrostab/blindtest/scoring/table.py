@@ -273,12 +273,12 @@ def _baseline_lines(rows: Sequence[Row]) -> list[Line]:
     names = sorted({name for row in rows for name in row["baseline_detectors"]})
     lines = [
         share(
-            f"{told} by the {name}",
+            label.format(name),
             (row["baseline_detectors"][name] for row in part if name in row["baseline_detectors"]),
         )
-        for told, part in (
-            ("effects at 1.5 times the limit and more seen", clear),
-            ("false alarms", nulls),
+        for label, part in (
+            ("detected by the {}, strength 1.5 or more", clear),
+            ("false alarms of the {}", nulls),
         )
         for name in names
     ]

@@ -1,4 +1,4 @@
-"""The benchmark of concealed effects."""
+"""Command `prove`: the blind test of the diagnosis."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gyrostab.units import HOUR
 
 __all__ = ["prove"]
 
-_EVERY = 60.0  # seconds between two lines of progress where there is no terminal
+_PROGRESS_INTERVAL_S = 60.0  # between two lines of progress without a terminal
 
 
 @app.command(sort_key=14, help_epilogue="")
@@ -32,30 +32,30 @@ def prove(
     resume: Flag = False,
     common: Common = Common(),
 ) -> None:
-    """Try the diagnosis on recordings whose hidden effects it is not told, and count how often it is right.
+    """Test the diagnosis blindly on recordings with known effects, and score it.
 
-    Draws cases by physics that the diagnosis does not share, prints the SHA-256 that seals their
-    truths, diagnoses the recordings, opens the seal, and writes scores.csv, table.md and figures,
-    failures included. About half a minute a case and core.
+    Draws cases with physics that the diagnosis does not share, prints the SHA-256 of their ground
+    truths, diagnoses the recordings, scores the diagnoses, and writes scores.csv, table.md and
+    figures, failures included. Takes about half a minute per case and core.
 
     Example: gyrostab prove --cases 20 --nulls 200 -o proof
 
     Parameters
     ----------
     output
-        Folder to make.
+        Folder to create.
     cases
-        Number of cases (default: 40); every 20 hold all kinds.
+        Number of cases (default: 40); every 20 include all kinds.
     seed
-        Of the draws (default: a fresh one, which is printed). Seeds below 1000000 are for tuning;
-        figures that are published use others.
+        Seed of the draws (default: a random one, which is printed). Seeds below 1000000 are for
+        tuning; published figures use others.
     nulls
         Null records of each diagnosis (default: 400; 200 for a quick look).
     real
-        Folder of real recordings (default: $GYROSTAB_RECORDINGS); one is salted for every 40 cases.
-        Without it none is.
+        Folder of real recordings (default: $GYROSTAB_RECORDINGS); one injection is made for every
+        40 cases. Without the folder there are no injections.
     resume
-        Continue a run that was stopped or killed; begin one where there is none.
+        Continue a run that was stopped or killed, or start one.
     """
     from gyrostab.blindtest.runner.benchmark import prove as run_benchmark
     from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED
@@ -66,11 +66,15 @@ def prove(
 
     if seed is not None and seed < FIRST_PUBLIC_SEED:
         print(
-            f"note: seed {seed} is below {FIRST_PUBLIC_SEED}: such seeds are for tuning, and their figures are not for publication",
+            f"note: seed {seed} is below {FIRST_PUBLIC_SEED}: such seeds are for tuning, "
+            "and their figures are not for publication",
             file=sys.stderr,
         )
     try:
-        with show_stages(common) as stage, _lines(stage, quiet=common.quiet_progress) as told:
+        with (
+            show_stages(common) as stage,
+            _print_progress(stage, quiet=common.quiet_progress) as report,
+        ):
             proof = run_benchmark(
                 output,
                 cases=cases,
@@ -80,18 +84,18 @@ def prove(
                 real=real,
                 resume=resume,
                 overwrite=common.overwrite,
-                progress=told,
+                progress=report,
                 say=say,
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"interrupted; what is finished is kept: gyrostab prove --resume -o {output} goes on"
+            f"interrupted; finished parts are kept: gyrostab prove --resume -o {output} continues"
         ) from None
     print(markdown(proof.table))
-    print("\ntargets missed:", *(f"  {line}" for line in proof.missed or ["none"]), sep="\n")
+    print("\nmissed targets:", *(f"  {line}" for line in proof.missed or ["none"]), sep="\n")
     if proof.failed:
         print(
-            "\ndiagnoses that failed:",
+            "\nfailed diagnoses:",
             *(f"  {name}: {why}" for name, why in proof.failed.items()),
             sep="\n",
         )
@@ -99,32 +103,32 @@ def prove(
 
 
 @contextmanager
-def _lines(stage: Any, *, quiet: bool) -> Iterator[Any]:
-    """Say how far the work is, now and then, where no bar can be drawn."""
+def _print_progress(stage: Any, *, quiet: bool) -> Iterator[Any]:
+    """Print a line of progress now and then where a bar cannot be drawn."""
     if quiet or sys.stderr.isatty():
         yield stage
         return
-    now: dict[str, Any] = {"label": "", "first": 0, "begun": 0.0, "said": 0.0}
+    now: dict[str, Any] = {"label": "", "first": 0, "begun": 0.0, "printed": 0.0}
 
-    def told(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
+    def report(label: str, total: int = 0, done: int | None = None, unit: str = "samples") -> None:
         stage(label, total, done, unit)
         clock = time.monotonic()
         if label != now["label"]:
-            now.update(label=label, first=done or 0, begun=clock, said=clock)
+            now.update(label=label, first=done or 0, begun=clock, printed=clock)
         worked = (done or 0) - now["first"]
-        if worked and total and clock - now["said"] > _EVERY:
-            now["said"] = clock
+        if worked and total and clock - now["printed"] > _PROGRESS_INTERVAL_S:
+            now["printed"] = clock
             left = (clock - now["begun"]) / worked * (total - (done or 0))
             print(
-                f"{label} {done} of {total} {unit}, {_length(left)} left",
+                f"{label} {done} of {total} {unit}, {_format_duration(left)} left",
                 file=sys.stderr,
                 flush=True,
             )
 
-    yield told
+    yield report
 
 
-def _length(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     return (
         f"{seconds / HOUR:.1f} h"
         if seconds > 5400

@@ -1,7 +1,7 @@
 """Checks whether a path may be written, and writing that is complete or leaves nothing."""
 
-from gyrostab.store.output.check import check_folder, check_output, resolve_link
-from gyrostab.store.output.content import find_foreign_item
+from gyrostab.store.output.check import check_folder, check_output, check_target, resolve_link
+from gyrostab.store.output.content import find_foreign_item, read_json
 from gyrostab.store.output.inputs import (
     describe_file,
     find_sources,
@@ -20,6 +20,7 @@ from gyrostab.store.output.write import (
 __all__ = [
     "check_folder",
     "check_output",
+    "check_target",
     "describe_file",
     "find_foreign_item",
     "find_sources",
@@ -28,6 +29,7 @@ __all__ = [
     "new_output",
     "pass_sources",
     "protect_inputs",
+    "read_json",
     "remember_source",
     "remove_leftovers",
     "replace_file",
