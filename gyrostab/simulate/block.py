@@ -1,4 +1,4 @@
-"""One stretch of a simulated log: from drivers and fresh random numbers through noise, effects and logger to rates."""
+"""One block of a simulated log: drivers, noise, effects and logger, up to the rates."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Step:
-    """One effect in its place: rows of its axes, and factors from the units of its channels to those that it needs."""
+    """One effect with the rows of its axes, and the unit conversion of its channels."""
 
     effect: Effect
     setup: Setup
@@ -34,7 +34,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything about a simulation that does not change with time.
+    """Constant properties of a simulation.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ def next_block(
             step.rows, np.broadcast_to(values, (len(step.rows), index.size)), strict=True
         ):
             true[plan.axes[row]] = true[plan.axes[row]] + part
-    signal = _noise(plan, state, by_stage["noise"], act, units, true)
+    signal = _add_noise(plan, state, by_stage["noise"], act, units, true)
     for number in by_stage["rate"]:
         step, values = act(number, true=true, signal=signal[list(plan.steps[number].rows)])
         signal[list(step.rows)] += values
@@ -149,7 +149,7 @@ def next_block(
         for number in by_stage[stage]:
             step, values = act(number, true=true, signal=signal[list(plan.steps[number].rows)])
             signal[list(step.rows)] = values
-    slow = _sample(plan, by_stage["sampling"], act, signal, true, count)
+    slow = _sample_log(plan, by_stage["sampling"], act, signal, true, count)
     true = (
         {axis: values.reshape(count, factor).mean(axis=1) for axis, values in true.items()}
         if factor > 1
@@ -160,11 +160,11 @@ def next_block(
             number, fast=False, true=true, signal=slow[list(plan.steps[number].rows)]
         )
         slow[list(step.rows)] = values
-    _lose(plan, slow, first)
+    _drop_gaps(plan, slow, first)
     return slow, state
 
 
-def _noise(
+def _add_noise(
     plan: Plan,
     state: BlockState,
     numbers: list[int],
@@ -204,7 +204,7 @@ def _noise(
     return signal
 
 
-def _sample(
+def _sample_log(
     plan: Plan, numbers: list[int], act: Any, signal: Array, true: Mapping[str, Array], count: int
 ) -> Array:
     """The samples of the log: those that an effect picked, or means over the sampling interval."""
@@ -214,7 +214,8 @@ def _sample(
         if any(row.size != count * plan.oversampling for row in before):
             name = plan.steps[number].effect.name
             raise OptionError(
-                f"effect {name!r} comes after another that has picked the samples of the log already; leave one of them out"
+                f"effect {name!r} follows another effect that has decimated the log already; "
+                "leave one of them out"
             )
         step, values = act(number, true=true, signal=np.stack(before))
         for row, one in zip(step.rows, values, strict=True):
@@ -227,7 +228,7 @@ def _sample(
     )
 
 
-def _lose(plan: Plan, rate: Array, first: int) -> None:
+def _drop_gaps(plan: Plan, rate: Array, first: int) -> None:
     """Put NaN into the gaps."""
     count = rate.shape[1]
     for begin, end in plan.gaps[

@@ -26,7 +26,7 @@ _EAGER = 2**20  # longer channels are computed chunk by chunk, when they are use
 
 
 def inner_unit(unit: str, values: Any) -> tuple[str, Any]:
-    """The unit that a channel has inside, and its values in it; a unit that is not known is kept."""
+    """Convert a channel to the internal unit; keep an unknown unit."""
     if unit in INNER.values():
         return unit, values
     try:
@@ -53,7 +53,8 @@ def check_points(points: Any, where: str, columns: Sequence[str]) -> Array:
         or not np.isfinite(table).all()
     ):
         raise OptionError(
-            f"{where}: {points!r} is not a list of [{', '.join(columns)}]; write for instance [{[0.0] * len(columns)}]"
+            f"{where}: {points!r} is not a list of [{', '.join(columns)}]; "
+            f"write for instance [{[0.0] * len(columns)}]"
         )
     if np.any(np.diff(table[:, 0]) < 0):
         raise OptionError(f"{where}: the times {table[:, 0].tolist()} do not rise; sort them")
@@ -61,7 +62,7 @@ def check_points(points: Any, where: str, columns: Sequence[str]) -> Array:
 
 
 def piecewise(points: Array, *, held: bool) -> Callable[[Array], Array]:
-    """Function of time through `points` of (time, value): held from each to the next, or straight between them; held at the ends."""
+    """Make a function of time through `points` (time, value), piecewise constant or linear."""
     times, values = points.T
 
     def at(seconds: Array) -> Array:
@@ -108,21 +109,25 @@ def channel(
 
     Examples
     --------
-    >>> channel("supply_voltage", "V", lambda t: 28.0 - t / 3600, duration="1h").supply_voltage.sizes
+    >>> found = channel("supply_voltage", "V", lambda t: 28.0 - t / 3600, duration="1h")
+    >>> found.supply_voltage.sizes
     Frozen({'time_supply_voltage': 3600})
     """
     if not 0 < sensor_rate <= 1e5:
         raise OptionError(
-            f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number of Hz above 0 and up to 1e5"
+            f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number of Hz "
+            "above 0 and up to 1e5"
         )
     size = max(1, math.ceil(duration_seconds(duration, "duration") * sensor_rate - 1e-6))
     dim = f"time_{name}"
     attrs = {"units": unit, "long_name": name.replace("_", " "), **(attributes or {})}
     coordinates = time_coordinate(stamp_ns(start), sensor_rate, size, name=dim)
-    return xr.Dataset({name: (dim, _sampled(values, size, sensor_rate), attrs)}, coords=coordinates)
+    return xr.Dataset(
+        {name: (dim, _sample_values(values, size, sensor_rate), attrs)}, coords=coordinates
+    )
 
 
-def _sampled(values: Callable[[Array], Array], size: int, rate: float) -> Any:
+def _sample_values(values: Callable[[Array], Array], size: int, rate: float) -> Any:
     def part(first: int, count: int) -> Array:
         return np.asarray(values((first + np.arange(count)) / rate), dtype=np.float64)
 
@@ -139,7 +144,7 @@ def _sampled(values: Callable[[Array], Array], size: int, rate: float) -> Any:
 
 
 def combine(*parts: xr.Dataset) -> xr.Dataset:
-    """Put environments together: channels side by side, tables of gaps one after the other.
+    """Merge environments: their channels, and their concatenated gap tables.
 
     Raises
     ------
@@ -163,7 +168,8 @@ def combine(*parts: xr.Dataset) -> xr.Dataset:
         twice = [name for name in channels.data_vars if name in names]
         if twice:
             raise OptionError(
-                f"the environment has the channel {twice[0]!r} twice; leave one out, or name it otherwise (channel = ...)"
+                f"the environment has the channel {twice[0]!r} twice; leave one out, "
+                "or rename it (channel = ...)"
             )
         names += list(channels.data_vars)
         rest.append(channels)

@@ -93,48 +93,49 @@ def simulate(
     OptionError, FormatError
         When the model or an option makes no sense.
     SchemaError
-        When an effect lacks its channel, or `like` is no log.
+        When an effect lacks its channel, or `like` is not a log.
 
     Examples
     --------
     >>> log = simulate({"noise": {"N": 0.01}}, duration="1min", rate=100.0, seed=4)
     >>> log.rate.shape, log.rate.units
     ((3, 6000), 'degree hour-1')
-    >>> biased = {"noise": {"N": 0.01}, "effect": [{"name": "temperature_bias", "sensitivity": 0.1}],
-    ...           "environment": [{"profile": "steps", "channel": "temperature", "unit": "degC", "points": [[0, 35]]}]}
+    >>> warm = {"profile": "steps", "channel": "temperature", "unit": "degC", "points": [[0, 35]]}
+    >>> effect = {"name": "temperature_bias", "sensitivity": 0.1}
+    >>> biased = {"noise": {"N": 0.01}, "effect": [effect], "environment": [warm]}
     >>> difference = simulate(biased, duration="1min", rate=100.0, seed=4).rate - log.rate
     >>> float(difference.min().round(6)), float(difference.max().round(6))
     (1.0, 1.0)
     """
     made = model if isinstance(model, Model) else read_model(model)
     like = None if like is None else as_log(like)
-    frame = _frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
+    frame = _make_frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
     if chunk is not None and chunk < 1:
         raise OptionError(f"chunk={chunk!r}: give at least 1 sample")
-    world = _world(made, frame, like, environment)
-    table = _gap_table(world, frame)
-    steps = _steps(made, frame, table)
-    plan = _plan(made, frame, world, table, steps)
+    environment = _make_world(made, frame, like, environment)
+    table = _gap_table(environment, frame)
+    steps = _list_steps(made, frame, table)
+    plan = _make_plan(made, frame, environment, table, steps)
     starts = [
         begin_noise(
             frame.seed,
             axis,
             rate=frame.rate * frame.oversampling,
-            terms=_terms(plan, row),
+            terms=_noise_terms(plan, row),
             flicker_band=made.flicker_band,
         )
         for row, axis in enumerate(frame.axes)
     ]
     data = lazy_rates(
         plan,
-        _begin(plan, frame.seed),
+        _begin_states(plan, frame.seed),
         starts,
         frame.size,
         chunk=chunk or max(1, BLOCK // frame.oversampling),
     )
     if like is not None:
-        data = _lost(data, like[signal_name(like)].transpose("axis", "time").data)
-    return _labelled(made, frame, world, table, data)
+        data = _mark_missing(data, like[signal_name(like)].transpose("axis", "time").data)
+    return _label_log(made, frame, environment, table, data)
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ class _Frame:
     oversampling: int
 
 
-def _frame(
+def _make_frame(
     model: Model,
     *,
     duration: Any,
@@ -167,10 +168,11 @@ def _frame(
         extra = [name for name, value in given.items() if value is not None]
         if extra:
             raise OptionError(
-                f"{extra[0]} is taken from the recording that the log shall be like; leave out {extra[0]} or like"
+                f"{extra[0]} is taken from the recording given as like; "
+                f"leave out {extra[0]} or like"
             )
         axes = tuple(str(axis) for axis in like["axis"].values)
-        return _checked(
+        return _check_model(
             model,
             _Frame(
                 float(like.attrs["sampling_rate_hz"]),
@@ -186,7 +188,8 @@ def _frame(
     for name, value, example in (("rate", hertz, "100 (Hz)"), ("duration", length, "1h")):
         if value is None:
             raise OptionError(
-                f"{model.source}: there is no {name}; give {name} = {example} in [log], --{name}, or --like RECORDING"
+                f"{model.source}: there is no {name}; give {name} = {example} in [log], "
+                f"--{name}, or --like RECORDING"
             )
     if (
         isinstance(hertz, bool)
@@ -198,7 +201,8 @@ def _frame(
         )
     if isinstance(length, bool) or duration_seconds(length, "duration") > 1e9:
         raise OptionError(
-            f"{model.source}: a duration of {length} is not one; give for instance 1h, at most 1e9 s"
+            f"{model.source}: the duration {length} is not valid; "
+            "give for instance 1h, at most 1e9 s"
         )
     size = round(duration_seconds(length, "duration") * hertz)
     if size < 1:
@@ -206,24 +210,25 @@ def _frame(
             f"{model.source}: a duration of {length} is shorter than one sample at {hertz:g} Hz"
         )
     begin = stamp_ns(start if start is not None else model.log.get("start", "1970-01-01"))
-    return _checked(
+    return _check_model(
         model, _Frame(float(hertz), size, begin, chosen, model.axes or ("x", "y", "z"), factor)
     )
 
 
-def _checked(model: Model, frame: _Frame) -> _Frame:
+def _check_model(model: Model, frame: _Frame) -> _Frame:
     named = [axis for axis in model.noise if axis] + [
         axis for effect in model.effects for axis in effect.axes
     ]
     for axis in named:
         if axis not in frame.axes:
             raise OptionError(
-                f"{model.source}: there is no axis {axis!r} in this log; it has {', '.join(frame.axes)}"
+                f"{model.source}: there is no axis {axis!r} in this log; "
+                f"it has {', '.join(frame.axes)}"
             )
     return frame
 
 
-def _world(
+def _make_world(
     model: Model, frame: _Frame, like: xr.Dataset | None, environment: xr.Dataset | None
 ) -> xr.Dataset:
     """Channels and gaps from all that there are."""
@@ -249,16 +254,16 @@ def _world(
     return combine(*parts).drop_attrs(deep=False) if parts else xr.Dataset()
 
 
-def _gap_table(world: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
-    """Gaps in samples: first missing, first present after, samples missing, rows concerned, cause; those that overlap are one."""
-    if "gap_start" not in world:
+def _gap_table(environment: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
+    """Convert and merge gaps: first missing, first present after, samples, rows, cause."""
+    if "gap_start" not in environment:
         return np.empty((0, 5), np.int64)
     first, end = (
         np.ceil(
             grid_index(
                 frame.start,
                 frame.rate,
-                world[name].values.astype("datetime64[ns]").astype(np.int64),
+                environment[name].values.astype("datetime64[ns]").astype(np.int64),
             )
             - 1e-3
         )
@@ -267,7 +272,7 @@ def _gap_table(world: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
     first, end = (np.clip(edge, 0, frame.size).astype(np.int64) for edge in (first, end))
     rows: list[list[int]] = []
     for begin, until, cause in sorted(
-        zip(first.tolist(), end.tolist(), world["gap_cause"].values.tolist(), strict=True)
+        zip(first.tolist(), end.tolist(), environment["gap_cause"].values.tolist(), strict=True)
     ):
         if until <= begin:
             continue
@@ -281,7 +286,7 @@ def _gap_table(world: xr.Dataset, frame: _Frame) -> NDArray[np.int64]:
     return table
 
 
-def _steps(model: Model, frame: _Frame, table: NDArray[np.int64]) -> list[Step]:
+def _list_steps(model: Model, frame: _Frame, table: NDArray[np.int64]) -> list[Step]:
     """The effects in the order in which they act."""
     steps = []
     for effect in sorted(
@@ -306,14 +311,14 @@ def _steps(model: Model, frame: _Frame, table: NDArray[np.int64]) -> list[Step]:
     return check_effects(steps)
 
 
-def _factors(effect: Effect, world: xr.Dataset, present: list[str]) -> dict[str, float]:
-    """Factors from the units of an effect's channels to those that it needs; `SchemaError` where a channel or its unit is wrong."""
+def _convert_units(effect: Effect, environment: xr.Dataset, present: list[str]) -> dict[str, float]:
+    """Compute the unit conversion of an effect's channels; `SchemaError` for a wrong one."""
     factors = {}
     names = effect.channel_names()
     for role in effect.needs():
         if names[role] not in present:
             raise driver_error(effect, role, present)
-        wanted, found = effect.channels[role], str(world[names[role]].attrs.get("units"))
+        wanted, found = effect.channels[role], str(environment[names[role]].attrs.get("units"))
         if found == wanted:
             continue
         with contextlib.suppress(UnitError):
@@ -327,20 +332,27 @@ def _factors(effect: Effect, world: xr.Dataset, present: list[str]) -> dict[str,
     return factors
 
 
-def _plan(
-    model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], steps: list[Step]
+def _make_plan(
+    model: Model,
+    frame: _Frame,
+    environment: xr.Dataset,
+    table: NDArray[np.int64],
+    steps: list[Step],
 ) -> Plan:
-    present = log_channels(world)
-    steps = [replace(step, factors=_factors(step.effect, world, present)) for step in steps]
+    present = log_channels(environment)
+    steps = [
+        replace(step, factors=_convert_units(step.effect, environment, present)) for step in steps
+    ]
     needed = {step.effect.channel_names()[role] for step in steps for role in step.effect.needs()}
     turning = (
-        str(world["rotation_rate"].attrs.get("rotation_axis", ""))
+        str(environment["rotation_rate"].attrs.get("rotation_axis", ""))
         if "rotation_rate" in present
         else ""
     )
     if turning and turning not in frame.axes:
         raise OptionError(
-            f"{model.source}: the tool turns about the axis {turning!r}, which the log has not; it has {', '.join(frame.axes)}"
+            f"{model.source}: the tool rotates about the axis {turning!r}, which the log "
+            f"does not have; it has {', '.join(frame.axes)}"
         )
     if turning:
         needed.add("rotation_rate")
@@ -351,13 +363,13 @@ def _plan(
         axes=frame.axes,
         coefficients=tuple(model.coefficients(axis) for axis in frame.axes),
         steps=tuple(steps),
-        sources={name: make_source(world, name) for name in sorted(needed)},
+        sources={name: make_source(environment, name) for name in sorted(needed)},
         turning=turning,
         gaps=table[:, :2],
     )
 
 
-def _terms(plan: Plan, row: int) -> str:
+def _noise_terms(plan: Plan, row: int) -> str:
     """Noise terms of an axis that some stretch may hold."""
     changed = "".join(
         step.effect.terms
@@ -367,7 +379,7 @@ def _terms(plan: Plan, row: int) -> str:
     return "".join(term for term in "QNBK" if plan.coefficients[row][term] > 0.0 or term in changed)
 
 
-def _begin(plan: Plan, seed: int) -> BlockState:
+def _begin_states(plan: Plan, seed: int) -> BlockState:
     counts: dict[str, int] = {}
     states = []
     for step in plan.steps:
@@ -377,18 +389,18 @@ def _begin(plan: Plan, seed: int) -> BlockState:
     return BlockState(states)
 
 
-def _lost(data: Any, signal: Any) -> Any:
+def _mark_missing(data: Any, signal: Any) -> Any:
     """The samples that are NaN in `signal` are lost here too."""
     import dask.array as da
 
     return da.where(da.isnan(da.asarray(signal)).rechunk(data.chunks), np.nan, data)
 
 
-def _labelled(
-    model: Model, frame: _Frame, world: xr.Dataset, table: NDArray[np.int64], data: Any
+def _label_log(
+    model: Model, frame: _Frame, environment: xr.Dataset, table: NDArray[np.int64], data: Any
 ) -> xr.Dataset:
-    gaps = [name for name, variable in world.variables.items() if variable.dims == ("gap",)]
-    log = world.drop_vars(gaps).assign(
+    gaps = [name for name, variable in environment.variables.items() if variable.dims == ("gap",)]
+    log = environment.drop_vars(gaps).assign(
         {
             "rate": (
                 ("axis", "time"),
@@ -406,7 +418,8 @@ def _labelled(
         "sampling_rate_hz": frame.rate,
         "kind": "rate",
         "source_files": [model.source],
-        "history": f"{now} gyrostab.simulate: {frame.size} samples at {frame.rate:.10g} Hz, seed {frame.seed}",
+        "history": f"{now} gyrostab.simulate: {frame.size} samples "
+        f"at {frame.rate:.10g} Hz, seed {frame.seed}",
         "notes": [],
         "simulation_model": model.text,
         "simulation_seed": frame.seed,

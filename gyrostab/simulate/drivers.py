@@ -1,4 +1,4 @@
-"""Channels of a log at the samples where effects need them: interpolated, without holes, for any stretch of time."""
+"""Channels of a log interpolated to the samples of the effects, for any span of time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Source:
-    """A channel that can be asked for its value at any instant.
+    """A channel that can be interpolated at any time.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Source:
     size: int = 0
 
     def stretch(self, before: int, end: int) -> Stretch | None:
-        """Which values the instants after `before` up to `end` [ns] need; None for a channel that is in memory."""
+        """Find the values needed for times after `before` up to `end` [ns]; None if in memory."""
         if self.stamps is not None:
             return None
         first, last = (
@@ -74,7 +74,7 @@ class Source:
     def at(
         self, instants: NDArray[np.int64], part: tuple[Stretch, Any] | None, carry: float | None
     ) -> tuple[Array, float | None]:
-        """Values at rising `instants` [ns since 1970].
+        """Interpolate at increasing `instants` [ns since 1970].
 
         Parameters
         ----------
@@ -91,11 +91,11 @@ class Source:
         carry : float or None
         """
         if self.stamps is not None:
-            return self._between(instants), None
+            return self._interpolate_between(instants), None
         assert part is not None
         stretch, values = part
         known = np.asarray(values, dtype=np.float64)
-        whole = _filled(np.concatenate([[self.first if carry is None else carry], known]))
+        whole = _fill_gaps(np.concatenate([[self.first if carry is None else carry], known]))
         position = grid_index(self.start, self.rate, instants)
         position = np.where(
             np.abs(position - np.rint(position)) < 1e-6, np.rint(position), position
@@ -109,7 +109,7 @@ class Source:
             after = after + (position - base) * (whole[np.minimum(place + 1, known.size)] - after)
         return after, float(whole[place[-1]])
 
-    def _between(self, instants: NDArray[np.int64]) -> Array:
+    def _interpolate_between(self, instants: NDArray[np.int64]) -> Array:
         stamps = self.stamps
         assert stamps is not None
         if self.held:
@@ -126,7 +126,7 @@ class Source:
         return np.asarray(np.interp(at, known, self.values[low:high]))
 
 
-def _filled(values: Array) -> Array:
+def _fill_gaps(values: Array) -> Array:
     """Each NaN replaced by the number before it."""
     good = ~np.isnan(values)
     return np.asarray(values[np.maximum.accumulate(np.where(good, np.arange(values.size), 0))])
@@ -146,7 +146,7 @@ def _first_number(values: Any, name: str) -> float:
 
 
 def make_source(log: xr.Dataset, name: str) -> Source:
-    """A channel of a log, ready to be asked.
+    """Prepare a channel of a log for interpolation.
 
     Raises
     ------
@@ -156,7 +156,8 @@ def make_source(log: xr.Dataset, name: str) -> Source:
     Examples
     --------
     >>> from gyrostab.simulate.environment import ramps
-    >>> warm = make_source(ramps("temperature", "degC", [[0, 20], [4, 60]], duration=5.0), "temperature")
+    >>> ramp = ramps("temperature", "degC", [[0, 20], [4, 60]], duration=5.0)
+    >>> warm = make_source(ramp, "temperature")
     >>> warm.at(np.array([500_000_000, 1_500_000_000]), None, None)[0]
     array([25., 35.])
     """

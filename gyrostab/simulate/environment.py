@@ -1,4 +1,4 @@
-"""Environment of a simulated tool: channels that drive the effects, each a function that gives a Dataset.
+"""Environment of a simulated tool: functions that make the driving channels.
 
 Times are seconds since the start of the log. ``PROFILES`` lists the functions and the units of
 their parameters for models.
@@ -32,7 +32,7 @@ __all__ = ["chamber", "light_power", "ramps", "rotation", "steps", "supply", "tr
 Array = NDArray[np.float64]
 
 
-def _points(
+def _make_from_points(
     name: str,
     unit: str,
     points: Points,
@@ -66,7 +66,7 @@ def steps(
     start: Any = "1970-01-01",
     sensor_rate: float = 1.0,
 ) -> xr.Dataset:
-    """Any channel that jumps from value to value.
+    """Make a piecewise constant channel.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def steps(
     >>> steps("pressure", "bar", [[0, 1], [2, 300]], duration=4.0).pressure.values
     array([  100000.,   100000., 30000000., 30000000.])
     """
-    return _points(channel, unit, points, True, duration, start, sensor_rate)
+    return _make_from_points(channel, unit, points, True, duration, start, sensor_rate)
 
 
 def ramps(
@@ -98,14 +98,14 @@ def ramps(
     start: Any = "1970-01-01",
     sensor_rate: float = 1.0,
 ) -> xr.Dataset:
-    """Any channel that runs straight from value to value; arguments as for `steps`.
+    """Make a piecewise linear channel; arguments as for `steps`.
 
     Examples
     --------
     >>> ramps("temperature", "degC", [[0, 20], [4, 60]], duration=4.0).temperature.values
     array([20., 30., 40., 50.])
     """
-    return _points(channel, unit, points, False, duration, start, sensor_rate)
+    return _make_from_points(channel, unit, points, False, duration, start, sensor_rate)
 
 
 def vibration(
@@ -116,7 +116,7 @@ def vibration(
     sensor_rate: float = 1.0,
     band: Sequence[float] = (20.0, 2000.0),
 ) -> xr.Dataset:
-    """Vibration as its rms acceleration, on and off or in steps, with a flat spectrum in a band.
+    """Make vibration (rms acceleration), on and off or in steps, with a flat band spectrum.
 
     Parameters
     ----------
@@ -142,13 +142,13 @@ def vibration(
     low, high = (float(edge) for edge in band)
     if not 0.0 <= low < high:
         raise OptionError(f"band of vibration {list(band)}: give [lower, higher] frequency in Hz")
-    return _points(
+    return _make_from_points(
         "vibration", "g", points, True, duration, start, sensor_rate, band_hz=[low, high]
     )
 
 
-def _lagged(values: Array, lag: float, sensor_rate: float) -> Array:
-    """First-order response to `values` (straight between the samples) with the time constant `lag` [s], from rest at the first."""
+def _apply_lag(values: Array, lag: float, sensor_rate: float) -> Array:
+    """Apply a first-order lag [s] to `values` (linear between samples), from equilibrium."""
     if lag <= 0.0:
         return values
     from scipy.signal import lfilter
@@ -174,7 +174,7 @@ def chamber(
     channel: str = "temperature",
     sensor_rate: float = 1.0,
 ) -> xr.Dataset:
-    """Temperature in a thermal chamber that goes up and down between two ends; by default the test of Li et al. 2013.
+    """Make the temperature of a thermal chamber cycle; by default the test of Li et al. 2013.
 
     Parameters
     ----------
@@ -204,31 +204,31 @@ def chamber(
         )
     if first not in ("low", "high"):
         raise OptionError(f"chamber: first is 'low' or 'high', not {first!r}")
-    seconds, wait = duration_seconds(duration, "duration"), _seconds(hold)
+    seconds, wait = duration_seconds(duration, "duration"), _to_seconds(hold)
     way = (high - low) / speed * 60.0
     count = math.ceil(seconds / (wait + way)) + 1
     begin = np.arange(count) * (wait + way)
     ends = np.where(np.arange(count) % 2 == (first == "high"), low, high)
     table = np.stack([np.stack([begin, begin + wait], axis=1).ravel(), np.repeat(ends, 2)], axis=1)
-    return _temperature(
+    return _make_temperature(
         channel,
         lambda t: piecewise(table, held=False)(t),
         seconds,
         start,
         sensor_rate,
-        _seconds(lag),
+        _to_seconds(lag),
     )
 
 
-def _seconds(value: Any) -> float:
+def _to_seconds(value: Any) -> float:
     return 0.0 if value == 0 else duration_seconds(value, "time")
 
 
-def _temperature(
+def _make_temperature(
     name: str, function: Any, seconds: float, start: Any, sensor_rate: float, lag: float
 ) -> xr.Dataset:
     size = max(1, math.ceil(seconds * sensor_rate - 1e-6))
-    felt = _lagged(function(np.arange(size) / sensor_rate), lag, sensor_rate)
+    felt = _apply_lag(function(np.arange(size) / sensor_rate), lag, sensor_rate)
 
     def values(t: Array) -> Array:
         return np.asarray(felt[np.rint(t * sensor_rate).astype(np.int64)])
@@ -251,7 +251,7 @@ def trip(
     channel: str = "temperature",
     sensor_rate: float = 1.0,
 ) -> xr.Dataset:
-    """Temperature of a tool that is run into a well, drills and comes out, and its depth.
+    """Make the temperature and depth of a tool that is run in hole, drills and is pulled out.
 
     The tool follows the mud around it with a time constant. Standing mud has the temperature of the
     rock, ``surface + gradient depth``; mud that circulates comes from above and takes a share of
@@ -299,8 +299,10 @@ def trip(
         return np.asarray(surface + warmth * np.where(flows, 1.0 - cooling, 1.0))
 
     seconds = duration_seconds(duration, "duration")
-    warm = _temperature(channel, mud, seconds, start, sensor_rate, _seconds(response))
-    return combine(warm, _points("depth", "m", depths, False, seconds, start, sensor_rate))
+    warm = _make_temperature(channel, mud, seconds, start, sensor_rate, _to_seconds(response))
+    return combine(
+        warm, _make_from_points("depth", "m", depths, False, seconds, start, sensor_rate)
+    )
 
 
 def supply(
@@ -313,7 +315,7 @@ def supply(
     loads: Points = (),
     sensor_rate: float = 1.0,
 ) -> xr.Dataset:
-    """Voltage of a battery that runs down, with loads that draw it lower.
+    """Make the voltage of a discharging battery under load.
 
     Parameters
     ----------
@@ -362,7 +364,7 @@ def light_power(
     points: Points = (),
     sensor_rate: float = 1.0,
 ) -> xr.Dataset:
-    """Optical power at the detector, which falls as the source ages.
+    """Make the optical power at the detector, which falls as the source ages.
 
     Parameters
     ----------
@@ -377,7 +379,8 @@ def light_power(
 
     Examples
     --------
-    >>> light_power(duration="1h", loss=0.0, points=[[0, 0], [3600, 3.0103]]).light_power[[0, 1800]].values.round(7)
+    >>> found = light_power(duration="1h", loss=0.0, points=[[0, 0], [3600, 3.0103]])
+    >>> found.light_power[[0, 1800]].values.round(7)
     array([1.00e-04, 7.07e-05])
     """
     table = (

@@ -1,4 +1,4 @@
-"""The rates of a simulated log as a dask array whose blocks follow one from another, and can be had in any order."""
+"""Rates of a simulated log as a dask array of chained blocks, computable in any order."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STATES = 512
 
 
 class Chain:
-    """Steps of which each needs the state after the one before.
+    """Steps that each need the state after the previous one.
 
     A chain remembers states on its way, so that going through it costs every step once, however it
     is cut into calls, and going back costs little. Threads may ask at the same time. A copy in
@@ -62,7 +62,7 @@ class Chain:
                     self._recent[place], self._states[place + 1] = self._step(
                         place, self._states[place]
                     )
-                    self._forget(place)
+                    self._forget_state(place)
                 self._taken = max(self._taken, number + 1)
             return self._recent[number]
 
@@ -70,7 +70,7 @@ class Chain:
         """Take a step and give its result, unless it was taken already; then give None."""
         return self(number) if number >= self._taken else None
 
-    def _forget(self, place: int) -> None:
+    def _forget_state(self, place: int) -> None:
         while len(self._recent) > RECENT:
             del self._recent[next(iter(self._recent))]
         old = place - 2 * RECENT
@@ -79,7 +79,7 @@ class Chain:
 
 
 class _Channel:
-    """A long channel, chunk by chunk; a chunk that is computed lazily has a small graph of its own."""
+    """A long channel, chunk by chunk; each lazily computed chunk has a small separate graph."""
 
     def __init__(self, values: Any):
         import dask.array as da
@@ -101,7 +101,7 @@ class _Channel:
 
 
 class _Log:
-    """The blocks of a log: a chain of random numbers for each axis, and the chain of the blocks themselves."""
+    """Blocks of a log: one chain of random numbers per axis, and the chain of the blocks."""
 
     def __init__(
         self, plan: Plan, state: BlockState, starts: Sequence[NoiseState], counts: Sequence[int]
@@ -118,14 +118,14 @@ class _Log:
             },
         )
         self.firsts, self.counts = np.concatenate([[0], np.cumsum(counts)]).tolist(), list(counts)
-        self.draws = [Chain(self._draw, start, len(counts)) for start in starts]
-        self.blocks = Chain(self._block, state, len(counts))
+        self.draws = [Chain(self._draw_numbers, start, len(counts)) for start in starts]
+        self.blocks = Chain(self._compute_block, state, len(counts))
 
-    def _draw(self, number: int, state: NoiseState) -> Any:
+    def _draw_numbers(self, number: int, state: NoiseState) -> Any:
         factor = self.plan.oversampling
         return draw(state, self.firsts[number] * factor, self.counts[number] * factor)
 
-    def _block(self, number: int, state: BlockState) -> Any:
+    def _compute_block(self, number: int, state: BlockState) -> Any:
         first, count, factor = self.firsts[number], self.counts[number], self.plan.oversampling
         instants = np.array([max(first * factor - 1, 0), (first + count) * factor - 1])
         before, end = grid_times(self.plan.start, self.plan.rate * factor, instants).tolist()
@@ -140,7 +140,7 @@ class _Log:
 
 
 def _go_draw(log: _Log, row: int, number: int, *before: Any) -> None:
-    """Draw a block of an axis; what comes before holds it back, so that blocks come in their order and not far ahead of their use."""
+    """Draw a block of an axis; its predecessor delays it, which keeps blocks in order."""
     log.draws[row].go(number)
 
 
@@ -149,14 +149,14 @@ def _go_block(log: _Log, number: int, *before: Any) -> Any:
     return log.blocks.go(number)
 
 
-def _rates(log: _Log, number: int, made: Any) -> NDArray[np.float64]:
+def _make_rates(log: _Log, number: int, made: Any) -> NDArray[np.float64]:
     return np.asarray(log.blocks(number) if made is None else made)
 
 
 def lazy_rates(
     plan: Plan, state: BlockState, starts: Sequence[NoiseState], size: int, *, chunk: int
 ) -> Any:
-    """Rates of a whole log, block by block.
+    """Make the rates of a whole log, block by block.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def lazy_rates(
             *earlier,
             *((f"{log}-draw", row, number) for row in rows),
         )
-        tasks[(name, 0, number)] = (_rates, log, number, (f"{log}-block", number))
+        tasks[(name, 0, number)] = (_make_rates, log, number, (f"{log}-block", number))
     return da.Array(
         HighLevelGraph.from_collections(name, tasks),
         name,

@@ -1,4 +1,4 @@
-"""Gaps of a simulated log: lost telemetry, lost power. Each function gives a table of gaps; times are seconds since the start."""
+"""Gap tables of a simulated log (lost telemetry, lost power), in seconds since the start."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["gaps", "losses", "power_cuts"]
 _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
 
 
-def _table(spans: NDArray[np.float64], cause: int, start: Any) -> xr.Dataset:
+def _make_table(spans: NDArray[np.float64], cause: int, start: Any) -> xr.Dataset:
     """Gaps from seconds; they are cut to samples when the log is made."""
     edges = stamp_ns(start) + np.rint(spans.reshape(-1, 2) * 1e9).astype(np.int64)
     flags = {
@@ -50,7 +50,7 @@ def _table(spans: NDArray[np.float64], cause: int, start: Any) -> xr.Dataset:
 
 
 def gaps(spans: Points, *, duration: Any = None, start: Any = "1970-01-01") -> xr.Dataset:
-    """Stretches of lost data at given times.
+    """Make gaps at given times.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def gaps(spans: Points, *, duration: Any = None, start: Any = "1970-01-01") -> x
     table = check_points(spans, "spans of gaps", ("from [s]", "to [s]"))
     if np.any(table[:, 1] <= table[:, 0]):
         raise OptionError(f"spans of gaps: {table.tolist()}: each must end after it begins")
-    return _table(table, _MISSING, start)
+    return _make_table(table, _MISSING, start)
 
 
 def losses(
@@ -83,7 +83,7 @@ def losses(
     burst: Any = 120.0,
     within: float = 20.0,
 ) -> xr.Dataset:
-    """Data lost in mud-pulse telemetry: single frames now and then, and many in bursts while the channel is bad.
+    """Draw data losses of mud-pulse telemetry: single frames, and bursts of frames.
 
     Parameters
     ----------
@@ -119,17 +119,17 @@ def losses(
         if not value >= 0.0:
             raise OptionError(f"losses: {name}={value!r} must not be below zero")
     rng = stream(seed, "losses")
-    good = _poisson(rng, 0.0, seconds, per_hour)
+    good = _draw_poisson(rng, 0.0, seconds, per_hour)
     bad = [
-        _poisson(rng, begin, begin + rng.exponential(spell), per_hour * max(0.0, within - 1.0))
-        for begin in _poisson(rng, 0.0, seconds, bursts_per_hour)
+        _draw_poisson(rng, begin, begin + rng.exponential(spell), per_hour * max(0.0, within - 1.0))
+        for begin in _draw_poisson(rng, 0.0, seconds, bursts_per_hour)
     ]
     begin = np.sort(np.concatenate([good, *bad]))
     spans = np.stack([begin, begin + rng.exponential(length, begin.size)], axis=1)
-    return _table(spans, _MISSING, start)
+    return _make_table(spans, _MISSING, start)
 
 
-def _poisson(
+def _draw_poisson(
     rng: np.random.Generator, begin: float, end: float, per_hour: float
 ) -> NDArray[np.float64]:
     if not 0.0 <= per_hour * (end - begin) <= 1e8:
@@ -148,7 +148,7 @@ def power_cuts(
     per_day: float = 0.0,
     mean: Any = 60.0,
 ) -> xr.Dataset:
-    """Losses of power: data is missing meanwhile, and the gyro starts anew afterwards (warm-up, bias jumps).
+    """Draw losses of power, after which the gyro restarts (warm-up, bias jumps).
 
     Parameters
     ----------
@@ -172,8 +172,8 @@ def power_cuts(
         else np.empty((0, 2))
     )
     rng = stream(seed, "power_cuts")
-    begin = _poisson(rng, 0.0, duration_seconds(duration, "duration"), per_day / 24.0)
+    begin = _draw_poisson(rng, 0.0, duration_seconds(duration, "duration"), per_day / 24.0)
     more = np.stack(
         [begin, begin + rng.exponential(duration_seconds(mean, "mean"), begin.size)], axis=1
     )
-    return _table(np.concatenate([table, more]), _RESTART, start)
+    return _make_table(np.concatenate([table, more]), _RESTART, start)

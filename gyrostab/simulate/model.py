@@ -1,4 +1,4 @@
-"""A model: noise, effects, environment and the frame of the log, from TOML or a dict. See docs/simulate.md."""
+"""Model of a log (noise, effects, environment, frame) from TOML or a dict; see docs/simulate.md."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ _LOG = ("rate", "duration", "start", "seed", "axes", "oversampling")
 
 @dataclass(frozen=True)
 class Model:
-    """What `gyrostab.simulate` makes a log from.
+    """Model from which `gyrostab.simulate` makes a log.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
         The file, or its tables ``log``, ``noise``, ``environment`` and ``effect`` as in
         ``docs/simulate.md``. Numbers are in the units of the coefficients (Q [urad], N
         [deg/sqrt(h)], B [deg/h], K [deg/h^1.5], R [deg/h^2]) and of the parameters of the effects;
-        text carries a unit of its own.
+        text carries its unit.
 
     Returns
     -------
@@ -153,35 +153,38 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     for key, table in tables.items():
         if key not in known:
             raise OptionError(
-                f"{where}: there is no section {key!r}{close_to(key, known)}; there are [log], [noise], [[effect]], [[environment]]"
+                f"{where}: there is no section {key!r}{close_to(key, known)}; "
+                "there are [log], [noise], [[effect]], [[environment]]"
             )
         if not isinstance(table, list if key in ("effect", "environment") else Mapping):
             raise OptionError(
-                f"{where}: write {key} as {'[[' + key + ']]' if key in ('effect', 'environment') else '[' + key + ']'}"
+                f"{where}: write {key} as "
+                f"{'[[' + key + ']]' if key in ('effect', 'environment') else '[' + key + ']'}"
             )
     for key in ("effect", "environment"):
         for number, table in enumerate(tables.get(key, []), start=1):
             if not isinstance(table, Mapping):
                 raise OptionError(
-                    f"{where}: {key} {number} is {table!r}, not a table; write [[{key}]] and its parameters below"
+                    f"{where}: {key} {number} is {table!r}, not a table; "
+                    f"write [[{key}]] and its parameters below"
                 )
-    noise, band = _noise(tables.get("noise", {}), where)
+    noise, band = _read_noise(tables.get("noise", {}), where)
     effects = [
         make_effect(table, where=f"{where}, effect {number}")
         for number, table in enumerate(tables.get("effect", []), start=1)
     ]
     profiles = [
-        _profile(table, f"{where}, environment {number}")
+        _read_profile(table, f"{where}, environment {number}")
         for number, table in enumerate(tables.get("environment", []), start=1)
     ]
-    log = _log(tables.get("log", {}), where)
-    axes = tuple(log.pop("axes", ())) or _axes(noise, effects)
+    log = _read_log_section(tables.get("log", {}), where)
+    axes = tuple(log.pop("axes", ())) or _list_axes(noise, effects)
     found = Model(axes, noise, band, tuple(effects), tuple(profiles), log, source=where, text=text)
     _check_axes(found)
     return found
 
 
-def _noise(
+def _read_noise(
     table: Mapping[str, Any], where: str
 ) -> tuple[dict[str, dict[str, float]], tuple[float, float]]:
     noise: dict[str, dict[str, float]] = {}
@@ -200,19 +203,20 @@ def _noise(
             band = (float(edges[0]), float(edges[1]))
         elif isinstance(value, Mapping):
             noise[key] = {
-                term: _coefficient(term, number, f"{where}, [noise.{key}]")
+                term: _read_coefficient(term, number, f"{where}, [noise.{key}]")
                 for term, number in value.items()
             }
         else:
-            noise.setdefault("", {})[key] = _coefficient(key, value, f"{where}, [noise]")
+            noise.setdefault("", {})[key] = _read_coefficient(key, value, f"{where}, [noise]")
     return noise, band
 
 
-def _coefficient(term: str, value: Any, where: str) -> float:
+def _read_coefficient(term: str, value: Any, where: str) -> float:
     if term not in LAWS:
         listed = ", ".join(f"{symbol} [{law.label}]" for symbol, law in LAWS.items())
         raise OptionError(
-            f"{where}: there is no noise term {term!r}; there are {listed}, and flicker_band in [noise]"
+            f"{where}: there is no noise term {term!r}; "
+            f"there are {listed}, and flicker_band in [noise]"
         )
     number = amount(value, LAWS[term].label, f"{where}: {term}")
     if (
@@ -227,12 +231,13 @@ def _coefficient(term: str, value: Any, where: str) -> float:
     return float(number)
 
 
-def _log(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+def _read_log_section(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in table.items():
         if key not in _LOG:
             raise OptionError(
-                f"{where}, [log]: there is no {key!r}{close_to(key, _LOG)}; there are {', '.join(_LOG)}"
+                f"{where}, [log]: there is no {key!r}{close_to(key, _LOG)}; "
+                f"there are {', '.join(_LOG)}"
             )
         found[key] = (
             amount(value, {"rate": "Hz", "duration": "s"}[key], f"{where}: {key}")
@@ -246,7 +251,8 @@ def _log(table: Mapping[str, Any], where: str) -> dict[str, Any]:
             or found[key] < (key == "oversampling")
         ):
             raise OptionError(
-                f"{where}, [log]: {key} = {found[key]!r} is not a whole number {'above 0' if key != 'seed' else 'from 0 up'}"
+                f"{where}, [log]: {key} = {found[key]!r} is not a whole number "
+                f"{'above 0' if key != 'seed' else 'from 0 up'}"
             )
     axes = found.get("axes", ["x"])
     if (
@@ -256,7 +262,8 @@ def _log(table: Mapping[str, Any], where: str) -> dict[str, Any]:
         or len(set(axes)) < len(axes)
     ):
         raise OptionError(
-            f'{where}, [log]: axes = {axes!r} is not a list of different names; write for instance axes = ["x", "y", "z"]'
+            f"{where}, [log]: axes = {axes!r} is not a list of different names; "
+            'write for instance axes = ["x", "y", "z"]'
         )
     if found.get("oversampling", 1) > 1000:
         raise OptionError(
@@ -267,7 +274,7 @@ def _log(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     return found
 
 
-def _axes(noise: Mapping[str, Any], effects: list[Effect]) -> tuple[str, ...]:
+def _list_axes(noise: Mapping[str, Any], effects: list[Effect]) -> tuple[str, ...]:
     if "" in noise or not noise:
         return ()
     named = [axis for axis in noise if axis] + [axis for effect in effects for axis in effect.axes]
@@ -278,14 +285,15 @@ def _check_axes(model: Model) -> None:
     if not model.axes:
         return
     for effect in model.effects:
-        strange = [axis for axis in effect.axes if axis not in model.axes]
-        if strange:
+        unknown = [axis for axis in effect.axes if axis not in model.axes]
+        if unknown:
             raise OptionError(
-                f"{model.source}: effect {effect.name!r}: the log has no axis {strange[0]!r}; it has {', '.join(model.axes)}"
+                f"{model.source}: effect {effect.name!r}: the log has no axis {unknown[0]!r}; "
+                f"it has {', '.join(model.axes)}"
             )
 
 
-def _profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[str, Any]]:
+def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[str, Any]]:
     name = table.get("profile")
     if not isinstance(name, str) or name not in PROFILES:
         what = (
@@ -307,12 +315,14 @@ def _profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[str, An
                 f"{item} [{units[item]}]" if item in units else item for item in arguments
             )
             raise OptionError(
-                f"{where}: profile {name!r} has no parameter {key!r}{close_to(key, list(arguments))}; it has {listed}"
+                f"{where}: profile {name!r} has no parameter {key!r}"
+                f"{close_to(key, list(arguments))}; it has {listed}"
             )
     for key, item in arguments.items():
         if item.default is inspect.Parameter.empty and key not in values:
             raise OptionError(
-                f"{where}: profile {name!r} lacks {key!r}; see gyrostab.simulate.environment.{name} for what it holds"
+                f"{where}: profile {name!r} lacks {key!r}; "
+                f"see gyrostab.simulate.environment.{name} for its parameters"
             )
     for key, value in values.items():
         kind, what = (

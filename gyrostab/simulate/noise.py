@@ -1,7 +1,7 @@
 """Noise of a gyro axis: Q, N, B, K, R of the noise table, and Gauss-Markov and sinusoidal parts.
 
-Every term of every axis has a stream of random numbers of its own, which depends on the seed, the
-axis and the term and on nothing else. So a term stays the same whatever the other terms, the
+Every term of every axis has a separate stream of random numbers, which depends on the seed, the
+axis and the term and on nothing else. A term therefore stays the same whatever the other terms, the
 effects, the length and the chunks are.
 """
 
@@ -69,7 +69,7 @@ class NoiseState:
 
 @dataclass(frozen=True)
 class Units:
-    """Fresh numbers of unit strength for a stretch of samples, before the level of the noise is known."""
+    """Random numbers of unit strength for a span of samples, before scaling."""
 
     first: int
     size: int
@@ -84,7 +84,7 @@ def begin_noise(
     terms: str = "QNBK",
     flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf),
 ) -> NoiseState:
-    """State of the noise of one axis before its first sample.
+    """Make the state of the noise of one axis before its first sample.
 
     Parameters
     ----------
@@ -103,7 +103,8 @@ def begin_noise(
     low, high = flicker_band
     if not 0.0 < low < high:
         raise OptionError(
-            f"the band of flicker noise {low:g} to {high:g} Hz is empty; give the lower frequency, above 0, and the higher one"
+            f"the band of flicker noise {low:g} to {high:g} Hz is empty; "
+            "give the lower frequency, above 0, and the higher one"
         )
     times = flicker_times(rate, low=low, high=high)
     position = (
@@ -113,11 +114,11 @@ def begin_noise(
         rate=rate, streams=streams, times=times, endless=math.isinf(high), flicker=position
     )
     if "Q" in streams:
-        state.angle = float(_uniform(streams["Q"], 1)[0])
+        state.angle = float(_draw_uniform(streams["Q"], 1)[0])
     return state
 
 
-def _uniform(rng: np.random.Generator, size: int) -> Array:
+def _draw_uniform(rng: np.random.Generator, size: int) -> Array:
     """Rounding errors of unit variance."""
     return math.sqrt(12.0) * (rng.random(size) - 0.5)
 
@@ -128,19 +129,19 @@ def draw(state: NoiseState, first: int, size: int) -> tuple[Units, NoiseState]:
     found: dict[str, Any] = {}
     for term, rng in state.streams.items():
         if term == "Q":
-            angle = np.concatenate([[state.angle], _uniform(rng, size)])
+            angle = np.concatenate([[state.angle], _draw_uniform(rng, size)])
             state.angle = float(angle[-1])
             found[term] = angle
         elif term == "N":
             found[term] = rng.standard_normal(size)
         elif term == "B":
-            found[term] = _flicker(state, rng, size)
+            found[term] = _draw_flicker(state, rng, size)
         else:
             found[term] = rng.standard_normal((size, 2))
     return Units(first, size, found), state
 
 
-def _flicker(state: NoiseState, rng: np.random.Generator, size: int) -> Array:
+def _draw_flicker(state: NoiseState, rng: np.random.Generator, size: int) -> Array:
     """Flicker noise of unit strength, in pieces that stay in the processor's cache."""
     means = np.empty(size)
     for first in range(0, size, _PIECE):
@@ -160,7 +161,7 @@ def shape(
     *,
     ramp: float = 0.0,
 ) -> tuple[Array, dict[str, float]]:
-    """Give the numbers their level.
+    """Scale the random numbers to their level.
 
     Parameters
     ----------
@@ -213,7 +214,7 @@ class _Parts:
     sinusoid: tuple[float, float, float] | None
 
 
-def _more(
+def _add_parts(
     parts: _Parts, state: tuple[Any, ...], first: int, size: int
 ) -> tuple[Array, tuple[Any, ...]]:
     """The next `size` samples."""
@@ -250,7 +251,7 @@ def make_noise(
     lazy: bool = False,
     chunk: int = CHUNK,
 ) -> Any:
-    """Make the noise of one gyro axis; each sample is the mean rate over its own interval.
+    """Make the noise of one gyro axis; each sample is the mean rate over its interval.
 
     The Allan variance is exactly that of the noise table at every averaging time: quantization
     noise is white in the angle, random walk and Gauss-Markov noise are continuous processes
@@ -309,18 +310,18 @@ def make_noise(
     parts = _Parts(rate, coefficients, gauss_markov, sinusoid)
     spans = [(first, min(chunk, size - first)) for first in range(0, size, chunk)]
     if lazy:
-        return _lazy(parts, state, spans)
+        return _lazy_noise(parts, state, spans)
     values = np.empty(size)
     for first, count in spans:
-        values[first : first + count], state = _more(parts, state, first, count)
+        values[first : first + count], state = _add_parts(parts, state, first, count)
     return values
 
 
-def _lazy(parts: _Parts, state: Any, spans: list[tuple[int, int]]) -> Any:
+def _lazy_noise(parts: _Parts, state: Any, spans: list[tuple[int, int]]) -> Any:
     import dask
     import dask.array as da
 
-    step = dask.delayed(_more, pure=False, nout=2)
+    step = dask.delayed(_add_parts, pure=False, nout=2)
     blocks = []
     for first, count in spans:
         values, state = step(parts, state, first, count)

@@ -1,4 +1,4 @@
-"""A tool that turns about its own axis: rate, toolface, and gravity in the frame that turns with it."""
+"""Rotation of the tool about its axis: rate, toolface, and gravity in the tool frame."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ __all__ = ["rotation"]
 Array = NDArray[np.float64]
 
 
-def _turn(table: Array, stick_slip: float, period: float) -> tuple[Any, Any]:
-    """Rate [deg/s] and angle [deg] of a shaft driven along `table` of (time, rate), with a torsional oscillation on top."""
+def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[Any, Any]:
+    """Compute rate [deg/s] and angle [deg] from a table (time, rate) with stick-slip added."""
     times, rates = table.T
     if times.size == 1:
         times, rates = np.append(times, times + 1.0), np.repeat(rates, 2)
@@ -70,7 +70,7 @@ def rotation(
     accelerations: bool = True,
     sensor_rate: float = 100.0,
 ) -> xr.Dataset:
-    """Rotation of the tool about its own axis, its toolface, and gravity in the frame that turns with it.
+    """Make the rotation of the tool about its axis, its toolface, and gravity in its frame.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def rotation(
     table = check_points(points, "points of rotation", ("time [s]", "rate [deg/s]"))
     if not 0.0 <= stick_slip <= 2.0:
         raise OptionError(f"rotation: stick_slip {stick_slip!r} is outside of 0 to 2")
-    rate, angle = _turn(table, stick_slip, duration_seconds(period, "period"))
+    rate, angle = _integrate_turns(table, stick_slip, duration_seconds(period, "period"))
     tilt = math.radians(inclination)
 
     def face(t: Array) -> Array:

@@ -238,7 +238,7 @@ def test_own_rate_and_channel_agree():
                 "log": {"rate": 1, "duration": "9s"},
             }
         )
-    with pytest.raises(OptionError, match="0 is no ramp"):
+    with pytest.raises(OptionError, match="0 is not a ramp"):
         make_effect(common | {"full": 0})
 
 

@@ -83,7 +83,7 @@ def test_jumps_come_at_restarts_and_shocks_only():
     assert (
         make_effect({"name": "bias_jump", "shock": 0.5, "shocks_per_hour": 3})
         .say()
-        .endswith("by 0.5 deg/h rms at shocks, 3 in an hour.")
+        .endswith("by 0.5 deg/h rms at shocks, 3 per hour.")
     )
 
 

@@ -164,7 +164,7 @@ def test_earth_rate_and_gravity_share_the_frame_of_the_tool():
 
 def test_axes_of_other_names_say_where_they_look():
     with pytest.raises(
-        OptionError, match="axis 'north' is not x, y or z; say where it looks with off and around"
+        OptionError, match="axis 'north' is not x, y or z; give its direction with off and around"
     ):
         run(
             make_effect({"name": "earth_rate", "latitude": 45}),

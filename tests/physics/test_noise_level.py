@@ -61,7 +61,7 @@ def test_light_power_of_blin_gives_the_typical_share():
 def test_light_power_that_makes_no_sense_is_refused():
     with pytest.raises(
         OptionError,
-        match=r"thermal \+ shot are 1.2 of N\^2; give shares that are together 1 or less",
+        match=r"thermal \+ shot are 1.2 of N\^2; give shares with a sum of 1 or less",
     ):
         make_effect({"name": "light_power_noise", "thermal": 0.7, "shot": 0.5})
     dark = {"name": "light_power_noise", "thermal": 0.5, "driver": "pd"}

@@ -68,7 +68,7 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
         ({"effect": [BIASED[0] | {"axes": 3}]}, "axes = 3 is not a list of names"),
         ({"effect": [BIASED[0] | {"driver": [3]}]}, r"driver = \[3\] is not a list of names"),
         ({"log": LOG | {"axes": ["x", "x"]}}, "is not a list of different names"),
-        ({"log": LOG | {"duration": 1e300}}, "a duration of 1e.300 is not one"),
+        ({"log": LOG | {"duration": 1e300}}, "the duration 1e.300 is not valid"),
         ({"environment": [{"profile": "losses", "per_hour": 1e300}]}, "at most 1e8 gaps"),
         ({"environment": [{"profile": "losses", "seed": "x"}]}, "seed='x': give a whole number"),
         (
