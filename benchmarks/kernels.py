@@ -320,8 +320,8 @@ def report(quick: bool) -> Iterator[str]:
             yield from shape(name, taus, repeats, quick)
     yield from archive(repeats, quick)
     yield (
-        "\nShares are of the numba loop on as many terms, the best of several turns; the "
-        "archive is in millions of samples per second."
+        "\nShares are of the numba loop on as many terms (best of several turns); "
+        "the archive is in 10^6 samples a second."
     )
 
 
