@@ -78,7 +78,7 @@ def _name_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 def find_lost_spans(
-    lost: Sequence[LostFile], spans: Mapping[Path, Span], look: Callable[[Path], FileSummary]
+    lost: Sequence[LostFile], spans: Mapping[Path, Span], scan: Callable[[Path], FileSummary]
 ) -> dict[Path, Span]:
     """Find the time spans of lost files, as far as they can be determined.
 
@@ -99,14 +99,14 @@ def find_lost_spans(
     dict of Path to (int, int)
         First and last instant [ns since 1970].
     """
-    names = sorted([*spans, *(one.path for one in lost)], key=_name_key)
+    names = sorted([*spans, *(file.path for file in lost)], key=_name_key)
     found: dict[Path, Span] = {}
-    for path in (one.path for one in lost):
+    for path in (file.path for file in lost):
         place = names.index(path)
         before = next((name for name in reversed(names[:place]) if name in spans), None)
         after = next((name for name in names[place:] if name in spans), None)
         between = _span_between(spans, before, after) if before and after else None
-        span = between or _span_of_stamps(path, look)
+        span = between or _span_of_stamps(path, scan)
         if span:
             found[path] = span
     return found
@@ -120,10 +120,10 @@ def _span_between(spans: Mapping[Path, Span], before: Path, after: Path) -> Span
     return (end, start) if free else None
 
 
-def _span_of_stamps(path: Path, look: Callable[[Path], FileSummary]) -> Span | None:
+def _span_of_stamps(path: Path, scan: Callable[[Path], FileSummary]) -> Span | None:
     """Return the first and last readable stamp of a damaged file."""
     with contextlib.suppress(GyrostabError, OSError, RuntimeError, ValueError):
-        summary = look(path)
+        summary = scan(path)
         if summary.first is not None and summary.last is not None and summary.first < summary.last:
             return _to_ns(summary.first), _to_ns(summary.last)
     return None
@@ -140,19 +140,22 @@ def add_lost_notes(
     if not lost:
         return log
     notes = []
-    for one in lost:
+    for file in lost:
         where = "where no other file has its time, there is a gap"
-        if one.path in spans:
+        if file.path in spans:
             first, last = (
                 str(np.datetime64(stamp, "ns").astype("datetime64[ms]"))
-                for stamp in spans[one.path]
+                for stamp in spans[file.path]
             )
             where = (
                 f"its time is between {first} and {last}, which is a gap unless another file "
                 "covers it"
             )
-        notes.append(f"{one.reason}; the file is left out: {where}")
+        notes.append(f"{file.reason}; the file is left out: {where}")
     return log.assign_attrs(
         notes=[*texts(log, "notes"), *notes],
-        unreadable_files=[*log.attrs.get("unreadable_files", []), *(one.path.name for one in lost)],
+        unreadable_files=[
+            *log.attrs.get("unreadable_files", []),
+            *(file.path.name for file in lost),
+        ],
     )

@@ -76,13 +76,13 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
     index: Any = table.index
     columns: Any = table.columns
     if not isinstance(index, pd.DatetimeIndex):
-        how = (
+        advice = (
             "transpose it: df.T"
             if isinstance(columns, pd.DatetimeIndex)
             else "set one: df.set_index(pd.DatetimeIndex(...))"
         )
         raise SchemaError(
-            f"the index of the DataFrame holds {index.inferred_type}, not times; {how}"
+            f"the index of the DataFrame holds {index.inferred_type}, not times; {advice}"
         )
     index = index.tz_convert("UTC").tz_localize(None) if index.tz is not None else index
     if not index.is_monotonic_increasing:

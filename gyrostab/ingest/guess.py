@@ -100,7 +100,7 @@ class Guess:
 
 
 def guess_columns(
-    look: FileInspection,
+    inspection: FileInspection,
     *,
     rate: float | None = None,
     rate_hint: float | None = None,
@@ -126,31 +126,37 @@ def guess_columns(
     """
     reasons: list[str] = []
     warnings: list[str] = []
-    time, time_unit = (None, None) if look.time is not None else _guess_time(look, reasons)
+    time, time_unit = (
+        (None, None) if inspection.time is not None else _guess_time(inspection, reasons)
+    )
     assumed = None
-    if look.time is None and time is None and rate is None:
+    if inspection.time is None and time is None and rate is None:
         assumed = rate_hint or TYPICAL_RATE_HZ
-        told = (
+        rate_note = (
             "is named in the file"
             if rate_hint
             else "is an assumption, as the file holds no time: put the true rate in its place"
         )
-        (reasons if rate_hint else warnings).append(f"--rate {assumed:g} {told}")
+        (reasons if rate_hint else warnings).append(f"--rate {assumed:g} {rate_note}")
     sampling = (
         rate
         or assumed
-        or (1.0 / (time.pace * _unit_seconds(time_unit)) if time is not None else look.rate_hz)
+        or (
+            1.0 / (time.pace * _unit_seconds(time_unit)) if time is not None else inspection.rate_hz
+        )
     )
-    axes = _guess_axes(look, time, reasons)
+    axes = _guess_axes(inspection, time, reasons)
     unit = None
     if axes and not all(given_unit(column) for column in axes.values()):
-        unit = guess_unit(look, axes, sampling, reasons, warnings, angles=angles)
+        unit = guess_unit(inspection, axes, sampling, reasons, warnings, angles=angles)
     if not axes:
         warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
         )
     taken = {column.key for column in axes.values()}
-    temperature = next((c for c in look.columns if c.key not in taken and _is_temperature(c)), None)
+    temperature = next(
+        (c for c in inspection.columns if c.key not in taken and _is_temperature(c)), None
+    )
     return Guess(
         axes, unit, time, time_unit, assumed, temperature, tuple(reasons), tuple(warnings), sampling
     )
@@ -161,13 +167,13 @@ def _unit_seconds(unit: str | None) -> float:
 
 
 def _guess_time(
-    look: FileInspection, reasons: list[str]
+    inspection: FileInspection, reasons: list[str]
 ) -> tuple[ColumnInspection | None, str | None]:
     best: tuple[float, ColumnInspection, str, str] | None = None
-    for column in look.columns:
+    for column in inspection.columns:
         if (
             column.rows < 2
-            or column.rows < 0.5 * look.rows
+            or column.rows < 0.5 * inspection.rows
             or column.rising < 0.5
             or column.rising + column.held < 0.95
             or column.pace <= 0
@@ -178,7 +184,7 @@ def _guess_time(
         counter = (
             column.whole
             and abs(column.pace - 1.0) < 1e-6
-            and abs(column.std - look.rows / math.sqrt(12)) < 0.1 * look.rows
+            and abs(column.std - inspection.rows / math.sqrt(12)) < 0.1 * inspection.rows
         )
         if not named and (counter or _COUNTER_WORD.search(low)):
             continue
@@ -215,25 +221,25 @@ def _rate_distance(column: ColumnInspection, unit: str) -> float:
 
 
 def _guess_axes(
-    look: FileInspection, time: ColumnInspection | None, reasons: list[str]
+    inspection: FileInspection, time: ColumnInspection | None, reasons: list[str]
 ) -> dict[str, ColumnInspection]:
-    known = {column.name.lower(): column for column in look.columns if column.role == "gyro"}
+    known = {column.name.lower(): column for column in inspection.columns if column.role == "gyro"}
     if known:
         return {AXIS_PATTERN.sub(r"\2", name): column for name, column in known.items()}
     usable = [
         c
-        for c in look.columns
-        if c is not time and c.rows >= 0.25 * look.rows and c.std > 0 and _may_be_gyro(c)
+        for c in inspection.columns
+        if c is not time and c.rows >= 0.25 * inspection.rows and c.std > 0 and _may_be_gyro(c)
     ]
     groups = list(_group_columns(usable))
     steady = [_mean_over_scatter(list(group.values())) for _, group in groups]
     best: tuple[float, dict[str, ColumnInspection]] | None = None
-    for (template, group), own in zip(groups, steady, strict=True):
-        score = _gyro_score(template, list(group.values()), look)
-        others = [other for other in steady if other is not own]
+    for (template, group), steadiness in zip(groups, steady, strict=True):
+        score = _gyro_score(template, list(group.values()), inspection)
+        others = [other for other in steady if other is not steadiness]
         if others and len(group) == 3:
             score += (
-                0.75 if own <= min(others) else -0.75 if own > max(others) else 0.0
+                0.75 if steadiness <= min(others) else -0.75 if steadiness > max(others) else 0.0
             )  # gravity makes the mean of an accelerometer large
         if score >= MIN_SCORE and (best is None or score > best[0]):
             best = score, group
@@ -303,7 +309,9 @@ def _group_columns(
             )
 
 
-def _gyro_score(template: str, group: Sequence[ColumnInspection], look: FileInspection) -> float:
+def _gyro_score(
+    template: str, group: Sequence[ColumnInspection], inspection: FileInspection
+) -> float:
     """Return a score of how much a group of columns looks like a gyro."""
     low = template.lower()
     if any(given_unit(column) for column in group):

@@ -75,7 +75,7 @@ def temperature_unit(column: ColumnInspection) -> str:
 
 
 def guess_unit(
-    look: FileInspection,
+    inspection: FileInspection,
     axes: dict[str, ColumnInspection],
     rate: float,
     reasons: list[str],
@@ -117,7 +117,7 @@ def guess_unit(
         *(c.key for c in group if re.search(r"count|lsb|raw", c.key.lower())),
     ]
     large = (
-        look.summary.format == "miniseed"
+        inspection.summary.format == "miniseed"
         and max(max(abs(c.low), abs(c.high)) for c in group) > 10.0
     )
     if counts or large or all(c.whole for c in group):

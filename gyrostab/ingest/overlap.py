@@ -150,5 +150,5 @@ def _count_common(
     right = np.asarray(part[signal].sel(axis=axes)[:, others[0] : others[1]].values)[:, b]
     known = np.isfinite(left) & np.isfinite(right)
     close = np.isclose(left, right, rtol=1e-6, atol=0.0) | ~known
-    told = known.any(axis=0)
-    return int(told.sum()), int((close.all(axis=0) & told).sum())
+    has_values = known.any(axis=0)
+    return int(has_values.sum()), int((close.all(axis=0) & has_values).sum())

@@ -79,7 +79,7 @@ def scan(paths: Sequence[str | Path] | str | Path, **reading: Any) -> pd.DataFra
     >>> print(table.loc[0, "rate_hz"], table.loc[0, "axes"], table.loc[0, "rows"])
     10.0 x 50
     """
-    examined = scan_and_inspect(paths, look=False, **reading)
+    examined = scan_and_inspect(paths, inspect=False, **reading)
     if examined.errors and len(examined.errors) == len(examined.table):
         raise examined.errors[0]
     return examined.table
@@ -90,7 +90,7 @@ class InspectedFile:
     """Inspection of a file that needs options, with a guess and options that read it."""
 
     paths: list[Path]  # files with the same columns; the first was inspected
-    look: FileInspection
+    inspection: FileInspection
     guess: Guess
     options: dict[str, Any]
     row: dict[str, Any] | None  # row of the table, read with these options
@@ -103,11 +103,11 @@ class ScanResult:
 
     table: pd.DataFrame
     errors: list[GyrostabError]
-    looks: list[InspectedFile]
+    inspected: list[InspectedFile]
 
 
 def scan_and_inspect(
-    paths: Sequence[str | Path] | str | Path, *, look: bool = True, **reading: Any
+    paths: Sequence[str | Path] | str | Path, *, inspect: bool = True, **reading: Any
 ) -> ScanResult:
     """Scan logs, and inspect the columns of those that need options.
 
@@ -115,38 +115,38 @@ def scan_and_inspect(
     ----------
     paths, **reading
         As for `scan`.
-    look : bool
+    inspect : bool
         Whether to inspect columns; of files with the same columns the first is inspected.
 
     Returns
     -------
-    Examined
+    ScanResult
         Errors of unreadable files are collected, not raised.
     """
     from gyrostab.ingest.files import expand
 
     rows: list[dict[str, Any]] = []
     errors: list[GyrostabError] = []
-    looks: dict[Any, InspectedFile | None] = {}
+    inspected: dict[Any, InspectedFile | None] = {}
     for path in expand(paths):
         try:
             rows.append(_scan_one(path, reading))
         except GyrostabError as error:
             errors.append(error)
-            found = _inspect_once(path, reading, looks) if look else None
+            found = _inspect_once(path, reading, inspected) if inspect else None
             rows.append({"file": str(path), "odd": str(error)})
             if found is not None:
-                rows[-1].update(format=found.look.summary.format)
-                rows[-1].update(rows=found.look.rows if found.paths == [path] else None)
+                rows[-1].update(format=found.inspection.summary.format)
+                rows[-1].update(rows=found.inspection.rows if found.paths == [path] else None)
     return ScanResult(
         pd.DataFrame(rows, columns=list(COLUMNS)),
         errors,
-        [found for found in looks.values() if found is not None],
+        [found for found in inspected.values() if found is not None],
     )
 
 
 def _inspect_once(
-    path: Path, reading: dict[str, Any], looks: dict[Any, InspectedFile | None]
+    path: Path, reading: dict[str, Any], inspected: dict[Any, InspectedFile | None]
 ) -> InspectedFile | None:
     """Inspect a file, unless one with the same columns was inspected."""
     from gyrostab.ingest import ReadOptions, scan_file
@@ -160,24 +160,24 @@ def _inspect_once(
         headers = tuple(
             (column.header, column.role, column.unit) for column in scan_file(path, options).columns
         )
-        if headers not in looks:
-            looks[headers] = None
+        if headers not in inspected:
+            inspected[headers] = None
             inside = inspect_file(path, options)
             angles = options.kind == "angle"
             guess = guess_columns(
                 inside, rate=options.rate, rate_hint=_named_rate(path), angles=angles
             )
-            looks[headers] = _try_guess(path, inside, guess, reading)
+            inspected[headers] = _try_guess(path, inside, guess, reading)
     except GyrostabError:
         return None
-    found = looks[headers]
+    found = inspected[headers]
     if found is not None and path not in found.paths:
         found.paths.append(path)
     return found
 
 
 def _try_guess(
-    path: Path, look: FileInspection, guess: Guess, reading: dict[str, Any]
+    path: Path, inspection: FileInspection, guess: Guess, reading: dict[str, Any]
 ) -> InspectedFile:
     """Read a file by the guess, also with its mean rate if many samples seem to be missing."""
     from gyrostab.ingest.guess_unit import temperature_unit
@@ -205,13 +205,15 @@ def _try_guess(
         options["rate"] = guess.rate
     options = {name: value for name, value in options.items() if value != {}}
     tries = [options]
-    if "rate" not in options and math.isfinite(look.rate_hz):
-        tries.append({**options, "rate": float(f"{look.rate_hz:.6g}")})
+    if "rate" not in options and math.isfinite(inspection.rate_hz):
+        tries.append({**options, "rate": float(f"{inspection.rate_hz:.6g}")})
     reason = "no column looks like a gyro"
     read: list[InspectedFile] = []
     for trial in tries if guess.axes else []:
         try:
-            read.append(InspectedFile([path], look, guess, trial, _scan_one(path, trial), None))
+            read.append(
+                InspectedFile([path], inspection, guess, trial, _scan_one(path, trial), None)
+            )
         except GyrostabError as error:
             reason = str(error)
         if read and read[-1].row is not None and read[-1].row["missing_share"] < MAX_MISSING_SHARE:
@@ -219,7 +221,7 @@ def _try_guess(
     best = min(
         read, key=lambda found: found.row["missing_share"] if found.row else 1.0, default=None
     )
-    return best or InspectedFile([path], look, guess, options, None, reason)
+    return best or InspectedFile([path], inspection, guess, options, None, reason)
 
 
 def _named_rate(path: Path) -> float | None:

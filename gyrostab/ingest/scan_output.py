@@ -81,8 +81,8 @@ def print_scan(table: pd.DataFrame) -> None:
         )
     for _, row in table.iterrows():
         if pd.isna(row["rate_hz"]):
-            told = "cannot be read" if pd.isna(row["format"]) else "needs options, see below"
-            framed.add_row(escape(row["file"]), f"[red]{told}[/red]")
+            lines = "cannot be read" if pd.isna(row["format"]) else "needs options, see below"
+            framed.add_row(escape(row["file"]), f"[red]{lines}[/red]")
             continue
         cells = (
             f"{row['file']} ({row['format']})",
@@ -111,14 +111,14 @@ INSPECTION_COLUMNS = ("column", "unit", "low", "high", "mean", "scatter", "rate_
 def _inspection_rows(found: InspectedFile) -> list[tuple[str, ...]]:
     """Return the columns of a file as rows of text, in the order of `INSPECTION_COLUMNS`."""
     guess = found.guess
-    taken = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
+    targets = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
     if guess.time is not None:
-        taken[guess.time.key] = "time"
+        targets[guess.time.key] = "time"
     if guess.temperature is not None:
-        taken.setdefault(guess.temperature.key, "temperature")
+        targets.setdefault(guess.temperature.key, "temperature")
     rows: list[tuple[str, ...]] = []
-    if found.look.time is not None:
-        time = found.look.time
+    if found.inspection.time is not None:
+        time = found.inspection.time
         rows.append(
             (
                 time.header,
@@ -127,11 +127,11 @@ def _inspection_rows(found: InspectedFile) -> list[tuple[str, ...]]:
                 "",
                 "",
                 "",
-                _format_number(found.look.rate_hz),
+                _format_number(found.inspection.rate_hz),
                 "time",
             )
         )
-    for column in found.look.columns:
+    for column in found.inspection.columns:
         known = math.isfinite(column.rate_hz) or column.rows == 0
         numbers = (
             column.low,
@@ -146,7 +146,7 @@ def _inspection_rows(found: InspectedFile) -> list[tuple[str, ...]]:
                 column.key,
                 column.unit or "",
                 *map(_format_number, numbers),
-                taken.get(column.key, kept) if column.rows else "no numbers",
+                targets.get(column.key, kept) if column.rows else "no numbers",
             )
         )
     return rows
@@ -160,27 +160,31 @@ def print_inspection(found: InspectedFile) -> None:
     """Print the columns of a file and the guess; in a pipe every line begins with ``#``."""
     rows = _inspection_rows(found)
     guess = found.guess
-    told = [*guess.reasons, *(f"check: {warning}" for warning in guess.warnings), *found.look.notes]
+    lines = [
+        *guess.reasons,
+        *(f"check: {warning}" for warning in guess.warnings),
+        *found.inspection.notes,
+    ]
     if found.row is not None:
         read = found.row
-        told.append(
+        lines.append(
             f"read so: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes "
             f"{read['axes']}, {read['missing_share']:.2%} missing"
         )
     if found.error is not None and guess.axes:
-        told.append(f"not readable by this guess: {found.error}")
+        lines.append(f"not readable by this guess: {found.error}")
     if not sys.stdout.isatty():
-        print(f"# {found.paths[0]}: {len(rows)} columns, {found.look.rows} rows")
+        print(f"# {found.paths[0]}: {len(rows)} columns, {found.inspection.rows} rows")
         for row in [INSPECTION_COLUMNS, *rows]:
             print("# " + "\t".join(row))
-        for text in told:
+        for text in lines:
             print(f"# {text}")
         return
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    framed = Table(title=escape(f"{found.paths[0]}: {found.look.rows:,} rows"))
+    framed = Table(title=escape(f"{found.paths[0]}: {found.inspection.rows:,} rows"))
     for heading in INSPECTION_COLUMNS:
         framed.add_column(
             heading.replace("_", " "),
@@ -191,7 +195,7 @@ def print_inspection(found: InspectedFile) -> None:
         framed.add_row(*map(escape, row))
     console = Console()
     console.print(framed)
-    for text in told:
+    for text in lines:
         console.print(escape(text), highlight=False)
 
 

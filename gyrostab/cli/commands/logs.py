@@ -38,7 +38,7 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     readable = table[table["rate_hz"].notna()]
     if len(readable):
         print_next(next_command(list(readable["file"]), options), apart=True)
-    for found in examined.looks:
+    for found in examined.inspected:
         print_inspection(found)
         if found.row is not None:
             print_next(next_command(found.paths, found.options))

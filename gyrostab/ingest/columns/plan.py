@@ -121,9 +121,9 @@ def plan_columns(
     plan_channels(draft, [column for column in rest if not AXIS_PATTERN.match(column.low)])
     rate = preset.rate if time is None and options.rate is None else None
     if preset.name:
-        told = f", and {rate:g} Hz by the lines above the header" if rate else ""
+        source_note = f", and {rate:g} Hz by the lines above the header" if rate else ""
         draft.notes.insert(
-            0, f"read as a file of {preset.name}{told}; --map, --unit and --rate overrule it"
+            0, f"read as a file of {preset.name}{source_note}; --map, --unit and --rate overrule it"
         )
     elif found := [
         f"{c.header} is {c.name}" for c in named if c.preset and AXIS_PATTERN.match(c.low)

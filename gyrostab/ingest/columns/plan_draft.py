@@ -99,20 +99,22 @@ class PlanDraft:
             name, quantity, _ = min(
                 self.unitless, key=lambda entry: entry[1] is None
             )  # a known quantity first
-            how = f"keep one with a unit: --unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
+            advice = (
+                f"keep one with a unit: --unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
+            )
             self.notes.append(
                 "left out, as they carry no unit: "
-                f"{list_names([header for _, _, header in self.unitless])} ({how})"
+                f"{list_names([header for _, _, header in self.unitless])} ({advice})"
             )
         if self.surplus:
             needed = self.kept_channels + len(self.surplus)
-            how = (
+            advice = (
                 "map those that are needed (--map NAME=NAME); "
                 f"{describe_limit('channels', needed, self.options.limits)}"
             )
             self.notes.append(
                 "left out, as there are more channels than a log keeps: "
-                f"{list_names(self.surplus, 5)} ({how})"
+                f"{list_names(self.surplus, 5)} ({advice})"
             )
         if self.left_out:
             self.notes.append(

@@ -122,11 +122,11 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
     try:
         return parse_time_unit(text, column.calendar if text == column.stored else None)
     except GyrostabError as error:
-        how = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
+        advice = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
         draft.problems.append(
             UnitError(
                 f"{draft.path.name}: column {column.header!r}: {error}; or give it with --unit "
-                f"{how}"
+                f"{advice}"
             )
         )
         return None
@@ -173,10 +173,10 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
     text = draft.find_unit(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
     if text is None:
         message = f"{draft.path.name}: the gyro column {column.header!r} carries no unit"
-        how = f"give it with --unit {stem}={example} (all axes) or --unit {column.low}={example}"
+        advice = f"give it with --unit {stem}={example} (all axes) or --unit {column.low}={example}"
         draft.problems.append(
             MissingUnitError(
-                f"{message}; {how}, or write it in the header: {column.low} [{example}]"
+                f"{message}; {advice}, or write it in the header: {column.low} [{example}]"
             )
         )
         draft.add_summary(column, column.low, "gyro", None, None)
@@ -208,13 +208,13 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
             f"{draft.path.name}: column {column.header!r} has the unit {text!r}, which is "
             f"a unit of {unit.quantity}, not of {allowed[0]}"
         )
-        how = (
+        advice = (
             f"{allowed[0]} units are {known_units(allowed[0])}; give the right one with --unit "
             f"{stem}={example}"
         )
         draft.problems.append(
             UnitError(
-                f'{message}; {how}, or with a factor for counts: --unit "{stem}=0.1 '
+                f'{message}; {advice}, or with a factor for counts: --unit "{stem}=0.1 '
                 f'{_arcsec_unit(stem)}"'
             )
         )
@@ -248,11 +248,11 @@ def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) 
         message = (
             f"{draft.path.name}: column {header!r} is an angle, and nothing says of which kind"
         )
-        how = (
+        advice = (
             "--kind angle if it is the cumulative angle, --kind rate if each row is the "
             "increment since the row before"
         )
-        draft.problems.append(OptionError(f"{message}; give {how}"))
+        draft.problems.append(OptionError(f"{message}; give {advice}"))
     return "angle" if draft.options.kind == "angle" else "increment"
 
 
@@ -322,15 +322,15 @@ def _plan_channel(
             units = INNER["number"]
         elif known:
             message = f"column {column.header!r}: {text!r} is not a known unit of {expected}"
-            how = (
+            advice = (
                 f"known are {known_units(expected)}; give it with --unit "
                 f"{name}={example_unit(quantity)}"
             )
             if not asked:
-                draft.notes.append(f"{message}, so it is left out; {how}")
+                draft.notes.append(f"{message}, so it is left out; {advice}")
                 draft.leave_out(column)
                 return
-            fix = f'{how}, or drop the column with --map "{column.key}=-"'
+            fix = f'{advice}, or drop the column with --map "{column.key}=-"'
             draft.problems.append(UnitError(f"{draft.path.name}: {message}; {fix}"))
         else:
             quantity = None
@@ -357,8 +357,8 @@ def _arcsec_unit(stem: str) -> str:
 def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
     columns = [column for column in distinct_columns(headers) if column.header]
     free = [c for c in columns if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
-    looks = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
-    likely = next(looks, free[0] if free else None)
+    candidates = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
+    likely = next(candidates, free[0] if free else None)
     low = likely.header.lower() if likely else ""
     unit = (
         "deg/h" if re.search(r"deg_?(per_?|/)?h|dph", low) else "rad/s" if "rad" in low else "deg/s"
@@ -372,10 +372,10 @@ def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:
         f"{path.name}: no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
         f"{list_names([c.name for c in columns], 100)}"
     )
-    how = (
+    advice = (
         "Say which they are, for instance: --map "
         f'"{likely.key if likely else "NAME"}=gyro_x"{given}'
     )
     return FormatError(
-        f"{message}. {how}; gyrostab scan {shlex.quote(path.name)} looks into each column"
+        f"{message}. {advice}; gyrostab scan {shlex.quote(path.name)} inspects each column"
     )

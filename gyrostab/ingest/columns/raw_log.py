@@ -168,31 +168,31 @@ class RawLogBuilder:
             bad_cells, sum(int(np.count_nonzero(mask)) for mask in others), low, high,
         )  # fmt: skip
 
-    def add(self, taken: ConvertedBlock, locate: Locate | None = None) -> None:
+    def add(self, converted: ConvertedBlock, locate: Locate | None = None) -> None:
         """Add one block.
 
         Parameters
         ----------
-        taken : Taken
+        converted : ConvertedBlock
             From `prepare`.
         locate : callable, optional
             Row numbers within the block -> names of the rows for messages.
         """
-        if taken.rows == 0:
+        if converted.rows == 0:
             return
         locate = locate or _row_names(self.buffers.rows)
-        self.bad_cells += taken.bad_cells
-        for source, (missing, low, high, whole) in taken.ranges.items():
+        self.bad_cells += converted.bad_cells
+        for source, (missing, low, high, whole) in converted.ranges.items():
             span = self.whole[source]
-            if span is not None and missing < taken.rows:
+            if span is not None and missing < converted.rows:
                 self.whole[source] = (min(span[0], low), max(span[1], high)) if whole else None
-        if taken.bad_rows.size:
-            self._note_rows(taken.bad_rows, locate)
-        if taken.cell_rows.size:
-            self._note_cells(taken.cell_rows, taken.cells, locate)
-        self.low, self.high = min(self.low, taken.low), max(self.high, taken.high)
-        self.seen += [taken.seen] if taken.seen is not None else []
-        self.buffers.add(taken.block)
+        if converted.bad_rows.size:
+            self._note_rows(converted.bad_rows, locate)
+        if converted.cell_rows.size:
+            self._note_cells(converted.cell_rows, converted.cells, locate)
+        self.low, self.high = min(self.low, converted.low), max(self.high, converted.high)
+        self.seen += [converted.seen] if converted.seen is not None else []
+        self.buffers.add(converted.block)
 
     def _convert_column(
         self, column: Column, values: NDArray[np.float64]

@@ -124,16 +124,16 @@ def read_columns(
         Whether `fetch` is thread-safe and can be called at any later time; columns above the limit
         then stay in the file.
     """
-    intake = RawLogBuilder(plan.check(), options, limit=limit)
+    builder = RawLogBuilder(plan.check(), options, limit=limit)
     stay = lasting and 8 * rows * len(plan.columns) > limit
     if stay:
-        intake.tens = dict.fromkeys(intake.tens, 0.0)  # nothing is packed
+        builder.tens = dict.fromkeys(builder.tens, 0.0)  # nothing is packed
     step = batch_rows(len(plan.columns))
     spans = ((start, min(start + step, rows)) for start in range(0, rows, step))
-    take = partial(_convert_span, intake, plan, options, fetch, stay)
-    for taken in map_in_order(take, spans) if lasting else map(take, spans):
-        intake.add(taken)
-    return intake.finish(notes)
+    take = partial(_convert_span, builder, plan, options, fetch, stay)
+    for converted in map_in_order(take, spans) if lasting else map(take, spans):
+        builder.add(converted)
+    return builder.finish(notes)
 
 
 def batch_rows(columns: int) -> int:
@@ -148,7 +148,7 @@ def batch_rows(columns: int) -> int:
 
 
 def _convert_span(
-    intake: RawLogBuilder,
+    builder: RawLogBuilder,
     plan: Plan,
     options: ReadOptions,
     fetch: Fetch,
@@ -156,35 +156,35 @@ def _convert_span(
     span: tuple[int, int],
 ) -> ConvertedBlock:
     """Convert one batch; keep only its findings if the values stay in the file."""
-    taken = convert_batch(
-        intake, options, {column.source: fetch(column.source, *span) for column in plan.columns}
+    converted = convert_batch(
+        builder, options, {column.source: fetch(column.source, *span) for column in plan.columns}
     )
     if not stay:
-        return taken
-    begin, rows = span[0], taken.rows
+        return converted
+    begin, rows = span[0], converted.rows
     seen = None
-    if intake.gyro:
+    if builder.gyro:
         cells = np.stack(
-            [cast(NDArray[np.float64], taken.block[column.source]) for column in intake.gyro]
+            [cast(NDArray[np.float64], converted.block[column.source]) for column in builder.gyro]
         )
         seen = inspect_rows(
             cells,
             {
-                column.name: cast(NDArray[Any], taken.block[column.source])
-                for column in intake.channels
+                column.name: cast(NDArray[Any], converted.block[column.source])
+                for column in builder.channels
             },
             begin,
         )
     block: dict[int, Any] = {}
     for column in plan.columns:
-        piece = taken.block[column.source]
+        piece = converted.block[column.source]
         read = partial(
             _read_stamps if column.role == "time" else _read_values, column, options, fetch
         )
         block[column.source] = (
             piece if isinstance(piece, EvenStampsPiece) else FilePiece(read, begin, rows)
         )
-    return taken._replace(block=block, seen=seen)
+    return converted._replace(block=block, seen=seen)
 
 
 def _read_values(
@@ -204,17 +204,19 @@ def _read_stamps(
 
 
 def convert_batch(
-    intake: RawLogBuilder, options: ReadOptions, batch: dict[int, Any]
+    builder: RawLogBuilder, options: ReadOptions, batch: dict[int, Any]
 ) -> ConvertedBlock:
     """Convert one batch of columns for the builder."""
     values, words = {}, 0
-    for column in [*intake.gyro, *intake.channels]:
-        values[column.source], odd = to_floats(batch[column.source])
-        words += odd if column.role == "channel" else 0
+    for column in [*builder.gyro, *builder.channels]:
+        values[column.source], not_numbers = to_floats(batch[column.source])
+        words += not_numbers if column.role == "channel" else 0
     stamps = (
-        None if intake.time is None else to_stamps(batch[intake.time.source], intake.time, options)
+        None
+        if builder.time is None
+        else to_stamps(batch[builder.time.source], builder.time, options)
     )
-    return intake.prepare(values, stamps, words=words)
+    return builder.prepare(values, stamps, words=words)
 
 
 def float32_note(plan: Plan, dtypes: Sequence[Any]) -> list[str]:

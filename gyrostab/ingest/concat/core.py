@@ -240,7 +240,7 @@ def _common_attributes(
         for key, value in first.items()
         if all(_is_equal(source.log.attrs.get(key), value) for source in sources)
     }
-    files, said = (
+    files, notes_of_logs = (
         [texts(source.log, name) for source in sources] for name in ("source_files", "notes")
     )
     labels = [
@@ -259,7 +259,7 @@ def _common_attributes(
         "sampling_rate_hz": sources[0].rate,
         "source_files": list(dict.fromkeys(name for names in files for name in names)),
         "history": "\n".join(filter(None, [first.get("history"), done])),
-        "notes": [*merge_notes(zip(labels, said, strict=True)), *notes],
+        "notes": [*merge_notes(zip(labels, notes_of_logs, strict=True)), *notes],
         **({"unreadable_files": lost} if lost else {}),
     }
 

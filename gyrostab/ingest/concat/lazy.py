@@ -122,9 +122,9 @@ def place_on_grid(
     sources: dict[str, Any] = {}
     for number, parts in enumerate(rows):
         placed = [_RowBlocks(part) for part in parts]
-        sources.update({one.array.name: one.array for one in placed})
-        first = np.array([one.first for one in placed], dtype=np.int64)
-        end = np.array([one.end for one in placed], dtype=np.int64)
+        sources.update({entry.array.name: entry.array for entry in placed})
+        first = np.array([entry.first for entry in placed], dtype=np.int64)
+        end = np.array([entry.end for entry in placed], dtype=np.int64)
         for place, length in enumerate(lengths):
             begin = place * chunk
             keys: dict[Any, int] = {}
@@ -166,9 +166,9 @@ def read_parts_into(
 ) -> None:
     """Read samples of one row from `begin` on into `out`, with the result of `place_on_grid`."""
     found = [
-        (number, *one)
+        (number, *entry)
         for number, part in enumerate(rows[row])
-        for one in _overlapping_runs(part, begin, begin + out.size)
+        for entry in _overlapping_runs(part, begin, begin + out.size)
     ]
     ends = sorted((at, at + length) for *_, at, length in found)
     if any(stop > start for (_, stop), (start, _) in pairwise(ends)):

@@ -20,7 +20,7 @@ def name_some(names: Sequence[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def merge_notes(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
+def merge_notes(notes_by_file: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     """Merge the notes of all files, with file names in front; equal notes appear once.
 
     Examples
@@ -30,7 +30,7 @@ def merge_notes(said: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     ['a.csv, b.csv: 2 rows are unreadable']
     """
     pooled: dict[str, list[str]] = {}
-    for name, notes in said:
+    for name, notes in notes_by_file:
         for note in notes:
             pooled.setdefault(note.removeprefix(f"{name}: "), []).append(name)
     return [f"{name_some(names)}: {note}" for note, names in pooled.items()]

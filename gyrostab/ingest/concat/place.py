@@ -57,9 +57,9 @@ class _Match:
 def _count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
     """Count the samples known in both arrays (axis, ..., sample), and the equal ones."""
     known = np.isfinite(held) & np.isfinite(new)
-    told = known.any(axis=0)
-    same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~known).all(axis=0) & told
-    return told.sum(axis=-1), same.sum(axis=-1)
+    has_values = known.any(axis=0)
+    same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~known).all(axis=0) & has_values
+    return has_values.sum(axis=-1), same.sum(axis=-1)
 
 
 def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:

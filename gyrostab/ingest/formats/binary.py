@@ -109,23 +109,27 @@ def _record_type(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], in
             "correct the layout"
         )
     names, types, offsets, size = [], [], [], 0
-    for number, one in enumerate(layout.get("fields", ()), 1):
+    for number, field in enumerate(layout.get("fields", ()), 1):
         if (
-            isinstance(one, dict)
-            and set(one) == {"skip"}
-            and isinstance(one["skip"], int)
-            and one["skip"] > 0
+            isinstance(field, dict)
+            and set(field) == {"skip"}
+            and isinstance(field["skip"], int)
+            and field["skip"] > 0
         ):
-            size += one["skip"]
+            size += field["skip"]
             continue
-        if not isinstance(one, dict) or set(one) != {"name", "type"} or one["type"] not in TYPES:
+        if (
+            not isinstance(field, dict)
+            or set(field) != {"name", "type"}
+            or field["type"] not in TYPES
+        ):
             what = (
                 f'is {{name = "...", type = "..."}} or {{skip = BYTES}}, the types are '
                 f"{', '.join(TYPES)}"
             )
             raise OptionError(f"{place.name}: field {number} {what}; correct the layout")
-        names.append(str(one["name"]))
-        types.append(np.dtype(order + np.dtype(one["type"]).str[1:]))
+        names.append(str(field["name"]))
+        types.append(np.dtype(order + np.dtype(field["type"]).str[1:]))
         offsets.append(size)
         size += types[-1].itemsize
     if not names or len(set(names)) < len(names):

@@ -67,15 +67,15 @@ def _read_curves(path: Path, options: ReadOptions) -> Table:
         if curve.mnemonic.upper() in ("TIME", "DATETIME") and holds_dates(curve.data)
     ][:1]
     dates = clocks[0].data if clocks else None
-    both = {
+    curves_by_name = {
         curve.mnemonic.upper(): curve
         for curve in curves
         if curve.mnemonic.upper() in ("TIME", "DATE")
     }
     named = {name.strip().upper() for name in options.map}
-    if not clocks and len(both) == 2 and not named & both.keys():
-        clocks = list(both.values())
-        dates = _date_and_time(path, both["DATE"], both["TIME"])
+    if not clocks and len(curves_by_name) == 2 and not named & curves_by_name.keys():
+        clocks = list(curves_by_name.values())
+        dates = _date_and_time(path, curves_by_name["DATE"], curves_by_name["TIME"])
     names = tuple(
         "" if any(curve is clock for clock in clocks) else str(curve.mnemonic) for curve in curves
     )
@@ -130,7 +130,7 @@ def _date_and_time(path: Path, date: Any, time: Any) -> NDArray[np.datetime64]:
 
 def _date_order(unit: str, days: list[str]) -> str | None:
     """Return the date format: that of the curve's unit, or the only one that fits."""
-    said = (
+    unit_format = (
         re.sub(r"(?i)y{4}|y{2}|m{3}|m{2}|d{2}", lambda part: _DATE_CODES[part[0].lower()], unit)
         if re.search(r"(?i)yy", unit)
         else ""
@@ -145,7 +145,7 @@ def _date_order(unit: str, days: list[str]) -> str | None:
         "%d/%b/%Y",
         "%d %b %Y",
     )
-    for order in (said, *known):
+    for order in (unit_format, *known):
         if order and _has_date_format(order, days):
             return order
     unclear = [

@@ -106,13 +106,13 @@ def _read_traces(path: Path, *, unpack: bool) -> list[_Trace]:
                 ):
                     continue  # text and log records of the station
                 code = pymseed.sourceid2nslc(trace.sourceid)
-                one = traces.setdefault(
+                channel = traces.setdefault(
                     (trace.sourceid, piece.samprate), _Trace(tuple(code), piece.samprate)
                 )
-                one.starts.append(int(piece.starttime))
-                one.sizes.append(int(piece.samplecnt))
+                channel.starts.append(int(piece.starttime))
+                channel.sizes.append(int(piece.samplecnt))
                 if unpack:
-                    one.values.append(np.array(piece.np_datasamples))
+                    channel.values.append(np.array(piece.np_datasamples))
     except pymseed.MiniSEEDError as error:
         raise FormatError(
             f"{path.name}: this miniSEED file cannot be read ({error}); it may be cut off, copy "
@@ -147,14 +147,16 @@ def _group_traces(traces: list[_Trace]) -> list[Table]:
     return tables
 
 
-def _in_step(one: _Trace, other: _Trace) -> bool:
-    apart = _MAX_START_DIFFERENCE * 1e9 / one.rate
+def _in_step(first: _Trace, second: _Trace) -> bool:
+    apart = _MAX_START_DIFFERENCE * 1e9 / first.rate
     same = (
-        one.rate == other.rate
-        and one.sizes[:-1] == other.sizes[:-1]
-        and len(one.sizes) == len(other.sizes)
+        first.rate == second.rate
+        and first.sizes[:-1] == second.sizes[:-1]
+        and len(first.sizes) == len(second.sizes)
     )
-    return same and all(abs(a - b) <= apart for a, b in zip(one.starts, other.starts, strict=True))
+    return same and all(
+        abs(a - b) <= apart for a, b in zip(first.starts, second.starts, strict=True)
+    )
 
 
 def _axis_of_code(name: str) -> str | None:

@@ -60,22 +60,22 @@ def read(path: Path, options: ReadOptions, *, limit: int = SPILL_BYTES) -> xr.Da
     file, plan = _open_parquet(path, options)
     names = file.schema_arrow.names
     check_stored(path, file.metadata.num_rows, len(plan.columns), options.limits)
-    intake = RawLogBuilder(plan.check(), options, limit=limit)
+    builder = RawLogBuilder(plan.check(), options, limit=limit)
     wanted = [names[column.source] for column in plan.columns]
 
     def convert(batch: Any) -> ConvertedBlock:
         found = {name: batch.column(place) for place, name in enumerate(batch.schema.names)}
         return convert_batch(
-            intake,
+            builder,
             options,
             {column.source: _to_numpy(found[names[column.source]]) for column in plan.columns},
         )
 
-    for taken in map_in_order(
+    for converted in map_in_order(
         convert, file.iter_batches(batch_size=batch_rows(len(wanted)), columns=wanted)
     ):
-        intake.add(taken)
-    return intake.finish(float32_note(plan, file.schema_arrow.types))
+        builder.add(converted)
+    return builder.finish(float32_note(plan, file.schema_arrow.types))
 
 
 def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:

@@ -168,14 +168,14 @@ def read_tables(
     for place, table in enumerate(planned.tables):
         plan, fetch = planned.part(place)
         if place in planned.main:
-            told = notes if not main else ()
+            table_notes = notes if not main else ()
             main.append(
                 read_columns(
                     plan if not main else replace(plan, notes=()),
                     options,
                     table.rows,
                     fetch,
-                    notes=told,
+                    notes=table_notes,
                     limit=limit,
                 )
             )

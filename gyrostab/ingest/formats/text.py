@@ -109,18 +109,19 @@ def read(
     """Return the raw log of a text file; raise `CancelledError` once `stop` returns true."""
     layout, plan = _plan_file(path, options)
     options = options if plan.rate is None else replace(options, rate=plan.rate)
-    intake = RawLogBuilder(plan.check(), options, limit=limit)
-    typing = CellTypes(layout, plan, options, stamp_types(layout, plan))
+    builder = RawLogBuilder(plan.check(), options, limit=limit)
+    cell_types = CellTypes(layout, plan, options, stamp_types(layout, plan))
     line = layout.line
     for parts in map_in_order(
-        partial(_parse_block, typing=typing, intake=intake), _read_blocks(path, layout.offset)
+        partial(_parse_block, cell_types=cell_types, builder=builder),
+        _read_blocks(path, layout.offset),
     ):
         if stop is not None and stop():
             raise CancelledError
         for part in parts:
-            intake.add(part.taken, partial(_line_names, part, line))
+            builder.add(part.taken, partial(_line_names, part, line))
             line += part.lines
-    return intake.finish(layout.notes)
+    return builder.finish(layout.notes)
 
 
 def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
@@ -280,16 +281,16 @@ class _ParsedPart(NamedTuple):
     span: slice
 
 
-def _parse_block(block: bytes, typing: CellTypes, intake: RawLogBuilder) -> list[_ParsedPart]:
+def _parse_block(block: bytes, cell_types: CellTypes, builder: RawLogBuilder) -> list[_ParsedPart]:
     """Parse one block."""
     parts: list[_ParsedPart] = []
     start, reach, left = 0, LINE_BYTES, _count_lines(block, slice(None))
     while start < len(block):
-        (values, stamps), stop = parse_plain(block, start, left, typing)
+        (values, stamps), stop = parse_plain(block, start, left, cell_types)
         if stop > start:
             lines = left if stop == len(block) else _count_lines(block, slice(start, stop))
             parts.append(
-                _ParsedPart(intake.prepare(values, stamps), lines, block, slice(start, stop))
+                _ParsedPart(builder.prepare(values, stamps), lines, block, slice(start, stop))
             )
             left -= lines
         if stop == len(block):
@@ -297,7 +298,9 @@ def _parse_block(block: bytes, typing: CellTypes, intake: RawLogBuilder) -> list
         reach = LINE_BYTES if stop - start > PIECE_BYTES else min(4 * reach, PIECE_BYTES)
         start = block.find(b"\n", min(stop + reach, len(block) - 1)) + 1
         parts.append(
-            _parse_piece(_clean_lines(block[stop:start], typing.layout.separator), typing, intake)
+            _parse_piece(
+                _clean_lines(block[stop:start], cell_types.layout.separator), cell_types, builder
+            )
         )
         left -= parts[-1].lines
     return parts
@@ -307,10 +310,10 @@ def _count_lines(block: bytes, span: slice) -> int:
     return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8)[span] == 10))
 
 
-def _parse_piece(piece: bytes, typing: CellTypes, intake: RawLogBuilder) -> _ParsedPart:
+def _parse_piece(piece: bytes, cell_types: CellTypes, builder: RawLogBuilder) -> _ParsedPart:
     """Parse a piece in which at least one row is not plain."""
     lines = piece.count(b"\n")
-    parsed = parse_fast(piece, typing) if len(piece) > SHORT_BYTES else None
+    parsed = parse_fast(piece, cell_types) if len(piece) > SHORT_BYTES else None
     if parsed is not None:
         rows = _count_rows(*parsed)
         if (
@@ -319,10 +322,10 @@ def _parse_piece(piece: bytes, typing: CellTypes, intake: RawLogBuilder) -> _Par
             or rows == sum(1 for text in piece.split(b"\n") if text.strip())
         ):
             return _ParsedPart(
-                intake.prepare(*parsed), lines, piece, slice(None)
+                builder.prepare(*parsed), lines, piece, slice(None)
             )  # otherwise an unmatched quote hides line ends
-    values, stamps, words = parse_cells(piece, typing)
-    return _ParsedPart(intake.prepare(values, stamps, words=words), lines, piece, slice(None))
+    values, stamps, words = parse_cells(piece, cell_types)
+    return _ParsedPart(builder.prepare(values, stamps, words=words), lines, piece, slice(None))
 
 
 def _count_rows(values: dict[int, NDArray[np.float64]], stamps: NDArray[np.int64] | None) -> int:

@@ -22,16 +22,18 @@ _MISSING, _UNREADABLE, _OUTSIDE = (
 )
 
 
-def _missing_samples(placement: Placement, found: ScanPass) -> NDArray[np.int64]:
+def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     """List the samples without a row between the runs."""
     runs, events = placement.runs, placement.events
     end, row_end = runs[:-1, 0] + runs[:-1, 2], runs[:-1, 1] + runs[:-1, 2]
     start, row_start = runs[1:, 0], runs[1:, 1]
-    told = np.sort(
+    listed_rows = np.sort(
         events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2]
     )  # rows that have a line of another cause
     skipped = (
-        row_start - row_end - (np.searchsorted(told, row_start) - np.searchsorted(told, row_end))
+        row_start
+        - row_end
+        - (np.searchsorted(listed_rows, row_start) - np.searchsorted(listed_rows, row_end))
     )
     skipped = np.where(row_start > row_end, np.maximum(skipped, 0), 0)
     broken = events[np.isin(events[:, 0], (STEP, RESTART))]
@@ -42,7 +44,7 @@ def _missing_samples(placement: Placement, found: ScanPass) -> NDArray[np.int64]
         at = np.minimum(at, len(broken) - 1)
         at_break = broken[at, 1] == end
         cause = np.where(at_break, broken[at, 0], cause)
-    listed = (start > end) | ((skipped > 0) & (found.absent <= 0.01 * found.rows))
+    listed = (start > end) | ((skipped > 0) & (scanned.absent <= 0.01 * scanned.rows))
     return np.stack([end, start, start - end, skipped, cause], axis=1)[listed]
 
 
@@ -70,7 +72,7 @@ def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def find_gaps(
-    placement: Placement, found: ScanPass, *, most: int = MAX_TABLE_ROWS
+    placement: Placement, scanned: ScanPass, *, most: int = MAX_TABLE_ROWS
 ) -> NDArray[np.int64]:
     """Make the table of gaps in samples.
 
@@ -81,9 +83,9 @@ def find_gaps(
     """
     table = np.concatenate(
         [
-            _missing_samples(placement, found),
-            _unusable_cells(found.unreadable, _UNREADABLE, placement),
-            _unusable_cells(found.infinite, _OUTSIDE, placement),
+            _missing_samples(placement, scanned),
+            _unusable_cells(scanned.unreadable, _UNREADABLE, placement),
+            _unusable_cells(scanned.infinite, _OUTSIDE, placement),
             _dropped_rows(placement.events),
         ]
     )

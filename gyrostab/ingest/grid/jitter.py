@@ -134,7 +134,7 @@ def fit_jitter(
 
     Returns
     -------
-    Course or None
+    JitterModel or None
         None if no period explains the stamps.
     """
     seen = _observe_parts(parts, observe, guesses[0])
@@ -163,7 +163,7 @@ def fit_jitter(
         _refine_model(seen, JitterModel(period, sigma, observe, group, np.inf), sure)
         for period, sigma in started
     ]
-    explained = min(filter(None, found), key=lambda course: course.code_length, default=None)
+    explained = min(filter(None, found), key=lambda jitter: jitter.code_length, default=None)
     return (
         explained if explained is not None and explained.fits else None
     )  # the best may fit stamps of doubled rows
@@ -254,12 +254,12 @@ def _row_cost(seen: list[ObservedStamps], period: float, sigma_ns: float, sure: 
 
 
 def _refine_model(
-    seen: list[ObservedStamps], course: JitterModel, sure: float, *, most_off: float = 0.05
+    seen: list[ObservedStamps], jitter: JitterModel, sure: float, *, most_off: float = 0.05
 ) -> JitterModel | None:
     """Refine period and jitter along the sequence of samples; None if the fit fails."""
     if not seen:
         return None
-    period, sigma = course.period, course.sigma
+    period, sigma = jitter.period, jitter.sigma
     for gain in (_SEARCH_GAIN, _SEARCH_GAIN / 2, GAIN, GAIN):
         cc = ct = nats = rows = dropped = single = steps = 0.0
         offs = []
@@ -280,7 +280,7 @@ def _refine_model(
             return None
         period = float(ct / cc)
         sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
-        if not abs(period / course.period - 1) < most_off or sigma > 2 * _MAX_SIGMA:
+        if not abs(period / jitter.period - 1) < most_off or sigma > 2 * _MAX_SIGMA:
             return None
     fits = (
         sigma < _MAX_SIGMA
@@ -288,7 +288,7 @@ def _refine_model(
         and nats < _MAX_NATS * rows
         and single > 0.1 * steps
     )
-    return JitterModel(period, sigma, course.observe, course.group, nats / rows, fits)
+    return JitterModel(period, sigma, jitter.observe, jitter.group, nats / rows, fits)
 
 
 def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
@@ -297,20 +297,20 @@ def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
 
 
 def count_samples(
-    rows: Integers, stamps: Integers, course: JitterModel, longest: float
+    rows: Integers, stamps: Integers, jitter: JitterModel, longest: float
 ) -> tuple[Integers, Integers, Integers]:
     """Return stamps [ns], sample numbers and piece numbers of the used rows of a block."""
-    at = observe_rows(stamps, course.observe, course.period)
-    if course.observe != "all":
+    at = observe_rows(stamps, jitter.observe, jitter.period)
+    if jitter.observe != "all":
         at = at[1:-1]  # the groups at both ends may be cut
     sample, piece, off, _ = follow(
         rows[at],
         stamps[at],
-        course.period,
-        max(course.sigma, MIN_SIGMA),
+        jitter.period,
+        max(jitter.sigma, MIN_SIGMA),
         GAIN,
         longest,
         TRACE_ROWS,
     )
-    near = _is_near(off, course.sigma)
+    near = _is_near(off, jitter.sigma)
     return stamps[at][near], sample[near], piece[near]

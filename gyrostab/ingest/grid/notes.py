@@ -56,7 +56,7 @@ def describe_rate(
     raw: xr.Dataset,
     estimate: RateEstimate,
     rate: float,
-    odd: list[tuple[int, int, float]],
+    deviating: list[tuple[int, int, float]],
     placement: Placement,
 ) -> list[str]:
     """Return notes on the sampling rate."""
@@ -75,8 +75,8 @@ def describe_rate(
             else ""
         )
         notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
-    course = estimate.course
-    if course is not None and course.group >= 2:
+    jitter = estimate.jitter
+    if jitter is not None and jitter.group >= 2:
         why = (
             "many rows share one stamp"
             if estimate.coarse
@@ -86,10 +86,10 @@ def describe_rate(
             f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are "
             "missing where a group comes late"
         )
-    elif course is not None:
+    elif jitter is not None:
         notes.append(
-            f"{where}: the stamps scatter by {format_duration(course.sigma / rate)}, "
-            f"{course.sigma:.2g} of a sampling interval, "
+            f"{where}: the stamps scatter by {format_duration(jitter.sigma / rate)}, "
+            f"{jitter.sigma:.2g} of a sampling interval, "
             f"as times of arrival do: rows keep their order at {rate:.10g} Hz, and a missing "
             "sample is located to a few rows"
         )
@@ -115,7 +115,7 @@ def describe_rate(
             f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million "
             f"from {rate:.10g} Hz"
         )
-    for row, stamp, own in odd[:_MAX_NAMED]:
+    for row, stamp, own in deviating[:_MAX_NAMED]:
         file, local = file_of(raw, row)
         notes.append(
             f"{file}: from about {format_stamp(stamp)} (row {local}) the samples come at "
@@ -182,7 +182,7 @@ def _describe_missing(
 
 
 def describe_placement(
-    raw: xr.Dataset, found: ScanPass, placement: Placement, table: NDArray[np.int64], rate: float
+    raw: xr.Dataset, scanned: ScanPass, placement: Placement, table: NDArray[np.int64], rate: float
 ) -> list[str]:
     """Return notes on gaps, restarts, and rows and cells that were dropped or moved."""
     where = file_of(raw)[0]
@@ -204,8 +204,8 @@ def describe_placement(
             f"{kept} were put in their place, {len(late) - kept} dropped"
         )
     lost = (
-        found.rows
-        - found.absent
+        scanned.rows
+        - scanned.absent
         - placement.placed
         - len(twice)
         - (len(late) - kept if len(late) else 0)
@@ -215,12 +215,12 @@ def describe_placement(
             f"{where}: dropped for want of a readable time stamp: {_count_of(lost, 'row')} whose "
             "neighbours do not tell where they belong"
         )
-    infinite = int((found.infinite[:, 1] - found.infinite[:, 0]).sum())
+    infinite = int((scanned.infinite[:, 1] - scanned.infinite[:, 0]).sum())
     if infinite:
         notes.append(f"{where}: infinite values in {_count_of(infinite, 'row')}, taken as missing")
     notes += [
         f"{where}: axis {axis} never changes its value; is the sensor dead, or the column the "
         "wrong one?"
-        for axis in found.constant
+        for axis in scanned.constant
     ]
     return notes

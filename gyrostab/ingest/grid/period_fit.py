@@ -31,13 +31,13 @@ def fit_pieces(
     counted: bool,
     coarse: bool,
     longest: float,
-    course: JitterModel | None = None,
+    jitter: JitterModel | None = None,
 ) -> NDArray[np.float64]:
     """Sum each unbroken piece: n, mean count, mean stamp [ns], cc, ct, squared residuals."""
     table = np.empty((0, 6))
     zero: int | None = None
     work = partial(
-        _piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, course=course
+        _piece_sums, period=period, counted=counted, coarse=coarse, longest=longest, jitter=jitter
     )
     for first, sums in map_in_order(work, stamps()):
         if first is None:
@@ -58,7 +58,7 @@ def _piece_sums(
     counted: bool,
     coarse: bool,
     longest: float,
-    course: JitterModel | None,
+    jitter: JitterModel | None,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
     """Return first stamp, reference stamp and sums of the pieces of a block."""
     rows, block = found
@@ -66,8 +66,8 @@ def _piece_sums(
     if len(block) == 0:
         return None, np.empty((0, 6))
     first = int(block[0])
-    if course is not None:
-        block, count, piece = count_samples(np.arange(len(found[1])), found[1], course, longest)
+    if jitter is not None:
+        block, count, piece = count_samples(np.arange(len(found[1])), found[1], jitter, longest)
         return (first, int(block[0])) if len(block) else None, piece_sums(
             block, count, piece, period
         )

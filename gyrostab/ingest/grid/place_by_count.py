@@ -77,26 +77,26 @@ def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, int, float]],
     noise = 1.4826 * float(np.median(change)) if len(change) else 0.0
     least = max(6 * noise, float(np.median(windows.reach)), 3.0)
     found: list[tuple[int, float, int, float]] = []
-    course, placed, wander, b = float(low[0]), float(low[0]), 0.0, 1
+    level, placed, wander, b = float(low[0]), float(low[0]), 0.0, 1
     while b < len(low):
         after = low[b : b + 3]
-        size = float(np.median(after)) - course
+        size = float(np.median(after)) - level
         if (
             abs(size) > least
-            and abs(low[b] - course) > least
-            and (after - course > least).all() | (after - course < -least).all()
+            and abs(low[b] - level) > least
+            and (after - level > least).all() | (after - level < -least).all()
         ):
             # a loss late in a window does not change the lowest point of that window
             rows = (windows.up if size > 0 else windows.down)[b - 1 : b + 1]
-            tops = windows.high[b - 1] - course if size > 0 else course - low[b - 1]
+            tops = windows.high[b - 1] - level if size > 0 else level - low[b - 1]
             row = int(rows[0]) if size > 0 and tops > 0.7 * size else int(rows[-1])
-            found.append((row, size, b, course))
-            course = float(np.median(after))
-            placed += course - found[-1][3]
+            found.append((row, size, b, level))
+            level = float(np.median(after))
+            placed += level - found[-1][3]
             b += 1
             continue
-        course += 0.2 * (float(low[b]) - course)
-        wander = max(wander, abs(course - placed))
+        level += 0.2 * (float(low[b]) - level)
+        wander = max(wander, abs(level - placed))
         b += 1
     return found, wander
 
@@ -126,19 +126,19 @@ def place_by_count(
     start = first + int(np.rint(edge * period)) if abs(edge) < 2 * width else first
     shifts, cuts, events = [0], [0], []
     begun = 0.0
-    for row, size, _window, course in jumps:
+    for row, size, _window, level in jumps:
         extra = int(np.rint(size))
-        before = first + int((row - 1 + course) * period)
+        before = first + int((row - 1 + level) * period)
         if size < 0 or size > max_gap * rate:
             back = -size
-            elapsed = row + course - begun
+            elapsed = row + level - begun
             cause = (
                 RESTART
-                if size < 0 and (2 * back > elapsed or row + course + size < 0.1 * elapsed)
+                if size < 0 and (2 * back > elapsed or row + level + size < 0.1 * elapsed)
                 else STEP
             )
             events.append((cause, row + shifts[-1], row, before, before + int((size + 1) * period)))
-            extra, begun = 1, row + course + size
+            extra, begun = 1, row + level + size
         shifts.append(shifts[-1] + extra)
         cuts.append(row)
     runs = _counted_runs(stamps, np.array(cuts), np.array(shifts))

@@ -38,9 +38,9 @@ _LATE_SAMPLES = 16.0
 class _Placer:
     """Assign samples to rows, stretch by stretch."""
 
-    def __init__(self, course: JitterModel, period: float, hold: float, max_gap_ns: float):
-        self.course, self.period, self.hold, self.max_gap_ns = course, period, hold, max_gap_ns
-        self.sigma = max(course.sigma, MIN_SIGMA)
+    def __init__(self, jitter: JitterModel, period: float, hold: float, max_gap_ns: float):
+        self.jitter, self.period, self.hold, self.max_gap_ns = jitter, period, hold, max_gap_ns
+        self.sigma = max(jitter.sigma, MIN_SIGMA)
         self.start: int | None = None
         self.latest = 0
         self.last = -1  # sample of the latest row
@@ -49,12 +49,12 @@ class _Placer:
 
     def add(self, rows: Integers, count: Integers, stamps: Integers, n: int) -> None:
         """Place the first `n` rows of a stretch; the others are look-ahead."""
-        at = observe_rows(stamps, self.course.observe, self.period)
+        at = observe_rows(stamps, self.jitter.observe, self.period)
         if len(at) == 0:
             return
         if self.start is None:
             self.latest = int(stamps[at[0]])
-        reach = _LATE_SAMPLES * max(self.period, self.course.group * self.period)
+        reach = _LATE_SAMPLES * max(self.period, self.jitter.group * self.period)
         breaks, self.latest = find_breaks(
             stamps[at], int(np.searchsorted(at, n)), self.latest, reach, self.max_gap_ns
         )
@@ -102,7 +102,7 @@ class _Placer:
     def _place_stretch(
         self, rows: Integers, count: Integers, stamps: Integers, n: int, *, begins: bool
     ) -> None:
-        at = observe_rows(stamps, self.course.observe, self.period)
+        at = observe_rows(stamps, self.jitter.observe, self.period)
         begins = begins or self.start is None
         if begins:
             self._begin_piece(count, stamps, at)
@@ -127,9 +127,9 @@ class _Placer:
         if begins:
             self._set_first_sample(int(levels[0]))
         nearest = np.searchsorted(
-            at, np.arange(n), side="left" if self.course.observe == "last" else "right"
+            at, np.arange(n), side="left" if self.jitter.observe == "last" else "right"
         )
-        nearest -= self.course.observe != "last"
+        nearest -= self.jitter.observe != "last"
         known = np.append(levels, self.level if len(at) == 0 else levels[-1])
         level = np.where(nearest < 0, self.level, known[np.clip(nearest, 0, len(at))])
         done = int(np.searchsorted(at, n))
@@ -178,7 +178,7 @@ def append_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integ
 
 def place_rows(
     blocks: Iterator[tuple[Integers, Integers]],
-    course: JitterModel,
+    jitter: JitterModel,
     period: float,
     *,
     hold: float,
@@ -191,7 +191,7 @@ def place_rows(
     ----------
     blocks : iterator
         Blocks of (row numbers, stamps [ns]).
-    course : Course
+    jitter : JitterModel
         Period and jitter of the stamps.
     period : float
         Sampling period of the grid [ns].
@@ -209,9 +209,9 @@ def place_rows(
     runs, events : list of ndarray
         As in `gyrostab.ingest.grid.place.Placement`.
     """
-    ahead = int(min(_AHEAD_ROWS * np.ceil(course.group), _MAX_AHEAD_ROWS))
-    size = int(min(TRACE_ROWS * np.ceil(course.group), _MAX_ROWS))
-    placer = _Placer(course, period, hold, max_gap_ns)
+    ahead = int(min(_AHEAD_ROWS * np.ceil(jitter.group), _MAX_AHEAD_ROWS))
+    size = int(min(TRACE_ROWS * np.ceil(jitter.group), _MAX_ROWS))
+    placer = _Placer(jitter, period, hold, max_gap_ns)
     held = [np.empty(0, dtype=np.int64)] * 3
     done = 0
     for rows, stamps in blocks:
@@ -231,7 +231,7 @@ def place_rows(
 
 def place_in_order(
     stamps: Stamps,
-    course: JitterModel,
+    jitter: JitterModel,
     rate: float,
     *,
     tolerance: float,
@@ -245,7 +245,7 @@ def place_in_order(
     ----------
     stamps, rate, tolerance, max_gap, where
         As for `place_by_stamp`.
-    course : Course
+    jitter : JitterModel
         Period and jitter of the stamps.
     by_row : bool
         Whether rows that `stamps` leaves out occupy samples.
@@ -258,7 +258,7 @@ def place_in_order(
     whole, fraction = period_ns(rate)
     start, runs, events = place_rows(
         stamps(),
-        course,
+        jitter,
         whole + fraction,
         hold=0.5 + tolerance,
         max_gap_ns=max_gap * SECOND,

@@ -75,7 +75,7 @@ class RateEstimate:
         losses.
     finer : float or None
         Rate [Hz] if the pattern of steps is due to recurring losses; None without such a pattern.
-    course : JitterModel or None
+    jitter : JitterModel or None
         Jitter of the stamps, if single stamps do not give the sample but many together do.
     """
 
@@ -86,7 +86,7 @@ class RateEstimate:
     raw: float
     even: float | None = None
     finer: float | None = None
-    course: JitterModel | None = None
+    jitter: JitterModel | None = None
 
 
 def _round_rate(rate: float, error: float, samples: float, counted: bool) -> float:
@@ -160,9 +160,9 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         or step_scatter(steps, period) > _SHARP_SCATTER
         or np.mean(steps == 0) >= SHARED_SHARE
     ):
-        course = _fit_jitter(parts, period, coarse, sure)
-        if course is not None:
-            return _estimate_with_jitter(stamps, course, coarse, sure)
+        jitter = _fit_jitter(parts, period, coarse, sure)
+        if jitter is not None:
+            return _estimate_with_jitter(stamps, jitter, coarse, sure)
     longest = longest_step(parts, period) if counted else sure * period
     estimate = _estimate_pooled(
         fit_pieces(stamps, period, counted, coarse, longest), period, counted, coarse
@@ -192,13 +192,13 @@ def _fit_jitter(
 
 
 def _estimate_with_jitter(
-    stamps: Stamps, course: JitterModel, coarse: bool, sure: float
+    stamps: Stamps, jitter: JitterModel, coarse: bool, sure: float
 ) -> RateEstimate:
     """Estimate the rate along the sequence of samples of jittered stamps."""
-    longest = sure * course.period * max(1.0, course.group)
-    pieces = fit_pieces(stamps, course.period, False, False, longest, course)
+    longest = sure * jitter.period * max(1.0, jitter.group)
+    pieces = fit_pieces(stamps, jitter.period, False, False, longest, jitter)
     return replace(
-        _estimate_pooled(pieces, course.period, False, False), coarse=coarse, course=course
+        _estimate_pooled(pieces, jitter.period, False, False), coarse=coarse, jitter=jitter
     )
 
 
@@ -253,9 +253,9 @@ def estimate_near(stamps: Stamps, rate: float) -> RateEstimate | None:
         return sharp
     sure = _trusted_samples(sum(len(part) - 1 for part in parts))
     for observe in ("all", "last"):
-        course = fit_jitter_near(parts, SECOND / rate, observe, sure=sure)
-        if course is not None:
-            return _estimate_with_jitter(stamps, course, False, sure)
+        jitter = fit_jitter_near(parts, SECOND / rate, observe, sure=sure)
+        if jitter is not None:
+            return _estimate_with_jitter(stamps, jitter, False, sure)
     return None
 
 
@@ -271,19 +271,19 @@ def is_far_worse(stamps: Stamps, near: RateEstimate, found: RateEstimate) -> boo
     >>> is_far_worse(stamps, estimate_near(stamps, 110.0), estimate_rate(stamps, where="tool.csv"))
     True
     """
-    theirs = found.course
-    if theirs is None and not found.counted:
+    found_jitter = found.jitter
+    if found_jitter is None and not found.counted:
         parts = sample_stretches(partial(recut_blocks, stamps, _BLOCK))
-        theirs = fit_jitter_near(
+        found_jitter = fit_jitter_near(
             parts,
             SECOND / found.raw,
             "all",
             sure=_trusted_samples(sum(len(part) - 1 for part in parts)),
         )
     return (
-        near.course is not None
-        and theirs is not None
-        and near.course.code_length > theirs.code_length + _FAR_WORSE_NATS
+        near.jitter is not None
+        and found_jitter is not None
+        and near.jitter.code_length > found_jitter.code_length + _FAR_WORSE_NATS
     )
 
 
@@ -329,11 +329,11 @@ def deviating_stretches(
             continue
         for begin, look in zip(begins.tolist(), far.tolist(), strict=True):
             part = values[begin : begin + size]
-            own = period_of_lines([part]) if look else None
-            odd = own is not None and abs(own / period - 1) > 0.02
-            if odd and not inside and own is not None:
-                found.append((int(rows[begin]), int(part[0]), SECOND / own))
-            inside = odd
+            own_period = period_of_lines([part]) if look else None
+            is_deviating = own_period is not None and abs(own_period / period - 1) > 0.02
+            if is_deviating and not inside and own_period is not None:
+                found.append((int(rows[begin]), int(part[0]), SECOND / own_period))
+            inside = is_deviating
     return found
 
 

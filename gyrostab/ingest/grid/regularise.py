@@ -99,7 +99,7 @@ def _start_stamp(raw: xr.Dataset, notes: list[str]) -> int:
 
 def _place_rows(
     raw: xr.Dataset,
-    found: ScanPass,
+    scanned: ScanPass,
     declared: float | None,
     *,
     tolerance: float,
@@ -113,14 +113,16 @@ def _place_rows(
             raise TimeError(
                 f"{where}: the file has no time column; give the sampling rate with --rate HZ"
             )
-        return place_without_time(found.rows, _start_stamp(raw, notes)), declared
-    everything = found.absent <= 0.01 * found.rows  # single unreadable rows still occupy samples
-    stamps: Stamps = partial(stamp_blocks, raw, found, block=block)
-    counted: Stamps = partial(stamp_blocks, raw, found, block=block, all_rows=everything)
+        return place_without_time(scanned.rows, _start_stamp(raw, notes)), declared
+    count_all_rows = (
+        scanned.absent <= 0.01 * scanned.rows
+    )  # single unreadable rows still occupy samples
+    stamps: Stamps = partial(stamp_blocks, raw, scanned, block=block)
+    counted: Stamps = partial(stamp_blocks, raw, scanned, block=block, all_rows=count_all_rows)
     try:
         estimate = estimate_rate(stamps, where=where)
     except TimeError:
-        if declared is None or found.rows - found.absent > 1:
+        if declared is None or scanned.rows - scanned.absent > 1:
             raise
         estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
     if declared is not None and abs(declared / estimate.raw - 1) > _MAX_RATE_DIFFERENCE:
@@ -153,16 +155,16 @@ def _place_rows(
         )  # a given rate settles the question
     if estimate.counted:
         placement = place_by_count(counted, estimate, rate, max_gap=max_gap)
-        odd: list[tuple[int, int, float]] = []
+        deviating: list[tuple[int, int, float]] = []
     else:
-        limits = _OrderOptions(tolerance, max_gap, everything, where)
-        placement, odd = _place_stamped(raw, found, stamps, estimate, rate, limits)
-    notes += describe_rate(raw, estimate, rate, odd, placement)
+        limits = _OrderOptions(tolerance, max_gap, count_all_rows, where)
+        placement, deviating = _place_stamped(raw, scanned, stamps, estimate, rate, limits)
+    notes += describe_rate(raw, estimate, rate, deviating, placement)
     return placement, rate
 
 
 def _place_even(
-    raw: xr.Dataset, found: ScanPass, place: Callable[..., tuple[Placement, float]]
+    raw: xr.Dataset, scanned: ScanPass, place: Callable[..., tuple[Placement, float]]
 ) -> tuple[Placement, float] | None:
     """Place the rows of a long log with evenly spaced stamps, from its beginning alone.
 
@@ -171,7 +173,7 @@ def _place_even(
     line: tuple[int, int] | None = (
         getattr(raw["time"].data, "gyrostab_line", None) if "time" in raw.variables else None
     )
-    if line is None or found.absent or found.repeated or found.rows <= _EVEN_ROWS:
+    if line is None or scanned.absent or scanned.repeated or scanned.rows <= _EVEN_ROWS:
         return None
     start, step = line
     stamps = (start + step * np.arange(_EVEN_ROWS)).view("datetime64[ns]")
@@ -182,7 +184,7 @@ def _place_even(
         {"time": ("row", stamps), "axis": raw["axis"].values},
         raw.attrs,
     )
-    present = replace(found, rows=_EVEN_ROWS, present=found.present[: _EVEN_ROWS // 8].copy())
+    present = replace(scanned, rows=_EVEN_ROWS, present=scanned.present[: _EVEN_ROWS // 8].copy())
     notes: list[str] = []
     placement, rate = place(head, present, notes=notes)
     whole, fraction = period_ns(rate)
@@ -194,7 +196,7 @@ def _place_even(
         or len(placement.events)
     ):
         return None
-    return replace(placement, runs=np.array([[0, 0, found.rows]], dtype=np.int64)), rate
+    return replace(placement, runs=np.array([[0, 0, scanned.rows]], dtype=np.int64)), rate
 
 
 class _OrderOptions(NamedTuple):
@@ -208,45 +210,45 @@ class _OrderOptions(NamedTuple):
 
 def _place_stamped(
     raw: xr.Dataset,
-    found: ScanPass,
+    scanned: ScanPass,
     stamps: Stamps,
     estimate: RateEstimate,
     rate: float,
     limits: _OrderOptions,
 ) -> tuple[Placement, list[tuple[int, int, float]]]:
     """Place rows by their stamps, or in order if stamps have jitter; return deviating stretches."""
-    course = estimate.course
+    jitter = estimate.jitter
 
-    def place_along(course: JitterModel) -> Placement:
+    def place_along(jitter: JitterModel) -> Placement:
         def place() -> Placement:
             return place_in_order(
                 stamps,
-                course,
+                jitter,
                 rate,
-                **limits._replace(by_row=limits.by_row and not found.repeated)._asdict(),
+                **limits._replace(by_row=limits.by_row and not scanned.repeated)._asdict(),
             )
 
-        return _place_once(raw, found, place)
+        return _place_once(raw, scanned, place)
 
-    if course is not None and course.sigma > _SHARP_SIGMA:
-        return place_along(course), []
+    if jitter is not None and jitter.sigma > _SHARP_SIGMA:
+        return place_along(jitter), []
     tolerance, max_gap, where = limits.tolerance, limits.max_gap, limits.where
     placement = _place_once(
         raw,
-        found,
+        scanned,
         partial(place_by_stamp, stamps, rate, tolerance=tolerance, max_gap=max_gap, where=where),
     )
-    dropped = found.rows - found.absent - found.repeated - placement.placed
-    if not found.repeated and (
+    dropped = scanned.rows - scanned.absent - scanned.repeated - placement.placed
+    if not scanned.repeated and (
         dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows
     ):  # placing in order may recover them
-        along = place_along(course or JitterModel.of_sharp(1e9 / rate))
+        along = place_along(jitter or JitterModel.of_sharp(1e9 / rate))
         if along.placed - placement.placed >= _LATE_SHARE * dropped:
             placement = along
     return placement, deviating_stretches(stamps, 1e9 / rate)
 
 
-def _place_once(raw: xr.Dataset, found: ScanPass, place: Callable[[], Placement]) -> Placement:
+def _place_once(raw: xr.Dataset, scanned: ScanPass, place: Callable[[], Placement]) -> Placement:
     """Place each sample once; repeated stretches of rows are duplicates, not clock restarts."""
     placement, known = place(), np.empty((0, 3), dtype=np.int64)
     for _ in range(_MAX_ROUNDS):
@@ -254,21 +256,21 @@ def _place_once(raw: xr.Dataset, found: ScanPass, place: Callable[[], Placement]
         if not len(repeats):
             break
         for row, _source, length in repeats.tolist():
-            found.leave_out(row, row + length)
+            scanned.leave_out(row, row + length)
         known = np.concatenate([known, repeats])
         placement = place()
     return with_repeats(placement, raw, known) if len(known) else placement
 
 
 def _place_channels(
-    raw: xr.Dataset, found: ScanPass, placement: Placement, rate: float, chunk: int
+    raw: xr.Dataset, scanned: ScanPass, placement: Placement, rate: float, chunk: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the channels on the grid, and time coordinates of slow channels."""
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {}
-    for name, rows in found.filled.items():
+    for name, rows in scanned.filled.items():
         channel = raw[name]
-        if rows > 0.5 * (found.rows - found.absent):
+        if rows > 0.5 * (scanned.rows - scanned.absent):
             variables[name] = (
                 "time",
                 rows_on_grid(channel.data, placement, chunk=chunk),
@@ -294,14 +296,14 @@ def _log_attributes(
     history = "\n".join(
         filter(None, [raw.attrs.get("history"), f"{now} gyrostab.regularise: {done}"])
     )
-    said = [*texts(raw, "notes"), *notes]
+    all_notes = [*texts(raw, "notes"), *notes]
     return {
         "source_files": [],
         **kept,
         "kind": kind,
         "sampling_rate_hz": rate,
         "history": history,
-        "notes": said,
+        "notes": all_notes,
     }
 
 
@@ -377,7 +379,7 @@ def regularise(
     check_raw(raw)
     _check_options(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
     if "axis_rows" in raw.attrs:
-        each = partial(
+        regularise_group = partial(
             regularise,
             rate=rate,
             tolerance=tolerance,
@@ -386,11 +388,11 @@ def regularise(
             block=block,
             limits=limits,
         )
-        return regularise_axes(raw, each, max_gap=max_gap, limits=limits)
+        return regularise_axes(raw, regularise_group, max_gap=max_gap, limits=limits)
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     allowed = check_limits(limits)
-    found = scan_rows(raw, name, block=block)
+    scanned = scan_rows(raw, name, block=block)
     notes: list[str] = []
     place = partial(
         _place_rows,
@@ -399,14 +401,14 @@ def regularise(
         max_gap=gap_limit,
         block=block,
     )
-    placement, hertz = _place_even(raw, found, place) or place(raw, found, notes=notes)
+    placement, hertz = _place_even(raw, scanned, place) or place(raw, scanned, notes=notes)
     check_grid(raw, placement, hertz, gap_limit, allowed)
     check_span(placement.start, hertz, placement.size, file_of(raw)[0])
     chunk = chunk or chunk_samples(hertz)
     table = name_lost(
-        find_gaps(placement, found), raw.attrs.get("unreadable_spans", ()), placement.start, hertz
+        find_gaps(placement, scanned), raw.attrs.get("unreadable_spans", ()), placement.start, hertz
     )
-    notes += describe_placement(raw, found, placement, table, hertz)
+    notes += describe_placement(raw, scanned, placement, table, hertz)
 
     increments = raw.attrs.get("kind") == "increment"
     signal = "rate" if increments else name
@@ -414,7 +416,7 @@ def regularise(
     attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
     unit = raw[name].encoding.get("scale_factor")
     packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}
-    variables, own = _place_channels(raw, found, placement, hertz, chunk)
+    variables, own = _place_channels(raw, scanned, placement, hertz, chunk)
     variables = {
         signal: (
             ("axis", "time"),
@@ -430,6 +432,8 @@ def regularise(
         .merge(time_coordinate(placement.start, hertz, placement.size))
         .coords
     )
-    done = f"{placement.placed} of {found.rows} rows on {placement.size} samples at {hertz:.10g} Hz"
+    done = (
+        f"{placement.placed} of {scanned.rows} rows on {placement.size} samples at {hertz:.10g} Hz"
+    )
     log = xr.Dataset(variables, coordinates, _log_attributes(raw, signal, hertz, done, notes))
     return log.assign_attrs(notes=[*log.attrs["notes"], *describe_channels(log)])

@@ -88,7 +88,7 @@ def _same_stamps(raw: xr.Dataset, source: int, row: int) -> int:
 
 def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int) -> bool:
     """Return whether values are equal where both are known, and not constant."""
-    told = alike = 0
+    compared = alike = 0
     changes = False
     for begin in range(0, length, BLOCK_ROWS):
         end = min(begin + BLOCK_ROWS, length)
@@ -97,12 +97,12 @@ def _same_values(raw: xr.Dataset, name: str, source: int, row: int, length: int)
         )
         known = np.isfinite(left) & np.isfinite(right)
         rows = known.any(axis=0)
-        told += int(rows.sum())
+        compared += int(rows.sum())
         alike += int(((left == right) | ~known).all(axis=0)[rows].sum())
         changes = changes or bool(
             ((np.diff(left, axis=1) != 0) & known[:, 1:] & known[:, :-1]).any()
         )
-    return changes and told >= 2 and alike >= _MIN_ALIKE_SHARE * told
+    return changes and compared >= 2 and alike >= _MIN_ALIKE_SHARE * compared
 
 
 def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:

@@ -95,8 +95,10 @@ def _scan_blocks(
     """Yield the findings of each block, from the reader if it has scanned it."""
     rows = raw.sizes["row"]
     seen: list[RowInspection] = getattr(raw[name].data, "gyrostab_inspections", [])
-    whole = sum(one.rows for one in seen) == rows and all(one.rows % 8 == 0 for one in seen[:-1])
-    if seen and whole and all(one.filled.keys() == set(channels) for one in seen):
+    whole = sum(inspection.rows for inspection in seen) == rows and all(
+        inspection.rows % 8 == 0 for inspection in seen[:-1]
+    )
+    if seen and whole and all(inspection.filled.keys() == set(channels) for inspection in seen):
         return seen
     return map_in_order(
         partial(_scan_block, raw, name, channels),
@@ -120,13 +122,13 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
     low, high = np.full(n_axes, np.inf), np.full(n_axes, -np.inf)
     channels = [str(key) for key, variable in raw.data_vars.items() if variable.dims == ("row",)]
     filled = dict.fromkeys(channels, 0)
-    for one in _scan_blocks(raw, name, channels, block):
-        absent += one.absent
-        bits.append(one.bits)
-        unreadable.append(one.unreadable)
-        infinite.append(one.infinite)
-        low, high = np.minimum(low, one.low), np.maximum(high, one.high)
-        for key, count in one.filled.items():
+    for inspection in _scan_blocks(raw, name, channels, block):
+        absent += inspection.absent
+        bits.append(inspection.bits)
+        unreadable.append(inspection.unreadable)
+        infinite.append(inspection.infinite)
+        low, high = np.minimum(low, inspection.low), np.maximum(high, inspection.high)
+        for key, count in inspection.filled.items():
             filled[key] += count
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
@@ -146,11 +148,11 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
 
 
 def stamp_blocks(
-    raw: xr.Dataset, found: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
+    raw: xr.Dataset, scanned: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
     return map_in_order(
-        _identity, _read_stamp_blocks(raw, found, block, all_rows=all_rows), workers=1
+        _identity, _read_stamp_blocks(raw, scanned, block, all_rows=all_rows), workers=1
     )
 
 
@@ -161,16 +163,16 @@ def _identity(
 
 
 def _read_stamp_blocks(
-    raw: xr.Dataset, found: ScanPass, block: int, *, all_rows: bool
+    raw: xr.Dataset, scanned: ScanPass, block: int, *, all_rows: bool
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     stamps = raw["time"].data
-    for begin in range(0, found.rows, block):
-        end = min(found.rows, begin + block)
+    for begin in range(0, scanned.rows, block):
+        end = min(scanned.rows, begin + block)
         values = read_slice(stamps, begin, end).astype("datetime64[ns]", copy=False).view(np.int64)
-        if not found.repeated and (all_rows or found.absent == 0):
+        if not scanned.repeated and (all_rows or scanned.absent == 0):
             yield np.arange(begin, end), values
         else:
-            keep = found.mask(begin, end)
+            keep = scanned.mask(begin, end)
             yield np.flatnonzero(keep) + begin, values[keep]
 
 

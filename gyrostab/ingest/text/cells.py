@@ -52,33 +52,35 @@ class CellTypes:
         return self.plan.time.time_unit if self.plan.time else None
 
 
-def parse_plain(block: bytes, start: int, rows: int, typing: CellTypes) -> tuple[Parsed, int]:
+def parse_plain(block: bytes, start: int, rows: int, cell_types: CellTypes) -> tuple[Parsed, int]:
     """Parse up to `rows` plain rows from byte `start` on; also return where they end."""
     from gyrostab.kernels.encoding.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, read_rows
 
-    layout = typing.layout
+    layout = cell_types.layout
     roles = np.full(layout.width, SKIPPED, dtype=np.int64)
-    roles[typing.sources] = NUMBER
-    if typing.time is not None:
-        roles[typing.time] = NUMERIC_TIME if typing.unit else ISO
+    roles[cell_types.sources] = NUMBER
+    if cell_types.time is not None:
+        roles[cell_types.time] = NUMERIC_TIME if cell_types.unit else ISO
     separator = BLANKS if layout.separator == BLANK else ord(layout.separator)
     point = ord("," if layout.decimal_comma else ".")
     text = np.frombuffer(block, dtype=np.uint8)
     numbers, stamps, stop = read_rows(
-        text, start, roles, separator=separator, point=point, digits=typing.digits, rows=rows
+        text, start, roles, separator=separator, point=point, digits=cell_types.digits, rows=rows
     )
-    values = dict(zip(sorted(typing.sources), numbers, strict=True))
-    return (values, None if typing.time is None else _since_epoch(stamps, typing)), stop
+    values = dict(zip(sorted(cell_types.sources), numbers, strict=True))
+    return (values, None if cell_types.time is None else _since_epoch(stamps, cell_types)), stop
 
 
-def _since_epoch(counts: NDArray[np.int64], typing: CellTypes) -> NDArray[np.int64]:
+def _since_epoch(counts: NDArray[np.int64], cell_types: CellTypes) -> NDArray[np.int64]:
     """Convert counts of nanoseconds or of a non-decimal unit to stamps [ns since 1970]."""
-    unit = typing.unit
+    unit = cell_types.unit
     if unit is None:
         return counts
-    if unit.digits is None or unit.ns != 10**typing.digits:
-        return np.where(counts == NAT, NAT, integers_to_ns(counts, unit, typing.options.epoch_ns))
-    zero = typing.options.epoch_ns if unit.epoch is None else unit.epoch
+    if unit.digits is None or unit.ns != 10**cell_types.digits:
+        return np.where(
+            counts == NAT, NAT, integers_to_ns(counts, unit, cell_types.options.epoch_ns)
+        )
+    zero = cell_types.options.epoch_ns if unit.epoch is None else unit.epoch
     return (
         counts
         if zero == 0
@@ -112,34 +114,36 @@ def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
     return (*integer, pa.decimal128(38, digits), pa.decimal128(38, digits + 11))
 
 
-def parse_fast(piece: bytes, typing: CellTypes) -> Parsed | None:
+def parse_fast(piece: bytes, cell_types: CellTypes) -> Parsed | None:
     """Parse a block with pyarrow; None if any cell is not a number, void or expected stamp."""
     import pyarrow as pa
 
-    if typing.time is not None and not typing.stamp_types:
+    if cell_types.time is not None and not cell_types.stamp_types:
         return None
-    for attempt in range(typing.stamp, len(typing.stamp_types)):
+    for attempt in range(cell_types.stamp, len(cell_types.stamp_types)):
         try:
-            table = _read_table(piece, typing, typing.stamp_types[attempt])
+            table = _read_table(piece, cell_types, cell_types.stamp_types[attempt])
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
             continue
-        typing.stamp = attempt
-        values = {source: _to_floats(table.column(str(source))) for source in typing.sources}
+        cell_types.stamp = attempt
+        values = {source: _to_floats(table.column(str(source))) for source in cell_types.sources}
         stamps = (
-            None if typing.time is None else _table_stamps(table.column(str(typing.time)), typing)
+            None
+            if cell_types.time is None
+            else _table_stamps(table.column(str(cell_types.time)), cell_types)
         )
         return values, stamps
     return None
 
 
-def _read_table(piece: bytes, typing: CellTypes, stamp_type: Any) -> Any:
+def _read_table(piece: bytes, cell_types: CellTypes, stamp_type: Any) -> Any:
     import pyarrow as pa
     from pyarrow import csv as arrow_csv
 
-    layout = typing.layout
-    types = {str(source): pa.float64() for source in typing.sources}
-    if typing.time is not None:
-        types[str(typing.time)] = stamp_type
+    layout = cell_types.layout
+    types = {str(source): pa.float64() for source in cell_types.sources}
+    if cell_types.time is not None:
+        types[str(cell_types.time)] = stamp_type
     return arrow_csv.read_csv(
         pa.BufferReader(piece),
         read_options=arrow_csv.ReadOptions(
@@ -161,24 +165,24 @@ def _to_floats(column: Any) -> NDArray[np.float64]:
     return np.concatenate(parts) if parts else np.empty(0)
 
 
-def _table_stamps(column: Any, typing: CellTypes) -> NDArray[np.int64]:
+def _table_stamps(column: Any, cell_types: CellTypes) -> NDArray[np.int64]:
     import pyarrow as pa
 
     kind = column.type
     if pa.types.is_decimal(kind):
-        digits = typing.unit.digits  # type: ignore[union-attr]
+        digits = cell_types.unit.digits  # type: ignore[union-attr]
         if kind.scale != digits:
             import pyarrow.compute as compute
 
             column = compute.round(column, ndigits=digits).cast(pa.decimal128(38, digits))
-    parts = [_chunk_stamps(chunk, typing) for chunk in column.chunks]
+    parts = [_chunk_stamps(chunk, cell_types) for chunk in column.chunks]
     return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
 
 
-def _chunk_stamps(chunk: Any, typing: CellTypes) -> NDArray[np.int64]:
+def _chunk_stamps(chunk: Any, cell_types: CellTypes) -> NDArray[np.int64]:
     import pyarrow as pa
 
-    unit = typing.unit
+    unit = cell_types.unit
     valid = (
         np.ones(len(chunk), dtype=bool)
         if chunk.null_count == 0
@@ -191,11 +195,11 @@ def _chunk_stamps(chunk: Any, typing: CellTypes) -> NDArray[np.int64]:
         )
         low, high = words[:, 0], words[:, 1]
         valid = valid & (high == low >> 63)
-        zero = typing.options.epoch_ns if unit is None or unit.epoch is None else unit.epoch
+        zero = cell_types.options.epoch_ns if unit is None or unit.epoch is None else unit.epoch
         return np.where(valid & _sum_fits(low, zero), low + np.int64(zero), NAT)
     counts = np.frombuffer(buffer, dtype=np.int64)[chunk.offset :][: len(chunk)]
     if unit is not None:
-        counts = integers_to_ns(counts, unit, typing.options.epoch_ns)
+        counts = integers_to_ns(counts, unit, cell_types.options.epoch_ns)
     return np.where(valid, counts, NAT)
 
 
@@ -205,7 +209,7 @@ def _sum_fits(counts: NDArray[np.int64], zero: int) -> NDArray[np.bool_]:
 
 
 def parse_cells(
-    piece: bytes, typing: CellTypes
+    piece: bytes, cell_types: CellTypes
 ) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None, int]:
     """Parse a piece of text line by line.
 
@@ -218,23 +222,23 @@ def parse_cells(
     words : int
         Channel cells that are neither a number nor void.
     """
-    width = typing.layout.width
+    width = cell_types.layout.width
     rows: list[list[str] | None] = []
     for text in piece.decode("latin-1").split("\n"):
         bare = text.split("#")[0].strip("\r") if "#" in text else text.strip("\r")
         if bare.strip():
-            rows.append(_split_row(bare, typing.layout, width))
+            rows.append(_split_row(bare, cell_types.layout, width))
     words = 0
     values = {}
-    for source in typing.sources:
+    for source in cell_types.sources:
         numbers = np.empty(len(rows))
         for index, row in enumerate(rows):
             numbers[index] = (
                 np.nan
                 if row is None
-                else _parse_number(row[source], comma=typing.layout.decimal_comma)
+                else _parse_number(row[source], comma=cell_types.layout.decimal_comma)
             )
-        if source not in typing.gyro:
+        if source not in cell_types.gyro:
             bad = np.flatnonzero(~np.isfinite(numbers))
             cells = (rows[index] for index in bad)
             words += sum(
@@ -243,7 +247,7 @@ def parse_cells(
                 if row is not None and row[source].strip().lower() not in _VOID_WORDS
             )
         values[source] = numbers
-    return values, _cell_stamps(rows, typing), words
+    return values, _cell_stamps(rows, cell_types), words
 
 
 def _split_row(text: str, layout: Layout, width: int) -> list[str] | None:
@@ -265,13 +269,13 @@ def _parse_number(cell: str, *, comma: bool) -> float:
     return np.nan if "_" in cell else value
 
 
-def _cell_stamps(rows: list[list[str] | None], typing: CellTypes) -> NDArray[np.int64] | None:
-    if typing.time is None:
+def _cell_stamps(rows: list[list[str] | None], cell_types: CellTypes) -> NDArray[np.int64] | None:
+    if cell_types.time is None:
         return None
-    cells = ["" if row is None else row[typing.time] for row in rows]
-    if typing.layout.decimal_comma:
+    cells = ["" if row is None else row[cell_types.time] for row in rows]
+    if cell_types.layout.decimal_comma:
         cells = [cell.replace(",", ".") for cell in cells]
-    if typing.unit is not None:
-        suffix = f" {typing.unit.text}"  # durations as MATLAB writes them
+    if cell_types.unit is not None:
+        suffix = f" {cell_types.unit.text}"  # durations as MATLAB writes them
         cells = [cell.strip().removesuffix(suffix) for cell in cells]
-    return cells_to_ns(cells, typing.unit, typing.options.epoch_ns)
+    return cells_to_ns(cells, cell_types.unit, cell_types.options.epoch_ns)
