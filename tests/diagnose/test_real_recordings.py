@@ -78,7 +78,7 @@ def test_a_lattice_as_coarse_as_the_noise_tells_of_no_dead_zone(log_of: Callable
     level = calibrate_noise(blocks)["coefficient"]
     found, reasons = effect_candidates(blocks, level)
     for name in ("dead_zone", "held_samples", "clipping"):
-        assert "lattice" in reasons[name]
+        assert "quantization grid" in reasons[name]
         assert name not in {one.effect for one in found}
     assert "rate_quantization" in {one.effect for one in found if one.statistic == "marks"}
 

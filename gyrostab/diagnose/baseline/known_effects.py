@@ -149,10 +149,10 @@ class _ActingEffect(NamedTuple):
     Attributes
     ----------
     effect : Effect
-        Axes that it acts on, by index.
-        Axes that it acts on.
-        The names of these axes.
-        Their names.
+    rows : list of int
+        Indices of the axes that it acts on.
+    axes : tuple of str
+        Names of these axes.
     prediction : Prediction
         Its prediction.
     """

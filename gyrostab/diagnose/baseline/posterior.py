@@ -78,9 +78,9 @@ class Posterior(NamedTuple):
 
     Attributes
     ----------
+    square, error : ndarray, shape (4,)
         Squares of Q, N, B, K that fit the band powers best, and their errors [squared units of the
         noise table].
-    K, B, weight : ndarray, shape (cell,)
     K, B, weight : ndarray, shape (cell,)
         Fine grid of K and B, and its posterior probabilities.
     draws : ndarray, shape (draw, 4)

@@ -48,7 +48,7 @@ def rounded_rates(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.bool_]
     -------
     ndarray of bool, shape (axis,)
     """
-    step = blocks["lattice"].values
+    step = blocks["quantization_step"].values
     if not (step > 0.0).any():
         return np.zeros(step.shape, np.bool_)
     return np.asarray(truncated_axes(blocks) | _rounded_by_spectrum(blocks, baseline, step))

@@ -288,7 +288,7 @@ def _transferred_power(component: Component, state: State) -> Array:
     transfer = np.tensordot(mean, component.variant.design, axes=1)
     return np.asarray(
         np.abs(transfer) ** 2
-        * np.nan_to_num(reference_channel_power(component.candidate.witness[0], state.blocks))
+        * np.nan_to_num(reference_channel_power(component.candidate.reference[0], state.blocks))
     )
 
 

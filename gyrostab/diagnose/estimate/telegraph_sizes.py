@@ -44,7 +44,7 @@ def estimate_telegraph(
         sign = 1.0 if component is ranked[0] or float(np.cov(own, course)[0, 1]) >= 0.0 else -1.0
         label = name if len(axes) == 1 else f"{name}.{component.row[0]}"
         out[label] = (sign * float(mean[0]), float(math.sqrt(covariance[0, 0])))
-    stays = max(float(first.values["hops"]) / 2.0, 1.0)  # on either level
+    stays = max(float(first.values["switches"]) / 2.0, 1.0)  # on either level
     return out | {
         time: (float(first.values[time]), float(first.values[time]) / math.sqrt(stays))
         for time in ("low", "high")

@@ -73,7 +73,7 @@ class SwitchingEvidence:
         Lower bound of the log Bayes factor against noise [nats]; -inf with fewer than
         `MIN_SWITCHES` switches, or if normal noise of any spectrum comes within
         `MIN_NATS_OVER_NORMAL` nats.
-    share : ndarray, shape (block, piece)
+    share : ndarray, shape (block, sub_block)
         Share of each sub-block on the upper level.
     times : ndarray, shape (2,)
         Mean times on the lower and on the upper level [s].
@@ -98,12 +98,12 @@ def switching_evidence(
     Parameters
     ----------
     data : xarray.Dataset
-        Block statistics of one record with ``piece_mean`` (axis block inner) [degree hour-1] and
-        ``piece_samples``.
+        Block statistics of one record with ``sub_block_mean`` (axis block sub_block) [degree
+        hour-1] and ``sub_block_samples``.
     baseline : xarray.Dataset
         As for `gyrostab.diagnose.evidence.telegraph.telegraph_evidence`.
     axis : str
-    given : ndarray, shape (block, piece, column), optional
+    given : ndarray, shape (block, sub_block, column), optional
         Columns of effects in the model in both cases.
 
     Returns
@@ -111,7 +111,7 @@ def switching_evidence(
     SwitchingEvidence or None
         None if the record has no such means, or too few.
     """
-    if "piece_mean" not in data or "record" in data.dims:
+    if "sub_block_mean" not in data or "record" in data.dims:
         return None
     values, variance, merged = _sub_block_means(data, baseline, axis)
     shape = values.shape
@@ -203,8 +203,8 @@ def _count_equal_neighbours(share: Array) -> Array:
 def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple[Array, Array, int]:
     """Return means over sub-blocks, their white variance, and how many are merged in each."""
     result, known = data.sel(axis=axis), baseline.sel(axis=axis)
-    samples = result["piece_samples"].transpose("block", "inner").values.astype(np.float64)
-    mean = result["piece_mean"].transpose("block", "inner").values
+    samples = result["sub_block_samples"].transpose("block", "sub_block").values.astype(np.float64)
+    mean = result["sub_block_mean"].transpose("block", "sub_block").values
     merged = 1
     while samples.size // merged > _MAX_MEANS and merged < samples.shape[1]:
         merged *= 2
@@ -336,7 +336,7 @@ def switching_powers(share: Array, low: float, high: float, size: int, rate: flo
 
     Parameters
     ----------
-    share : ndarray, shape (block, piece)
+    share : ndarray, shape (block, sub_block)
         Share of each sub-block on the upper level.
     low, high : float
         Mean times on both levels [s].

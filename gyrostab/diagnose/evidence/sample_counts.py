@@ -49,16 +49,18 @@ def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
     Examples
     --------
     >>> one = {
-    ...     "lattice": ("axis", [3.0, 0.1]),
+    ...     "quantization_step": ("axis", [3.0, 0.1]),
     ...     "power": (("axis", "block", "band"), np.full((2, 9, 1), 0.5)),
     ... }
     >>> bands = {"band_low": ("band", [0.0]), "band_high": ("band", [100.0])}
     >>> has_coarse_grid(xr.Dataset(one, coords=bands))
     array([ True, False])
     """
-    if "lattice" not in blocks:
+    if "quantization_step" not in blocks:
         return np.zeros(blocks.sizes["axis"], np.bool_)
-    return np.asarray(blocks["lattice"].values > _MIN_COARSE_SCATTERS * quiescent_scatter(blocks))
+    return np.asarray(
+        blocks["quantization_step"].values > _MIN_COARSE_SCATTERS * quiescent_scatter(blocks)
+    )
 
 
 def quiescent_scatter(blocks: xr.Dataset) -> NDArray[np.float64]:

@@ -115,12 +115,12 @@ def sum_evidence(components: Sequence[Component]) -> float:
 
 def evidence_of(components: Sequence[Component], like: Component) -> float:
     """Return the evidence of the component with the same statistic, row and reference channel."""
-    wanted = like.candidate.statistic, like.row, like.candidate.witness
+    wanted = like.candidate.statistic, like.row, like.candidate.reference
     return next(
         (
             one.evidence_nats
             for one in components
-            if (one.candidate.statistic, one.row, one.candidate.witness) == wanted
+            if (one.candidate.statistic, one.row, one.candidate.reference) == wanted
         ),
         like.evidence_nats,
     )
@@ -131,7 +131,7 @@ def candidates_of(components: Sequence[Component]) -> list[Candidate]:
     seen: dict[tuple[str, str, tuple[str, ...]], Candidate] = {}
     for component in components:
         seen[
-            component.candidate.key, component.candidate.statistic, component.candidate.witness
+            component.candidate.key, component.candidate.statistic, component.candidate.reference
         ] = component.candidate
     return list(seen.values())
 

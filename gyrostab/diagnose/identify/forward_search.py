@@ -82,7 +82,7 @@ def name_effects(
     best, count_evidence = _score_null_records(
         candidates, nulls, start, folds, np.random.default_rng(seed), progress
     )
-    if not count_evidence.rounded.any() and (blocks["lattice"] > 0.0).any():
+    if not count_evidence.rounded.any() and (blocks["quantization_step"] > 0.0).any():
         reasons["rate_quantization"] = (
             "not identifiable: the quantization grid is that of angles, or too fine to show"
         )

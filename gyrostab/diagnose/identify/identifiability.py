@@ -137,7 +137,7 @@ def _is_component_physical(component: Component, state: State) -> bool:
     if (
         effect == "misalignment"
         and statistic == "transfer"
-        and not _is_moving(component.candidate.witness[0], state)
+        and not _is_moving(component.candidate.reference[0], state)
     ):
         return False
     if _is_rotation(component) and _rotation_share(component, state) < MIN_LEAN_RAD:

@@ -24,7 +24,7 @@ def split_layers(components: Sequence[Component]) -> list[list[Component]]:
     out: list[list[Component]] = []
     seen: Counter[tuple[object, ...]] = Counter()
     for component in components:
-        place = component.candidate.statistic, component.row, component.candidate.witness
+        place = component.candidate.statistic, component.row, component.candidate.reference
         if seen[place] == len(out):
             out.append([])
         out[seen[place]].append(component)

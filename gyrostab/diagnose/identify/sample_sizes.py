@@ -58,7 +58,7 @@ def estimate_from_counts(
     rate = float(blocks.attrs["sampling_rate_hz"])
     hours = samples / rate / HOUR
     if mark == "lattice":
-        return {"step": (float(blocks["lattice"].sel(axis=axis)), 0.0)}
+        return {"step": (float(blocks["quantization_step"].sel(axis=axis)), 0.0)}
     row = [str(one) for one in blocks["axis"].values].index(axis)
     usual = float(count_evidence.of[mark][0][row].sum()) if mark in count_evidence.of else 0.0
     count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
@@ -83,7 +83,7 @@ def estimate_from_counts(
         }
     if effect == "held_samples":
         usual = (
-            usual if float(blocks["lattice"].sel(axis=axis)) > 0.0 else 0.0
+            usual if float(blocks["quantization_step"].sel(axis=axis)) > 0.0 else 0.0
         )  # without a quantization grid chance repeats no sample
         count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
         runs = _held_runs(blocks, axis, mark, usual)

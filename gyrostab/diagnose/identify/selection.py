@@ -627,5 +627,5 @@ def _confirmed_components(components: Sequence[Component], state: State) -> list
         component
         for component in components
         if component.candidate.statistic == "transfer"
-        and component.candidate.witness[0] not in state.axes
+        and component.candidate.reference[0] not in state.axes
     ]

@@ -100,7 +100,7 @@ def identify_switching(
         key
         for key in put_followers_first(passing, components, state)
         if any(
-            component.variant.inside.size and not state.given.get(("inner", component.row[0]))
+            component.variant.inside.size and not state.given.get(("sub_block", component.row[0]))
             for component in components[key]
         )
     ]

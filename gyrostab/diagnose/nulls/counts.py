@@ -46,7 +46,7 @@ def null_counts(
     mean = _interpolate_means(blocks["mean"].transpose("axis", "block").values)
     repeat, zero = np.zeros(samples.shape), np.zeros(samples.shape)
     truncated = truncated_axes(blocks)
-    for axis, step in enumerate(blocks["lattice"].values):
+    for axis, step in enumerate(blocks["quantization_step"].values):
         if step > 0.0:
             repeat[axis], zero[axis] = _grid_probabilities(
                 mean[axis], float(step), sd[axis], truncated=bool(truncated[axis])
@@ -141,7 +141,7 @@ def _draw_extremes(
 ) -> NDArray[np.int64]:
     """Draw the blocks of the smallest and largest value; each is repeated on a coarse grid."""
     out = np.zeros((count, *samples.shape), np.int64)
-    for axis, step in enumerate(blocks["lattice"].values):
+    for axis, step in enumerate(blocks["quantization_step"].values):
         total = int(samples[axis].sum())
         if not total:
             continue

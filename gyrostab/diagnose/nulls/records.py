@@ -274,9 +274,9 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
         name: (("axis", "block"), values)
         for name, values in null_counts(blocks, setup.sd, count, rng).items()
     }
-    if "witness_cross" in blocks:
-        variables["witness_cross"] = (
-            ("axis", "witness", "block", "band"),
+    if "reference_cross" in blocks:
+        variables["reference_cross"] = (
+            ("axis", "reference", "block", "band"),
             _draw_channel_cross(setup, power, rng),
         )
     if "order" in blocks:
@@ -448,8 +448,10 @@ def _draw_channel_cross(
     setup: _NullSetup, power: Array, rng: np.random.Generator
 ) -> NDArray[np.complex128]:
     """Draw cross-spectra of axes with reference channels."""
-    recorded = _values_in_order(setup.blocks, "witness_cross", "axis", "witness", "block", "band")
-    channel_power = _values_in_order(setup.blocks, "witness_power", "witness", "block", "band")
+    recorded = _values_in_order(
+        setup.blocks, "reference_cross", "axis", "reference", "block", "band"
+    )
+    channel_power = _values_in_order(setup.blocks, "reference_power", "reference", "block", "band")
     size = np.sqrt(power[:, :, None] * channel_power)
     cross = size * _draw_coherency(setup.shape[:, None], size.shape, rng)
     cross[..., np.isnan(recorded)] = np.nan
@@ -543,7 +545,7 @@ def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> A
     )
     score = ((1.0 - 2.0 / a) / np.maximum(root, 0.1) ** 3 - 1.0) / np.sqrt(2.0 / (a - 4.0))
     out = mean + setup.tails[:, :1] + np.sqrt(variance) * setup.tails[:, 1:] * score
-    for axis, step in enumerate(blocks["lattice"].values):
+    for axis, step in enumerate(blocks["quantization_step"].values):
         good = recorded[axis][np.isfinite(recorded[axis])]
         if step > COARSE_STEP_SIGMA * setup.sd[axis, 0] and good.size:
             out[:, axis] = rng.choice(good, out[:, axis].shape)

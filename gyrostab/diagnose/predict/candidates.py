@@ -466,7 +466,7 @@ def _transfer_candidates(
 ) -> list[Candidate]:
     """Build candidates of rates that follow another channel or axis at every frequency."""
     reference_channels = (
-        {str(one) for one in blocks["witness"].values} if "witness" in blocks.dims else set()
+        {str(one) for one in blocks["reference"].values} if "reference" in blocks.dims else set()
     )
     axes = set(windows.axes) if "cross" in blocks else set()
     found: dict[str, list[Variant]] = {}
@@ -483,21 +483,21 @@ def _transfer_candidates(
         for channel in [*found, *unknown_channels]:
             found[channel] = found.get(channel, []) + _any_transfer(windows.frequency.size)
     return [
-        Candidate(name, "transfer", (), _distinct_variants(variants), witness=(channel,))
+        Candidate(name, "transfer", (), _distinct_variants(variants), reference=(channel,))
         for channel, variants in found.items()
     ]
 
 
 def _motion_candidates(kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
     """Build real motion that only channels of no known effect see, such as a seismometer."""
-    if kind.name != "real_motion" or "witness" not in blocks.dims:
+    if kind.name != "real_motion" or "reference" not in blocks.dims:
         return []
     variants = _distinct_variants(_any_transfer(blocks.sizes["band"]))
     unknown_channels = sorted(
-        str(one) for one in blocks["witness"].values if not _is_known_channel(str(one))
+        str(one) for one in blocks["reference"].values if not _is_known_channel(str(one))
     )
     return [
-        Candidate(kind.name, "transfer", (), variants, witness=(channel,))
+        Candidate(kind.name, "transfer", (), variants, reference=(channel,))
         for channel in unknown_channels
     ]
 

@@ -97,7 +97,7 @@ def _wanted_units(name: str) -> list[str]:
 
 def _is_compared(name: str, blocks: xr.Dataset) -> bool:
     """Return whether a channel is on the time grid of the gyro, so that spectra are comparable."""
-    return "witness" in blocks.dims and name in blocks["witness"].values
+    return "reference" in blocks.dims and name in blocks["reference"].values
 
 
 def _describe_unused(name: str, blocks: xr.Dataset) -> str:

@@ -148,7 +148,7 @@ def add_fast_switching(state: State, component: Component) -> State:
     """Add the course of a bias that switches within blocks to the block and sub-block means."""
     axis = component.row[0]
     return state.with_columns("mean", axis, mean_columns(component.variant, 0)).with_columns(
-        "inner", axis, [component.variant.inside]
+        "sub_block", axis, [component.variant.inside]
     )
 
 
@@ -313,7 +313,7 @@ def _ramp_lines(state: State) -> NDArray[np.bool_]:
 def _condition_transfer(state: State, component: Component) -> State:
     """Condition on a transfer from a reference channel."""
     axis = component.row[0]
-    power = reference_channel_power(component.candidate.witness[0], state.blocks)
+    power = reference_channel_power(component.candidate.reference[0], state.blocks)
     power = np.where(np.isfinite(power), power, 0.0)
     columns = np.concatenate(
         [

@@ -41,7 +41,7 @@ class Variant:
         Correlation time of a random mean [s], inf for a random walk.
     weight : float
         Prior probability relative to the other variants of the candidate.
-    inside : ndarray, shape (block, piece)
+    inside : ndarray, shape (block, sub_block)
         For levels: share of the sub-blocks on the upper level; empty unless the bias switches
         within blocks.
     """
@@ -72,7 +72,7 @@ class Candidate:
         Over the grid of nuisance parameters.
     marks : tuple of str
         Sample counts that it raises, for the statistic "marks".
-    witness : tuple of str
+    reference : tuple of str
         Reference channel or axis of each column, for the statistic "transfer".
     each : bool
         Whether every axis has its own size; otherwise one size holds for all.
@@ -83,13 +83,13 @@ class Candidate:
     driver: tuple[str, ...]
     variants: tuple[Variant, ...]
     marks: tuple[str, ...] = ()
-    witness: tuple[str, ...] = ()
+    reference: tuple[str, ...] = ()
     each: bool = True
 
     @property
     def key(self) -> str:
         """Name with the channels, which distinguishes candidates of the same effect."""
-        named = ",".join(filter(None, (*self.driver, *self.witness)))
+        named = ",".join(filter(None, (*self.driver, *self.reference)))
         return f"{self.effect}({named})" if named else self.effect
 
 

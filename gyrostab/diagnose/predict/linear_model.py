@@ -452,9 +452,9 @@ def reference_channel_of(
                     has_power, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan
                 )
         return cross_power, reference_channel_power(name, blocks)
-    place = [str(one) for one in blocks["witness"].values].index(name)
+    place = [str(one) for one in blocks["reference"].values].index(name)
     cross = _records_last(
-        data["witness_cross"].transpose(..., "axis", "witness", "block", "band").values, 4
+        data["reference_cross"].transpose(..., "axis", "reference", "block", "band").values, 4
     )
     return cross[row, place], reference_channel_power(name, blocks)
 
@@ -465,7 +465,9 @@ def reference_channel_power(name: str, blocks: xr.Dataset) -> Array:
         return np.asarray(
             measured(blocks, "power").sel(axis=name).transpose("block", "band").values
         )
-    return np.asarray(blocks["witness_power"].sel(witness=name).transpose("block", "band").values)
+    return np.asarray(
+        blocks["reference_power"].sel(reference=name).transpose("block", "band").values
+    )
 
 
 def _build_transfer(
@@ -473,10 +475,10 @@ def _build_transfer(
 ) -> LinearModel:
     """Build the model of the transfer from a reference channel to an axis."""
     cross, power = reference_channel_of(
-        candidates[0].witness[0], row, data, state.blocks, state.baseline
+        candidates[0].reference[0], row, data, state.blocks, state.baseline
     )
     root = np.sqrt(np.where(power > 0.0, power, np.nan))
-    share = _moving_share(candidates[0].witness[0], power, state)
+    share = _moving_share(candidates[0].reference[0], power, state)
     weight = 2.0 * state.blocks["shape"].values[row] / state.weight[row]
     weight = np.where(
         np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0

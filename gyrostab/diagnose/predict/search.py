@@ -137,7 +137,7 @@ def compute_evidence(
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for one in candidates:
         groups.setdefault(
-            (one.statistic, one.witness, one.each if one.statistic == "order" else True), []
+            (one.statistic, one.reference, one.each if one.statistic == "order" else True), []
         ).append(one)
     for (statistic, *_), group in groups.items():
         if statistic == "mean":
@@ -183,7 +183,7 @@ def _given_mean_columns(state: State) -> dict[tuple[str, str], list[int]]:
     return {
         key: [id(column) for column in columns]
         for key, columns in state.given.items()
-        if key[0] in ("mean", "inner") and columns
+        if key[0] in ("mean", "sub_block") and columns
     }
 
 
@@ -443,7 +443,7 @@ def _is_resolved(found: SwitchingEvidence, block: float) -> bool:
 
 def _search_sub_blocks(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
     """Search sub-blocks; None if more is named in block means than is known in sub-blocks."""
-    known, inner = (state.given.get((statistic, axis), []) for statistic in ("mean", "inner"))
+    known, inner = (state.given.get((statistic, axis), []) for statistic in ("mean", "sub_block"))
     if len(inner) < len(known):
         return None
     return switching_evidence(
@@ -457,7 +457,7 @@ def _variant_with_course(
     """Return the variant with the course of the first record, and its mean times [s]."""
     if within is not None:
         low, high = within.times
-        values = {"low": float(low), "high": float(high), "hops": within.switch_count}
+        values = {"low": float(low), "high": float(high), "switches": within.switch_count}
         return replace(
             variant,
             values=values,
@@ -466,5 +466,5 @@ def _variant_with_course(
         )
     block = float(state.blocks.attrs["block_s"])
     low, high = found.times[0] * block
-    values = {"low": float(low), "high": float(high), "hops": float(found.switch_count[0])}
+    values = {"low": float(low), "high": float(high), "switches": float(found.switch_count[0])}
     return replace(variant, values=values, design=found.share[0][None, None])

@@ -331,6 +331,7 @@ def _place_samples(
 def _take_nearest(
     instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float
 ) -> Array:
+    """Return the nearest value of each instant, NaN beyond reach."""
     after = (
         np.clip(np.searchsorted(stamps, instants), 1, stamps.size - 1)
         if stamps.size > 1
@@ -350,6 +351,7 @@ def _interpolate_linearly(
     *,
     hold_previous: bool,
 ) -> Array:
+    """Interpolate linearly, or hold the previous value; NaN across gaps longer than reach."""
     after = np.searchsorted(stamps, instants, side="left")
     inside = (after < stamps.size) & (
         (after > 0) | (stamps[np.minimum(after, stamps.size - 1)] == instants)
@@ -365,6 +367,7 @@ def _interpolate_linearly(
 def _average_around(
     instants: Stamps, stamps: Stamps, values: Array, reach: float, period: float
 ) -> Array:
+    """Return the mean of the values within half a period of the gyro of each instant."""
     edges = np.append(instants, instants[-1] + round(period)) - round(period / 2.0)
     place = np.searchsorted(edges, stamps, side="right") - 1
     inside = (place >= 0) & (place < instants.size)

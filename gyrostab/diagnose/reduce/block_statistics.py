@@ -143,18 +143,18 @@ def reduce_log(
     -------
     xarray.Dataset
         By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``,
-        By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``,
         ``neighbours``, ``adjacent``, ``kurtosis``, ``peaks``, ``outliers``, ``repeats`` and their
         ``repeat_runs``, ``extremes``, ``zeros`` and their ``zero_runs``, and among the zeros
         ``stuck`` and ``filled``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1],
         two-sided, and the ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair,
-        block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``witness_power``,
-        ``witness_cross`` (reference channels), ``line_power(axis, part, line)``, ``line_weight``,
+        block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``reference_power``,
+        ``reference_cross`` (reference channels), ``line_power(axis, part, line)``, ``line_weight``,
         ``order`` and ``order_level`` (axis, block, harmonic), ``profile(axis, block, phase)``,
-        ``piece_mean`` and ``piece_samples`` (axis, block, inner) of sub-blocks, ``lattice(axis)``
-        (quantization step), ``bin_width(axis, bin)`` [quantization steps], ``axes_at_once(subset,
-        axis)``, ``at_once(subset, block)``, ``channel_<name>(block)``, ``fine_<name>(block,
-        piece)`` of channels that effects follow with a lag, and gaps and restarts in seconds.
+        ``sub_block_mean`` and ``sub_block_samples`` (axis, block, sub_block),
+        ``quantization_step(axis)`` [degree hour-1], ``bin_width(axis, bin)`` [quantization steps],
+        ``axes_at_once(subset, axis)``, ``at_once(subset, block)``, ``channel_<name>(block)``,
+        ``fine_<name>(block, block_part)`` of channels that effects follow with a lag, and gaps and
+        restarts in seconds.
         Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
@@ -332,7 +332,7 @@ def _label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> 
             at_once,
             _make_attrs("samples that exactly these axes have at once", "1"),
         ),
-        "lattice": (
+        "quantization_step": (
             "axis",
             steps,
             _make_attrs("quantization step of the values, 0 for none", _RATE_UNIT),
@@ -381,15 +381,19 @@ def _kept_values(work: Accumulator, row: int, most: int | None = None) -> Array:
 def _sub_block_means(work: Accumulator) -> dict[str, Any]:
     """Return means over sub-blocks, which show a bias that switches within blocks."""
     total, count = work.sub_blocks
-    dims = ("axis", "block", "inner")
+    dims = ("axis", "block", "sub_block")
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = total / count
     return {
-        "piece_mean": (dims, mean, _make_attrs("mean rate of a piece of the block", _RATE_UNIT)),
-        "piece_samples": (
+        "sub_block_mean": (
+            dims,
+            mean,
+            _make_attrs("mean rate of a sub-block", _RATE_UNIT),
+        ),
+        "sub_block_samples": (
             dims,
             count.astype(np.int64),
-            _make_attrs("samples of a piece of the block", "1"),
+            _make_attrs("samples of a sub-block", "1"),
         ),
     }
 
@@ -511,10 +515,10 @@ def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
             "long_name": "mean periodogram of a channel, two-sided density",
             "units": f"square of the channel's unit per Hz ({unit_list})",
         }
-        variables["witness_power"] = (("witness", "block", "band"), work.power[axes:], attrs)
+        variables["reference_power"] = (("reference", "block", "band"), work.power[axes:], attrs)
         attrs = {"long_name": "mean cross-periodogram of axis and channel, F_axis conj(F_channel)",
                  "units": f"degree hour-1 Hz-1 times the channel's unit ({unit_list})"}  # fmt: skip
-        variables["witness_cross"] = (("axis", "witness", "block", "band"), with_axes, attrs)
+        variables["reference_cross"] = (("axis", "reference", "block", "band"), with_axes, attrs)
     return variables
 
 
@@ -601,7 +605,7 @@ def _channel_part_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
                 values.shape
             )
             variables[f"fine_{name}"] = (
-                ("block", "piece"),
+                ("block", "block_part"),
                 smooth,
                 _make_attrs(f"{name} in parts of the block, without noise", units),
             )
@@ -645,6 +649,7 @@ def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, 
 
 
 def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
+    """Return the coordinates of the block statistics."""
     ends = np.arange(work.block_count + 1) * work.length
     stamps = grid_times(work.start, work.rate, ends)
     step = work.rate / work.length
@@ -688,7 +693,7 @@ def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         ),
     }
     if work.channels:
-        coordinates["witness"] = ("witness", np.array(work.channels, dtype=object))
+        coordinates["reference"] = ("reference", np.array(work.channels, dtype=object))
     if work.order is not None:
         coordinates["harmonic"] = (
             "harmonic",

@@ -134,7 +134,7 @@ def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     -------
     ndarray of bool, shape (axis,)
     """
-    quantized = np.asarray(blocks["lattice"].values > 0.0)
+    quantized = np.asarray(blocks["quantization_step"].values > 0.0)
     width, error, known = _read_widths(blocks)
     like_truncation = known & _is_like_truncation(width, error)
     narrower = known & (
@@ -158,7 +158,7 @@ def possibly_truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Find the quantized axes whose bins do not rule out truncation; see `truncated_axes`."""
     width, error, known = _read_widths(blocks)
     return np.asarray(
-        (blocks["lattice"].values > 0.0) & (~known | _is_like_truncation(width, error))
+        (blocks["quantization_step"].values > 0.0) & (~known | _is_like_truncation(width, error))
     )
 
 

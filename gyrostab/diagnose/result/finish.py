@@ -106,7 +106,7 @@ def _used_channels(identifications: Identifications) -> set[str]:
     return {
         name
         for candidate in identifications.candidates
-        for name in (*candidate.driver, *candidate.witness)
+        for name in (*candidate.driver, *candidate.reference)
     }
 
 

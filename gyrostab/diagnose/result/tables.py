@@ -357,7 +357,7 @@ def _axes_following(axis: str, identified: Sequence[Identification]) -> list[str
         {
             name
             for component in components
-            if axis in (*component.variant.columns, *component.candidate.witness)
+            if axis in (*component.variant.columns, *component.candidate.reference)
             for name in component.row
         }
     )

@@ -44,14 +44,14 @@ def quantized_record(
 def test_rounded_rates_and_angles_are_distinguished(steps: float, mean: float) -> None:
     for kind, expected in (("rate", True), ("angle", False)):
         blocks = quantized_record(kind, steps, mean=mean)
-        np.testing.assert_allclose(blocks["lattice"], steps * SCATTER, rtol=1e-6)
+        np.testing.assert_allclose(blocks["quantization_step"], steps * SCATTER, rtol=1e-6)
         assert (rounded_rates(blocks, calibrate_noise(blocks)) == expected).all(), kind
 
 
 @pytest.mark.parametrize("kind", ["rate", "angle"])
 def test_fine_steps_are_undecided(kind: str) -> None:
     blocks = quantized_record(kind, 0.3)
-    assert (blocks["lattice"] > 0).all()
+    assert (blocks["quantization_step"] > 0).all()
     assert not rounded_rates(blocks, calibrate_noise(blocks)).any()
 
 
@@ -64,7 +64,7 @@ def test_a_filtered_angle_counter_is_not_a_rounded_rate() -> None:
     )  # removes more at the highest frequencies than the steps add
     counted = np.diff(np.floor(np.cumsum(smooth, axis=1) / step), axis=1, prepend=0.0) * step
     blocks = reduce_log(make_log(counted, rate=10.0, unit="deg/h"))
-    assert (blocks["lattice"] > 0).all()
+    assert (blocks["quantization_step"] > 0).all()
     assert not rounded_rates(blocks, calibrate_noise(blocks)).any()
 
 
@@ -81,7 +81,7 @@ def test_axes_together_decide_what_one_axis_cannot() -> None:
 
 def test_without_a_grid_no_rate_is_rounded() -> None:
     blocks = quantized_record("rate", 2.0)
-    plain = blocks.assign(lattice=blocks["lattice"] * 0.0)
+    plain = blocks.assign(quantization_step=blocks["quantization_step"] * 0.0)
     assert not rounded_rates(plain, calibrate_noise(blocks)).any()
 
 
@@ -109,7 +109,7 @@ def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
     baseline, records = nulls(blocks, 40)
     found = name_effects(blocks, baseline, records)
     assert [identification.effect for identification in found.identified] == names
-    assert ("lattice" in found.reasons.get("rate_quantization", "")) == (kind == "angle")
+    assert ("quantization grid" in found.reasons.get("rate_quantization", "")) == (kind == "angle")
 
 
 def cut_record(

@@ -38,8 +38,8 @@ def frame(pieces: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
         {
             "mean": (("axis", "block"), pieces.mean(axis=1)[None]),
             "samples": (("axis", "block"), np.full((1, BLOCKS), PIECES * 10)),
-            "piece_mean": (("axis", "block", "inner"), pieces[None]),
-            "piece_samples": (("axis", "block", "inner"), np.full((1, BLOCKS, PIECES), 10)),
+            "sub_block_mean": (("axis", "block", "sub_block"), pieces[None]),
+            "sub_block_samples": (("axis", "block", "sub_block"), np.full((1, BLOCKS, PIECES), 10)),
             "begin": ("block", begin),
             "end": ("block", begin + STEP),
         },
@@ -140,7 +140,7 @@ def test_switching_powers_match_those_of_the_samples() -> None:
     blocks = reduce_log(log, block="20s")
     size = int(blocks.attrs["block_samples"])
     seen = blocks["power"].values[0]
-    told = switching_powers(blocks["piece_mean"].values[0], 15.0, 6.0, size, 10.0)
+    told = switching_powers(blocks["sub_block_mean"].values[0], 15.0, 6.0, size, 10.0)
     slow = blocks["frequency"].values < 0.3
     np.testing.assert_allclose(told[:, slow].mean(axis=0), seen[:, slow].mean(axis=0), rtol=0.05)
     np.testing.assert_allclose(

@@ -166,7 +166,9 @@ def test_the_sign_of_the_bias_does_not_matter() -> None:
 def component(
     state: State, course: np.ndarray, axis: str = "x", evidence_nats: float = 50.0
 ) -> Component:
-    variant = Variant({"low": 100.0, "high": 200.0, "hops": 18.0}, ("step",), course[None, None])
+    variant = Variant(
+        {"low": 100.0, "high": 200.0, "switches": 18.0}, ("step",), course[None, None]
+    )
     return Component(
         Candidate("telegraph", "levels", (), (variant,)), variant, (axis,), evidence_nats
     )

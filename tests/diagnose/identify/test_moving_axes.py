@@ -99,7 +99,7 @@ def identification(
     design = np.empty(0) if course is None else course[None, None]
     variant, candidate = (
         SimpleNamespace(columns=(column,), design=design),
-        SimpleNamespace(statistic=statistic, witness=()),
+        SimpleNamespace(statistic=statistic, reference=()),
     )
     return SimpleNamespace(
         effect=effect, components=(SimpleNamespace(candidate=candidate, row=row, variant=variant),)

@@ -19,9 +19,9 @@ from gyrostab.simulate import simulate
 VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
 
 
-def component(evidence_nats, *, row="x", witness=""):
+def component(evidence_nats, *, row="x", reference=""):
     return Component(
-        Candidate("misalignment", "transfer", (), (VARIANT,), witness=(witness,)),
+        Candidate("misalignment", "transfer", (), (VARIANT,), reference=(reference,)),
         VARIANT,
         (row,),
         evidence_nats,
@@ -33,7 +33,7 @@ def test_rows_that_come_again_are_a_layer_of_their_own():
         component(9.0),
         component(8.0, row="y"),
         component(7.0),
-        component(6.0, witness="seismometer"),
+        component(6.0, reference="seismometer"),
         component(5.0),
     ]
     assert [[one.evidence_nats for one in layer] for layer in split_layers(components)] == [
@@ -44,9 +44,10 @@ def test_rows_that_come_again_are_a_layer_of_their_own():
 
 
 def test_a_part_has_no_gain_of_another_witness():
-    components = [component(40.0, witness="z"), component(9.0, witness="seismometer")]
+    components = [component(40.0, reference="z"), component(9.0, reference="seismometer")]
     assert [
-        evidence_of(components, component(1.0, witness=name)) for name in ("z", "seismometer", "y")
+        evidence_of(components, component(1.0, reference=name))
+        for name in ("z", "seismometer", "y")
     ] == [
         40.0,
         9.0,

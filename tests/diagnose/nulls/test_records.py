@@ -20,9 +20,9 @@ NOISE = {"Q": 0.05, "N": 0.003, "B": 0.004, "K": 0.02}
 RECORDS = 30
 
 
-def raw(seed: int, lost: float, *, axes: str = "x", lattice: float = 0.0) -> xr.Dataset:
+def raw(seed: int, lost: float, *, axes: str = "x", quantization_step: float = 0.0) -> xr.Dataset:
     """One hour at 10 Hz with the same gaps for every seed."""
-    effect = [{"name": "rate_quantization", "step": lattice}] if lattice else []
+    effect = [{"name": "rate_quantization", "step": quantization_step}] if quantization_step else []
     log = simulate(
         {"log": {"axes": list(axes)}, "noise": NOISE, "effect": effect},
         duration="1h",
@@ -159,7 +159,7 @@ def test_tails_of_the_kurtosis_match_samples():
 
 
 def test_quantization_causes_repeats_zeros_and_extremes():
-    record = raw(1, 0.0, lattice=0.5)
+    record = raw(1, 0.0, quantization_step=0.5)
     nulls = joined(
         list(null_records(record, calibrate_noise(record), count=50, rng=np.random.default_rng(1)))
     )
@@ -220,7 +220,7 @@ def test_orders_profiles_and_reference_channels_have_the_scatter_of_noise():
             )
         )
     )
-    for name, rel in (("order", 0.08), ("profile", 0.05), ("witness_cross", 0.1)):
+    for name, rel in (("order", 0.08), ("profile", 0.05), ("reference_cross", 0.1)):
         found = np.concatenate([np.abs(one[name].values.ravel()) ** 2 for one in records])
         other = np.abs(nulls[name].values) ** 2
         assert np.nanmean(found) == pytest.approx(np.nanmean(other), rel=rel), name

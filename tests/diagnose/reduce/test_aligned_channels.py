@@ -235,7 +235,7 @@ def test_reason_of_an_effect_names_the_unused_channel():
     assert "the channel ramp is not used: it is sampled at 2 Hz" in reasons["feedback_reset"]
     assert "no channel temperature" in reasons["shupe"]
     (one,) = unused_channels(
-        blocks, {name for each in found for name in (*each.driver, *each.witness)}
+        blocks, {name for each in found for name in (*each.driver, *each.reference)}
     )
     assert one["name"] == "ramp"
 
@@ -268,7 +268,7 @@ def test_every_unused_channel_is_listed(name: str, unit: str, values: Any, reaso
     log = with_channel(log_of(60_000), name, np.arange(600.0), values, unit)
     blocks, found, reasons = candidates_of(log)
     (one,) = unused_channels(
-        blocks, {each for candidate in found for each in (*candidate.driver, *candidate.witness)}
+        blocks, {each for candidate in found for each in (*candidate.driver, *candidate.reference)}
     )
     assert one["name"] == name
     assert reason in one["reason"]
@@ -285,7 +285,7 @@ def test_a_seismometer_with_its_own_stamps_is_compared_sample_by_sample():
         with_channel(log, "seismometer_z", (np.arange(60_000) + 0.37) / RATE, ground)
     )
     assert ("real_motion", ("seismometer_z",)) in {
-        (one.effect, one.witness) for one in found if one.statistic == "transfer"
+        (one.effect, one.reference) for one in found if one.statistic == "transfer"
     }
     assert unused_channels(blocks, {"seismometer_z"}) == []
 

@@ -194,10 +194,10 @@ def test_cross_spectra_contain_common_signals(gaps: str):
     rng = np.random.default_rng(7)
     shared, own = rng.standard_normal(200_000), rng.standard_normal((3, 200_000))
     x = own + np.array([[0.5], [-0.4], [0.0]]) * shared
-    witness = shared + 0.1 * rng.standard_normal(shared.size)
+    reference = shared + 0.1 * rng.standard_normal(shared.size)
     x = np.stack([with_gaps(row, gaps, rng) for row in x])
-    witness = with_gaps(witness, gaps, rng)
-    blocks = reduce_log(log_of(x, channels={"accel_x": (witness, "g")}), block="500samples")
+    reference = with_gaps(reference, gaps, rng)
+    blocks = reduce_log(log_of(x, channels={"accel_x": (reference, "g")}), block="500samples")
     assert [
         (str(a), str(b))
         for a, b in zip(blocks["first"].values, blocks["second"].values, strict=True)
@@ -210,9 +210,11 @@ def test_cross_spectra_contain_common_signals(gaps: str):
     assert cross[0].real == pytest.approx(-0.2, abs=0.15)
     assert np.mean(cross[0][-6:]).real == pytest.approx(-0.2, abs=0.02)
     assert np.abs(np.mean(cross[:, -6:], axis=1)[1:]).max() < 0.02
-    coupling = (blocks.witness_cross.sel(axis="x", witness="accel_x").mean("block") * RATE).values
+    coupling = (
+        blocks.reference_cross.sel(axis="x", reference="accel_x").mean("block") * RATE
+    ).values
     assert np.mean(coupling[-6:]) == pytest.approx(0.5, abs=0.02)
-    assert (blocks.witness_power.mean("block").values[0] * RATE)[-6:] == pytest.approx(
+    assert (blocks.reference_power.mean("block").values[0] * RATE)[-6:] == pytest.approx(
         1.01, abs=0.03
     )
 
@@ -330,7 +332,7 @@ def test_temperatures_are_smoothed_within_blocks(own):
     log = log.assign_coords(time_temperature_2=log.time.values[::900])
     blocks = reduce_log(log)
     fine = blocks.fine_temperature
-    assert fine.dims == ("block", "piece")
+    assert fine.dims == ("block", "block_part")
     assert fine.attrs["units"] == "degree_Celsius"
     error = fine.values - true.reshape(*fine.shape, -1).mean(axis=2)
     raw = 0.1 / np.sqrt(180_000 / every / fine.size) * (1.0 if own else 10.0)

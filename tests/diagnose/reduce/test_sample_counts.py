@@ -26,7 +26,7 @@ def test_anomalous_samples_are_counted_in_their_blocks():
     assert int(clean.outliers.sum()) == 0
     assert int(clean.repeats.sum() + clean.zeros.sum()) == 0
     assert int(clean.extremes.sum()) == 2
-    assert clean.lattice.values == 0.0
+    assert clean.quantization_step.values == 0.0
     assert np.abs(clean.kurtosis.values).max() < 0.6
     y = x.copy()
     y[5_500] += 40.0
