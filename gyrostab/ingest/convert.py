@@ -151,7 +151,7 @@ def from_dataarray(
     TimeError
         When ``time`` runs backwards, or has no sampling rate.
     OptionError
-        When the values are angles and nothing says of which kind.
+        When the values are angles of unknown kind.
 
     Examples
     --------

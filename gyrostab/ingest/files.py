@@ -371,7 +371,7 @@ def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Datas
     if options.rate is not None and abs(options.rate / rate - 1) > 1e-6:
         raise OptionError(
             f"{name} is a regular log of {rate:.10g} Hz, not of {options.rate:.10g} Hz; leave "
-            "out --rate, or ingest its source anew"
+            "out --rate, or ingest its source again"
         )
     idle = [
         f"--{option}"

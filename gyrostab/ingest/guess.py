@@ -135,7 +135,7 @@ def guess_columns(
         rate_note = (
             "is named in the file"
             if rate_hint
-            else "is an assumption, as the file holds no time: put the true rate in its place"
+            else "is an assumption, because the file has no time column: use the true rate instead"
         )
         (reasons if rate_hint else warnings).append(f"--rate {assumed:g} {rate_note}")
     sampling = (

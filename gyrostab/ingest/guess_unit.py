@@ -193,7 +193,7 @@ def _scale_of_counts(
         "rotation of the Earth"
     )
     warnings.append(
-        "the columns are counts, and nothing in the file says how much one is: put the scale of "
-        f"the data sheet for {text}"
+        "the columns are counts, and the file does not give their scale: replace "
+        f"{text} with the scale of the data sheet"
     )
     return text

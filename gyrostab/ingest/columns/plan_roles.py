@@ -245,9 +245,7 @@ def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) 
             draft.problems.append(OptionError(f"{message}; {fix}"))
         return "rate"
     if draft.options.kind is None:
-        message = (
-            f"{draft.path.name}: column {header!r} is an angle, and nothing says of which kind"
-        )
+        message = f"{draft.path.name}: column {header!r} is an angle of unknown kind"
         advice = (
             "--kind angle if it is the cumulative angle, --kind rate if each row is the "
             "increment since the row before"

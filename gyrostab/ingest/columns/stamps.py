@@ -80,7 +80,7 @@ class TimeUnit:
     def digits(self) -> int | None:
         """Decimals down to one nanosecond (9 for seconds); None if not a power of ten.
 
-        Also None when the epoch is outside the years 1678 to 2262, so that sums with it exceed 64
+        Also None when the epoch is outside the years 1678 to 2262, where sums with it exceed 64
         bits.
         """
         if self.epoch is not None and abs(self.epoch) > _MAX_INT64:

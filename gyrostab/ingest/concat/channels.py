@@ -72,7 +72,7 @@ def _channel_attributes(holders: Sequence[PlacedLog], name: str) -> dict[str, An
     if len(units) > 1:
         listed = ", ".join(f"{unit!r} in {file}" for unit, file in units.items())
         raise UnitError(
-            f"channel {name!r} has different units: {listed}; ingest one of them anew with "
+            f"channel {name!r} has different units: {listed}; ingest one of them again with "
             f"--unit {name}=UNIT or --map {name}=-"
         )
     return dict(holders[0].source.log[name].attrs)

@@ -212,8 +212,8 @@ def describe_placement(
     )
     if lost > 0:
         notes.append(
-            f"{where}: dropped for want of a readable time stamp: {_count_of(lost, 'row')} whose "
-            "neighbours do not tell where they belong"
+            f"{where}: dropped without a readable time stamp: {_count_of(lost, 'row')} whose "
+            "neighbours do not determine their samples"
         )
     infinite = int((scanned.infinite[:, 1] - scanned.infinite[:, 0]).sum())
     if infinite:
