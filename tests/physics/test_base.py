@@ -105,7 +105,7 @@ def test_chunks_do_not_matter(kind, seed):
 
 
 @each
-def test_says_one_sentence(kind):
+def test_say_returns_one_sentence(kind):
     text = kind.example().say()
     assert text.endswith(".")
     assert text[0].isupper()
@@ -165,7 +165,7 @@ def test_units_and_ranges_are_kept(kind):
 
 
 @each
-def test_without_its_channel_it_says_which(kind):
+def test_missing_channel_is_named(kind):
     effect = kind.example()
     needs = effect.needs()
     table = {
@@ -202,7 +202,7 @@ def test_sizes_are_sourced_and_the_text_names_what_it_is_confused_with(kind):
     assert all(item.source for item in kind.parameters())
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # models
 
 
@@ -255,7 +255,7 @@ def test_table_lists_every_parameter_of_every_effect():
     assert row["required"]
 
 
-# --------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # the two examples
 
 
@@ -273,6 +273,6 @@ def test_g_sensitivity_is_its_scalar_product_and_needs_only_what_it_uses():
     bias = run(effect, size=2, drivers={"accel_x": [1.0, 0.0], "accel_z": [0.0, 1.0]})
     np.testing.assert_allclose(bias, [[0.01, -0.02]], rtol=1e-12)
     assert (
-        effect.say()
-        == "The bias follows the acceleration on axis y, by 0.01 deg/h/g along x, -0.02 deg/h/g along z."
+        effect.say() == "The bias follows the acceleration on axis y, "
+        "by 0.01 deg/h/g along x, -0.02 deg/h/g along z."
     )

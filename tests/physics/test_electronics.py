@@ -1,4 +1,4 @@
-"""Effects of optics and supply, and the means and densities that effects say, against their closed forms."""
+"""Effects of optics and supply, and predicted means and densities, against closed forms."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from tests.support.effect_bench import (
 NRAD_PER_S = math.degrees(1e-9) * 3600.0  # deg/h
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # optics
 
 
-def test_a_dead_zone_cuts_the_middle_out():
+def test_dead_zone_removes_rates_near_zero():
     signal = np.array([[-0.5, -0.2, -0.05, 0.0, 0.15, 0.5]])
     kept = run(make_effect({"name": "dead_zone", "width": 0.2}), size=6, axes="x", signal=signal)
     np.testing.assert_allclose(kept, [[-0.3, 0.0, 0.0, 0.0, 0.0, 0.3]], atol=1e-15)
@@ -83,7 +83,7 @@ def test_a_sweep_through_a_dead_zone_has_odd_harmonics():
 
 
 def reset_truth(effect, w, rate, size, fine=400):
-    """The error by adding up impulse after impulse, at a rate that is given sample by sample [deg/h]."""
+    """Sum the error impulse by impulse, at a rate given for each sample [deg/h]."""
     turn, step = effect.turn * NRAD_PER_S, 1.0 / (rate * fine)  # deg/h s
     angle = np.concatenate([[0.0], np.cumsum(np.repeat(w, fine)) * step / turn])
     resets = np.diff(np.floor(angle))
@@ -99,7 +99,7 @@ def reset_truth(effect, w, rate, size, fine=400):
 
 
 @pytest.mark.parametrize("part", [{"kick": 12.0}, {"tail": 18.0, "decay": 0.03}, {"sawtooth": 0.5}])
-def test_resets_add_their_angles_whichever_way_it_turns(part):
+def test_resets_add_their_angles_in_both_directions(part):
     effect = make_effect({"name": "feedback_reset", "diameter": 0.2, **part})
     turn = effect.turn * NRAD_PER_S
     assert effect.turn == pytest.approx(1.45 * 1550e-9 / 0.2 * 1e9)
@@ -126,7 +126,7 @@ def test_resets_faster_than_samples_are_a_scale_factor():
     )
 
 
-def test_the_comb_of_resets_moves_with_the_rate():
+def test_comb_of_resets_follows_the_rate():
     effect = make_effect({"name": "feedback_reset", "sawtooth": 0.4, "kick": 3.0})
     places = []
     for w in (10.0, 25.0):
@@ -144,7 +144,7 @@ def test_the_comb_of_resets_moves_with_the_rate():
     assert places[1] / places[0] == pytest.approx(2.5, rel=0.01)
 
 
-def test_the_comb_has_the_power_that_is_said():
+def test_comb_has_the_predicted_power():
     for part in ({"kick": 3.0}, {"tail": 3.0}, {"sawtooth": 0.4}):
         effect = make_effect({"name": "feedback_reset", **part})
         rates = run(effect, size=60_000, rate=100.0, axes="x", signal=11.15)[0]
@@ -163,7 +163,7 @@ def test_the_comb_has_the_power_that_is_said():
         )
 
 
-def test_the_resets_of_a_real_gyro_are_of_this_kind_and_size(recordings):
+def test_resets_of_a_real_gyro_match_the_model(recordings):
     with gzip.open(recordings("fog-blueseis-ramp/fog_ramp.csv.gz"), "rt") as file:
         columns = np.loadtxt(file, delimiter=",", skiprows=1)
     measured, ramp = columns[:, 1] * NRAD_PER_S, columns[:, 2]
@@ -215,7 +215,7 @@ def test_the_resets_of_a_real_gyro_are_of_this_kind_and_size(recordings):
     assert abs(np.polyfit(saw, by_phase(measured - model), 1)[0]) < 0.003
 
 
-def test_own_rate_and_channel_agree():
+def test_ramp_from_rate_and_from_channel_agree():
     common = {"name": "feedback_reset", "kick": 3.0, "tail": 5.0, "sawtooth": 0.2}
     own = make_effect(common)
     w = np.full(500, 0.013 * 100 * own.turn * NRAD_PER_S)
@@ -262,7 +262,7 @@ def test_shared_noise_shows_in_the_cross_axis_covariance_only():
     assert make_effect(effect).explain(windows_of(100, 20.0, 1.0)).coherent
 
 
-# -----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # means that are said
 
 
@@ -280,7 +280,7 @@ def test_shared_noise_shows_in_the_cross_axis_covariance_only():
     ],
     ids=lambda table: "-".join(map(str, table.values())),
 )
-def test_window_means_are_those_that_are_said(table):
+def test_window_means_match_the_prediction(table):
     effect, t = make_effect(table), np.arange(6000) / 50.0
     drivers = {"supply_voltage": 25 + np.sin(t / 9), "light_power": 1e-4 + 1e-5 * np.cos(t / 7)}
     signal = np.array([[150.0], [-400.0]]) + 0.05 * np.sin(3 * t)
@@ -304,7 +304,7 @@ def test_window_means_are_those_that_are_said(table):
     )
 
 
-def test_what_has_a_memory_begins_as_if_it_had_been_there_long():
+def test_random_processes_start_in_their_stationary_state():
     many = [f"a{number}" for number in range(2500)]
     first = run(
         make_effect({"name": "telegraph", "step": 1.0, "low": 300, "high": 100}), size=1, axes=many
@@ -324,7 +324,7 @@ def test_what_has_a_memory_begins_as_if_it_had_been_there_long():
     np.testing.assert_allclose(stuck, 0.0, atol=1e-15)
 
 
-# --------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # densities that are said
 
 
@@ -339,7 +339,7 @@ def test_what_has_a_memory_begins_as_if_it_had_been_there_long():
         ({"name": "shared_source", "N": 0.01, "bandwidth": 1.0}, "N", 0.01),
     ],
 )
-def test_a_random_rate_has_the_density_that_it_says(table, parameter, size):
+def test_random_rate_has_the_predicted_density(table, parameter, size):
     effect = make_effect(table)
     rates = run(effect, size=60_000, rate=10.0)
     edges = np.array([0.02, 0.1, 0.5, 2.0, 4.0, 4.95])
@@ -361,7 +361,7 @@ def test_a_random_rate_has_the_density_that_it_says(table, parameter, size):
         ({"name": "spikes", "lsb": 0.5, "bits": 8, "per_hour": 3600}, "lsb", 0.5),
     ],
 )
-def test_what_the_logger_adds_has_the_density_that_it_says(table, parameter, size):
+def test_logger_effects_have_the_predicted_density(table, parameter, size):
     effect = make_effect(table)
     signal = np.random.default_rng(4).normal(0.3, 4.0, (3, 60_000))
     edges = np.array([0.02, 1.0, 2.0, 3.0, 4.0, 4.95])
@@ -381,7 +381,7 @@ def test_lorentz_density_folds_the_continuous_one():
         np.testing.assert_allclose(lorentz_density(f, time, 10.0), folded, rtol=1e-3)
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # chunks
 
 VARIANTS = [
@@ -421,7 +421,7 @@ VARIANTS = [
 
 @settings(max_examples=60, deadline=None)
 @given(st.sampled_from(VARIANTS), st.integers(0, 10_000))
-def test_how_time_is_cut_does_not_matter(table, seed):
+def test_chunks_do_not_change_the_result(table, seed):
     size = 1200
     signal = np.random.default_rng(5).normal(4.0, 3.0, (3, size))
     drivers = {

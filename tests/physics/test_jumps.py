@@ -35,7 +35,7 @@ def test_means_of_steps_are_integrals(positions, cut):
         np.testing.assert_allclose(found[:, i], inside @ levels, atol=1e-12)
 
 
-def test_a_jump_has_the_allan_variance_of_a_step_and_looks_like_k():
+def test_jump_has_the_allan_variance_of_a_step():
     effect = {"name": "bias_jump", "step": 0.1, "at": 300, "axes": ["x"]}
     log = simulate({"effect": [effect], "noise": {}, "log": {"rate": 10, "duration": "600s"}})
     surface = davar(log, window="200s", step="50s", taus=[1.0, 5.0, 20.0]).sel(axis="x")
@@ -108,7 +108,7 @@ def test_gauss_markov_has_the_allan_variance_of_the_standard():
     assert curve.max() == pytest.approx(0.617, abs=0.001)
 
 
-def test_a_telegraph_is_a_gauss_markov_process_to_second_order_but_has_two_levels():
+def test_telegraph_equals_gauss_markov_to_second_order_with_two_levels():
     effect = make_effect({"name": "telegraph", "step": 0.2, "low": 60, "high": 30})
     rates = run(effect, size=400_000, rate=5.0)
     assert effect.correlation_time == pytest.approx(20.0)
@@ -126,7 +126,7 @@ def test_a_telegraph_is_a_gauss_markov_process_to_second_order_but_has_two_level
     assert abs(np.corrcoef(rates)[0, 1]) < 0.1
 
 
-def test_a_hop_has_the_size_of_the_fringe_and_ends_when_power_does():
+def test_fringe_step_has_its_size_and_ends_at_power_loss():
     table = {
         "name": "fringe_hop",
         "length": 500,
@@ -210,8 +210,8 @@ def test_a_slow_supply_settles_after_a_step_and_trails_a_ramp():
 
 
 @pytest.mark.parametrize("lag", [3.0, 20.0, 100.0, 2000.0])
-def test_means_of_a_slow_supply_are_those_that_are_said(lag):
-    """Loads that are switched inside of windows of 20 s: parts of the windows tell the settling, their means blur it."""
+def test_means_of_a_slow_supply_match_the_prediction(lag):
+    """Loads are switched inside of 20 s windows: parts of windows show the settling."""
     t = np.arange(30_000) / 20.0
     drivers = {
         "supply_voltage": 24.0 - 2.0 * ((t > 305.0) & (t < 707.5)),
@@ -237,7 +237,7 @@ def test_means_of_a_slow_supply_are_those_that_are_said(lag):
 
 
 def test_a_supply_without_lag_is_the_limit_of_short_ones():
-    """With a lag of nothing the means are those of the channel itself, whatever its course is taken for."""
+    """Without a lag the means are those of the channel itself, however it is interpolated."""
     means = {"supply_voltage": np.array([24.0, 22.0, 23.0, 23.5])}
     windows = windows_of(800, 10.0, 20.0, axes=("x",), drivers=means)
     at_once, soon = (slow_supply(lag).explain(windows).mean["voltage"] for lag in (0.0, 1e-6))
@@ -254,6 +254,6 @@ def test_a_supply_without_lag_is_the_limit_of_short_ones():
 def test_a_slow_supply_says_its_lag():
     said = make_effect({"name": "supply_bias", "voltage": 0.02, "lag": 40.0}).say({"lag": 5.0})
     assert (
-        said
-        == "The bias follows the supply on all axes, by 0.02 deg/h/V of the voltage, with a lag of 40 ± 5 s."
+        said == "The bias follows the supply on all axes, by 0.02 deg/h/V of the voltage, "
+        "with a lag of 40 ± 5 s."
     )

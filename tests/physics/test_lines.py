@@ -101,7 +101,7 @@ def test_lines_lock_to_a_changing_rotation():
         np.testing.assert_allclose(rates[row], wave.reshape(-1, factor).mean(axis=1), atol=3e-4)
 
 
-def test_a_part_of_a_line_is_refused():
+def test_fractional_number_of_lines_is_refused():
     with pytest.raises(OptionError, match=r"'harmonics': 2\.5 is not a whole number of lines"):
         make_effect({"name": "rotation_line", "amplitude": 1, "harmonics": 2.5})
 

@@ -16,7 +16,7 @@ from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import avar, band_powers, run, windows_of
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # logger
 
 
@@ -35,7 +35,7 @@ def test_a_low_pass_has_the_response_of_its_design():
     np.testing.assert_allclose(steady, 3.0, rtol=1e-12)
 
 
-def test_a_moving_average_takes_noise_from_short_times_only():
+def test_moving_average_reduces_noise_at_short_times_only():
     noise = np.random.default_rng(6).normal(size=(1, 200_000))
     done = run(
         make_effect({"name": "logger_filter", "length": 0.08}),
@@ -56,7 +56,7 @@ def test_a_moving_average_takes_noise_from_short_times_only():
     assert ratio[2] == pytest.approx(1.0, abs=0.03)
 
 
-def test_picking_without_a_filter_folds_and_means_do_not():
+def test_point_sampling_aliases_and_averaging_does_not():
     common = {
         "noise": {"N": 0.01},
         "log": {"rate": 20, "duration": "1000s", "oversampling": 8, "axes": ["x"]},
@@ -87,7 +87,7 @@ def test_picking_without_a_filter_folds_and_means_do_not():
         {"length": 0.1},
     ],
 )
-def test_a_filter_shapes_the_spectrum_as_it_says(table):
+def test_filter_has_the_predicted_response(table):
     effect = {"name": "logger_filter", **table}
     common = {
         "noise": {"N": 0.01},
@@ -102,7 +102,7 @@ def test_a_filter_shapes_the_spectrum_as_it_says(table):
     np.testing.assert_allclose(band_powers(rates, 20.0, edges), 0.36 * np.array(said), rtol=0.08)
 
 
-def test_a_filter_that_cannot_be_is_refused():
+def test_impossible_filter_is_refused():
     setup = Setup(rate=10.0, size=100, start=0, axes=("x",))
     rng = np.random.default_rng(1)
     with pytest.raises(
@@ -116,7 +116,7 @@ def test_a_filter_that_cannot_be_is_refused():
         make_effect({"name": "logger_filter", "cutoff": 1, "order": 2.5})
 
 
-def test_the_lattice_adds_a_twelfth_of_its_square_or_swallows_all():
+def test_quantization_adds_a_twelfth_of_its_square_or_hides_all():
     signal = np.random.default_rng(7).normal(0.3, 1.0, (1, 100_000))
     done = run(
         make_effect({"name": "rate_quantization", "step": 2.0}),
@@ -148,7 +148,7 @@ def test_the_lattice_adds_a_twelfth_of_its_square_or_swallows_all():
     )
 
 
-def test_a_real_gyro_stands_on_its_lattice(recordings):
+def test_real_gyro_has_a_quantization_grid(recordings):
     with gzip.open(recordings("mems-static-53min/ch104.csv.gz"), "rt") as file:
         measured = (
             np.loadtxt(file, delimiter=",", skiprows=1, usecols=(0, 1, 2), max_rows=5000).T * 3600
@@ -204,7 +204,7 @@ def test_held_samples_are_runs_that_raise_n_at_long_times():
     assert exact - 1 == pytest.approx(720 * said, rel=0.1)
 
 
-def test_zeros_pull_the_mean_down():
+def test_zero_filled_samples_bias_the_mean():
     effect = make_effect({"name": "held_samples", "per_hour": 720, "length": 0.4, "fill": "zero"})
     done = run(effect, size=200_000, axes="x", signal=15.0)
     assert set(np.unique(done)) == {0.0, 15.0}
@@ -228,7 +228,7 @@ def test_clipping_cuts_the_tails():
     assert done.var() == pytest.approx(inside + 2 * 1.5**2 * norm.sf(1.5), rel=0.01)
 
 
-# -----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # clock
 
 
@@ -252,7 +252,7 @@ def test_a_fast_clock_reads_too_little_on_all_axes():
 @pytest.mark.parametrize(
     ("error", "drift"), [(2000, 0), (-2000, 0), (-3000, 1e4), (0, 8000), (1000, -1e4)]
 )
-def test_the_log_holds_what_was_there_at_the_time_of_the_clock(error, drift, reading):
+def test_log_holds_the_signal_at_the_time_of_the_clock(error, drift, reading):
     def motion(t):
         return 50.0 * np.sin(2 * np.pi * t / 60.0) + 0.2 * t
 
@@ -278,7 +278,7 @@ def test_the_log_holds_what_was_there_at_the_time_of_the_clock(error, drift, rea
     assert known.mean() > 0.99
 
 
-def test_a_line_moves_by_the_error_of_the_clock():
+def test_clock_error_shifts_a_line():
     wave = np.sin(2 * np.pi * 7.0 * np.arange(100_000) / 100.0)
     for error in (5000, -5000):
         done = run(
@@ -294,7 +294,7 @@ def test_a_line_moves_by_the_error_of_the_clock():
         )
 
 
-def test_a_sample_is_skipped_or_doubled_as_often_as_the_error_says():
+def test_samples_are_skipped_or_repeated_at_the_rate_of_the_error():
     count = np.arange(40_000.0)
     fast = run(
         make_effect({"name": "clock_error", "error": 1000, "output": "rate"}),
@@ -313,7 +313,7 @@ def test_a_sample_is_skipped_or_doubled_as_often_as_the_error_says():
     assert set(np.unique(np.diff(fast))) == {0.0, 1.0}
 
 
-def test_the_clock_leaves_white_noise_as_it_is():
+def test_clock_error_keeps_white_noise():
     noise = np.random.default_rng(11).normal(size=(3, 200_000))
     for reading, share in (("latest", 0.0), ("average", 1.0)):
         done = run(
@@ -329,7 +329,7 @@ def test_the_clock_leaves_white_noise_as_it_is():
         np.testing.assert_allclose(ratio, 1.0 - share / (2 * np.array([1, 10, 40])), rtol=0.02)
 
 
-def test_a_clock_that_is_far_off_is_refused():
+def test_large_clock_error_is_refused():
     setup = Setup(rate=400.0, size=400 * 3600 * 200, start=0, axes=("x",))
     rng = np.random.default_rng(1)
     with pytest.raises(OptionError, match="slip reaches 28800003 samples; make the log shorter"):

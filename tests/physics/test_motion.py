@@ -15,7 +15,7 @@ from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import allan_of_density, run, sigma
 
-# -------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # rotation
 
 
@@ -74,7 +74,7 @@ def test_misalignment_leaks_the_true_rate_of_other_axes_only():
         run(effect, size=2, axes=("x", "y"))
 
 
-def test_misalignment_sees_the_turning_of_the_tool():
+def test_misalignment_leaks_the_rotation_of_the_tool():
     world = [
         {"profile": "rotation", "points": [[0, 6 * 180.0]], "axis": "z", "accelerations": False}
     ]
@@ -91,7 +91,7 @@ def test_misalignment_sees_the_turning_of_the_tool():
 
 
 def tool_axes(inclination, azimuth, toolface):
-    """Directions of x, y, z in north, east, down, by rotation matrices: turn by azimuth, lean, turn by toolface about the tool."""
+    """Compute x, y, z in north, east, down: rotate by azimuth, inclination and toolface."""
 
     def about(axis, angle):
         c, s = math.cos(angle), math.sin(angle)
@@ -104,9 +104,7 @@ def tool_axes(inclination, azimuth, toolface):
 
 @given(st.floats(-90, 90), st.floats(0, 180), st.floats(-360, 360), st.floats(-360, 360))
 @settings(max_examples=60, deadline=None)
-def test_earth_rate_of_a_standing_tool_is_the_rotated_vector(
-    latitude, inclination, azimuth, toolface
-):
+def test_earth_rate_at_rest_is_the_rotated_vector(latitude, inclination, azimuth, toolface):
     effect = make_effect(
         {
             "name": "earth_rate",
@@ -123,7 +121,7 @@ def test_earth_rate_of_a_standing_tool_is_the_rotated_vector(
     np.testing.assert_allclose(seen, axes.T @ earth, atol=1e-9)
 
 
-def test_earth_rate_of_a_turning_tool_is_a_line_in_quadrature():
+def test_earth_rate_during_rotation_is_a_line_in_quadrature():
     effect = make_effect({"name": "earth_rate", "latitude": 50, "inclination": 40, "azimuth": 110})
     rate, speed, size = 20.0, 90.0, 20_000
     x, y, z = run(effect, size=size, rate=rate, drivers={"rotation_rate": speed})
@@ -141,7 +139,7 @@ def test_earth_rate_of_a_turning_tool_is_a_line_in_quadrature():
 
 
 def test_earth_rate_and_gravity_share_the_frame_of_the_tool():
-    """Inclination 90, pointing north at the pole: the earth turns about the plumb line, so its rate is along the measured gravity."""
+    """At the pole the earth rotates about the vertical: its rate is along measured gravity."""
     world = [{"profile": "rotation", "points": [[0, 30.0]], "inclination": 90.0, "toolface": 25.0}]
     effect = {"name": "earth_rate", "latitude": 90, "inclination": 90, "toolface": 25}
     log = simulate(
@@ -162,7 +160,7 @@ def test_earth_rate_and_gravity_share_the_frame_of_the_tool():
         )
 
 
-def test_axes_of_other_names_say_where_they_look():
+def test_axes_of_other_names_need_directions():
     with pytest.raises(
         OptionError, match="axis 'north' is not x, y or z; give its direction with off and around"
     ):
@@ -184,7 +182,7 @@ def test_axes_of_other_names_say_where_they_look():
     )
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # real motion
 
 
@@ -210,7 +208,7 @@ def test_sway_is_one_motion_in_its_direction_with_no_floor():
     assert (angle - angle.mean()).std() == pytest.approx(6.0 / (2 * math.pi * 0.5 * 3600), rel=0.1)
 
 
-def test_tilt_of_the_mounting_turns_by_what_the_acceleration_changed():
+def test_tilt_follows_the_change_of_acceleration():
     effect = make_effect(
         {"name": "real_motion", "x": 2.0, "y": -1.0, "direction": 1.0, "axes": ["y"]}
     )

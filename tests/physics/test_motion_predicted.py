@@ -1,4 +1,4 @@
-"""What the effects of vibration, rotation, lines and motion predict for windows is what they generate, however time is cut."""
+"""Effects of vibration, rotation, lines and motion generate what they predict."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.effect_bench import random_cuts, run, same_whatever_the_cuts
 
 
 def windows_of(rates, rate, length, drivers, own=None, frequency=None):
-    """Windows side by side, with the mean of the drivers (rms of vibration), and the means of the rates."""
+    """Make adjacent windows with mean drivers (rms of vibration), and the means of the rates."""
     n = rates.shape[1] // length
     edges = np.arange(n + 1) * length / rate
 
@@ -112,7 +112,7 @@ def test_tilt_leaves_the_slope_of_the_acceleration_in_the_means():
     ],
     ids=lambda table: "-".join(map(str, [table["name"], *list(table.values())[2:]])),
 )
-def test_spectra_are_those_that_are_predicted(table):
+def test_spectra_match_the_prediction(table):
     effect = make_effect(table)
     rate, length, count = 10.0, 1000, 60
     drivers = {"vibration": 2.0, "rotation_rate": 417.6}

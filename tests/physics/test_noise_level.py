@@ -1,4 +1,4 @@
-"""Effects of temperature, light power, age and vibration on the noise level against their closed forms."""
+"""Effects of temperature, light power, age and vibration on noise against closed forms."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_light_power_of_blin_gives_the_typical_share():
     assert effects()["light_power_noise"].example().thermal == pytest.approx(ratio / (1 + ratio))
 
 
-def test_light_power_that_makes_no_sense_is_refused():
+def test_invalid_light_power_is_refused():
     with pytest.raises(
         OptionError,
         match=r"thermal \+ shot are 1.2 of N\^2; give shares with a sum of 1 or less",
@@ -104,7 +104,7 @@ def test_squared_noise_ages_with_a_power_of_time():
     ],
     ids=["temperature", "light"],
 )
-def test_the_same_noise_gets_stronger_as_a_whole(table, world, share):
+def test_noise_is_scaled_as_a_whole(table, world, share):
     model = {
         "environment": [world],
         "noise": {"N": 0.01, "K": 0.5},
@@ -144,7 +144,7 @@ def shaken(effect, *, noise, duration=900, rate=50, seed=8):
     )
 
 
-def test_vibration_adds_noise_in_squares_while_it_lasts_on_each_axis_by_itself():
+def test_vibration_adds_independent_noise_in_squares_while_it_lasts():
     log = shaken({"name": "vibration_noise", "white": 0.01, "exponent": 1.0}, noise={"N": 0.03})
     surface = davar(log, window="300s", step="300s", taus=[0.02, 0.2, 2.0])
     ratio = surface.avar.values / LAWS["N"].avar(surface.tau.values, 1.0)
@@ -166,7 +166,7 @@ def test_vibration_adds_noise_of_the_angle_with_its_slope():
     np.testing.assert_allclose(surface.avar.values, np.tile(expected, (2, 1)), rtol=0.08)
 
 
-def test_a_walk_is_inside_the_windows_and_stays_where_rectification_is_at_the_edges_and_goes_back():
+def test_random_walk_persists_where_rectification_reverts():
     walk = shaken({"name": "vibration_random_walk", "sensitivity": 2.0}, noise={})
     step = shaken({"name": "vibration_rectification", "sensitivity": 0.05}, noise={})
     taus = [0.02, 0.1, 1.0]
@@ -193,7 +193,7 @@ def test_a_walk_is_inside_the_windows_and_stays_where_rectification_is_at_the_ed
     assert not np.any(step.rate.values[:, -1])
 
 
-def test_a_walk_spreads_as_fast_as_its_k_says():
+def test_random_walk_spreads_according_to_k():
     effect = {"name": "vibration_random_walk", "sensitivity": 3.0}
     log = {"rate": 1, "duration": 900, "axes": [f"a{i}" for i in range(400)]}
     model = {

@@ -26,17 +26,17 @@ HOUR = 3600.0
 
 
 def ramp_record(rate, *, begin, end, total, speed):
-    """Temperature that stands, climbs by `speed` [degC/min] from `begin` to `end` [s], and stands."""
+    """Make a temperature that rises with `speed` [degC/min] from `begin` to `end` [s]."""
     t = np.arange(round(total * rate)) / rate
     return 20.0 + speed / 60.0 * (np.clip(t, begin, end) - begin)
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # diffusion
 
 
 def heated_slab(surface, dt, lag, cells=200):
-    """Means of the outer and inner half of a slab, insulated at the left, whose right face follows `surface`: Crank-Nicolson."""
+    """Compute the means of both halves of a slab under `surface` by Crank-Nicolson."""
     kappa = 4.0 / (math.pi**2 * lag)  # in thicknesses^2 per second
     r = kappa * dt * cells**2
     main = np.full(cells, -2.0)
@@ -56,7 +56,7 @@ def heated_slab(surface, dt, lag, cells=200):
     return np.array([out[0], *out]).T
 
 
-def test_shupe_is_the_heat_that_goes_through_a_winding():
+def test_shupe_matches_heat_conduction_through_a_winding():
     rate, lag = 1.0, 265.0
     surface = ramp_record(rate, begin=100, end=1300, total=2500, speed=1.5)
     outer, inner = heated_slab(surface, 1.0 / rate, lag)
@@ -91,7 +91,7 @@ def test_lag_follows_from_thickness_and_diffusivity():
     )
 
 
-def test_one_mode_of_shupe_is_a_simple_lag_odd_in_direction_and_free_of_the_rate():
+def test_one_mode_of_shupe_is_a_simple_lag():
     effect = make_effect({"name": "shupe", "sensitivity": 0.4, "modes": 1, "lag": 60})
     for rate in (1.0, 10.0, 100.0):
         warm = ramp_record(rate, begin=50, end=250, total=400, speed=2.0)
@@ -104,7 +104,7 @@ def test_one_mode_of_shupe_is_a_simple_lag_odd_in_direction_and_free_of_the_rate
         np.testing.assert_allclose(down, -found, atol=1e-12)
 
 
-def test_shupe_is_invisible_at_a_steady_ramp_and_a_step_where_it_begins():
+def test_shupe_is_constant_on_a_ramp_and_steps_at_its_start():
     world = [
         {
             "profile": "ramps",
@@ -132,7 +132,7 @@ def test_shupe_is_invisible_at_a_steady_ramp_and_a_step_where_it_begins():
     np.testing.assert_allclose(surface.window_mean.values[[0, 3, 5]], [0.0, 0.2, 0.2], atol=1e-9)
 
 
-def test_a_bias_that_follows_the_temperature_late_is_two_effects_together():
+def test_lagged_temperature_bias_equals_two_effects():
     """``y' = (T - y) / L`` after a step and along a ramp, from a T and -a L of the lagged change of T."""
     t, a, lag = (np.arange(8000) - 2000) / 10.0, 0.02, 90.0
     after = np.maximum(t, 0.0)
@@ -152,8 +152,8 @@ def test_a_bias_that_follows_the_temperature_late_is_two_effects_together():
         np.testing.assert_allclose(found, a * (late - 20.0), atol=1e-3 * a * 7.0)
 
 
-def test_a_ramp_seen_through_a_late_sensor_is_felt_when_it_begins():
-    """T as a sensor of 40 s shows a ramp that begins at 0: the winding of one mode follows the true ramp, ``v (1 - exp(-t / lag))``."""
+def test_sensor_lag_is_corrected_on_a_ramp():
+    """A sensor with a lag of 40 s sees a ramp; one mode follows the true ramp."""
     rate, lag, late, v = 10.0, 60.0, 40.0, 2.0
     t = np.arange(6000) / rate
     seen = 20.0 + v / 60.0 * (t - late * -np.expm1(-t / late))
@@ -170,7 +170,7 @@ def test_a_ramp_seen_through_a_late_sensor_is_felt_when_it_begins():
     assert np.abs(without - expected).max() > 0.2 * expected.max()
 
 
-def test_a_step_seen_through_a_late_sensor_is_a_step_of_the_surface():
+def test_sensor_lag_is_corrected_on_a_step():
     """A winding of one mode reads ``D / lag exp(-t / lag)`` after a step D of its surface."""
     rate, lag, late, step = 20.0, 60.0, 40.0, 5.0
     t = np.arange(12_000) / rate
@@ -184,14 +184,14 @@ def test_a_step_seen_through_a_late_sensor_is_a_step_of_the_surface():
     np.testing.assert_allclose(found[away], expected[away], atol=0.003 * expected.max())
 
 
-def test_shupe_refuses_parts_of_modes_and_halves_of_one():
+def test_shupe_refuses_invalid_modes():
     with pytest.raises(OptionError, match=r"'modes': 2\.5 is not a whole number of modes"):
         make_effect({"name": "shupe", "sensitivity": 1, "modes": 2.5})
     with pytest.raises(OptionError, match="transient needs at least 2 modes"):
         make_effect({"name": "shupe", "sensitivity": 1, "transient": 1, "modes": 1})
 
 
-def test_a_long_plateau_leaves_exactly_nothing():
+def test_long_plateau_leaves_exactly_zero():
     effect = make_effect({"name": "shupe", "sensitivity": 1.0, "lag": 0.5})
     warm = np.concatenate([[20.0], np.full(20_000, 30.0)])
     found = run(effect, size=warm.size, rate=10.0, drivers={"temperature": warm})[0]
@@ -199,7 +199,7 @@ def test_a_long_plateau_leaves_exactly_nothing():
     assert found[-1] == 0.0
 
 
-def test_a_ramp_of_temperature_is_a_rate_ramp_up_and_down_alike_and_shupe_only_moves_the_mean():
+def test_temperature_ramp_is_a_rate_ramp_and_shupe_shifts_the_mean():
     world = [{"profile": "chamber", "low": 0, "high": 40, "speed": 2, "hold": "10 min"}]
     tables = [
         {"name": "temperature_bias", "sensitivity": 0.01, "axes": ["x"]},
@@ -233,7 +233,7 @@ def test_a_ramp_of_temperature_is_a_rate_ramp_up_and_down_alike_and_shupe_only_m
     )
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # gradient
 
 
@@ -277,7 +277,7 @@ def test_gradient_takes_channels_of_any_name_and_is_a_ramp_while_it_builds_up():
     )
 
 
-# ----------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # warm-up
 
 
@@ -294,7 +294,7 @@ def test_warm_up_is_an_exponential_averaged_over_each_sample():
         assert found[i] == pytest.approx(truth, rel=1e-9)
 
 
-def test_warm_up_begins_anew_after_restarts_and_gaps_long_enough():
+def test_warm_up_restarts_after_restarts_and_long_gaps():
     effect = make_effect({"name": "warm_up", "amplitude": 1.0, "time": 100})
     tables = {"gaps": np.array([[2000, 2100], [4000, 4600]]), "restarts": np.array([[4000, 4600]])}
     found = run(effect, size=8000, **tables)[0]
@@ -310,7 +310,7 @@ def test_warm_up_begins_anew_after_restarts_and_gaps_long_enough():
     np.testing.assert_allclose(warm[4600:], first[:3400], rtol=1e-12)
 
 
-def test_a_short_loss_of_power_brings_back_only_what_cooled():
+def test_short_power_loss_restores_only_a_part():
     effect = make_effect({"name": "warm_up", "amplitude": 1.0, "time": 100, "cooling": 300})
     found = run(effect, size=9000, restarts=np.array([[5000, 5600], [7000, 7030]]))[0]
     mean = -math.expm1(-1e-3) / 1e-3
@@ -341,7 +341,7 @@ def test_warm_up_looks_like_a_rate_ramp_that_fades_after_every_restart():
         np.testing.assert_allclose(surface.avar.values[rows], expected, rtol=0.01)
 
 
-# -------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # hysteresis
 
 
@@ -363,7 +363,7 @@ def test_hysteresis_opens_a_loop_of_known_area():
     assert temperature[500] == pytest.approx(temperature[1500])
 
 
-def test_hysteresis_stays_on_a_plateau_where_shupe_goes_back():
+def test_hysteresis_persists_on_a_plateau_where_shupe_decays():
     world = ramp_record(1.0, begin=0, end=1800, total=9000, speed=1.0)
     play_left = run(
         make_effect({"name": "thermal_hysteresis", "sensitivity": 0.01}),
@@ -387,7 +387,7 @@ turns = st.lists(st.floats(-50, 100), min_size=2, max_size=8)
 
 @given(turns, st.floats(0.1, 20.0))
 @settings(max_examples=60, deadline=None)
-def test_play_does_not_depend_on_speed_and_forgets_what_was_overrun(values, width):
+def test_dead_band_is_independent_of_speed_and_forgets_overrun_reversals(values, width):
     coarse, _ = play(np.array(values), width, values[0])
     fine = np.concatenate([np.linspace(a, b, 50) for a, b in itertools.pairwise(values)])
     slow, _ = play(fine, width, values[0])
@@ -397,7 +397,7 @@ def test_play_does_not_depend_on_speed_and_forgets_what_was_overrun(values, widt
     assert play(np.array([*values, high]), width, values[0])[1] == pytest.approx(high - width)
 
 
-# -----------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # ageing
 
 

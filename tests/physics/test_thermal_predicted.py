@@ -1,4 +1,4 @@
-"""What the effects of temperature, age, light power and vibration predict for windows is what they generate, however time is cut."""
+"""Effects of temperature, age, light power and vibration generate what they predict."""
 
 from __future__ import annotations
 
@@ -169,8 +169,8 @@ def test_predicted_spectra_have_the_allan_variance_of_the_law(name, parameter, l
 
 @given(st.floats(1.0, 500.0), st.integers(3, 40), st.integers(0, 2**31))
 @settings(max_examples=25, deadline=None)
-def test_delayed_changes_add_up_to_what_the_lag_let_through(lag, count, seed):
-    """The means over intervals that follow each other sum to how far the lagged temperature came; long after a change that is all of it."""
+def test_lagged_changes_sum_to_the_lagged_temperature(lag, count, seed):
+    """Means over adjacent intervals sum to the change of the lagged temperature."""
     rng = np.random.default_rng(seed)
     known = np.cumsum(rng.uniform(1.0, 30.0, count))
     values = rng.normal(0.0, 5.0, count)
@@ -187,8 +187,8 @@ def test_delayed_changes_add_up_to_what_the_lag_let_through(lag, count, seed):
     [{"lag": 300, "sensor_lag": 40}, {"lag": 300}, {"lag": 30, "modes": 1, "sensor_lag": 60}],
     ids=str,
 )
-def test_fine_values_sharpen_what_the_change_of_temperature_does(table):
-    """Windows of 60 s see a corner of the temperature between two of them only in values inside of them."""
+def test_fine_values_sharpen_the_predicted_change(table):
+    """60 s windows resolve a corner of the temperature only with values inside of them."""
     warm = 20.0 + 2.0 / 60.0 * np.clip(_T - 3000.0, 0.0, 1200.0)
     effect = make_effect({"name": "shupe", "sensitivity": 1.0} | table)
     found = (
@@ -205,7 +205,7 @@ def test_fine_values_sharpen_what_the_change_of_temperature_does(table):
     assert off[1] < 0.4 * off[0]
 
 
-def test_windows_that_overlap_know_only_their_means():
+def test_overlapping_windows_use_means_only():
     begin, means = np.array([0.0, 30.0]), np.array([1.0, 2.0])
     windows = Windows(
         begin,
@@ -241,7 +241,7 @@ CASES = [
 @pytest.mark.parametrize("table", CASES, ids=lambda table: "-".join(map(str, table.values())))
 @given(st.integers(0, 2**31), st.sampled_from([0.3, 10.0, 977.0]))
 @settings(max_examples=8, deadline=None)
-def test_time_may_be_cut_anywhere(table, seed, rate):
+def test_chunk_edges_do_not_matter(table, seed, rate):
     rng = np.random.default_rng(seed)
     size = 600
     drivers = {
@@ -345,5 +345,5 @@ def test_a_simulated_log_does_not_depend_on_its_chunks():
         ),
     ],
 )
-def test_the_sentence_has_all_its_numbers(table, words):
+def test_sentence_has_all_parameters(table, words):
     assert re.search(words, make_effect(table).say())

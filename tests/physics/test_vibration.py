@@ -1,4 +1,4 @@
-"""Effects of vibration, acceleration and the magnetic field, and the processes behind them, against their closed forms."""
+"""Effects of vibration, acceleration and the magnetic field against closed forms."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import allan_of_samples, run, sigma
 
-# -------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # processes in continuous time
 
 
@@ -86,12 +86,12 @@ def test_a_mount_amplifies_at_its_resonance_only():
     np.testing.assert_allclose(gain, expected, rtol=1e-9)
 
 
-# ------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # vibration
 
 
 def vibrating(**effect):
-    """White noise of 0.003 deg/sqrt(h) at 400 Hz, with and without 50 deg/h rms of vibration at 700 to 800 Hz."""
+    """White noise of 0.003 deg/sqrt(h) at 400 Hz, with and without vibration at 700 to 800 Hz."""
     world = [{"profile": "vibration", "points": [[0, 13.39]], "sensor_rate": 1}]
     model = {
         "noise": {"N": 0.0031},
@@ -130,7 +130,7 @@ def test_a_band_on_a_multiple_of_the_sampling_rate_looks_like_n_or_q(sampling, t
     assert found[2] == pytest.approx(expected[2], rel=0.2 if sampling == "point" else 0.06)
 
 
-def test_a_band_folds_where_it_must():
+def test_band_is_aliased_to_the_expected_frequencies():
     effect = make_effect(
         {
             "name": "aliased_vibration",

@@ -30,7 +30,7 @@ from tests.support.simulated import model
     seed=st.integers(0, 99),
 )
 def test_a_long_channel_does_not_depend_on_the_chunks(cuts, rate, held, seed):
-    """Read stretch by stretch, with holes, at another rate: each piece as from the whole, and as by plain interpolation."""
+    """Parts of a channel with gaps equal those of the whole, and plain interpolation."""
     rng = np.random.default_rng(seed)
     values = rng.normal(size=int(25 * rate))
     values[rng.random(values.size) < 0.2] = np.nan
@@ -119,8 +119,8 @@ def test_a_log_like_a_recording_has_its_stamps_gaps_and_channels():
         simulate({"noise": {"x": {"N": 0.01}}}, like=recorded)
 
 
-def test_like_a_real_recording(recordings, tmp_path):
-    """Stamps, gaps, restarts and channels are the recording's; the temperature it measured drives an effect."""
+def test_simulation_like_a_real_recording(recordings, tmp_path):
+    """Stamps, gaps, restarts and channels are the recording's; its temperature drives an effect."""
     path = recordings("fog-hybrid-warmup/run1_static.txt")
     names = {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z", "Tx": "temperature"}
     units = {"gyro": "deg/s", "time": "s", "temperature": "degC"}

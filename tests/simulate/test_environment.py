@@ -1,4 +1,4 @@
-"""Environments against their closed forms: chamber, trip, rotation, light, losses, cuts of the power."""
+"""Environments against closed forms: chamber, trip, rotation, light, losses, power cuts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_chamber_is_the_test_of_li_et_al():
 
 
 def test_a_lag_is_that_of_a_first_order_response():
-    """On a ramp of r the response trails by r times the lag, once the start is forgotten: exactly, with the known transient."""
+    """On a ramp r the response trails by r times the lag, after the known transient."""
     lag, t = 300.0, np.arange(6000.0)
     felt = env.chamber(duration="130min", low=-40, high=60, hold=1, lag=lag).temperature.values[
         1:6001
@@ -66,7 +66,7 @@ def test_toolface_is_the_integral_of_the_rate(stick_slip):
     np.testing.assert_allclose(turning.accel_z.values, 0.0, atol=1e-12)
 
 
-def test_a_tool_that_hangs_plumb_feels_gravity_on_its_axis():
+def test_vertical_tool_has_gravity_on_its_axis():
     still = env.rotation([[0, 0]], duration=1.0, inclination=0.0)
     assert (still.accel_z.values == -1.0).all()  # z points down; what holds the tool pushes up
     np.testing.assert_allclose(still.accel_x.values, 0.0, atol=1e-15)
@@ -97,7 +97,7 @@ def test_random_power_cuts_are_restarts():
     assert set(gap_table(log).cause) == {"restart"}
 
 
-def test_gaps_that_overlap_are_one():
+def test_overlapping_gaps_are_merged():
     world = combine(gaps([[1, 3], [2, 5]]), power_cuts([[4.5, 6]], duration=10.0))
     table = gap_table(simulate({"noise": {"N": 1}}, duration="10s", rate=10.0, environment=world))
     assert table[["seconds", "cause"]].values.tolist() == [[5.0, "restart"]]

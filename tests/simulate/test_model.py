@@ -1,4 +1,4 @@
-"""Models and the command that takes them: units, mistakes explained, the models that are shipped."""
+"""Models and the simulate command: units, error messages and shipped models."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gyrostab.simulate.model import PROFILES
 from tests.conftest import ROOT
 from tests.support.simulated import BIASED, LOG, WORLD, model
 
-# -----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # models
 
 
@@ -77,7 +77,7 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
         ),
     ],
 )
-def test_a_wrong_model_is_explained(wrong, words):
+def test_invalid_model_is_explained(wrong, words):
     with pytest.raises(OptionError, match=words):
         simulate(model(**wrong))
 
@@ -117,7 +117,7 @@ def test_units_are_converted():
     assert made.log == {"duration": 120.0, "rate": 1000.0}
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # command
 
 
@@ -200,7 +200,7 @@ def test_command_explains_a_wrong_model(tmp_path, capsys):
     assert not (tmp_path / "log.nc").exists()
 
 
-# -----------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # shipped models
 
 MODELS = sorted((ROOT / "data" / "models").glob("*.toml"))
@@ -215,13 +215,13 @@ def test_shipped_models_make_logs(path):
     assert (values.std(axis=1) > 0).all()
 
 
-def test_shipped_models_are_all_there():
+def test_shipped_models_are_complete():
     assert {"p16_vibration", "l13_vibration", "l13_temperature", "mwd_24h"} <= {
         path.stem for path in MODELS
     }
 
 
-def test_p16_has_its_timeline():
+def test_p16_model_has_its_timeline():
     log = simulate(ROOT / "data" / "models" / "p16_vibration.toml")
     assert log.attrs["sampling_rate_hz"] == 400
     assert log.sizes["time"] == 930 * 400

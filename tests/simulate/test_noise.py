@@ -29,7 +29,7 @@ def allan(records: np.ndarray, k: int, rate: float = RATE) -> float:
 
 
 def markov_avar(tau: np.ndarray | float, sigma: float, time: float) -> np.ndarray:
-    """Allan variance of a first-order Gauss-Markov process, IEEE Std 952: (q T)^2 / tau (1 - ...), with q^2 T / 2 = sigma^2."""
+    """Compute the Allan variance of a Gauss-Markov process, IEEE Std 952, q^2 T / 2 = sigma^2."""
     x = np.asarray(tau, float) / time
     exact = 2 / x * (1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
     return sigma**2 * np.where(x < 1e-3, 2 * x / 3 * (1 - 0.75 * x), exact)
@@ -58,8 +58,8 @@ def ensembles() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("term", [*"QNBKR", "gauss_markov", "sinusoid"])
-def test_ensemble_allan_variance_is_the_law_at_every_tau(term, ensembles):
-    """From one sample to a tenth of the record, within 2 % (the ensemble itself scatters by 0.7 % at the longest)."""
+def test_ensemble_allan_variance_matches_the_law_at_every_tau(term, ensembles):
+    """From one sample to a tenth of the record, within 2 % (the ensemble scatters by 0.7 %)."""
     ensembles[term] = made = records(term)
     found = np.array([allan(made, int(k)) for k in TAUS])
     expected = laws(term, TAUS / RATE)
@@ -70,7 +70,7 @@ def test_ensemble_allan_variance_is_the_law_at_every_tau(term, ensembles):
 
 @pytest.mark.parametrize("term", [*"QNBK", "gauss_markov"])
 def test_ensemble_spectrum_integrates_to_the_law(term, ensembles):
-    """P16 Eq. 7 on the spectrum of the samples: sigma^2 = int S(f) 2 sin^4(pi f tau) / (k sin(pi f dt))^2 df over all f that there are.
+    """P16 Eq. 7: sigma^2 = int S(f) 2 sin^4(pi f tau) / (k sin(pi f dt))^2 df over all f.
 
     For samples, whose angle is a sum, (k sin(pi f dt))^2 stands for (pi f tau)^2; aliases are in S
     already.
@@ -122,7 +122,7 @@ def test_the_bump_of_a_sinusoid_is_at_0_371_over_its_frequency():
 
 @pytest.mark.parametrize("rate", [0.1, 10.0, 400.0, 2000.0])
 def test_flicker_is_flat_from_one_sample_to_twenty_hours(rate):
-    """The exact Allan variance of the sum of processes, with what is faster than a sample as white noise of its mean."""
+    """Compute the exact Allan variance of the sum of processes, the fast ones as white noise."""
     times = flicker_times(rate, low=FLICKER_LOW)
     tau = np.geomspace(1 / rate, 72000.0, 300)
     share = np.log(RATIO) / np.pi
@@ -149,7 +149,7 @@ def test_flicker_keeps_to_its_band():
 
 
 def test_random_walk_is_averaged_not_sampled():
-    """Samples of a random walk have (K^2 tau / 3) (1 + 1 / (2 k^2)), half as much again at one sample; means have K^2 tau / 3."""
+    """Point samples have (K^2 tau / 3) (1 + 1 / (2 k^2)); means have K^2 tau / 3."""
     rng = np.random.default_rng(1)
     steps = rng.standard_normal((RECORDS, 60))
     sampled = np.cumsum(steps, axis=1)
@@ -167,7 +167,7 @@ def test_quantization_is_a_bounded_error_of_the_angle():
     assert np.abs(np.corrcoef(angle[1:], angle[:-1])[0, 1]) < 0.02
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # streams
 
 ALL = {**SIZES, "gauss_markov": MARKOV, "sinusoid": SINE}

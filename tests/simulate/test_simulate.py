@@ -23,11 +23,11 @@ from gyrostab.simulate import drivers, lazy, read_model, simulate
 from gyrostab.simulate.lazy import Chain
 from tests.support.simulated import BIASED, LOG, WORLD, every_channel, model
 
-# -------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # logs
 
 
-def test_it_is_a_log_like_any_other():
+def test_simulated_log_has_the_schema_of_a_log():
     log = simulate(model())
     check_log(log)
     assert dict(log.sizes)["time"] == 1800
@@ -53,7 +53,7 @@ def test_it_is_a_log_like_any_other():
     assert missing[:, 800:900].all()
 
 
-def test_it_goes_through_file_and_analysis(tmp_path):
+def test_simulated_log_is_written_and_analysed(tmp_path):
     log = simulate(model())
     back = open_log(to_netcdf(log, tmp_path / "log.nc"))
     np.testing.assert_array_equal(back.rate.values, log.rate.values)
@@ -113,7 +113,7 @@ def test_oversampling_keeps_the_noise_of_the_log():
         assert found == pytest.approx(0.02**2 * 3600 / 0.05 + 9 * 0.05 / 3600 / 3, rel=0.02)
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # effects
 
 
@@ -187,18 +187,18 @@ def test_two_effects_of_one_name_add():
     np.testing.assert_allclose(log.rate.values, 0.4, rtol=1e-12)
 
 
-def test_turning_is_true_rate_on_its_axis():
+def test_rotation_is_true_rate_on_its_axis():
     world = [{"profile": "rotation", "points": [[0, 90.0]], "axis": "z"}]
     log = simulate({"environment": world}, duration="5s", rate=10.0)
     np.testing.assert_allclose(log.rate.sel(axis="z"), 90.0 * 3600, rtol=1e-12)
     np.testing.assert_array_equal(log.rate.sel(axis="x"), 0.0)
 
 
-# -----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # blocks
 
 
-def test_a_chain_takes_each_step_once_and_goes_back_from_a_state_on_its_way():
+def test_chain_takes_each_step_once_and_resumes_from_a_state():
     taken: list[int] = []
 
     def step(number: int, state: int) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Run an effect by itself on plain arrays, cut into chunks at will: for the tests of the effects."""
+"""Run a single effect on plain arrays in arbitrary chunks, for the tests of the effects."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def sigma(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]
 def allan_of_density(
     density: Callable[[NDArray[np.float64]], Any], tau: float, top: float
 ) -> float:
-    """Allan variance of a two-sided density (P16 Eq. 7), by numerical integration up to `top` [Hz]."""
+    """Integrate the Allan variance of a two-sided density (P16 Eq. 7) up to `top` [Hz]."""
     f = np.linspace(top / 400_000, top, 400_000)
     return float(
         4.0 * np.trapezoid(density(f) * np.sin(np.pi * f * tau) ** 4 / (np.pi * f * tau) ** 2, f)
@@ -143,7 +143,7 @@ def allan_of_density(
 
 
 def allan_of_samples(density: Callable[[NDArray[np.float64]], Any], k: int, rate: float) -> float:
-    """Allan variance of samples with a two-sided density, k samples at a time: the mean of k has the response of Dirichlet."""
+    """Compute the Allan variance of samples with a two-sided density at k samples."""
     f = (np.arange(200_000) + 0.5) * (rate / 2) / 200_000
     x = np.pi * f / rate
     return float(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ _EMPTY_DIAGNOSIS = {
 }
 
 _MAX_LISTED = 40
+_COLUMNS = 118
 
 
 def score_rows(
@@ -132,7 +134,7 @@ def page_text(
         "### Failed diagnoses",
         _format_list([f"{name}: {why}" for name, why in failed.items()], "none"),
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part if "\n" in part else _wrap_text(part) for part in parts) + "\n"
 
 
 def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -213,7 +215,7 @@ def _describe_run(
             f"**The code changed {len(job['code']) - 1} times during this run: "
             "these figures are not those of one version.**"
         )
-    return "  \n".join(lines)
+    return "  \n".join(_wrap_text(line) for line in lines)
 
 
 def _first_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -238,9 +240,20 @@ def _describe_miss(row: Mapping[str, Any]) -> str:
 
 
 def _format_list(lines: Sequence[str], none: str) -> str:
-    shown = [f"- {line}" for line in lines[:_MAX_LISTED]] + (
+    shown = [_wrap_text(f"- {line}", indent="  ") for line in lines[:_MAX_LISTED]] + (
         [f"- and {len(lines) - _MAX_LISTED} more, see scores.csv"]
         if len(lines) > _MAX_LISTED
         else []
     )
     return "\n".join(shown) or none
+
+
+def _wrap_text(text: str, *, indent: str = "") -> str:
+    """Wrap a line of Markdown."""
+    return textwrap.fill(
+        text,
+        _COLUMNS,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
