@@ -1,4 +1,4 @@
-"""What knowing the noise is worth for effects of the mean: gains of concealed effects with all known, and with ever less known.
+"""Evidence for effects on the mean, with everything known about the noise and with less and less.
 
 Prints a row for each effect and strength: medians over records of an hour at 10 Hz, summed over the
 axes [nats].

@@ -488,8 +488,14 @@ def test_ambiguity_sets_are_symmetric_and_cover_the_catalogue():
         for name in group:
             assert group <= merge_ambiguous(name)
     contract = {name for group in AMBIGUITY for name in group} | {
-        "logger_filter", "supply_bias", "held_samples", "dead_zone", "clipping", "spikes", "rate_quantization",
-    }  # fmt: skip
+        "logger_filter",
+        "supply_bias",
+        "held_samples",
+        "dead_zone",
+        "clipping",
+        "spikes",
+        "rate_quantization",
+    }
     assert set(CATALOGUE) <= contract
 
 

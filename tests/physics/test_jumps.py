@@ -195,7 +195,7 @@ def slow_supply(lag):
 
 
 def test_a_slow_supply_settles_after_a_step_and_trails_a_ramp():
-    """A step D becomes ``D (1 - exp(-t / lag))``, a ramp v t ``v (t - lag (1 - exp(-t / lag)))``."""
+    """A step D gives ``D (1 - exp(-t / lag))``, a ramp v t ``v (t - lag (1 - exp(-t / lag)))``."""
     t = (np.arange(8000) - 1000) / 20.0
     power = 1e-4 + 2e-8 * np.maximum(t, 0.0)
     found = run(

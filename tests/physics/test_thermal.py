@@ -133,7 +133,7 @@ def test_shupe_is_constant_on_a_ramp_and_steps_at_its_start():
 
 
 def test_lagged_temperature_bias_equals_two_effects():
-    """``y' = (T - y) / L`` after a step and along a ramp, from a T and -a L of the lagged change of T."""
+    """``y' = (T - y) / L`` equals a T and -a L of the lagged change of T."""
     t, a, lag = (np.arange(8000) - 2000) / 10.0, 0.02, 90.0
     after = np.maximum(t, 0.0)
     settled = -np.expm1(-after / lag)

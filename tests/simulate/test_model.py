@@ -85,11 +85,13 @@ def test_invalid_model_is_explained(wrong, words):
 def test_a_wrong_effect_names_file_and_place(tmp_path):
     path = tmp_path / "m.toml"
     path.write_text(
-        '[noise]\nN = 1\n[[effect]]\nname = "temperature_bias"\nsensitivity = 1\n[[effect]]\nname = "shuppe"\n'
+        '[noise]\nN = 1\n[[effect]]\nname = "temperature_bias"\nsensitivity = 1\n'
+        '[[effect]]\nname = "shuppe"\n'
     )
     with pytest.raises(
         OptionError,
-        match=rf"{re.escape(str(path))}, effect 2: there is no effect 'shuppe'.*; there are .*temperature_bias",
+        match=rf"{re.escape(str(path))}, effect 2: there is no effect 'shuppe'.*; "
+        "there are .*temperature_bias",
     ):
         read_model(path)
     path.write_text("[noise\n")
@@ -124,7 +126,8 @@ def test_units_are_converted():
 def test_command_writes_a_log_that_run_takes(tmp_path, capsys):
     path = tmp_path / "m.toml"
     path.write_text(
-        '[noise]\nN = 0.02\n[[environment]]\nprofile = "chamber"\n[[effect]]\nname = "temperature_bias"\nsensitivity = 0.01\naxes = "x"\n'
+        '[noise]\nN = 0.02\n[[environment]]\nprofile = "chamber"\n'
+        '[[effect]]\nname = "temperature_bias"\nsensitivity = 0.01\naxes = "x"\n'
     )
     out = tmp_path / "log.nc"
     options = ["--duration", "2min", "--rate", "50", "--seed", "3", "--quiet-progress"]
