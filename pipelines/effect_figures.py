@@ -6,6 +6,7 @@ warm_up`` makes some of them.
 
 import re
 import sys
+import textwrap
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -72,7 +73,11 @@ def illustrate(page):
                     + "\n" * (number + 1 < len(parts))
                 )
             image = f"![{effects()[name].short}](../figures/effects/{name}.png)"
-            parts[number] = between(part, "figure", f"{image}\n\n{PLAN[name]['caption']}\n")
+            parts[number] = between(
+                part,
+                "figure",
+                f"{image}\n\n{textwrap.fill(PLAN[name]['caption'], 118, break_on_hyphens=False)}\n",
+            )
     page.write_text("".join(parts), encoding="utf-8")
 
 
