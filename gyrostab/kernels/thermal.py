@@ -1,8 +1,8 @@
-"""What temperature leaves behind in a body: diffusion through a coil, and play.
+"""Memory of temperature in a body: diffusion through a coil, and hysteresis by a dead band.
 
 A winding of thickness d, insulated on one side and heated on the other, follows its surface with
-modes of the relaxation times ``t_n = 4 d^2 / ((2 n - 1)^2 pi^2 kappa)``. All processes go on where
-they stopped, bit for bit, however time is cut into calls.
+modes of the relaxation times ``t_n = 4 d^2 / ((2 n - 1)^2 pi^2 kappa)``. The results do not depend,
+bit for bit, on how time is divided into calls.
 
 References
 ----------
@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import KERNEL
 
-__all__ = ["mean_changes", "mean_followed", "mean_play", "mean_rates", "play", "relax", "slab"]
+__all__ = [
+    "apply_dead_band",
+    "mean_changes",
+    "mean_dead_band_distance",
+    "mean_followed",
+    "mean_rates",
+    "relax",
+    "slab",
+]
 
 Array = NDArray[np.float64]
 
@@ -42,7 +50,7 @@ def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
     times : ndarray, shape (count,)
         Relaxation times [s], falling.
     whole : ndarray, shape (count,)
-        Share of each mode in how the mean of the winding follows; their sum is one.
+        Share of each mode in the response of the mean of the winding; their sum is one.
     halves : ndarray, shape (count,)
         The same for the outer half minus the inner half; their sum is zero.
 
@@ -98,7 +106,7 @@ def relax(
     weight : ndarray, shape (k, m)
         Sums over modes that are wanted.
     carry : (float, ndarray of shape (m,))
-        T and v at the sample before; at the start the first T and zeros.
+        T and v at the previous sample; at the start, the first T and zeros.
 
     Returns
     -------
@@ -137,9 +145,9 @@ def mean_changes(known: Array, values: Array, begin: Array, end: Array, time: fl
     known : ndarray, shape (n,)
         Times of the values, rising [s].
     values : ndarray, shape (n,)
-        T; beyond the ends it goes on as in the outermost intervals.
+        T; extrapolated linearly beyond the ends.
     begin, end : ndarray, shape (w,)
-        Edges of the intervals [s]; T stood still before the first of them.
+        Edges of the intervals [s]; T is constant before the first of them.
     time : float
         Relaxation time [s].
 
@@ -190,7 +198,7 @@ def mean_followed(known: Array, values: Array, begin: Array, end: Array, time: f
 
 
 def mean_rates(known: Array, values: Array, begin: Array, end: Array) -> Array:
-    """Mean rate of change over intervals, from a few values of T that are joined by straight lines.
+    """Average the rate of change over intervals, with T straight between few values.
 
     Parameters
     ----------
@@ -226,16 +234,16 @@ def _polygon_corners(known: Array, values: Array, begin: Array, end: Array) -> t
 
 
 @njit(**KERNEL)
-def play(values: Array, width: float, start: float) -> tuple[Array, float]:
+def apply_dead_band(values: Array, width: float, start: float) -> tuple[Array, float]:
     """Apply a dead band of half-width `width`: the output moves only when `values` pushes it.
 
     Parameters
     ----------
     values : ndarray, shape (n,)
     width : float
-        Half of the play.
+        Half-width of the dead band.
     start : float
-        Slider before the first value.
+        Output before the first value.
 
     Returns
     -------
@@ -244,7 +252,7 @@ def play(values: Array, width: float, start: float) -> tuple[Array, float]:
 
     Examples
     --------
-    >>> play(np.array([0.0, 5.0, 4.0, 0.0, -5.0]), 2.0, 0.0)
+    >>> apply_dead_band(np.array([0.0, 5.0, 4.0, 0.0, -5.0]), 2.0, 0.0)
     (array([ 0.,  3.,  3.,  2., -3.]), -3.0)
     """
     out = np.empty(values.size)
@@ -255,15 +263,17 @@ def play(values: Array, width: float, start: float) -> tuple[Array, float]:
     return out, here
 
 
-def mean_play(known: Array, values: Array, begin: Array, end: Array, width: float) -> Array:
-    """Average over intervals the distance of T from the output of `play`, with T straight.
+def mean_dead_band_distance(
+    known: Array, values: Array, begin: Array, end: Array, width: float
+) -> Array:
+    """Average the distance of T from the output of `apply_dead_band`, with T straight.
 
     Parameters
     ----------
     known, values, begin, end : ndarray
-        As for `mean_changes`; the slider begins at T at the first of all times.
+        As for `mean_changes`; the output begins at T at the first time.
     width : float
-        Half of the play.
+        Half-width of the dead band.
 
     Returns
     -------
@@ -272,7 +282,8 @@ def mean_play(known: Array, values: Array, begin: Array, end: Array, width: floa
     Examples
     --------
     >>> t, T = np.array([0.0, 10.0, 20.0]), np.array([0.0, 10.0, 0.0])
-    >>> mean_play(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]), 2.5).round(2)
+    >>> begin, end = np.array([0.0, 10.0]), np.array([10.0, 20.0])
+    >>> mean_dead_band_distance(t, T, begin, end, 2.5).round(2)
     array([ 2.19, -1.25])
     """
     at, line = _polygon_corners(known, values, begin, end)
@@ -283,7 +294,7 @@ def mean_play(known: Array, values: Array, begin: Array, end: Array, width: floa
         np.interp(corner, np.arange(at.size), at),
         np.interp(corner, np.arange(at.size), line),
     )
-    slider, _ = play(line, width, float(line[0]))
+    slider, _ = apply_dead_band(line, width, float(line[0]))
     apart = line - slider
     total = np.concatenate([[0.0], np.cumsum((apart[1:] + apart[:-1]) / 2.0 * np.diff(at))])
     return np.asarray(

@@ -40,7 +40,7 @@ class Workspace:
 
 
 class Workspaces(threading.local):
-    """A `Workspace` for each thread that looks at ``own``."""
+    """A separate `Workspace` for each thread, as ``own``."""
 
     def __init__(self) -> None:
         self.own = Workspace()

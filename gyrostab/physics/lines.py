@@ -80,10 +80,10 @@ class SpectralLine(Effect):
         if math.isinf(self.quality):
             self.each("phase", setup.axes)
             return None
-        from gyrostab.kernels.random.coloured import oscillator, rest
+        from gyrostab.kernels.random.coloured import draw_state, oscillator
 
         reading = oscillator(self.frequency, self.quality, setup.rate)
-        return reading, rng, rest(reading, rng.standard_normal(2))
+        return reading, rng, draw_state(reading, rng.standard_normal(2))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Compute the rate contribution [degree hour-1] of every sample."""
@@ -95,10 +95,10 @@ class SpectralLine(Effect):
             ) * cycles
             phase = np.radians(self.each("phase", chunk.setup.axes))[:, None] - math.pi / 2.0
             return np.asarray(amplitude * turn_means(middle, np.full(1, cycles), phase)), None
-        from gyrostab.kernels.random.coloured import march
+        from gyrostab.kernels.random.coloured import read_process
 
         reading, rng, position = state
-        values, position = march(
+        values, position = read_process(
             reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position
         )
         return amplitude / math.sqrt(2.0) * values, (reading, rng, position)

@@ -446,17 +446,17 @@ class RealMotion(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Draw the stationary state of the oscillator; the tilt starts at zero."""
-        from gyrostab.kernels.random.coloured import oscillator, rest
+        from gyrostab.kernels.random.coloured import draw_state, oscillator
 
         reading = oscillator(self.frequency, self.quality, setup.rate)
-        return reading, rng, rest(reading, rng.standard_normal(2)), None
+        return reading, rng, draw_state(reading, rng.standard_normal(2)), None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Compute the true rate [degree hour-1] of every sample."""
-        from gyrostab.kernels.random.coloured import march
+        from gyrostab.kernels.random.coloured import read_process
 
         reading, rng, position, tilt = state
-        motion, position = march(
+        motion, position = read_process(
             reading.step, reading.read, reading.kick, rng.standard_normal((chunk.size, 3)), position
         )
         motion = self.sway * motion

@@ -405,12 +405,12 @@ class ThermalHysteresis(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Compute the rate contribution [degree hour-1] of every sample."""
-        from gyrostab.kernels.thermal import play
+        from gyrostab.kernels.thermal import apply_dead_band
 
         temperature = np.ascontiguousarray(chunk.drivers["temperature"])
         if not chunk.size:
             return np.zeros(0), state
-        follower, state = play(
+        follower, state = apply_dead_band(
             temperature, self.width, float(temperature[0]) if state is None else state
         )
         return self.sensitivity * (temperature - follower), state
@@ -423,10 +423,10 @@ class ThermalHysteresis(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means from the temperature at its finest resolution, linearly joined."""
-        from gyrostab.kernels.thermal import mean_play
+        from gyrostab.kernels.thermal import mean_dead_band_distance
 
         at, temperature = windows.course("temperature")
-        apart = mean_play(at, temperature, windows.begin, windows.end, self.width)
+        apart = mean_dead_band_distance(at, temperature, windows.begin, windows.end, self.width)
         return Prediction(mean={"sensitivity": apart})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:

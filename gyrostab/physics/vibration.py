@@ -265,7 +265,7 @@ class AliasedVibration(Effect):
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         """Draw the stationary state of the process."""
-        from gyrostab.kernels.random.coloured import band, rest
+        from gyrostab.kernels.random.coloured import band, draw_state
 
         average = self.sampling == "average"
         reading = band(
@@ -279,17 +279,17 @@ class AliasedVibration(Effect):
         return (
             reading,
             rng,
-            rest(reading, rng.standard_normal(reading.read.size)),
+            draw_state(reading, rng.standard_normal(reading.read.size)),
             self.each("sensitivity", setup.axes),
         )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Compute the rate contribution [degree hour-1] of every sample."""
-        from gyrostab.kernels.random.coloured import march
+        from gyrostab.kernels.random.coloured import read_process
 
         reading, rng, position, sensitivity = state
         normal = rng.standard_normal((chunk.size, position.size + 1))
-        values, position = march(reading.step, reading.read, reading.kick, normal, position)
+        values, position = read_process(reading.step, reading.read, reading.kick, normal, position)
         return sensitivity[:, None] * (chunk.drivers["vibration"] * values), (
             reading,
             rng,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.grid.stamps import look
+from gyrostab.kernels.grid.stamps import scan_cells
 
 __all__ = ["RowInspection", "inspect_rows", "with_inspections"]
 
@@ -57,7 +57,7 @@ def inspect_rows(
         Row of the log at which the block begins.
     """
     present = np.empty(cells.shape[1], dtype=bool)
-    absent, holes, infinities, low, high = look(
+    absent, holes, infinities, low, high = scan_cells(
         np.ascontiguousarray(cells, dtype=np.float64), present
     )
     unreadable = _find_spans(np.isnan(cells).any(axis=0) & present, begin) if holes else _NO_SPANS

@@ -131,7 +131,7 @@ def test_covariance_between_averaging_times_is_that_of_simulated_noise():
 
 @pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])
 def test_standard_errors_are_right(share, block):
-    """z-scores of repeated simulations have a standard deviation of 0.9 to 1.1, also through gaps."""
+    """z-scores of repeated simulations have a standard deviation of 0.9 to 1.1, also with gaps."""
     rng = np.random.default_rng([4, block])
     truth = {"Q": 0.3, "N": 0.01, "K": 400.0}
     x = white(rng, 1000, 3000, N=truth["N"], rate=RATE) + quantization(
@@ -422,7 +422,7 @@ def test_fast_fit_equals_the_reference_implementation(law, share, block):
 
 
 def cells_of(x, **options):
-    """Arguments of `fit_windows` for independent windows, and the tables of `gyrostab.allan.fit`."""
+    """Arguments of `fit_windows` for independent windows, with the tables of the fit."""
     cells, ks, rate, window = fit._fit_inputs(windows_of(x, **options))
     return [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells], fit._cached_tables(
         tuple(ks.tolist()), (0,) * ks.size, rate, window

@@ -15,7 +15,7 @@ from scipy.linalg import solve_banded
 
 from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
-from gyrostab.kernels.thermal import play, slab
+from gyrostab.kernels.thermal import apply_dead_band, slab
 from gyrostab.noise import LAWS
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.simulate import environment as env
@@ -388,13 +388,15 @@ turns = st.lists(st.floats(-50, 100), min_size=2, max_size=8)
 @given(turns, st.floats(0.1, 20.0))
 @settings(max_examples=60, deadline=None)
 def test_dead_band_is_independent_of_speed_and_forgets_overrun_reversals(values, width):
-    coarse, _ = play(np.array(values), width, values[0])
+    coarse, _ = apply_dead_band(np.array(values), width, values[0])
     fine = np.concatenate([np.linspace(a, b, 50) for a, b in itertools.pairwise(values)])
-    slow, _ = play(fine, width, values[0])
+    slow, _ = apply_dead_band(fine, width, values[0])
     np.testing.assert_allclose(slow[49::50], coarse[1:], atol=1e-9)
     assert np.all(np.abs(np.array(values) - coarse) <= width + 1e-9)
     high = max(values) + 2 * width + 1  # a way up beyond all before wipes out their trace
-    assert play(np.array([*values, high]), width, values[0])[1] == pytest.approx(high - width)
+    assert apply_dead_band(np.array([*values, high]), width, values[0])[1] == pytest.approx(
+        high - width
+    )
 
 
 # --------------------------------------------------------------------------------

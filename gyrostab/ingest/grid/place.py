@@ -15,7 +15,7 @@ from gyrostab.ingest.grid.scan_pass import file_of
 from gyrostab.ingest.grid.stretches import Stamps
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
-from gyrostab.kernels.grid.stamps import DUPLICATE, LOOK, OUT_OF_ORDER
+from gyrostab.kernels.grid.stamps import DUPLICATE, LOOK_AHEAD, OUT_OF_ORDER
 from gyrostab.store.lazy_slices import read_slice
 from gyrostab.time.grid import period_ns
 
@@ -151,7 +151,7 @@ def place_without_time(rows: int, start: int) -> Placement:
 def _look_ahead_stretches(
     stamps: Stamps,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], int]]:
-    """Yield stretches of rows and stamps with `LOOK` rows of look-ahead, and the rows to place."""
+    """Yield stretches of rows and stamps with `LOOK_AHEAD` more rows, and the rows to place."""
     rest_rows, rest_stamps = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     for rows, values in stamps():
         rest_rows, rest_stamps = (
@@ -159,9 +159,10 @@ def _look_ahead_stretches(
             np.concatenate([rest_stamps, values]),
         )
         at = 0
-        while len(rest_rows) - at > LOOK:
-            n = min(_STRETCH_ROWS, len(rest_rows) - at - LOOK)
-            yield rest_rows[at : at + n + LOOK], rest_stamps[at : at + n + LOOK], n
+        while len(rest_rows) - at > LOOK_AHEAD:
+            n = min(_STRETCH_ROWS, len(rest_rows) - at - LOOK_AHEAD)
+            end = at + n + LOOK_AHEAD
+            yield rest_rows[at:end], rest_stamps[at:end], n
             at += n
         rest_rows, rest_stamps = rest_rows[at:], rest_stamps[at:]
     if len(rest_rows):

@@ -3,13 +3,13 @@
 Windows start on multiples of the step S and hold ``L = W - 2k + 1`` second differences of the
 angle. Per block of S samples and per averaging factor k two sums are kept: the *head*, the first
 ``L mod S`` terms, and the *tail*, the rest. A window is then a number of whole blocks plus one
-head, for every window and exactly. Nothing is subtracted, so a shock does not stay behind in the
-sums as it does in a recursion (Wang et al., Sensors 16 (2016), Eq. 19).
+head, exactly. Nothing is subtracted, so a shock does not affect later sums, as it does in a
+recursion (Wang et al., Sensors 16 (2016), Eq. 19).
 
 The angle is integrated anew for each unit of work from the rate less a constant: the Allan variance
-is blind to a constant rate, and a short integral keeps its digits on a rotating tool. Where even
-the short integral is too large for double precision (a shock of 10^6 sigma) the angle is kept as a
-sum of two doubles.
+does not depend on a constant rate, and a short integral keeps its precision on a rotating tool.
+Where even the short integral is too large for double precision (a shock of 10^6 sigma) the angle is
+kept as a sum of two doubles.
 
 Missing samples never enter the loops: valid terms are intervals between gaps.
 """
@@ -38,11 +38,10 @@ _STRETCH_POINTS = 65536
 
 
 def group_factors(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """First averaging factor of each group that goes through the angle together, and the end.
+    """Group the averaging factors that share one pass over the angle: first of each, and the end.
 
     The factors of a group have one shift; a group has at most `MAX_LAGS` of them, or
-    `CONSECUTIVE_LAGS` that
-    follow each other.
+    `CONSECUTIVE_LAGS` that follow each other.
     """
     starts = np.flatnonzero(np.diff(shifts)) + 1
     lags = ks >> shifts
@@ -180,18 +179,18 @@ def grouped_blocks(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Sum heads and tails of every block and averaging factor, and count their terms.
 
-    The angle is integrated as the blocks need it, and of what has been integrated only so much is
-    held that it stays in the cache.
+    The angle is integrated as the blocks need it, and only as much of it is held as fits in the
+    cache.
 
     Parameters
     ----------
     x : ndarray (n,)
-        Rates, or nothing where `flat` holds the angle already.
+        Rates, or empty if `flat` already holds the angle.
     offset : float
-        Taken from each rate.
+        Subtracted from each rate.
     flat, capacity, places : float64, int, int64 (n_tau,)
-        Room for so many points of the angle (see `held_points`) and their thinned levels (see
-        `pyramid_places`); where the level of each averaging factor begins.
+        Buffer for `capacity` points of the angle (see `held_points`) and their thinned levels (see
+        `pyramid_places`); start of the level of each averaging factor.
     starts, stops : int64 (n_runs,)
         Runs of present points of the angle, one more each than of present rates.
     step, ks, shifts, groups, head_lengths, whole, n_windows
@@ -284,7 +283,7 @@ def windows_from_blocks(heads, tails, whole, out):  # type: ignore[no-untyped-de
 def full_counts(
     window: int, step: int, n_windows: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Terms of each window without gaps, (n_windows, n_tau)."""
+    """Count the terms of each window without gaps, (n_windows, n_tau)."""
     lengths = window - 2 * ks + 1
     if not shifts.any():
         return np.tile(lengths.astype(np.float64), (n_windows, 1))

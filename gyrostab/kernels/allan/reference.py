@@ -1,14 +1,14 @@
 """The published algorithms: classical DAVAR and recursive fast DAVAR, for comparison and tests.
 
-Both take every window's second differences of the angle ``theta``. With the paper's convention
+Both use the second differences of the angle ``theta`` of every window. With convention "paper",
 theta has one point per sample and a window of W samples has ``W - 2k`` terms; otherwise W rate
 samples have W + 1 angles and ``W - 2k + 1`` terms, as in allantools and in the R package wv.
 
 References
 ----------
 Wang et al., Sensors 16 (2016): Eq. 16-17 (classical), 19-20 (recursion), 21-22 (missing data).
-Their Eq. 5 and 12 divide differences of averages by ``k^2 tau0^2`` once more; Eq. 16-17, in the
-angle, are right.
+Their Eq. 5 and 12 divide differences of averages by ``k^2 tau0^2`` once too often; Eq. 16-17, in
+the angle, are correct.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def reference_theta(
     theta : float64 (n or n + 1,)
         The integral of the rate in sample units; missing rates add nothing.
     present : bool (n or n + 1,)
-        Whether the angle is given (angles), or, in the paper's convention, the sample that ends
-        there (rates).
+        True if the angle is given (angles) or, with convention "paper", the sample that ends there
+        (rates).
     missing : int64 (n or n + 1,)
         Missing rate samples before the angle; zeros for angles.
     """
@@ -94,11 +94,10 @@ def _second_difference(theta, present, missing, m, k):  # type: ignore[no-untype
 
 @njit(**KERNEL)
 def recursive_sums(theta, present, missing, window_points, step, n_windows, ks):  # type: ignore[no-untyped-def]
-    """Fast DAVAR (Eq. 19): sample by sample, the newest squared difference in, the oldest out.
+    """Run the fast DAVAR (Eq. 19), which adds the newest and subtracts the oldest square.
 
-    Parameters are those of `direct_sums`; so is the result. The differences of nearly equal sums
-    lose digits after a shock (1 part in 1 after 10^6 sigma), which is why this is a reference and
-    not the default.
+    Parameters and results are those of `direct_sums`. Differences of nearly equal sums lose all
+    precision after a shock of 10^6 sigma; this method is therefore only a reference.
     """
     sums = np.zeros((n_windows, ks.size))
     counts = np.zeros((n_windows, ks.size), np.int64)

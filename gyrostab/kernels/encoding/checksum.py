@@ -14,7 +14,7 @@ __all__ = ["fletcher32"]
 def fletcher32(data: NDArray[np.uint8]) -> int:
     """Compute Fletcher's 32-bit checksum of big-endian 16-bit words, as in HDF5 and numcodecs.
 
-    An odd last byte is the higher half of a word. Python's lock is let go meanwhile.
+    An odd last byte is the higher half of a word. The GIL is released.
 
     Parameters
     ----------

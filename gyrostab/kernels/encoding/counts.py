@@ -1,4 +1,4 @@
-"""Values that are whole multiples of one factor: to integer counts and back, bit for bit."""
+"""Conversion of multiples of one factor to integer counts and back, bit for bit."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def to_counts(
     dtype : dtype
         Integer type of the counts.
     fill : int
-        Stands for NaN.
+        Count for NaN.
 
     Examples
     --------
@@ -73,6 +73,6 @@ def from_counts(
 
 @njit(**KERNEL)
 def _from_counts(counts, scale, fill, values):  # type: ignore[no-untyped-def]
-    """One pass in place of three."""
+    """Run `from_counts` in one pass instead of three."""
     for i in range(counts.size):
         values[i] = np.nan if counts[i] == fill else counts[i] * scale

@@ -116,7 +116,7 @@ def decimals_of(values: NDArray[np.float64]) -> float:
 
 @njit(**KERNEL)
 def _count_steps(stamps):  # type: ignore[no-untyped-def]
-    """How often the step from one stamp to the next changes."""
+    """Count the changes of the step between stamps."""
     changes = np.int64(0)
     for i in range(2, stamps.size):
         changes += stamps[i] - stamps[i - 1] != stamps[i - 1] - stamps[i - 2]
@@ -155,7 +155,7 @@ def even_steps(stamps: NDArray[np.int64]) -> NDArray[np.int64] | None:
 
 @njit(**KERNEL)
 def unroll_steps(table, begin, stamps):  # type: ignore[no-untyped-def]
-    """The stamps from row `begin` on that `even_steps` made the table of.
+    """Restore stamps from row `begin` on from the table of `even_steps`.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Read rows of plain text into numbers and stamps, in the form that nearly all logs have.
 
-Cells are decimal numbers, dates as ISO 8601 writes them, or void. The first row that holds anything
-else ends the work, and the caller reads that row in another way. Numbers are rounded as `float`
-rounds them, to the last bit; stamps are whole nanoseconds.
+Cells are decimal numbers, ISO 8601 dates, or empty. Reading stops at the first row that holds
+anything else, and the caller reads that row in another way. Numbers are rounded as by `float`, to
+the last bit; stamps are whole nanoseconds.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _LONGEST_NS = np.uint64(2**63 - 1)
 
 
 def _powers_of_five() -> NDArray[np.uint64]:
-    """The leading 128 bits of the powers of five from `_LEAST` to `_MOST`, in two words each."""
+    """Compute the leading 128 bits of the powers of five from `_LEAST` to `_MOST`, in two words."""
     words = []
     for power in range(_LEAST, _MOST + 1):
         if power < 0:
@@ -89,7 +89,7 @@ def _load_byte(typing, text, at):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def _load_eight(typing, text, at):  # type: ignore[no-untyped-def]
-    """Eight bytes from an address on; the first is the lowest."""
+    """Load eight bytes from an address on, little-endian."""
 
     def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return builder.load(
@@ -101,7 +101,7 @@ def _load_eight(typing, text, at):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def _zeros_behind(typing, word):  # type: ignore[no-untyped-def]
-    """How many bits after the last one that is set are not; 64 in nothing."""
+    """Count the trailing zero bits of a word; 64 for zero."""
 
     def count(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return builder.cttz(arguments[0], ir.IntType(1)(0))
@@ -111,7 +111,7 @@ def _zeros_behind(typing, word):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _multiply_words(a, b):  # type: ignore[no-untyped-def]
-    """High and low word of the product of two words."""
+    """Multiply two words: high and low word."""
     half = np.uint64(32)
     a0, a1, b0, b1 = a & _HALF, a >> half, b & _HALF, b >> half
     low = a0 * b0
@@ -161,9 +161,9 @@ def _nearest_double(mantissa, power):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
-    """Go on with a whole number: its value, and where it ends.
+    """Continue reading a whole number: value and end.
 
-    Eight bytes at a time, as a loop over digits ends where the processor does not expect it.
+    Reads eight bytes at a time, because the processor cannot predict the end of a loop over digits.
     """
     while at + 8 <= size:
         bare = _load_eight(text, at) ^ _ZEROS
@@ -189,7 +189,7 @@ def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
-    """Read sign, digits, decimals and end of a number without exponent; the end is -1 if none."""
+    """Read sign, digits, decimals and end; the end is negative without number, or for a long one."""
     negative = _load_byte(text, at) == _MINUS
     at += np.int64(negative) | np.int64(_load_byte(text, at) == _PLUS)
     first = at
@@ -216,7 +216,7 @@ def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _read_number(text, at, size, point):  # type: ignore[no-untyped-def]
-    """Value of a number, and its end; the end is negative where there is none."""
+    """Read a number: value and end; the end is negative without a number."""
     negative, mantissa, decimals, end = _read_decimal(text, at, size, point)
     if end < 0:
         here = at + (_load_byte(text, at) == _MINUS)
@@ -241,7 +241,7 @@ def _read_number(text, at, size, point):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-def]
-    """A number of time as a whole number of ``10**-digits``, half to even, and its end."""
+    """Read a numeric time as a multiple of ``10**-digits``, rounded half to even, and its end."""
     negative, mantissa, decimals, end = _read_decimal(text, at, size, point)
     if end < 0 or (digits == 0 and decimals > 0) or decimals - digits > 18:
         return np.int64(0), np.int64(-1)
@@ -260,7 +260,7 @@ def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-de
 
 @njit(**INNER)
 def _read_pair(text, at):  # type: ignore[no-untyped-def]
-    """A number of two digits, or one above 99."""
+    """Read a number of two digits; above 99 if invalid."""
     tens, ones = (
         np.uint8(_load_byte(text, at) - np.uint8(_ZERO)),
         np.uint8(_load_byte(text, at + 1) - np.uint8(_ZERO)),
@@ -270,7 +270,7 @@ def _read_pair(text, at):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _days_since_1970(year, month, day):  # type: ignore[no-untyped-def]
-    """Days since 1970-01-01 (years begin in March)."""
+    """Count the days since 1970-01-01 (years begin in March)."""
     year -= month <= 2
     age = year - 1600
     of_year = (153 * (month - 3 if month > 2 else month + 9) + 2) // 5 + day - 1
@@ -343,7 +343,7 @@ def _cell_end(text, at, separator, last):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _skip_cell(text, at, separator):  # type: ignore[no-untyped-def]
-    """The end of a cell that is not wanted; negative where quotes or comments make it unsure."""
+    """Find the end of a skipped cell; negative where quotes or comments make it uncertain."""
     while (
         _load_byte(text, at) != _LINE
         and _load_byte(text, at) != separator
@@ -370,7 +370,7 @@ def _is_void(text, at, separator):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _read_cell(text, at, size, role, separator, point, digits):  # type: ignore[no-untyped-def]
-    """Number, stamp and end of a cell; the end is negative where it is not plain."""
+    """Read number, stamp and end of a cell; the end is negative for other content."""
     if role == SKIPPED:
         return 0.0, np.int64(0), _skip_cell(text, at, separator)
     if _is_void(text, at, separator):
@@ -388,7 +388,7 @@ def _read_cell(text, at, size, role, separator, point, digits):  # type: ignore[
 
 @njit(**INNER)
 def _next_row(text, at, size):  # type: ignore[no-untyped-def]
-    """Where the next line begins that is neither blank nor a comment."""
+    """Find the next line that is neither blank nor a comment."""
     while at < size:
         here = _past_blanks(text, at, np.int64(_TAB))
         if _load_byte(text, here) == _HASH or _load_byte(text, here) == _PERCENT:
@@ -403,7 +403,7 @@ def _next_row(text, at, size):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def _read_rows(lines, start, roles, separator, point, digits, values, stamps):  # type: ignore[no-untyped-def]
-    """`read_rows`, into `values` and `stamps`."""
+    """Run `read_rows` into `values` and `stamps`."""
     text, size, width = lines.ctypes.data, len(lines), len(roles)
     row, begin = np.int64(0), _next_row(text, np.int64(start), size)
     while begin < size and row < len(stamps):
@@ -436,32 +436,32 @@ def read_rows(
     digits: int,
     rows: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
-    """Read rows up to the first that is not plain.
+    """Read rows up to the first with other content.
 
     Parameters
     ----------
     text : ndarray of uint8
         Whole lines; the last byte is the end of a line.
     start : int
-        Where to begin, at the beginning of a line.
+        Index of the beginning of the first line to read.
     roles : ndarray of int64
         What each column holds: `SKIPPED`, `NUMBER`, `NUMERIC_TIME`, `ISO`.
     separator, point : int
         Codes of the separator (`BLANKS` for runs of them) and of the decimal point.
     digits : int
-        Numbers of time are rounded to so many decimals and given as whole numbers of the last; with
-        0 they must be whole.
+        Numeric times are rounded to this number of decimals and given as whole numbers of the last;
+        with 0 they must be whole.
     rows : int
-        Room for rows: as many lines as there are.
+        Largest number of rows: the number of lines.
 
     Returns
     -------
     values : ndarray of float64, shape (numbers, n)
-        One line for each column of numbers, NaN where void.
+        One line for each column of numbers, NaN where empty.
     stamps : ndarray of int64, shape (n,)
-        Whole numbers of time, or nanoseconds since 1970 for `ISO`; the least integer where void.
+        Numeric times, or nanoseconds since 1970 for `ISO`; the smallest integer where empty.
     stop : int
-        Where the first row that is not plain begins, or the end.
+        Index of the first row with other content, or the end.
     """
     values = np.empty((int(np.count_nonzero(roles == NUMBER)), rows))
     stamps = np.empty(rows, dtype=np.int64)
@@ -473,7 +473,7 @@ def read_rows(
 
 @njit(**KERNEL)
 def clean_column(values, factor, offset):  # type: ignore[no-untyped-def]
-    """Convert in place, ``values * factor + offset``, what is not finite to NaN.
+    """Convert in place, ``values * factor + offset``, and set infinite values to NaN.
 
     Returns
     -------

@@ -31,7 +31,7 @@ def _chi_square_quantile(freedom, start, step, curve):  # type: ignore[no-untype
 
 @njit(**KERNEL)
 def interpolate_quantile(freedom, start, step, curve):  # type: ignore[no-untyped-def]
-    """Quantile of chi-square over its degrees of freedom.
+    """Interpolate the quantile of chi-square over its degrees of freedom.
 
     Parameters
     ----------
@@ -64,7 +64,10 @@ def _predict_cell(columns, white, quantization, ramp, squares, seen):  # type: i
 
 @njit(**INNER)
 def _cell_quantile(a, whole, own_dof, share, dof, most, start, step, curve):  # type: ignore[no-untyped-def]
-    """Find the quantile of a cell in which term `a` is alone; `whole` where nothing is missing."""
+    """Find the quantile of a cell with term `a` alone; `whole` without gaps.
+
+    For a ramp, the degrees of freedom of the cell are used.
+    """
     if a == 4:
         return _chi_square_quantile(min(own_dof, most, dof), start, step, curve)
     return whole if share == 1.0 else _chi_square_quantile(min(own_dof, most), start, step, curve)
@@ -90,13 +93,13 @@ def cell_limits(  # type: ignore[no-untyped-def]
 ):
     """Find the upper limit of each squared coefficient from one cell, at least its own part.
 
-    The cell is the one where the fitted model promises the lowest limit, so that its own scatter
-    does not choose it.
+    The cell is the one with the lowest limit under the fitted model, so that its scatter does not
+    influence the choice.
 
     Parameters
     ----------
     avar, white, quantization, ramp, factor, dof : float64 (n_windows, n_tau)
-        Cells, what the gaps do to them, and their degrees of freedom under the fitted noise.
+        Cells, their responses to gaps, and their degrees of freedom under the fitted noise.
     squares : float64 (n_windows, 5)
         Fitted squared coefficients; NaN counts as zero.
     columns : float64 (n_tau, 5)
@@ -107,7 +110,7 @@ def cell_limits(  # type: ignore[no-untyped-def]
     ks : float64 (n_tau,)
         Averaging factors, rising.
     span : float64 (5,)
-        A cell may bound a term if the longest averaging factor of its window is at most so many
+        A cell may bound a term if the longest averaging factor of its window is at most this many
         times its own.
     most : float
         Degrees of freedom are not taken above this.

@@ -40,8 +40,7 @@ _PERSIST_ROWS = 16
 def _keep_hypothesis(table, n, level, phase, cost, parent):  # type: ignore[no-untyped-def]
     """Add a hypothesis to the first `n` of a table, each level once; returns the new number.
 
-    The one with the fewest losses stays whatever it costs: while rows are late, all others are
-    cheaper.
+    The one with the fewest losses is kept at any cost: while rows are late, all others are cheaper.
     """
     lowest, worst = np.int64(0), np.int64(-1)
     for h in range(n):
@@ -65,7 +64,7 @@ def _keep_hypothesis(table, n, level, phase, cost, parent):  # type: ignore[no-u
 
 @njit(**INNER)
 def _switch_nats(far):  # type: ignore[no-untyped-def]
-    """Cost of going `far` samples ahead (a loss), or back (rows without a sample)."""
+    """Compute the cost of going `far` samples ahead (a loss), or back (rows without a sample)."""
     if far > 0:
         return _LOSS_NATS + np.log(far)
     return min(-_DROP_NATS * far, _LATE_NATS)
@@ -230,7 +229,7 @@ def find_breaks(stamps, n, latest, reach, longest):  # type: ignore[no-untyped-d
     stamps : ndarray of int64
         Stamps [ns], all readable; some more than `n`.
     n : int
-        Stamps to look at; the rest is what follows.
+        Stamps to check; the others follow them.
     latest : int
         Latest stamp before [ns].
     reach : float

@@ -16,17 +16,17 @@ from gyrostab.kernels.compiled import INNER, KERNEL
 __all__ = [
     "DUPLICATE",
     "FIRST",
-    "LOOK",
+    "LOOK_AHEAD",
     "NO_STAMP",
     "OPEN_RUN",
     "OUT_OF_ORDER",
     "RESTART",
     "STARTED",
     "STEP",
-    "look",
     "new_state",
     "piece_sums",
     "place",
+    "scan_cells",
     "track",
 ]
 
@@ -36,7 +36,7 @@ Integers = NDArray[np.int64]
 NO_STAMP = np.iinfo(np.int64).min
 
 #: Rows that `place` may look ahead; hand it that many more than it is to place.
-LOOK = 64
+LOOK_AHEAD = 64
 _ORDER = 16  # rows within which an out-of-order row is followed by one past the latest stamp
 
 # what happened to a row, numbered as in schema.GAP_CAUSES
@@ -123,7 +123,7 @@ def track(stamps, period, gain, longest):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
-    """Sums of straight lines through the pieces of a stretch, stamp over count.
+    """Sum the straight lines through the pieces of a block, stamp over count.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
     Returns
     -------
     ndarray, shape (pieces, 6)
-        Stamps in the piece, mean count, mean stamp [ns from the first of the stretch], sums of
+        Stamps in the piece, mean count, mean stamp [ns from the first of the block], sums of
         squares of the counts and of counts times stamps about their means, and of the residuals.
     """
     n = len(stamps)
@@ -175,8 +175,8 @@ def piece_sums(stamps, count, piece, period):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def look(cells, present):  # type: ignore[no-untyped-def]
-    """Look at every cell once.
+def scan_cells(cells, present):  # type: ignore[no-untyped-def]
+    """Count missing cells and find the range of values, in one pass.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyp
     """Check whether the next readable stamps after row j agree with unbroken counting."""
     found = 0
     zero = state[_GRID0] - state[_PHASE] * _UNIT
-    for m in range(j + 1, min(len(stamps), j + 1 + LOOK)):
+    for m in range(j + 1, min(len(stamps), j + 1 + LOOK_AHEAD)):
         if stamps[m] == NO_STAMP:
             continue
         position = zero + (stamps[m] - state[_STAMP0]) / period
@@ -236,9 +236,9 @@ def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyp
 
 @njit(**INNER)
 def _stays_behind(stamps, j, n, latest):  # type: ignore[no-untyped-def]
-    """Whether the stamps after row j stay behind the latest one, so that the clock was set back."""
+    """Check whether the stamps after row j stay behind the latest one: the clock was set back."""
     found = 0
-    for m in range(j + 1, min(n, j + 1 + LOOK)):
+    for m in range(j + 1, min(n, j + 1 + LOOK_AHEAD)):
         if stamps[m] == NO_STAMP:
             continue
         if stamps[m] > latest:
@@ -273,7 +273,7 @@ def _occupy_sample(ring, head, sample):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _is_free(ring, state, target):  # type: ignore[no-untyped-def]
-    """Whether a sample before the head, of the same piece and not too long ago, has no row yet."""
+    """Check whether a recent sample before the head, of the same piece, has no row yet."""
     lowest = max(state[_GRID0], state[_HEAD] - len(ring) + 1)
     return lowest <= target <= state[_HEAD] and not ring[target % len(ring)]
 
@@ -370,7 +370,7 @@ def _note_event(events, n, cause, sample, row, before, stamp):  # type: ignore[n
 def _skip_even_rows(rows, stamps, j, n, period, expected, row, stamp0):  # type: ignore[no-untyped-def]
     """Find the first row from j on that does not follow the last one at the `expected` stamp.
 
-    No row waits here for what the ones before did to the phase, which they leave at zero.
+    These rows leave the phase at zero, so that none depends on the one before.
     """
     first = j
     while (
@@ -410,7 +410,7 @@ def _on_time(rows, stamps, j, n, period, hold, state, ring):  # type: ignore[no-
 
 @njit(**KERNEL)
 def _place_rows(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  # type: ignore[no-untyped-def]
-    """`place` into `runs` and `events`; returns how many there are of each."""
+    """Run `place` into `runs` and `events`; returns the number of each."""
     n_runs, n_events = np.int64(0), np.int64(0)
     j = np.int64(-1)
     while True:
@@ -479,20 +479,20 @@ def place(
     state: Integers,
     ring: NDArray[np.bool_],
 ) -> tuple[Integers, Integers]:
-    """Give rows their samples.
+    """Assign rows to samples.
 
     The next row takes the next sample while its stamp is within half a sample of it; otherwise the
-    sample is found anew from the stamp, counted from the start of the piece, so nothing
-    accumulates. Stamps are seen from their own slow course along the grid (the phase), so that
-    jitter on top of a slightly wrong rate does not double or skip samples; only when the course
-    itself is more than `hold` off, one sample is left out, or one row.
+    sample is computed from the stamp, counted from the start of the piece, so errors do not
+    accumulate. Stamps are compared with their slow course along the grid (the phase), so that
+    jitter with a slightly wrong rate does not double or skip samples; only if the course is more
+    than `hold` off, one sample is left out, or one row.
 
     Parameters
     ----------
     rows, stamps : ndarray of int64
-        Row numbers, rising, and stamps [ns] or `NO_STAMP`; up to `LOOK` more than `n`.
+        Row numbers, rising, and stamps [ns] or `NO_STAMP`; up to `LOOK_AHEAD` more than `n`.
     n : int
-        Rows to place; the rest is only looked at.
+        Rows to place; the others are only read ahead.
     period : float
         Sampling period [ns].
     hold : float

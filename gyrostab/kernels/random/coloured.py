@@ -28,11 +28,11 @@ __all__ = [
     "Reading",
     "band",
     "band_psd",
+    "draw_state",
     "folded_psd",
-    "march",
     "oscillator",
     "oscillator_psd",
-    "rest",
+    "read_process",
 ]
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ ORDER = 6
 
 
 class Reading(NamedTuple):
-    """How a process goes on from sample to sample, and what is read of it."""
+    """Transition of a process from sample to sample, and its output."""
 
     step: Array  # (d, d): state at the next sample from the state at this one
     read: Array  # (d,): reading from the state at this sample
@@ -84,7 +84,7 @@ def _chain_sections(sections: Sequence[_Section]) -> tuple[Array, Array, Array]:
 
 
 def _factor_covariance(covariance: Array) -> Array:
-    """A lower triangle whose square is the covariance, which may be singular."""
+    """Factor a covariance, which may be singular, into a lower triangle."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.ascontiguousarray(np.asarray(np.linalg.qr(root.T, mode="r")).T)
@@ -124,7 +124,7 @@ def oscillator(frequency: float, quality: float, rate: float, *, average: bool =
     rate : float
         Sampling rate [Hz].
     average : bool
-        Mean over each sample instead of the value at its beginning.
+        Read the mean over each sample instead of the value at its beginning.
     """
     omega = 2.0 * math.pi * frequency
     a, _, _ = _chain_sections([_Section(omega, omega / quality, True)])
@@ -132,7 +132,7 @@ def oscillator(frequency: float, quality: float, rate: float, *, average: bool =
 
 
 def _band_sections(low: float, high: float) -> list[_Section]:
-    """Butterworth's band with half power at `low` and `high` [Hz]."""
+    """Make a Butterworth band-pass with half power at `low` and `high` [Hz]."""
     width, centre = 2.0 * math.pi * (high - low), 2.0 * math.pi * math.sqrt(low * high)
     angles = math.pi * (2.0 * np.arange(ORDER) + ORDER + 1.0) / (2.0 * ORDER)
     half = np.exp(1j * angles) * width / 2.0
@@ -153,7 +153,7 @@ def band(
     quality: float = 1.0,
     average: bool = False,
 ) -> Reading:
-    """Noise of unit variance in a band, behind an optional mount.
+    """Describe noise of unit variance in a band, with an optional mount.
 
     Parameters
     ----------
@@ -162,10 +162,10 @@ def band(
     rate : float
         Sampling rate [Hz].
     resonance, quality : float
-        Frequency [Hz] and quality of a mass on a spring that the noise goes through; its gain is
-        one at low frequency. None at 0 Hz.
+        Frequency [Hz] and quality of a mass on a spring that filters the noise; its gain is one at
+        low frequency. 0 Hz: no mount.
     average : bool
-        Mean over each sample instead of the value at its beginning.
+        Read the mean over each sample instead of the value at its beginning.
     """
     sections = _band_sections(low, high)
     size = 2 * len(sections)
@@ -178,13 +178,13 @@ def band(
     return _make_reading(a, covariance / power, c, rate, average=average)
 
 
-def rest(reading: Reading, normal: Array) -> Array:
+def draw_state(reading: Reading, normal: Array) -> Array:
     """Draw a state of the stationary process from standard normal numbers, one per state."""
     return np.asarray(reading.spread @ normal)
 
 
 @njit(**KERNEL)
-def march(
+def read_process(
     step: Array, read: Array, kick: Array, normal: Array, position: Array
 ) -> tuple[Array, Array]:
     """Read the process at the samples.
@@ -230,7 +230,7 @@ def march(
 
 
 def oscillator_psd(f: Array, frequency: float, quality: float) -> Array:
-    """Two-sided density [Hz-1] of `oscillator` in continuous time."""
+    """Compute the two-sided density [Hz-1] of `oscillator` in continuous time."""
     width = frequency / quality
     return np.asarray(width * f**2 / (math.pi * ((f**2 - frequency**2) ** 2 + (width * f) ** 2)))
 
@@ -238,7 +238,7 @@ def oscillator_psd(f: Array, frequency: float, quality: float) -> Array:
 def band_psd(
     f: Array, low: float, high: float, *, resonance: float = 0.0, quality: float = 1.0
 ) -> Array:
-    """Two-sided density [Hz-1] of `band` in continuous time."""
+    """Compute the two-sided density [Hz-1] of `band` in continuous time."""
     x = (f**2 - low * high) / ((high - low) * np.maximum(np.abs(f), 1e-9 * low))
     share = math.pi / (2 * ORDER)
     density = 0.5 / ((high - low) * share / math.sin(share)) / (1.0 + x ** (2 * ORDER))

@@ -1,9 +1,9 @@
 """Noise of an ideal gyro: each sample is the mean rate over its interval.
 
 All processes are exact in continuous time: their means over any number of samples have the Allan
-variance of the continuous law, not of a sampled one. All go on where they stopped, bit for bit,
-however the samples are cut into calls, because every sample uses its own fresh numbers, in their
-order. Strength one throughout; the caller gives units.
+variance of the continuous law, not of a sampled one. The results do not depend, bit for bit, on how
+samples are divided into calls, because every sample uses its own random numbers, in order. All
+strengths are one; the caller gives units.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SHORTEST = 1.0 / 12.0
 
 
 def running_sum(steps: Array, carry: float) -> tuple[Array, float]:
-    """Cumulative sum of `steps` after `carry`, and the sum to carry on with.
+    """Compute the cumulative sum of `steps` after `carry`, and the last sum.
 
     Examples
     --------
@@ -48,11 +48,11 @@ def running_sum(steps: Array, carry: float) -> tuple[Array, float]:
 
 
 def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, float]:
-    """Means over the samples of a Brownian motion with the increments `steps`.
+    """Average a Brownian motion with the increments `steps` over the samples.
 
     The mean over an interval with the increment d is the start plus d / 2 plus an independent part
-    of variance 1/12 of the increment's; so the mean over k samples has the Allan variance k / 3,
-    with no correction for sampling.
+    of variance 1/12 of the increment's; so the mean over k samples has the Allan variance k / 3
+    without a correction for sampling.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, flo
 def ornstein_uhlenbeck(
     normal: Array, decay: Array, weight: Array, rest: float, position: Array
 ) -> tuple[Array, Array]:
-    """Sum of the means over every sample of Ornstein-Uhlenbeck processes of unit variance.
+    """Sum the sample means of Ornstein-Uhlenbeck processes of unit variance.
 
     Parameters
     ----------
@@ -90,14 +90,14 @@ def ornstein_uhlenbeck(
     rest : float
         Standard deviation of the sum of the means, given the ends.
     position : ndarray, shape (m,)
-        Where the processes are at the start of the first sample.
+        State of the processes at the start of the first sample.
 
     Returns
     -------
     total : ndarray, shape (n,)
         Sum over the processes of ``weight * (start + end)``, and the rest.
     position : ndarray, shape (m,)
-        Where they are at the end of the last sample.
+        State at the end of the last sample.
     """
     n, m = normal.shape[0], position.size
     total = np.empty(n)
@@ -136,13 +136,13 @@ def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> 
     samples : float
         Correlation time [samples].
     position : float
-        Where the process is at the start; a standard normal number at the very start.
+        State at the start; initially a standard normal number.
 
     Returns
     -------
     means : ndarray, shape (n,)
     position : float
-        Where it is at the end.
+        State at the end.
 
     Examples
     --------
@@ -158,9 +158,9 @@ def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> 
 
 
 def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Array:
-    """Correlation times [s] of the processes that make flicker noise in samples at `rate` [Hz].
+    """Choose the correlation times [s] of the processes of flicker noise at `rate` [Hz].
 
-    They stand in even log spacing, beginning at ``1 / (2 pi low)`` [s], so that another `rate` adds
+    They are evenly spaced in log, beginning at ``1 / (2 pi low)`` [s], so that another `rate` adds
     or takes only the short ones. The sum has the two-sided density B^2 / (2 pi f) from about 3
     times `low` to a third of `high` [Hz].
     """
@@ -173,7 +173,7 @@ def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Array:
 def flicker_means(
     normal: Array, times: Array, rate: float, position: Array, *, endless: bool = True
 ) -> tuple[Array, Array]:
-    """Means over the samples of flicker noise with B = 1.
+    """Make sample means of flicker noise with B = 1.
 
     Parameters
     ----------
@@ -184,10 +184,10 @@ def flicker_means(
     rate : float
         Sampling rate [Hz].
     position : ndarray, shape (m,)
-        Where the processes are at the start; standard normal numbers at the very start.
+        State of the processes; initially standard normal numbers.
     endless : bool
-        The spectrum goes on above what `times` hold; what is faster than a sample is white noise to
-        it.
+        The spectrum continues above that of `times`; processes faster than a sample are added as
+        white noise.
 
     Returns
     -------

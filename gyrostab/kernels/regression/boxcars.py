@@ -1,8 +1,8 @@
 """Matched filters for boxcars in white noise, random walk and relaxing processes, in linear time.
 
-For the covariance C of the series these kernels give ``C^-1 y`` (the disturbance smoother of de
+For the covariance C of the series these kernels compute ``C^-1 y`` (the disturbance smoother of de
 Jong) and ``x' C^-1 x`` for every boxcar x, so that the matched filter of a boxcar is a sum of
-``C^-1 y`` over it. Nothing of the size of C is made.
+``C^-1 y`` over it. No array of the size of C is made.
 
 References
 ----------
@@ -31,11 +31,11 @@ def filter_gains(variance, present, walk, ou_variance, decay, innovation, gain):
     present : bool (n,)
         False where there is no observation.
     walk : float64 (n,)
-        Variance that the random walk gains from here to the next observation.
+        Increase of the variance of the random walk until the next observation.
     ou_variance : float64 (p,)
         Variances of the relaxing processes.
     decay : float64 (n, p)
-        What is left of each from here to the next observation.
+        Decay of each process until the next observation.
     innovation, gain : float64 (n,), (n, p + 1)
         Results; the random walk is the first state, and begins at zero.
     """
@@ -71,12 +71,12 @@ def filter_gains(variance, present, walk, ou_variance, decay, innovation, gain):
 
 @njit(**KERNEL)
 def precision_times(columns, innovation, gain, decay, out):  # type: ignore[no-untyped-def]
-    """Inverse covariance times each column, ``C^-1 y``; zero where there is no observation.
+    """Multiply each column by the inverse covariance, ``C^-1 y``; zero without an observation.
 
     Parameters
     ----------
     columns : float64 (m, n)
-        The series, one a row; what stands at missing observations is not used.
+        The series, one per row; values at missing observations are not used.
     innovation, gain, decay : float64 (n,), (n, p + 1), (n, p)
         As in `filter_gains`.
     out : float64 (m, n)
@@ -113,7 +113,7 @@ def precision_times(columns, innovation, gain, decay, out):  # type: ignore[no-u
 
 @njit(**KERNEL)
 def remaining_information(innovation, gain, decay, out):  # type: ignore[no-untyped-def]
-    """Information that the observations from each on hold about the states predicted there.
+    """Compute the information of all later observations about the states predicted at each.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def remaining_information(innovation, gain, decay, out):  # type: ignore[no-unty
 
 @njit(**KERNEL)
 def boxcar_information(first, stop, innovation, gain, decay, remaining, out):  # type: ignore[no-untyped-def]
-    """``x' C^-1 x`` of the boxcar that is 1 from `first` up to `stop`, for each pair of them.
+    """Compute ``x' C^-1 x`` of the boxcars x that are 1 from `first` up to `stop`.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def boxcar_information(first, stop, innovation, gain, decay, remaining, out):  #
     innovation, gain, decay : float64 (n,), (n, p + 1), (n, p)
         As in `filter_gains`.
     remaining : float64 (n + 1, p + 1, p + 1)
-        Of `remaining_information`.
+        Result of `remaining_information`.
     out : float64 (k,)
         Result.
     """

@@ -51,7 +51,7 @@ class Laws(NamedTuple):
 
 
 class LagFit(NamedTuple):
-    """Slopes by (noise law, series, lag), with what is needed to weigh the laws."""
+    """Slopes by (noise law, series, lag), with the log weights of the laws."""
 
     slope: Array
     stderr: Array
@@ -77,7 +77,7 @@ def block_averages(
     Returns
     -------
     mean : sparse (n_blocks, n)
-        Matrix that averages.
+        Averaging matrix.
     centre : float64 (n_blocks,)
         Mean time of the windows of each block [s].
     white : float64 (n_blocks, n_blocks)
@@ -140,7 +140,7 @@ def noise_laws(centre: Array, white: Array) -> Laws:
 
 
 def decompose(family: list[Array], prior: Array) -> Laws:
-    """Factors of covariances (n, n), each with the logarithm of its weight beforehand."""
+    """Factor covariances (n, n), each with the logarithm of its prior weight."""
     factor, n = np.linalg.cholesky(np.array(family)), family[0].shape[0]
     whiten = np.array(
         [solve_triangular(one, np.eye(n), lower=True, check_finite=False) for one in factor]
@@ -164,7 +164,7 @@ def project_out(laws: Laws, nuisance: Array) -> Laws:
 
 
 def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
-    """Slope of every series on the driver at every lag, under every noise law.
+    """Fit the slope of every series on the driver at every lag, under every noise law.
 
     Parameters
     ----------
@@ -196,13 +196,13 @@ def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
 
 
 def weights(fit: LagFit) -> Array:
-    """Weight of every law, (law, series, lag), one in sum."""
+    """Compute the weights of the laws, (law, series, lag), with a sum of one."""
     raw = np.exp(fit.log_weight - fit.log_weight.max(axis=0))
     return np.asarray(raw / raw.sum(axis=0))
 
 
 def null_weights(fit: LagFit, series: int) -> Array:
-    """Weight of every law if nothing follows the driver."""
+    """Compute the weights of the laws if nothing follows the driver."""
     raw = np.exp(fit.log_without[:, series] - fit.log_without[:, series].max())
     return np.asarray(raw / raw.sum())
 
@@ -234,12 +234,12 @@ def simulate_p_values(
     weight : float64 (n_laws,)
         Weights of the laws in the draws.
     draws, seed : int
-        How many, and of which numbers.
+        Number of draws, and seed.
 
     Returns
     -------
     float64 (draws, n_lags)
-        What `p_values` says of them.
+        P-values, as from `p_values`.
     """
     normal = np.random.default_rng(seed).normal(size=(driver.shape[0], draws))
     law = np.searchsorted(

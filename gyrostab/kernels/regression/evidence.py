@@ -1,4 +1,4 @@
-"""Evidence for designs whose sizes are unknown, by the products of whitened data and designs.
+"""Evidence for designs of unknown size, from products of whitened data and designs.
 
 A design has columns x with unknown factors beta. The prior of beta is a mixture of normal
 distributions of several widths; with eigenvalues of ``x' x`` the marginal likelihood of each width

@@ -19,21 +19,21 @@ _TINY = 1e-290
 
 
 def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
-    """Chances of a block of two levels.
+    """Compute the transition probabilities of a block of two levels.
 
     Parameters
     ----------
     low, high : ndarray, shape (record,)
-        Mean times on the levels [blocks].
+        Mean durations on the levels [blocks].
     parts : int
         Parts of a block.
 
     Returns
     -------
     chance : ndarray, shape (record, 2, 2, parts + 1)
-        From the level before, to that at the end, with so many parts on the upper one.
+        Probability by level before, level at the end, and number of parts on the upper level.
     rises : ndarray, shape (record, 2, 2, parts + 1)
-        Expected steps up, times the chance.
+        Expected number of steps up, times the probability.
 
     Examples
     --------
@@ -67,17 +67,17 @@ def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
 def levels_smooth(
     like: Array, chance: Array, rises: Array, start: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Evidence of block means, and what they say of the share of each block on the upper level.
+    """Compute the evidence of block means, and the expected share of each on the upper level.
 
     Parameters
     ----------
     like : ndarray, shape (record, n, parts + 1)
-        Likelihood of each block mean by the number of parts on the upper level, over anything; 1
-        where it is missing.
+        Likelihood of each block mean by the number of parts on the upper level, up to a factor;
+        1 where it is missing.
     chance, rises : ndarray, shape (record, 2, 2, parts + 1)
         From `level_tables`.
     start : ndarray, shape (record, 2)
-        Chances of the levels before the first block.
+        Probabilities of the levels before the first block.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Least squares with coefficients that cannot be negative.
+"""Non-negative least squares.
 
 The non-negative solution is exact: of five terms there are at most 31 subsets, and all are tried.
 """
@@ -95,8 +95,7 @@ def solve_nonnegative(normal, right, allowed, solution, guess):  # type: ignore[
     solution : float64 (n,)
         Overwritten with the minimiser.
     guess : int
-        Bit set that is tried first; if it holds the minimiser, no other is tried. None where it is
-        0.
+        Bit set that is tried first; if it gives the minimiser, no other is tried. 0: no guess.
     """
     n = right.size
     room, members = np.empty((2 * n + 3, n)), np.empty(n, np.int64)

@@ -1,4 +1,4 @@
-"""Curves through noisy values, as smooth as the values themselves ask for."""
+"""Smooth curves through noisy values, with the smoothness chosen from the data."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _DIFFERENCE = (1.0, -2.0, 1.0)
 def smooth_curve(values: Array, *, longest: float) -> Array:
     """Remove white noise by least squares with a penalty on squared second differences.
 
-    The penalty is the one with the least generalised cross-validation, so that a curve with little
-    noise stays as it is.
+    The penalty minimises the generalised cross-validation, so that a curve with little noise is
+    almost unchanged.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Block means of a random bias in one pass: whitening by a Kalman filter with a free constant.
 
 The bias is a random walk from an unknown start (the free constant), plus Ornstein-Uhlenbeck
-processes, plus white noise. What is observed are means over blocks that follow each other, so the
-moments are those of means, not of points.
+processes, plus white noise. The observations are means over consecutive blocks, so the moments are
+those of means, not of points.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def flicker_states(step: float, span: float) -> tuple[Array, Array, float]:
     Returns
     -------
     variance, time : ndarray, shape (p,)
-        Variances and correlation times [s] of the processes; the times stand in even log spacing.
+        Variances and correlation times [s] of the processes; the times are evenly spaced in log.
     white : float
-        Variance of a block mean by what is faster.
+        Variance of a block mean from faster processes.
 
     Examples
     --------
@@ -56,10 +56,10 @@ def flicker_states(step: float, span: float) -> tuple[Array, Array, float]:
 
 @njit(**INNER)
 def _block_moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared):  # type: ignore[no-untyped-def]
-    """Variance of the mean over a block of `step` seconds when the states at its start are known.
+    """Compute the variance of a block mean over `step` seconds, given the states at its start.
 
-    Fills in how each state goes on, its weight in the mean, the variance of what is new at the end,
-    and the covariance of that with the mean.
+    Also writes the decay of each state, its weight in the mean, the variance of its innovation, and
+    the covariance of the innovation with the mean.
     """
     decay[0], weight[0], drive[0], shared[0] = 1.0, 1.0, K2 * step, K2 * step / 2.0
     rest = K2 * step / 3.0
@@ -107,7 +107,7 @@ def _subtract_gain(covariance, gain, F):  # type: ignore[no-untyped-def]
 
 @njit(fastmath={"contract"}, **INNER)
 def _scale_innovations(row, state, weight, decay, gain, scale, out):  # type: ignore[no-untyped-def]
-    """Scaled innovations of all columns to `out`; the states of all columns to the next block."""
+    """Write the scaled innovations of all columns to `out`, and advance their states by a block."""
     for c in range(row.size):
         out[c] = row[c] - state[0, c]
     for j in range(1, weight.size):
@@ -140,7 +140,7 @@ def whiten(
     Parameters
     ----------
     columns : ndarray, shape (n, m)
-        Data and designs; all finite, whatever they are where not present.
+        Data and designs; all finite, with any value where not present.
     variance : ndarray, shape (n,)
         White variance of every block mean.
     step_seconds : ndarray, shape (n,)
@@ -157,7 +157,7 @@ def whiten(
     whitened : ndarray, shape (n, m)
         Rows not present are zero, and so is the first row present, which the constant takes.
     log_determinant : float
-        ``log det V + log(1' V^-1 1)`` over the blocks present; 0 when there are none.
+        ``log det V + log(1' V^-1 1)`` over the blocks present; 0 without any.
     """
     n, width = columns.shape
     m = ou_variance.size + 1

@@ -25,8 +25,7 @@ def _second_difference(integral: Array) -> Array:
 def sample_covariance(size: int, rate: float) -> Array:
     """Compute the covariance of samples l apart for unit Q, N, B and K, as means over intervals.
 
-    That of B and K is one of differences: it has an unknown constant, which no block statistic
-    sees.
+    That of B and K is defined up to a constant, on which no block statistic depends.
 
     Parameters
     ----------
@@ -57,7 +56,11 @@ def sample_covariance(size: int, rate: float) -> Array:
 
 
 def _plain_spectra(frequency: Array, rate: float) -> Array:
-    """Plain two-sided densities of the four terms, shape (4, frequency)."""
+    """Compute plain two-sided densities of the four terms, shape (4, frequency).
+
+    For unit strength, without averaging over the samples: only the shape that is interpolated. The
+    laws are in `gyrostab.noise`, which kernels do not import.
+    """
     bend = np.sin(math.pi * frequency / rate)
     return np.stack(
         [
@@ -75,11 +78,11 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     Parameters
     ----------
     weights : ndarray, shape (size,)
-        The taper, which comes after the mean of the block is taken off.
+        The taper, applied after the mean of the block is removed.
     rate : float
         Sampling rate [Hz].
     ordinates : int
-        Ordinates 1, 2, ... that are wanted.
+        Number of ordinates, from 1 on.
 
     Returns
     -------

@@ -76,19 +76,19 @@ def band_edges(size: int, bands: int = 16) -> NDArray[np.int64]:
 
 @njit(**KERNEL)
 def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
-    """What the samples of each block tell, in one pass.
+    """Compute statistics of the samples of each block, in one pass.
 
     Parameters
     ----------
     x : ndarray, shape (block, sample)
         Values, NaN where missing.
     centred : ndarray, shape (block, sample)
-        Is filled with the values less their block's mean, 0 where missing.
+        Overwritten with the values minus the mean of their block, 0 where missing.
     moments : ndarray, shape (block, 5)
-        Is filled with mean, second and fourth central moment, smallest and largest value; NaN in an
-        empty block.
+        Overwritten with mean, second and fourth central moment, smallest and largest value; NaN in
+        an empty block.
     counts : ndarray of int64, shape (block, 9)
-        Is filled with the samples present, exact zeros, samples equal to the one before but for
+        Overwritten with the samples present, exact zeros, samples equal to the one before but for
         zeros, samples equal to the smallest and to the largest value of the block, how many of
         these two are equal to the one before and no zeros, and the runs of samples that are equal
         to the one before and no zeros, and of zeros.
@@ -163,7 +163,7 @@ def gap_spectra(
     Parameters
     ----------
     present : ndarray of bool, shape (block, sample)
-        Where there are samples; at least one in each block.
+        True where a sample is present; at least one in each block.
     weights : ndarray, shape (sample,)
         The taper.
 
@@ -184,7 +184,7 @@ def gap_spectra(
 
 @njit(**INNER)
 def _squared_at(squared, b, place, size):  # type: ignore[no-untyped-def]
-    """Value of the Hermitian spectrum of ``(w m)^2`` at any place."""
+    """Look up the Hermitian spectrum of ``(w m)^2`` at any index."""
     place = abs(place)
     if place > size // 2:
         return np.conj(squared[b, size - place])
@@ -193,7 +193,7 @@ def _squared_at(squared, b, place, size):  # type: ignore[no-untyped-def]
 
 @njit(**KERNEL)
 def shape_of_bands(mask, squared, expected, present, edges, size):  # type: ignore[no-untyped-def]
-    """Shape of the gamma distribution of each block's band powers in white noise, (block, band).
+    """Compute the gamma shape of the band powers of each block in white noise, (block, band).
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ def band_covariance(size: int) -> Array:
 
 @njit(**KERNEL)
 def band_powers(one, other, expected, place, edges, rate):  # type: ignore[no-untyped-def]
-    """Mean cross-periodogram of each block and band, as a two-sided density, (block, band) complex.
+    """Average the cross-periodogram of each block and band, as a complex two-sided density.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def band_powers(one, other, expected, place, edges, rate):  # type: ignore[no-un
     expected : ndarray, shape (mask, ordinate)
         Expected powers, from `gap_spectra`, of the masks that occur.
     place : ndarray of int64, shape (block,)
-        Which of the masks each block has.
+        Number of the mask of each block.
     edges : ndarray of int64
         From `band_edges`.
     rate : float

@@ -22,7 +22,7 @@ def place(samples, *, max_gap=1e9, hold=0.75, pieces=None):
     state, ring = kernel.new_state()
     runs, events = [], []
     for a, b in pairwise([0, *(pieces or []), len(rows)]):
-        end = min(len(rows), b + kernel.LOOK)
+        end = min(len(rows), b + kernel.LOOK_AHEAD)
         run, event = kernel.place(
             rows[a:end], stamps[a:end], b - a, PERIOD, hold, max_gap, state, ring
         )
