@@ -189,7 +189,7 @@ def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
-    """Read sign, digits, decimals and end; the end is negative without number, or for a long one."""
+    """Read sign, digits, decimals and end; the end is negative without one, or if long."""
     negative = _load_byte(text, at) == _MINUS
     at += np.int64(negative) | np.int64(_load_byte(text, at) == _PLUS)
     first = at
