@@ -7,7 +7,7 @@
 >>> product = gyrostab.fit_noise(surface)                    # doctest: +SKIP
 >>> gyrostab.to_netcdf(product, "product.nc")                # doctest: +SKIP
 
-Every public name is loaded when it is first used, so that importing the package costs nothing.
+Every public name is loaded on first use, so that importing the package is fast.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from gyrostab.simulate import read_model as read_model
     from gyrostab.simulate import simulate as simulate
 
-# public name -> module that holds it
+# module of each public name
 _HOME = {
     "confidence_interval": "allan.confidence",
     "correlate": "correlate",
@@ -131,7 +131,7 @@ __all__ = [
 
 
 class _Package(ModuleType):
-    """Keeps ``gyrostab.davar`` the function when Python would bind the module of the same name on its import."""
+    """Keep ``gyrostab.davar`` the function when Python imports the module of the same name."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (name in _HOME and isinstance(value, ModuleType)):

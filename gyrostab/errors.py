@@ -1,7 +1,7 @@
-"""Errors that gyrostab raises on purpose.
+"""Exceptions of gyrostab.
 
-Each one also inherits the builtin that a Python user would expect, so ``except ValueError`` keeps
-working. A message says what was read (file, line or time), what is wrong with it and what to do.
+Each one also inherits from the builtin exception that a Python user would expect, so that ``except
+ValueError`` works. A message names the place (file, line or time), what is wrong and what to do.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ __all__ = [
 
 #: Errors of the operating system that concern the process or the path, not the content of a file.
 _SYSTEM_ERRNOS = (
-    errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EINTR, errno.EISDIR, errno.ELOOP, errno.EMFILE, errno.ENAMETOOLONG, errno.ENFILE,
-    errno.ENOENT, errno.ENOMEM, errno.ENOSPC, errno.ENOTDIR, errno.EPERM, errno.ESTALE,
+    errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EINTR, errno.EISDIR, errno.ELOOP, errno.EMFILE,
+    errno.ENAMETOOLONG, errno.ENFILE, errno.ENOENT, errno.ENOMEM, errno.ENOSPC,
+    errno.ENOTDIR, errno.EPERM, errno.ESTALE,
 )  # fmt: skip
 
 
 class GyrostabError(Exception):
-    """Root of the family: bad input or usage, explained in one message."""
+    """Base class: bad input or usage, explained in one message."""
 
 
 class FormatError(GyrostabError, ValueError):
@@ -47,7 +48,7 @@ class DamageError(FormatError):
 
 
 class UnitError(GyrostabError, ValueError):
-    """A unit is unknown, or does not fit the quantity it stands for."""
+    """A unit is unknown, or does not fit its quantity."""
 
 
 class MissingUnitError(UnitError):
@@ -71,20 +72,19 @@ class OutputError(GyrostabError, OSError):
 
 
 class ResumeError(GyrostabError, ValueError):
-    """A run that was begun cannot be continued, or not by this process."""
+    """An unfinished run cannot be continued, or not by this process."""
 
 
 class WorkerError(GyrostabError, RuntimeError):
-    """The processes that were to do the work cannot be reached, cannot see the files, or have died."""
+    """Worker processes cannot be reached, cannot see the files, or have died."""
 
 
 @contextmanager
 def reading_of(path: str | PathLike[str]) -> Iterator[None]:
-    """Turn whatever a library raises while it reads a file into a `DamageError` that names the file.
+    """Convert exceptions of a library that reads a file to a `DamageError` that names the file.
 
-    Format libraries raise exceptions of any type on damaged bytes. Each entry to a file (opening
-    it, and every later read of data that stayed on disk) runs within this context, so that no
-    caller has to know those types.
+    Format libraries raise exceptions of any type on damaged bytes. Opening a file and every later
+    read of lazy data run in this context, so that callers need not know those types.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def reading_of(path: str | PathLike[str]) -> Iterator[None]:
     >>> with reading_of("/data/log.nc"):
     ...     raise RuntimeError("NetCDF: HDF error")
     Traceback (most recent call last):
-    gyrostab.errors.DamageError: log.nc: is damaged, or not of its format (RuntimeError: NetCDF: HDF error); copy it again
+    gyrostab.errors.DamageError: log.nc: is damaged, or not of its format (RuntimeError: ...
     """
     try:
         yield
@@ -120,7 +120,8 @@ def _describe_damage(path: str | PathLike[str], error: Exception) -> DamageError
     name, text = Path(path).name, " ".join(str(error).split())
     if isinstance(error, MemoryError):
         return DamageError(
-            f"{name}: reading it takes more memory than there is{f' ({text})' if text else ''}; is it damaged?"
+            f"{name}: reading it takes more memory than there is{f' ({text})' if text else ''}; "
+            "is it damaged?"
         )
     reason = f"{type(error).__name__}: {text}" if text else type(error).__name__
     return DamageError(f"{name}: is damaged, or not of its format ({reason:.300}); copy it again")

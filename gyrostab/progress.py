@@ -1,4 +1,4 @@
-"""What a long command shows while it works: a bar on a terminal, one plain line elsewhere; always on stderr."""
+"""Progress of long commands on stderr: a bar on a terminal, one plain line elsewhere."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ __all__ = ["Stage", "no_stage", "show_progress"]
 
 
 class Stage(Protocol):
-    """What a long function tells of its progress."""
+    """Callback for the progress of a long function."""
 
     def __call__(
         self, label: str, total: int = 0, done: int | None = None, unit: str = "samples"
     ) -> None:
-        """Begin a stage (another label than before), or say how much of it is done.
+        """Begin a stage (a new label), or report how much of it is done.
 
         Parameters
         ----------
         label : str
             Name of the stage.
         total : int
-            What is to be done in it: samples over all axes, files ...; 0 when nobody knows.
+            Amount of work: samples over all axes, files, ...; 0 when unknown.
         done : int, optional
-            What is done of it. A stage that does not say so moves with the tasks that dask
-            finishes.
+            Amount that is done. Without it, the stage follows the finished tasks of dask.
         unit : str
-            What is counted.
+            Unit of the amounts.
         """
 
 
@@ -49,8 +48,7 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
     Yields
     ------
     Stage
-        To be called with a label and the number of samples that the stage works through (0 when it
-        has none).
+        Function to call with a label and the number of samples of the stage (0 without any).
 
     Examples
     --------
@@ -68,13 +66,13 @@ def show_progress(*, quiet: bool = False) -> Iterator[Stage]:
 
 
 def _format_speed(amount: float, seconds: float, unit: str) -> str:
-    """Throughput of samples; other things are too few to have one."""
+    """Format the throughput of samples; empty for other units."""
     return f"{amount / seconds / 1e6:.2f} Msamples/s" if unit == "samples" and seconds > 0 else ""
 
 
 @contextmanager
 def _show_line() -> Iterator[Stage]:
-    """One line when the work is done."""
+    """Show one line at the end."""
     begun = since = time.perf_counter()
     current, first, amount, worked = "", 0, 0, ""
 
@@ -84,10 +82,11 @@ def _show_line() -> Iterator[Stage]:
         if label != current:
             if amount:
                 seconds = max(now - since, 1e-9)
-                worked = f" ({current}: {amount:,} samples in {seconds:.1f} s, {_format_speed(amount, seconds, 'samples')})"
+                speed = _format_speed(amount, seconds, "samples")
+                worked = f" ({current}: {amount:,} samples in {seconds:.1f} s, {speed})"
             since, current, first, amount = now, label, done or 0, 0
         if unit == "samples":
-            amount = total - first  # what an earlier run has done counts for nothing here
+            amount = total - first  # without what an earlier run has done
 
     yield stage
     stage("", 0)
@@ -96,7 +95,7 @@ def _show_line() -> Iterator[Stage]:
 
 @contextmanager
 def _show_bar() -> Iterator[Stage]:
-    """One bar per stage, with throughput and the time left."""
+    """Show one bar per stage, with throughput and the time left."""
     from dask.callbacks import Callback
     from rich.console import Console
     from rich.progress import (
@@ -130,8 +129,8 @@ def _show_bar() -> Iterator[Stage]:
                 progress.update(now["task"], total=1.0, completed=1.0)
 
         def show(share: float, amount: float, unit: str) -> None:
-            said = _format_speed(amount, time.perf_counter() - now["begun"], unit)
-            progress.update(now["task"], total=1.0, completed=share, speed=said)
+            speed = _format_speed(amount, time.perf_counter() - now["begun"], unit)
+            progress.update(now["task"], total=1.0, completed=share, speed=speed)
 
         def stage(
             label: str, total: int = 0, done: int | None = None, unit: str = "samples"

@@ -96,15 +96,18 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "units": "1",
     },
     "white_response": {
-        "long_name": "Allan variance of angle random walk seen through the gaps, as a share of the gap-free law",
+        "long_name": "Allan variance of angle random walk seen through the gaps, "
+        "as a share of the gap-free law",
         "units": "1",
     },
     "quantization_response": {
-        "long_name": "Allan variance of quantization noise seen through the gaps, as a share of the gap-free law",
+        "long_name": "Allan variance of quantization noise seen through the gaps, "
+        "as a share of the gap-free law",
         "units": "1",
     },
     "ramp_response": {
-        "long_name": "Allan variance of a rate ramp seen through the gaps, as a share of the gap-free law",
+        "long_name": "Allan variance of a rate ramp seen through the gaps, "
+        "as a share of the gap-free law",
         "units": "1",
     },
     "window_mean": {"long_name": "mean rotation rate of the window", "units": INNER["rate"]},
@@ -134,7 +137,10 @@ def _add_coefficients() -> None:
         note = ""
         if law.tau_ref_hours is not None:
             extra["tau_ref"] = f"{law.tau_ref_hours:g} h"
-            note = f", stored as the Allan deviation of its term at tau = {law.tau_ref_hours:g} h (numerically {symbol} in {law.label})"
+            note = (
+                f", stored as the Allan deviation of its term at tau = {law.tau_ref_hours:g} h "
+                f"(numerically {symbol} in {law.label})"
+            )
         base = {"units": law.units, **extra}
         VARIABLES[symbol] = {"long_name": f"{law.name} coefficient{note}", **base}
         VARIABLES[f"{symbol}_stderr"] = {
@@ -172,13 +178,16 @@ def signal_name(log: xr.Dataset) -> str:
     if len(found) != 1:
         holds = ", ".join(found or sorted(map(str, log.data_vars))) or "nothing"
         raise SchemaError(
-            f"a log holds either 'rate' or 'angle'; this dataset holds {holds}; make one with gyrostab.make_log"
+            f"a log holds either 'rate' or 'angle'; this dataset holds {holds}; "
+            "make one with gyrostab.make_log"
         )
     return found[0]
 
 
 def texts(dataset: xr.Dataset, name: str) -> list[str]:
-    """The texts of an attribute such as ``notes`` or ``source_files``; a single one may stand there without a list.
+    """Return the texts of an attribute such as ``notes`` or ``source_files`` as a list.
+
+    A single text may be stored without a list.
 
     Examples
     --------
@@ -190,7 +199,7 @@ def texts(dataset: xr.Dataset, name: str) -> list[str]:
 
 
 def log_channels(log: xr.Dataset) -> list[str]:
-    """Names of the channels of a log: one-dimensional variables on ``time`` or on their own ``time_<channel>``."""
+    """List the channels of a log: one-dimensional variables on ``time`` or ``time_<channel>``."""
     return [
         str(name)
         for name in log.data_vars
@@ -201,16 +210,19 @@ def log_channels(log: xr.Dataset) -> list[str]:
 def _require_variables(dataset: xr.Dataset, what: str, dims: dict[str, tuple[str, ...]]) -> None:
     if not isinstance(dataset, xr.Dataset):
         raise SchemaError(
-            f"this is a {type(dataset).__name__}, not a {what}: give the whole xarray.Dataset; {_MAKERS[what]} makes one"
+            f"this is a {type(dataset).__name__}, not a {what}: give the whole xarray.Dataset; "
+            f"{_MAKERS[what]} makes one"
         )
     for name, expected in dims.items():
         if name not in dataset.variables:
             raise SchemaError(
-                f"this is not a {what}: it has no variable {name!r}; it has {sorted(map(str, dataset.variables))}"
+                f"this is not a {what}: it has no variable {name!r}; "
+                f"it has {sorted(map(str, dataset.variables))}"
             )
         if (has := dataset.variables[name].dims) != expected:
             raise SchemaError(
-                f"{what}: variable {name!r} has dimensions {has}, expected {expected}; transpose or rename them"
+                f"{what}: variable {name!r} has dimensions {has}, expected {expected}; "
+                "transpose or rename them"
             )
 
 
@@ -231,7 +243,7 @@ def check_raw(raw: xr.Dataset) -> None:
 
 
 def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
-    """Raise `SchemaError` unless `log` has what a regular log has: ``time``, a signal ``(axis, time)`` with units, a rate.
+    """Raise `SchemaError` unless `log` is a regular log: uniform time, a signal with units, a rate.
 
     Whether ``time`` is uniform, and the rate true, is checked by
     `gyrostab.ingest.uniform.as_uniform`, which every function that takes a log calls. With
@@ -249,7 +261,8 @@ def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
     declared = log.attrs.get("sampling_rate_hz")
     if rate and (declared is None or not np.isfinite(declared) or declared <= 0):
         raise SchemaError(
-            f"the log needs the attribute 'sampling_rate_hz' in Hz, a number above 0; it has {declared!r}"
+            "the log needs the attribute 'sampling_rate_hz' in Hz, a number above 0; "
+            f"it has {declared!r}"
         )
 
 
@@ -257,7 +270,8 @@ def _check_units(dataset: xr.Dataset, name: str) -> None:
     units = dataset.variables[name].attrs.get("units")
     if units != SIGNAL_UNITS[name]:
         raise SchemaError(
-            f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; convert it and say so"
+            f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; "
+            "convert it and say so"
         )
 
 
@@ -275,7 +289,8 @@ def check_surface(surface: xr.Dataset) -> None:
     units, expected = surface.variables["avar"].attrs.get("units"), VARIABLES["avar"]["units"]
     if units != expected:
         raise SchemaError(
-            f"variable 'avar' has units {units!r}, expected {expected!r}; give the surface as gyrostab.davar made it"
+            f"variable 'avar' has units {units!r}, expected {expected!r}; "
+            "give the surface as gyrostab.davar made it"
         )
     _check_tau(surface)
 
@@ -293,8 +308,9 @@ def _check_tau(surface: xr.Dataset) -> None:
         or np.any(np.diff(whole) <= 0)
     ):
         raise SchemaError(
-            f"the averaging times of the surface are not rising whole numbers of samples at {float(rate):g} Hz (sampling_rate_hz): they "
-            "have been averaged, interpolated or sorted, or stem from another log; choose them with taus=... in gyrostab.davar"
+            "the averaging times of the surface are not rising whole numbers of samples at "
+            f"{float(rate):g} Hz (sampling_rate_hz): they have been averaged, interpolated or "
+            "sorted, or stem from another log; choose them with taus=... in gyrostab.davar"
         )
     samples, seconds = surface.attrs.get("window_samples"), surface.attrs.get("window_s")
     if (
@@ -303,7 +319,8 @@ def _check_tau(surface: xr.Dataset) -> None:
         and abs(samples / rate - seconds) > _TAU_TOLERANCE * seconds
     ):
         raise SchemaError(
-            f"the surface has windows of {samples} samples and of {seconds:g} s, which do not agree at {float(rate):g} Hz: its attributes "
+            f"the surface has windows of {samples} samples and of {seconds:g} s, "
+            f"which do not agree at {float(rate):g} Hz: its attributes "
             "have been changed; compute it anew with gyrostab.davar"
         )
 

@@ -48,7 +48,7 @@ _SPELLINGS: dict[str, tuple[str, float, float]] = {}
 # their case only
 _PLAIN: dict[tuple[str, str], tuple[str, float, float] | None] = {}
 
-# Words of unit strings -> the one form that `_remove_accents` gives them.
+# Words of unit strings -> the one form that `_fold_spelling` gives them.
 _WORDS = {
     word: short
     for short, words in {
@@ -69,7 +69,7 @@ _WORDS = {
 
 
 def _normalize(text: str) -> str:
-    """One spelling for ``rad s^-1``, ``rad*s**-1``, ``rad s⁻¹`` and ``rad s-1``; letters keep their case."""
+    """Unify ``rad s^-1``, ``rad*s**-1``, ``rad s⁻¹`` and ``rad s-1``; letters keep their case."""
     text = re.sub(
         "[º˚]", "°", text.strip()
     )  # ordinal sign and ring, often typed for the degree sign
@@ -78,8 +78,8 @@ def _normalize(text: str) -> str:
     return re.sub(r"\s+", " ", text)
 
 
-def _remove_accents(text: str) -> str:
-    """The form in which spellings are compared where case, blanks and words such as `seconds` make no difference."""
+def _fold_spelling(text: str) -> str:
+    """Remove the differences of case, blanks and words such as `seconds` from a spelling."""
     text = _normalize(text).casefold().replace("°", "deg ").replace(" per ", "/").replace("^", "")
     text = re.sub(r"[a-zμ]+", lambda word: _WORDS.get(word[0], word[0]), text.replace("_", " "))
     text = re.sub(r"\s*/\s*", "/", text)
@@ -93,7 +93,7 @@ def _add_unit(quantity: str, factor: float, *spellings: str, offset: float = 0.0
     known = (quantity, factor, offset)
     for spelling in spellings:
         _SPELLINGS[_normalize(spelling)] = known
-        key = quantity, _remove_accents(spelling)
+        key = quantity, _fold_spelling(spelling)
         _PLAIN[key] = known if _PLAIN.get(key, known) == known else None
 
 
@@ -232,7 +232,8 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
         scale = float(match.group(1))
         if scale == 0.0 or not math.isfinite(scale):
             raise UnitError(
-                f"unit {text!r}: the factor {match.group(1)} is not usable; give a finite number other than 0"
+                f"unit {text!r}: the factor {match.group(1)} is not usable; "
+                "give a finite number other than 0"
             )
         return Unit(text, kind, factor * scale, offset)
     raise UnitError(
@@ -265,7 +266,7 @@ def _parse_base(name: str) -> tuple[str, float, float] | None:
 
 
 def _parse_product(text: str) -> tuple[str, float, float] | None:
-    """Read a product of powers as UDUNITS writes them (``rad.s-1``, ``degree per second``): quantity, factor and offset."""
+    """Parse a product of powers as UDUNITS writes it (``rad.s-1``, ``degree per second``)."""
     text = re.sub(r"\s*[.⋅×]\s*(?=[^\s\d])", " ", _normalize(text).replace("^", ""))
     text = re.sub(r"_?\bper\b_?|_per_", "/", text, flags=re.IGNORECASE)
     powers = {"angle": 0, "time": 0, "length": 0}
@@ -288,11 +289,11 @@ def _parse_product(text: str) -> tuple[str, float, float] | None:
 
 
 def _find_unit(text: str, quantity: str | None) -> tuple[str, float, float] | None:
-    """Return quantity, factor and offset of a spelling: as it is written, then with its case and blanks ignored."""
+    """Find quantity, factor and offset of a spelling, as written or without case and blanks."""
     exact = _SPELLINGS.get(_normalize(text)) or _parse_product(text)
     if exact is not None and quantity in (None, exact[0]):
         return exact
-    plain = _remove_accents(text)
+    plain = _fold_spelling(text)
     if quantity is not None and (found := _PLAIN.get((quantity, plain))):
         return found
     if exact is not None or len(plain) < 2:  # a single letter means what its case says

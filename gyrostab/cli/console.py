@@ -29,7 +29,7 @@ __all__ = [
 
 
 def read_config(tokens: Sequence[str], commands: Collection[str]) -> Any:
-    """Make the cyclopts reader of option defaults from the file of ``--config``; None without it."""
+    """Make the cyclopts reader of option defaults for the file of ``--config``, or None."""
     name = None
     for place, token in enumerate(tokens):
         if token == "--config" and place + 1 < len(tokens):
@@ -86,7 +86,7 @@ def show_plain_warnings() -> Iterator[None]:
 
 @contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Treat ``kill``, a time limit or a closed terminal like Ctrl-C, so that nothing is left behind.
+    """Treat ``kill``, a time limit or a closed terminal like Ctrl-C, to leave nothing behind.
 
     Windows has no SIGHUP, and its SIGTERM cannot be caught when another process sends it.
     """

@@ -20,9 +20,9 @@ Output = Annotated[Path, Parameter(name=["--output", "-o"], metavar="FILE")]
 
 app = App(
     name="gyrostab",
-    help="Dynamic Allan variance of gyro logs: noise coefficients over time, and a diagnosis of the "
-    "physical effects that a simulation leaves out.",
-    help_epilogue="Try it: gyrostab demo -o demo-output. Options of a command: gyrostab run --help.",
+    help="Dynamic Allan variance of gyro logs: noise coefficients over time, and a diagnosis of "
+    "the physical effects that a simulation leaves out.",
+    help_epilogue="Try it: gyrostab demo -o demo-output. Help on a command: gyrostab run --help.",
     version_flags=["--version"],
     help_format="markdown",
     suppress_keyboard_interrupt=False,
@@ -49,7 +49,8 @@ def find_inputs(arguments: Mapping[str, Any]) -> list[Path]:
 
     Examples
     --------
-    >>> find_inputs({"logs": [Path("run7.csv")], "output": Path("run7.nc"), "map": ["wx=gyro_x", "names.toml"]})
+    >>> output = Path("run7.nc")
+    >>> find_inputs({"logs": [Path("run7.csv")], "output": output, "map": ["names.toml"]})
     [PosixPath('run7.csv'), PosixPath('names.toml')]
     """
     found: list[Path] = []

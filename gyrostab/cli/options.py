@@ -130,7 +130,8 @@ class ChannelFile:
         """Return the keyword arguments of `gyrostab.read_channel` except file and name."""
         if self.channel is None and (self.epoch or self.map or self.unit):
             raise OptionError(
-                "--epoch, --map and --unit say how to read the file of --channel; name that file too"
+                "--epoch, --map and --unit say how to read the file of --channel; "
+                "name that file too"
             )
         return {
             "epoch": self.epoch,
@@ -269,7 +270,8 @@ def _parse_pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
             found.update({key: str(value) for key, value in read_toml(Path(item)).items()})
         else:
             raise OptionError(
-                f"{option} {item!r}: write NAME=VALUE, for instance {option} {_PAIR_EXAMPLES[option]}"
+                f"{option} {item!r}: write NAME=VALUE, "
+                f"for instance {option} {_PAIR_EXAMPLES[option]}"
             )
     return found
 

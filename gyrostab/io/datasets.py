@@ -1,4 +1,4 @@
-"""Logs, surfaces and products as CF NetCDF or Zarr, and back as they were in memory.
+"""Write logs, surfaces and products to CF NetCDF or Zarr, and open them again.
 
 On disk the dimensions are ``(axis, tau, time)``, every time is an exact integer, every unit string
 is one that UDUNITS reads rightly, only data carries a fill value, and lists stand in the attributes
@@ -63,14 +63,14 @@ def to_netcdf(
         In memory ``(axis, time, tau)``, units as in `gyrostab.units.INNER`. A log is written with
         the sampling rate of its ``time``, and with NaN where samples have been dropped.
     path : path-like
-        The file to make. It takes this name only once it is complete.
+        The file to write. It takes this name only once it is complete.
     overwrite : bool
         Replace an existing file, unless the dataset is lazy and still reads from it.
     compression : {"zstd", "zlib"}, optional
         zlib is read by every NetCDF program and is the default; zstd is two to four times as fast,
         and Octave, MATLAB and h5netcdf do not read it.
     progress : callable, optional
-        Told the share of the long variables that is written.
+        Called with the share of the long variables that is written.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def to_netcdf(
     Raises
     ------
     OptionError
-        When there is no such compression, or when the dataset reads from the file.
+        When the compression is unknown, or when the dataset reads from the file.
     OutputError
         When the file exists, or cannot be written; nothing half-written is left behind.
     TimeError
@@ -120,7 +120,7 @@ def to_netcdf(
 
 
 def _compute_time_axes(dataset: Any) -> xr.Dataset:
-    """A log on its uniform time, with a true sampling rate and table of gaps; any other dataset as it is."""
+    """Compute the time axis, sampling rate and table of gaps of a log; return others unchanged."""
     if not isinstance(dataset, xr.Dataset):
         return as_log(dataset)
     for name, units in SIGNAL_UNITS.items():
@@ -136,7 +136,7 @@ def _compute_time_axes(dataset: Any) -> xr.Dataset:
 
 
 def _begin_netcdf(rest: xr.Dataset, path: Path, encoding: dict[Any, dict[str, Any]]) -> None:
-    """Write what is not long. `Dataset.to_netcdf` would do, but loads dask.distributed to see whether that is at work."""
+    """Write all but the long variables; `Dataset.to_netcdf` would load dask.distributed."""
     if any(
         variable.chunks is not None and variable.size >= CHUNK_VALUES
         for variable in rest.variables.values()
@@ -172,7 +172,7 @@ def _netcdf_encoding(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, d
 
 
 def _make_filters(compression: str | None) -> dict[str, Any]:
-    """Compression of a NetCDF file, with checksums where the compression has none of its own."""
+    """Choose the filters of a NetCDF file; a checksum if the compression has none."""
     import netCDF4
 
     if compression not in (None, "zstd", "zlib"):
@@ -182,7 +182,8 @@ def _make_filters(compression: str | None) -> dict[str, Any]:
             if probe.has_zstd_filter():
                 return {"compression": "zstd", "complevel": 3, "fletcher32": True}
         warnings.warn(
-            f"netCDF library {netCDF4.__netcdf4libversion__} has no zstd here: the log is compressed with zlib",
+            f"netCDF library {netCDF4.__netcdf4libversion__} has no zstd here: "
+            "the log is compressed with zlib",
             stacklevel=3,
         )
     return {"zlib": True, "complevel": 4, "shuffle": True}
@@ -195,19 +196,21 @@ def to_zarr(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Write a product, a DAVAR surface or a log as a Zarr store (a directory, format 2), by the same rules as `to_netcdf`.
+    """Write a product, a DAVAR surface or a log as a Zarr store (a directory, format 2).
+
+    The rules are those of `to_netcdf`.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         In memory ``(axis, time, tau)``.
     path : path-like
-        The directory to make.
+        The directory to write.
     overwrite : bool
         Replace an existing store, unless other files are in it, or the dataset is lazy and still
         reads from it.
     progress : callable, optional
-        Told the share of the long variables that is written.
+        Called with the share of the long variables that is written.
 
     Returns
     -------
@@ -217,14 +220,15 @@ def to_zarr(
     Raises
     ------
     OutputError
-        When it exists, holds what belongs to no Zarr store, or cannot be written.
+        When it exists, holds foreign files, or cannot be written.
     OptionError
         When the dataset reads from it.
 
     Examples
     --------
     >>> import tempfile
-    >>> cube = xr.Dataset({"avar": (("axis", "time", "tau"), np.ones((1, 2, 3)))}, coords={"axis": ["x"]})
+    >>> avar = ("axis", "time", "tau"), np.ones((1, 2, 3))
+    >>> cube = xr.Dataset({"avar": avar}, coords={"axis": ["x"]})
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     xr.open_zarr(to_zarr(cube, folder + "/cube.zarr")).avar.dims
     ('axis', 'tau', 'time')
@@ -265,7 +269,7 @@ def to_zarr(
 
 
 def _zarr_encoding(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
-    """Chunks and compression; every chunk of a log carries a checksum, as blosc has none."""
+    """Choose chunks and compression; add a checksum to every chunk of a log, as blosc has none."""
     from numcodecs import Blosc, Fletcher32
 
     encoding: dict[Any, dict[str, Any]] = {}
@@ -284,7 +288,7 @@ def _zarr_encoding(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
 
 
 def _write_counts(stored: xr.Dataset, write: Callable[[xr.Dataset], None]) -> None:
-    """Write with integer counts where they are declared, in a wider type or as doubles where they turn out not to fit."""
+    """Write declared integer counts, in a wider type or as doubles if they do not fit."""
     while True:
         try:
             return write(
@@ -299,14 +303,15 @@ def _write_counts(stored: xr.Dataset, write: Callable[[xr.Dataset], None]) -> No
                 stored[name].encoding = {**declared, "dtype": np.dtype("i4")}
                 continue
             warnings.warn(
-                f"{name}: not every value is a whole multiple of {declared['scale_factor']:g}; stored as doubles",
+                f"{name}: not every value is a whole multiple of {declared['scale_factor']:g}; "
+                "stored as doubles",
                 stacklevel=3,
             )
             stored[name].encoding = {}
 
 
 def _find_rate(stored: xr.Dataset) -> float | None:
-    """Sampling rate of a log [Hz]; None for anything else."""
+    """Find the sampling rate [Hz] of a log; None for other datasets."""
     return (
         float(stored.attrs["sampling_rate_hz"])
         if stored.attrs["gyrostab_content"] == "log"
@@ -315,13 +320,13 @@ def _find_rate(stored: xr.Dataset) -> float | None:
 
 
 def _is_data(dataset: xr.Dataset, name: Any) -> bool:
-    """Whether a variable is data, as opposed to a coordinate or the bounds of one."""
+    """Whether a variable is data, not a coordinate or its bounds."""
     bounds = {variable.attrs.get("bounds") for variable in dataset.variables.values()}
     return name not in dataset.coords and name not in bounds
 
 
 def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
-    """One axis (and one term) a chunk, every tau, and as much time as fits; of a log 20 minutes."""
+    """Plan chunks of one axis (and one term), all tau, and much time; 20 minutes for a log."""
     inner = int(
         np.prod(
             [
@@ -342,7 +347,7 @@ def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
 
 
 def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Dataset:
-    """Open what `to_netcdf` or `to_zarr` wrote, as it was in memory; data stays on disk (dask) until it is used.
+    """Open a dataset that `to_netcdf` or `to_zarr` wrote; data stays on disk (dask) until used.
 
     A dataset that xarray wrote by its own `to_netcdf` or `to_zarr` is opened too.
 
@@ -363,7 +368,7 @@ def open_dataset(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
     Raises
     ------
     FormatError
-        When there is no such file, or when it is damaged.
+        When the file does not exist, or when it is damaged.
 
     Examples
     --------
@@ -394,7 +399,7 @@ def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
     Raises
     ------
     FormatError
-        When there is no such file, when it is damaged, or when it holds something else.
+        When the file does not exist, when it is damaged, or when it holds something else.
 
     Examples
     --------
@@ -432,7 +437,7 @@ def open_surface(path: str | os.PathLike[str]) -> xr.Dataset:
     Raises
     ------
     FormatError
-        When there is no such file, when it is damaged, or when it holds something else.
+        When the file does not exist, when it is damaged, or when it holds something else.
     """
     return _open_path(path, "a DAVAR surface", check_surface, "make one with 'gyrostab davar'")
 
@@ -459,14 +464,15 @@ def open_log(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Datase
     Raises
     ------
     FormatError
-        When there is no such file, when it is damaged, or when it holds something else.
+        When the file does not exist, when it is damaged, or when it holds something else.
 
     Examples
     --------
     >>> import tempfile
     >>> from gyrostab.ingest.make_log import make_log
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = to_netcdf(make_log([[1.0, np.nan, 2.0]], rate=100.0, unit="deg/h"), folder + "/log.nc")
+    ...     log = make_log([[1.0, np.nan, 2.0]], rate=100.0, unit="deg/h")
+    ...     _ = to_netcdf(log, folder + "/log.nc")
     ...     with open_log(folder + "/log.nc") as log:
     ...         print(log.rate.values)
     [[ 1. nan  2.]]

@@ -1,4 +1,4 @@
-"""The noise of a gyro as Kalibr and the ROS tools state it: continuous-time densities in radians, in a YAML file.
+"""Export gyro noise for Kalibr and ROS: continuous-time densities in radians, in a YAML file.
 
 ==========================  ================  =========  =======================================
 key                         unit              from       factor
@@ -9,7 +9,7 @@ gyroscope_bias_instability  rad/s             B          pi / 180 / 3600, B in d
 update_rate                 Hz                           sampling rate of the log
 ==========================  ================  =========  =======================================
 
-Kalibr itself knows no bias instability and passes its key over. The floor of the Allan deviation
+Kalibr itself does not use bias instability and ignores its key. The floor of the Allan deviation
 lies at 0.664 of it.
 
 References
@@ -55,9 +55,9 @@ class KalibrValue:
         Median over the windows that observe the term, or of their upper limits where more windows
         only bound it [unit of the key in `KEYS`]; NaN when there is neither.
     meaning : str
-        What the value is.
+        Meaning of the value.
     share : float
-        Share of the windows that it is the median of [1].
+        Share of the windows that enter the median [1].
     """
 
     value: float
@@ -82,7 +82,7 @@ def kalibr_noise(product: xr.Dataset) -> dict[str, dict[str, KalibrValue]]:
     Raises
     ------
     SchemaError
-        When it is no product.
+        When `product` is not a product.
     """
     keys = {symbol: (key, factor) for key, (symbol, factor, _) in KEYS.items()}
     found: dict[str, dict[str, KalibrValue]] = {}
@@ -103,7 +103,9 @@ def _convert_term(term: TermSummary, factor: float) -> KalibrValue:
 def to_kalibr(
     product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool = False
 ) -> Path:
-    """Write N, K and B as a YAML file for Kalibr: the worst axis at the top, where Kalibr looks, and each axis below.
+    """Write N, K and B as a YAML file for Kalibr.
+
+    The worst axis is at the top, where Kalibr reads, and each axis is below.
 
     Parameters
     ----------
@@ -111,7 +113,7 @@ def to_kalibr(
         What `gyrostab.fit_noise` returns or `gyrostab.open_product` opens, with the attribute
         ``sampling_rate_hz``.
     path : path-like
-        The file to make.
+        The file to write.
     overwrite : bool
         Replace an existing file.
 
@@ -123,7 +125,7 @@ def to_kalibr(
     Raises
     ------
     SchemaError
-        When it is no product, or does not say the sampling rate.
+        When `product` is not a product, or has no sampling rate.
     OutputError
         When the file exists, or cannot be written.
     """
@@ -131,13 +133,16 @@ def to_kalibr(
     rate = product.attrs.get("sampling_rate_hz")
     if rate is None:
         raise SchemaError(
-            "the product has no attribute 'sampling_rate_hz', which is Kalibr's update_rate; give it one in Hz"
+            "the product has no attribute 'sampling_rate_hz', which is Kalibr's update_rate; "
+            "give it one in Hz"
         )
     names = [Path(name).name for name in texts(product, "source_files")]
     lines = [
-        "# Noise of a gyro for Kalibr: medians over the windows of a dynamic Allan variance, made by gyrostab",
+        "# Noise of a gyro for Kalibr: medians over the windows of a dynamic Allan variance, "
+        "made by gyrostab",
         f"# from {', '.join(names) or 'a log'}. At the top the worst axis, below each of them.",
-        "# Kalibr also asks for rostopic, accelerometer_noise_density and accelerometer_random_walk: a gyro log does not tell them.",
+        "# Kalibr also asks for rostopic, accelerometer_noise_density and "
+        "accelerometer_random_walk: a gyro log does not tell them.",
         *(_describe_fit(fit) for fit in summarise_fit(product)),
         f"update_rate: {float(rate)!r}  # Hz",
     ]
@@ -156,17 +161,20 @@ def to_kalibr(
 
 
 def _describe_fit(fit: FitSummary) -> str:
-    """Say in a comment how well the noise terms describe an axis."""
+    """Describe in a comment how well the noise terms fit an axis."""
     if not fit.windows:
         return f"# axis {fit.axis}: no window has a misfit to judge the fit by"
     text = f"# axis {fit.axis}: median chi2/dof {fit.chi2_per_dof:.3g} over {fit.windows} windows"
     if fit.fails:
-        text += f"; the noise terms do NOT describe {fit.failing_share:.0%} of them: fit again with a longer --fit-from"
+        text += (
+            f"; the noise terms do NOT describe {fit.failing_share:.0%} of them: "
+            "fit again with a longer --fit-from"
+        )
     return text
 
 
 def _find_worst(values: list[KalibrValue]) -> KalibrValue:
-    """The largest value that any axis may have; an axis that tells nothing leaves it to the others."""
+    """Find the largest value or limit of any axis; an axis without one is left out."""
     known = [value for value in values if not math.isnan(value.value)]
     return max(known, key=lambda value: value.value) if known else values[0]
 
@@ -174,9 +182,12 @@ def _find_worst(values: list[KalibrValue]) -> KalibrValue:
 def _format_entry(key: str, found: KalibrValue, *, indent: str) -> list[str]:
     symbol, _, unit = KEYS[key]
     said = {
-        "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, observed in {found.share:.0%} of the windows",
-        "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({LAWS[symbol].name}), in {found.share:.0%} of the windows",
-        "not_observable": f"{unit}; not observable in any window: a longer --window may show {symbol} ({LAWS[symbol].name})",
+        "observed": f"{unit}; {symbol}, {LAWS[symbol].name}, "
+        f"observed in {found.share:.0%} of the windows",
+        "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({LAWS[symbol].name}), "
+        f"in {found.share:.0%} of the windows",
+        "not_observable": f"{unit}; not observable in any window: "
+        f"a longer --window may show {symbol} ({LAWS[symbol].name})",
     }[found.meaning]
     number = "null" if math.isnan(found.value) else f"{found.value:.6e}"
     return [f"{indent}{key}: {number}  # {said}", f"{indent}{key}_meaning: {found.meaning}"]

@@ -1,8 +1,8 @@
-"""Finished parts of a product as files: each is whole or is not trusted, and all together read as one dataset.
+"""Finished parts of a product as block files, which can be opened as one dataset.
 
-A block file holds, one after the other, a magic word, the length of a header, the header as JSON,
-the arrays as they stand in memory, and the SHA-256 of everything before. It is written under
-another name, brought to the disk and only then renamed.
+A block file holds, in this order, a magic word, the length of a header, the header as JSON, the
+arrays as they are in memory, and the SHA-256 of everything before. It is written under another
+name, brought to the disk and then renamed. A file with a wrong checksum is not used.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Block(NamedTuple):
     path : pathlib.Path
         Block file.
     part : slice
-        Windows that it holds.
+        Windows of the part.
     header : dict
         Dimensions, dtypes, shapes, places and attributes of its variables.
     begin : int
@@ -51,7 +51,7 @@ class Block(NamedTuple):
 
 
 def block_path(folder: Path, part: slice) -> Path:
-    """Name of the block file of a part."""
+    """Return the path of the block file of a part."""
     return folder / f"windows-{part.start:010d}.block"
 
 
@@ -67,12 +67,12 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     dataset : xarray.Dataset
         The part, in memory.
     job : str
-        Digest of inputs and options; a block of another job is not trusted.
+        Hash of inputs and options; a block of another job is not used.
 
     Returns
     -------
     Block
-        What `find_blocks` would find.
+        The block, as `find_blocks` finds it.
 
     Raises
     ------
@@ -86,12 +86,14 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     described, place = {}, 0
     for (name, values), variable in zip(arrays.items(), dataset.variables.values(), strict=True):
         described[name] = {
-            "dims": list(variable.dims), "dtype": values.dtype.str, "shape": list(values.shape), "place": place,
-            "attrs": _encode_attributes(variable.attrs),
+            "dims": list(variable.dims), "dtype": values.dtype.str, "shape": list(values.shape),
+            "place": place, "attrs": _encode_attributes(variable.attrs),
         }  # fmt: skip
         place += -(-values.nbytes // _ALIGN_BYTES) * _ALIGN_BYTES
     header = {
-        "job": job, "part": [part.start, part.stop], "coords": [str(name) for name in dataset.coords], "attrs": _encode_attributes(dataset.attrs),
+        "job": job, "part": [part.start, part.stop],
+        "coords": [str(name) for name in dataset.coords],
+        "attrs": _encode_attributes(dataset.attrs),
         "variables": described,
     }  # fmt: skip
     text = json.dumps(header).encode()
@@ -121,7 +123,7 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
 
 
 def _find_arrays_offset(text: int) -> int:
-    """Place of the arrays after a header of so many bytes."""
+    """Find the byte at which the arrays begin, after a header text of so many bytes."""
     return -(-(16 + text) // _ALIGN_BYTES) * _ALIGN_BYTES
 
 
@@ -131,9 +133,9 @@ def _write_all(file: Any, view: memoryview) -> None:
 
 
 def find_blocks(folder: Path, parts: Sequence[slice], *, job: str) -> dict[int, Block]:
-    """Find the finished parts that are whole and belong to the job, by their number in `parts`.
+    """Find the intact finished parts of the job, by their number in `parts`.
 
-    A block that is cut short, altered, or of another job is left out, so that it is computed again.
+    A block that is cut short, altered, or of another job is left out and computed again.
     """
     found = {}
     for number, part in enumerate(parts):
@@ -146,7 +148,7 @@ def find_blocks(folder: Path, parts: Sequence[slice], *, job: str) -> dict[int, 
 
 
 def _read_verified_header(path: Path) -> bytes:
-    """Header of a block file; nothing when it is not there or its checksum is wrong."""
+    """Read the header of a block file; empty when it is missing or its checksum is wrong."""
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size - hashlib.sha256().digest_size
@@ -168,7 +170,7 @@ def _read_verified_header(path: Path) -> bytes:
 
 
 def assemble(blocks: Sequence[Block]) -> xr.Dataset:
-    """Put blocks together to one dataset; where that is large, its long variables are read from the files when they are used.
+    """Assemble blocks to one dataset; long variables of a large one are read from the files lazily.
 
     Parameters
     ----------
@@ -178,8 +180,8 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        The product: coordinates in memory, and the rest too where all of it is small; otherwise
-        dask arrays in the chunks of the file that will be written.
+        The product, in memory if it is small; otherwise with coordinates in memory, and dask arrays
+        in the chunks of the file that will be written.
     """
     first = blocks[0].header
     small = sum(block.path.stat().st_size for block in blocks) <= _MAX_MEMORY_BYTES
@@ -210,7 +212,7 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
 
 
 def _slice_variable(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
-    """One variable of a block that is mapped as a whole."""
+    """Slice one variable from a block that is mapped as a whole."""
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
     begin = block.begin + described["place"]
@@ -220,7 +222,7 @@ def _slice_variable(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArr
 
 
 def _map_variable(block: Block, name: str) -> NDArray[Any]:
-    """One variable of a block, mapped."""
+    """Map one variable of a block."""
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
     if 0 in shape:
@@ -231,7 +233,7 @@ def _map_variable(block: Block, name: str) -> NDArray[Any]:
 
 
 def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
-    """A variable along time as a dask array that reads the block files."""
+    """Make a dask array that reads a variable along time from the block files."""
     import dask.array as da
 
     described = blocks[0].header["variables"][name]
@@ -268,7 +270,8 @@ def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
     chunks = da.core.normalize_chunks(
         [sizes.get(dim, size) for dim, size in dims], shape=tuple(shape)
     )
-    label = f"{blocks[0].header['job']}-{name}"  # without it dask would hash all that `read` knows
+    # without a name, dask would hash everything that `read` refers to
+    label = f"{blocks[0].header['job']}-{name}"
     return with_box_reader(
         da.map_blocks(
             read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label
@@ -278,11 +281,10 @@ def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
 
 
 def _read_into(out: NDArray[Any], block: Block, name: str, place: Sequence[slice]) -> None:
-    """Part of a variable of a block, read at once where it lies in one piece: mapping a file anew costs more than it is long."""
+    """Read a part of a variable of a block; directly if it is contiguous, as mapping is slow."""
     shape = block.header["variables"][name]["shape"]
-    inner = max(
-        (i for i, size in enumerate(shape) if out.shape[i] < size), default=0
-    )  # from the dimension after on, all is wanted
+    # all of the dimensions after this one is read
+    inner = max((i for i, size in enumerate(shape) if out.shape[i] < size), default=0)
     if out.flags.c_contiguous and out.size and all(size == 1 for size in out.shape[:inner]):
         first = int(np.ravel_multi_index([one.start for one in place], shape)) * out.itemsize
         with block.path.open("rb", buffering=0) as file:
@@ -294,14 +296,14 @@ def _read_into(out: NDArray[Any], block: Block, name: str, place: Sequence[slice
 
 
 def _read_exactly(file: Any, view: memoryview) -> bool:
-    """Read until a piece of memory is full; False when the file ends before."""
+    """Read until the memory is full; False when the file ends before."""
     while view.nbytes and (count := file.readinto(view)):
         view = view[count:]
     return not view.nbytes
 
 
 def _encode_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Attributes as JSON holds them; arrays and numpy scalars are marked, so that they come back as they were."""
+    """Encode attributes for JSON; arrays and numpy scalars are marked, to be restored."""
     plain: dict[str, Any] = {}
     for name, value in attrs.items():
         array = isinstance(value, np.ndarray | np.generic)

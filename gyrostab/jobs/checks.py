@@ -1,4 +1,4 @@
-"""What can be found wrong before the long work starts."""
+"""Checks of options before the computation starts."""
 
 from __future__ import annotations
 
@@ -18,38 +18,39 @@ def check_windows(
     tau_max: str | None = None,
     **other: Any,
 ) -> None:
-    """Make sure, before the long work starts, that the lengths of time can be read at all.
+    """Check the durations of windows and averaging times before the computation starts.
 
     Parameters
     ----------
     window, step, taus, tau_max : str
-        Options of `gyrostab.allan.davar.davar`, as text; others are passed over.
+        Options of `gyrostab.allan.davar.davar`, as text; others are ignored.
 
     Raises
     ------
     OptionError
-        When one of them is no length of time, or the step or an averaging time is too long for the
+        When one of them is not a duration, or the step or an averaging time is too long for the
         window.
 
     Examples
     --------
     >>> check_windows(window="10", step="1min")
     Traceback (most recent call last):
-    gyrostab.errors.OptionError: window 10 has no unit; write '10s' for seconds or '10samples' for samples
+    gyrostab.errors.OptionError: window 10 has no unit; write '10s' for seconds or '10samples' ...
     """
     from gyrostab.time.durations import TAUS, averaging_factors, duration_seconds, samples
 
     fine = 1e6  # Hz; the true rate is not known yet
     if window is None:  # chosen when the record is known
         return
-    length, hop = samples(window, fine, "window"), samples(step, fine, "step") if step else 1
-    if step and ("sample" in window) == ("sample" in step) and hop > length:
+    length = samples(window, fine, "window")
+    step_length = samples(step, fine, "step") if step else 1
+    if step and ("sample" in window) == ("sample" in step) and step_length > length:
         raise OptionError(
-            f"the step of {step} is longer than the window of {window}, so samples would be left out; give a shorter --step"
+            f"the step of {step} is longer than the window of {window}, "
+            "so samples would be left out; give a shorter --step"
         )
-    half = (
-        None if "sample" in window else length / fine / 2
-    )  # how long a number of samples is depends on the rate
+    # the duration of a number of samples depends on the rate
+    half = None if "sample" in window else length / fine / 2
     given = [tau_max] if tau_max else []
     if taus.strip().isdigit():
         averaging_factors(taus, rate=fine, window=2)
@@ -58,6 +59,7 @@ def check_windows(
     for tau in given:
         if duration_seconds(tau, "tau", example=TAUS) > (half or math.inf):
             raise OptionError(
-                f"tau {tau.strip()} is longer than half of the window of {window}, so no second difference fits; "
+                f"tau {tau.strip()} is longer than half of the window of {window}, "
+                "so no second difference fits; "
                 "give a longer --window or a shorter tau"
             )

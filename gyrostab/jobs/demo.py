@@ -1,4 +1,4 @@
-"""The main job on the simulated log that is shipped: a gyro on a shaker, still, vibrating, still again."""
+"""The whole analysis on the shipped simulated log: a gyro at rest, vibrating, and at rest again."""
 
 from __future__ import annotations
 
@@ -51,13 +51,12 @@ def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Time
     Parameters
     ----------
     vibration : xarray.DataArray
-        Rms acceleration [g] by its own time.
+        Rms acceleration [g] on its own time coordinate.
 
     Returns
     -------
     dict
-        ``still``, ``vibrating`` and ``after``: first and last stamp [UTC] that surely lie in the
-        part.
+        ``still``, ``vibrating`` and ``after``: first and last stamp [UTC] within the part.
 
     Raises
     ------
@@ -77,7 +76,8 @@ def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Time
     shaken = np.flatnonzero(level > 0.5 * level.max()) if level.size else np.array([], dtype=int)
     if shaken.size == 0 or shaken[0] == 0 or shaken[-1] == level.size - 1:
         raise SchemaError(
-            "the channel 'vibration' does not rise and fall again within the log; no parts can be told apart"
+            "the channel 'vibration' does not rise and fall again within the log; "
+            "no parts can be told apart"
         )
     first, last = int(shaken[0]), int(shaken[-1])
     return {
@@ -90,7 +90,7 @@ def find_parts(vibration: xr.DataArray) -> dict[str, tuple[pd.Timestamp, pd.Time
 def summarise(
     product: xr.Dataset, parts: dict[str, tuple[pd.Timestamp, pd.Timestamp]]
 ) -> pd.DataFrame:
-    """Tabulate the coefficients of each part, over the windows that lie wholly in it.
+    """Tabulate the coefficients of each part, over the windows inside it.
 
     Parameters
     ----------
@@ -98,14 +98,13 @@ def summarise(
         Product of `gyrostab.fit_noise`, with the length of its windows in the attribute
         ``window_s``.
     parts : dict
-        Name to first and last stamp, as `find_parts` gives them.
+        First and last stamp by name, from `find_parts`.
 
     Returns
     -------
     pandas.DataFrame
-        One row per axis and term: axis, term, unit, and one column of text per part: the median
-        where most windows observe the term, ``< x`` with the median of the upper limits where most
-        do not.
+        One row per axis and term: axis, term, unit, and one column of text per part. The text is
+        the median if most windows observe the term, else ``< x`` with the median upper limit.
     """
     half = pd.Timedelta(seconds=float(product.attrs["window_s"])) / 2
     centre = pd.DatetimeIndex(product["time"].values)
@@ -128,9 +127,10 @@ def _format_term(term: TermSummary) -> str:
 
 
 def format_summary(summary: pd.DataFrame) -> str:
-    """Lay the table of `summarise` out as text."""
+    """Format the table of `summarise` as text."""
     return (
-        f"Noise coefficients, medians over the windows of {WINDOW} wholly in each part (< x: not observable, 95 % upper limit)\n\n"
+        f"Noise coefficients, medians over the windows of {WINDOW} wholly in each part "
+        "(< x: not observable, 95 % upper limit)\n\n"
         + summary.to_string(index=False, justify="right")
     )
 
@@ -138,16 +138,16 @@ def format_summary(summary: pd.DataFrame) -> str:
 def run_demo(
     folder: str | Path, *, overwrite: bool = False, stage: Stage = no_stage
 ) -> tuple[pd.DataFrame, list[Path]]:
-    """Run the main job on the shipped log.
+    """Run the whole analysis on the shipped log.
 
     Parameters
     ----------
     folder : path
-        Where to write; it is made when it does not exist.
+        Folder to write to; it is made if it does not exist.
     overwrite : bool
         Whether files of an earlier run may be replaced.
     stage : callable
-        Told the name of each stage as it begins, and its number of samples.
+        Called with the name of each stage and its number of samples.
 
     Returns
     -------

@@ -1,4 +1,8 @@
-"""The long work in parts: computed side by side, in any order, each one kept on disk as soon as it is certain; then written as one."""
+"""Computation of a product in parts.
+
+Parts are computed in parallel, in any order, and each is written to a block file once the inputs
+are found unchanged. At the end all blocks are written as one file.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +26,10 @@ __all__ = ["Blocks", "compute_blocks", "compute_part", "find_constant_shares", "
 
 #: Finished parts by their number.
 Blocks = dict[int, Block]
-_MAX_HELD_SECONDS, _MAX_HELD_BYTES = (
-    1.0,
-    2**26,
-)  # results wait so long at most until the inputs are looked at again
-_MIN_CHECK_INTERVAL_RATIO = (
-    50  # and no longer than so many of the looks take: what has been written need not be at the end
-)
+# Results are held at most this long, or this large, before the inputs are checked again,
+_MAX_HELD_SECONDS, _MAX_HELD_BYTES = 1.0, 2**26
+# and at most as long as this number of checks takes, so that little is lost when a run is killed.
+_MAX_HELD_CHECKS = 50
 
 
 def compute_part(
@@ -38,7 +39,7 @@ def compute_part(
     fitting: Mapping[str, Any] | None,
     space: Workspace | None = None,
 ) -> xr.Dataset:
-    """Some windows of a product (or of a surface, where `fitting` is None), at once and in the calling thread."""
+    """Compute some windows of a product, or of a surface if `fitting` is None, in this thread."""
     surface = davar_part(log, part=part, space=space, **windows)
     if fitting is None:
         return surface
@@ -56,7 +57,7 @@ def compute_blocks(
     check: Callable[[], None],
     advance: Callable[[int], None],
 ) -> None:
-    """Compute the parts that are missing and write each to its block file.
+    """Compute the missing parts and write each to its block file.
 
     Parameters
     ----------
@@ -65,29 +66,28 @@ def compute_blocks(
     parts : sequence of slice
         All parts.
     blocks : dict
-        Finished parts; those that are computed are added, so that it says what is done even after
-        an error.
+        Finished parts; computed parts are added, also when an error follows.
     job : str
-        Digest of the job.
+        Hash of the job.
     pool : Pool
-        Where the work is done.
+        Where the parts are computed.
     call : sequence
-        Function and its first arguments; the part follows.
+        Function and its first arguments; the part is the last one.
     check : callable
-        Raises when an input has changed. No result is written before a check that came after it.
+        Raises when an input has changed. A result is written only after a later check.
     advance : callable
-        Told how many parts are done.
+        Called with the number of finished parts.
     """
     missing = [number for number in range(len(parts)) if number not in blocks]
     held: list[tuple[int, xr.Dataset]] = []
-    last, look = time.monotonic(), 0.0
+    last, check_seconds = time.monotonic(), 0.0
 
     def keep() -> None:
-        nonlocal last, look
+        nonlocal last, check_seconds
         if held:
             begun = time.monotonic()
             check()
-            look = time.monotonic() - begun
+            check_seconds = time.monotonic() - begun
         while held:
             number, result = held.pop()
             blocks[number] = write_block(folder, parts[number], result, job=job)
@@ -102,13 +102,13 @@ def compute_blocks(
         ):
             held.append((numbers[done[-1].start], result))
             if (
-                time.monotonic() - last > min(_MAX_HELD_SECONDS, _MIN_CHECK_INTERVAL_RATIO * look)
+                time.monotonic() - last > min(_MAX_HELD_SECONDS, _MAX_HELD_CHECKS * check_seconds)
                 or sum(one.nbytes for _, one in held) > _MAX_HELD_BYTES
             ):
                 keep()
     except BaseException as error:
         if isinstance(error, Exception):
-            check()  # an input that has vanished explains more than what reading it said
+            check()  # that an input has vanished explains more than the error of reading it
         keep()
         raise
     keep()
@@ -117,12 +117,12 @@ def compute_blocks(
 def write_blocks(
     blocks: Blocks, target: Path, *, attrs: Mapping[str, Any], overwrite: bool, stage: Stage
 ) -> xr.Dataset:
-    """Write all blocks as one NetCDF file, always in the same order, so that the same numbers make the same bytes.
+    """Write all blocks as one NetCDF file, in a fixed order, so that its bytes are reproducible.
 
     Returns
     -------
     xarray.Dataset
-        What was written, still reading from the blocks.
+        The written dataset, which still reads from the blocks.
     """
     import dask
 
@@ -158,7 +158,7 @@ def write_blocks(
 
 
 def find_constant_shares(product: xr.Dataset) -> dict[str, float]:
-    """Share of the windows in which an axis never moved: the Allan variance is zero at the shortest and the longest tau."""
+    """Find the share of windows in which an axis is constant: zero variance at both end tau."""
     ends = product["avar"].isel(tau=[0, -1])
     still = (ends == 0.0).all("tau").mean("time").compute(scheduler="synchronous")
     return {

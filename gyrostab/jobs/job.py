@@ -1,8 +1,8 @@
-"""The folder of a run beside its output: what the run was asked for, what is finished, and who works on it.
+"""The job folder of a run: its inputs and options, finished parts, and a lock.
 
-``.PRODUCT.nc.job/`` holds ``job.json`` (inputs, options, versions), a file for each finished block
-(`gyrostab.jobs.checkpoint`) and ``lock``. ``job.json`` is there before the first block and is
-removed first, so that blocks without it are leftovers.
+``.PRODUCT.nc.job/``, next to the output, holds ``job.json`` (inputs, options, versions), a file for
+each finished block (`gyrostab.jobs.checkpoint`) and ``lock``. ``job.json`` is written before the
+first block and removed first, so that blocks without it are leftovers.
 """
 
 from __future__ import annotations
@@ -55,14 +55,15 @@ _MAX_DIFFERENCES = 4  # differences that a message lists
 
 
 def job_folder(output: Path) -> Path:
-    """Folder of the run that makes `output`."""
+    """Return the job folder of an output."""
     return output.with_name(f".{output.name}.job")
 
 
 def check_job_folder(folder: Path) -> None:
-    """Raise `OutputError` when something has the name of a job folder that no run has made; it would be written into and removed.
+    """Raise `OutputError` when the name of the job folder is taken by something that no run made.
 
-    Files of a run have fixed names, and ``lock`` or ``job.json`` says what they are.
+    A run would write into it and remove it. Files of a run have fixed names, and ``lock`` or
+    ``job.json`` identifies them.
     """
     if not os.path.lexists(folder):
         return
@@ -72,13 +73,14 @@ def check_job_folder(folder: Path) -> None:
         foreign = names
     if foreign:
         raise OutputError(
-            f"{folder / min(foreign)}: the run keeps its finished parts under this name, and gyrostab did not make what is there; "
+            f"{folder / min(foreign)}: the run keeps its finished parts under this name, "
+            "and gyrostab did not make what is there; "
             "move it, or give the output another name with -o"
         )
 
 
 def _is_marked(path: Path) -> bool:
-    """Whether a file of a job folder says that a run has made it."""
+    """Whether a file of a job folder shows that a run made the folder."""
     if path.name == "lock":
         return is_lock(path)
     if path.name == "job.json":
@@ -88,13 +90,13 @@ def _is_marked(path: Path) -> bool:
 
 
 def is_lock(path: Path) -> bool:
-    """Whether a file is a lock that `lock_job` has made."""
+    """Whether `lock_job` made a file."""
     start = _read_start(path, 8)
     return start is not None and b"process ".startswith(start)
 
 
 def _read_start(path: Path, count: int) -> bytes | None:
-    """First bytes of a regular file; None of anything else."""
+    """Read the first bytes of a regular file; None for anything else."""
     if not path.is_file() or path.is_symlink():
         return None
     with path.open("rb") as file:
@@ -102,12 +104,12 @@ def _read_start(path: Path, count: int) -> bytes | None:
 
 
 def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
-    """Path, size [bytes] and time of change of each input; of a directory (Zarr) those of all its files together."""
+    """Describe each input by path, size [bytes] and time of change; a Zarr folder as a whole."""
     return [{"path": os.path.abspath(path), **describe_file(path)} for path in paths]
 
 
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:
-    """All that the numbers of a product depend on: inputs in their order, options, versions and the machine's numbers."""
+    """Collect all that a product depends on: inputs in order, options, versions and machine."""
     versions = {name: _find_version(name) for name in ("gyrostab", "numpy", "numba")}
     return {
         "inputs": describe_inputs(paths),
@@ -133,7 +135,7 @@ def _find_version(name: str) -> str:
 
 
 def hash_fingerprint(fingerprint: Mapping[str, Any]) -> str:
-    """Short name of a fingerprint; where the inputs lie does not matter, but what they are called, their size and their time do."""
+    """Hash a fingerprint; name, size and time of the inputs matter, but not their folder."""
     inputs = [{**item, "path": os.path.basename(item["path"])} for item in fingerprint["inputs"]]
     return (
         "sha256:"
@@ -144,13 +146,16 @@ def hash_fingerprint(fingerprint: Mapping[str, Any]) -> str:
 
 
 def describe_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """What differs between two fingerprints, in one line; empty when nothing does.
+    """Describe the differences between two fingerprints in one line; empty if there are none.
 
     Examples
     --------
-    >>> old = {"inputs": [{"path": "/run7/b.csv", "bytes": 120, "changed_ns": 0}], "options": {"window": "10min"}, "versions": {}}
-    >>> new = {"inputs": [{"path": "/run7/b.csv", "bytes": 100, "changed_ns": 5}], "options": {"window": "5min"}, "versions": {}}
-    >>> describe_differences(old, new)
+    >>> before = [{"path": "/run7/b.csv", "bytes": 120, "changed_ns": 0}]
+    >>> now = [{"path": "/run7/b.csv", "bytes": 100, "changed_ns": 5}]
+    >>> describe_differences(
+    ...     {"inputs": before, "options": {"window": "10min"}, "versions": {}},
+    ...     {"inputs": now, "options": {"window": "5min"}, "versions": {}},
+    ... )
     'run7/b.csv has changed: 100 bytes, was 120; window is 5min, was 10min'
     """
     said = _describe_input_changes(before["inputs"], now["inputs"])
@@ -188,11 +193,13 @@ def _describe_input_changes(before: list[dict[str, Any]], now: list[dict[str, An
             said.append(f"{_shorten_path(path)} has vanished")
         elif size != was:
             said.append(
-                f"{_shorten_path(path)} has changed: {size} bytes, was {'missing' if was is None else was}"
+                f"{_shorten_path(path)} has changed: {size} bytes, "
+                f"was {'missing' if was is None else was}"
             )
         elif new[path]["changed_ns"] != old[path]["changed_ns"]:
             said.append(
-                f"{_shorten_path(path)} has changed: written {_format_change_time(new[path])}, was {_format_change_time(old[path])}"
+                f"{_shorten_path(path)} has changed: "
+                f"written {_format_change_time(new[path])}, was {_format_change_time(old[path])}"
             )
         else:
             said.append(f"{_shorten_path(path)} has changed: other files are in it")
@@ -202,7 +209,7 @@ def _describe_input_changes(before: list[dict[str, Any]], now: list[dict[str, An
 
 
 def _shorten_path(path: str) -> str:
-    """Last folder and name of a file."""
+    """Return the last folder and the name of a file."""
     return os.path.join(*Path(path).parts[-2:])
 
 
@@ -212,14 +219,14 @@ def _format_change_time(item: Mapping[str, Any]) -> str:
 
 @contextlib.contextmanager
 def lock_job(folder: Path) -> Iterator[None]:
-    """Be the only process that works in a job folder, which is made if it is not there.
+    """Lock a job folder for this process; make it if it does not exist.
 
-    The lock belongs to the process and ends with it, however it ends.
+    The lock ends with the process, also when it is killed.
 
     Raises
     ------
     ResumeError
-        When another process works in it.
+        When another process holds the lock.
     """
     handle = _open_lock(folder)
     try:
@@ -269,7 +276,7 @@ def _remove_lock(folder: Path) -> None:
 
 
 def read_job(folder: Path) -> dict[str, Any] | None:
-    """What a begun run was asked for; None when none was begun, or when the file is damaged."""
+    """Read inputs and options of an unfinished run; None without one, or if the file is damaged."""
     job = read_json(folder / "job.json")
     if not isinstance(job, dict) or job.get("schema") != _SCHEMA:
         return None
@@ -281,7 +288,7 @@ def _hash_json(content: Any) -> str:
 
 
 def begin_job(folder: Path, fingerprint: Mapping[str, Any], *, parts: int, overwrite: bool) -> None:
-    """Write what the run was asked for, before its first block."""
+    """Write inputs and options of a run, before its first block."""
     job = {"schema": _SCHEMA, "overwrite": overwrite, "parts": parts, **fingerprint}
     with replace_file(folder / "job.json") as temporary:
         temporary.write_text(
@@ -290,13 +297,13 @@ def begin_job(folder: Path, fingerprint: Mapping[str, Any], *, parts: int, overw
 
 
 def write_store_checksum(folder: Path) -> None:
-    """Write down the checksum of the store of the log in a job folder."""
+    """Write the checksum of the stored log in a job folder."""
     with replace_file(folder / _STORE_CHECKSUM_FILE) as temporary:
         temporary.write_text(_hash_tree(folder / "log.zarr"), encoding="ascii")
 
 
 def remove_damage(folder: Path) -> None:
-    """Remove from a job folder what a killed run left half written, and the store of the log where its checksum is wrong."""
+    """Remove incomplete files of a killed run, and the stored log if its checksum is wrong."""
     for name in filter(is_leftover, _list_names(folder)):
         _remove_path(folder / name)
     store, seal = folder / "log.zarr", folder / _STORE_CHECKSUM_FILE
@@ -311,13 +318,12 @@ def remove_damage(folder: Path) -> None:
 
 
 def _hash_tree(folder: Path) -> str:
-    """SHA-256 of the names and the content of all files of a folder."""
+    """Compute the SHA-256 of the names and contents of all files of a folder."""
     total = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as file:
-            total.update(
-                f"{path.relative_to(folder).as_posix()} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode()
-            )
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        total.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
     return total.hexdigest()
 
 
@@ -334,7 +340,7 @@ def count_finished_parts(folder: Path) -> int:
 
 
 def has_finished_work(folder: Path) -> bool:
-    """Whether a job folder holds work that is worth keeping: finished parts, or a store of the log."""
+    """Whether a job folder holds finished work: finished parts, or a stored log."""
     return (folder / "job.json").exists() and (
         count_finished_parts(folder) > 0 or "log.zarr" in _list_names(folder)
     )
@@ -348,7 +354,7 @@ def _list_names(folder: Path) -> list[str]:
 
 
 def clear_job(folder: Path) -> None:
-    """Forget the work in a job folder; the lock stays."""
+    """Remove everything from a job folder but the lock."""
     (folder / "job.json").unlink(missing_ok=True)
     for name in _list_names(folder):
         if name != "lock":
@@ -356,7 +362,7 @@ def clear_job(folder: Path) -> None:
 
 
 def remove_job(folder: Path, *, output: Path) -> None:
-    """Remove a job folder, and what a killed run left of its output under other names."""
+    """Remove a job folder, and incomplete outputs of killed runs."""
     clear_job(folder)
     remove_leftovers(output)
     with contextlib.suppress(OSError):  # Windows does not remove a file that is open

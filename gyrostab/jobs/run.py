@@ -1,4 +1,4 @@
-"""The main job, composed of the stages: logs -> regular log -> dynamic Allan variance -> coefficients -> NetCDF."""
+"""The whole analysis: logs -> regular log -> dynamic Allan variance -> coefficients -> NetCDF."""
 
 from __future__ import annotations
 
@@ -62,15 +62,15 @@ def load_log(
     Parameters
     ----------
     paths : sequence of path
-        Files, in any order; NetCDF and Zarr logs that gyrostab wrote are joined as they are,
-        without loading them.
+        Files, in any order; NetCDF and Zarr logs that gyrostab wrote are concatenated without
+        loading them.
     max_gap : str
-        Longest gap; a longer step of the stamps is taken for a step of the clock.
+        Longest gap; a larger step of the stamps is treated as a step of the clock.
     time_from, time_to : str, datetime or duration, optional
-        Keep the samples from the one up to, but not including, the other: dates and times (ISO
-        8601, UTC), or durations after the start of the log.
+        First time to use, and the time up to which (exclusive): dates and times (ISO 8601, UTC), or
+        durations after the start of the log.
     exclude : sequence of str or pairs
-        Spans ``"START/END"`` of which the samples are taken as missing; see
+        Spans ``"START/END"`` whose samples are treated as missing; see
         `gyrostab.ingest.uniform.cut_log`.
     **reading
         Options of `gyrostab.ingest.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``,
@@ -107,7 +107,7 @@ def load_log(
 
 
 def _format_option(value: Any) -> str:
-    """An option in one line."""
+    """Format the value of an option in one line."""
     if isinstance(value, Mapping):
         return ", ".join(f"{left}={right}" for left, right in value.items())
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
@@ -132,11 +132,11 @@ def run(
     workers: int | None = None,
     stage: Stage = no_stage,
 ) -> Path:
-    """Make the product of some logs and write it as NetCDF, without holding the log in memory, and so that it can be continued.
+    """Compute the product of some logs and write it as NetCDF, in parts that can be continued.
 
-    The work is done in parts, and each finished part is kept in the folder ``.PRODUCT.nc.job``
-    beside the output until the product is complete. A run that was stopped, or killed, is continued
-    with `resume`; its product is the same, bit for bit.
+    The log is never held in memory as a whole. Each finished part is kept in the folder
+    ``.PRODUCT.nc.job``, next to the output, until the product is complete. A run that was stopped
+    or killed is continued with `resume`; its product is the same, bit for bit.
 
     Parameters
     ----------
@@ -150,18 +150,17 @@ def run(
     surface_only : bool
         Write the dynamic Allan variance without fitting it.
     overwrite : bool
-        Whether an existing output may be replaced, and an unfinished run of it forgotten.
+        Whether an existing output may be replaced, and an unfinished run of it discarded.
     resume : bool
-        Continue an unfinished run of the same inputs and options; begin where there is none; do
-        nothing when the product is complete.
+        Continue an unfinished run of the same inputs and options, or begin one; do nothing when the
+        product is complete.
     scheduler : str
         ``threads``, ``processes``, or the address of a dask.distributed scheduler, whose workers
         must see the same files.
     workers : int, optional
         Threads or processes; one for each core by default.
     stage : callable
-        Told the name of each stage as it begins, how much is to be done in it, and how much is
-        done.
+        Called with the name of each stage, how much is to be done in it, and how much is done.
 
     Returns
     -------
@@ -171,15 +170,15 @@ def run(
     Raises
     ------
     ResumeError
-        When an unfinished run is in the way, cannot be continued as asked, or is being worked on by
-        another process.
+        When there is an unfinished run without `resume` or `overwrite`, or it cannot be continued
+        as asked, or another process works on it.
     WorkerError
-        When the workers cannot do the work.
+        When the workers fail.
     OutputError, OptionError, FormatError
-        For an output, an option or an input that is wrong; the message says whether finished parts
-        are kept.
+        When an output, an option or an input is wrong; the message says whether finished parts are
+        kept.
     KeyboardInterrupt
-        When interrupted; its message says how much is done.
+        When interrupted; the message says how much is done.
     """
     scheduler = check_scheduler(scheduler)
     fitting = None if surface_only else dict(fitting or {})
@@ -199,7 +198,7 @@ def run(
 
 
 class _Job(NamedTuple):
-    """What a run is asked for."""
+    """Target, inputs and options of a run."""
 
     target: Path
     folder: Path
@@ -210,7 +209,7 @@ class _Job(NamedTuple):
 
 
 class _Progress(NamedTuple):
-    """What there is of it already."""
+    """State of an unfinished or complete run."""
 
     complete: bool
     fresh: bool
@@ -226,7 +225,7 @@ def _run_job(
     overwrite: bool,
     stage: Stage,
 ) -> None:
-    """Do what is missing of a job, as the only process that works on it."""
+    """Compute what is missing of a job, under its lock."""
     blocks: Blocks = {}
     with lock_job(job.folder):
         try:
@@ -269,7 +268,7 @@ def _describe_job(paths: Sequence[str | Path], target: Path, options: dict[str, 
 
 
 def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
-    """Find out how far the job is, and refuse what would destroy something or mix two jobs."""
+    """Find the state of a job, and refuse to destroy an output or to mix two jobs."""
     before, kept = read_job(job.folder), has_finished_work(job.folder)
     if resume and _read_job_name(job.target) == job.name:
         return _Progress(complete=True, fresh=False, overwrite=False)
@@ -278,17 +277,18 @@ def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
             _add_resume_advice(job, f"{job.target}: a run of it was begun and not finished")
             + ", --overwrite starts anew"
         )
-    said = describe_differences(before, job.fingerprint) if before else ""
-    if resume and kept and said:
+    changes = describe_differences(before, job.fingerprint) if before else ""
+    if resume and kept and changes:
         raise ResumeError(
-            f"{job.target}: the run that was begun cannot be continued, because {said}; put that back, "
-            "or give --overwrite in place of --resume to start anew"
+            f"{job.target}: the run that was begun cannot be continued, because {changes}; "
+            "put that back, or give --overwrite in place of --resume to start anew"
         )
-    again = bool(resume and before and not said)
+    again = bool(resume and before and not changes)
     overwrite = overwrite or bool(before and again and before["overwrite"])
     if job.target.exists() and resume and not overwrite:
         raise OutputError(
-            f"output {str(job.target)!r} exists already, and is not the product of these logs and options; "
+            f"output {str(job.target)!r} exists already, "
+            "and is not the product of these logs and options; "
             "give --overwrite to replace it, or another name with -o"
         )
     check_output(job.target, overwrite=overwrite)
@@ -296,7 +296,7 @@ def _inspect_job(job: _Job, *, resume: bool, overwrite: bool) -> _Progress:
 
 
 def _read_job_name(path: Path) -> str | None:
-    """Digest of the job that made a product; None for anything else."""
+    """Read the hash of the job that made a product; None for anything else."""
     if not path.is_file():
         return None
     import netCDF4
@@ -309,16 +309,22 @@ def _read_job_name(path: Path) -> str | None:
 
 
 def _add_resume_advice(job: _Job, what: str) -> str:
-    """A message with what is done and how to go on."""
+    """Add to a message how much is done and how to continue."""
     kept, before = count_finished_parts(job.folder), read_job(job.folder)
     if not before or not has_finished_work(job.folder):
-        return f"{what}; nothing was written under the name of the output. Start the same command again."
+        return (
+            f"{what}; nothing was written under the name of the output. "
+            "Start the same command again."
+        )
     parts = before["parts"]
-    return f"{what}; {kept} of {parts} parts ({kept / parts:.0%}) are kept, and the same command with --resume continues"
+    return (
+        f"{what}; {kept} of {parts} parts ({kept / parts:.0%}) are kept, "
+        "and the same command with --resume continues"
+    )
 
 
 def _is_own_log(path: Path) -> bool:
-    """Whether a file is a log that gyrostab wrote, which every worker can open for itself."""
+    """Whether gyrostab wrote a log, so that every worker can open it."""
     from gyrostab.io.datasets import open_log
 
     try:
@@ -337,7 +343,7 @@ def _compute_missing(
     pool: Pool,
     stage: Stage,
 ) -> None:
-    """Compute what is missing of the job."""
+    """Compute the missing parts of a job."""
     from gyrostab.allan.davar import davar_parts
     from gyrostab.allan.plan import choose_window
     from gyrostab.io.datasets import to_zarr
@@ -432,19 +438,19 @@ def _compute_part_of_log(
 def _compute_part_of_files(
     source: str, windows: Mapping[str, Any], fitting: Mapping[str, Any] | None, part: slice
 ) -> xr.Dataset:
-    """In another process: open the log there, once, so that only names travel."""
+    """Compute a part in another process, which opens the log once; only names are sent."""
     return compute_part(_open_once(source), part, windows, fitting)
 
 
 @lru_cache(maxsize=1)
 def _open_once(source: str) -> xr.Dataset:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the process that sent us here has said it
+        warnings.simplefilter("ignore")  # the parent process has shown the warnings
         return load_log(**json.loads(source))
 
 
 def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) -> None:
-    """Write the product, and warn of windows in which an axis never moved."""
+    """Write the product, and warn of windows in which an axis is constant."""
     product = write_blocks(
         blocks, job.target, attrs={"gyrostab_job": job.name}, overwrite=overwrite, stage=stage
     )
@@ -452,6 +458,7 @@ def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) 
     for axis, share in find_constant_shares(product).items():
         if share > 0.0:
             warnings.warn(
-                f"gyro axis {axis} is constant in {share:.0%} of the windows: is the sensor stuck, or its column a filler?",
+                f"gyro axis {axis} is constant in {share:.0%} of the windows: "
+                "is the sensor stuck, or its column a filler?",
                 stacklevel=2,
             )

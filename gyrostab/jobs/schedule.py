@@ -1,4 +1,4 @@
-"""Who does the work: threads of this process, processes of this machine, or the workers of a dask.distributed scheduler."""
+"""Pools of workers: threads, processes, or the workers of a dask.distributed scheduler."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _NO_WORKER_TIMEOUT_S = 60.0  # s without any worker
 
 
 class Pool(NamedTuple):
-    """Where calls are sent.
+    """A pool of workers.
 
     Attributes
     ----------
     submit : callable
-        ``submit(function, *arguments)`` gives a `concurrent.futures.Future`.
+        ``submit(function, *arguments)`` returns a `concurrent.futures.Future`.
     width : callable
-        Number of calls that can run side by side now.
+        Number of calls that can run in parallel now.
     remote : bool
-        Other processes do the work: functions and arguments are pickled.
+        Whether calls run in other processes, with pickled functions and arguments.
     share : callable
-        Makes of an argument of many calls what is to be passed instead, so that it travels once.
+        Replaces an argument of many calls by a reference, so that it is sent once.
     """
 
     submit: Callable[..., Future[Any]]
@@ -46,7 +46,7 @@ class Pool(NamedTuple):
 
 
 def check_scheduler(scheduler: str) -> str:
-    """Make sure that a scheduler is named rightly.
+    """Check the name of a scheduler.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def check_scheduler(scheduler: str) -> str:
     Returns
     -------
     str
-        The same, with the protocol put before an address without one.
+        The name, with the protocol added to an address without one.
 
     Raises
     ------
@@ -73,7 +73,8 @@ def check_scheduler(scheduler: str) -> str:
     if ":" in scheduler:
         return f"tcp://{scheduler}"
     raise OptionError(
-        f"--scheduler {scheduler!r}: give threads, processes, or the address of a dask scheduler such as tcp://127.0.0.1:8786"
+        f"--scheduler {scheduler!r}: give threads, processes, "
+        "or the address of a dask scheduler such as tcp://127.0.0.1:8786"
     )
 
 
@@ -81,22 +82,22 @@ def check_scheduler(scheduler: str) -> str:
 def open_pool(
     scheduler: str, *, workers: int | None = None, files: Sequence[Path] = ()
 ) -> Iterator[Pool]:
-    """Open threads, processes, or a connection to a scheduler, for the length of the ``with`` block.
+    """Open threads, processes, or a connection to a scheduler for the ``with`` block.
 
     Parameters
     ----------
     scheduler : str
         From `check_scheduler`.
     workers : int, optional
-        Threads or processes; one for each core by default. A dask.distributed scheduler has its
-        own.
+        Number of threads or processes (default: one per core). Not used with a dask.distributed
+        scheduler.
     files : sequence of Path
         Files that every worker of dask.distributed must see under the same name.
 
     Yields
     ------
     Pool
-        Calls that wait are dropped when the block is left.
+        Waiting calls are cancelled at the end of the block.
 
     Raises
     ------
@@ -155,7 +156,7 @@ def _begin_process() -> None:
 
 
 class _ResultWithWarnings(NamedTuple):
-    """What a call in another process gave, and what it warned of."""
+    """Result and warnings of a call in another process."""
 
     result: Any
     notes: list[str]
@@ -166,7 +167,7 @@ def _call_with_warnings(function: Callable[..., Any], *arguments: Any) -> _Resul
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", UserWarning)
         result = function(*arguments)
-    return _ResultWithWarnings(result, [str(one.message) for one in caught])
+    return _ResultWithWarnings(result, [str(item.message) for item in caught])
 
 
 @contextlib.contextmanager
@@ -180,14 +181,16 @@ def _connect_cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
         client = Client(address, timeout=_CONNECT_TIMEOUT_S, set_as_default=False, name="gyrostab")
     except (OSError, ValueError, TimeoutError) as error:
         raise WorkerError(
-            f"--scheduler {address}: no dask scheduler answers there ({error}); start one with 'dask scheduler', or correct the address"
+            f"--scheduler {address}: no dask scheduler answers there ({error}); "
+            "start one with 'dask scheduler', or correct the address"
         ) from error
     with contextlib.closing(client):
         try:
             client.wait_for_workers(1, timeout=_CONNECT_TIMEOUT_S)
         except TimeoutError as error:
             raise WorkerError(
-                f"--scheduler {address}: the scheduler has no workers; start some with 'dask worker {address} --nthreads 1'"
+                f"--scheduler {address}: the scheduler has no workers; "
+                f"start some with 'dask worker {address} --nthreads 1'"
             ) from error
         _check_workers(client, address, files)
         executor = client.get_executor(pure=False)
@@ -206,7 +209,7 @@ def _connect_cluster(address: str, files: Sequence[Path]) -> Iterator[Pool]:
 def _reach_scheduler(
     address: str, request: Callable[..., Any], *arguments: Any, **options: Any
 ) -> Any:
-    """Make a request of a scheduler, or raise `WorkerError` when it does not answer: distributed raises errors of many kinds."""
+    """Call a scheduler; `WorkerError` for any exception, as distributed raises many kinds."""
     try:
         return request(*arguments, **options)
     except Exception as error:
@@ -214,10 +217,9 @@ def _reach_scheduler(
 
 
 def _describe_loss(address: str, error: BaseException) -> str:
-    said = " ".join(str(error).split()) or type(error).__name__
-    return f"the dask scheduler {address} has died or is out of reach ({said}); start it again".replace(
-        "  ", " "
-    )
+    reason = " ".join(str(error).split()) or type(error).__name__
+    scheduler = f"the dask scheduler {address}".strip()
+    return f"{scheduler} has died or is out of reach ({reason}); start it again"
 
 
 def _identity(value: Any) -> Any:
@@ -225,7 +227,7 @@ def _identity(value: Any) -> Any:
 
 
 def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
-    """Let every worker look for the files; a worker elsewhere has another disk, and another gyrostab perhaps."""
+    """Check that every worker has the same files and the same gyrostab."""
     sizes = {os.path.abspath(path): _find_size(path) for path in files}
     found = _reach_scheduler(address, client.run, _inspect_files, list(sizes), on_error="return")
     from gyrostab import __version__
@@ -233,13 +235,15 @@ def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
     for worker, answer in found.items():
         if isinstance(answer, BaseException):
             raise WorkerError(
-                f"--scheduler {address}: worker {worker} cannot run gyrostab ({type(answer).__name__}: {answer}); "
+                f"--scheduler {address}: worker {worker} cannot run gyrostab "
+                f"({type(answer).__name__}: {answer}); "
                 f"install gyrostab {__version__} there too"
             )
         version, seen = answer
         if version != __version__:
             raise WorkerError(
-                f"--scheduler {address}: worker {worker} has gyrostab {version}, here it is {__version__}; install the same"
+                f"--scheduler {address}: worker {worker} has gyrostab {version}, "
+                f"here it is {__version__}; install the same"
             )
         for path, size in sizes.items():
             if seen[path] != size:
@@ -247,7 +251,8 @@ def _check_workers(client: Any, address: str, files: Sequence[Path]) -> None:
                     "does not see" if seen[path] is None else "sees another file under the name of"
                 )
                 raise WorkerError(
-                    f"--scheduler {address}: worker {worker} {what} {path}; all workers need the same file system under the same names"
+                    f"--scheduler {address}: worker {worker} {what} {path}; "
+                    "all workers need the same file system under the same names"
                 )
 
 
@@ -258,7 +263,7 @@ def _inspect_files(paths: Sequence[str]) -> tuple[str, dict[str, int | None]]:
 
 
 def _find_size(path: str | Path) -> int | None:
-    """Size of a file; of a directory only that it is there; None when nothing is."""
+    """Find the size of a file; 0 for a folder; None when it does not exist."""
     try:
         return 0 if os.path.isdir(path) else os.stat(path).st_size
     except OSError:
@@ -268,12 +273,14 @@ def _find_size(path: str | Path) -> int | None:
 def run_calls(
     pool: Pool, calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Make calls side by side, few more at a time than can run, and give each back with its result as it comes.
+    """Run calls in parallel, and yield each with its result as it finishes.
+
+    Only a few more calls are submitted than can run at a time.
 
     Parameters
     ----------
     pool : Pool
-        Where they run.
+        The workers.
     calls : iterable of tuple
         Function and its arguments.
 
@@ -284,7 +291,7 @@ def run_calls(
     Raises
     ------
     WorkerError
-        When the workers have died, or the scheduler is gone; whatever a call raised, too.
+        When the workers or the scheduler have died. Exceptions of a call are raised unchanged.
     """
     waiting: dict[Future[Any], tuple[Any, ...]] = {}
     rest = iter(calls)
@@ -301,7 +308,8 @@ def run_calls(
                 idle_since = time.monotonic()
             elif time.monotonic() - idle_since > _NO_WORKER_TIMEOUT_S:
                 raise WorkerError(
-                    f"the scheduler has had no worker for {_NO_WORKER_TIMEOUT_S:.0f} s; start workers again"
+                    f"the scheduler has had no worker for {_NO_WORKER_TIMEOUT_S:.0f} s; "
+                    "start workers again"
                 )
             for future in done:
                 yield waiting.pop(future), _unpack_result(future)
@@ -329,10 +337,10 @@ def _unpack_result(future: Future[Any]) -> Any:
     except Exception as error:
         if type(error).__name__ == "KilledWorker":
             raise WorkerError(
-                f"the workers died again and again on the same part ({error}); is their memory enough?"
+                f"the workers died again and again on the same part ({error}); "
+                "is their memory enough?"
             ) from error
-        if type(error).__module__.startswith(
-            "distributed."
-        ):  # not of the call, but of the way to it
+        # not an error of the call, but of the connection
+        if type(error).__module__.startswith("distributed."):
             raise WorkerError(_describe_loss("", error)) from error
         raise

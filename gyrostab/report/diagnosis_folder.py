@@ -25,7 +25,9 @@ FILES = ("diagnosis.json", "model.toml", "diagnosis.nc", "report.html")
 def write_diagnosis(
     diagnosis: Diagnosis, directory: str | os.PathLike[str], *, overwrite: bool = False
 ) -> list[Path]:
-    """Write ``diagnosis.json``, ``model.toml``, ``diagnosis.nc`` and ``report.html`` into a folder, which appears once all are complete.
+    """Write ``diagnosis.json``, ``model.toml``, ``diagnosis.nc`` and ``report.html`` to a folder.
+
+    The folder appears once all files are complete.
 
     Parameters
     ----------
@@ -61,7 +63,7 @@ def write_diagnosis(
 
 
 def find_foreign_file(directory: Path) -> str | None:
-    """Find an item in a folder that is not part of a diagnosis; None for the folder of a diagnosis, and for an empty one."""
+    """Find an item in a folder that is not part of a diagnosis; None if there is none."""
     names = sorted(item.name for item in directory.iterdir())
     ours = is_diagnosis(directory)
     return next(
@@ -91,7 +93,10 @@ def _make_heading(diagnosis: Diagnosis) -> str:
         ", ".join(Path(name).name for name in diagnosis.content["recording"]["files"])
         or "the recording"
     )
-    return f"The simulation of {files} with what its diagnosis found.\ngyrostab simulate model.toml --like RECORDING -o simulation.nc"
+    return (
+        f"The simulation of {files} with what its diagnosis found.\n"
+        "gyrostab simulate model.toml --like RECORDING -o simulation.nc"
+    )
 
 
 def open_diagnosis(directory: str | os.PathLike[str]) -> Diagnosis:
@@ -115,7 +120,7 @@ def open_diagnosis(directory: str | os.PathLike[str]) -> Diagnosis:
     --------
     >>> open_diagnosis("nowhere")
     Traceback (most recent call last):
-    gyrostab.errors.FormatError: nowhere: there is no such folder; gyrostab diagnose RECORDING -o DIR makes one
+    gyrostab.errors.FormatError: nowhere: there is no such folder; gyrostab diagnose RECORDING ...
     """
     directory = Path(directory)
     if not directory.is_dir():
@@ -128,11 +133,13 @@ def open_diagnosis(directory: str | os.PathLike[str]) -> Diagnosis:
         model = tomllib.loads((directory / "model.toml").read_text(encoding="utf-8"))
     except OSError as error:
         raise FormatError(
-            f"{error.filename}: cannot be read ({error.strerror}); is {directory} the folder of a diagnosis?"
+            f"{error.filename}: cannot be read ({error.strerror}); "
+            f"is {directory} the folder of a diagnosis?"
         ) from error
     except (ValueError, SchemaError) as error:
         raise FormatError(
-            f"{directory}: holds no diagnosis that can be read ({error}); make it again with gyrostab diagnose"
+            f"{directory}: holds no diagnosis that can be read ({error}); "
+            "make it again with gyrostab diagnose"
         ) from error
     surfaces: xr.Dataset = open_dataset(directory / "diagnosis.nc").load()
     surfaces.close()

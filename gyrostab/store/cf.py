@@ -166,7 +166,7 @@ def _find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
 
 
 def index_dim(dim: Any) -> str:
-    """Name of a dimension with computed stamps in the file; CF reserves ``time`` for stored ones."""
+    """Name a dimension with computed stamps in the file; CF reserves ``time`` for stored ones."""
     return f"{dim}_index"
 
 

@@ -36,9 +36,9 @@ class _FileArray(BackendArray):
         return dtype
 
     def __getitem__(self, key: Any) -> Any:
-        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER, self._read)
+        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER, self._read_values)
 
-    def _read(self, place: tuple[Any, ...]) -> NDArray[Any]:
+    def _read_values(self, place: tuple[Any, ...]) -> NDArray[Any]:
         with reading_of(self.path):
             return self.variable[place].values
 

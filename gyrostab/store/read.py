@@ -235,14 +235,14 @@ class _ChunkedVariable:
             place = out[low - begin : high - begin]
             try:
                 whole = low == first and high == min(first + self.length, self.shape[-1])
-                self._decode(
-                    self._stored(row, number, whole=whole)[low - first : high - first], place
+                self._decode_samples(
+                    self._read_chunk(row, number, whole=whole)[low - first : high - first], place
                 )
             except ChunkDamage as damage:
-                self._tell(row, number, str(damage))
+                self._handle_damage(row, number, str(damage))
                 place[:] = np.nan
 
-    def _decode(self, raw: NDArray[Any], out: NDArray[np.floating[Any]]) -> None:
+    def _decode_samples(self, raw: NDArray[Any], out: NDArray[np.floating[Any]]) -> None:
         if self.scale is not None:
             from_counts(raw, float(self.scale), int(self.missing), out=out)
             return
@@ -250,7 +250,7 @@ class _ChunkedVariable:
         if self.missing is not None and self.missing == self.missing:
             out[raw == self.missing] = np.nan
 
-    def _stored(self, row: int, number: int, *, whole: bool) -> NDArray[Any]:
+    def _read_chunk(self, row: int, number: int, *, whole: bool) -> NDArray[Any]:
         """Read one chunk as it is on disk; one that is not used as a `whole` is cached.
 
         The last chunk of a row is longer than the row.
@@ -265,7 +265,7 @@ class _ChunkedVariable:
             raise ChunkDamage(f"is damaged: it holds {chunk.size} values in place of {self.length}")
         return chunk
 
-    def _tell(self, row: int, number: int, damage: str) -> None:
+    def _handle_damage(self, row: int, number: int, damage: str) -> None:
         """Warn of a damaged chunk, once, or raise `FormatError`."""
         if isinstance(self.spans, dict):
             grid, end = self.spans, min((number + 1) * self.length, self.shape[-1])

@@ -80,14 +80,14 @@ class EvenRows:
                 part = out[at : at + step]
                 file.seek(self.begin + (start + at) * self.stride)
                 if self.stride == self.dtype.itemsize:
-                    self._fill(file, part.view(np.uint8).data)
+                    self._read_exactly(file, part.view(np.uint8).data)
                     continue
                 spread = np.empty((part.size - 1) * self.stride + self.dtype.itemsize, np.uint8)
-                self._fill(file, spread.data)
+                self._read_exactly(file, spread.data)
                 part[:] = np.ndarray(part.shape, self.dtype, spread, 0, (self.stride,))
         return out
 
-    def _fill(self, file: Any, view: memoryview) -> None:
+    def _read_exactly(self, file: Any, view: memoryview) -> None:
         while view.nbytes:
             got = file.readinto(view)
             if not got:
@@ -142,11 +142,11 @@ class ChunkedRows:
                 )
             alone = len(self.shape) == 1 or self.chunks[1 - self.along] == 1
             part = low > first or high < min(first + length, self.shape[self.along])
-            chunk = self._chunk(at, alone=alone, part=part)
+            chunk = self._read_chunk(at, alone=alone, part=part)
             out[low - start : high - start] = self.fill if chunk is None else chunk[inside]
         return out
 
-    def _chunk(self, at: tuple[int, ...], *, alone: bool, part: bool) -> NDArray[Any] | None:
+    def _read_chunk(self, at: tuple[int, ...], *, alone: bool, part: bool) -> NDArray[Any] | None:
         """Read a chunk; cache it if another column or a later read will use it."""
         large = math.prod(self.chunks) * self.dtype.itemsize >= _LARGE_CHUNK_BYTES
         kept, key = _EDGE_CACHE if alone and not large else _SHARED_CACHE, (*self.key, at)

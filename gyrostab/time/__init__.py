@@ -1,1 +1,1 @@
-"""Time: the computed uniform axis of a log, durations as users write them, and the clock for histories."""
+"""Uniform time axes, durations as users write them, and the clock for histories."""

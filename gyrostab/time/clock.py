@@ -1,4 +1,4 @@
-"""The time of day for histories: the clock's, or the one that a reproducible build asks for."""
+"""The current time for histories, or the fixed time of a reproducible build."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ __all__ = ["time_of_day"]
 
 
 def time_of_day() -> str:
-    """Time now, UTC, as ISO 8601; that of the environment variable ``SOURCE_DATE_EPOCH`` [s since 1970] where it is set.
+    """Return the current time, UTC, as ISO 8601.
+
+    The environment variable ``SOURCE_DATE_EPOCH`` [s since 1970] replaces the clock if it is set.
 
     With that variable, the same inputs, options and versions make the same file, byte for byte.
 
     Raises
     ------
     OptionError
-        When the variable holds no whole number of seconds.
+        When the variable is not an integer number of seconds.
 
     References
     ----------
@@ -34,6 +36,7 @@ def time_of_day() -> str:
         now = datetime.now(UTC) if not given else datetime.fromtimestamp(int(given), UTC)
     except (ValueError, OverflowError, OSError) as error:
         raise OptionError(
-            f"SOURCE_DATE_EPOCH={given!r} in the environment is no whole number of seconds since 1970; unset it"
+            f"SOURCE_DATE_EPOCH={given!r} in the environment is not a whole number of seconds "
+            "since 1970; unset it"
         ) from error
     return f"{now:%Y-%m-%dT%H:%M:%SZ}"

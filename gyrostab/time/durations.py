@@ -1,4 +1,4 @@
-"""Windows, steps and averaging times as users give them, to whole numbers of samples."""
+"""Conversion of windows, steps and averaging times to numbers of samples."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from gyrostab.errors import OptionError
 
 __all__ = ["TAUS", "averaging_factors", "duration_seconds", "is_bare_number", "samples", "thin"]
 
-#: What averaging times may be, for messages.
+#: Examples of averaging times, for messages.
 TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
 _SAMPLE_COUNT = re.compile(r"^\s*(\d+)\s*samples?\s*$")
 _NUMBER = re.compile(r"^\s*[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*$", re.IGNORECASE)
 
 
 def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2h") -> float:
-    """Seconds of a duration: a number [s], a timedelta, or a string such as ``"10min"`` or ``"0.1s"``; a message names the examples.
+    """Convert a duration to seconds: a number [s], a timedelta, or a string such as ``"10min"``.
 
     Lengths that may also be counted in samples (window, step and block) are read by `samples`,
     which takes no bare number.
@@ -56,7 +56,7 @@ def duration_seconds(value: Any, option: str, *, example: str = "10min, 30s or 2
 
 
 def samples(value: Any, rate: float, option: str) -> int:
-    """Whole samples of a duration, or of a number of samples such as ``"2000samples"``.
+    """Convert a duration, or a text such as ``"2000samples"``, to a number of samples.
 
     Parameters
     ----------
@@ -80,7 +80,8 @@ def samples(value: Any, rate: float, option: str) -> int:
     if is_bare_number(value):
         text = str(value).strip()
         raise OptionError(
-            f"{option} {text} has no unit; write '{text}s' for seconds or '{text}samples' for samples"
+            f"{option} {text} has no unit; "
+            f"write '{text}s' for seconds or '{text}samples' for samples"
         )
     match = _SAMPLE_COUNT.match(value) if isinstance(value, str) else None
     if match:
@@ -92,13 +93,14 @@ def samples(value: Any, rate: float, option: str) -> int:
     count = round(seconds * rate)
     if count < 1:
         raise OptionError(
-            f"{option} {value!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more"
+            f"{option} {value!r} is shorter than one sample at {rate:g} Hz; "
+            f"give {1 / rate:g} s or more"
         )
     return count
 
 
 def is_bare_number(value: Any) -> bool:
-    """Whether a length is given as a number without a unit, also one written as text.
+    """Whether a length is a number without a unit, also as text.
 
     Examples
     --------
@@ -113,12 +115,12 @@ def is_bare_number(value: Any) -> bool:
 def averaging_factors(
     taus: Any, *, rate: float, window: int, tau_max: Any = None
 ) -> NDArray[np.int64]:
-    """Averaging factors k, rising and distinct, of the averaging times ``k / rate`` asked for.
+    """Find the averaging factors k of the requested averaging times ``k / rate``, in rising order.
 
     Parameters
     ----------
     taus : int, {"octave", "all"} or sequence
-        So many in even log spacing, powers of two, every one, or a list of durations [s].
+        A number of them evenly spaced in log, ``octave``, ``all``, or a list of durations [s].
     rate : float
         Sampling rate [Hz].
     window : int
@@ -129,7 +131,7 @@ def averaging_factors(
     Raises
     ------
     OptionError
-        When an averaging time is longer than half of the window, or none is left.
+        When an averaging time is longer than half of the window, or there is none.
 
     Examples
     --------
@@ -158,7 +160,8 @@ def averaging_factors(
     if isinstance(taus, (int, np.integer)):
         if taus < 1:
             raise OptionError(
-                f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' or a list such as 0.1s,1s"
+                f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' "
+                "or a list such as 0.1s,1s"
             )
         return (
             np.unique(np.round(np.geomspace(1, limit, int(taus))).astype(np.int64))
@@ -170,11 +173,13 @@ def averaging_factors(
         k = round(duration_seconds(tau, "tau", example=TAUS) * rate)
         if k < 1:
             raise OptionError(
-                f"tau {tau!r} is shorter than one sample at {rate:g} Hz; give {1 / rate:g} s or more"
+                f"tau {tau!r} is shorter than one sample at {rate:g} Hz; "
+                f"give {1 / rate:g} s or more"
             )
         if k > longest:
             raise OptionError(
-                f"tau {tau!r} is longer than half of the window ({longest / rate:g} s), so no second difference fits; "
+                f"tau {tau!r} is longer than half of the window ({longest / rate:g} s), "
+                "so no second difference fits; "
                 "give a longer --window or shorter --taus"
             )
         ks.append(k)
@@ -184,7 +189,7 @@ def averaging_factors(
 
 
 def thin(ks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Power of two that thins the second differences of each factor: the largest with ``k >= 8 * 2**shift``.
+    """Find how far to thin the second differences: the largest shift with ``k >= 8 * 2**shift``.
 
     Examples
     --------

@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 NANOSECONDS = 10**9
-#: Stamps are whole nanoseconds: at a higher rate several samples would share one.
+#: Stamps are integer nanoseconds: at a higher rate, several samples would share one.
 MAX_RATE_HZ = 1e9
 
 _CLOCK = r"(\d{1,2})(?::(\d{1,2})(?::(\d{1,2})(?:[.,](\d+))?)?)?"
@@ -91,14 +91,14 @@ def split_instant(text: str) -> tuple[int, int, int, int] | None:
 
 
 def stamp_ns(start: Any, what: str = "start") -> int:
-    """Return nanoseconds since 1970 of an instant that a user gives as text, or as such a number.
+    """Convert an instant, as text or as nanoseconds since 1970, to nanoseconds since 1970.
 
     Parameters
     ----------
     start : str, int or datetime
         The instant; text is ISO 8601, UTC unless it says otherwise.
     what : str
-        What it is, for the message.
+        Name of the instant, for the message.
 
     Raises
     ------
@@ -127,13 +127,14 @@ def stamp_ns(start: Any, what: str = "start") -> int:
         ) from error
     if abs(stamp) >= 2**63:
         raise OptionError(
-            f"{what} {start!r} is outside the years 1678 to 2262, which 64-bit nanoseconds hold; give another date"
+            f"{what} {start!r} is outside the years 1678 to 2262, which 64-bit nanoseconds hold; "
+            "give another date"
         )
     return stamp
 
 
 def check_rate(rate: float, what: str) -> None:
-    """Make sure that a number can be a sampling rate; `what` is how the message calls it.
+    """Check that a number can be a sampling rate; `what` is its name in the message.
 
     Raises
     ------
@@ -144,16 +145,19 @@ def check_rate(rate: float, what: str) -> None:
     --------
     >>> check_rate(0.0, "--rate")
     Traceback (most recent call last):
-    gyrostab.errors.OptionError: --rate 0: give the sampling rate in Hz, a number above 0 and at most 1e+09
+    gyrostab.errors.OptionError: --rate 0: give the sampling rate in Hz, a number above 0 and at...
     """
     if not 0 < rate <= MAX_RATE_HZ:  # false for nan too
         raise OptionError(
-            f"{what} {rate:g}: give the sampling rate in Hz, a number above 0 and at most {MAX_RATE_HZ:g}"
+            f"{what} {rate:g}: give the sampling rate in Hz, "
+            f"a number above 0 and at most {MAX_RATE_HZ:g}"
         )
 
 
 def check_span(start: int, rate: float, size: int, where: str) -> None:
-    """Make sure that the stamps of a uniform axis fit into 64-bit nanoseconds; `where` begins the message.
+    """Check that the stamps of a uniform axis fit into 64-bit nanoseconds.
+
+    `where` begins the message.
 
     Raises
     ------
@@ -163,7 +167,8 @@ def check_span(start: int, rate: float, size: int, where: str) -> None:
     last = start + max(size - 1, 0) * NANOSECONDS / rate
     if not abs(last) < 2.0**63:
         raise TimeError(
-            f"{where}: {size} samples at {rate:.6g} Hz from {np.datetime64(start, 'ns')} would end outside the years 1678 to 2262; "
+            f"{where}: {size} samples at {rate:.6g} Hz from {np.datetime64(start, 'ns')} "
+            "would end outside the years 1678 to 2262; "
             "check the sampling rate and the start"
         )
 
@@ -178,7 +183,7 @@ def _parse_stamp_ns(text: str) -> int:
 
 @lru_cache(maxsize=64)
 def period_ns(rate: float) -> tuple[int, float]:
-    """Whole and fractional nanoseconds of the sampling period of `rate` [Hz].
+    """Split the sampling period of `rate` [Hz] into integer and fractional nanoseconds.
 
     Examples
     --------
@@ -193,7 +198,7 @@ def period_ns(rate: float) -> tuple[int, float]:
 
 
 def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
-    """Stamps [ns since 1970] of the samples `index` (integers, any shape) of a grid.
+    """Compute the stamps [ns since 1970] of samples of a grid.
 
     Parameters
     ----------
@@ -215,19 +220,19 @@ def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
 
 
 def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
-    """Position on the grid, in samples and fractions of one, of `stamps` [ns since 1970]."""
+    """Compute the positions of `stamps` [ns since 1970] on the grid, in fractional samples."""
     whole, fraction = period_ns(rate)
     return np.asarray((np.asarray(stamps, dtype=np.int64) - start) / (whole + fraction))
 
 
 def first_stamp(log: xr.Dataset) -> int:
-    """Stamp of the first sample of a log [ns since 1970], without computing the others."""
+    """Return the first stamp of a log [ns since 1970] without computing the others."""
     first = np.asarray(log.variables["time"][0].values).astype("datetime64[ns]")
     return int(first.astype(np.int64).ravel()[0])
 
 
 class _GridTransform(CoordinateTransform):
-    """Sample position -> stamp, for sample ``first + stride * position`` of a grid."""
+    """Transform from position to stamp, for sample ``first + stride * position`` of a grid."""
 
     def __init__(
         self,
@@ -284,21 +289,21 @@ class _GridTransform(CoordinateTransform):
         )
 
     def extended(self, size: int) -> _GridTransform:
-        """The same grid with so many samples."""
+        """Return the same grid with another number of samples."""
         name, dim = str(self.coord_names[0]), self.dims[0]
         return _GridTransform(
             self.start, self.rate, size, first=self.first, stride=self.stride, name=name, dim=dim
         )
 
     def has_ends_of(self, other: _GridTransform) -> bool:
-        """Whether the other grid, of the same size, has the same first and last stamp."""
+        """Whether another grid of the same size has the same first and last stamp."""
         ends = {self.dims[0]: np.array([0, max(self.size - 1, 0)])}
         own, others = (grid.forward(ends)[grid.coord_names[0]] for grid in (self, other))
         return bool(np.array_equal(own, others))
 
 
 class TimeGridIndex(CoordinateTransformIndex):
-    """xarray index over a uniform time axis: slices stay lazy, labels select by arithmetic instead of by search."""
+    """Index of a uniform time axis: slices stay lazy, and labels are found by arithmetic."""
 
     transform: _GridTransform
 
@@ -319,7 +324,7 @@ class TimeGridIndex(CoordinateTransformIndex):
 
     @classmethod
     def concat(cls, indexes: Sequence[Any], dim: Any, positions: Any = None) -> Any:
-        """Join axes: one that is computed if each goes on where the one before ends, else one in memory."""
+        """Concatenate axes; the result is computed if each begins where the previous one ends."""
         if positions is None and all(isinstance(index, cls) for index in indexes):
             grids = [index.transform for index in indexes]
             whole, at, fits = grids[0].extended(sum(grid.size for grid in grids)), 0, True
@@ -334,16 +339,15 @@ class TimeGridIndex(CoordinateTransformIndex):
     def sel(
         self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None
     ) -> IndexSelResult:
-        """Positions of stamps, exactly or nearest; of slices of time, both ends included; of a day such as "2026-11-20"."""
+        """Find positions of stamps (exact or nearest), of a day, or of slices with both ends."""
         (name,) = self.transform.coord_names
         label = labels[name]
         dim = self.transform.dims[0]
         if isinstance(label, slice):
             return IndexSelResult({dim: self._slice(label)})
         if isinstance(label, str) and method is None and len(label) < len("2000-01-01T00:00:00"):
-            period = pd.Period(
-                label
-            )  # "2026-11-20" or "2026-11-20T14": the whole day or hour, as pandas does
+            # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
+            period = pd.Period(label)
             return IndexSelResult({dim: self._slice(slice(period.start_time, period.end_time))})
         stamps = np.asarray(getattr(label, "values", label)).astype("datetime64[ns]")
         position = self.transform.reverse({name: stamps})[dim]
@@ -377,14 +381,11 @@ class TimeGridIndex(CoordinateTransformIndex):
                 and isinstance(bound, str)
                 and not re.search(r"(Z|[+-]\d\d:?\d\d)$", bound)
             )
-            stamp = (
-                pd.Period(bound).end_time if whole else pd.Timestamp(bound)
-            )  # "T12:00:03" ends with that second
+            # "T12:00:03" ends with that second
+            stamp = pd.Period(bound).end_time if whole else pd.Timestamp(bound)
             stamp = stamp.tz_convert(None) if stamp.tzinfo else stamp
             guess = int(np.floor(self.transform.reverse({name: np.datetime64(stamp)})[dim])) - 1
-            while (
-                guess < self.transform.size
-            ):  # at most three steps: the guess is off by rounding only
+            while guess < self.transform.size:  # at most three steps: only rounding is missing
                 here = self.transform.forward({dim: guess})[name]
                 if here > np.datetime64(stamp) or (here == np.datetime64(stamp) and side == "left"):
                     break

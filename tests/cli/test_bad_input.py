@@ -145,7 +145,7 @@ BAD_INPUT = {
     ),
     "damaged log of ours": (_damaged_log, r"bad\.nc: .*is damaged"),
     "window without a unit": (_bad_log("--window", "20", "--step", "5s"), "window|20"),
-    "window that is no duration": (_bad_log("--window", "long"), "long"),
+    "window that is not a duration": (_bad_log("--window", "long"), "long"),
     "axis that is not there": (_bad_log("--axis", "w", *WINDOW), "axis|'w'"),
     "more than half unreadable": (_bad_log(change=_words), "unreadable"),
     "no such file": (lambda folder: [folder / "none.csv", "-o", folder / "out.nc"], "none.csv"),
@@ -166,7 +166,7 @@ BAD_INPUT = {
     "map without a name": (_bad_log("--map", "wx"), "--map"),
     "config that is not there": (_bad_log("--config", "/nonexistent/run.toml"), "run.toml"),
     "option that is not there": (_bad_log("--begin-again"), "--begin-again"),
-    "value that is no number": (_bad_log("--rate", "fast"), "--rate"),
+    "value that is not a number": (_bad_log("--rate", "fast"), "--rate"),
     "rate above a stamp per nanosecond": (
         _without_stamps("--rate", "1e308"),
         r"--rate 1e\+308: .* at most 1e\+09",

@@ -367,7 +367,7 @@ def test_scan_counts_the_gaps_of_a_log_without_a_table(tmp_path, capsys):
 
 
 def test_a_cell_of_digits_without_end_is_no_stamp(tmp_path, capsys):
-    """Python refuses to convert such a text to an integer, which is no reason to refuse the log."""
+    """Python refuses to convert such a text to an integer, and the log is read all the same."""
     path = write_log(tmp_path / "log.csv", change=lambda rows: [*rows[:-1], "9" * 5000 + ",1,1"])
     assert call("scan", path) == 0
     assert "1 of 6000 rows are unreadable: line 6001" in capsys.readouterr().out

@@ -34,7 +34,7 @@ PARTS = 5
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    """A scheduler and two workers of one thread each, as a user starts them: programs of their own, which may be ended at any moment."""
+    """A scheduler and two workers of one thread each, as a user starts them: separate programs, which may be ended at any moment."""
     folder = tmp_path_factory.mktemp("cluster")
     where = folder / "scheduler.json"
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
@@ -73,7 +73,7 @@ def address(tmp_path_factory):
 def _program(
     module: str, *arguments: str, env: dict[str, str]
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A program that runs beside the tests, and ends with all that it has started."""
+    """A program that runs during the tests, and ends with all that it has started."""
     command = [sys.executable, "-m", module, *arguments]
     started = subprocess.Popen(
         command,
@@ -135,7 +135,7 @@ def test_two_worker_processes_make_the_same_bytes(address, log, whole, tmp_path)
         assert len(seen) == 2
         assert all("gyrostab.allan.davar" in loaded for loaded, _ in seen.values())
         assert all(threads is None for _, threads in seen.values()), (
-            "a kernel has started threads of its own"
+            "a kernel has started threads"
         )
 
 

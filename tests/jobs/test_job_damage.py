@@ -38,11 +38,11 @@ def test_a_flipped_bit_in_the_description_of_a_run_is_noticed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "damage", ["none", "flipped", "cut", "gone", "never sealed", "seal damaged"]
+    "damage", ["none", "flipped", "cut", "gone", "no checksum", "checksum damaged"]
 )
 def test_a_damaged_store_of_a_run_is_removed(tmp_path, damage):
     store = to_zarr(make_log(np.arange(100.0)[None], rate=1.0, unit="deg/h"), tmp_path / "log.zarr")
-    if damage != "never sealed":
+    if damage != "no checksum":
         write_store_checksum(tmp_path)
     chunk = store / "rate" / "0.0"
     content = chunk.read_bytes()
@@ -52,7 +52,7 @@ def test_a_damaged_store_of_a_run_is_removed(tmp_path, damage):
         (store / ".zattrs").write_bytes((store / ".zattrs").read_bytes()[:-5])
     elif damage == "gone":
         chunk.unlink()
-    elif damage == "seal damaged":
+    elif damage == "checksum damaged":
         (tmp_path / "log.sha256").write_bytes(b"\xff")
     (tmp_path / ".windows-0000000000.block.gyrostab-0123abcd.part").write_text("half")
     remove_damage(tmp_path)

@@ -53,7 +53,7 @@ def test_the_graph_is_small_and_travels(tmp_path, form):
 @pytest.mark.parametrize(
     ("form", "how"), [("nc", "flip"), ("zarr", "flip"), ("zarr", "cut"), ("zarr", "remove")]
 )
-def test_a_damaged_chunk_becomes_a_gap_and_is_told_once(tmp_path, form, how):
+def test_a_damaged_chunk_becomes_a_gap_with_one_warning(tmp_path, form, how):
     path = WRITERS[form](counts_log(), tmp_path / f"log.{form}")
     spoil(path, 1, 1, how=how)
     wanted = counts_log().rate.copy()

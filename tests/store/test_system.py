@@ -1,4 +1,4 @@
-"""Every call that some system lacks has a fallback; here the calls are taken away one by one."""
+"""Every call that some system lacks has a fallback; here the tests remove the calls one by one."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Scripts of the repository that are no part of the package, as modules."""
+"""Scripts of the repository outside the package, as modules."""
 
 from __future__ import annotations
 

@@ -46,7 +46,8 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
         raise examined.errors[0]
     if len(lost):
         raise FormatError(
-            f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; the table says why"
+            f"{len(lost)} of {len(table)} files cannot be read: {', '.join(lost['file'])}; "
+            "the table says why"
         )
 
 

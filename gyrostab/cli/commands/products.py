@@ -169,7 +169,8 @@ def export(
     output
         File (YAML) or folder (Zarr) to write.
     format
-        kalibr: N, K and B in radians, for the worst axis and for each axis. zarr: the whole product.
+        kalibr: N, K and B in radians, for the worst axis and for each axis. zarr: the whole
+        product.
     """
     from gyrostab.io.datasets import open_product, to_zarr
     from gyrostab.io.kalibr import to_kalibr

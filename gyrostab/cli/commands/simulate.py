@@ -64,7 +64,8 @@ def simulate(
         else:
             if reading.time_from or reading.time_to or reading.exclude:
                 raise OptionError(
-                    "--from, --to and --exclude cut the recording of --like; give that recording too, or --duration"
+                    "--from, --to and --exclude cut the recording of --like; "
+                    "give that recording too, or --duration"
                 )
             log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
         stage("simulating", count_samples(log))

@@ -118,7 +118,7 @@ def test_a_store_that_holds_something_else_is_not_replaced(folder, command, capf
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_store_is_replaced_when_told_so(folder, command, capfd):
+def test_a_store_is_replaced_with_overwrite(folder, command, capfd):
     before = read_tree(folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -519,7 +519,7 @@ def test_an_input_that_changes_before_the_output_is_complete(folder, change, mon
     assert not [name for name in os.listdir(folder) if "new.nc" in name]
 
 
-def test_a_leftover_of_a_killed_process_is_told(tmp_path):
+def test_a_leftover_of_a_killed_process_is_reported(tmp_path):
     left = tmp_path / ".log.nc.gyrostab-0123abcd.part"
     left.write_text("half")
     with pytest.warns(UserWarning, match="killed: then delete it"):

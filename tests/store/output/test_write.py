@@ -19,7 +19,7 @@ from tests.support import synthetic
 
 
 @pytest.mark.parametrize("write", [to_netcdf, to_zarr])
-def test_existing_output_is_kept_unless_told_otherwise(tmp_path, write):
+def test_an_existing_output_stays_without_overwrite(tmp_path, write):
     path = write(synthetic.surface(windows=3), tmp_path / "out")
     with pytest.raises(OutputError, match="exists already; give --overwrite"):
         write(synthetic.surface(windows=4), path)
