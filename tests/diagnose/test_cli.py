@@ -1,4 +1,4 @@
-"""The whole way of a diagnosis, the command, and its manners."""
+"""A diagnosis from log to files, the command line, and its errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gyrostab.report.diagnosis_folder import FILES
 from gyrostab.simulate import simulate
 from tests.support.command_line import call
 
-LOUD = {
+VIBRATED = {
     "log": {
         "axes": ["x"],
         "rate": 20.0,
@@ -67,8 +67,8 @@ def white(
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
-    """Noise that rises with vibration, a channel that stands still, and one that falls silent for a third of the time."""
-    log = simulate(LOUD).compute()
+    """Noise that rises with vibration, a constant channel, and one with gaps."""
+    log = simulate(VIBRATED).compute()
     log["temperature"] = log["temperature"].where(
         (np.arange(log.sizes["time_temperature"]) // 20) % 3 != 1
     )
@@ -85,12 +85,12 @@ def folder(recording, tmp_path_factory) -> Path:
     return found
 
 
-def test_the_command_writes_the_four_files(folder: Path):
+def test_command_writes_four_files(folder: Path):
     assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
     assert [path.name for path in folder.parent.iterdir()] == ["diagnosis"]
 
 
-def test_what_was_put_in_is_named_on_one_axis_beside_a_constant_channel_and_one_with_gaps(
+def test_simulated_effect_is_identified(
     folder: Path,
 ):
     content = json.loads((folder / "diagnosis.json").read_text())
@@ -111,7 +111,7 @@ def test_what_was_put_in_is_named_on_one_axis_beside_a_constant_channel_and_one_
     assert "supply_bias" in content["not_found"]
 
 
-def test_the_model_simulates_what_was_recorded(folder: Path, recording: Path, tmp_path: Path):
+def test_model_reproduces_the_recording(folder: Path, recording: Path, tmp_path: Path):
     again = tmp_path / "again.nc"
     assert (
         call(
@@ -128,7 +128,7 @@ def test_the_model_simulates_what_was_recorded(folder: Path, recording: Path, tm
     assert now[:7900].std() == pytest.approx(before[:7900].std(), rel=0.06)
 
 
-def test_python_opens_what_the_command_wrote(folder: Path):
+def test_python_opens_the_output_folder(folder: Path):
     found = gyrostab.open_diagnosis(folder)
     assert found.effects
     assert list(found.surfaces["case"].values) == ["recording", "before", "after"]
@@ -147,7 +147,7 @@ def test_python_opens_what_the_command_wrote(folder: Path):
     )
 
 
-def test_noise_alone_is_no_mismatch_without_any_channel():
+def test_noise_without_channels_has_no_mismatch():
     told: list[str] = []
     found = diagnose(
         white(seconds=600.0, seed=2),
@@ -169,11 +169,11 @@ def test_noise_alone_is_no_mismatch_without_any_channel():
     ]
 
 
-# ------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # manners
 
 
-def test_an_axis_that_never_changes_is_left_out():
+def test_constant_axis_is_left_out():
     log = white(2)
     log["rate"][1] = 3.0
     with pytest.warns(UserWarning, match="the same on axis y: left out"):
@@ -184,9 +184,7 @@ def test_an_axis_that_never_changes_is_left_out():
         diagnose(log.isel(axis=[1]), nulls=100)
 
 
-def test_an_existing_folder_is_kept(
-    folder: Path, recording: Path, capfd: pytest.CaptureFixture[str]
-):
+def test_existing_folder_is_kept(folder: Path, recording: Path, capfd: pytest.CaptureFixture[str]):
     before = (folder / "diagnosis.json").read_bytes()
     capfd.readouterr()
     assert call("diagnose", recording, "-o", folder) == 2
@@ -194,7 +192,7 @@ def test_an_existing_folder_is_kept(
     assert (folder / "diagnosis.json").read_bytes() == before
 
 
-def test_a_short_recording_is_told_how_long_it_must_be(
+def test_short_recording_is_refused_with_the_required_length(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
     to_netcdf(white(seconds=60.0), tmp_path / "short.nc")
@@ -226,7 +224,7 @@ def test_a_short_recording_is_told_how_long_it_must_be(
         ),
     ],
 )
-def test_a_simulation_on_other_stamps_is_refused_with_what_to_do(change, complaint: str):
+def test_simulation_on_other_stamps_is_refused(change, complaint: str):
     log = white()
     with pytest.raises(OptionError) as raised:
         diagnose(log, simulation=change(log))
@@ -234,7 +232,7 @@ def test_a_simulation_on_other_stamps_is_refused_with_what_to_do(change, complai
     assert "--like RECORDING" in str(raised.value)
 
 
-def test_options_that_make_no_sense_are_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_invalid_options_are_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     log = white()
     for options, complaint in (
         ({"nulls": 20}, "nulls=20"),
@@ -271,16 +269,16 @@ def test_options_that_make_no_sense_are_refused(tmp_path: Path, capfd: pytest.Ca
 @pytest.mark.parametrize(
     "text", ["", "1h", "0s/", "0s/1h/2h", "dawn/dusk", "2026-13-40/2026-14-50"]
 )
-def test_quiet_stretches_that_cannot_be_read(text: str):
+def test_unreadable_quiescent_stretches_are_refused(text: str):
     with pytest.raises(OptionError, match="quiet"):
         parse_quiescent_span(text)
 
 
-# -------------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # pieces
 
 
-def test_times_of_an_effect_are_few_or_the_whole_record():
+def test_intervals_are_few_or_the_whole_record():
     begin = np.arange(200.0)
     there = np.zeros(200, bool)
     there[50:80] = there[82:90] = True
@@ -290,7 +288,7 @@ def test_times_of_an_effect_are_few_or_the_whole_record():
     assert join_blocks(np.arange(200) % 12 < 3, begin, begin + 1.0) == [(0.0, 200.0)]
 
 
-def test_a_line_explains_a_line_at_its_own_frequency_only():
+def test_line_explains_only_its_own_frequency():
     line = Component(
         Candidate("spectral_line", "line", (), ()),
         Variant({}, ("amplitude",), np.empty(0)),
@@ -332,7 +330,7 @@ def test_a_line_explains_a_line_at_its_own_frequency_only():
     )
 
 
-def test_the_chance_of_a_gain_goes_on_beyond_the_null_records():
+def test_p_value_is_extrapolated_beyond_the_null_records():
     best = np.sort(np.random.default_rng(1).exponential(size=400))
     chances = [chance_of_gain(best, evidence_nats) for evidence_nats in np.linspace(0.0, 20.0, 60)]
     assert np.all(np.diff(chances) <= 1e-12)

@@ -1,4 +1,4 @@
-"""From a log to the result: what the last steps found is in the numbers, the model and the surfaces that are handed on."""
+"""A diagnosis from log to result: numbers, model and surfaces contain the fitted effects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ N = 0.003  # deg/sqrt(h)
 
 @pytest.fixture(scope="module")
 def found() -> Diagnosis:
-    """Half an hour with vibration that is never still, and raises the noise of x; and with spikes on y."""
+    """Half an hour with constant vibration that raises the noise of x, and with spikes on y."""
     model = {
         "noise": {"N": N, "B": 0.004, "K": 0.02},
         "effect": [
@@ -32,14 +32,14 @@ def found() -> Diagnosis:
     return diagnose(simulate(model, duration="30min", rate=10.0, seed=5).compute(), nulls=100)
 
 
-def test_both_are_named(found: Diagnosis) -> None:
+def test_both_effects_are_identified(found: Diagnosis) -> None:
     assert {one["name"]: one["axes"] for one in found.effects} == {
         "vibration_noise": ["x"],
         "spikes": ["y"],
     }
 
 
-def test_the_model_has_the_noise_beside_the_effects(found: Diagnosis) -> None:
+def test_model_has_the_recalibrated_noise(found: Diagnosis) -> None:
     assert (
         found.content["baseline"]["noise"]["x"]["N"]["value"] > 1.5 * N
     )  # that of the first calibration, which knows of none
@@ -49,7 +49,7 @@ def test_the_model_has_the_noise_beside_the_effects(found: Diagnosis) -> None:
     assert found.model["noise"]["y"]["N"] == pytest.approx(N, rel=0.1)
 
 
-def test_the_surface_with_the_effects_is_that_of_the_recording(found: Diagnosis) -> None:
+def test_surface_with_effects_matches_the_recording(found: Diagnosis) -> None:
     """White noise that vibration raises, on x; on y noise and spikes."""
     short = found.surfaces["avar"].isel(tau=0)
     recorded, after = (short.sel(case=case) for case in ("recording", "after"))
@@ -59,5 +59,5 @@ def test_the_surface_with_the_effects_is_that_of_the_recording(found: Diagnosis)
     )
 
 
-def test_what_is_held_out_is_told_without_the_blocks_of_spikes(found: Diagnosis) -> None:
+def test_held_out_misfit_excludes_blocks_with_spikes(found: Diagnosis) -> None:
     assert found.content["held_out"]["misfit_after"] == pytest.approx(1.0, abs=0.15)

@@ -1,4 +1,4 @@
-"""Real recordings in small form: what the diagnosis names on them, and what it must not."""
+"""Small real recordings: what the diagnosis identifies, and what it must not."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RESETS_PER_S = 1502 / 360  # counted in the recording by its publisher's notes
 
 
 @pytest.fixture
-def log_of(
+def open_recording(
     recordings: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Any]:
     """A recording of the plan, cut to so many seconds; skipped where it is absent."""
@@ -35,12 +35,12 @@ def log_of(
     return read
 
 
-def names(found: Any) -> list[str]:
+def named_effects(found: Any) -> list[str]:
     return [one["name"] for one in found.effects]
 
 
-def test_resets_of_the_ramp_come_before_their_lines(log_of: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(log_of("fog-blueseis-ramp", end=180.0), nulls=100)
+def test_ramp_resets_are_named_before_their_lines(open_recording: Callable[..., Any]) -> None:
+    found = gyrostab.diagnose(open_recording("fog-blueseis-ramp", end=180.0), nulls=100)
     first = found.effects[0]
     assert (first["name"], first["axes"], first["driver"]) == ("feedback_reset", ["z"], "ramp")
     kicked = first["parameters"]["kick"]["value"] + first["parameters"]["tail"]["value"]
@@ -60,20 +60,20 @@ def test_resets_of_the_ramp_come_before_their_lines(log_of: Callable[..., Any]) 
     assert held["misfit_after"] < 0.2 * held["misfit_before"]
 
 
-def test_the_turns_of_the_ramp_are_counted(log_of: Callable[..., Any]) -> None:
-    turns = reduce_log(log_of("fog-blueseis-ramp", end=60.0))["ramp_turns"].values
+def test_turns_of_the_ramp_are_counted(open_recording: Callable[..., Any]) -> None:
+    turns = reduce_log(open_recording("fog-blueseis-ramp", end=60.0))["ramp_turns"].values
     assert -np.mean(turns) == pytest.approx(RESETS_PER_S, rel=0.01)
 
 
-def test_without_the_ramp_no_resets_are_claimed(log_of: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(log_of("fog-blueseis-without-ramp", end=180.0), nulls=100)
+def test_no_resets_without_the_ramp_channel(open_recording: Callable[..., Any]) -> None:
+    found = gyrostab.diagnose(open_recording("fog-blueseis-without-ramp", end=180.0), nulls=100)
     assert found.verdict != "no mismatch"
-    assert "feedback_reset" not in names(found)
+    assert "feedback_reset" not in named_effects(found)
     assert "no channel ramp" in found.content["not_found"]["feedback_reset"]["reason"]
 
 
-def test_a_lattice_as_coarse_as_the_noise_tells_of_no_dead_zone(log_of: Callable[..., Any]) -> None:
-    blocks = reduce_log(log_of("rlg-static-30min"))
+def test_coarse_quantization_grid_is_not_a_dead_zone(open_recording: Callable[..., Any]) -> None:
+    blocks = reduce_log(open_recording("rlg-static-30min"))
     assert has_coarse_grid(blocks).all()
     level = calibrate_noise(blocks)["coefficient"]
     found, reasons = effect_candidates(blocks, level)
@@ -83,13 +83,13 @@ def test_a_lattice_as_coarse_as_the_noise_tells_of_no_dead_zone(log_of: Callable
     assert "rate_quantization" in {one.effect for one in found if one.statistic == "marks"}
 
 
-def test_the_sway_of_the_platform_is_real_motion(log_of: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(log_of("rlg-static-30min", end=180.0), nulls=100)
-    assert "real_motion" in names(found)
-    assert not {"dead_zone", "held_samples", "clipping"} & set(names(found))
+def test_platform_sway_is_real_motion(open_recording: Callable[..., Any]) -> None:
+    found = gyrostab.diagnose(open_recording("rlg-static-30min", end=180.0), nulls=100)
+    assert "real_motion" in named_effects(found)
+    assert not {"dead_zone", "held_samples", "clipping"} & set(named_effects(found))
 
 
-def test_the_fibre_optic_axis_is_not_said_to_follow_temperature(log_of: Callable[..., Any]) -> None:
-    found = gyrostab.diagnose(log_of("fog-hybrid-warmup"), nulls=100)
+def test_fibre_optic_axis_does_not_follow_temperature(open_recording: Callable[..., Any]) -> None:
+    found = gyrostab.diagnose(open_recording("fog-hybrid-warmup"), nulls=100)
     thermal = [one for one in found.effects if "temperature" in (one["driver"] or "")]
     assert not any("z" in one["axes"] for one in thermal)

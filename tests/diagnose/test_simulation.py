@@ -1,4 +1,4 @@
-"""A recording against a simulated log, the whole way: nothing where they are alike, the effect where it is in one only."""
+"""A recording against a simulated log: no mismatch if alike, else the effect that one lacks."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ SHAKE = {
 
 
 @cache
-def log_of(seed: int, *sizes: float):
+def simulate_log(seed: int, *sizes: float):
     effects = [{"name": "vibration_noise", "white": size} for size in sizes]
     model = {"noise": NOISE, "effect": effects, "environment": [SHAKE], "log": {"axes": ["x"]}}
     return simulate(model, duration="25min", rate=10.0, seed=seed).compute()
 
 
-def test_a_simulation_of_the_same_model_is_no_mismatch():
-    found = gyrostab.diagnose(log_of(2), simulation=log_of(1), nulls=100)
+def test_same_model_has_no_mismatch():
+    found = gyrostab.diagnose(simulate_log(2), simulation=simulate_log(1), nulls=100)
     assert found.verdict == "no mismatch"
     assert found.effects == []
     assert found.content["baseline"]["source"] == "simulation"
 
 
-def test_what_the_simulation_lacks_is_named():
-    found = gyrostab.diagnose(log_of(2, 0.0006), simulation=log_of(1), nulls=100)
+def test_effect_missing_in_the_simulation_is_identified():
+    found = gyrostab.diagnose(simulate_log(2, 0.0006), simulation=simulate_log(1), nulls=100)
     assert found.verdict == "explained"
     (effect,) = found.effects
     assert effect["name"] == "vibration_noise"
@@ -45,7 +45,7 @@ BUMP = {"name": "spectral_line", "amplitude": 0.5, "frequency": 2.6, "quality": 
 
 
 @cache
-def axes_log(seed: int, *names: str):
+def simulate_axes(seed: int, *names: str):
     effects = {"shared_source": SHARED, "line": LINE, "bump": BUMP}
     model = {
         "noise": NOISE,
@@ -56,19 +56,19 @@ def axes_log(seed: int, *names: str):
 
 
 @pytest.mark.parametrize("seed", [11, 12])
-def test_what_a_simulation_shows_all_the_time_is_no_mismatch(seed):
+def test_steady_effects_of_the_simulation_are_not_mismatches(seed):
     names = ("shared_source", "line", "bump")
     found = gyrostab.diagnose(
-        axes_log(seed, *names), simulation=axes_log(seed + 100, *names), nulls=100
+        simulate_axes(seed, *names), simulation=simulate_axes(seed + 100, *names), nulls=100
     )
     assert found.verdict == "no mismatch"
 
 
 @pytest.mark.parametrize("lacking", ["shared_source", "line"])
-def test_what_a_simulation_lacks_beside_what_it_shows_is_named(lacking):
+def test_effect_in_addition_to_the_simulation_is_identified(lacking):
     names = ("shared_source", "line", "bump")
-    simulation = axes_log(111, *(name for name in names if name != lacking))
-    found = gyrostab.diagnose(axes_log(11, *names), simulation=simulation, nulls=100)
+    simulation = simulate_axes(111, *(name for name in names if name != lacking))
+    found = gyrostab.diagnose(simulate_axes(11, *names), simulation=simulation, nulls=100)
     assert [effect["name"] for effect in found.effects] == [
         {"line": "spectral_line"}.get(lacking, lacking)
     ]

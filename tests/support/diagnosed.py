@@ -50,19 +50,28 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
     density = np.full((3, len(axes), 12), (0.003 * 60) ** 2)
     return xr.Dataset(
         {
-            "avar": (("case", "axis", "window", "tau"), np.stack([recording, plain, after]), {"units": "degree2 hour-2"}),
-            "avar_low": (("case", "axis", "window", "tau"), np.stack([recording * np.nan, plain * (1 - z), after * (1 - z)])),
-            "avar_high": (("case", "axis", "window", "tau"), np.stack([recording * np.nan, plain * (1 + z), after * (1 + z)])),
+            "avar": (("case", "axis", "window", "tau"), np.stack([recording, plain, after]),
+            {"units": "degree2 hour-2"}),
+            "avar_low": (("case", "axis", "window", "tau"), np.stack([recording * np.nan,
+            plain * (1 - z), after * (1 - z)])),
+            "avar_high": (("case", "axis", "window", "tau"), np.stack([recording * np.nan,
+            plain * (1 + z), after * (1 + z)])),
             "mean": (("case", "axis", "window"), mean, {"units": "degree hour-1"}),
-            "mean_stderr": (("case", "axis", "window"), np.full(mean.shape, 0.018), {"units": "degree hour-1"}),
-            "block_mean": (("axis", "block"), shift + 0.04 * rng.standard_normal(shift.shape), {"units": "degree hour-1"}),
+            "mean_stderr": (("case", "axis", "window"), np.full(mean.shape, 0.018),
+            {"units": "degree hour-1"}),
+            "block_mean": (("axis", "block"), shift + 0.04 * rng.standard_normal(shift.shape),
+            {"units": "degree hour-1"}),
             "density": (("case", "axis", "band"), density, {"units": "degree2 hour-2 s"}),
-            "line_density": (("axis", "line"), density[0, :, :1] * rng.gamma(180.0, 1 / 180.0, (len(axes), line.size))),
-            "channel_vibration": ("block", np.where((block >= 1500) & (block < 1800), 6.0, 0.02), {"units": "g"}),
+            "line_density": (("axis", "line"), density[0, :, :1] * rng.gamma(180.0, 1 / 180.0,
+            (len(axes), line.size))),
+            "channel_vibration": ("block", np.where((block >= 1500) & (block < 1800), 6.0, 0.02),
+            {"units": "g"}),
         },
         coords={
-            "case": ["recording", "before", "after"], "axis": list(axes), "tau": tau, "begin": ("window", begin), "end": ("window", end),
-            "block_begin": ("block", block), "block_end": ("block", block + 20.0), "line_frequency": ("line", line),
+            "case": ["recording", "before", "after"], "axis": list(axes), "tau": tau,
+            "begin": ("window", begin), "end": ("window", end),
+            "block_begin": ("block", block), "block_end": ("block", block + 20.0),
+            "line_frequency": ("line", line),
             "frequency": ("band", np.geomspace(0.05, 50, 12)),
         },
     )  # fmt: skip
@@ -70,7 +79,8 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
 
 def content() -> dict[str, Any]:
     region = {
-        "view": "davar", "what": "avar", "axes": ["x"], "begin": 1500.0, "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
+        "view": "davar", "what": "avar", "axes": ["x"], "begin": 1500.0, "end": 1800.0,
+        "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
         "sign": 1, "p_value": 0.0004, "estimate": 1.8, "frequency": np.nan,
     }  # fmt: skip
     shift = region | {
@@ -84,9 +94,12 @@ def content() -> dict[str, Any]:
     }
     kept = ("view", "axes", "tau_min_s", "tau_max_s", "ratio", "p_value")
     mismatches = [
-        {"id": number, **{key: one[key] for key in kept}, "start": when(one["begin"]), "end": when(one["end"]), "explained_by": [name],
+        {"id": number, **{key: one[key] for key in kept}, "start": when(one["begin"]),
+        "end": when(one["end"]), "explained_by": [name],
          "statement": mismatch_statement(one, 3600.0)}
-        for number, (one, name) in enumerate([(shift, "vibration_rectification"), (region, "vibration_noise")], start=1)
+        for number, (one, name) in enumerate(
+            [(shift, "vibration_rectification"), (region, "vibration_noise")], start=1
+        )
     ]  # fmt: skip
     effects = []
     for name, parameter, value, unit, others in (
@@ -98,11 +111,14 @@ def content() -> dict[str, Any]:
         )
         effects.append(
             {
-                "name": name, "axes": ["x"], "driver": "vibration", "intervals": [[when(1500), when(1800)]],
+                "name": name, "axes": ["x"], "driver": "vibration", "intervals": [[when(1500),
+                when(1800)]],
                 "parameters": {
-                    parameter: {"value": value, "stderr": 0.05 * value, "low": 0.9 * value, "high": 1.1 * value, "unit": unit}
+                    parameter: {"value": value, "stderr": 0.05 * value, "low": 0.9 * value,
+                    "high": 1.1 * value, "unit": unit}
                 },
-                "held_out_gain": {"nats": 31.0, "stderr": 6.0, "threshold": 5.7}, "alternatives": others,
+                "held_out_gain": {"nats": 31.0, "stderr": 6.0, "threshold": 5.7},
+                "alternatives": others,
                 "statement": effect_statement(said, alternatives=others),
             }
         )  # fmt: skip
@@ -116,22 +132,27 @@ def content() -> dict[str, Any]:
     return {
         "schema": "gyrostab.diagnosis/1",
         "recording": {
-            "files": ["run7/log.csv"], "axes": ["x", "y"], "start": when(0), "end": when(3600), "sampling_rate_hz": 100.0,
+            "files": ["run7/log.csv"], "axes": ["x", "y"], "start": when(0), "end": when(3600),
+            "sampling_rate_hz": 100.0,
             "channels": ["vibration"], "missing_share": 0.02,
         },
-        "baseline": {"source": "calibrated", "noise": noise, "calibrated_on": [[when(0), when(1400)], [when(1900), when(3600)]]},
+        "baseline": {"source": "calibrated", "noise": noise, "calibrated_on": [[when(0),
+        when(1400)], [when(1900), when(3600)]]},
         "verdict": "explained",
         "false_alarm_level": 0.01,
         "mismatches": mismatches,
         "effects": effects,
         "unexplained": [],
-        "unused_channels": [{"name": "humidity", "reason": "no effect follows a channel of this name"}],
+        "unused_channels": [{"name": "humidity",
+        "reason": "no effect follows a channel of this name"}],
         "not_found": {
-            "shupe": {"upper_limit": None, "unit": None, "reason": "not identifiable: there is no temperature channel"},
+            "shupe": {"upper_limit": None, "unit": None,
+            "reason": "not identifiable: there is no temperature channel"},
             "spectral_line": {"upper_limit": 0.05, "unit": "deg/h", "reason": "below limit"},
         },
         "held_out": {
-            "blocks": 36, "log_likelihood_gain": 62.0, "stderr": 8.0, "misfit_before": 3.1, "misfit_after": 1.02, "coverage95_before": 0.71,
+            "blocks": 36, "log_likelihood_gain": 62.0, "stderr": 8.0, "misfit_before": 3.1,
+            "misfit_after": 1.02, "coverage95_before": 0.71,
             "coverage95_after": 0.95, "forecast_gain": None,
         },
         "seconds": 12.3,

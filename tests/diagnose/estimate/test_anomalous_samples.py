@@ -1,4 +1,4 @@
-"""Samples that stand still: at zero, at the ends of the range, or wherever the rate was."""
+"""Samples that are stuck: at zero, at the ends of the range, or at the last value."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
     ],
     ids=lambda value: "-".join(map(str, value.values())),
 )
-def test_it_is_told_where_they_stand(table, options):
+def test_stuck_samples_are_identified(table, options):
     found = named(table, **options)
     (identification,) = found.identified
     assert identification.effect == table["name"]
@@ -62,7 +62,7 @@ def test_it_is_told_where_they_stand(table, options):
         assert fitted.effect.fill == table.get("fill", "repeat")
 
 
-def test_a_pulse_that_comes_again_and_again_is_lines_and_no_spikes():
+def test_periodic_pulse_is_lines_and_not_spikes():
     noise = SCATTER * np.random.default_rng(6).standard_normal((2, 15_000))
     noise[0, ::37] += 8.0 * SCATTER
     noise[1, np.random.default_rng(7).choice(15_000, 40, replace=False)] += 12.0 * SCATTER
@@ -76,8 +76,10 @@ def test_a_pulse_that_comes_again_and_again_is_lines_and_no_spikes():
     assert found["spikes"] == ("y",)
 
 
-def on_a_lattice(held: int, *, seed: int = 21, size: int = 15_000) -> xr.Dataset:
-    """Three axes on a lattice of a seventh of their scatter, on which one sample in twenty is zero; z is lost in the second half.
+def on_quantization_grid(held: int, *, seed: int = 21, size: int = 15_000) -> xr.Dataset:
+    """Three axes, quantized to a seventh of their scatter: 1 of 20 samples is zero.
+
+    z is lost in the second half.
 
     `held` stretches of six samples are filled with zeros.
     """
@@ -91,8 +93,8 @@ def on_a_lattice(held: int, *, seed: int = 21, size: int = 15_000) -> xr.Dataset
     return reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
 
 
-def test_zeros_of_a_lattice_are_expected_together_where_an_axis_is_lost():
-    blocks = on_a_lattice(0)
+def test_zeros_of_a_quantization_grid_coincide_when_an_axis_is_lost():
+    blocks = on_quantization_grid(0)
     zeros, samples = (blocks[name].sum("block").values for name in ("zeros", "samples"))
     assert (zeros / samples > 0.04).all()
     lost = blocks["begin"].values > 800.0
@@ -103,8 +105,8 @@ def test_zeros_of_a_lattice_are_expected_together_where_an_axis_is_lost():
     np.testing.assert_allclose(drawn[:2], blocks["filled"].values[:2, lost].mean(axis=1), atol=0.12)
 
 
-def test_samples_that_were_filled_with_zeros_are_seen_where_an_axis_is_lost():
-    blocks = on_a_lattice(20)
+def test_zero_filled_samples_are_identified_when_an_axis_is_lost():
+    blocks = on_quantization_grid(20)
     baseline, records = nulls(blocks, 40)
     (identification,) = name_effects(blocks, baseline, records).identified
     assert (identification.effect, identification.axes) == ("held_samples", ("x", "y", "z"))
@@ -112,8 +114,8 @@ def test_samples_that_were_filled_with_zeros_are_seen_where_an_axis_is_lost():
     assert float(blocks["filled"].sel(axis="x").sum()) == pytest.approx(120, abs=25)
 
 
-def test_an_axis_that_is_lost_early_keeps_blocks_where_all_that_are_left_have_odd_samples():
-    """Of 92 blocks z has 20, with zeros in each: without them nothing would be left of it."""
+def test_axis_lost_early_keeps_blocks_with_anomalous_samples():
+    """z has 20 of 92 blocks, with zeros in each: without them nothing would be left of it."""
     rng = np.random.default_rng(104)
     noise = SCATTER * rng.standard_normal((3, 15_000))
     noise[2, 3_240:] = np.nan
@@ -131,8 +133,8 @@ def test_an_axis_that_is_lost_early_keeps_blocks_where_all_that_are_left_have_od
 
 
 @pytest.mark.parametrize("fill", ["repeat", "zero"])
-def test_how_often_and_how_long_samples_were_held_is_told(fill):
-    """Held stretches drawn here, 40 of 6 samples each and 20 of 2."""
+def test_number_and_length_of_held_samples_are_estimated(fill):
+    """Held stretches: 40 of 6 samples, and 20 of 2."""
     rng = np.random.default_rng(8)
     noise = SCATTER * rng.standard_normal((3, 15_000))
     for number, first in enumerate(
@@ -154,7 +156,7 @@ def test_how_often_and_how_long_samples_were_held_is_told(fill):
             assert one.parameters[name].low < true < one.parameters[name].high
 
 
-def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
+def test_burst_of_bit_errors_has_the_size_of_its_power():
     rng = np.random.default_rng(4)
     noise = SCATTER * rng.standard_normal((3, 15_000))
     places = 6_000 + 3 * np.arange(14)
@@ -168,7 +170,7 @@ def test_a_burst_of_bit_errors_has_the_size_that_its_power_tells():
     assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0
 
 
-def test_noise_that_rises_within_a_block_is_no_outlier_beside_spikes_of_another_axis():
+def test_noise_rising_within_a_block_has_no_outliers():
     rng = np.random.default_rng(6)
     shaken = (np.arange(15_000) >= 31 * 162 + 120) & (
         np.arange(15_000) < 62 * 162 + 40
@@ -191,7 +193,7 @@ def test_noise_that_rises_within_a_block_is_no_outlier_beside_spikes_of_another_
     assert list(axes.values()) == [("x", "y", "z")]  # of what vibration does
 
 
-def test_noise_that_rises_and_falls_has_no_spikes():
+def test_rising_and_falling_noise_has_no_spikes():
     rng = np.random.default_rng(100)
     for edge in (40, 81, 120):
         shaken = (np.arange(15_000) >= 31 * 162 + edge) & (np.arange(15_000) < 62 * 162 + edge)
@@ -206,7 +208,7 @@ def test_noise_that_rises_and_falls_has_no_spikes():
         )
 
 
-def test_spikes_of_six_deviations_are_named_and_counted():
+def test_spikes_of_six_sigma_are_identified_and_counted():
     rng = np.random.default_rng(8)
     noise = SCATTER * rng.standard_normal((3, 15_000))
     noise[1, rng.choice(15_000, 20, replace=False)] += 6.0 * SCATTER * rng.choice([-1.0, 1.0], 20)
@@ -220,7 +222,7 @@ def test_spikes_of_six_deviations_are_named_and_counted():
     assert 0.5 < fitted.parameters["size"].value / (6.0 * SCATTER) < 2.0
 
 
-def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_powers_of_the_model():
+def test_spikes_in_most_blocks_keep_their_size_and_power():
     rng = np.random.default_rng(11)
     hit = rng.random((1, 15_000)) < 0.009
     noise = SCATTER * (
@@ -253,7 +255,7 @@ def test_spikes_in_most_blocks_have_the_size_that_they_have_and_are_in_the_power
         assert before == pytest.approx(1.0, rel=0.4) if known else before < 0.1
 
 
-def test_bursts_of_noise_shorter_than_a_block_have_no_spikes():
+def test_bursts_shorter_than_a_block_have_no_spikes():
     rng = np.random.default_rng(9)
     loud = np.ones(15_000)
     for first in rng.integers(0, 14_900, 10):

@@ -1,4 +1,4 @@
-"""Intervals hold the truth where a response is slow and bent, or quicker than any value that naming tries."""
+"""Intervals hold the true value for slow and curved responses, and off the grid."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
-from tests.diagnose.estimate.test_joint_fit import claimed
+from tests.diagnose.estimate.test_joint_fit import identify_by_hand
 from tests.support.named import WORLD, record
 
 RECORDS, SECONDS, BLOCK = 20, 3600, 20
@@ -22,13 +22,13 @@ VOLTS = [[0, 28.0], [600, 27.0], [1300, 28.2], [2100, 26.8], [2900, 27.9]]
 HEAT = [[0, 30], [400, 30], [1000, 36], [1600, 36], [2200, 31], [2800, 31], [3300, 35], [3600, 35]]
 
 
-def in_blocks(seconds: np.ndarray) -> xr.DataArray:
-    """Block means of what has one value a second."""
+def average_blocks(seconds: np.ndarray) -> xr.DataArray:
+    """Average one value per second over blocks."""
     return xr.DataArray(seconds.reshape(-1, BLOCK).mean(axis=1), dims="block")
 
 
-def slow(values: np.ndarray, time: float) -> np.ndarray:
-    """What follows values of every second with a time constant, second by second."""
+def filter_slowly(values: np.ndarray, time: float) -> np.ndarray:
+    """Filter values of every second by a time constant."""
     out = np.empty_like(values)
     out[0] = values[0]
     for place in range(1, values.size):
@@ -36,13 +36,13 @@ def slow(values: np.ndarray, time: float) -> np.ndarray:
     return out
 
 
-def fits(
+def fit_records(
     environment: tuple[dict[str, Any], ...], effect: str, column: str, shape: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Numbers of an effect in records of noise to which its mean, of one value a second, is added."""
+    """Fit an effect to records of noise with its mean, given once per second."""
     blocks = record([], environment=environment)
     baseline = calibrate_noise(blocks)
-    frame = claimed(blocks, baseline, effect, "mean", (column,))
+    frame = identify_by_hand(blocks, baseline, effect, "mean", (column,))
     drawn = next(
         iter(
             null_records(
@@ -52,7 +52,7 @@ def fits(
     )
     out = []
     for number in range(RECORDS):
-        mean = drawn["mean"].isel(record=number).transpose("axis", "block") + in_blocks(shape)
+        mean = drawn["mean"].isel(record=number).transpose("axis", "block") + average_blocks(shape)
         state = condition_on(
             initial_state(blocks.assign(mean=mean), baseline), list(frame.identified[0].components)
         )
@@ -60,15 +60,15 @@ def fits(
     return out
 
 
-def held(found: list[dict[str, Any]], name: str, truth: float) -> float:
+def covered_share(found: list[dict[str, Any]], name: str, truth: float) -> float:
     return float(np.mean([one[name].low <= truth <= one[name].high for one in found]))
 
 
-def half_width(found: list[dict[str, Any]], name: str) -> float:
+def median_half_width(found: list[dict[str, Any]], name: str) -> float:
     return float(np.median([0.5 * (one[name].high - one[name].low) for one in found]))
 
 
-def test_of_a_slow_and_bent_response_to_the_supply_the_sensitivity_at_rest_and_the_lag_are_held():
+def test_intervals_of_a_slow_curved_supply_response():
     time, size = 45.0, 0.12
     second = np.arange(SECONDS)
     volt = np.array([level for _, level in VOLTS])[
@@ -81,24 +81,24 @@ def test_of_a_slow_and_bent_response_to_the_supply_the_sensitivity_at_rest_and_t
         *WORLD["usual"],
         {"profile": "steps", "channel": "supply_voltage", "unit": "V", "points": VOLTS},
     )
-    found = fits(environment, "supply_bias", "voltage", size * slow(bent, time))
-    assert 0.9 <= held(found, "voltage", at_rest) <= 1.0
-    assert 0.9 <= held(found, "lag", time) <= 1.0
-    assert half_width(found, "voltage") < 0.25 * at_rest
-    assert half_width(found, "lag") < 0.5 * time
+    found = fit_records(environment, "supply_bias", "voltage", size * filter_slowly(bent, time))
+    assert 0.9 <= covered_share(found, "voltage", at_rest) <= 1.0
+    assert 0.9 <= covered_share(found, "lag", time) <= 1.0
+    assert median_half_width(found, "voltage") < 0.25 * at_rest
+    assert median_half_width(found, "lag") < 0.5 * time
 
 
-def test_a_warm_up_that_is_quicker_than_those_of_the_grid_is_held():
+def test_intervals_of_a_warm_up_faster_than_the_grid():
     time, size = 25.0, 1.0
-    found = fits(
+    found = fit_records(
         WORLD["usual"], "warm_up", "amplitude", size * np.exp(-(np.arange(SECONDS) + 0.5) / time)
     )
-    assert 0.9 <= held(found, "amplitude", size) <= 1.0
-    assert 0.9 <= held(found, "time", time) <= 1.0
-    assert half_width(found, "time") < 0.6 * time
+    assert 0.9 <= covered_share(found, "amplitude", size) <= 1.0
+    assert 0.9 <= covered_share(found, "time", time) <= 1.0
+    assert median_half_width(found, "time") < 0.6 * time
 
 
-def test_a_play_between_those_of_the_grid_is_held():
+def test_intervals_of_a_dead_band_between_grid_values():
     width, size = 0.9, 0.15
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
     slider = np.empty_like(heat)
@@ -109,13 +109,13 @@ def test_a_play_between_those_of_the_grid_is_held():
         {"profile": "ramps", "channel": "temperature", "unit": "degC", "points": HEAT},
         WORLD["usual"][1],
     )
-    found = fits(environment, "thermal_hysteresis", "sensitivity", size * (heat - slider))
-    assert 0.9 <= held(found, "sensitivity", size) <= 1.0
-    assert 0.9 <= held(found, "width", width) <= 1.0
-    assert half_width(found, "sensitivity") < 0.4 * size
+    found = fit_records(environment, "thermal_hysteresis", "sensitivity", size * (heat - slider))
+    assert 0.9 <= covered_share(found, "sensitivity", size) <= 1.0
+    assert 0.9 <= covered_share(found, "width", width) <= 1.0
+    assert median_half_width(found, "sensitivity") < 0.4 * size
 
 
-def test_what_is_there_but_slower_than_others_is_below_its_limit():
+def test_limit_of_an_effect_slower_than_the_grid():
     size, time = 0.25, 700.0
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
     environment = (
@@ -124,7 +124,7 @@ def test_what_is_there_but_slower_than_others_is_below_its_limit():
     )
     blocks = record([], environment=environment)
     baseline = calibrate_noise(blocks)
-    frame = claimed(blocks, baseline, "shupe", "mean", ("sensitivity",))
+    frame = identify_by_hand(blocks, baseline, "shupe", "mean", ("sensitivity",))
     frame = replace(
         frame,
         identified=(),
@@ -137,7 +137,7 @@ def test_what_is_there_but_slower_than_others_is_below_its_limit():
             )
         )
     )
-    there = in_blocks(size * slow(60.0 * np.gradient(heat), time))
+    there = average_blocks(size * filter_slowly(60.0 * np.gradient(heat), time))
     found = []
     for number in range(RECORDS):
         seen = blocks.assign(

@@ -1,4 +1,4 @@
-"""A recording against the very model that made it: effects that happen at random, or move with the tool, are no news; others are."""
+"""A recording against its own model: random and tool-dependent effects are expected, others not."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ EARTH = {"name": "earth_rate", "latitude": 50.0}
 SCALE = {"name": "scale_factor", "linear": 1000.0, "axes": ["z"]}
 
 
-def diagnosed(effects, *, environment=(), more=(), axes="xyz", seed=2):
-    """Diagnosis against the model without the effects in `more`."""
+def diagnose_against_model(effects, *, environment=(), more=(), axes="xyz", seed=2):
+    """Diagnose against the model without the effects in `more`."""
     model = {
         "noise": NOISE,
         "effect": [*effects, *more],
@@ -57,13 +57,13 @@ def diagnosed(effects, *, environment=(), more=(), axes="xyz", seed=2):
     ],
     ids=["spikes, memory, walk", "held samples", "sway", "turning"],
 )
-def test_what_the_model_holds_is_no_mismatch(effects, environment, axes):
-    found = diagnosed(effects, environment=environment, axes=axes)
+def test_effects_of_the_model_are_not_mismatches(effects, environment, axes):
+    found = diagnose_against_model(effects, environment=environment, axes=axes)
     assert found.verdict == "no mismatch", (found.effects, found.content["mismatches"])
 
 
-def test_another_effect_beside_those_that_are_expected_is_named():
-    found = diagnosed([SPIKES, MEMORY], more=[JUMP], axes="xy")
+def test_effect_in_addition_to_expected_ones_is_identified():
+    found = diagnose_against_model([SPIKES, MEMORY], more=[JUMP], axes="xy")
     assert [effect["name"] for effect in found.effects] == ["bias_jump"]
     assert (
         found.effects[0]["parameters"]["step"]["low"]
@@ -83,7 +83,7 @@ def blocks():
 
 
 @pytest.mark.parametrize(("memory", "rms"), [(300.0, 0.5), (30.0, 0.5)])
-def test_null_means_wander_as_the_model_does(blocks, memory, rms):
+def test_null_means_wander_like_the_model(blocks, memory, rms):
     """The covariance of block means is that of the double integral of the exponential memory."""
     effect = {"name": "gauss_markov", "rms": rms, "correlation_time": memory}
     baseline = baseline_from_model(blocks, {"noise": {"N": 1e-5}, "effect": [effect]})
@@ -102,7 +102,7 @@ def test_null_means_wander_as_the_model_does(blocks, memory, rms):
     assert block_mean_variance(a, np.array([1.0])) == pytest.approx(own)
 
 
-def test_null_means_walk_while_it_shakes(blocks):
+def test_null_means_walk_during_vibration(blocks):
     effect = {"name": "vibration_random_walk", "sensitivity": 0.3}
     baseline = baseline_from_model(blocks, {"noise": {"N": 0.003}, "effect": [effect]})
     nulls = np.concatenate(
@@ -124,7 +124,7 @@ def test_null_means_walk_while_it_shakes(blocks):
     assert walk[shaken] == pytest.approx((0.3 * 6.0) ** 2 / 3600.0, rel=0.02)
 
 
-def test_blocks_in_which_a_known_rate_moves_are_left_out(blocks):
+def test_blocks_with_a_moving_known_rate_are_left_out(blocks):
     baseline = baseline_from_model(
         blocks, {"noise": NOISE, "effect": [{"name": "scale_factor", "linear": 1000.0}]}
     )
@@ -136,8 +136,8 @@ def test_blocks_in_which_a_known_rate_moves_are_left_out(blocks):
 
 
 @pytest.mark.parametrize(("frequency", "quality"), [(0.3, 20.0), (1.3, 30.0), (0.21, 60.0)])
-def test_a_narrow_resonance_is_expected_as_the_taper_shows_it(frequency, quality):
-    """Against the mean spectrum of white noise through a resonator of scipy, driven far longer than its memory."""
+def test_narrow_resonance_is_expected_with_the_leakage_of_the_taper(frequency, quality):
+    """Compare with white noise through a resonator of scipy, driven far longer than its memory."""
     effect = {"name": "spectral_line", "amplitude": 1.0, "frequency": frequency, "quality": quality}
     rng = np.random.default_rng(5)
     rate, fine = 10.0, 40.0

@@ -1,4 +1,4 @@
-"""Sizes of named effects: unbiased, with intervals that hold the truth, also where the form is only nearly right."""
+"""Sizes are unbiased, and intervals hold the true value, also for slightly wrong forms."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ RECORDS = 60
 
 
 @pytest.fixture(scope="module")
-def quiet():
+def noise_only():
     blocks = record([])
     return blocks, calibrate_noise(blocks)
 
 
-def claimed(
+def identify_by_hand(
     blocks: xr.Dataset, baseline: xr.Dataset, effect: str, statistic: str, columns: tuple[str, ...]
 ) -> Identifications:
-    """A naming of one effect on the first axis."""
+    """Return the identification of one effect on the first axis."""
     candidates, reasons = effect_candidates(blocks, COEFFICIENT)
     one = next(one for one in candidates if one.effect == effect and one.statistic == statistic)
     variant = next(variant for variant in one.variants if variant.columns == columns)
@@ -54,9 +54,9 @@ def claimed(
     )
 
 
-def fits(quiet, change, effect, statistic, columns):
-    """Fits of many records of noise to which `change` adds an effect."""
-    blocks, baseline = quiet
+def fit_records(noise_only, change, effect, statistic, columns):
+    """Fit many records of noise to which `change` adds an effect."""
+    blocks, baseline = noise_only
     drawn = next(
         iter(
             null_records(
@@ -65,7 +65,7 @@ def fits(quiet, change, effect, statistic, columns):
         )
     )
     out = []
-    frame = claimed(blocks, baseline, effect, statistic, columns)
+    frame = identify_by_hand(blocks, baseline, effect, statistic, columns)
     for number in range(RECORDS):
         one = blocks.assign(
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
@@ -84,21 +84,21 @@ def coverage(estimates, truth: float) -> float:
 
 
 @pytest.mark.parametrize(("size", "power"), [(0.1, 2.0), (0.5, 2.0), (0.5, 1.9)])
-def test_intervals_of_rectification_hold_the_truth(quiet, size, power):
-    g = quiet[0]["channel_vibration"].values
+def test_intervals_of_rectification_hold_the_true_value(noise_only, size, power):
+    g = noise_only[0]["channel_vibration"].values
     truth = size / 36.0
 
     def change(one):
         return one.assign(mean=one["mean"] + xr.DataArray(size * (g / 6.0) ** power, dims="block"))
 
-    found = fits(quiet, change, "vibration_rectification", "mean", ("sensitivity",))
+    found = fit_records(noise_only, change, "vibration_rectification", "mean", ("sensitivity",))
     assert 0.90 <= coverage(found, truth) <= 1.0
     assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=FORM_ERROR)
 
 
 @pytest.mark.parametrize("share", [0.2, 1.0])
-def test_intervals_of_vibration_noise_hold_the_truth(quiet, share):
-    g = quiet[0]["channel_vibration"].values
+def test_intervals_of_vibration_noise_hold_the_true_value(noise_only, share):
+    g = noise_only[0]["channel_vibration"].values
     truth = 0.003 * np.sqrt(share) / 6.0
 
     def change(one):
@@ -106,14 +106,14 @@ def test_intervals_of_vibration_noise_hold_the_truth(quiet, share):
             power=one["power"] * xr.DataArray(1.0 + share * (g / 6.0) ** 2, dims="block")
         )
 
-    found = fits(quiet, change, "vibration_noise", "power", ("white",))
+    found = fit_records(noise_only, change, "vibration_noise", "power", ("white",))
     assert 0.88 <= coverage(found, truth) <= 1.0
     assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=0.06)
 
 
 @pytest.mark.parametrize(("levels", "both"), [((5.0, 5.0), False), ((3.0, 8.0), True)])
-def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
-    blocks, baseline = quiet
+def test_terms_not_separated_by_one_level_become_one(noise_only, levels, both):
+    blocks, baseline = noise_only
     place = np.linspace(0.0, 1.0, blocks.sizes["block"])
     g = np.where(
         (place > 0.2) & (place < 0.4),
@@ -128,7 +128,9 @@ def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
     )
     one = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
     one["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
-    frame = claimed(one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic"))
+    frame = identify_by_hand(
+        one, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic")
+    )
     (fitted,) = fit_identifications(frame, baseline)
     assert set(fitted.parameters) == ({"sensitivity", "quartic"} if both else {"sensitivity"})
     assert ("does not tell" in fitted.say()) is not both
@@ -139,10 +141,8 @@ def test_terms_that_one_level_does_not_hold_apart_are_one(quiet, levels, both):
 
 @pytest.mark.parametrize("column", ["sensitivity", "quartic"])
 @pytest.mark.parametrize("levels", [(5.0, 5.0), (3.0, 8.0)])
-def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_from_it(
-    quiet, levels, column
-):
-    blocks, baseline = quiet
+def test_single_term_is_the_plainest_of_equivalent_ones(noise_only, levels, column):
+    blocks, baseline = noise_only
     place = np.linspace(0.0, 1.0, blocks.sizes["block"])
     g = np.where(
         (place > 0.2) & (place < 0.4),
@@ -156,7 +156,7 @@ def test_a_term_alone_is_the_plainest_of_those_that_the_record_does_not_tell_fro
     one = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
     one["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
     (fitted,) = fit_identifications(
-        claimed(one, baseline, "vibration_rectification", "mean", (column,)), baseline
+        identify_by_hand(one, baseline, "vibration_rectification", "mean", (column,)), baseline
     )
     alike = levels[0] == levels[1]
     assert set(fitted.parameters) == ({"sensitivity"} if alike else {column})
@@ -170,7 +170,7 @@ def shaken():
     return name_effects(blocks, baseline, records), baseline
 
 
-def test_the_model_has_the_effect(shaken):
+def test_model_contains_the_effect(shaken):
     identifications, baseline = shaken
     (fitted,) = fit_identifications(identifications, baseline)
     one = fitted.parameters["sensitivity"]
@@ -191,7 +191,7 @@ def test_the_model_has_the_effect(shaken):
     np.testing.assert_allclose(again, truth, atol=0.25 * float(np.abs(truth).max()))
 
 
-def test_the_prediction_fits_only_what_it_may_see(shaken):
+def test_prediction_is_fitted_to_known_blocks_only(shaken):
     identifications, baseline = shaken
     after = predict_baseline(identifications, baseline)
     vibration = identifications.state.blocks["channel_vibration"].values
@@ -199,15 +199,16 @@ def test_the_prediction_fits_only_what_it_may_see(shaken):
     assert np.ptp(gained) == pytest.approx(0.005 * np.max(vibration**2), rel=0.35)
     assert np.allclose((after["known_mean"] - baseline["known_mean"]).sel(axis="x"), 0.0)
     blind = predict_baseline(identifications, baseline, vibration < 1.0)
-    changed = replace(identifications, state=replace(identifications.state, blocks=identifications.state.blocks.assign(
-        mean=identifications.state.blocks["mean"] + xr.DataArray(np.where(vibration < 1.0, 0.0, 5.0), dims="block")
-    )))  # fmt: skip
+    state = identifications.state
+    shift = xr.DataArray(np.where(vibration < 1.0, 0.0, 5.0), dims="block")
+    shifted = state.blocks.assign(mean=state.blocks["mean"] + shift)
+    changed = replace(identifications, state=replace(state, blocks=shifted))
     np.testing.assert_allclose(
         predict_baseline(changed, baseline, vibration < 1.0)["known_mean"], blind["known_mean"]
     )
 
 
-def test_what_was_not_found_has_a_limit_or_a_reason(shaken):
+def test_effects_not_found_have_a_limit_or_a_reason(shaken):
     identifications, _ = shaken
     found = find_upper_limits(identifications)
     assert "vibration_rectification" not in found
@@ -229,11 +230,11 @@ def test_size_of_a_line():
     assert frequency == pytest.approx(2.345, abs=0.03)
 
 
-def test_where_a_line_is_is_known_to_a_step_of_its_spectrum():
+def test_line_frequency_is_known_to_one_bin():
     true = 4.013
     blocks = record([{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}])
     baseline = calibrate_noise(blocks)
-    identifications = claimed(blocks, baseline, "spectral_line", "line", ("amplitude",))
+    identifications = identify_by_hand(blocks, baseline, "spectral_line", "line", ("amplitude",))
     place = int(blocks["line_power"].sel(axis="x").mean("part").values.argmax())
     component = replace(identifications.identified[0].components[0], place=place)
     (fitted,) = fit_identifications(
@@ -249,20 +250,21 @@ def test_where_a_line_is_is_known_to_a_step_of_its_spectrum():
     assert found.high - found.low < 2.0 * step
 
 
-def test_simulation_of_named_effects_runs(shaken):
+def test_model_with_identified_effects_runs(shaken):
     identifications, baseline = shaken
     (fitted,) = fit_identifications(identifications, baseline)
     values = {item.name: getattr(fitted.effect, item.name) for item in fitted.effect.parameters()}
     log = simulate(
         {"noise": {"N": 0.003}, "effect": [{"name": fitted.effect.name, "axes": ["y"], **values}],
-         "environment": [{"profile": "vibration", "points": [[0, 0.0], [30, 6.0]]}], "log": {"axes": ["x", "y"]}},
+         "environment": [{"profile": "vibration", "points": [[0, 0.0], [30, 6.0]]}],
+         "log": {"axes": ["x", "y"]}},
         duration="1min", rate=10.0,
     )  # fmt: skip
     assert np.isfinite(log["rate"].values).all()
 
 
-def test_axes_that_the_strongest_view_lacks_have_their_sizes_from_the_next():
-    """Two axes are named by what they share, the third by its power alone: its size is no nought."""
+def test_axes_missing_in_the_strongest_statistic_get_sizes_from_the_next():
+    """Two axes are identified by common noise, the third by its power: its size is not 0."""
     world = [
         {
             "profile": "vibration",

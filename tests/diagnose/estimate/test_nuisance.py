@@ -1,4 +1,4 @@
-"""Lags and exponents that a record does not tell: the plainest is said, and sizes know of the others."""
+"""Lags and exponents that a record does not determine: defaults, and sizes with room for others."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.physics.registry import make_effect
-from tests.diagnose.estimate.test_joint_fit import claimed
+from tests.diagnose.estimate.test_joint_fit import identify_by_hand
 from tests.support.named import record
 
 
 @pytest.fixture(scope="module")
-def quiet():
+def noise_only():
     blocks = record([])
     return blocks, calibrate_noise(blocks)
 
@@ -38,10 +38,10 @@ def _variant(identifications, component, values):
     )
 
 
-def fitted(quiet, effect, statistic, column, *, true, size, named):
-    """The fit of an effect with the values `true`, where naming likes `named` best."""
-    blocks, baseline = quiet
-    identifications = claimed(blocks, baseline, effect, statistic, (column,))
+def fit_effect(noise_only, effect, statistic, column, *, true, size, named):
+    """Fit an effect with the values `true`, where the identification prefers `named`."""
+    blocks, baseline = noise_only
+    identifications = identify_by_hand(blocks, baseline, effect, statistic, (column,))
     component = identifications.identified[0].components[0]
     design = _variant(identifications, component, true).design
     if statistic == "mean":
@@ -63,10 +63,10 @@ def fitted(quiet, effect, statistic, column, *, true, size, named):
     return found
 
 
-def test_where_the_record_does_not_tell_a_lag_there_is_none_and_the_size_has_room_for_it(quiet):
+def test_undetermined_lag_is_zero_and_widens_the_size(noise_only):
     truth = 0.01
-    found = fitted(
-        quiet,
+    found = fit_effect(
+        noise_only,
         "shupe",
         "mean",
         "sensitivity",
@@ -82,9 +82,9 @@ def test_where_the_record_does_not_tell_a_lag_there_is_none_and_the_size_has_roo
     assert " s at most" in found.say()
 
 
-def test_a_lag_that_the_record_shows_is_told(quiet):
-    found = fitted(
-        quiet,
+def test_determined_lag_is_estimated(noise_only):
+    found = fit_effect(
+        noise_only,
         "shupe",
         "mean",
         "sensitivity",
@@ -97,9 +97,9 @@ def test_a_lag_that_the_record_shows_is_told(quiet):
     assert found.parameters["sensitivity"].value == pytest.approx(0.3, rel=0.1)
 
 
-def test_the_exponent_of_the_model_is_that_of_the_size(quiet):
-    found = fitted(
-        quiet,
+def test_exponent_of_the_model_is_that_of_the_size(noise_only):
+    found = fit_effect(
+        noise_only,
         "vibration_noise",
         "power",
         "white",
@@ -111,7 +111,7 @@ def test_the_exponent_of_the_model_is_that_of_the_size(quiet):
     assert "exponent" not in found.parameters
 
 
-def test_a_lag_of_nothing_is_no_lag():
+def test_effect_without_lags_has_no_lag_places():
     assert (
         make_effect({"name": "shupe", "sensitivity": 0.1, "lag": 1e-3, "axes": ["x"]})
         .say()

@@ -1,4 +1,4 @@
-"""The noise with the named effects in it: what was there before them, however much of the record they fill."""
+"""Noise calibrated with the effects in the model is that of the simulation without them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 SHAKE = {"profile": "vibration", "points": [[0, 3.0], [850, 3.0], [851, 6.0], [1800, 6.0]]}
 
 
-def reduced_of(*effects, axes=("x", "y"), environment=(), lost=0.0):
+def reduce_simulation(*effects, axes=("x", "y"), environment=(), lost=0.0):
     model = {
         "noise": NOISE,
         "effect": list(effects),
@@ -38,8 +38,8 @@ def reduced_of(*effects, axes=("x", "y"), environment=(), lost=0.0):
     return reduce_log(log.assign(rate=log["rate"].where(there).assign_attrs(log["rate"].attrs)))
 
 
-def naming_of(blocks, baseline, effect, statistic, columns, **values):
-    """A naming of one effect on the axis x, or on both where it is a property of the pair."""
+def identify_by_hand(blocks, baseline, effect, statistic, columns, **values):
+    """Return the identification of one effect on x, or on both axes if it belongs to the pair."""
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
     one = next(one for one in known if one.effect == effect and one.statistic == statistic)
     fits = [each for each in one.variants if each.columns == columns]
@@ -59,7 +59,7 @@ def naming_of(blocks, baseline, effect, statistic, columns, **values):
     )
 
 
-def noise_of(baseline, term, axis="x"):
+def noise_coefficient(baseline, term, axis="x"):
     return tuple(
         float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr")
     )
@@ -67,11 +67,11 @@ def noise_of(baseline, term, axis="x"):
 
 @pytest.fixture(scope="module")
 def shaken():
-    blocks = reduced_of(
+    blocks = reduce_simulation(
         {"name": "vibration_noise", "white": 0.002, "axes": ["x"]}, environment=[SHAKE]
     )
     baseline = calibrate_noise(blocks)
-    identifications = naming_of(
+    identifications = identify_by_hand(
         blocks, baseline, "vibration_noise", "power", ("white",), exponent=1.0
     )
     return (
@@ -81,55 +81,56 @@ def shaken():
     )
 
 
-def test_vibration_at_two_levels_and_never_none(shaken):
+def test_vibration_at_two_levels_that_never_rests(shaken):
     _, baseline, after = shaken
-    assert noise_of(baseline, "N")[0] > 1.7 * 0.003
-    value, error = noise_of(after, "N")
+    assert noise_coefficient(baseline, "N")[0] > 1.7 * 0.003
+    value, error = noise_coefficient(after, "N")
     assert error < 0.2 * value
     assert abs(value - 0.003) < 3.0 * error
     assert after.attrs["recalibrated"] == ["x"]
 
 
-def test_a_diagnosis_tells_noise_and_effects_as_they_are_beside_each_other(shaken):
+def test_diagnosis_separates_noise_and_effects(shaken):
     """The first calibration has the vibration in its noise, and finds less of it than there is."""
     identifications, baseline, after = shaken
     fit = conclude.refit_with_noise(
         identifications, baseline, first := fit_identifications(identifications, baseline)
     )
-    assert noise_of(fit.noise, "N")[0] == noise_of(after, "N")[0] < 1.2 * 0.003
+    assert noise_coefficient(fit.noise, "N")[0] == noise_coefficient(after, "N")[0] < 1.2 * 0.003
     (size,) = fit.fitted[0].parameters.values()
     assert size.low < 0.002 < size.high
     held = conclude.measure_evidence(identifications.state.blocks, baseline, identifications, first)
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.15)
 
 
-def test_a_size_in_shares_of_the_noise_is_one_of_the_noise_beside_it():
-    """Warm throughout, so that the first calibration has twice the noise and more, and its growth in shares of that."""
+def test_relative_size_refers_to_the_recalibrated_noise():
+    """Warm throughout: the first calibration has twice the noise and more, and the growth relative
+    to it."""
     heat = {
         "profile": "ramps",
         "channel": "temperature",
         "unit": "degC",
         "points": [[0, 35], [600, 35], [601, 50], [1200, 50], [1201, 65], [1800, 65]],
     }
-    blocks = reduced_of(
+    blocks = reduce_simulation(
         {"name": "temperature_noise", "linear": 0.05, "axes": ["x"]}, environment=[heat]
     )
     baseline = calibrate_noise(blocks)
-    identifications = naming_of(blocks, baseline, "temperature_noise", "power", ("linear",))
+    identifications = identify_by_hand(blocks, baseline, "temperature_noise", "power", ("linear",))
     first = fit_identifications(identifications, baseline)
     fit = conclude.refit_with_noise(identifications, baseline, first)
     assert first[0].parameters["linear"].high < 0.05
-    growth = fit.fitted[0].parameters["linear"].value * noise_of(fit.noise, "N")[0] ** 2
+    growth = fit.fitted[0].parameters["linear"].value * noise_coefficient(fit.noise, "N")[0] ** 2
     assert growth == pytest.approx(0.05 * 0.003**2, rel=0.1)
 
 
-def test_an_axis_without_an_effect_keeps_its_noise(shaken):
+def test_axis_without_an_effect_keeps_its_noise(shaken):
     _, baseline, after = shaken
     for name in ("coefficient", "spectrum", "square", "grid_calibrated", "mean_variance"):
         np.testing.assert_array_equal(after[name].sel(axis="y"), baseline[name].sel(axis="y"))
 
 
-def test_effect_and_new_noise_make_the_record(shaken):
+def test_effect_and_new_noise_add_up_to_the_record(shaken):
     identifications, _, after = shaken
     model = predict_baseline(with_noise(identifications, after), after)
     ratio = (identifications.state.blocks["power"] / model["spectrum"]).sel(axis="x")
@@ -143,7 +144,7 @@ def test_effect_and_new_noise_make_the_record(shaken):
         )
 
 
-def test_noise_of_held_out_time_is_not_used(shaken):
+def test_held_out_blocks_are_not_used(shaken):
     identifications, baseline, _ = shaken
     known = np.arange(identifications.state.blocks.sizes["block"]) % 2 == 0
     blind = recalibrate(identifications, baseline, [], known)
@@ -155,19 +156,21 @@ def test_noise_of_held_out_time_is_not_used(shaken):
         [],
         known,
     )
-    assert noise_of(blind, "N")[0] == pytest.approx(noise_of(other, "N")[0], rel=0.03)
+    assert noise_coefficient(blind, "N")[0] == pytest.approx(
+        noise_coefficient(other, "N")[0], rel=0.03
+    )
 
 
-def test_what_axes_share_is_no_noise_of_their_own():
-    blocks = reduced_of({"name": "shared_source", "N": 0.002})
+def test_common_noise_is_not_noise_of_one_axis():
+    blocks = reduce_simulation({"name": "shared_source", "N": 0.002})
     baseline = calibrate_noise(blocks)
-    identifications = naming_of(
+    identifications = identify_by_hand(
         blocks, baseline, "shared_source", "cross", ("N",), bandwidth=np.inf
     )
     after = recalibrate(identifications, baseline, fit_identifications(identifications, baseline))
     for axis in "xy":
-        assert noise_of(baseline, "N", axis)[0] > 1.15 * 0.003
-        value, error = noise_of(after, "N", axis)
+        assert noise_coefficient(baseline, "N", axis)[0] > 1.15 * 0.003
+        value, error = noise_coefficient(after, "N", axis)
         assert abs(value - 0.003) < 3.0 * error
         assert (
             error < 0.2 * value
@@ -175,13 +178,13 @@ def test_what_axes_share_is_no_noise_of_their_own():
     np.testing.assert_allclose(after["spectrum"].median(), baseline["spectrum"].median(), rtol=0.05)
 
 
-def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
+def test_phase_locked_power_is_counted_once():
     shaken = {
         "profile": "vibration",
         "points": [[0, 0.02], [600, 0.02], [601, 6.0], [1200, 6.0], [1201, 0.02], [1800, 0.02]],
         "band": [17.5, 20.0],
     }
-    blocks = reduced_of(
+    blocks = reduce_simulation(
         {"name": "aliased_vibration", "sensitivity": 0.3, "low": 17.5, "high": 20.0},
         environment=[shaken],
     )
@@ -215,7 +218,7 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
         assert sizes
         assert sizes == pytest.approx([0.3] * len(sizes), rel=0.1)
     for axis in "xy":
-        value, error = noise_of(noise, "N", axis)
+        value, error = noise_coefficient(noise, "N", axis)
         assert abs(value - 0.003) < 3.0 * error
     again = {
         "name": "aliased_vibration",
@@ -223,7 +226,7 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
         "low": first[0].effect.low,
         "high": first[0].effect.high,
     }
-    model = reduced_of(again, environment=[shaken])  # 17.5 to 20 Hz fold onto 0 to 2.5 Hz
+    model = reduce_simulation(again, environment=[shaken])  # 17.5 to 20 Hz fold onto 0 to 2.5 Hz
     band, loud = model["frequency"].values, model["channel_vibration"].values > 3.0
     power = model["power"].mean("axis").values
     above = power[loud].mean(axis=0) / power[~loud].mean(axis=0) - 1.0
@@ -231,12 +234,12 @@ def test_power_that_an_effect_holds_in_its_own_view_is_counted_once():
 
 
 @pytest.mark.parametrize("size", [10.0, 40.0])
-def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them(size):
-    blocks = reduced_of(
+def test_anomalous_samples_do_not_raise_the_noise(size):
+    blocks = reduce_simulation(
         {"name": "spikes", "kind": "outlier", "per_hour": 60.0, "size": size}, axes=["x"]
     )
     baseline = calibrate_noise(blocks)
-    identifications = naming_of(blocks, baseline, "spikes", "marks", ("outliers",))
+    identifications = identify_by_hand(blocks, baseline, "spikes", "marks", ("outliers",))
     identifications = replace(
         identifications, count_evidence=CountEvidence({"outliers": (np.zeros(1), np.ones(1))})
     )
@@ -245,7 +248,7 @@ def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them
         one = fitted.parameters[name]
         assert one.low <= true <= one.high
         assert one.stderr < 0.3 * one.value
-    value, error = noise_of(recalibrate(identifications, baseline, [fitted]), "N")
+    value, error = noise_coefficient(recalibrate(identifications, baseline, [fitted]), "N")
     assert abs(value - 0.003) < 3.0 * error
     assert error < 0.05 * value
 
@@ -261,23 +264,23 @@ def test_odd_samples_are_counted_measured_and_no_noise_of_the_blocks_beside_them
         ({"length": 0.5}, {"length": 0.5, "instrument": 1.0, "cutoff": 0.0}),
     ],
 )
-def test_noise_before_a_filter(table, grid, lost):
-    blocks = reduced_of({"name": "logger_filter", **table}, axes=["x"], lost=lost)
+def test_noise_before_a_filter_is_recovered(table, grid, lost):
+    blocks = reduce_simulation({"name": "logger_filter", **table}, axes=["x"], lost=lost)
     baseline = calibrate_noise(blocks)
-    identifications = naming_of(blocks, baseline, "logger_filter", "power", (), **grid)
+    identifications = identify_by_hand(blocks, baseline, "logger_filter", "power", (), **grid)
     (fitted,) = fit_identifications(identifications, baseline)
     name = "cutoff" if "cutoff" in table else "length"
     one = fitted.parameters[name]
     assert one.low <= table[name] <= one.high
     assert one.value == pytest.approx(table[name], rel=0.04 if lost == 0.0 else 0.15)
     after = recalibrate(identifications, baseline, [fitted])
-    assert noise_of(baseline, "N")[0] < 0.8 * 0.003
-    value, error = noise_of(after, "N")
+    assert noise_coefficient(baseline, "N")[0] < 0.8 * 0.003
+    value, error = noise_coefficient(after, "N")
     assert abs(value - 0.003) < 3.0 * error
     assert error < 0.1 * value
 
 
-def test_a_model_that_was_given_keeps_its_noise(shaken):
+def test_given_model_keeps_its_noise(shaken):
     identifications, baseline, _ = shaken
     given = baseline.assign_attrs(source="model")
     assert recalibrate(identifications, given, []) is given

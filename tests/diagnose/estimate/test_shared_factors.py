@@ -1,4 +1,4 @@
-"""Sizes of noise that axes share: what products tell, what a low-pass hides, and what one pair cannot say."""
+"""Factors of common noise: from products of pairs, behind a low-pass, and with a single pair."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RECORDS = 8
 
 
 @pytest.fixture(scope="module")
-def quiet():
+def noise_only():
     blocks = record([])
     candidates, _ = effect_candidates(blocks, COEFFICIENT)
     return (
@@ -30,9 +30,9 @@ def quiet():
     )
 
 
-def sizes(quiet, factors, number, *, bandwidth=math.inf, axes=AXES):
-    """Sizes from cross-spectra that are drawn about those of common noise with these factors, white or behind one pole."""
-    blocks, baseline, candidate = quiet
+def estimate_sizes(noise_only, factors, number, *, bandwidth=math.inf, axes=AXES):
+    """Estimate factors from cross-spectra drawn for common noise, white or behind one pole."""
+    blocks, baseline, candidate = noise_only
     rng = np.random.default_rng([11, number])
     f = blocks["frequency"].values
     density = 3600.0 / (1.0 + (f / bandwidth) ** 2)
@@ -61,11 +61,11 @@ def sizes(quiet, factors, number, *, bandwidth=math.inf, axes=AXES):
 
 
 @pytest.mark.parametrize("bandwidth", [math.inf, 1.2])
-def test_intervals_hold_the_factors(quiet, bandwidth):
+def test_intervals_hold_the_true_factors(noise_only, bandwidth):
     truth = (0.0014, 0.0011, -0.0016)
     held = []
     for number in range(RECORDS):
-        found = sizes(quiet, truth, number, bandwidth=bandwidth)
+        found = estimate_sizes(noise_only, truth, number, bandwidth=bandwidth)
         sign = np.sign(
             sum(found[f"N.{axis}"][0] * one for axis, one in zip(AXES, truth, strict=True))
         )
@@ -77,17 +77,17 @@ def test_intervals_hold_the_factors(quiet, bandwidth):
     assert np.mean(inside) >= 0.8
 
 
-def test_a_low_pass_is_told_where_it_shows_and_is_none_where_it_does_not(quiet):
-    slow = sizes(quiet, (0.002, 0.002, 0.002), 1, bandwidth=0.8)["bandwidth"]
+def test_bandwidth_is_given_only_if_it_shows(noise_only):
+    slow = estimate_sizes(noise_only, (0.002, 0.002, 0.002), 1, bandwidth=0.8)["bandwidth"]
     assert slow[2] < 0.8 < slow[3]
     assert slow[3] / slow[2] < 2.0
-    assert math.isinf(sizes(quiet, (0.002, 0.002, 0.002), 1)["bandwidth"][0])
+    assert math.isinf(estimate_sizes(noise_only, (0.002, 0.002, 0.002), 1)["bandwidth"][0])
 
 
-def test_one_pair_tells_the_product_alone(quiet):
-    """The factors may be any between the most that the axis has and what the most of the other one leaves."""
+def test_one_pair_determines_only_the_product(noise_only):
+    """The factors range between the most that the axis has and what the other axis leaves."""
     truth = (0.0024, 0.0009, 0.0)
-    found = sizes(quiet, truth, 3, axes=("x", "y"))
+    found = estimate_sizes(noise_only, truth, 3, axes=("x", "y"))
     (x, _, x_low, x_high), (y, _, y_low, y_high) = found["N.x"], found["N.y"]
     assert x * y == pytest.approx(truth[0] * truth[1], rel=0.15)
     assert x_low < truth[0] < x_high < 0.0032
@@ -95,14 +95,14 @@ def test_one_pair_tells_the_product_alone(quiet):
     assert x_low * y_high == pytest.approx(truth[0] * truth[1], rel=0.25)
 
 
-def test_no_axis_shares_more_than_it_has(quiet):
-    found = sizes(quiet, (0.0004, 0.0004, 0.0004), 5)
+def test_common_noise_does_not_exceed_the_noise(noise_only):
+    found = estimate_sizes(noise_only, (0.0004, 0.0004, 0.0004), 5)
     assert all(abs(found[f"N.{axis}"][3]) < 0.0033 for axis in AXES)
 
 
-def test_other_pairs_of_axes_change_nothing(quiet):
+def test_other_pairs_do_not_matter(noise_only):
     one, other = (
-        sizes(quiet, (0.002, 0.0015, 0.0), 7, axes=("x", "y")),
-        sizes(quiet, (0.002, 0.0015, 0.003), 7, axes=("x", "y")),
+        estimate_sizes(noise_only, (0.002, 0.0015, 0.0), 7, axes=("x", "y")),
+        estimate_sizes(noise_only, (0.002, 0.0015, 0.003), 7, axes=("x", "y")),
     )
     assert one == other

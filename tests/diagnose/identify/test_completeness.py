@@ -1,4 +1,4 @@
-"""What names leave in the powers: nothing where they are right, a structure in time where they are not."""
+"""Effects leave no structure in time in the powers if they are right, and some if they are not."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Dataset:
-    """White noise at 10 Hz on one axis, its standard deviation times a factor for each block of 20 s."""
+    """White noise at 10 Hz on one axis, scaled by a factor in each block of 20 s."""
     rng = np.random.default_rng(seed)
     rates = rng.standard_normal((1, BLOCKS * LENGTH)) * np.repeat(factor, LENGTH)
     if gaps:
@@ -35,8 +35,8 @@ def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Datas
     return reduce_log(make_log(rates, rate=10.0, unit="deg/h"), block="20s")
 
 
-def left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
-    """Unrest beside columns (block,) of added white power."""
+def fluctuation_left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
+    """Return the variance fluctuation with columns (block,) of added white power in the model."""
     state: State = initial_state(blocks, calibrate_noise(blocks))
     spread = [
         np.broadcast_to(one[:, None], state.weight.shape[1:]).astype(float) for one in columns
@@ -47,28 +47,28 @@ def left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("gaps", [False, True])
-def test_noise_that_stands_still_is_at_rest(gaps: bool) -> None:
-    found = [left(record(np.ones(BLOCKS), seed=seed, gaps=gaps)) for seed in range(12)]
+def test_steady_noise_does_not_fluctuate(gaps: bool) -> None:
+    found = [fluctuation_left(record(np.ones(BLOCKS), seed=seed, gaps=gaps)) for seed in range(12)]
     assert max(found) < 2.0
     assert np.median(found) < 0.0
 
 
-def test_bursts_are_unrest_and_none_once_they_are_known() -> None:
+def test_bursts_fluctuate_until_they_are_in_the_model() -> None:
     burst = np.zeros(BLOCKS)
     burst[[10, 11, 12, 30, 31, 52, 53, 54, 55, 90, 91, 92]] = 0.6
     blocks = record(np.sqrt(1.0 + burst))
-    assert left(blocks) > 8.0
-    assert left(blocks, burst) < 2.0
-    assert left(blocks, np.linspace(0.0, 1.0, BLOCKS)) > 8.0
+    assert fluctuation_left(blocks) > 8.0
+    assert fluctuation_left(blocks, burst) < 2.0
+    assert fluctuation_left(blocks, np.linspace(0.0, 1.0, BLOCKS)) > 8.0
 
 
-def test_a_single_loud_block_is_no_course_of_time() -> None:
+def test_single_noisy_block_is_not_a_fluctuation() -> None:
     one = np.ones(BLOCKS)
     one[40] = 30.0
-    assert left(record(one)) < 8.0
+    assert fluctuation_left(record(one)) < 8.0
 
 
-def test_blocks_that_are_masked_do_not_count() -> None:
+def test_masked_blocks_do_not_count() -> None:
     burst = np.ones(BLOCKS)
     burst[20:40] = 1.5
     blocks = record(burst)
@@ -77,12 +77,12 @@ def test_blocks_that_are_masked_do_not_count() -> None:
     assert variance_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
 
 
-def test_a_smooth_name_for_bursts_is_taken_back() -> None:
+def test_smooth_effect_that_stands_for_bursts_is_withdrawn() -> None:
     level = np.ones(BLOCKS)
     rng = np.random.default_rng(4)
     level[60:] = np.where(
         rng.random(60) < 0.4, 1.35, 1.0
-    )  # later is louder on average, and not at all steadily
+    )  # later is noisier on average, and not at all steadily
     blocks = record(level)
     baseline, records = nulls(blocks, 40)
     found = name_effects(blocks, baseline, records)
@@ -100,7 +100,7 @@ def test_a_smooth_name_for_bursts_is_taken_back() -> None:
     ] == ["ageing_noise"]
 
 
-def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
+def test_noisy_axes_are_not_correlated() -> None:
     rng = np.random.default_rng(6)
     loud = np.ones(BLOCKS)
     loud[40:60] = 20.0
@@ -123,7 +123,7 @@ def test_what_is_loud_on_both_axes_has_nothing_in_common() -> None:
     assert common(search._score_candidates(state, set())) < 3.0
 
 
-def test_no_jump_and_no_ageing_is_named_beside_a_drift_of_no_name_that_brings_more():
+def test_jump_and_ageing_are_withdrawn_in_a_stronger_drift():
     noise = 0.5 * np.random.default_rng(1).standard_normal((2, 9000))[1:]
     seconds = np.arange(9000) / 10.0
     turned = [
@@ -140,7 +140,7 @@ def test_no_jump_and_no_ageing_is_named_beside_a_drift_of_no_name_that_brings_mo
         1000,
         400,
         0,
-    ]  # deg/h, with no channel to tell of it
+    ]  # deg/h, without a channel that shows it
     noise += np.interp(seconds, np.linspace(0.0, 640.0, 13), turned)
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
     found = name_effects(blocks, *nulls(blocks, 40))

@@ -1,4 +1,4 @@
-"""What lasts for a while, or is loud everywhere, and what no law of time, no jump, no leak and no rotation is to be named for."""
+"""Temporary and fluctuating noise must not become ageing, jumps, leaks or rotation lines."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ SECOND = np.arange(BLOCKS * LENGTH) / RATE
 MODEL = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}}
 
 
-def reduced_of(rate: np.ndarray) -> xr.Dataset:
-    """Rates (axis, time) [deg/h] in blocks of 20 s."""
+def reduce_rates(rate: np.ndarray) -> xr.Dataset:
+    """Reduce rates (axis, time) [deg/h] to blocks of 20 s."""
     return reduce_log(make_log(rate, rate=RATE, unit="deg/h"), block="20s")
 
 
-def loud(factor: np.ndarray) -> np.ndarray:
+def noise_with_levels(factor: np.ndarray) -> np.ndarray:
     """White noise on one axis, its standard deviation times a factor for each block."""
     return np.asarray(
         np.random.default_rng(1).standard_normal((1, BLOCKS * LENGTH)) * np.repeat(factor, LENGTH)
     )
 
 
-def started(rate: np.ndarray) -> State:
-    blocks = reduced_of(rate)
+def state_of_rates(rate: np.ndarray) -> State:
+    blocks = reduce_rates(rate)
     return initial_state(
         blocks,
         baseline_from_model(
@@ -59,17 +59,17 @@ def candidate(state: State, effect: str, statistic: str) -> Candidate:
     return next(one for one in known if (one.effect, one.statistic) == (effect, statistic))
 
 
-def parts_of(state: State, one: Candidate) -> list[Component]:
+def components_of(state: State, one: Candidate) -> list[Component]:
     return group_components(
         compute_evidence([one], state.blocks, state, fold_blocks(state.blocks))
     )[one.key]
 
 
 @pytest.mark.parametrize("inside", [slice(0, 3), slice(-4, None)])
-def test_noise_that_is_louder_for_one_stretch_does_not_age(inside: slice) -> None:
+def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     factor = np.ones(BLOCKS)
     factor[inside] = 3.0
-    blocks = reduced_of(loud(factor))
+    blocks = reduce_rates(noise_with_levels(factor))
     found = name_effects(blocks, *nulls(blocks, 40))
     assert not found.identified
     first = found.unknown[0]
@@ -80,16 +80,14 @@ def test_noise_that_is_louder_for_one_stretch_does_not_age(inside: slice) -> Non
 
 
 @pytest.mark.parametrize(("first", "last", "named"), [(1.0, 1.3, ["ageing_noise"]), (1.3, 1.0, [])])
-def test_noise_gets_louder_with_age_and_not_the_other_way(
-    first: float, last: float, named: list[str]
-) -> None:
-    blocks = reduced_of(loud(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))
+def test_ageing_noise_only_grows(first: float, last: float, named: list[str]) -> None:
+    blocks = reduce_rates(noise_with_levels(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))
     found = name_effects(blocks, *nulls(blocks, 40))
     assert [identification.effect for identification in found.identified] == named
     assert found.verdict == ("explained" if named else "unknown")
 
 
-def test_stretches_of_all_lengths_are_tried_at_both_ends() -> None:
+def test_stretches_of_all_lengths_reach_both_ends() -> None:
     for block_count in (5, 92, 540, 4320):
         tried = {tuple(one) for one in burst_intervals(block_count).tolist()}
         assert len(tried) <= 240
@@ -103,8 +101,9 @@ def test_stretches_of_all_lengths_are_tried_at_both_ends() -> None:
 
 
 @pytest.mark.parametrize(("size", "jump"), [(8.0, True), (0.0, False)])
-def test_waves_slower_than_a_block_are_no_jumps(size: float, jump: bool) -> None:
-    """From half an hour on means scatter by twenty of their errors; beside them a level that stays is still seen."""
+def test_waves_slower_than_a_block_are_not_jumps(size: float, jump: bool) -> None:
+    """From half an hour on, means scatter by twenty of their errors; a lasting level is still found
+    among them."""
     waves = (
         np.repeat(np.random.default_rng(3).standard_normal(BLOCKS), LENGTH)
         * 20.0
@@ -112,39 +111,43 @@ def test_waves_slower_than_a_block_are_no_jumps(size: float, jump: bool) -> None
         / np.sqrt(LENGTH)
     )
     waves[SECOND < 1800.0] = 0.0
-    state = started(
+    state = state_of_rates(
         WHITE * np.random.default_rng(4).standard_normal((1, SECOND.size))
         + waves
         + size * (SECOND >= 1000.0)
     )
-    found = parts_of(state, candidate(state, "bias_jump", "mean"))
+    found = components_of(state, candidate(state, "bias_jump", "mean"))
     assert sum_evidence(found) > 20.0
     assert bool(is_physical(found, state)) == jump
 
 
 @pytest.mark.parametrize(("back", "jump"), [(2.0, False), (1.2, True)])
-def test_what_comes_back_to_the_same_level_is_an_event(back: float, jump: bool) -> None:
+def test_return_to_the_old_level_is_not_a_jump(back: float, jump: bool) -> None:
     course = 2.0 * (SECOND >= 1000.0) - back * (SECOND >= 1160.0)
-    state = started(WHITE * np.random.default_rng(4).standard_normal((1, SECOND.size)) + course)
-    found = parts_of(state, candidate(state, "bias_jump", "mean"))
+    state = state_of_rates(
+        WHITE * np.random.default_rng(4).standard_normal((1, SECOND.size)) + course
+    )
+    found = components_of(state, candidate(state, "bias_jump", "mean"))
     assert sum_evidence(found) > 8.0
     assert bool(is_physical(found, state)) == jump
 
 
 @pytest.mark.parametrize(("back", "jump"), [(1.0, False), (0.0, True)])
-def test_a_slight_event_that_lasts_long_is_no_jump(back: float, jump: bool) -> None:
-    """Two errors of a mean, for a twelfth of two hours: too little to be louder means."""
+def test_long_weak_event_is_not_a_jump(back: float, jump: bool) -> None:
+    """Two errors of a mean, for a twelfth of two hours: too little for noisier means."""
     second = np.arange(360 * LENGTH) / RATE
     course = 0.12 * ((second >= 3000.0) - back * (second >= 3640.0))
-    state = started(WHITE * np.random.default_rng(5).standard_normal((1, second.size)) + course)
-    found = parts_of(state, candidate(state, "bias_jump", "mean"))
+    state = state_of_rates(
+        WHITE * np.random.default_rng(5).standard_normal((1, second.size)) + course
+    )
+    found = components_of(state, candidate(state, "bias_jump", "mean"))
     assert sum_evidence(found) > 8.0
     assert bool(is_physical(found, state)) == jump
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_only_motion_leaks(moves: bool) -> None:
-    """Noise and a line that both axes have in common, with and without a sway of y that comes and goes and leaks into x."""
+def test_only_motion_is_a_misalignment(moves: bool) -> None:
+    """Noise and a line in common, with and without an intermittent sway of y that leaks into x."""
     rng = np.random.default_rng(6)
     shared = WHITE * rng.standard_normal(SECOND.size) + WHITE * np.sin(2.0 * np.pi * 1.7 * SECOND)
     rate = WHITE * rng.standard_normal((2, SECOND.size)) + 0.5 * shared
@@ -152,7 +155,7 @@ def test_only_motion_leaks(moves: bool) -> None:
         SECOND % 800.0 < 300.0
     )
     rate += 30.0 * WHITE * np.array([[0.015], [1.0]]) * sway * moves
-    state = started(rate)
+    state = state_of_rates(rate)
     leaks = [
         one
         for one in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
@@ -164,12 +167,12 @@ def test_only_motion_leaks(moves: bool) -> None:
 
 
 @pytest.mark.parametrize("sway", [0.0, 3.0])
-def test_what_is_at_rest_cannot_leak(sway: float) -> None:
-    """Whatever chance makes a leak of it gain."""
+def test_axis_at_rest_cannot_leak(sway: float) -> None:
+    """Whatever evidence chance gives to a leak."""
     rng = np.random.default_rng(6)
     rate = WHITE * rng.standard_normal((2, SECOND.size))
     rate[1] += sway * WHITE * np.sin(2.0 * np.pi * 1.7 * SECOND)
-    state = started(rate)
+    state = state_of_rates(rate)
     one = next(
         each
         for each in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
@@ -180,10 +183,10 @@ def test_what_is_at_rest_cannot_leak(sway: float) -> None:
 
 
 @pytest.mark.parametrize("leak", [0.0, 0.003])
-def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) -> None:
+def test_leak_must_exceed_time_shifted_surrogates(leak: float) -> None:
     rng = np.random.default_rng(8)
     turning = np.interp(SECOND, np.linspace(0.0, SECOND[-1], 25), 200.0 * rng.standard_normal(25))
-    state = started(
+    state = state_of_rates(
         WHITE * rng.standard_normal((2, SECOND.size)) + np.array([[leak], [1.0]]) * turning
     )
     one = candidate(state, "misalignment", "mean")
@@ -196,10 +199,9 @@ def test_a_leak_must_beat_the_means_of_the_other_axis_slid_in_time(leak: float) 
 
 
 @pytest.mark.parametrize(("late", "named"), [(0.0, ["vibration_rectification"]), (0.7, [])])
-def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(
-    late: float, named: list[str]
-) -> None:
-    """A bias swings as the square of the vibration does, or a ninth of a period before it: then half of all other times do as well."""
+def test_channel_that_fails_the_time_shift_test_is_not_named(late: float, named: list[str]) -> None:
+    """A bias follows the squared vibration, or leads it by a ninth of a period: then half of all
+    shifts explain as much."""
     phase = 2.0 * np.pi * SECOND / 200.0
     rate = WHITE * np.random.default_rng(9).standard_normal((1, SECOND.size)) + 0.3 * np.sin(phase)
     shaking = np.sqrt(2.0 + np.sin(phase - late))
@@ -210,8 +212,9 @@ def test_a_channel_that_does_no_better_than_slid_in_time_is_not_named(
     assert [identification.effect for identification in found.identified] == named
 
 
-def swelling(size: float) -> State:
-    """Swell about 0.3 Hz that comes in groups, twenty times above the noise; a tool that turns as often, with a line of its turning."""
+def make_swell(size: float) -> State:
+    """Swell about 0.3 Hz in groups, twenty times above the noise; a tool that rotates as fast, with
+    its line."""
     rng = np.random.default_rng(5)
     swell = lfilter(
         [1.0],
@@ -223,10 +226,10 @@ def swelling(size: float) -> State:
     rate = (
         WHITE * rng.standard_normal((1, SECOND.size)) + swell + size * np.sin(2.0 * np.pi * turns)
     )
-    return turned(rate, turns)
+    return state_of_rotation(rate, turns)
 
 
-def turned(rate: np.ndarray, turns: np.ndarray) -> State:
+def state_of_rotation(rate: np.ndarray, turns: np.ndarray) -> State:
     """Rates (axis, time) [deg/h] with the channel of a tool that has made so many turns."""
     log = make_log(rate, rate=RATE, unit="deg/h")
     turning = 360.0 * np.gradient(turns, SECOND)
@@ -237,13 +240,13 @@ def turned(rate: np.ndarray, turns: np.ndarray) -> State:
 
 
 @pytest.mark.parametrize("size", [0.0, 6.0])
-def test_waves_that_do_not_turn_with_the_tool_are_no_line_of_its_turning(size: float) -> None:
-    state = swelling(size)
-    found = parts_of(state, candidate(state, "rotation_line", "order"))
+def test_waves_not_locked_to_the_rotation_are_not_rotation_lines(size: float) -> None:
+    state = make_swell(size)
+    found = components_of(state, candidate(state, "rotation_line", "order"))
     assert (sum_evidence(found) > 15.0) == (size > 0.0)
 
 
-def test_what_turns_with_the_tool_leaves_the_noise_about_it_alone() -> None:
+def test_rotation_lines_do_not_change_the_noise_around_them() -> None:
     """Three harmonics, a hundred times the noise: white noise of 0.003 deg/sqrt(h) about each."""
     rng = np.random.default_rng(2)
     turns = 0.21 * SECOND + 0.2 * np.sin(2.0 * np.pi * SECOND / 300.0)
@@ -253,15 +256,16 @@ def test_what_turns_with_the_tool_leaves_the_noise_about_it_alone() -> None:
         size * np.sin(2.0 * np.pi * k * turns) for k, size in ((1, 3.0), (2, 5.0), (3, 2.0))
     )
     level = [
-        turned(values[None], turns).blocks["order_level"].values[0] for values in (rate, quiet)
+        state_of_rotation(values[None], turns).blocks["order_level"].values[0]
+        for values in (rate, quiet)
     ]
     usual = 3600.0 * 0.003**2
     assert np.nanmean(level[1]) == pytest.approx(usual, rel=0.08)
     assert np.nanmedian(level[0]) < 3.0 * usual
 
 
-def test_what_is_scored_at_orders_is_as_wild_as_in_null_records() -> None:
-    state = swelling(0.0)
+def test_scores_at_orders_scatter_like_null_records() -> None:
+    state = make_swell(0.0)
     (drawn,) = null_records(
         state.blocks, state.baseline, count=40, rng=np.random.default_rng(1), chunk=40
     )

@@ -1,4 +1,4 @@
-"""Names for simulated effects, and none for noise."""
+"""Identify simulated effects, and nothing in noise."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.named import WORLD, nulls, record
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def named(effects, *, environment=WORLD["usual"], seed=1, drop=(), count=40):
+def identify(effects, *, environment=WORLD["usual"], seed=1, drop=(), count=40):
     blocks = record(effects, environment=environment, seed=seed, drop=drop)
     baseline, records = nulls(blocks, count)
     return name_effects(blocks, baseline, records)
@@ -37,18 +37,18 @@ VIBRATION = [{"name": "vibration_noise", "white": 6e-4, "axes": ["x"]}]
 
 @pytest.fixture(scope="module")
 def shaken():
-    return named(VIBRATION)
+    return identify(VIBRATION)
 
 
-def test_noise_gets_no_name():
-    found = named([], seed=2)
+def test_noise_has_no_identification():
+    found = identify([], seed=2)
     assert found.verdict == "no mismatch"
     assert found.identified == found.unknown == ()
     assert 3.0 < found.threshold < 15.0
     assert found.null_best.size == 40
 
 
-def test_vibration_noise_is_named_on_its_axis(shaken):
+def test_vibration_noise_is_identified_on_its_axis(shaken):
     (identification,) = shaken.identified
     assert identification.effect == "vibration_noise"
     assert identification.axes == ("x",)
@@ -59,8 +59,8 @@ def test_vibration_noise_is_named_on_its_axis(shaken):
     assert shaken.verdict == "explained"
 
 
-def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
-    """A part of negative size on an axis without the effect is dropped, not the effect with it."""
+def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
+    """Only the component of negative size, on an axis without the effect, is dropped."""
     state, (identification,) = shaken.state, shaken.identified
     (component,) = (one for one in identification.components if one.candidate.statistic == "power")
     elsewhere = [replace(component, row=(axis,)) for axis in "yz"]
@@ -73,8 +73,8 @@ def test_chance_on_another_axis_does_not_veto_a_name(shaken, monkeypatch):
     assert is_physical([component, *elsewhere], state) == [component, elsewhere[1]]
 
 
-def test_sizes_beyond_what_the_registry_allows_are_impossible(shaken):
-    """A bias of 15 deg/h for each of some 40 degC is that of a broken instrument, or no effect of temperature."""
+def test_sizes_outside_the_registry_are_rejected(shaken):
+    """15 deg/h for some 40 degC is that of a broken instrument, or not an effect of temperature."""
     bias = next(
         one
         for one in shaken.candidates
@@ -119,24 +119,24 @@ def test_sizes_beyond_what_the_registry_allows_are_impossible(shaken):
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else None,
 )
-def test_single_effects_are_named(table, environment, others):
-    found = named([table], environment=WORLD[environment])
+def test_single_effects_are_identified(table, environment, others):
+    found = identify([table], environment=WORLD[environment])
     assert [identification.effect for identification in found.identified] == [table["name"]]
     (identification,) = found.identified
     assert identification.axes == tuple(table["axes"])
     assert set(identification.alternatives) <= others
 
 
-def test_without_its_channel_an_effect_is_not_named():
-    found = named(VIBRATION, drop=("vibration",))
+def test_effect_without_its_channel_is_not_identified():
+    found = identify(VIBRATION, drop=("vibration",))
     assert not found.identified
     assert found.verdict == "unknown"
     assert {one.generic for one in found.unknown} <= {"~N(t)", "~S(f)", "~burst"}
     assert all(one.axes == ("x",) for one in found.unknown)
 
 
-def test_two_effects_are_both_named():
-    found = named(
+def test_two_effects_are_both_identified():
+    found = identify(
         [*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}]
     )
     assert {
@@ -147,7 +147,7 @@ def test_two_effects_are_both_named():
     }
 
 
-def test_slid_channels_do_worse(shaken):
+def test_time_shifted_channels_explain_less(shaken):
     (identification,) = shaken.identified
     start = replace(shaken.state, given={})
     beats, p_value = passes_time_shift_test(identification.components, start, shaken.folds)
@@ -157,7 +157,7 @@ def test_slid_channels_do_worse(shaken):
     assert not passes_time_shift_test(elsewhere, start, shaken.folds)[0]
 
 
-def test_what_is_named_is_taken_out_of_the_rest(shaken):
+def test_identified_effect_is_in_the_model_of_the_next(shaken):
     (identification,) = shaken.identified
     loud = shaken.state.weight[0] / shaken.state.baseline["spectrum"].values[0]
     vibration = shaken.state.blocks["channel_vibration"].values
@@ -174,21 +174,21 @@ def test_too_few_null_records_are_refused():
         name_effects(blocks, baseline, records)
 
 
-def test_claims_are_plain(shaken):
+def test_identifications_are_frozen_data(shaken):
     assert all(isinstance(identification, Identification) for identification in shaken.identified)
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # parts
 
 
-def test_other_axes_must_pay_for_themselves():
+def test_additional_axes_need_evidence():
     assert combine_rows(np.array([10.0, 1.0, -5.0])) == 10.0
     assert combine_rows(np.array([10.0, 10.0, 10.0])) == 27.0
     assert combine_rows(np.array([-2.0, -1.0])) == -1.0
 
 
-def test_level_of_an_exponential_tail():
+def test_tail_level_of_an_exponential_law():
     sample = np.random.default_rng(2).exponential(size=50_000)
     for level in (0.1, 0.01, 0.001):
         assert tail_level(sample, level) == pytest.approx(-np.log(level), rel=0.05)
@@ -198,7 +198,7 @@ def subsets(block_count: int) -> np.ndarray:
     return fold_subsets(fold_blocks(record([]).isel(block=slice(0, block_count))))
 
 
-def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
+def test_only_raised_counts_have_evidence():
     rng = np.random.default_rng(4)
     usual = rng.poisson(0.05, (500, 2, 120))
     mean, spread = expected_counts(usual)
@@ -210,8 +210,9 @@ def test_counts_that_are_usual_gain_nothing_and_raised_ones_do():
     assert raised.min() > 5.0
 
 
-def test_blocks_that_are_lost_are_expected_to_count_nothing():
-    """Half of the blocks are lost: in the others as many as usual are no more than usual, and three times as many are."""
+def test_lost_blocks_are_expected_to_have_no_counts():
+    """With half of the blocks lost, the usual count in the others is not raised, and three times as
+    many are."""
     rng = np.random.default_rng(5)
     there = np.arange(120) < 60
     usual = rng.poisson(1.0 * there, (400, 1, 120))
@@ -226,8 +227,8 @@ def test_blocks_that_are_lost_are_expected_to_count_nothing():
     assert many.min() > 40.0
 
 
-def test_every_line_of_a_comb_is_named():
-    """More lines than other effects are looked for."""
+def test_every_line_of_a_comb_is_identified():
+    """There are more lines than the limit for other effects."""
     quiet = reduce_log(
         make_log(np.random.default_rng(3).standard_normal((2, 24_000)), rate=10.0, unit="deg/h")
     )
@@ -254,7 +255,7 @@ def test_every_line_of_a_comb_is_named():
     assert comb.size == 14
 
 
-def test_a_line_stands_out_at_its_place_only():
+def test_line_has_evidence_only_at_its_frequency():
     rng = np.random.default_rng(5)
     weight = np.full((1, 8), 22.0)
     power = rng.gamma(22.0, 1 / 22.0, (40, 1, 8, 500))

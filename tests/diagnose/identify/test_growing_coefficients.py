@@ -1,4 +1,4 @@
-"""Growing coefficients are named for what they are; every name has a place; levels that change make no lines or tails."""
+"""Growing coefficients of a fit have named causes; changing levels make neither lines nor tails."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def small() -> tuple[xr.Dataset, gyrostab.Diagnosis]:
     return log, runs["five"]
 
 
-def test_the_fit_of_the_paper_says_that_everything_grows() -> None:
+def test_fit_of_the_paper_shows_growth_in_every_term() -> None:
     along = [
         {"name": "aliased_vibration", "axes": ["x"], "sensitivity": 3.73, "low": 700, "high": 800}
     ]
@@ -67,7 +67,7 @@ def test_the_fit_of_the_paper_says_that_everything_grows() -> None:
         assert (fits["shaken"][term] > 5.0 * fits["still"][term]).all()
 
 
-def test_growing_coefficients_are_named_for_what_they_are(small) -> None:
+def test_growing_coefficients_are_traced_to_their_causes(small) -> None:
     _, found = small
     named = {name for effect in found.effects for name in (effect["name"], *effect["alternatives"])}
     assert {"aliased_vibration", "vibration_rectification"} <= named
@@ -89,14 +89,14 @@ def test_growing_coefficients_are_named_for_what_they_are(small) -> None:
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.25)
 
 
-def test_everything_is_explained_and_every_name_has_a_place(small) -> None:
+def test_every_effect_explains_a_mismatch(small) -> None:
     _, found = small
     assert found.verdict == "explained", str(found)
     explained = {name for region in found.mismatches for name in region["explained_by"]}
     assert explained == {effect["name"] for effect in found.effects}
 
 
-def test_the_page_has_what_the_script_writes(small) -> None:
+def test_docs_contain_the_tables_of_the_script(small) -> None:
     text = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8")
     for name in ("fit", "found", "proof"):
         table = text.split(f"<!-- {name}: begin -->\n")[1].split(f"<!-- {name}: end -->")[0]
@@ -106,7 +106,7 @@ def test_the_page_has_what_the_script_writes(small) -> None:
     assert (ROOT / "docs" / "figures" / "diagnosis-p16.png").stat().st_size > 1000
 
 
-# -------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # a name without a box
 
 
@@ -156,7 +156,7 @@ def blocks() -> xr.Dataset:
         ("line", "spectrum", (0.371 / 0.5,) * 2),
     ],
 )
-def test_an_effect_without_a_box_gets_one_where_it_acts(
+def test_effect_without_a_mismatch_gets_one_where_it_acts(
     statistic: str, told: str, taus: tuple[float, float]
 ) -> None:
     (region,) = identification_tables(
@@ -165,13 +165,14 @@ def test_an_effect_without_a_box_gets_one_where_it_acts(
     assert (region["view"], region["axes"], region["explained_by"]) == (told, ["y"], ["shupe"])
     assert (region["tau_min_s"], region["tau_max_s"]) == pytest.approx(taus)
     whole = statistic == "line"  # a steady line is there all the time
-    assert (region["start"], region["end"]) == (("1970-01-01T00:00:00.000Z", "1970-01-01T00:13:20.000Z") if whole else (
-        "1970-01-01T00:03:20.000Z", "1970-01-01T00:06:40.000Z"))  # fmt: skip
+    start, end = ("00:00", "13:20") if whole else ("03:20", "06:40")
+    assert region["start"] == f"1970-01-01T00:{start}.000Z"
+    assert region["end"] == f"1970-01-01T00:{end}.000Z"
     assert 0.0 < region["p_value"] < 1e-9
     assert "Shupe" in region["statement"]
 
 
-def test_an_effect_with_a_box_gets_no_other() -> None:
+def test_effect_with_a_mismatch_gets_no_other() -> None:
     known = [{"explained_by": ["shupe"], "axes": ["x", "y"]}]
     assert identification_tables(identifications("mean"), blocks(), known) == []
     assert [
@@ -182,51 +183,53 @@ def test_an_effect_with_a_box_gets_no_other() -> None:
     ] == [2]
 
 
-# -------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # levels that change
 
 
 @pytest.fixture(scope="module")
-def loud() -> xr.Dataset:
-    """Ten minutes of white noise at 50 Hz on two axes, thirty times louder for 70 s that begin in the middle of a block."""
+def noisy_log() -> xr.Dataset:
+    """White noise at 50 Hz on two axes, thirty times noisier for 70 s from within a block."""
     rng = np.random.default_rng(3)
     values = rng.standard_normal((2, 30_000))
     values[:, 10_200:13_700] *= 30.0
     return reduce_log(make_log(values, rate=50.0, unit="deg/h"))
 
 
-def flat(blocks: xr.Dataset, level: np.ndarray) -> xr.Dataset:
+def flatten_levels(blocks: xr.Dataset, level: np.ndarray) -> xr.Dataset:
     expected = np.broadcast_to(level[:, None] / 50.0, blocks["power"].shape)
     return xr.Dataset(
         {"spectrum": (("axis", "block", "band"), expected), "frequency": blocks["frequency"]}
     )
 
 
-def test_one_loud_block_among_quiet_ones_makes_no_lines(loud) -> None:
-    scores = spectrum.score(loud, flat(loud, np.ones(loud.sizes["block"])))
+def test_one_noisy_block_makes_no_lines(noisy_log) -> None:
+    scores = spectrum.score(noisy_log, flatten_levels(noisy_log, np.ones(noisy_log.sizes["block"])))
     assert scores is not None
     assert np.nanmax(scores["z"].values) < 4.8  # of 2 898, of which few are independent
 
 
-def test_two_levels_in_a_block_make_no_tails(loud) -> None:
+def test_two_levels_in_a_block_make_no_tails(noisy_log) -> None:
     share = (
-        np.clip(np.minimum(loud["end"], 274.0) - np.maximum(loud["begin"], 204.0), 0.0, None).values
-        / loud.attrs["block_s"]
+        np.clip(
+            np.minimum(noisy_log["end"], 274.0) - np.maximum(noisy_log["begin"], 204.0), 0.0, None
+        ).values
+        / noisy_log.attrs["block_s"]
     )
-    base = flat(loud, 1.0 + share * 899.0)
-    calm = drop_changed_tails(loud, base["spectrum"].values)
+    base = flatten_levels(noisy_log, 1.0 + share * 899.0)
+    calm = drop_changed_tails(noisy_log, base["spectrum"].values)
     before, after = (
-        distribution.score(one, base).isel(tau=-1)["ratio"].max() for one in (loud, calm)
+        distribution.score(one, base).isel(tau=-1)["ratio"].max() for one in (noisy_log, calm)
     )
     assert before > 4.0
     assert after < 1.4  # of 324 samples: five standard deviations
 
 
-def test_what_the_axes_share_by_the_model_is_no_mismatch(loud) -> None:
+def test_common_noise_of_the_model_is_not_a_mismatch(noisy_log) -> None:
     common = np.random.default_rng(4).standard_normal((1, 30_000))
     own = np.random.default_rng(5).standard_normal((2, 30_000))
     shared = reduce_log(make_log(own + common, rate=50.0, unit="deg/h"))
-    base = flat(shared, np.full(shared.sizes["block"], 2.0))
+    base = flatten_levels(shared, np.full(shared.sizes["block"], 2.0))
     model = base.assign(
         cross=(("pair", "block", "band"), np.full(shared["cross"].shape, 1.0 / 50.0, complex))
     )
@@ -237,7 +240,7 @@ def test_what_the_axes_share_by_the_model_is_no_mismatch(loud) -> None:
     assert after < 8.0
 
 
-def test_odd_samples_count_on_held_out_time() -> None:
+def test_anomalous_samples_count_in_the_held_out_evidence() -> None:
     model = {
         "log": {"axes": ["x"]},
         "noise": {"N": 0.003},

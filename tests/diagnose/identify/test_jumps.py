@@ -1,4 +1,4 @@
-"""A jump is sudden: what goes over within some blocks has another name, or none."""
+"""A jump is sudden: a gradual change is another effect, or unidentified."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MIDDLE = 905.0  # inside a block
     ("way", "size", "jump"),
     [(0.0, 0.4, True), (0.0, 4.0, True), (100.0, 0.8, False), (160.0, 4.0, False)],
 )
-def test_what_goes_over_within_some_blocks_is_no_jump(way: float, size: float, jump: bool) -> None:
+def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> None:
     second = np.arange(18_000) / 10.0
     course = np.clip((second - MIDDLE) / max(way, 1e-3) + 0.5, 0.0, 1.0)
     noise = (
@@ -49,8 +49,8 @@ def test_what_goes_over_within_some_blocks_is_no_jump(way: float, size: float, j
     assert bool(is_physical(components, state)) == jump
 
 
-def test_where_power_came_back_a_jump_may_settle() -> None:
-    """Its cause is known there, and what comes after a start is often slow."""
+def test_jump_at_a_restart_may_settle() -> None:
+    """Its cause is known there, and what follows a start is often slow."""
     second = np.arange(18_000) / 10.0
     course = np.clip((second - 960.0) / 100.0, 0.0, 1.0)
     rate = 0.6 * np.random.default_rng(4).standard_normal((2, second.size)) + 0.8 * course

@@ -1,4 +1,4 @@
-"""A filter of the logger is one for all axes."""
+"""A filter of the logger is the same for all axes."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from gyrostab.ingest.make_log import make_log
         ((0.15, 0.15, 0.0), False),
     ],
 )
-def test_a_filter_that_other_axes_deny_is_none_of_the_logger(late, one_filter):
-    """So much of every sample comes with the next: one law for a logger, and a noise of their own for axes of which one has none of it."""
+def test_filter_must_fit_all_axes(late, one_filter):
+    """Neighbouring samples are correlated: on all axes for a logger, or on one axis only."""
     share = np.array(late)[:, None]
     raw = np.random.default_rng(5).standard_normal((share.size, 18_001))
     blocks = reduce_log(
@@ -52,20 +52,21 @@ def test_a_filter_that_other_axes_deny_is_none_of_the_logger(late, one_filter):
     assert is_physical(components, state) == (components if one_filter else [])
 
 
-def test_a_cutoff_that_the_record_does_not_tell_has_an_interval_of_all_that_suit() -> None:
-    """Samples with a little memory are a picked low-pass beyond half the rate; with free quantization noise one far down does the same."""
+def test_undetermined_cutoff_has_a_wide_interval() -> None:
+    """Samples with a little memory are a picked low-pass beyond half the rate; with free
+    quantization noise, one at a low cutoff does the same."""
     share, rate = 0.05, 10.0
     raw = np.random.default_rng(2).standard_normal((2, 12_000))
-    low, high = _cutoff(
+    low, high = _cutoff_interval(
         make_log(lfilter([1.0 - share], [1.0, -share], raw, axis=1), rate=rate, unit="deg/h")
     )
     assert low <= -np.log(share) * rate / (2.0 * np.pi) <= high
     assert high > 3.0 * low
 
 
-def test_a_cutoff_that_the_record_tells_keeps_its_narrow_interval() -> None:
+def test_determined_cutoff_has_a_narrow_interval() -> None:
     raw = np.random.default_rng(3).standard_normal((2, 120_000))
-    low, high = _cutoff(
+    low, high = _cutoff_interval(
         make_log(
             sosfilt(butter(4, 2.0, fs=100.0, output="sos"), raw, axis=1)[:, ::10],
             rate=10.0,
@@ -76,8 +77,8 @@ def test_a_cutoff_that_the_record_tells_keeps_its_narrow_interval() -> None:
     assert high < 1.2 * low
 
 
-def _cutoff(log: xr.Dataset) -> tuple[float, float]:
-    """95 % interval of the cutoff of a filter on all axes of a record."""
+def _cutoff_interval(log: xr.Dataset) -> tuple[float, float]:
+    """Return the 95 % interval of the cutoff of a filter on all axes."""
     blocks = reduce_log(log)
     baseline = calibrate_noise(blocks)
     candidate = next(

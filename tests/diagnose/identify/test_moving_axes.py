@@ -1,4 +1,4 @@
-"""Axes that turn far above their noise: where they do, and that it stays out of what is calibrated and compared."""
+"""Axes that move far beyond their noise are found, and left out of calibration and comparison."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ BEGIN, END = 2000, 4000  # samples in which z turns
 
 
 @pytest.fixture(scope="module")
-def still() -> xr.Dataset:
+def at_rest() -> xr.Dataset:
     return simulate(
         {"log": {"axes": ["x", "y", "z"]}, "noise": {"N": N}}, duration="20min", rate=10.0, seed=5
     )
 
 
 @pytest.fixture(scope="module")
-def turning(still) -> xr.Dataset:
-    log = still.copy(deep=True)
+def turning(at_rest) -> xr.Dataset:
+    log = at_rest.copy(deep=True)
     bump = np.zeros(log.sizes["time"])
     bump[BEGIN:END] = 400.0 * np.sin(np.pi * np.linspace(0.0, 1.0, END - BEGIN)) ** 2
     rate = log["rate"].transpose("axis", "time").values
@@ -40,21 +40,21 @@ def turning(still) -> xr.Dataset:
 
 
 @pytest.fixture(scope="module")
-def seen(turning) -> tuple[xr.Dataset, xr.Dataset]:
+def reduced(turning) -> tuple[xr.Dataset, xr.Dataset]:
     whole = reduce_log(turning)
     return whole, without_motion(turning, whole, moving_blocks(whole))
 
 
-def test_noise_and_drift_do_not_move(still):
-    assert not moving_blocks(reduce_log(still)).any()
-    ramp = np.linspace(0.0, 500.0, still.sizes["time"])
+def test_noise_and_drift_are_not_motion(at_rest):
+    assert not moving_blocks(reduce_log(at_rest)).any()
+    ramp = np.linspace(0.0, 500.0, at_rest.sizes["time"])
     assert not moving_blocks(
-        reduce_log(still.assign(rate=still["rate"] + xr.DataArray(ramp, dims="time")))
+        reduce_log(at_rest.assign(rate=at_rest["rate"] + xr.DataArray(ramp, dims="time")))
     ).any()
 
 
-def test_the_axis_that_turns_is_found_where_it_does(seen):
-    whole, _ = seen
+def test_moving_blocks_of_a_rotating_axis_are_found(reduced):
+    whole, _ = reduced
     moving = moving_blocks(whole)
     length = whole.attrs["block_samples"]
     assert not moving[:2].any()
@@ -64,7 +64,7 @@ def test_the_axis_that_turns_is_found_where_it_does(seen):
     assert np.diff(inside).max() == 1
 
 
-def test_what_turns_most_of_the_time_has_no_rest(turning):
+def test_axis_that_mostly_rotates_has_no_rest(turning):
     rate = turning["rate"].transpose("axis", "time").values.copy()
     rate[2, 3000:] += 400.0 * np.arange(rate.shape[1] - 3000) / 1000.0
     assert not moving_blocks(
@@ -72,8 +72,8 @@ def test_what_turns_most_of_the_time_has_no_rest(turning):
     )[2].any()
 
 
-def test_left_out_on_the_axis_alone_and_kept_as_measured(seen):
-    whole, rest = seen
+def test_motion_is_left_out_on_its_axis_and_kept_as_measured(reduced):
+    whole, rest = reduced
     moving = rest["moving"].values
     assert np.isnan(rest["mean"].values[moving]).all()
     assert np.isnan(rest["power"].values[moving]).all()
@@ -84,8 +84,8 @@ def test_left_out_on_the_axis_alone_and_kept_as_measured(seen):
     assert rest.sizes["gap"] == whole.sizes["gap"]
 
 
-def test_the_noise_is_that_of_the_rest(seen):
-    _, rest = seen
+def test_noise_is_calibrated_at_rest(reduced):
+    _, rest = reduced
     baseline = calibrate_noise(rest)
     error = (baseline["coefficient"].sel(term="N") - N) / baseline["stderr"].sel(term="N")
     assert (np.abs(error) < 4.0).all()
@@ -106,8 +106,8 @@ def identification(
     )
 
 
-def test_an_effect_explains_the_motion_if_it_leaves_next_to_nothing_of_it(seen):
-    whole, _ = seen
+def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced):
+    whole, _ = reduced
     moving = moving_blocks(whole)
     bump = np.nan_to_num(whole["mean"].values[2] - np.nanmedian(whole["mean"].values[2]))
     assert not unexplained_motion(
@@ -123,9 +123,9 @@ def test_an_effect_explains_the_motion_if_it_leaves_next_to_nothing_of_it(seen):
         np.testing.assert_array_equal(unexplained_motion(whole, [other]), moving)
 
 
-def test_a_jump_that_stays_is_no_motion_once_it_is_named(still):
-    step = np.where(np.arange(still.sizes["time"]) < 8000, 0.0, 300.0)
-    whole = reduce_log(still.assign(rate=still["rate"] + xr.DataArray(step, dims="time")))
+def test_identified_jump_is_not_motion(at_rest):
+    step = np.where(np.arange(at_rest.sizes["time"]) < 8000, 0.0, 300.0)
+    whole = reduce_log(at_rest.assign(rate=at_rest["rate"] + xr.DataArray(step, dims="time")))
     assert moving_blocks(whole).any(axis=1).all()
     block_count = whole["begin"].values * 10.0 >= 8000
     named = [
@@ -135,8 +135,8 @@ def test_a_jump_that_stays_is_no_motion_once_it_is_named(still):
     assert not unexplained_motion(whole, named).any()
 
 
-def test_rest_is_found_where_an_axis_turns_more_than_half_of_the_time(still):
-    log = still.copy(deep=True)
+def test_rest_is_found_in_less_than_half_of_the_time(at_rest):
+    log = at_rest.copy(deep=True)
     rate = log["rate"].transpose("axis", "time").values
     rate[2, 2000:9000] += 400.0 * np.sin(np.pi * np.linspace(0.0, 3.0, 7000)) ** 2
     whole = reduce_log(log.assign(rate=(("axis", "time"), rate, log["rate"].attrs)))
@@ -148,8 +148,8 @@ def test_rest_is_found_where_an_axis_turns_more_than_half_of_the_time(still):
     assert not moving[2][(seconds < 150.0) | (seconds > 960.0)].any()
 
 
-def test_one_mismatch_says_where_it_moves_and_who_sees_it(seen):
-    whole, rest = seen
+def test_motion_is_one_mismatch_with_the_axes_that_sense_it(reduced):
+    whole, rest = reduced
     assert motion_tables([], whole, []) == []
     (alone,) = motion_tables([], rest, [{}])
     assert (alone["id"], alone["axes"], alone["explained_by"]) == (2, ["z"], [])
@@ -160,7 +160,7 @@ def test_one_mismatch_says_where_it_moves_and_who_sees_it(seen):
     assert "real rotation" in witnessed["statement"]
 
 
-def test_what_moves_stays_in_where_the_rest_is_too_little_to_calibrate_on(turning):
+def test_motion_stays_when_the_rest_cannot_be_calibrated(turning):
     sparse = (
         np.random.default_rng(3).random(turning.sizes["time"]) < 0.85
     )  # too few samples for spectra

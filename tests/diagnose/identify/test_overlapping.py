@@ -1,4 +1,4 @@
-"""Effects that are named more than once on an axis."""
+"""Effects with several components in one row, such as two jumps on an axis."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def component(evidence_nats, *, row="x", reference=""):
     )
 
 
-def test_rows_that_come_again_are_a_layer_of_their_own():
+def test_repeated_rows_form_new_layers():
     components = [
         component(9.0),
         component(8.0, row="y"),
@@ -43,7 +43,7 @@ def test_rows_that_come_again_are_a_layer_of_their_own():
     ]
 
 
-def test_a_part_has_no_gain_of_another_witness():
+def test_evidence_is_kept_apart_by_reference_channel():
     components = [component(40.0, reference="z"), component(9.0, reference="seismometer")]
     assert [
         evidence_of(components, component(1.0, reference=name))
@@ -55,7 +55,7 @@ def test_a_part_has_no_gain_of_another_witness():
     ]
 
 
-def test_a_claim_keeps_the_axes_that_show_it_beside_the_others():
+def test_identification_keeps_axes_that_still_show_it():
     components = (component(9.0), component(8.0, row="y"))
     identification = Identification("misalignment", (), ("x", "y"), components, 15.5, 8.0)
     key = components[0].candidate.key
@@ -73,7 +73,7 @@ def test_a_claim_keeps_the_axes_that_show_it_beside_the_others():
     assert with_axes_of(identification, {}) == identification
 
 
-def test_two_opposite_jumps_gain_together_what_none_gains_alone():
+def test_two_opposite_jumps_have_evidence_only_together():
     jumps = [
         {"name": "bias_jump", "step": [step], "at": at, "axes": ["x"]}
         for step, at in ((0.3, 600.0), (-0.3, 1300.0))

@@ -1,4 +1,4 @@
-"""Waves of known course, in what the effects are worth together: by their own view, not by the power of their bands."""
+"""Phase-locked components count by their own statistic, not by band powers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def identification(*components: Component) -> Identification:
     )
 
 
-def test_only_waves_are_taken_out_with_what_they_gain() -> None:
+def test_only_phase_locked_components_are_removed() -> None:
     mean, wave, comb = (
         component("mean", 5.0),
         component("order", 20.0),
@@ -53,8 +53,8 @@ def test_only_waves_are_taken_out_with_what_they_gain() -> None:
     assert left.identified[1] is identifications.identified[2]
 
 
-def model(size: float, seconds: float) -> dict[str, Any]:
-    """A line at the turning of the tool on x, and a second axis with noise alone."""
+def line_model(size: float, seconds: float) -> dict[str, Any]:
+    """A line at the rotation rate on x, and a second axis with noise only."""
     return {
         "noise": {"N": N, "B": 0.002, "K": 0.01},
         "effect": [{"name": "rotation_line", "amplitude": size, "axes": ["x"]}],
@@ -65,10 +65,11 @@ def model(size: float, seconds: float) -> dict[str, Any]:
     }
 
 
-def test_a_wave_locked_to_the_rotation_is_worth_what_the_normal_law_says() -> None:
+def test_evidence_of_a_rotation_line_follows_the_normal_law() -> None:
     size, seconds = 0.07, 1200.0
     found = diagnose(
-        simulate(model(size, seconds), duration=seconds, rate=10.0, seed=4).compute(), nulls=100
+        simulate(line_model(size, seconds), duration=seconds, rate=10.0, seed=4).compute(),
+        nulls=100,
     )
     assert [one["name"] for one in found.effects] == ["rotation_line"]
     assert found.content["held_out"]["log_likelihood_gain"] == pytest.approx(
@@ -76,9 +77,10 @@ def test_a_wave_locked_to_the_rotation_is_worth_what_the_normal_law_says() -> No
     )
 
 
-def test_the_allan_variance_is_held_against_the_model_with_the_wave() -> None:
-    """The powers of the model whose gain is told are without the wave, and would fit no better than before."""
-    table = model(0.3, 600.0)
+def test_allan_variance_is_compared_with_the_complete_model() -> None:
+    """The model for the likelihood lacks the phase-locked power, and would fit no better than
+    before."""
+    table = line_model(0.3, 600.0)
     log = simulate(table, duration=600.0, rate=10.0, seed=4).compute()
     found = diagnose(log, simulation={"noise": table["noise"]}, nulls=100)
     assert [one["name"] for one in found.effects] == ["rotation_line"]

@@ -1,4 +1,4 @@
-"""Errors of the scale factor and a turning that an axis really sees: the share of the turning tells them apart."""
+"""Scale-factor errors and real rotation are distinguished by the share of the rotation."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _TURNS = [
 ]
 
 
-def _reduced(share: float) -> xr.Dataset:
-    """Statistics of a log of which axis z sees a share of the turning."""
+def _reduce_share(share: float) -> xr.Dataset:
+    """Reduce a log in which axis z senses a share of the rotation."""
     effect = {"name": "real_motion", "spin": share, "sway": 0.0, "axes": ["z"]}
     model = {
         "log": {"axes": ["x", "z"]},
@@ -44,7 +44,7 @@ def _reduced(share: float) -> xr.Dataset:
     return reduce_log(simulate(model, duration="20min", rate=10.0, seed=3).compute())
 
 
-def _parts(blocks: xr.Dataset):
+def _find_components(blocks: xr.Dataset):
     baseline = calibrate_noise(blocks)
     known = [
         one
@@ -64,8 +64,8 @@ def _parts(blocks: xr.Dataset):
     ("share", "plainer", "allowed"),
     [(3e-6, "scale_factor", False), (1e-3, "scale_factor", True), (0.5, None, True)],
 )
-def test_the_share_of_the_turning_tells_what_it_is(share, plainer, allowed):
-    components, state = _parts(_reduced(share))
+def test_share_of_the_rotation_selects_the_effect(share, plainer, allowed):
+    components, state = _find_components(_reduce_share(share))
     motion, error = components["real_motion"], components["scale_factor"]
     assert motion[0].row == ("z",)
     assert motion[0].evidence_nats > 30.0
@@ -74,8 +74,8 @@ def test_the_share_of_the_turning_tells_what_it_is(share, plainer, allowed):
     assert find_plainer_effect(error, state) is None
 
 
-def test_a_few_millionths_of_the_turning_are_an_error_of_the_scale_factor():
-    blocks = _reduced(1e-6)
+def test_tiny_share_of_the_rotation_is_a_scale_factor_error():
+    blocks = _reduce_share(1e-6)
     baseline, records = nulls(blocks, 40)
     found = name_effects(blocks, baseline, records)
     (identification,) = found.identified

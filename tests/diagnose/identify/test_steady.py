@@ -1,4 +1,4 @@
-"""What nothing drives is there all the time."""
+"""Effects without a driver must be present all the time."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ MODEL = {"noise": {"N": 0.003}, "log": {"axes": ["x"]}}
 SECOND = np.arange(24_000) / 10.0
 
 
-def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], State]:
-    """Parts of a Gauss-Markov bias of 0.5 s that is there in every such share of 600 s."""
+def _simulate_wander(size: float, share: float, seed: int) -> tuple[list[Component], State]:
+    """Components of a Gauss-Markov bias of 0.5 s that is present for this share of each 600 s."""
     rng = np.random.default_rng(seed)
     white = 0.003 * 60.0 * np.sqrt(10.0) * rng.standard_normal(SECOND.size)
     keep = np.exp(-0.2)
@@ -45,15 +45,15 @@ def _wandering(size: float, share: float, seed: int) -> tuple[list[Component], S
 
 @pytest.mark.parametrize("size", [0.12, 0.18])
 @pytest.mark.parametrize(("share", "steady"), [(1.0, True), (0.5, False)])
-def test_what_comes_and_goes_is_no_steady_wander(size: float, share: float, steady: bool) -> None:
-    components, state = _wandering(size / np.sqrt(share), share, seed=3)
+def test_intermittent_wander_is_rejected(size: float, share: float, steady: bool) -> None:
+    components, state = _simulate_wander(size / np.sqrt(share), share, seed=3)
     assert components[0].evidence_nats > 10.0
     assert is_always_present(components[0], state) == steady
     assert bool(is_physical(components, state)) == steady
 
 
-def test_chance_takes_no_steady_wander_away() -> None:
+def test_chance_does_not_reject_steady_wander() -> None:
     assert all(
         is_always_present(components[0], state)
-        for components, state in (_wandering(0.2, 1.0, seed) for seed in range(8))
+        for components, state in (_simulate_wander(0.2, 1.0, seed) for seed in range(8))
     )

@@ -1,4 +1,4 @@
-"""Slid copies of a channel, against which an effect that follows it must stand."""
+"""Time-shifted surrogates of a channel, which an effect must exceed."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 
-def _slides(sensitivity: float, period: float) -> tuple[bool, float]:
-    """Of a bias that follows a temperature which swings with this period [s]."""
+def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float]:
+    """Test a bias that follows a temperature with this period [s]."""
     swing = [
         [t, 40.0 + 20.0 * np.sin(2.0 * np.pi * t / period)]
         for t in np.arange(0.0, 1801.0, 15.0).tolist()
@@ -45,14 +45,15 @@ def _slides(sensitivity: float, period: float) -> tuple[bool, float]:
     )
 
 
-def test_a_channel_that_swings_is_no_worse_for_its_mirror_image():
-    """Half a period on it is the same channel with the other sign, which a size of either sign follows as well."""
-    beats, p_value = _slides(0.02, 600.0)
+def test_periodic_channel_is_not_rejected_for_its_mirror_image():
+    """Half a period later it is the same channel with the other sign, which a negative size follows
+    as well."""
+    beats, p_value = _run_time_shift_test(0.02, 600.0)
     assert beats
     assert p_value == 0.0
 
 
-def test_a_channel_that_does_nothing_does_not_stand():
-    beats, p_value = _slides(0.0, 1300.0)
+def test_unrelated_channel_fails():
+    beats, p_value = _run_time_shift_test(0.0, 1300.0)
     assert not beats
     assert p_value > 0.01

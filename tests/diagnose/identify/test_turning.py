@@ -1,4 +1,4 @@
-"""What is locked to the turning of the tool: the earth's rate, whichever way round its axes stand, and lines with their harmonics."""
+"""Components locked to the rotation: earth rate with either handedness, and harmonics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
 
-def _log(*effects, points=((0, 108.0), (1200, 108.0))):
+def _simulate_rotation(*effects, points=((0, 108.0), (1200, 108.0))):
     model = {
         "log": {"axes": ["x", "y"]},
         "noise": {"N": 0.003},
@@ -28,8 +28,8 @@ def _log(*effects, points=((0, 108.0), (1200, 108.0))):
     return simulate(model, duration="20min", rate=10.0, seed=5).compute()
 
 
-def _table(effect, *names):
-    """Some parameters of an effect, as a model has them."""
+def _some_parameters(effect, *names):
+    """Return some parameters of an effect, as a model has them."""
     values = {name: getattr(effect, name) for name in names}
     return {"name": effect.name} | {
         name: list(value) if isinstance(value, tuple) else value for name, value in values.items()
@@ -37,8 +37,8 @@ def _table(effect, *names):
 
 
 @pytest.mark.parametrize("around", [90.0, -90.0])
-def test_earth_rate_is_taken_out_and_made_again(around):
-    log = _log(
+def test_earth_rate_is_recovered(around):
+    log = _simulate_rotation(
         {
             "name": "earth_rate",
             "latitude": 45.0,
@@ -71,14 +71,16 @@ def test_earth_rate_is_taken_out_and_made_again(around):
         (identification,), (), 8.0, np.zeros(1), reasons, tuple(known), state, folds
     )
     (fitted,) = fit_identifications(identifications, baseline)
-    again = _log(_table(fitted.effect, "latitude", "toolface", "off", "around"))
+    again = _simulate_rotation(
+        _some_parameters(fitted.effect, "latitude", "toolface", "off", "around")
+    )
     assert float(np.abs(again["rate"] - log["rate"]).max()) < 0.01 * float(log["rate"].std())
 
 
 @pytest.mark.parametrize(("latitude", "most"), [(60.0, 4.5), (89.8, 0.3)])
-def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most):
-    """Of 4 % of the earth's rate across the tool, not of the angle itself, which depends on where it is counted from."""
-    log = _log(
+def test_angles_have_the_relative_error_of_the_size(latitude, most):
+    """4 % of the earth rate across the tool, not of the angle, whose origin is arbitrary."""
+    log = _simulate_rotation(
         {
             "name": "earth_rate",
             "latitude": latitude,
@@ -115,8 +117,8 @@ def test_angles_are_known_as_well_as_the_size_that_they_come_from(latitude, most
     assert found["toolface"].low < 150.0 < found["toolface"].high
 
 
-def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
-    """The second line is the strongest, the third a half of it; x has them all, y the first alone."""
+def test_all_harmonics_of_the_rotation_are_recovered():
+    """The second line is the strongest, the third half of it; x has all, y only the first."""
     points = ((0, 108.0), (600, 108.0), (610, 66.0), (1200, 66.0))
     both = {
         "name": "rotation_line",
@@ -125,7 +127,7 @@ def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
         "axes": ["x", "y"],
     }
     x = {"name": "rotation_line", "axes": ["x"]}
-    log = _log(
+    log = _simulate_rotation(
         both,
         {**x, "order": 2.0, "amplitude": [0.8], "phase": [100.0]},
         {**x, "order": 3.0, "amplitude": [0.4]},
@@ -163,14 +165,15 @@ def test_all_harmonics_of_the_turning_are_taken_out_and_made_again():
         (2.0, ("x",)),
         (3.0, ("x",)),
     ]
-    again = _log(
+    again = _simulate_rotation(
         *(
-            {**_table(one.effect, "amplitude", "phase", "order"), "axes": list(one.axes)}
+            {**_some_parameters(one.effect, "amplitude", "phase", "order"), "axes": list(one.axes)}
             for one in fitted
         ),
         points=points,
     )
     left, whole = (
-        (one["rate"] - log["rate"]).std("time").values for one in (again, _log(points=points))
+        (one["rate"] - log["rate"]).std("time").values
+        for one in (again, _simulate_rotation(points=points))
     )
     assert (left < 0.05 * whole).all()

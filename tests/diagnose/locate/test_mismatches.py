@@ -1,4 +1,4 @@
-"""Boxes around what differs: where, how far, how sure; and none where nothing does."""
+"""Locate regions where recording and simulation differ, and none where they agree."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def null(base):
     return null_scores(base, chunks(base, 200, np.random.default_rng(21)))
 
 
-def _overlap(found, begin, end):
+def _overlap_share(found, begin, end):
     shared = min(float(found["end"]), end) - max(float(found["begin"]), begin)
     return max(shared, 0.0) / (max(float(found["end"]), end) - min(float(found["begin"]), begin))
 
 
-def test_false_alarms_come_as_often_as_asked(base, null):
-    """Over all views, by other records than those that set the limits."""
+def test_false_alarm_rate_is_that_of_the_level(base, null):
+    """With all statistics, on other records than those that set the thresholds."""
     p = np.concatenate(
         [smallest_p(chunk, base, null) for chunk in chunks(base, 300, np.random.default_rng(22))]
     )
@@ -52,7 +52,7 @@ def test_false_alarms_come_as_often_as_asked(base, null):
     assert sum(alarms) <= 2
 
 
-def test_a_level_decides_what_is_told(base, null):
+def test_level_sets_the_threshold(base, null):
     found = records(base, 1, np.random.default_rng(40)).isel(record=0)
     found["power"][0, 75:90] *= 1.06
     p = float(smallest_p(found, base, null))
@@ -60,7 +60,7 @@ def test_a_level_decides_what_is_told(base, null):
     assert locate_mismatches(found, base, null, level=1.5 * p).sizes["mismatch"] >= 1
     assert locate_mismatches(found, base, null, level=0.7 * p).sizes["mismatch"] == 0
     for level in (0.0, 0.7, -1.0):
-        with pytest.raises(OptionError, match="false alarms"):
+        with pytest.raises(OptionError, match="false-alarm probability"):
             locate_mismatches(found, base, null, level=level)
 
 
@@ -71,7 +71,7 @@ def test_too_few_null_records_are_refused(base):
 
 @pytest.mark.parametrize("missing", [0.0, 0.3])
 @pytest.mark.parametrize("share", [0.25, 0.5])
-def test_a_burst_of_noise_has_its_box(share, missing):
+def test_burst_of_noise_has_a_region(share, missing):
     base = baseline(missing=missing)
     null = null_scores(base, chunks(base, 75, np.random.default_rng(23), missing=missing))
     overlaps = []
@@ -81,7 +81,9 @@ def test_a_burst_of_noise_has_its_box(share, missing):
         regions = locate_mismatches(found, base, null)
         regions = regions.sel(mismatch=(regions["view"] == "davar") & (regions["axes"] == "y"))
         overlaps.append(
-            _overlap(regions.isel(mismatch=0), 1500.0, 1800.0) if regions.sizes["mismatch"] else 0.0
+            _overlap_share(regions.isel(mismatch=0), 1500.0, 1800.0)
+            if regions.sizes["mismatch"]
+            else 0.0
         )
         if share == 0.5:
             assert regions.sizes["mismatch"] == 1
@@ -92,7 +94,7 @@ def test_a_burst_of_noise_has_its_box(share, missing):
     assert np.median(overlaps) >= 0.7
 
 
-def test_a_step_of_the_mean_has_its_box(base, null):
+def test_step_of_the_mean_has_a_region(base, null):
     overlaps = []
     for seed in range(9):
         found = records(base, 1, np.random.default_rng(seed)).isel(record=0)
@@ -107,13 +109,13 @@ def test_a_step_of_the_mean_has_its_box(base, null):
             (regions["sign"] < 0, 2400.0, 2800.0),
         ):
             one = regions.sel(mismatch=region).isel(mismatch=0)
-            overlaps.append(_overlap(one, begin, end))
+            overlaps.append(_overlap_share(one, begin, end))
             assert abs(float(one["estimate"])) == pytest.approx(0.1, abs=0.045)
     assert np.median(overlaps) >= 0.7
 
 
-def test_a_band_has_its_averaging_times(base, null):
-    """Noise between 3 and 12 Hz alone is a box around tau = 0.37 / f and no broader than that."""
+def test_band_of_noise_has_its_averaging_times(base, null):
+    """Noise between 3 and 12 Hz only is a region around tau = 0.37 / f, and no wider than that."""
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     inside = (found["frequency"].values > 3.0) & (found["frequency"].values < 12.0)
     found["power"][0, 60:120] *= 1.0 + 3.0 * xr.DataArray(inside.astype(float), dims="band")
@@ -122,10 +124,10 @@ def test_a_band_has_its_averaging_times(base, null):
     assert float(region["tau_min_s"]) in (0.02, 0.04)
     assert float(region["tau_min_s"]) < 0.37 / 7.0 < float(region["tau_max_s"])
     assert float(region["tau_max_s"]) <= 0.32
-    assert _overlap(region, 1200.0, 2400.0) > 0.95
+    assert _overlap_share(region, 1200.0, 2400.0) > 0.95
 
 
-def test_less_noise_than_simulated_has_its_sign(base, null):
+def test_less_noise_than_simulated_has_negative_sign(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["power"] *= 0.9
     regions = locate_mismatches(found, base, null)
@@ -136,7 +138,7 @@ def test_less_noise_than_simulated_has_its_sign(base, null):
     assert float(regions["ratio"][0]) == pytest.approx(0.9, abs=0.02)
 
 
-def test_two_bursts_are_two_boxes(base, null):
+def test_two_bursts_are_two_regions(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["power"][0, 30:45] *= 1.3
     found["power"][0, 100:115] *= 1.3
@@ -147,7 +149,7 @@ def test_two_bursts_are_two_boxes(base, null):
     assert begins[1] == pytest.approx(2000.0, abs=2 * BLOCK_S)
 
 
-def test_a_mean_that_wanders_is_one_mismatch(base, null):
+def test_wandering_mean_is_one_mismatch(base, null):
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     found["mean"][1] += 0.5 * np.sin(2.0 * np.pi * np.arange(180) / 30.0)
     regions = locate_mismatches(found, base, null)
@@ -157,7 +159,7 @@ def test_a_mean_that_wanders_is_one_mismatch(base, null):
     assert abs(float(regions["estimate"][0])) == pytest.approx(0.4, abs=0.15)
 
 
-def test_pieces_become_one_box_and_strangers_do_not():
+def test_pieces_of_one_region_are_merged_and_others_are_not():
     region = {
         "view": "davar",
         "axes": "x",
@@ -192,10 +194,10 @@ def test_pieces_become_one_box_and_strangers_do_not():
 
 
 # -- the whole way from samples
-# ------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 
 
-def _log(seed, effect, missing=0.0):
+def _make_log_with(seed, effect, missing=0.0):
     rng = np.random.default_rng(seed)
     rate = SIGMA * rng.standard_normal((3, SIZE))
     effect(rate, np.arange(SIZE) / RATE, rng)
@@ -204,7 +206,7 @@ def _log(seed, effect, missing=0.0):
     return reduce_log(make_log(rate, rate=RATE, unit="deg/h"))
 
 
-def _nothing(rate, t, rng):
+def _add_nothing(rate, t, rng):
     pass
 
 
@@ -222,7 +224,7 @@ def _baseline_of(blocks):
     )
 
 
-def _nulls(blocks, base, count, rng):
+def _draw_nulls(blocks, base, count, rng):
     """Null records on the bands of a real reduction."""
     shape, weight = blocks["shape"].values, blocks["line_weight"].values[..., None]
     lines = (25, *blocks["line_power"].shape)
@@ -273,25 +275,29 @@ def _nulls(blocks, base, count, rng):
 
 @pytest.fixture(scope="module")
 def raw():
-    blocks = _log(1, _nothing)
+    blocks = _make_log_with(1, _add_nothing)
     base = _baseline_of(blocks)
-    return base, null_scores(base, _nulls(blocks, base, 100, np.random.default_rng(24))), blocks
+    return (
+        base,
+        null_scores(base, _draw_nulls(blocks, base, 100, np.random.default_rng(24))),
+        blocks,
+    )
 
 
-def _vibration(rate, t, rng):
+def _add_vibration(rate, t, rng):
     on = (t >= 1500.0) & (t < 1800.0)
     rate[0, on] += 0.4 * SIGMA * rng.standard_normal(on.sum())
 
 
-def _line(rate, t, rng):
+def _add_line(rate, t, rng):
     rate[2] += 0.15 * np.sin(2.0 * np.pi * 13.37 * t + 1.0)
 
 
-def _shared(rate, t, rng):
+def _add_common_noise(rate, t, rng):
     rate += 0.12 * SIGMA * np.array([1.0, 0.8, -1.1])[:, None] * rng.standard_normal(t.size)
 
 
-def _spikes(rate, t, rng):
+def _add_spikes(rate, t, rng):
     at = np.linspace(180_000, 269_000, 12).astype(int)
     rate[0, at] += rng.choice([-1.0, 1.0], 12) * 15.0 * SIGMA
 
@@ -299,35 +305,35 @@ def _spikes(rate, t, rng):
 @pytest.mark.parametrize(
     ("effect", "statistic", "axes", "begin", "end"),
     [
-        (_vibration, "davar", {"x"}, 1500.0, 1800.0),
-        (_line, "spectrum", {"z"}, 0.0, 3600.0),
-        (_shared, "cross_axis", {"x", "y", "z"}, 0.0, 3600.0),
-        (_spikes, "distribution", {"x"}, 1800.0, 2700.0),
+        (_add_vibration, "davar", {"x"}, 1500.0, 1800.0),
+        (_add_line, "spectrum", {"z"}, 0.0, 3600.0),
+        (_add_common_noise, "cross_axis", {"x", "y", "z"}, 0.0, 3600.0),
+        (_add_spikes, "distribution", {"x"}, 1800.0, 2700.0),
     ],
 )
-def test_effects_in_samples_are_found_where_they_are(raw, effect, statistic, axes, begin, end):
+def test_effects_in_samples_are_located(raw, effect, statistic, axes, begin, end):
     base, null, _ = raw
-    regions = locate_mismatches(_log(2, effect), base, null)
+    regions = locate_mismatches(_make_log_with(2, effect), base, null)
     regions = regions.sel(mismatch=regions["view"] == statistic)
     assert regions.sizes["mismatch"] >= 1
     first = regions.isel(mismatch=0)
     assert set(str(first["axes"].values).split()) == axes
-    assert _overlap(first, begin, end) >= 0.7
-    if effect is _line:
+    assert _overlap_share(first, begin, end) >= 0.7
+    if effect is _add_line:
         assert float(first["frequency"]) == pytest.approx(13.37, abs=0.06)
         assert float(first["estimate"]) == pytest.approx(0.15, rel=0.15)
-    if effect is _spikes:
+    if effect is _add_spikes:
         assert str(first["what"].values) == "outliers"
 
 
-def test_samples_without_an_effect_have_no_box(raw):
+def test_samples_without_an_effect_have_no_region(raw):
     base, null, blocks = raw
     assert locate_mismatches(blocks, base, null).sizes["mismatch"] == 0
 
 
-def test_the_table_says_what_the_contract_needs(raw):
+def test_table_has_the_fields_of_the_json(raw):
     base, null, _ = raw
-    regions = locate_mismatches(_log(2, _vibration), base, null)
+    regions = locate_mismatches(_make_log_with(2, _add_vibration), base, null)
     assert regions["mismatch"].values[0] == 1
     assert np.all(np.diff(regions["p_value"].values) >= 0)
     start = regions["start_time"].values[0] - np.datetime64(0, "ns")

@@ -1,4 +1,4 @@
-"""When a named effect acts: where its channel is away from rest, and where the tool turns."""
+"""Named effects act where their channel leaves its rest level, and while the tool rotates."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def identification(blocks, effect, statistic):
     return Identification(effect, one.driver, ("x",), (component,), 50.0, 8.0)
 
 
-def test_what_is_locked_to_the_rotation_acts_while_the_tool_turns(turning):
+def test_rotation_line_acts_while_the_tool_rotates(turning):
     found = join_blocks(
         active_blocks(identification(turning, "rotation_line", "order"), turning),
         turning["begin"].values,
@@ -40,7 +40,7 @@ def test_what_is_locked_to_the_rotation_acts_while_the_tool_turns(turning):
     assert found == [(1200.0, 3600.0)]
 
 
-def test_what_stands_at_rest_as_well_acts_at_rest_as_well(turning):
+def test_effect_present_at_rest_acts_at_rest(turning):
     one = identification(turning, "earth_rate", "order")
     both = replace(
         one, components=(*one.components, *identification(turning, "earth_rate", "mean").components)
@@ -50,7 +50,7 @@ def test_what_stands_at_rest_as_well_acts_at_rest_as_well(turning):
     ) == [(0.0, 3600.0)]
 
 
-def test_an_effect_of_a_channel_that_rests_less_than_half_of_the_time_acts_while_it_does_not_rest(
+def test_effect_of_a_mostly_active_channel_acts_while_it_is_active(
     turning,
 ):
     (span,) = join_blocks(
@@ -62,7 +62,7 @@ def test_an_effect_of_a_channel_that_rests_less_than_half_of_the_time_acts_while
 
 
 @pytest.mark.parametrize(("level", "there"), [(0.5, True), (0.2, False)])
-def test_a_tenth_of_the_largest_counts_as_there(level, there):
+def test_a_tenth_of_the_largest_counts_as_acting(level, there):
     blocks = record([])
     g = np.zeros(blocks.sizes["block"])
     g[40:60], g[100:120] = 5.0, 5.0 * level

@@ -1,4 +1,4 @@
-"""Which of the effects in the place of a mismatch it takes to explain it: by what is left when one is taken out."""
+"""The effects that are needed to explain a mismatch, by what is left without each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NAMES = (
 )
 
 
-def _claim(candidates, effect, statistic, column):
+def _make_identification(candidates, effect, statistic, column):
     one = next(one for one in candidates if (one.effect, one.statistic) == (effect, statistic))
     variant = next(
         one
@@ -43,7 +43,7 @@ def _claim(candidates, effect, statistic, column):
 
 @pytest.fixture(scope="module")
 def shaken():
-    """Vibration that raises noise and bias of x, with the spikes of a few blocks in it; three claims; and what null records do."""
+    """Vibration raises noise and bias of x, with spikes in a few blocks; three identifications."""
     blocks = record([])
     g = blocks["channel_vibration"].values
     baseline, chance = nulls(blocks, 60)
@@ -57,9 +57,9 @@ def shaken():
         outliers=(("axis", "block"), spiky),
     )
     candidates, reasons = effect_candidates(changed, COEFFICIENT)
-    identified = tuple(_claim(candidates, *names) for names in NAMES)
+    identified = tuple(_make_identification(candidates, *names) for names in NAMES)
     state = initial_state(changed, baseline)
-    for identification in identified[::-1]:  # odd samples are named first
+    for identification in identified[::-1]:  # anomalous samples are named first
         state = condition_on(state, list(identification.components))
     identifications = Identifications(
         identified, (), 8.0, np.zeros(1), reasons, tuple(candidates), state, fold_blocks(changed)
@@ -67,7 +67,7 @@ def shaken():
     return changed, baseline, identifications, null_scores(baseline, chance)
 
 
-def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(shaken):
+def test_leaving_out_an_effect_keeps_the_sizes_of_the_others(shaken):
     blocks, baseline, identifications, _ = shaken
     loud, bias, _ = identifications.identified
     whole, silent, level = (
@@ -87,12 +87,12 @@ def test_an_effect_that_is_left_out_is_missing_and_the_others_keep_their_sizes(s
     np.testing.assert_allclose((silent["spectrum"] / baseline["spectrum"])[0], 1.0, atol=0.2)
 
 
-def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
+def test_mismatch_lists_the_effects_that_it_needs(shaken):
     blocks, baseline, identifications, null = shaken
     found = locate_mismatches(blocks, baseline, null)
     after = predict_baseline(identifications, baseline)
 
-    def told(statistic, **options):
+    def attributed(statistic, **options):
         lists = attribute_mismatches(
             found, identifications.identified, blocks, after, null, level=0.005, **options
         )
@@ -105,14 +105,14 @@ def test_a_mismatch_lists_the_effects_that_it_takes(shaken):
     def without(out):
         return predict_baseline(identifications, baseline, left_out=out)
 
-    assert {"vibration_noise", "vibration_rectification", "spikes"} in told("davar")
-    noise = told("davar", without=without)
+    assert {"vibration_noise", "vibration_rectification", "spikes"} in attributed("davar")
+    noise = attributed("davar", without=without)
     assert noise
     assert set().union(*noise) == {"vibration_noise", "spikes"}
-    assert told("mean", without=without) == {frozenset({"vibration_rectification"})}
+    assert attributed("mean", without=without) == {frozenset({"vibration_rectification"})}
 
 
-def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
+def test_blocks_with_anomalous_samples_are_attributed_to_them(shaken):
     blocks, baseline, identifications, null = shaken
     loud, _, spikes = identifications.identified
     assert find_anomalous_blocks(spikes.components[0], blocks).sum() == 2
@@ -120,15 +120,16 @@ def test_blocks_of_odd_samples_bring_what_is_gone_without_them(shaken):
     after = predict_baseline(identifications, baseline)
     one = attribute_mismatches(
         found, [loud], blocks, after, null, level=0.005
-    )  # the loudest two blocks are still there
+    )  # the noisiest two blocks are still there
     both = attribute_mismatches(found, identifications.identified, blocks, after, null, level=0.005)
     davar = found["view"].values.tolist().index("davar")
     assert (one[davar], "vibration_noise" in both[davar]) == ([], True)
 
 
-@pytest.mark.parametrize(("step", "told"), [(0.3, ["bias_jump"]), (0.0, [])])
-def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
-    """The constant of a record is free, so that the mean before a jump stands out as well as that after it."""
+@pytest.mark.parametrize(("step", "attributed"), [(0.3, ["bias_jump"]), (0.0, [])])
+def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
+    """The constant of a record is free, so that either the mean before a jump or after it is a
+    mismatch."""
     _, baseline, _, null = shaken
     blocks = record([])
     after_it = blocks["begin"].values >= 1800.0
@@ -179,14 +180,14 @@ def test_a_jump_explains_the_mean_on_either_side_of_it(shaken, step, told):
     assert explained() == []  # by its time alone
     assert (
         explained(without=lambda out: predict_baseline(identifications, baseline, left_out=out))
-        == told
+        == attributed
     )
 
 
 BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
 
 
-def _shown(*statistics):
+def _make_shown(*statistics):
     variant = SimpleNamespace(columns=("white",))
     return [
         (
@@ -197,8 +198,8 @@ def _shown(*statistics):
     ]
 
 
-def _brought(**sizes):
-    """What is left, of scores that add, beside 1; a mismatch from 6 on."""
+def _scores_without(**sizes):
+    """Scores left without some effects, where sizes add to 1; a mismatch from 6 on."""
 
     def left(out):
         return 1.0 + sum(sizes[one.replace(" ", "_")] for one in out), 6.0
@@ -216,32 +217,34 @@ def _brought(**sizes):
         ((0.0, 0.0), [0]),  # one of them does it for the two
     ],
 )
-def test_an_effect_is_needed_without_which_it_is_a_mismatch_or_that_brings_a_fair_share(
-    sizes, kept
-):
-    shown = _shown("power", "mean")
-    found = needed_effects(BOX, shown, _brought(effect_0=sizes[0], effect_1=sizes[1]))
+def test_effect_is_needed_alone_or_by_a_fair_share(sizes, kept):
+    shown = _make_shown("power", "mean")
+    found = needed_effects(BOX, shown, _scores_without(effect_0=sizes[0], effect_1=sizes[1]))
     assert found == [f"effect {number}" for number in kept]
 
 
-def test_what_a_view_does_not_hold_stays():
+def test_effect_not_contained_in_the_statistic_stays():
     assert needed_effects(
-        BOX | {"view": "spectrum"}, _shown("power", "line"), _brought(effect_0=0.0, effect_1=0.0)
+        BOX | {"view": "spectrum"},
+        _make_shown("power", "line"),
+        _scores_without(effect_0=0.0, effect_1=0.0),
     ) == ["effect 0", "effect 1"]
-    assert needed_effects(BOX, _shown("power", "wander"), _brought(effect_0=9.0, effect_1=0.0)) == [
+    assert needed_effects(
+        BOX, _make_shown("power", "wander"), _scores_without(effect_0=9.0, effect_1=0.0)
+    ) == [
         "effect 0",
         "effect 1",
     ]
-    low_pass = _shown("power", "power")
+    low_pass = _make_shown("power", "power")
     low_pass[1][1][0].variant = SimpleNamespace(columns=())
-    assert needed_effects(BOX, low_pass, _brought(effect_0=9.0, effect_1=0.0)) == [
+    assert needed_effects(BOX, low_pass, _scores_without(effect_0=9.0, effect_1=0.0)) == [
         "effect 0",
         "effect 1",
     ]
 
 
 @pytest.mark.parametrize(("begin", "regions"), [(70.0, 2), (85.0, 1)])
-def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near(begin, regions):
+def test_short_mismatch_is_merged_only_with_a_near_long_one(begin, regions):
     long = {
         "view": "davar",
         "axes": "x y",
@@ -256,8 +259,8 @@ def test_a_short_mismatch_beside_a_long_one_is_one_with_it_only_where_it_is_near
     assert len(merge_regions([long, short])) == regions
 
 
-@pytest.mark.parametrize(("axes", "told"), [("xy", ["spectral_line"]), ("x", [])])
-def test_a_line_on_two_axes_is_why_they_vary_together(shaken, axes, told):
+@pytest.mark.parametrize(("axes", "attributed"), [("xy", ["spectral_line"]), ("x", [])])
+def test_line_on_two_axes_explains_their_covariance(shaken, axes, attributed):
     _, baseline, _, null = shaken
     quiet = record([])
     band = int(np.flatnonzero(quiet["band_low"].values < 2.0)[-1])
@@ -289,4 +292,4 @@ def test_a_line_on_two_axes_is_why_they_vary_together(shaken, axes, told):
     found = found.isel(mismatch=found["view"].values == "cross_axis")
     assert found.sizes["mismatch"] >= 1
     lists = attribute_mismatches(found, [identification], shared, baseline, null, level=0.005)
-    assert all(names == told for names in lists)
+    assert all(names == attributed for names in lists)

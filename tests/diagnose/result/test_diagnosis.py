@@ -50,7 +50,7 @@ def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 plain_pages = pytest.mark.usefixtures("without_figures")
 
-# --------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # ----------------- schema
 
 
@@ -90,7 +90,7 @@ def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 @pytest.mark.parametrize("place", _places(content()), ids=lambda place: ".".join(map(str, place)))
-def test_nothing_may_be_left_out_or_be_of_another_kind(place: tuple[Any, ...]):
+def test_missing_keys_and_wrong_types_are_errors(place: tuple[Any, ...]):
     optional = place == ("unused_channels",)  # files of earlier versions have none
     for spoil in ("other kind",) if optional else ("leave out", "other kind"):
         spoiled = content()
@@ -123,14 +123,14 @@ def test_nothing_may_be_left_out_or_be_of_another_kind(place: tuple[Any, ...]):
         (lambda c: c["effects"][0]["parameters"]["white"].pop("low"), "white.low"),
     ],
 )
-def test_what_contradicts_itself_is_named(change, complaint: str):
+def test_contradictions_are_errors(change, complaint: str):
     spoiled = content()
     change(spoiled)
     with pytest.raises(SchemaError, match=re.escape(complaint)):
         check_diagnosis(spoiled)
 
 
-def test_json_knows_no_infinities():
+def test_json_has_null_for_infinities():
     assert json.loads(
         json.dumps(
             plain({"a": np.array([1.0, np.inf]), "b": np.bool_(True), "c": (np.float32(2),)})
@@ -145,12 +145,12 @@ def test_json_knows_no_infinities():
         broken.to_json()
 
 
-# --------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # ------------------ model
 
 
 @pytest.mark.parametrize("name", list(effects()))
-def test_every_effect_comes_back_from_its_table(name: str):
+def test_effect_tables_round_trip(name: str):
     kind = effects()[name]
     effect = kind.example(axes=("x", "y"))
     written = model_text({"noise": {"N": 0.003}, "effect": [effect_table(effect)]})
@@ -186,12 +186,12 @@ def test_the_model_runs(tmp_path: Path):
     assert loud.mean() - quiet.mean() == pytest.approx(0.0022 * (6.0**2 - 0.02**2), abs=0.06)
 
 
-# --------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # ------------------ files
 
 
 @plain_pages
-def test_a_folder_holds_the_four_files_and_comes_back(tmp_path: Path):
+def test_folder_of_four_files_round_trips(tmp_path: Path):
     made = diagnosis()
     files = write_diagnosis(made, tmp_path / "found")
     assert [path.name for path in files] == list(FILES)
@@ -209,7 +209,7 @@ def test_a_folder_holds_the_four_files_and_comes_back(tmp_path: Path):
 
 
 @plain_pages
-def test_a_folder_is_replaced_only_when_asked_and_only_when_it_is_one(tmp_path: Path):
+def test_folder_is_replaced_only_with_overwrite(tmp_path: Path):
     folder = tmp_path / "found"
     write_diagnosis(diagnosis(), folder)
     with pytest.raises(OutputError, match="--overwrite"):
@@ -226,7 +226,7 @@ def test_a_folder_is_replaced_only_when_asked_and_only_when_it_is_one(tmp_path: 
 
 
 @plain_pages
-def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_interrupted_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -237,7 +237,7 @@ def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @plain_pages
-def test_a_content_that_does_not_pass_is_not_written(tmp_path: Path):
+def test_invalid_content_is_not_written(tmp_path: Path):
     spoiled = copy.deepcopy(content())
     del spoiled["held_out"]
     with pytest.raises(SchemaError, match="held_out"):
@@ -247,7 +247,7 @@ def test_a_content_that_does_not_pass_is_not_written(tmp_path: Path):
 
 @plain_pages
 @pytest.mark.parametrize("spoil", ["missing", "no JSON", "other JSON"])
-def test_what_is_no_diagnosis_is_said(tmp_path: Path, spoil: str):
+def test_opening_something_else_is_an_error(tmp_path: Path, spoil: str):
     folder = tmp_path / "found"
     folder.mkdir()
     if spoil != "missing":
@@ -256,7 +256,7 @@ def test_what_is_no_diagnosis_is_said(tmp_path: Path, spoil: str):
         open_diagnosis(folder)
 
 
-# --------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # ------------------- page
 
 
@@ -320,7 +320,7 @@ def test_page_gives_size_time_evidence_alternatives_and_next_step(page: Page):
 
 
 @plain_pages
-def test_a_page_without_findings_says_so(tmp_path: Path):
+def test_page_without_findings(tmp_path: Path):
     nothing = content() | {
         "verdict": "no mismatch",
         "mismatches": [],
@@ -363,7 +363,7 @@ def test_command_report_accepts_the_folder(tmp_path: Path, capfd: pytest.Capture
     assert call("report", tmp_path / "found", "-o", tmp_path / "other.html", "--log", "x.nc") == 2
 
 
-# --------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # -------------- sentences
 
 
@@ -381,7 +381,8 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
 @pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
 def test_every_statistic_has_a_sentence(statistic: str, axes: list[str]):
     region = {
-        "view": statistic, "what": "outliers", "axes": axes, "begin": 0.0, "end": 3600.0, "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
+        "view": statistic, "what": "outliers", "axes": axes, "begin": 0.0, "end": 3600.0,
+        "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
         "sign": -1, "p_value": 0.002, "estimate": -0.2, "frequency": 13.0,
     }  # fmt: skip
     sentence = mismatch_statement(region, 3600.0)
@@ -413,7 +414,7 @@ def test_every_verdict_has_a_summary(verdict: str):
     assert ("vibration" in text) == (verdict in ("explained", "partly explained"))
 
 
-def test_a_diagnosis_prints_its_verdict_and_sentences():
+def test_printed_diagnosis_has_verdict_and_sentences():
     text = str(diagnosis())
     assert text.startswith("explained: The recording differs from the simulation in 2 places")
     assert "- vibration_noise: Vibration raises the noise" in text

@@ -1,4 +1,4 @@
-"""What effects are worth on time that was held out, against closed forms; and the surfaces side by side."""
+"""Held-out evidence against closed forms, and the surfaces."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _add_effects(found, *, epsilon=0.0, height=0.0):
     found["mean"][1, ON] += height
 
 
-def test_without_effects_nothing_is_gained_and_the_simulation_fits():
+def test_no_gain_and_good_fit_without_effects():
     base, found = _record()
     result = held_out(found, base, base)
     assert result["log_likelihood_gain"] == 0.0
@@ -47,7 +47,7 @@ def test_without_effects_nothing_is_gained_and_the_simulation_fits():
     assert np.mean([one["mean_misfit_before"] for one in several]) == pytest.approx(1.0, abs=0.4)
 
 
-def test_raised_noise_gains_what_the_gamma_law_says():
+def test_gain_of_raised_noise_follows_the_gamma_law():
     base, found = _record(2)
     epsilon = 0.2
     _add_effects(found, epsilon=epsilon)
@@ -62,7 +62,7 @@ def test_raised_noise_gains_what_the_gamma_law_says():
     assert result["coverage95_before"] < 0.93 < result["coverage95_after"] < 0.97
 
 
-def test_a_mean_gains_what_the_normal_law_says():
+def test_gain_of_a_mean_follows_the_normal_law():
     base, found = _record(3)
     height = 0.15
     _add_effects(found, height=height)
@@ -73,7 +73,7 @@ def test_a_mean_gains_what_the_normal_law_says():
     assert result["misfit_after"] == pytest.approx(1.0, abs=0.12)
 
 
-def test_the_error_of_a_gain_is_its_scatter_over_records():
+def test_error_of_a_gain_is_its_scatter_over_records():
     gains, errors = [], []
     for seed in range(16):
         base, found = _record(200 + seed)
@@ -84,7 +84,7 @@ def test_the_error_of_a_gain_is_its_scatter_over_records():
     assert 0.6 < np.std(gains, ddof=1) / np.mean(errors) < 1.6
 
 
-def test_held_out_means_have_the_density_of_dense_algebra():
+def test_likelihood_of_means_agrees_with_dense_algebra():
     base, found = _record(4)
     known = np.ones(180, dtype=bool)
     known[40:52] = False
@@ -106,7 +106,7 @@ def test_held_out_means_have_the_density_of_dense_algebra():
     assert seen == pytest.approx(dense, rel=1e-6)
 
 
-def test_cross_spectra_have_the_density_of_the_wishart_law():
+def test_likelihood_of_cross_spectra_is_that_of_the_wishart_law():
     base = baseline(axes="xy")
     found = records(base, 1, np.random.default_rng(5)).isel(record=0)
     share = 0.3
@@ -132,7 +132,7 @@ def test_cross_spectra_have_the_density_of_the_wishart_law():
     assert seen > 0.0
 
 
-def test_models_never_see_what_they_are_judged_on():
+def test_models_are_not_fitted_to_held_out_blocks():
     base, found = _record(6)
     seen: list[np.ndarray] = []
 
@@ -149,8 +149,9 @@ def test_models_never_see_what_they_are_judged_on():
     assert not forecast[126:].any()
 
 
-def test_a_sham_effect_fitted_to_noise_loses():
-    """An effect whose size is fitted to the rest of the record gains nothing on held-out time where it is not there."""
+def test_effect_fitted_to_noise_loses():
+    """An effect whose size is fitted to the rest of the record gains nothing on held-out data
+    without it."""
     gains = []
     for seed in range(8):
         base, found = _record(100 + seed)
@@ -168,7 +169,7 @@ def test_a_sham_effect_fitted_to_noise_loses():
 
 
 @pytest.mark.parametrize(("period", "best"), [(36, 18), (180, 45)])  # blocks
-def test_a_slow_drift_in_a_random_walk_is_worth_more_on_long_stretches(period, best):
+def test_slow_drift_gains_more_on_long_stretches(period, best):
     base, found = _record(9, walk=0.1)
     after = base.copy(deep=True)
     drift = 0.3 * np.sin(2.0 * np.pi * np.arange(180) / period)
@@ -189,7 +190,7 @@ def test_a_slow_drift_in_a_random_walk_is_worth_more_on_long_stretches(period, b
     assert evidence_nats > on(5) + 1.0
 
 
-def test_a_forecast_gains_where_the_effect_goes_on():
+def test_forecast_gains_if_the_effect_continues():
     base, found = _record(7)
     after = base.copy(deep=True)
     wave = 0.1 * np.sin(2.0 * np.pi * np.arange(180) / 60.0)
@@ -200,13 +201,13 @@ def test_a_forecast_gains_where_the_effect_goes_on():
     assert evidence_nats == pytest.approx(0.5 * (tail**2).sum() / VARIANCE, rel=0.5)
 
 
-def test_gain_of_other_views_is_added():
+def test_gain_of_other_statistics_is_added():
     base, found = _record()
     result = held_out(found, base, base, more_gain=3.5)
     assert (result["log_likelihood_gain"], result["stderr"]) == (3.5, pytest.approx(np.sqrt(7.0)))
 
 
-def test_the_allan_variance_is_compared_with_the_model_that_is_shown():
+def test_allan_variance_is_compared_with_the_shown_model():
     base, found = _record()
     _add_effects(found, epsilon=0.5)
     whole = _with_effects(base, epsilon=0.5)
@@ -218,7 +219,7 @@ def test_the_allan_variance_is_compared_with_the_model_that_is_shown():
     assert abs(seen["misfit_after"] - 1.0) < 0.3 * abs(blind["misfit_after"] - 1.0)
 
 
-def test_stretches_cover_the_record_once_and_short_records_are_refused():
+def test_stretches_cover_the_record_and_short_records_are_refused():
     _, found = _record()
     cut = cut_stretches(found)
     assert cut.first[0] == 0
@@ -228,7 +229,7 @@ def test_stretches_cover_the_record_once_and_short_records_are_refused():
         cut_stretches(found.isel(block=slice(10)))
 
 
-def test_gaps_leave_the_coverage_as_it_is():
+def test_gaps_do_not_change_the_coverage():
     base = baseline(missing=0.3)
     found = records(base, 1, np.random.default_rng(8), missing=0.3).isel(record=0)
     for name in ("mean", "power", "kurtosis"):
@@ -239,7 +240,7 @@ def test_gaps_leave_the_coverage_as_it_is():
     assert np.isfinite(list(result.values())).all()
 
 
-def test_surfaces_stand_side_by_side():
+def test_surfaces_have_all_three_cases():
     base, found = _record(9)
     _add_effects(found, epsilon=0.5, height=0.4)
     surfaces = make_surfaces(found, base, _with_effects(base, epsilon=0.5, height=0.4))

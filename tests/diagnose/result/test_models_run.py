@@ -18,7 +18,7 @@ from gyrostab.physics.registry import effects
 from gyrostab.simulate import read_model, simulate
 
 RATE, SIZE = 10.0, 300
-#: Extremes of channels that a logger may write beside usual values, by the unit inside.
+#: Extremes of channels that a logger may write in addition to usual values, by the unit inside.
 GLITCHES = {"degree_Celsius": (-90.0, 180.0), "W": (1e-9, 10.0), "V": (0.0, 100.0)}
 
 
@@ -43,8 +43,9 @@ def recording(kind: Any, seed: int) -> xr.Dataset:
     return log
 
 
-def simulated(name: str, scale: float, seed: int) -> xr.Dataset | None:
-    """Write a model with an effect whose sizes are `scale` times the typical ones, and run it like a recording; None without an effect."""
+def simulate_sizes(name: str, scale: float, seed: int) -> xr.Dataset | None:
+    """Simulate an effect of `scale` times the typical sizes like a recording; None without an
+    effect."""
     kind = effects()[name]
     known = {item.name: item for item in kind.parameters()}
     sizes: dict[str, Any] = {}
@@ -70,9 +71,10 @@ def simulated(name: str, scale: float, seed: int) -> xr.Dataset | None:
 @pytest.mark.parametrize(
     "name", sorted({*effects()} - {"logger_filter"})
 )  # which needs one form of filter, not a size
-def test_sizes_far_from_the_usual_can_be_simulated(name: str):
-    """Sizes of a fit are anything: they are brought within what the effect allows, and then must run."""
-    made = [simulated(name, scale, seed=1) for scale in (-30.0, 300.0)]
+def test_unusual_sizes_can_be_simulated(name: str):
+    """Fitted sizes may be anything: they are brought within the range of the effect, and must then
+    run."""
+    made = [simulate_sizes(name, scale, seed=1) for scale in (-30.0, 300.0)]
     assert any(log is not None for log in made)
     assert all(np.isfinite(log["rate"].values).all() for log in made if log is not None)
 
@@ -82,12 +84,12 @@ def test_sizes_far_from_the_usual_can_be_simulated(name: str):
 )
 @settings(max_examples=10, deadline=None)
 @given(scale=st.floats(-1e5, 1e5), seed=st.integers(0, 2**16))
-def test_any_change_of_the_noise_level_can_be_simulated(name: str, scale: float, seed: int):
-    made = simulated(name, scale, seed)
+def test_any_noise_change_can_be_simulated(name: str, scale: float, seed: int):
+    made = simulate_sizes(name, scale, seed)
     assert made is None or np.isfinite(made["rate"].values).all()
 
 
-def test_a_falling_law_stops_at_a_tenth_of_the_noise():
+def test_falling_noise_stops_at_a_tenth():
     kind = effects()["temperature_noise"]
     log = recording(kind, 3)
     log["temperature"] = ("time", np.linspace(25.0, 65.0, SIZE), {"units": "degree_Celsius"})

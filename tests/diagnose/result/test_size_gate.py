@@ -1,4 +1,4 @@
-"""What must hold before an effect is listed and before a record counts as explained."""
+"""Conditions for an effect to be listed, and for a record to count as explained."""
 
 from __future__ import annotations
 
@@ -28,11 +28,12 @@ from gyrostab.diagnose.result.tables import effect_tables, unidentified_tables
 from gyrostab.diagnose.result.text import summary
 from gyrostab.diagnose.result.verdict import decide_verdict, failed_checks
 from gyrostab.physics.registry import effects
-from tests.diagnose.estimate.test_recalibrate import SHAKE, naming_of, reduced_of
+from tests.diagnose.estimate.test_recalibrate import SHAKE, identify_by_hand, reduce_simulation
 from tests.support.diagnosed import content
 
 GOOD = {
-    "blocks": 36, "log_likelihood_gain": 41.2, "stderr": 6.0, "misfit_before": 3.1, "misfit_after": 1.0,
+    "blocks": 36, "log_likelihood_gain": 41.2, "stderr": 6.0, "misfit_before": 3.1,
+    "misfit_after": 1.0,
     "coverage95_before": 0.71, "coverage95_after": 0.95, "forecast_gain": 12.0,
 }  # fmt: skip
 
@@ -41,7 +42,7 @@ def estimate(value: float, error: float) -> Estimate:
     return Estimate(value, error, value - 1.96 * error, value + 1.96 * error, "deg/h")
 
 
-def claim_of(
+def make_identification(
     effect: str, axes: str, gains: tuple[float, ...] | None = None, *, statistic: str = "mean"
 ) -> Identification:
     one: Any = Candidate(effect, statistic, (), ())
@@ -53,7 +54,7 @@ def claim_of(
     return Identification(effect, (), tuple(axes), components, 20.0 * len(axes), 8.0)
 
 
-def naming_with(*identified: Identification) -> Identifications:
+def make_identifications(*identified: Identification) -> Identifications:
     return Identifications(identified, (), 8.0, np.zeros(1), {}, (), *[None] * 2)  # type: ignore[arg-type]
 
 
@@ -70,21 +71,21 @@ def naming_with(*identified: Identification) -> Identifications:
         ({}, ("x", "y")),
     ],
 )
-def test_an_axis_is_supported_where_a_size_is_away_from_zero(
+def test_axis_is_supported_if_a_size_differs_from_zero(
     parameters: dict[str, Estimate], axes: tuple[str, ...]
 ):
-    identification = claim_of("temperature_bias", "xy")
+    identification = make_identification("temperature_bias", "xy")
     assert supported_axes(Fitted(identification, ("x", "y"), parameters, None)) == axes
 
 
-def test_a_line_of_amplitude_zero_is_no_effect():
-    identification = claim_of("spectral_line", "x", statistic="line")
+def test_line_of_zero_amplitude_is_not_an_effect():
+    identification = make_identification("spectral_line", "x", statistic="line")
     nothing = {
         "amplitude": Estimate(0.0, 0.0, 0.0, 0.0, "deg/h"),
         "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz"),
     }
     identifications = keep_supported(
-        naming_with(identification), [[Fitted(identification, ("x",), nothing, None)]]
+        make_identifications(identification), [[Fitted(identification, ("x",), nothing, None)]]
     )
     assert not identifications.identified
     assert [(one.axes, one.candidates) for one in identifications.unknown] == [
@@ -92,8 +93,11 @@ def test_a_line_of_amplitude_zero_is_no_effect():
     ]
 
 
-def test_an_effect_keeps_the_axes_on_which_its_size_is_known():
-    identification, other = claim_of("temperature_bias", "xy"), claim_of("shupe", "z")
+def test_effect_keeps_axes_with_a_size():
+    identification, other = (
+        make_identification("temperature_bias", "xy"),
+        make_identification("shupe", "z"),
+    )
     numbers = [
         [
             Fitted(identification, (axis,), {"sensitivity": estimate(0.4, error)}, None)
@@ -101,7 +105,7 @@ def test_an_effect_keeps_the_axes_on_which_its_size_is_known():
         ],
         [Fitted(other, ("z",), {"sensitivity": estimate(0.4, 0.1)}, None)],
     ]
-    before = naming_with(identification, other)
+    before = make_identifications(identification, other)
     identifications = keep_supported(before, numbers)
     assert [(one.effect, one.axes) for one in identifications.identified] == [
         ("temperature_bias", ("x",)),
@@ -113,24 +117,24 @@ def test_an_effect_keeps_the_axes_on_which_its_size_is_known():
     assert keep_supported(identifications, [numbers[0][:1], numbers[1]]) is identifications
 
 
-def test_what_chance_does_too_is_not_left_as_unknown():
-    identification = claim_of("temperature_bias", "xy", (30.0, 3.0))
+def test_unsupported_rest_below_the_threshold_is_dropped():
+    identification = make_identification("temperature_bias", "xy", (30.0, 3.0))
     numbers = [
         [
             Fitted(identification, (axis,), {"sensitivity": estimate(0.4, error)}, None)
             for axis, error in (("x", 0.1), ("y", 1.0))
         ]
     ]
-    identifications = keep_supported(naming_with(identification), numbers)
+    identifications = keep_supported(make_identifications(identification), numbers)
     assert [one.axes for one in identifications.identified] == [("x",)]
     assert not identifications.unknown
 
 
-def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
-    """Vibration that does nothing, named by hand: what remains is a mismatch and no effect."""
-    blocks = reduced_of(environment=[SHAKE])
+def test_effect_of_possibly_zero_size_becomes_unidentified():
+    """Vibration without any effect, named by hand: what remains is a mismatch without an effect."""
+    blocks = reduce_simulation(environment=[SHAKE])
     baseline = calibrate_noise(blocks)
-    identifications = naming_of(
+    identifications = identify_by_hand(
         blocks, baseline, "vibration_rectification", "mean", ("sensitivity",)
     )
     identifications = replace(identifications, null_best=np.arange(8.0))
@@ -142,7 +146,7 @@ def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
     assert "a bias caused by vibration" in region["statement"]
 
 
-# --------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------
 # ------------- verdict
 
 
@@ -161,7 +165,7 @@ def test_an_effect_with_a_size_that_may_be_zero_becomes_something_unknown():
         ({"coverage95_before": None, "coverage95_after": None}, "explained"),
     ],
 )
-def test_held_out_data_decide(change: dict[str, Any], verdict: str):
+def test_held_out_data_decide_the_verdict(change: dict[str, Any], verdict: str):
     held = GOOD | change
     assert decide_verdict([{}], ["shupe"], [], held) == verdict
     assert bool(failed_checks(held)) == (verdict != "explained")
@@ -181,7 +185,7 @@ SHARE = st.none() | st.floats(0.0, 1.0)
     after=SHARE,
     left=st.lists(st.integers(1, 3), max_size=2),
 )
-def test_explained_means_that_the_evidence_is_for_it(evidence_nats, forecast, before, after, left):
+def test_explained_requires_evidence(evidence_nats, forecast, before, after, left):
     held = GOOD | {
         "log_likelihood_gain": evidence_nats,
         "forecast_gain": forecast,
@@ -206,7 +210,7 @@ def test_explained_means_that_the_evidence_is_for_it(evidence_nats, forecast, be
         max_size=6,
     ),
 )
-def test_a_limit_over_several_laws_lies_between_theirs(laws):
+def test_limit_of_a_mixture_lies_between_its_laws(laws):
     size, sd, share = np.array(laws).T
     ends = size + 1.6448536269514722 * sd
     limit = mixture_limit(size, sd, share / share.sum())
@@ -222,16 +226,17 @@ def test_a_limit_over_several_laws_lies_between_theirs(laws):
     ],
     ids=["all the time", "over", "at the end"],
 )
-def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: bool):
-    """An event that is over says nothing of later, and the size of one near the end is not known before."""
+def test_only_lasting_effects_are_forecast(points: list[list[float]], told: bool):
+    """An event that is over does not affect later data, and the size of one near the end is unknown
+    before."""
     shaken = {"profile": "vibration", "points": points}
-    blocks = reduced_of(
+    blocks = reduce_simulation(
         {"name": "vibration_noise", "white": 0.002, "axes": ["x"]},
         axes=("x",),
         environment=[shaken],
     )
     baseline = calibrate_noise(blocks)
-    identifications = naming_of(
+    identifications = identify_by_hand(
         blocks, baseline, "vibration_noise", "power", ("white",), exponent=1.0
     )
     held = conclude.measure_evidence(
@@ -244,10 +249,11 @@ def test_only_effects_that_go_on_are_forecast(points: list[list[float]], told: b
 
 
 @pytest.mark.slow
-def test_a_turn_on_the_bench_is_not_explained_by_what_fails_its_forecast(
+def test_bench_rotation_is_not_explained_by_a_failed_forecast(
     recordings: Callable[[str], Path],
 ):
-    """A real record of 27 s whose rate turns to 123 deg/s at its end; the limits of what was not found once stopped the diagnosis."""
+    """A real record of 27 s whose rate reaches 123 deg/s at its end; upper limits once stopped the
+    diagnosis."""
     path = recordings("fog-hybrid-warmup/run2_turn.txt")
     known = {
         "map": {"wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z"},
