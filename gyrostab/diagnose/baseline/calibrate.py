@@ -228,14 +228,14 @@ def assemble_baseline(
         Expected power including effects; that of the noise by default.
     """
     columns = noise_powers(blocks)
-    square = np.stack([one.square for one in posteriors])
+    square = np.stack([posterior.square for posterior in posteriors])
     noise = np.einsum("abfn,an->abf", columns, square)
     expected = noise if spectrum is None else spectrum
     power, shape = (
         blocks["power"].transpose("axis", "block", "band").values,
         blocks["shape"].transpose("axis", "block", "band").values,
     )
-    floor = np.array([1e-3 * one.min() / HOUR for one in expected])
+    floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
     white = white_variance(
         blocks,
         np.stack(
@@ -248,10 +248,10 @@ def assemble_baseline(
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
     grids = [
-        _coarse_grid(one, max(one.square[1], least) * HOUR, span)
-        for one, least in zip(posteriors, floor, strict=True)
+        _coarse_grid(posterior, max(posterior.square[1], least) * HOUR, span)
+        for posterior, least in zip(posteriors, floor, strict=True)
     ]
-    draws = np.stack([one.draws for one in posteriors])
+    draws = np.stack([posterior.draws for posterior in posteriors])
     common, rest = common_variance(blocks)
     value, error = _mean_coefficients(posteriors)
     value[:, 4], error[:, 4] = 0.0, _ramp_error(blocks, white, value, quiet)
@@ -311,7 +311,7 @@ def assemble_baseline(
         ),
         "square_stderr": (
             ("axis", "noise"),
-            np.stack([one.error for one in posteriors]),
+            np.stack([posterior.error for posterior in posteriors]),
             {"units": f"square of {units}"},
         ),
         "posterior": (
@@ -321,7 +321,7 @@ def assemble_baseline(
         ),
         "posterior_slow": (
             ("axis", "draw", "slow"),
-            np.stack([one.slow for one in posteriors]),
+            np.stack([posterior.slow for posterior in posteriors]),
             {"units": f"square of {units}"},
         ),
         "grid_K": (("axis", "grid"), np.stack([grid[0] for grid in grids]), {"units": "deg/h^1.5"}),
@@ -344,8 +344,8 @@ def assemble_baseline(
     }
     not_joined = [
         str(axis)
-        for axis, one in zip(blocks["axis"].values, posteriors, strict=True)
-        if not one.joined
+        for axis, posterior in zip(blocks["axis"].values, posteriors, strict=True)
+        if not posterior.joined
     ]
     return xr.Dataset(
         variables,
@@ -357,8 +357,8 @@ def assemble_baseline(
 def _mean_coefficients(posteriors: list[Posterior]) -> tuple[Array, Array]:
     """Return values and errors (axis, term), without R; B and K are those of the block means."""
     value, error = np.zeros((len(posteriors), 5)), np.zeros((len(posteriors), 5))
-    for row, one in enumerate(posteriors):
-        roots = np.sqrt(np.concatenate([one.draws[:, :2], one.slow], axis=1))
+    for row, posterior in enumerate(posteriors):
+        roots = np.sqrt(np.concatenate([posterior.draws[:, :2], posterior.slow], axis=1))
         value[row, :4], error[row, :4] = roots.mean(axis=0), roots.std(axis=0)
     return value, error
 
@@ -429,7 +429,9 @@ def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) ->
         chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet)
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
-    known = expect_known_effects(blocks, parsed, np.stack([one.square for one in posteriors]))
+    known = expect_known_effects(
+        blocks, parsed, np.stack([posterior.square for posterior in posteriors])
+    )
     attrs["left_out"] = known.left_out
     hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
     ramp = np.array([parsed.coefficients(axis)["R"] for axis in axes])
@@ -456,7 +458,7 @@ def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) ->
             {"long_name": "expected power of lines", "units": _POWER_UNIT},
         )
     if known.lines:
-        noise = np.stack([line_columns(blocks) @ one.square for one in posteriors])
+        noise = np.stack([line_columns(blocks) @ posterior.square for posterior in posteriors])
         out["shape_alone"] *= independent_line_share(noise + known.lines["peaks"], blocks)[:, None]
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if quiet is None else ["R"]}] = 0.0
@@ -467,7 +469,7 @@ def _scale_to_quiescent(
     blocks: xr.Dataset, model: Model, posteriors: list[Posterior], quiet: NDArray[np.bool_]
 ) -> list[Posterior]:
     """Scale the noise of a model to the quiescent blocks (axis, block), given its effects."""
-    square = np.stack([one.square for one in posteriors])
+    square = np.stack([posterior.square for posterior in posteriors])
     whole, added = (
         expect_known_effects(blocks, model, values).spectrum for values in (square, 0.0 * square)
     )
@@ -478,8 +480,8 @@ def _scale_axes(posteriors: list[Posterior], factor: Array, error: Array) -> lis
     """Scale the noise of all axes, with the errors of the factors."""
     scalings = zip(posteriors, factor.tolist(), error.tolist(), strict=True)
     return [
-        scale_noise(one, by, relative_error, np.random.default_rng(row))
-        for row, (one, by, relative_error) in enumerate(scalings)
+        scale_noise(posterior, by, relative_error, np.random.default_rng(row))
+        for row, (posterior, by, relative_error) in enumerate(scalings)
     ]
 
 
@@ -527,13 +529,17 @@ def baseline_from_simulation(
     posteriors, level, unexplained = _calibrate_simulation(simulated, chosen)
     plain = (
         np.einsum(
-            "abfn,an->abf", noise_powers(simulated), np.stack([one.square for one in posteriors])
+            "abfn,an->abf",
+            noise_powers(simulated),
+            np.stack([posterior.square for posterior in posteriors]),
         )
         * level[..., None]
     )
     shown = measure_extra_statistics(simulated, plain, unexplained)
     noise = np.einsum(
-        "abfn,an->abf", noise_powers(blocks), np.stack([one.square for one in posteriors])
+        "abfn,an->abf",
+        noise_powers(blocks),
+        np.stack([posterior.square for posterior in posteriors]),
     )
     attrs = {
         "source": "simulation",
@@ -571,7 +577,9 @@ def _calibrate_simulation(
             power=simulated["power"].where(~xr.DataArray(unexplained, dims=("axis", "band")))
         )
         posteriors = _calibrate_axes(explained, chosen)
-        plain = np.einsum("abfn,an->abf", columns, np.stack([one.square for one in posteriors]))
+        plain = np.einsum(
+            "abfn,an->abf", columns, np.stack([posterior.square for posterior in posteriors])
+        )
         level = _level_over_time(explained, plain)
         newly_unexplained = worst_band(explained, plain * level[..., None]) & (
             unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - _MIN_BANDS

@@ -104,8 +104,8 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         for effect in map(_effect_of_instrument(model), model.effects)
     ]
     # Blocks with anomalous samples are found and left out.
-    described = [one for one in acting if not _has_anomalous_samples(one)]
-    powers = [power for one in described for power in _added_powers(one, blocks)]
+    described = [active for active in acting if not _has_anomalous_samples(active)]
+    powers = [power for active in described for power in _added_powers(active, blocks)]
     response = _filter_response(described, blocks)
     noise = np.einsum(
         "fn,abn->abf",
@@ -116,9 +116,9 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     for power in powers:
         added += power.on_axes
     narrow = [
-        (one.acting.effect, one.acting.rows, one.on_axes)
-        for one in powers
-        if one.acting.prediction.line is not None and one.factor.any()
+        (added_power.acting.effect, added_power.acting.rows, added_power.on_axes)
+        for added_power in powers
+        if added_power.acting.prediction.line is not None and added_power.factor.any()
     ]
     sizes = {
         "bands": blocks.sizes["band"],
@@ -133,12 +133,12 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         if narrow and "line_power" in blocks
         else {},
         wandering=add_up_wandering(
-            [(_process_squares(one, blocks), one.prediction) for one in described], **sizes
+            [(_process_squares(active, blocks), active.prediction) for active in described], **sizes
         ),
         left_out=[
-            one.effect.name
-            for one in acting
-            if _has_anomalous_samples(one) or _shows_elsewhere(one)
+            active.effect.name
+            for active in acting
+            if _has_anomalous_samples(active) or _shows_elsewhere(active)
         ],
     )
 
@@ -192,14 +192,14 @@ def _act_on_record(effect: Effect, blocks: xr.Dataset) -> _ActingEffect:
     return _ActingEffect(effect, rows, axis_names, _predict_effect(effect, blocks, axis_names))
 
 
-def _has_anomalous_samples(one: _ActingEffect) -> bool:
+def _has_anomalous_samples(active: _ActingEffect) -> bool:
     """Return whether an effect changes sample counts other than by a quantization grid."""
-    return bool({*one.prediction.marks} - {_EVERYWHERE})
+    return bool({*active.prediction.marks} - {_EVERYWHERE})
 
 
-def _shows_elsewhere(one: _ActingEffect) -> bool:
+def _shows_elsewhere(active: _ActingEffect) -> bool:
     """Return whether an effect also shows outside means, powers and cross-spectra."""
-    prediction = one.prediction
+    prediction = active.prediction
     elsewhere = (
         prediction.marks
         or not is_described_by_variance(prediction)
@@ -221,47 +221,47 @@ def _shows_elsewhere(one: _ActingEffect) -> bool:
 def _expected_means(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
     """Return the rates that effects add, (axis, block) [degree hour-1]."""
     mean = np.zeros((blocks.sizes["axis"], blocks.sizes["block"]))
-    for one in acting:
-        for name, values in one.prediction.mean.items():
-            mean[one.rows] += _sizes_by_axis(one.effect, name, one.axes)[:, None] * values
+    for active in acting:
+        for name, values in active.prediction.mean.items():
+            mean[active.rows] += _sizes_by_axis(active.effect, name, active.axes)[:, None] * values
     return mean
 
 
 def _expected_squares(acting: Sequence[_ActingEffect], square: Array, blocks: xr.Dataset) -> Array:
     """Return squared noise coefficients including effects, (axis, block, noise)."""
     level = np.repeat(square[:, None], blocks.sizes["block"], axis=1)
-    for one in acting:
-        for (term, name), values in one.prediction.level.items():
-            axis_square = square[one.rows, None, NOISE.index(term)]
-            level[one.rows, :, NOISE.index(term)] += (
-                axis_square * _sizes_by_axis(one.effect, name, one.axes)[:, None] * values
+    for active in acting:
+        for (term, name), values in active.prediction.level.items():
+            axis_square = square[active.rows, None, NOISE.index(term)]
+            level[active.rows, :, NOISE.index(term)] += (
+                axis_square * _sizes_by_axis(active.effect, name, active.axes)[:, None] * values
             )
     return level
 
 
-def _added_powers(one: _ActingEffect, blocks: xr.Dataset) -> list[_AddedPower]:
+def _added_powers(active: _ActingEffect, blocks: xr.Dataset) -> list[_AddedPower]:
     """Return the powers that an effect adds, one for each of its spectra."""
     out, bands = [], blocks.sizes["band"]
-    for name, values in one.prediction.spectrum.items():
+    for name, values in active.prediction.spectrum.items():
         factor = np.zeros(blocks.sizes["axis"], np.complex128)
-        factor[one.rows] = _complex_factors(one.effect, name, one.axes)
+        factor[active.rows] = _complex_factors(active.effect, name, active.axes)
         density = np.zeros((factor.size, blocks.sizes["block"], bands))
-        peak = _resonance_density(one.effect, name, blocks, one.axes)
-        density[one.rows] = (
+        peak = _resonance_density(active.effect, name, blocks, active.axes)
+        density[active.rows] = (
             values.reshape(*values.shape[:-1], bands, -1).mean(axis=-1)
             if peak is None
             else _average_in_bands(peak, blocks)
         )
-        out.append(_AddedPower(one, factor, density))
+        out.append(_AddedPower(active, factor, density))
     return out
 
 
 def _filter_response(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
     """Return the power response of filters, (axis, 1, band)."""
     response = np.ones((blocks.sizes["axis"], 1, blocks.sizes["band"]))
-    for one in acting:
-        if one.prediction.response is not None:
-            response[one.rows] *= band_response(one.effect, blocks)
+    for active in acting:
+        if active.prediction.response is not None:
+            response[active.rows] *= band_response(active.effect, blocks)
     return response
 
 
@@ -275,20 +275,22 @@ def _shared_cross(
     pairs = [(axes.index(a), axes.index(b)) for a, b in pair_rows(blocks)]
     shared = np.zeros((len(pairs), blocks.sizes["block"], blocks.sizes["band"]), np.complex128)
     for power in (power for power in powers if power.acting.prediction.coherent):
-        for number, (one, other) in enumerate(pairs):
-            factor_product = power.factor[one] * np.conj(power.factor[other])
-            shared[number] += factor_product * np.sqrt(power.density[one] * power.density[other])
-    for number, (one, other) in enumerate(pairs):
-        shared[number] *= np.sqrt(response[one] * response[other])
+        for number, (row, other_row) in enumerate(pairs):
+            factor_product = power.factor[row] * np.conj(power.factor[other_row])
+            shared[number] += factor_product * np.sqrt(
+                power.density[row] * power.density[other_row]
+            )
+    for number, (row, other_row) in enumerate(pairs):
+        shared[number] *= np.sqrt(response[row] * response[other_row])
     return spread_by_gaps(shared, blocks, "pair") if shared.any() else None
 
 
-def _process_squares(one: _ActingEffect, blocks: xr.Dataset) -> dict[str, Array]:
+def _process_squares(active: _ActingEffect, blocks: xr.Dataset) -> dict[str, Array]:
     """Return squared sizes of random processes in the means, (axis,) each."""
     squares = {}
-    for name in one.prediction.wander:
+    for name in active.prediction.wander:
         squares[name] = np.zeros(blocks.sizes["axis"])
-        squares[name][one.rows] = _sizes_by_axis(one.effect, name, one.axes) ** 2
+        squares[name][active.rows] = _sizes_by_axis(active.effect, name, active.axes) ** 2
     return squares
 
 
@@ -335,7 +337,9 @@ def _known_lines(
     """
     axes = [str(axis) for axis in blocks["axis"].values]
     frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
-    passed = np.stack([np.interp(np.log(frequency), np.log(bands), one) for one in response])
+    passed = np.stack(
+        [np.interp(np.log(frequency), np.log(bands), axis_response) for axis_response in response]
+    )
     steady, largest, broad = (np.zeros(passed.shape) for _ in range(3))
     near, band_power = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
     leak = _line_leakage(int(blocks.attrs["block_samples"]))
@@ -371,11 +375,11 @@ def _known_lines(
                 own_leak = _line_leakage(
                     int(blocks.attrs["block_samples"]), apart * float(blocks.attrs["block_s"])
                 )[0]
-            for row, one in zip(rows, size * passed[rows], strict=True):
+            for row, power in zip(rows, size * passed[rows], strict=True):
                 (steady if alone else broad)[row] += np.convolve(
-                    one, own_leak if alone else leak[0], "same"
+                    power, own_leak if alone else leak[0], "same"
                 )
-                largest[row] += np.convolve(one, leak[2], "same") if alone else 0.0
+                largest[row] += np.convolve(power, leak[2], "same") if alone else 0.0
     return {"lines": steady, "lines_most": largest, "peaks": broad, "line_spectrum": band_power}
 
 
@@ -432,7 +436,11 @@ def independent_line_share(density: Array, blocks: xr.Dataset) -> Array:
     It is below 1 if the density (axis, line) is dominated by some lines.
     """
     return np.stack(
-        [_average_in_bands(one, blocks) ** 2 / _average_in_bands(one**2, blocks) for one in density]
+        [
+            _average_in_bands(axis_density, blocks) ** 2
+            / _average_in_bands(axis_density**2, blocks)
+            for axis_density in density
+        ]
     )
 
 
@@ -525,7 +533,7 @@ def _predict_effect(
 
 def _sizes_by_axis(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
     """Return a parameter for each axis."""
-    known = {one.name: one for one in effect.parameters()}
+    known = {parameter.name: parameter for parameter in effect.parameters()}
     return (
         effect.each(name, axes)
         if known[name].many
@@ -535,7 +543,7 @@ def _sizes_by_axis(effect: Effect, name: str, axes: tuple[str, ...]) -> Array:
 
 def _complex_factors(effect: Effect, name: str, axes: tuple[str, ...]) -> NDArray[np.complex128]:
     """Return the complex factor of a spectrum for each axis: size, direction, phase."""
-    known = {one.name: one for one in effect.parameters()}
+    known = {parameter.name: parameter for parameter in effect.parameters()}
     factor = _sizes_by_axis(effect, name, axes).astype(np.complex128)
     if "direction" in known:
         factor *= _sizes_by_axis(effect, "direction", axes)

@@ -244,8 +244,8 @@ def _build_power(
             [_mix_with_mean(_select_row(one, row), near, width) for one in variant.design],
             weight.shape,
         )
-        for each in candidates
-        for variant in each.variants
+        for candidate in candidates
+        for variant in candidate.variants
     ]
     return with_independent_cells(
         LinearModel(values, weight, designs, given, whole),
@@ -306,8 +306,8 @@ def _build_cross(
             ],
             weight.shape,
         )
-        for each in candidates
-        for variant in each.variants
+        for candidate in candidates
+        for variant in candidate.variants
     ]
     return LinearModel(_real_and_imaginary(values, axis=1), weight, designs, given, precision)
 
@@ -380,8 +380,8 @@ def _build_order(
     both = np.concatenate([np.concatenate([one, one], axis=1) for one in weight], axis=1)
     stacked = np.concatenate([_real_and_imaginary(one, axis=1) for one in values], axis=1)
     designs = []
-    for each in candidates:
-        for variant in each.variants:
+    for candidate in candidates:
+        for variant in candidate.variants:
             for pattern in (variant.design[0], np.conj(variant.design[0])):
                 by_axis = [order_columns(one, (0,)) for one in pattern]
                 designs.append(
@@ -420,8 +420,8 @@ def _build_profile(
     )
     designs = [
         _stack_columns(list(variant.design), weight.shape)
-        for each in candidates
-        for variant in each.variants
+        for candidate in candidates
+        for variant in candidate.variants
     ]
     return LinearModel(values, weight, designs, given, precision)
 
@@ -491,8 +491,8 @@ def _build_transfer(
         _stack_columns(
             [_real_and_imaginary(one * root * share) for one in variant.design], weight.shape
         )
-        for each in candidates
-        for variant in each.variants
+        for candidate in candidates
+        for variant in candidate.variants
     ]
     return LinearModel(values, weight, designs, given, precision)
 

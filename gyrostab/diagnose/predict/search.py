@@ -135,10 +135,15 @@ def compute_evidence(
     """
     found: list[CandidateEvidence] = []
     groups: dict[tuple[object, ...], list[Candidate]] = {}
-    for one in candidates:
+    for candidate in candidates:
         groups.setdefault(
-            (one.statistic, one.reference, one.each if one.statistic == "order" else True), []
-        ).append(one)
+            (
+                candidate.statistic,
+                candidate.reference,
+                candidate.each if candidate.statistic == "order" else True,
+            ),
+            [],
+        ).append(candidate)
     for (statistic, *_), group in groups.items():
         if statistic == "mean":
             found += _search_means(group, data, state, folds)
@@ -172,7 +177,7 @@ def reusable_mean_evidence(
         state.blocks.drop_vars(_TAIL_VARIABLES, errors="ignore") for state in (before, now)
     )
     return (
-        [one for one in found if one.candidate.statistic in _MEAN_STATISTICS]
+        [evidence for evidence in found if evidence.candidate.statistic in _MEAN_STATISTICS]
         if left.equals(right)
         else []
     )
@@ -190,8 +195,8 @@ def _given_mean_columns(state: State) -> dict[tuple[str, str], list[int]]:
 def evidence_by_effect(found: Sequence[CandidateEvidence]) -> dict[str, Array]:
     """Sum up the evidence (record,) of every effect by the key of its candidates."""
     rows: dict[str, list[Array]] = {}
-    for one in found:
-        rows.setdefault(one.candidate.key, []).append(one.evidence_nats)
+    for evidence in found:
+        rows.setdefault(evidence.candidate.key, []).append(evidence.evidence_nats)
     return {
         key: combine_rows(np.concatenate(row_evidence, axis=1))
         for key, row_evidence in rows.items()
@@ -208,22 +213,27 @@ def _collect_evidence(
     group: Sequence[Candidate], rows: list[tuple[str, ...]], factors: list[Array], spread: int = 1
 ) -> list[CandidateEvidence]:
     """Compute the held-out evidence of a group from the factors of all variants, by row."""
-    variants = [[one for one in each.variants for _ in range(spread)] for each in group]
+    variants = [
+        [variant for variant in candidate.variants for _ in range(spread)] for candidate in group
+    ]
     owner = np.repeat(np.arange(len(group)), [len(group_variants) for group_variants in variants])
-    weight = [one.weight for group_variants in variants for one in group_variants]
+    weight = [variant.weight for group_variants in variants for variant in group_variants]
     # (candidate, record, row)
     evidence_nats = np.stack(
-        [held_out_evidence(one, owner, weight=weight) for one in factors], axis=-1
+        [held_out_evidence(row_factors, owner, weight=weight) for row_factors in factors], axis=-1
     )
     # (design, row)
-    first = np.stack([one[0, :, 0] for one in factors], axis=-1) + np.log(weight)[:, None]
+    first = (
+        np.stack([row_factors[0, :, 0] for row_factors in factors], axis=-1)
+        + np.log(weight)[:, None]
+    )
     out = []
-    for number, each in enumerate(group):
+    for number, candidate in enumerate(group):
         own = first[owner == number]
         best = tuple(variants[number][int(place)] for place in own.argmax(axis=0))
         out.append(
             CandidateEvidence(
-                each,
+                candidate,
                 rows,
                 evidence_nats[number],
                 best,
@@ -241,8 +251,8 @@ def _search_means(
     for row, axis in enumerate(state.axes):
         designs = [
             np.moveaxis(variant.design[:, row if variant.design.shape[1] > 1 else 0], 0, -1)
-            for each in group
-            for variant in each.variants
+            for candidate in group
+            for variant in candidate.variants
         ]
         given = state.given.get(("mean", axis))
         given_columns = np.stack(given, axis=-1) if given else None
@@ -275,7 +285,7 @@ def _search_linear_model(
         if not is_given and rng is not None:
             model = simulate_noise(model, rng, data.sizes["record"])
         factors.append(linear_model_factors(model, folds)[:, 1:])
-        spread = factors[-1].shape[1] // sum(len(each.variants) for each in group)
+        spread = factors[-1].shape[1] // sum(len(candidate.variants) for candidate in group)
     return _collect_evidence(group, rows, factors, spread)
 
 
@@ -291,9 +301,9 @@ def _search_sample_counts(
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     coarse = has_coarse_grid(state.blocks)
     out = []
-    for each in group:
+    for candidate in group:
         evidence_nats, best = [], []
-        for variant in each.variants:
+        for variant in candidate.variants:
             by_name = [
                 np.where(
                     coarse & (name in GRID_COUNTS),
@@ -303,9 +313,9 @@ def _search_sample_counts(
                 for name in variant.columns
             ]
             evidence_nats.append(np.max(by_name, axis=0))
-        place = np.argmax([one[0] for one in evidence_nats], axis=0)
-        best = [each.variants[int(number)] for number in place]
-        out.append(CandidateEvidence(each, rows, np.max(evidence_nats, axis=0), tuple(best)))
+        place = np.argmax([by_axis[0] for by_axis in evidence_nats], axis=0)
+        best = [candidate.variants[int(number)] for number in place]
+        out.append(CandidateEvidence(candidate, rows, np.max(evidence_nats, axis=0), tuple(best)))
     return out
 
 
@@ -362,8 +372,8 @@ def _search_lines(
     rows: list[tuple[str, ...]] = [(axis,) for axis in state.axes]
     places = np.repeat(place[:, None], len(rows), axis=1)
     return [
-        CandidateEvidence(each, rows, best, tuple(each.variants[0] for _ in rows), places)
-        for each in group
+        CandidateEvidence(candidate, rows, best, tuple(candidate.variants[0] for _ in rows), places)
+        for candidate in group
     ]
 
 
@@ -398,12 +408,12 @@ def _search_telegraph(
         courses.append((course, within))
     return [
         CandidateEvidence(
-            each,
+            candidate,
             rows,
             evidence_nats,
-            tuple(_variant_with_course(each.variants[0], *one, state) for one in courses),
+            tuple(_variant_with_course(candidate.variants[0], *pair, state) for pair in courses),
         )
-        for each in group
+        for candidate in group
     ]
 
 
