@@ -191,7 +191,7 @@ def attribute_mismatches(
 
     when = [_explained_spans(identification, blocks) for identification in identified]
     moves = [_moving_spans(identification, blocks, after) for identification in identified]
-    told = []
+    explained = []
     for region in regions:
         score, limit = score_left(region, scores, null, level)
         shown = []
@@ -234,8 +234,8 @@ def attribute_mismatches(
             if several
             else [identification for identification, _ in shown]
         )
-        told.append(list(dict.fromkeys(identification.effect for identification in kept)))
-    return told
+        explained.append(list(dict.fromkeys(identification.effect for identification in kept)))
+    return explained
 
 
 def drop_expected(
@@ -260,7 +260,7 @@ def drop_expected(
     null : NullScores
     level : float
     """
-    odd = [
+    anomalous = [
         one
         for one in expected
         if any(
@@ -269,16 +269,16 @@ def drop_expected(
             for component in one.components
         )
     ]
-    others = [one for one in expected if one not in odd]
+    others = [one for one in expected if one not in anomalous]
     by_count, by_all = (
         attribute_mismatches(found, identified, blocks, before, null, level=level)
-        for identified in (odd, others)
+        for identified in (anomalous, others)
     )
-    told = [
+    is_expected = [
         bool(named) or (bool(counted) and statistic == "distribution")
         for statistic, counted, named in zip(found["view"].values, by_count, by_all, strict=True)
     ]
-    return found.isel(mismatch=~np.array(told, np.bool_)) if expected else found
+    return found.isel(mismatch=~np.array(is_expected, np.bool_)) if expected else found
 
 
 def _is_caused_elsewhere(

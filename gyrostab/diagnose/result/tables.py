@@ -237,13 +237,13 @@ def unidentified_tables(
     out: list[dict[str, Any]] = []
     for one in identifications.unknown:
         statistic = _NUISANCE_VIEWS.get(one.generic, "davar")
-        told = any(
+        is_covered = any(
             region["view"] == statistic
             and set(region["axes"]) & set(one.axes)
             and not region["explained_by"]
             for region in known
         )
-        if not told:
+        if not is_covered:
             out.append(
                 _unidentified_table(
                     one, identifications, blocks, len(known) + len(out) + 1, statistic
