@@ -1,4 +1,4 @@
-"""The main job: logs to product in parts that survive a stop, in threads, in processes or on a cluster."""
+"""The whole analysis in parts that survive a stop, in threads, in processes or on a cluster."""
 
 from __future__ import annotations
 

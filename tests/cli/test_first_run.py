@@ -1,4 +1,4 @@
-"""The first run on a machine compiles the kernels, later ones load them from disk: the numbers are the same, bit for bit."""
+"""The first run compiles the kernels, later ones load them: the same numbers, bit for bit."""
 
 from __future__ import annotations
 

@@ -446,7 +446,7 @@ def test_attributes_of_the_schema_reach_the_file(files):
 
 
 def test_a_flipped_bit_is_noticed(tmp_path):
-    """Each compressed chunk carries zlib's checksum: a damaged copy is refused, not read as other numbers."""
+    """Each compressed chunk has the checksum of zlib: a damaged copy is refused."""
     path = to_netcdf(synthetic.product(windows=400), tmp_path / "product.nc")
     data = path.read_bytes()
     with h5py.File(path) as stored:

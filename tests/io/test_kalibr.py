@@ -1,4 +1,4 @@
-"""Noise densities for Kalibr: factors worked out by hand, medians of what is observed, limits said to be limits."""
+"""Noise densities for Kalibr: factors by hand, medians of observed values, marked limits."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_units_are_those_worked_out_by_hand(product):
 
 
 def test_density_gives_the_scatter_of_the_samples():
-    """White noise of density s has a standard deviation of s sqrt(rate); its Allan deviation at 1 s is s in rad/s."""
+    """White noise of density s has standard deviation s sqrt(rate) and ADEV s at 1 s, in rad/s."""
     rate, samples = 100.0, 400_000
     density = 0.02 * BY_HAND["gyroscope_noise_density"]  # N = 0.02 deg/sqrt(h)
     rates = np.random.default_rng(3).normal(0.0, density * math.sqrt(rate), samples)  # rad/s

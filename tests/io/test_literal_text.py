@@ -1,4 +1,4 @@
-"""Names and units that look like formulas: figures show them as they are, and files hold them under names that NetCDF allows."""
+"""Names and units that look like formulas: figures show them literally, files use safe names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run on a real dask scheduler with two worker processes on loopback: the same bits, and a worker that is killed loses nothing."""
+"""Runs on a real dask scheduler with two workers: same bits, also when a worker is killed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PARTS = 5
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    """A scheduler and two workers of one thread each, as a user starts them: separate programs, which may be ended at any moment."""
+    """Start a scheduler and two workers of one thread each as separate programs, as a user does."""
     folder = tmp_path_factory.mktemp("cluster")
     where = folder / "scheduler.json"
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
@@ -134,9 +134,7 @@ def test_two_worker_processes_make_the_same_bytes(address, log, whole, tmp_path)
         seen = client.run(_what_a_worker_knows)
         assert len(seen) == 2
         assert all("gyrostab.allan.davar" in loaded for loaded, _ in seen.values())
-        assert all(threads is None for _, threads in seen.values()), (
-            "a kernel has started threads"
-        )
+        assert all(threads is None for _, threads in seen.values()), "a kernel has started threads"
 
 
 def _what_a_worker_knows():
@@ -231,7 +229,7 @@ def test_what_is_sent_is_small_whatever_the_length(log, monkeypatch, tmp_path):
     assert max(sizes[1_270_000]) < 2000
 
 
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # what goes wrong
 
 
@@ -301,7 +299,7 @@ def test_distributed_is_not_installed(log, tmp_path):
 def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
     log, whole, tmp_path, monkeypatch, capfd
 ):
-    """The scheduler is killed while parts are on their way; what is finished is kept, and threads do the rest."""
+    """Finished parts survive the death of the scheduler, and threads compute the rest."""
     where = tmp_path / "scheduler.json"
     options = [
         "--window",

@@ -1,4 +1,4 @@
-"""The folder of a killed run whose files were damaged: what is wrong is not trusted, and what is foreign is not removed."""
+"""Job folders with damaged or foreign files: damage is not used, foreign files are not removed."""
 
 from __future__ import annotations
 

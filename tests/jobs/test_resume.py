@@ -1,4 +1,4 @@
-"""A run that is stopped, killed, out of room or without its input: what it says and leaves, and that --resume makes the same product."""
+"""Runs that are stopped, killed, out of disk or without input, and continued with --resume."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PARTS = 5
 
 
 def write_log(path: Path) -> Path:
-    """White noise of one axis that makes `PARTS` units of work, with a gap, and a temperature every second."""
+    """White noise of one axis for `PARTS` units of work, with a gap and a slow temperature."""
     rng = np.random.default_rng(7)
     rate = 5.0 + rng.standard_normal((1, 1_270_000))
     rate[:, 500_000:530_000] = np.nan
@@ -136,7 +136,7 @@ def stopped(log, after_two, tmp_path, capfd, monkeypatch) -> Path:
     return output
 
 
-# -------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # the parts
 
 
@@ -201,7 +201,7 @@ def test_workers_do_not_change_a_byte(log, whole, tmp_path, options):
     assert [path.name for path in tmp_path.iterdir()] == ["product.nc"]
 
 
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # stopped and continued
 
 
@@ -264,7 +264,7 @@ def test_resume_remembers_that_the_old_product_may_go(
     assert output.read_bytes() == whole
 
 
-# ------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # what has changed
 
 
@@ -347,7 +347,7 @@ def test_an_input_that_vanishes_meanwhile(
     assert output.read_bytes() == whole
 
 
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # no more room
 
 
@@ -406,7 +406,7 @@ def test_no_room_for_the_product(log, whole, tmp_path, monkeypatch, free_again, 
     assert (tmp_path / "product.nc").read_bytes() == whole
 
 
-# -------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # two at once, and kills
 
 

@@ -1,4 +1,4 @@
-"""A working store that is read in part, and one that is damaged: what is lost is a gap, and never silent."""
+"""Stores that are read in part or damaged: lost chunks become gaps, with a warning."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_chunk_of_a_few_bytes_is_damaged(tmp_path, content):
 
 @pytest.mark.parametrize("form", WRITERS)
 def test_the_chunk_cache_keeps_to_its_memory_limit(tmp_path, monkeypatch, form):
-    """Parts of the same chunks, in turn: read once while they fit, read anew when others have taken their place."""
+    """Parts of the same chunks in turn: one read while they fit the cache, another after that."""
     cache, chunk = ChunkCache(4 * CHUNK * 2, 4 * CHUNK), 4 * CHUNK
     decoded = []
     monkeypatch.setattr(read_module, "_CACHE", cache)
@@ -234,7 +234,7 @@ def test_what_stands_behind_a_chunk_that_is_cut_short_is_not_read():
 
 
 def test_a_library_that_fails_in_a_late_read_names_the_file(tmp_path):
-    """A product is read when it is used; the error of the library is then one of the file, whoever asks and wherever it is written."""
+    """A product is read when used, and errors of the library name the file even then."""
     product = synthetic.product(windows=400)
     path = to_netcdf(product, tmp_path / "product.nc")
     with h5py.File(path) as stored:

@@ -1,4 +1,4 @@
-"""Samples read without dask are those that dask gives, bit for bit, and what a run leaves out of its way changes nothing."""
+"""Samples read without dask equal those of dask, bit for bit."""
 
 import json
 import warnings
@@ -43,7 +43,7 @@ WINDOW = {"window": "40s", "step": "10s", "taus": "8"}
 
 @st.composite
 def placed(draw):
-    """Rows of arrays with gaps, on stretches of a grid that may overlap; and the size of the grid."""
+    """Rows of arrays with gaps, on parts of a grid that may overlap, and the size of the grid."""
     size = draw(st.integers(1, 60))
     rows = []
     for _ in range(draw(st.integers(1, 2))):
@@ -256,7 +256,7 @@ def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_pat
 
 
 def test_a_part_of_a_variable_in_blocks_is_that_of_the_whole(tmp_path):
-    """Pieces that lie in one stretch of a block and pieces that do not, across the edges of blocks."""
+    """Contiguous and other boxes of a block, across the edges of blocks."""
     rng, edges = np.random.default_rng(3), [0, 4, 5, 11]
     cube = rng.standard_normal((3, 11, 4))
     blocks = []

@@ -1,4 +1,4 @@
-"""Counts from every kind of source to the working store, and the archives that the benchmarks make."""
+"""Counts from every kind of source to the store, and the archives of the benchmarks."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_integer_columns_of_a_text_log_are_stored_as_counts(tmp_path, form):
 
 
 def test_counts_through_every_door(tmp_path):
-    """Parquet, MATLAB and packed NetCDF; several files; increments; axes of different factors; a fraction in the last row."""
+    """Several formats and files, increments, axes of different factors, fractions."""
     counts = np.rint(np.random.default_rng(3).normal(0, 3e5, 1000))
     time = np.arange(1000) * 10_000_000
     frame = pd.DataFrame({"time [ns]": time, "gyro_x [deg/s]": counts.astype(np.int32)})
@@ -126,7 +126,7 @@ def test_ingest_writes_the_working_store(tmp_path, capsys):
 
 @pytest.mark.parametrize("form", ["nc", "zarr", "csv"])
 def test_a_small_archive(tmp_path, form):
-    """The generator of `benchmarks`: files that overlap, gaps in and between them, the same from the same seed, one log when read."""
+    """Archives of `benchmarks`: overlaps, gaps in and between files, read as one log."""
     sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
     import make_archive
 

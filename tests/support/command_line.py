@@ -39,7 +39,7 @@ def call(*arguments: object) -> int:
 
 
 def stopped(code: str, *, exit_code: int, says: str) -> None:
-    """Run `code` in a separate process: it ends with this exit code and these words, and without a traceback."""
+    """Check that `code`, in a separate process, ends with this exit code and these words."""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == exit_code, done.stderr
     assert says in done.stderr

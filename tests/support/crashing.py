@@ -37,7 +37,7 @@ def make(log: Path, output: Path, **options: object) -> None:
 
 
 def forked(action: Callable[[], object], *, after: float | None = None) -> int:
-    """Run in a child process, killed after so many seconds; its exit status, negative for a signal."""
+    """Run in a child process, killed after some seconds; return the exit status (< 0: signal)."""
     child = os.fork()
     if child == 0:
         try:
@@ -53,7 +53,7 @@ def forked(action: Callable[[], object], *, after: float | None = None) -> int:
 
 
 def armed(number: int, found: Path) -> Callable[[], None]:
-    """Kill this process before its call `number` that changes the disk; write down how many there were."""
+    """Kill this process before its call `number` that changes the disk; write the count."""
     count = 0
 
     def arm() -> None:

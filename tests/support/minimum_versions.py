@@ -1,4 +1,4 @@
-"""Print the lowest version of each dependency that pyproject.toml allows, as a constraints file for pip.
+"""Print the lowest versions of the dependencies in pyproject.toml as constraints for pip.
 
 python -m tests.support.minimum_versions > constraints.txt
 """

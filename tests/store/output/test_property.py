@@ -1,4 +1,4 @@
-"""Whatever lies in a folder, and however a command ends: nothing changes but the output that was named."""
+"""However a command ends, nothing in the folder changes but its output."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Interruption(BaseException):
 
 @contextmanager
 def calls_of_the_disk(act: Callable[[int], None], folder: Path) -> Iterator[None]:
-    """Let something happen before each call that changes the disk in a folder; it is given the number of the call."""
+    """Call `act` with a running number before each call that changes the disk in a folder."""
     count = 0
 
     def wrap(function: Callable[..., object]) -> Callable[..., object]:
@@ -149,7 +149,7 @@ def check_tree(
     killed: bool,
     is_yaml: bool,
 ) -> None:
-    """Check that only the output has changed, and that it is complete: the old one or the new one."""
+    """Check that only the output has changed, and that it is complete (old or new)."""
 
     def is_output(name: str) -> bool:
         return name == target or name.startswith(f"{target}/")
@@ -224,12 +224,12 @@ def test_nothing_changes_but_the_output(inputs, data):
             assert read_tree(folder) == before
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # kills
 
 
 def kill_commands(inputs: Path, top: Path, seed: int, kills: int) -> dict[str, object]:
-    """Kill commands with SIGKILL before calls that change the disk, each in a child of this process, and look at what is left."""
+    """Kill commands, each in a child process, before calls that change the disk; check the rest."""
     draw = random.Random(seed)
     wrong, landed = [], 0
     for number in range(kills):

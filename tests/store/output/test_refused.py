@@ -1,4 +1,4 @@
-"""Outputs that would destroy something else: an input, a folder around it, a folder that another program made; and links."""
+"""Refused outputs: inputs, folders around them, foreign folders; and symbolic links."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ def test_an_output_inside_a_store_that_is_read_is_refused(folder, capfd):
     )
 
 
-# -------------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # links
 
 
@@ -275,7 +275,7 @@ def test_links_in_a_loop_and_what_is_no_file(folder, capfd):
         check_output("/dev/null", overwrite=True)
 
 
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # Python functions
 
 
@@ -309,7 +309,7 @@ def test_a_written_dataset_of_xarray_is_an_input_while_it_is_lazy(tmp_path):
         to_netcdf(lazy, path, overwrite=True)
 
 
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # folders of files
 
 
@@ -398,7 +398,7 @@ def test_a_benchmark_replaces_a_benchmark_only(folder, capfd):
     )
 
 
-# ------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------
 # the folder of a run
 
 

@@ -109,7 +109,7 @@ def test_an_interruption_leaves_nothing_behind(tmp_path, error):
 
 
 def test_a_late_piece_of_a_directory_is_removed_too(tmp_path, monkeypatch):
-    """A worker thread may write on for a moment after another one has failed; here it does so between two looks."""
+    """A worker thread may still write after another one has failed; here between two checks."""
     late = ["first", "second", "third"]
 
     def write_on(seconds):
