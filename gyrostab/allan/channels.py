@@ -113,8 +113,10 @@ def _average_windows(
 ) -> tuple[Any, Any]:
     """Compute mean and slope of each window; `ends` gives the bounds of the windows of a group."""
     lazy = isinstance(data, da.Array) and part is None
-    kept = slice(0, groups[-1].stop) if part is None else part
-    chosen = [group for group in groups if group.start < kept.stop and group.stop > kept.start]
+    selected = slice(0, groups[-1].stop) if part is None else part
+    chosen = [
+        group for group in groups if group.start < selected.stop and group.stop > selected.start
+    ]
     bounds = [ends(group) for group in chosen]
     first, last = int(bounds[0][0][0]), int(bounds[-1][1][-1])
     together = (
@@ -136,7 +138,7 @@ def _average_windows(
                 else together[low - first : high - first]
             )
             parts.append(_fit_trends(values, piece, rate, a - low, b - low))
-    both = (da if lazy else np).concatenate(parts, axis=1)[
-        :, kept.start - chosen[0].start : kept.stop - chosen[0].start
+    trends_of_windows = (da if lazy else np).concatenate(parts, axis=1)[
+        :, selected.start - chosen[0].start : selected.stop - chosen[0].start
     ]
-    return both[0], both[1]
+    return trends_of_windows[0], trends_of_windows[1]

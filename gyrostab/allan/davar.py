@@ -257,19 +257,19 @@ def davar_part(
     ]
     spans = [(windows.start * unit.step, last_sample(windows, unit)) for windows in units]
     space = space or Workspace()
-    done = [_compute_unit(x, unit, tables, space) for x in _read_spans(data, spans, space)]
-    rows = range(0, len(done), len(units))
+    results = [_compute_unit(x, unit, tables, space) for x in _read_spans(data, spans, space)]
+    rows = range(0, len(results), len(units))
     cells, means = (
         [
-            np.concatenate([arrays[i] for arrays in done[row : row + len(units)]], axis=1)
+            np.concatenate([arrays[i] for arrays in results[row : row + len(units)]], axis=1)
             for row in rows
         ]
         for i in range(2)
     )
-    kept = slice(part.start - units[0].start, part.stop - units[0].start)
+    selected = slice(part.start - units[0].start, part.stop - units[0].start)
     return _attach_labels(
-        np.stack(cells, axis=1)[:, :, kept],
-        np.stack(means, axis=1)[:, :, kept],
+        np.stack(cells, axis=1)[:, :, selected],
+        np.stack(means, axis=1)[:, :, selected],
         log,
         plan,
         part=part,

@@ -141,7 +141,7 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
     >>> bool(product.B.isnull().any()), bool(refit(product).B.isnull().any())
     (True, False)
     """
-    kept = {
+    option_attributes = {
         "terms": "fit_terms",
         "method": "fit_method",
         "tau_min": "fit_tau_min_s",
@@ -149,7 +149,7 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
     }
     own = {
         name: product.attrs[attribute]
-        for name, attribute in kept.items()
+        for name, attribute in option_attributes.items()
         if attribute in product.attrs
     }
     return fit_noise(product, **{**own, "observed_only": False, **options})
@@ -205,7 +205,7 @@ def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
     >>> fit_part(surface, terms="NK").equals(fit_noise(surface, terms="NK"))
     True
     """
-    return _fit_checked(surface, **options, here=True)
+    return _fit_checked(surface, **options, immediate=True)
 
 
 def _fit_checked(
@@ -216,7 +216,7 @@ def _fit_checked(
     tau_min: Any = None,
     tau_max: Any = None,
     observed_only: bool = True,
-    here: bool = False,
+    immediate: bool = False,
 ) -> xr.Dataset:
     check_surface(surface)
     wanted = list(terms)
@@ -228,7 +228,9 @@ def _fit_checked(
     allowed = sum(1 << TERMS.index(term) for term in wanted)
     chosen = _select_taus(surface["tau"].values, tau_min, tau_max)
     if method == "gls":
-        product = _fit_gls(surface, allowed, chosen, here=here, observed_only=observed_only)
+        product = _fit_gls(
+            surface, allowed, chosen, immediate=immediate, observed_only=observed_only
+        )
     else:
         product = _fit_adev(surface, wanted, chosen)
     tau = surface["tau"].values[chosen]
@@ -275,7 +277,12 @@ def _fit_inputs(surface: xr.Dataset) -> tuple[list[Any], NDArray[np.int64], floa
 
 
 def _fit_gls(
-    surface: xr.Dataset, allowed: int, within: NDArray[np.int64], *, here: bool, observed_only: bool
+    surface: xr.Dataset,
+    allowed: int,
+    within: NDArray[np.int64],
+    *,
+    immediate: bool,
+    observed_only: bool,
 ) -> xr.Dataset:
     cells, ks, rate, window = _fit_inputs(surface)
     chosen = within[_thin_factors(ks[within])]
@@ -291,7 +298,7 @@ def _fit_gls(
             arrays[0].shape[0], arrays[0].shape[1], -1
         )
 
-    if here:
+    if immediate:
         fitted = block(*cells)
     else:
         width = len(TERMS) * 4 + 2 + chosen.size
@@ -405,9 +412,9 @@ def _fit_block(
         )
         observed &= ~fails[:, None]
         upper = np.where(visible & ~observed, np.sqrt(limit), np.nan)
-    given = observed if observed_only else visible
-    stderr = np.where(given, stderr, np.nan)
-    value = np.where(given, value, np.nan)
+    reported = observed if observed_only else visible
+    stderr = np.where(reported, stderr, np.nan)
+    value = np.where(reported, value, np.nan)
     observable = np.where(observed, 2.0, np.where(visible & np.isfinite(upper), 1.0, 0.0))
     return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
 
@@ -542,14 +549,16 @@ def _fit_adev(surface: xr.Dataset, wanted: list[str], chosen: NDArray[np.int64])
     scale = np.linalg.norm(columns, axis=0)
     values = np.full((*deviation.shape[:2], len(TERMS)), np.nan)
     for where in np.ndindex(deviation.shape[:2]):
-        here = np.isfinite(deviation[where])
-        if np.count_nonzero(here) >= len(members):
-            solution = np.linalg.lstsq(columns[here] / scale, deviation[where][here], rcond=None)[0]
+        valid = np.isfinite(deviation[where])
+        if np.count_nonzero(valid) >= len(members):
+            solution = np.linalg.lstsq(columns[valid] / scale, deviation[where][valid], rcond=None)[
+                0
+            ]
             values[where][members] = np.abs(solution / scale)
     nothing = [np.full(deviation.shape[:2], np.nan) for _ in LAWS]
-    seen = [np.where(np.isfinite(values[..., i]), 2, 0) for i in range(len(TERMS))]
+    flags = [np.where(np.isfinite(values[..., i]), 2, 0) for i in range(len(TERMS))]
     extra = {
         name: (("axis", "time"), nothing[0], attributes(name)) for name in ("fit_chi2", "fit_dof")
     }
     coefficients = [values[..., i] for i in range(len(TERMS))]
-    return _assemble_product(surface, coefficients, nothing, nothing, seen, extra=extra)
+    return _assemble_product(surface, coefficients, nothing, nothing, flags, extra=extra)

@@ -189,18 +189,18 @@ def summarise_fit(product: xr.Dataset) -> list[FitSummary]:
     False
     """
     check_product(product)
-    found = []
+    summaries = []
     for axis in product["axis"].values:
         chi2, dof = (product[name].sel(axis=axis).values for name in ("fit_chi2", "fit_dof"))
         fitted = np.isfinite(chi2) & (dof > 0)
         count = int(np.count_nonzero(fitted))
         if count == 0:
-            found.append(FitSummary(str(axis), 0, np.nan, 0.0))
+            summaries.append(FitSummary(str(axis), 0, np.nan, 0.0))
             continue
         ratio = float(np.median(chi2[fitted] / dof[fitted]))
         failing = float(np.mean(~is_described(chi2[fitted], dof[fitted])))
-        found.append(FitSummary(str(axis), count, ratio, failing))
-    return found
+        summaries.append(FitSummary(str(axis), count, ratio, failing))
+    return summaries
 
 
 def find_fit_from(product: xr.Dataset) -> float | None:

@@ -59,15 +59,17 @@ def assemble(
             out[place] = entry[key]
         return out
 
-    kept = [*names, *(["observable"] if set(names) & set(TERMS) else [])]
-    result = product[kept].drop_attrs(deep=False).assign_coords(time_bounds=product["time_bounds"])
+    copied = [*names, *(["observable"] if set(names) & set(TERMS) else [])]
+    result = (
+        product[copied].drop_attrs(deep=False).assign_coords(time_bounds=product["time_bounds"])
+    )
     made: dict[str, Any] = {}
     for driver in found:
-        what = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
+        attributes = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
         made[driver.name] = (
             product[driver.name]
             if driver.name in product.data_vars
-            else ("time", driver.values[0], what)
+            else ("time", driver.values[0], attributes)
         )
     for name, (key, label, units) in _STATISTICS.items():
         made[name] = (dims, table(key), {"long_name": label, "units": units})

@@ -55,27 +55,27 @@ def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: b
     set of str
         Keys of `LIMITS`.
     """
-    found = set()
+    limits = set()
     span = float(np.ptp(x)) if x.size else 0.0
     if x.size < _MIN_BLOCKS:
-        found.add("too_few")
+        limits.add("too_few")
     if span <= max(_MIN_RANGE.get(units, 0.0), 1e-9 * float(np.abs(x).max(initial=0.0))):
-        return found | {"constant"}
+        return limits | {"constant"}
     inside = sum(
         float(((x[pieces == piece] - x[pieces == piece].mean()) ** 2).sum())
         for piece in np.unique(pieces)
     )
     if pieces.max() > 0 and inside < 0.1 * float(((x - x.mean()) ** 2).sum()):
-        found.add("clusters")
+        limits.add("clusters")
     rise = float((x - np.minimum.accumulate(x)).max())
     fall = float((np.maximum.accumulate(x) - x).max())
     if min(rise, fall) < 0.25 * span:
-        found.add("no_reversal")
+        limits.add("no_reversal")
     if not derived and x.size >= _MIN_BLOCKS:
         pace = np.abs(np.gradient(x))
         if np.mean(pace < 0.1 * np.quantile(pace, 0.95)) < 0.1:
-            found.add("no_plateau")
-    return found
+            limits.add("no_plateau")
+    return limits
 
 
 def readable_units(units: str) -> str:

@@ -180,9 +180,9 @@ def _legend_handles(driver: str, level: float) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    what = driver.replace("_", " ")
+    channel_name = driver.replace("_", " ")
     return [
-        Line2D([], [], linestyle="none", marker="^", color=_UP, label=f"{what} rises"),
+        Line2D([], [], linestyle="none", marker="^", color=_UP, label=f"{channel_name} rises"),
         Line2D(
             [],
             [],
@@ -190,7 +190,7 @@ def _legend_handles(driver: str, level: float) -> list[Any]:
             marker="v",
             color=_DOWN,
             markerfacecolor="none",
-            label=f"{what} falls",
+            label=f"{channel_name} falls",
         ),
         Patch(
             facecolor="#8c8c8c",

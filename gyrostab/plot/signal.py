@@ -95,9 +95,9 @@ def plot_signal(
             f"{channel.replace('_', ' ')}\n{unit_label(log[channel].attrs.get('units'))}".rstrip()
         )
     _shade_gaps(list(panels), log, columns)
-    what = "Rotation rate" if name == "rate" else "Rotation angle"
+    signal_text = "Rotation rate" if name == "rate" else "Rotation angle"
     rate = log.attrs.get("sampling_rate_hz")
-    figure.suptitle(f"{what} as recorded" + (f", {float(rate):g} Hz" if rate else ""))
+    figure.suptitle(f"{signal_text} as recorded" + (f", {float(rate):g} Hz" if rate else ""))
     time_axis(panels[-1], log["time"][[0, -1]].values)
     stack_panels(panels)
     return figure
