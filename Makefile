@@ -49,11 +49,12 @@ test-minimum: $(VENV)-minimum/.installed  ## the tests with the lowest versions 
 fuzz: $(VENV)/.installed-test  ## try damaged inputs and write docs/fuzzing.md (N=100000 SEED=1 JOBS=2); can be stopped and repeated
 	$(BIN)/python -W ignore -m tests.fuzz --count $(N) --seed $(SEED) --jobs $(JOBS) --output docs/fuzzing.md
 
-lint: $(VENV)/.installed-lint  ## style, types and imports
+lint: $(VENV)/.installed-lint  ## style, types, imports and wording
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.language
 
 bench: $(VENV)/.installed-test  ## measure docs/performance.md and docs/scaling.md again; 20 minutes on an idle machine
 	$(BIN)/python benchmarks/kernels.py --output docs/performance.md
