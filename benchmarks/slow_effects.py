@@ -99,10 +99,8 @@ def main() -> None:
     for name in EFFECTS:
         for strength in given.strengths:
             rows = [ladder(name, strength, number) for number in range(given.records)]
-            print(
-                f"| {name} | {strength:g} | {' | '.join(f'{value:.1f}' for value in np.median(rows, axis=0))} |",
-                flush=True,
-            )
+            cells = " | ".join(f"{value:.1f}" for value in np.median(rows, axis=0))
+            print(f"| {name} | {strength:g} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,6 @@ def recordings() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
-    """As `gyrostab.diagnose` has it: threads of the linear algebra would only wait for each other."""
+    """Use one thread for the linear algebra, as `gyrostab.diagnose` does."""
     with threadpool_limits(1, user_api="blas"):
         yield

@@ -14,11 +14,16 @@ from gyrostab.units import INNER, known_units, on_disk, parse_unit
 @pytest.mark.parametrize(
     ("text", "udunits"),
     [
-        ("deg/h", "degree hour-1"), ("deg/s", "degree s-1"), ("rad/s", "radian s-1"), ("mrad/s", "1e-3 radian s-1"),
-        ("urad/s", "1e-6 radian s-1"), ("nrad/s", "1e-9 radian s-1"), ("arcsec/s", "arcsecond s-1"), ("rpm", "6 degree s-1"),
-        ("rad s^-1", "radian s-1"), ("0.1 arcsec/s", "0.1 arcsecond s-1"), ("deg", "degree"), ("arcsec", "arcsecond"),
-        ("rad", "radian"), ("degC", "degree_Celsius"), ("K", "kelvin"), ("degF", "degree_Fahrenheit"), ("g", "9.80665 m s-2"),
-        ("m/s^2", "m s-2"), ("m s^-2", "m s-2"), ("mg", "9.80665e-3 m s-2"), ("mV", "mV"), ("uW", "uW"), ("psi", "psi"), ("bar", "bar"),
+        ("deg/h", "degree hour-1"), ("deg/s", "degree s-1"), ("rad/s", "radian s-1"),
+        ("mrad/s", "1e-3 radian s-1"),
+        ("urad/s", "1e-6 radian s-1"), ("nrad/s", "1e-9 radian s-1"),
+        ("arcsec/s", "arcsecond s-1"), ("rpm", "6 degree s-1"),
+        ("rad s^-1", "radian s-1"), ("0.1 arcsec/s", "0.1 arcsecond s-1"), ("deg", "degree"),
+        ("arcsec", "arcsecond"),
+        ("rad", "radian"), ("degC", "degree_Celsius"), ("K", "kelvin"),
+        ("degF", "degree_Fahrenheit"), ("g", "9.80665 m s-2"),
+        ("m/s^2", "m s-2"), ("m s^-2", "m s-2"), ("mg", "9.80665e-3 m s-2"), ("mV", "mV"),
+        ("uW", "uW"), ("psi", "psi"), ("bar", "bar"),
         ("uT", "uT"), ("G", "1e-4 T"),
     ],
 )  # fmt: skip
@@ -48,9 +53,12 @@ def test_what_udunits_reads_is_read_alike(text):
 @pytest.mark.parametrize(
     ("text", "plain"),
     [
-        ("DEG/HR", "degree/hour"), ("degrees_per_second", "degree/second"), ("deg.h^-1", "degree/hour"), ("RAD/S", "radian/second"),
-        ("deg/(s)", "degree/second"), ("°·s⁻¹", "degree/second"), ("deg⋅s⁻¹", "degree/second"), ("rad · s^-1", "radian/second"),
-        ("mRad/S", "1e-3 radian/second"), ("dps", "degree/second"), ("mdps", "1e-3 degree/second"), ("mdeg/s", "1e-3 degree/second"),
+        ("DEG/HR", "degree/hour"), ("degrees_per_second", "degree/second"),
+        ("deg.h^-1", "degree/hour"), ("RAD/S", "radian/second"),
+        ("deg/(s)", "degree/second"), ("°·s⁻¹", "degree/second"), ("deg⋅s⁻¹", "degree/second"),
+        ("rad · s^-1", "radian/second"),
+        ("mRad/S", "1e-3 radian/second"), ("dps", "degree/second"), ("mdps", "1e-3 degree/second"),
+        ("mdeg/s", "1e-3 degree/second"),
     ],
 )  # fmt: skip
 def test_spellings_of_data_sheets(text, plain):

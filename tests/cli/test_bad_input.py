@@ -204,9 +204,11 @@ def test_bad_input_is_one_message_and_nothing_left_behind(case, tmp_path, capfd)
 def test_disk_full_while_writing(tmp_path):
     path = write_log(tmp_path / "tool.csv", 900.0)
     code = (
-        "import resource, sys; from gyrostab.cli import main; import gyrostab; gyrostab.regularise; "
+        "import resource, sys; import gyrostab; from gyrostab.cli import main; "
+        "gyrostab.regularise; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (2**19, 2**19)); "
-        f"sys.exit(main(['ingest', {str(path)!r}, '-o', {str(tmp_path / 'log.nc')!r}, '--quiet-progress']))"
+        f"sys.exit(main(['ingest', {str(path)!r}, '-o', {str(tmp_path / 'log.nc')!r}, "
+        "'--quiet-progress']))"
     )
     stopped(code, exit_code=2, says="log.nc")
     assert [entry.name for entry in tmp_path.iterdir()] == ["tool.csv"]

@@ -150,7 +150,8 @@ def test_map_from_a_file(log, tmp_path):
 def test_config_gives_defaults_and_the_command_line_wins(log, tmp_path):
     config = tmp_path / "run.toml"
     config.write_text(
-        'quiet-progress = true\n[run]\nwindow = "20s"\nstep = "10s"\naxis = ["x"]\n[run.unit]\ngyro = "2 deg/h"\n[fit]\nterms = "N"\n'
+        'quiet-progress = true\n[run]\nwindow = "20s"\nstep = "10s"\naxis = ["x"]\n'
+        '[run.unit]\ngyro = "2 deg/h"\n[fit]\nterms = "N"\n'
     )
     assert call("run", log, "-o", tmp_path / "a.nc", "--config", config) == 0
     assert call("run", log, "-o", tmp_path / "b.nc", f"--config={config}", "--step", "5s") == 0
@@ -261,7 +262,8 @@ def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
     path = write_log(tmp_path / "long.csv")
     code = (
         "import os, signal, sys, xarray\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background starts with it ignored\n"
+        # a job in the background starts with the signal ignored
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from gyrostab.cli import main\n"
         "write = xarray.Dataset.dump_to_store\n"
         "def slow(dataset, target, **options):\n"

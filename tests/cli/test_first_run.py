@@ -15,10 +15,13 @@ n, windows, rng = 24, 60, np.random.default_rng(1)
 tau = np.geomspace(1.0, 1e3, n)
 columns = np.stack([tau**power for power in (-2.0, -1.0, 0.0, 1.0, 2.0)], axis=1)
 truth = columns @ np.array([1.0, 0.3, 0.01, 1e-4, 1e-8])
-whole, near = np.ones((windows, n)), 0.6 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / 20.0
+whole = np.ones((windows, n))
+near = 0.6 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / 20.0
 pairs, ramps = np.tile(near, (4, 4, 1, 1)), np.tile(near / 2.0, (4, 1, 1))
 avar = rng.gamma(8.0, truth / 8.0, (windows, n))
-found = fit_windows(avar, whole, whole, whole, whole, columns, np.ones(5), pairs, ramps, np.full(n, 20.0), 31)
+found = fit_windows(
+    avar, whole, whole, whole, whole, columns, np.ones(5), pairs, ramps, np.full(n, 20.0), 31
+)
 assert np.isfinite(found[0]).any()
 print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())
 """

@@ -1,4 +1,4 @@
-"""Other programs open a product, a log and a correlation and see the same numbers, missing values, units and times (``make interop``).
+"""Other programs open a product, a log and a correlation and read the same data (``make interop``).
 
 The numbers are compared with the dataset that was written, not with what gyrostab reads back.
 """
@@ -54,7 +54,7 @@ def correlation() -> xr.Dataset:
 
 
 def log() -> xr.Dataset:
-    """A log with rates in counts, one axis and a channel in doubles, and times of odd nanoseconds."""
+    """Make a log with rates in counts, an axis and a channel in doubles, and odd nanoseconds."""
     whole = synthetic.log(samples=400)
     whole["rate"] = (whole.rate.dims, np.rint(whole.rate.values / 0.01) * 0.01, whole.rate.attrs)
     whole["rate"].encoding = {"dtype": np.dtype("i2"), "scale_factor": 0.01}
@@ -72,7 +72,7 @@ def as_stored(log: xr.Dataset) -> xr.Dataset:
 
 @pytest.fixture(scope="module", params=["product", "log", "correlation"])
 def case(request, tmp_path_factory) -> tuple[xr.Dataset, Path, xr.Dataset]:
-    """What is to be found, the file, and what was written. zlib, as the other programs seldom have zstd."""
+    """Write a file with zlib, as other programs seldom have zstd; return what it must hold."""
     made = {"product": product, "log": log, "correlation": correlation}[request.param]()
     path = to_netcdf(
         made, tmp_path_factory.mktemp("interop") / f"{request.param}.nc", compression="zlib"

@@ -166,7 +166,13 @@ def test_parts_are_cuts_of_the_whole_bit_for_bit():
 def test_workers_that_share_the_parts_end_at_about_the_same_time(hours, workers):
     attrs = make_log(np.zeros(4), rate=400.0, unit="deg/h").attrs
     lazy = xr.Dataset(
-        {"rate": (("axis", "time"), da.zeros((3, hours * 1_440_000), chunks=480_000), {"units": "degree hour-1"})},
+        {
+            "rate": (
+                ("axis", "time"),
+                da.zeros((3, hours * 1_440_000), chunks=480_000),
+                {"units": "degree hour-1"},
+            )
+        },
         {"axis": list("xyz")}, attrs,
     ).assign_coords(time_coordinate(0, 400.0, hours * 1_440_000))  # fmt: skip
     parts = davar_parts(lazy, samples=2**24, window="10min", step="1min")

@@ -343,8 +343,14 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(kept, scale, unit, monkeyp
         "disk": [rows[:, :cut], rows[:, cut:]],
         "both": [rows[:, :cut], rows[:, cut:]],
     }[kept]
-    columns = [[as_lazy(spool.store(piece[row])) if kept == "disk" or (kept == "both" and number) else piece[row]
-                for number, piece in enumerate(pieces)] for row in (0, 1)]  # fmt: skip
+    on_disk = [kept == "disk" or (kept == "both" and number > 0) for number in range(len(pieces))]
+    columns = [
+        [
+            as_lazy(spool.store(piece[row])) if spooled else piece[row]
+            for piece, spooled in zip(pieces, on_disk, strict=True)
+        ]
+        for row in (0, 1)
+    ]
     raw = (
         rows
         if kept == "memory"

@@ -1,4 +1,4 @@
-"""A process that lets runs be killed and continued many times over, quickly: it forks, so nothing is imported or compiled twice.
+"""Kill and continue runs many times in a forked process, which imports and compiles only once.
 
 python -m tests.support.crashing FOLDER LOG SEED CALLS KILLS
 
