@@ -39,8 +39,10 @@ def test_conversion_agrees_with_udunits(text, udunits):
 @pytest.mark.parametrize(
     "text",
     [
-        "rad.s-1", "rad*s**-1", "s-1 rad", "radians/second", "Degree/Second", "DEGREE/HOUR", "degree per hour", "°/s", "mrad.s^-1",
-        "microradians/second", "millidegree s-1", "arc_second/second", "arcsec/sec", "arc_minute s-1", "turn/min", "revolutions/minute",
+        "rad.s-1", "rad*s**-1", "s-1 rad", "radians/second", "Degree/Second", "DEGREE/HOUR",
+        "degree per hour", "°/s", "mrad.s^-1",
+        "microradians/second", "millidegree s-1", "arc_second/second", "arcsec/sec",
+        "arc_minute s-1", "turn/min", "revolutions/minute",
         "cycle s-1", "rad/ms", "degree/day", "1e-3 rad.s-1", "m s^-2", "meter second-2", "cm/s2",
     ],
 )  # fmt: skip
