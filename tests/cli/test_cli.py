@@ -71,7 +71,7 @@ def test_davar_takes_any_log_and_no_product(log, product, tmp_path, capfd):
     for none, what in ((product, "a product"), (tmp_path / "davar.nc", "a dynamic Allan variance")):
         assert call("davar", none, "-o", tmp_path / "again.nc", *WINDOW) == 2
         assert (
-            f"{none.name}: is {what} that gyrostab wrote, and no log; give the log"
+            f"{none.name}: is {what} that gyrostab wrote, not a log; give the log"
             in capfd.readouterr().err
         )
 
