@@ -399,10 +399,10 @@ def test_a_part_that_kills_every_worker_is_explained(address):
 def test_worker_processes_end_with_a_killed_parent(tmp_path):
     code = (
         "import os, signal\n"
-        "from gyrostab.jobs.schedule import in_any_order, open_pool\n"
+        "from gyrostab.jobs.schedule import open_pool, run_calls\n"
         "if __name__ == '__main__':\n"
         "    with open_pool('processes', workers=1) as pool:\n"
-        "        [child] = [found for _, found in in_any_order(pool, [(os.getpid,)])]\n"
+        "        [child] = [found for _, found in run_calls(pool, [(os.getpid,)])]\n"
         "        print(child, flush=True)\n"
         "        os.kill(os.getpid(), signal.SIGKILL)\n"
     )

@@ -112,7 +112,7 @@ def test_coherency_tells_quadrature_and_its_sign() -> None:
 
 def test_logs_that_do_not_belong_together_are_refused() -> None:
     log = make_log(np.zeros((2, 600)), rate=10.0, unit="deg/h")
-    with pytest.raises(OptionError, match="same two axes"):
+    with pytest.raises(OptionError, match="the same axes, at least two"):
         plot_comparison(log, make_log(np.zeros((2, 500)), rate=10.0, unit="deg/h"), window="20s")
     with pytest.raises(OptionError, match="driver 'vibration' is not in the log"):
         plot_comparison(log, log, window="20s", driver="vibration")

@@ -72,7 +72,7 @@ def test_effect_in_addition_to_expected_ones_is_identified():
     )
     (expected,) = found.content["baseline"]["expected"]  # with the size that it has here
     assert (expected["name"], expected["axes"]) == ("spikes", ["x"])
-    assert "an hour" in expected["statement"], expected["statement"]
+    assert "per hour" in expected["statement"], expected["statement"]
     assert "spikes" not in found.content["not_found"]
 
 

@@ -269,9 +269,9 @@ def test_links_in_a_loop_and_what_is_no_file(folder, capfd):
         capfd=capfd,
     )
     os.mkfifo(folder / "pipe.nc")
-    with pytest.raises(OutputError, match="no regular file"):
+    with pytest.raises(OutputError, match="not a regular file"):
         check_output(folder / "pipe.nc", overwrite=True)
-    with pytest.raises(OutputError, match="no regular file"):
+    with pytest.raises(OutputError, match="not a regular file"):
         check_output("/dev/null", overwrite=True)
 
 
