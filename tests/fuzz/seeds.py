@@ -611,8 +611,8 @@ def checkpoint_seeds() -> Iterator[Seed]:
         raise KeyboardInterrupt
 
     log = next(text_seeds()).files["log.csv"]
-    written = core._write
-    core._write = stop
+    written = core._write_product
+    core._write_product = stop
     try:
         with folder() as place, contextlib.redirect_stderr(io.StringIO()):
             (place / "log.csv").write_bytes(log)
@@ -638,7 +638,7 @@ def checkpoint_seeds() -> Iterator[Seed]:
                         move_job(data, str(place), FOLDER) if name.endswith(".json") else data
                     )
     finally:
-        core._write = written
+        core._write_product = written
     yield Seed("checkpoint", files, "log.csv", (), ("resume",), ("log.csv",))
 
 
