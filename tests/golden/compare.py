@@ -53,7 +53,8 @@ def compare_datasets(a: xr.Dataset, b: xr.Dataset, rtol: float) -> Iterator[str]
     for name in sorted(set(map(str, a.variables)) & set(map(str, b.variables))):
         one, two = a[name], b[name]
         if one.dims != two.dims or not same(one.values, two.values, rtol):
-            yield f"{name}: values"
+            is_prose = one.dtype.kind in "OUS" and one.shape == two.shape
+            yield Text(name) if is_prose else f"{name}: values"
         if any(
             not np.array_equal(one.attrs.get(key, ""), two.attrs.get(key, "")) for key in ATTRIBUTES
         ):
