@@ -479,8 +479,8 @@ def main() -> int:
             given.write,
             trials,
             f"Made by `python benchmarks/durability.py --kills {given.kills} --seed {given.seed} "
-            f"--minutes {given.minutes:g}`; "
-            f"undisturbed, {seconds}.",
+            f"--minutes {given.minutes:g}`;"
+            f"\nundisturbed, {seconds}.",
         )
     return 1 if any(kind.wrong for kind in trials) else 0
 
