@@ -370,6 +370,18 @@ def test_curves_and_reliability():
     assert right.loc["spikes", ["right", "n"]].tolist() == [0.0, 11]
 
 
+def test_an_effect_out_of_catalogue_counts_as_named_when_left_unidentified():
+    rows = []
+    for i, found in enumerate((diagnosis(verdict="unknown"), diagnosis(identification("shupe")))):
+        rows += score_case(
+            found,
+            truth("flicker_step", kind="out_of_catalogue", strength=3.0, index=900 + i),
+        )
+    line = curves(rows).set_index(["effect", "strength"])
+    assert line.loc[("flicker_step", 3.0), ["detected", "named", "n"]].tolist() == [1.0, 0.5, 2]
+    assert ("all", 3.0) not in line.index
+
+
 def test_target_without_cases_is_neither_met_nor_missed():
     table = score_table(score_case(diagnosis(), truth(kind="null")))
     empty = table[table["n"] == 0]

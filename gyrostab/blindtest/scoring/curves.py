@@ -48,20 +48,16 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
                 continue
             line: dict[str, Any] = {"effect": effect, "strength": strength, "n": len(part)}
             for key in ("detected", "named"):
-                hits = sum(
-                    bool(
-                        row[
-                            "unknown"
-                            if key == "named" and row["kind"] == "out_of_catalogue"
-                            else key
-                        ]
-                    )
-                    for row in part
-                )
+                hits = sum(bool(row[_column_of(row, key)]) for row in part)
                 low, high = wilson(hits, len(part))
                 line |= {key: hits / len(part), f"{key}_low": low, f"{key}_high": high}
             out.append(line)
     return pd.DataFrame(out)
+
+
+def _column_of(row: Row, key: str) -> str:
+    """Return the column that counts: an effect out of catalogue has no name to be given."""
+    return "unidentified" if key == "named" and row["kind"] == "out_of_catalogue" else key
 
 
 def reliability(rows: Sequence[Row]) -> pd.DataFrame:
