@@ -200,13 +200,36 @@ class LightPowerNoise(Effect):
         return f"{follows}: at {self.quantity('nominal')} {shares}."
 
 
-def _raise_vibration(vibration: Array, exponent: float) -> Array:
-    """Raise the vibration [g] to the power of the added variance."""
-    return np.asarray(np.abs(vibration) ** (2.0 * exponent))
+@dataclass(frozen=True, kw_only=True)
+class _FollowsVibration(Effect):
+    """Noise whose added variance grows with a power of the rms acceleration."""
+
+    stage: ClassVar[Stage] = "noise"
+    channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
+
+    exponent: float = parameter(
+        "1", "power of the vibration with which the noise grows", default=1.0, low=0.1, high=4.0
+    )
+
+    def _growth(self, drivers: Mapping[str, Array]) -> Array:
+        """Compute the vibration [g] to the power of the added variance."""
+        return np.asarray(np.abs(drivers["vibration"]) ** (2.0 * self.exponent))
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        """List exponents."""
+        return {"exponent": np.array([0.5, 1.0, 2.0])}
+
+    def _law(self, errors: Mapping[str, float] | None) -> str:
+        """Describe how the sizes add up and grow."""
+        if self.exponent == 1.0:
+            return "added in squares"
+        return (
+            f"added in squares, with the power {self.quantity('exponent', errors)} of the vibration"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
-class VibrationNoise(Effect):
+class VibrationNoise(_FollowsVibration):
     """Noise level that follows the vibration: angle random walk, and noise of the angle.
 
     ``N^2(t) = N0^2 + s_N^2 g^2p``, ``Q^2(t) = Q0^2 + s_Q^2 g^2p``, g the rms acceleration in units
@@ -237,9 +260,7 @@ class VibrationNoise(Effect):
 
     name: ClassVar[str] = "vibration_noise"
     short: ClassVar[str] = "noise level follows vibration"
-    stage: ClassVar[Stage] = "noise"
     terms: ClassVar[str] = "QN"
-    channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("white", "quantization")
     references: ClassVar[tuple[str, ...]] = (
         "Li et al. 2013, Chin. J. Lasers 40, 0908004",
@@ -257,32 +278,22 @@ class VibrationNoise(Effect):
     quantization: float = parameter(
         "urad/g", "added Q, in squares, per rms g", default=0.0, typical=5.0, low=0.0, high=1e6
     )
-    exponent: float = parameter(
-        "1", "power of the vibration with which the noise grows", default=1.0, low=0.1, high=4.0
-    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Compute squared N and Q for every sample."""
-        excited = _raise_vibration(chunk.drivers["vibration"], self.exponent)
+        excited = self._growth(chunk.drivers)
         return {
             "N": chunk.level["N"] + self.white**2 * excited,
             "Q": chunk.level["Q"] + self.quantization**2 * excited,
         }, state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List exponents."""
-        return {"exponent": np.array([0.5, 1.0, 2.0])}
-
     def explain(self, windows: Windows) -> Prediction:
         """Predict the added spectra of independent noise on each axis."""
-        excited = _raise_vibration(windows.drivers["vibration"], self.exponent)[:, None]
-        white, rounding = (
-            sampled_psd(symbol, windows.frequency, windows.rate) for symbol in ("N", "Q")
-        )
+        excited = self._growth(windows.drivers)[:, None]
         return Prediction(
             spectrum={
-                "white": excited * white,
-                "quantization": excited * rounding,
+                name: excited * sampled_psd(symbol, windows.frequency, windows.rate)
+                for name, symbol in (("white", "N"), ("quantization", "Q"))
             }
         )
 
@@ -294,17 +305,12 @@ class VibrationNoise(Effect):
             for name, symbol in named
             if getattr(self, name)
         ]
-        power = (
-            ""
-            if self.exponent == 1.0
-            else f", with the power {self.quantity('exponent', errors)} of the vibration"
-        )
         size = " and ".join(terms) or "nothing"
-        return f"Vibration raises the noise {self.on_axes()}: {size}, added in squares{power}."
+        return f"Vibration raises the noise {self.on_axes()}: {size}, {self._law(errors)}."
 
 
 @dataclass(frozen=True, kw_only=True)
-class VibrationRandomWalk(Effect):
+class VibrationRandomWalk(_FollowsVibration):
     """Rate random walk that grows under vibration.
 
     ``K^2(t) = K0^2 + s^2 g^2p``, g the rms acceleration in units of 1 g, p the exponent
@@ -331,9 +337,7 @@ class VibrationRandomWalk(Effect):
 
     name: ClassVar[str] = "vibration_random_walk"
     short: ClassVar[str] = "K follows vibration"
-    stage: ClassVar[Stage] = "noise"
     terms: ClassVar[str] = "K"
-    channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
     size_parameters: ClassVar[tuple[str, ...]] = ("sensitivity",)
     references: ClassVar[tuple[str, ...]] = (
         "Li et al. 2013, Chin. J. Lasers 40, 0908004",
@@ -343,24 +347,14 @@ class VibrationRandomWalk(Effect):
     sensitivity: float = parameter(
         "deg/h^1.5/g", "added K, in squares, per rms g", typical=0.5, low=0.0, high=1e4
     )
-    exponent: float = parameter(
-        "1", "power of the vibration with which K grows", default=1.0, low=0.1, high=4.0
-    )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
         """Compute squared K for every sample."""
-        return {
-            "K": chunk.level["K"]
-            + self.sensitivity**2 * _raise_vibration(chunk.drivers["vibration"], self.exponent)
-        }, state
-
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List exponents."""
-        return {"exponent": np.array([0.5, 1.0, 2.0])}
+        return {"K": chunk.level["K"] + self.sensitivity**2 * self._growth(chunk.drivers)}, state
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict the added spectrum of a random walk averaged over each sample."""
-        excited = _raise_vibration(windows.drivers["vibration"], self.exponent)[:, None]
+        excited = self._growth(windows.drivers)[:, None]
         walk = sampled_psd("K", windows.frequency, windows.rate)
         return Prediction(
             spectrum={"sensitivity": excited * walk},
@@ -369,11 +363,5 @@ class VibrationRandomWalk(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         """Describe the effect in one sentence."""
-        power = (
-            ""
-            if self.exponent == 1.0
-            else f", with the power {self.quantity('exponent', errors)} of the vibration"
-        )
-        size = self.quantity("sensitivity", errors)
-        size = f"{size} of K, added in squares{power}"
-        return f"Vibration adds rate random walk {self.on_axes()}: {size}."
+        size = f"{self.quantity('sensitivity', errors)} of K"
+        return f"Vibration adds rate random walk {self.on_axes()}: {size}, {self._law(errors)}."
