@@ -93,8 +93,9 @@ def _read_layout(path: Path) -> tuple[Path, dict[str, Any]]:
         ) from error
 
 
-def _record_type(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], int]:
+def _record_type(path: Path) -> tuple[np.dtype[Any], int]:
     """Return the type of a record, and the number of bytes before the first."""
+    place, layout = _read_layout(path)
     known = {"header_bytes", "byte_order", "fields"}
     if unknown := sorted(set(layout) - known):
         raise OptionError(
@@ -134,21 +135,19 @@ def _record_type(place: Path, layout: dict[str, Any]) -> tuple[np.dtype[Any], in
         size += types[-1].itemsize
     if not names or len(set(names)) < len(names):
         raise OptionError(f"{place.name}: a layout needs fields with different names; correct it")
-    return np.dtype(
-        {"names": names, "formats": types, "offsets": offsets, "itemsize": size}
-    ), header
+    given = path.stat().st_size
+    if header + size > given:
+        raise FormatError(
+            f"{path.name}: it holds no record by the layout {place.name} ({given} bytes, but "
+            f"{header} of header and {size} a record); copy it again, or correct the layout"
+        )
+    record = np.dtype({"names": names, "formats": types, "offsets": offsets, "itemsize": size})
+    return record, header
 
 
 def _make_table(path: Path) -> tuple[Table, list[str]]:
-    place, layout = _read_layout(path)
-    record, header = _record_type(place, layout)
+    record, header = _record_type(path)
     rows, rest = divmod(path.stat().st_size - header, record.itemsize)
-    if rows < 1:
-        what = f"{path.stat().st_size} bytes, but {header} of header and {record.itemsize} a record"
-        raise FormatError(
-            f"{path.name}: it holds no record by the layout {place.name} ({what}); copy it "
-            "again, or correct the layout"
-        )
     notes = (
         [
             f"the last {rest} bytes are not a whole record of {record.itemsize} bytes; is the "
