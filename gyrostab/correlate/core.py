@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.correlate.dataset import assemble
-from gyrostab.correlate.drivers import Driver, align_drivers, other_channels, slope_units
-from gyrostab.correlate.judge import VERDICTS, describe_coupling, driver_limits
+from gyrostab.correlate.drivers import Driver, align_drivers, other_channels
+from gyrostab.correlate.judge import VERDICTS, describe_coupling, driver_limits, slope_label
 from gyrostab.errors import OptionError
 from gyrostab.kernels.regression.coupling import (
     Laws,
@@ -149,9 +149,7 @@ def correlate(
                 entries[(*place, d)] = entry
     _adjust_p_values(entries)
     for (a, v, d), entry in entries.items():
-        entry["units"] = slope_units(
-            str(product[names[v]].attrs.get("units", "1")), drivers[d].units
-        )
+        entry["unit_label"] = slope_label(product[names[v]], drivers[d].units)
         series_name = f"{names[v].replace('_', ' ')} of axis {product['axis'].values[a]}"
         entry["statement"] = describe_coupling(entry, drivers[d].label, series_name)
     return assemble(product, names, drivers, entries, level=level, longest=float(lags[-1] * step))

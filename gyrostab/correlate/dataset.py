@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.correlate.drivers import Driver, slope_units
-from gyrostab.correlate.judge import LIMITS, VERDICTS
+from gyrostab.correlate.judge import LIMITS, VERDICTS, slope_label
 from gyrostab.noise import TERMS
 
 __all__ = ["assemble", "join"]
@@ -90,14 +90,17 @@ def assemble(
     made["coupling_limits"] = (dims, *_limit_flags(shape, entries))
     for v, name in enumerate(names):
         for d, driver in enumerate(found):
-            units = slope_units(str(product[name].attrs.get("units", "1")), driver.units)
+            attributes = {
+                "units": slope_units(str(product[name].attrs.get("units", "1")), driver.units),
+                "unit_label": slope_label(product[name], driver.units),
+            }
             for suffix, key in _SLOPES.items():
                 series = name.replace("_", " ")
                 label = f"sensitivity of {series} to {driver.label}{_slope_label(key, level)}"
                 made[f"{name}_per_{driver.name}{suffix}"] = (
                     "axis",
                     table(key)[:, v, d],
-                    {"long_name": label, "units": units},
+                    {"long_name": label, **attributes},
                 )
     made["statement"] = (
         dims,

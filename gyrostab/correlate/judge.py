@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
+
+from gyrostab.correlate.drivers import slope_units
 
 __all__ = [
     "LIMITS",
@@ -14,6 +17,7 @@ __all__ = [
     "driver_limits",
     "format_p_value",
     "readable_units",
+    "slope_label",
 ]
 
 Array = NDArray[np.float64]
@@ -100,6 +104,22 @@ def readable_units(units: str) -> str:
     return (" ".join(above) or "1") + below
 
 
+def slope_label(series: xr.DataArray, driver: str) -> str:
+    """Spell the unit of a sensitivity as people write it: N in deg/sqrt(h), not as it is stored.
+
+    Examples
+    --------
+    >>> N = xr.DataArray(0.01, attrs={"units": "degree hour-1", "unit_label": "deg/sqrt(h)"})
+    >>> slope_label(N, "degree_Celsius"), slope_label(N, "K hour-1")
+    ('deg/sqrt(h)/K', 'deg/sqrt(h) h/K')
+    """
+    label = series.attrs.get("unit_label")
+    if label is None:
+        return readable_units(slope_units(str(series.attrs.get("units", "1")), driver))
+    per = readable_units(slope_units("1", driver))
+    return f"{label}{per[1:]}" if per.startswith("1/") else f"{label} {per}"
+
+
 def format_p_value(p: float) -> str:
     """Format a p-value; the simulation does not resolve values below 0.0001.
 
@@ -123,10 +143,10 @@ def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
         ]
         reason = "; ".join(hard) or "no window holds both"
         return f"The record cannot show whether {series} follows {driver}: {reason}."
-    units = readable_units(entry["units"])
+    units = entry["unit_label"]
     between = f"{entry['low']:.3g} to {entry['high']:.3g}"
     number = f"{entry['slope']:.3g} ({between}) {units}"
-    late = f" {entry['lag']:.3g} s later" if entry["lag"] else ""
+    late = f" {entry['lag']:.6g} s later" if entry["lag"] else ""
     start = series[0].upper() + series[1:]
     odds = f"p {'' if entry['p_adjusted'] < 1e-4 else '= '}{format_p_value(entry['p_adjusted'])}"
     if verdict == "none_seen":
@@ -138,7 +158,7 @@ def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
             f"search{note}{tail}."
         )
     if verdict == "not_told_apart" and entry["p_adjusted"] >= 0.05:
-        late = f" {entry['lag_white']:.3g} s later" if entry["lag_white"] else ""
+        late = f" {entry['lag_white']:.6g} s later" if entry["lag_white"] else ""
         return (
             f"{start} and {driver} change together{late}, by about {entry['slope_white']:.3g} "
             f"{units}, but {LIMITS['no_reversal'].format(driver=driver)}. Allowing for that, the "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from gyrostab.correlate.judge import VERDICTS, format_p_value, readable_units
+from gyrostab.correlate.judge import VERDICTS, format_p_value
 
 __all__ = ["correlation_rows", "format_correlation"]
 
@@ -50,7 +50,7 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                         f"{result.attrs['interval_level']:.0%} interval": "-"
                         if np.isnan(low)
                         else f"{low:.3g} .. {high:.3g}",
-                        "unit": readable_units(str(slope.attrs["units"])),
+                        "unit": str(slope.attrs["unit_label"]),
                         "r": r,
                         "n eff": n,
                         "p adjusted": "-" if np.isnan(p) else format_p_value(p),

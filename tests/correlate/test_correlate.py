@@ -49,6 +49,21 @@ def test_slope_and_lag_are_found_and_other_axes_show_no_coupling():
     assert "follows temperature" in str(found["statement"].sel(place).values)
 
 
+def test_statement_and_table_give_the_units_of_the_coefficients():
+    product = coupled.product(slope=0.3, noises="white")
+    product["N"] = product["window_mean"].assign_attrs(
+        units="degree hour-1", unit_label="deg/sqrt(h)"
+    )
+    found = gyrostab.correlate(product, variables=["N", "window_mean"], max_lag=0)
+    units = {"N": "deg/sqrt(h)/K", "window_mean": "deg/h/K"}
+    for name, unit in units.items():
+        place = {"axis": "x", "variable": name, "driver": "temperature"}
+        assert f") {unit}, p" in str(found["statement"].sel(place).values)
+    rows = gyrostab.correlation_rows(found)
+    assert {row["variable"]: row["unit"] for row in rows if row["driver"] == "temperature"} == units
+    assert found["N_per_temperature_rate"].attrs["unit_label"] == "deg/sqrt(h) h/K"
+
+
 def test_coupling_with_the_rate_of_change_is_found():
     found = gyrostab.correlate(
         coupled.product(pace=0.05, noises="white"), variables="window_mean", max_lag=0
