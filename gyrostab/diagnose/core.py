@@ -30,6 +30,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.task import Comparison, Task, lines_without_motion
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log
@@ -58,6 +59,7 @@ def diagnose(
     block: Any = None,
     restart_gap: Any = 5.0,
     progress: Stage = no_stage,
+    settings: Settings = DEFAULTS,
 ) -> Diagnosis:
     """Find where a recording differs from a simulation, and which physics explains it.
 
@@ -87,6 +89,8 @@ def diagnose(
         As in `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
     progress : Stage
         Callback for progress.
+    settings : Settings
+        Numbers that decide what is reported; docs/settings.md lists them with their sources.
 
     Returns
     -------
@@ -115,7 +119,16 @@ def diagnose(
     # the matrices are many and small: more threads would only wait for each other
     with threadpool_limits(1, user_api="blas"):
         return _diagnose(
-            log, simulation, quiet, seed, nulls, false_alarm_level, block, restart_gap, progress
+            log,
+            simulation,
+            quiet,
+            seed,
+            nulls,
+            false_alarm_level,
+            block,
+            restart_gap,
+            progress,
+            settings,
         )
 
 
@@ -129,6 +142,7 @@ def _diagnose(
     block: Any,
     restart_gap: Any,
     progress: Stage,
+    settings: Settings,
 ) -> Diagnosis:
     """Run the steps in their order."""
     started = time.perf_counter()
@@ -140,7 +154,7 @@ def _diagnose(
         log = log.sel(axis=axes)
         blocks = reduce_log(log, block=block, restart_gap=restart_gap, progress=progress)
         simulation = simulation.sel(axis=axes) if isinstance(simulation, xr.Dataset) else simulation
-    task = Task(log, simulation, quiet, restart_gap, seed, nulls, level, progress)
+    task = Task(log, simulation, quiet, restart_gap, seed, nulls, level, progress, settings)
     comparison = _compare(task, *_calibrate(task, blocks))
     comparison = _compare_without_motion(task, comparison)
     comparison = _compare_without_fast_switching(task, comparison)
@@ -176,7 +190,14 @@ def _compare(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Comparison
     task.progress("naming", 0)
     known = _effects_left_out(baseline, task.simulation)
     identifications = name_effects(
-        seen, baseline, records(), level=level, seed=task.seed, known=known, progress=task.progress
+        seen,
+        baseline,
+        records(),
+        level=level,
+        seed=task.seed,
+        known=known,
+        progress=task.progress,
+        settings=task.settings,
     )
     expected = identifications.expected
     before = expected_baseline(identifications, baseline)
@@ -195,7 +216,9 @@ def _compare_without_motion(task: Task, comparison: Comparison) -> Comparison:
     """
     if task.simulation is not None:
         return comparison
-    moving = unexplained_motion(comparison.blocks, comparison.identifications.identified)
+    moving = unexplained_motion(
+        comparison.blocks, comparison.identifications.identified, settings=task.settings
+    )
     if not moving.any():
         return comparison
     at_rest = without_motion(

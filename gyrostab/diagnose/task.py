@@ -12,6 +12,7 @@ from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.moving_axes import without_motion
 from gyrostab.diagnose.nulls.scores import NullScores
+from gyrostab.diagnose.settings import Settings
 from gyrostab.progress import Stage
 from gyrostab.simulate.model import Model
 
@@ -28,7 +29,7 @@ class Task:
         The recording, with the axes that vary.
     simulation : Model, xarray.Dataset or None
         What the recording is compared with; None when the noise is calibrated on the recording.
-    quiet, restart_gap, seed, nulls, level, progress
+    quiet, restart_gap, seed, nulls, level, progress, settings
         The options of `gyrostab.diagnose`; `level` is its `false_alarm_level`.
     """
 
@@ -40,6 +41,7 @@ class Task:
     nulls: int
     level: float
     progress: Stage
+    settings: Settings
 
 
 class Comparison(NamedTuple):

@@ -63,7 +63,7 @@ def predict_baseline(
     for name in ("mean", "power", "cross"):
         if name in seen:
             seen[name] = seen[name].where(xr.DataArray(keep, dims="block"))
-    state = initial_state(seen, baseline)
+    state = initial_state(seen, baseline, settings=identifications.state.settings)
     # for each column in the model, whether it belongs to an effect that is left out
     is_left_out: dict[tuple[str, str], list[bool]] = {}
     identified = (*identifications.expected, *identifications.identified)

@@ -29,16 +29,12 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 from gyrostab.physics.rotation import EarthRate
 
-__all__ = ["FORM_ERROR", "Estimate", "Fitted", "fit_identifications"]
+__all__ = ["Estimate", "Fitted", "fit_identifications"]
 
 Array = NDArray[np.float64]
-#: Error of the form of an effect, as a share of its size: no effect is exactly what its equation
-#: says. With forms wrong by the shares in docs/diagnosis.md, the intervals still hold the truth.
-FORM_ERROR = 0.04
 _ANGLE = "deg"
 _PLACE = "line", "frequency"  # where a line is does not depend on what makes it
 EARTH_RATE = 15.041067  # deg/h: 360 degrees in a sidereal day of 23.934470 h
-MIN_HARMONIC_SIGMA = 2.0  # standard errors of an amplitude, below which a harmonic is dropped
 
 
 @dataclass(frozen=True)
@@ -104,7 +100,9 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
         One entry per axis of an effect with a single size for all of its axes; one entry for all
         axes where each has its own size.
     """
-    start = initial_state(identifications.state.blocks, baseline)
+    start = initial_state(
+        identifications.state.blocks, baseline, settings=identifications.state.settings
+    )
     found: list[Fitted] = []
     for identification in identifications.identified:
         state = start
@@ -200,7 +198,7 @@ def _split_harmonics(identification: Identification, state: State) -> list[list[
     kept = [
         components
         for components, times in zip(alone, clear, strict=True)
-        if times > MIN_HARMONIC_SIGMA or times == max(clear)
+        if times > state.settings.visible_sigma or times == max(clear)
     ]
     rest = [component for component in identification.components if component not in turning]
     return [[*kept[0], *rest], *kept[1:]]
@@ -243,7 +241,7 @@ def _fit_components(
         # a low-pass of infinite bandwidth is not given; nor is an exponent that was not measured
         if math.isfinite(mean) and not math.isnan(sd):
             is_exact = unit == _ANGLE or (statistic, name) == _PLACE  # angles have it already
-            form = 0.0 if is_exact else FORM_ERROR * mean
+            form = 0.0 if is_exact else state.settings.size_error_share * mean
             estimates[name] = _make_estimate(
                 mean, sd, unit, ends=ends, positive=_is_positive(kind, name), form=form
             )
@@ -428,7 +426,7 @@ def _rotation_sizes(
     out: dict[str, tuple[float, ...]] = {}
     for component in components:
         size, sd, angle = _fit_amplitude(component, state)
-        error = math.hypot(sd / max(size, 1e-300), FORM_ERROR)
+        error = math.hypot(sd / max(size, 1e-300), state.settings.size_error_share)
         if not component.candidate.each:
             across = size * float(np.abs(component.variant.design).max())
             return {

@@ -10,18 +10,17 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.grid_refinement import Point, refine_grid
 from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.identify.selection import AMBIGUOUS_NATS, FORM_ERROR_SHARE
 from gyrostab.diagnose.predict.candidates import Variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
+from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.physics.registry import effects
 
 __all__ = ["average_sizes", "plain_places"]
 
 Array = NDArray[np.float64]
 MAX_ZERO_LAG_S = 1e-2  # a lag that counts as zero
-_TAILS = (0.025, 0.975)  # of a 95 % interval
 
 
 def average_sizes(
@@ -56,7 +55,10 @@ def average_sizes(
         for variant in _variant_family(component, identifications)
     ]
     usual = _usual_places(
-        component, [point.variant for point in grid], [point.evidence for point in grid]
+        component,
+        [point.variant for point in grid],
+        [point.evidence for point in grid],
+        state.settings.ambiguous_nats,
     )
     points = refine_grid(component, state, [grid[place] for place in usual])
     family = [point.variant for point in points]
@@ -67,7 +69,9 @@ def average_sizes(
         place
         for place in at_once
         if evidence[place]
-        > evidence.max() - AMBIGUOUS_NATS - FORM_ERROR_SHARE * max(component.evidence_nats, 0.0)
+        > evidence.max()
+        - state.settings.ambiguous_nats
+        - state.settings.form_error_share * max(component.evidence_nats, 0.0)
     ]
     if without_lag:
         middle, _ = _merge_points([points[place] for place in without_lag]).moments()
@@ -144,13 +148,13 @@ def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
 
 
 def _usual_places(
-    component: Component, family: Sequence[Variant], evidence: Sequence[float]
+    component: Component, family: Sequence[Variant], evidence: Sequence[float], margin: float
 ) -> list[int]:
     """Return the places of the plain variants, unless others are clearly better."""
     plain, top = plain_places(component.candidate.effect, family), max(evidence)
     return (
         plain
-        if plain and max(evidence[place] for place in plain) > top - AMBIGUOUS_NATS
+        if plain and max(evidence[place] for place in plain) > top - margin
         else list(range(len(family)))
     )
 
@@ -189,7 +193,7 @@ def _interval_ends(tried: Array, share: Array, middle: float) -> tuple[float, fl
     first, last = known[0] - (between[0] - known[0]), known[-1] + (known[-1] - between[-1])
     edge = np.concatenate([[max(first, 0.0)], between, [last]])
     below = np.append(0.0, np.cumsum(np.bincount(place, weights=share)))
-    low, high = np.interp(_TAILS, below / below[-1], edge)
+    low, high = np.interp(INTERVAL_TAILS, below / below[-1], edge)
     return min(float(low), middle), max(float(high), middle)
 
 

@@ -26,7 +26,7 @@ from gyrostab.diagnose.baseline.posterior import (
     floor_square,
     noise_posterior,
 )
-from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, Fitted, fit_identifications
+from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.predict.candidates import make_windows, rebuild_variant
 from gyrostab.diagnose.predict.condition import (
@@ -64,19 +64,19 @@ class AxisEffects:
         Power of fixed size.
     response : ndarray, shape (band,)
         Factor of the noise.
+    doubt : float
+        Relative error of `known`.
     free : list of ndarray, shape (block, band)
         Power per unit of a free size.
     means : list of ndarray, shape (block,)
         Means per unit of a free size.
-    doubt : float
-        Relative error of `known`.
     """
 
     known: Array
     response: Array
+    doubt: float
     free: list[Array] = field(default_factory=list)
     means: list[Array] = field(default_factory=list)
-    doubt: float = 2.0 * FORM_ERROR
 
 
 def recalibrate(
@@ -112,7 +112,7 @@ def recalibrate(
         return baseline
     blocks = identifications.state.blocks
     use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
-    state = initial_state(blocks, baseline)
+    state = initial_state(blocks, baseline, settings=identifications.state.settings)
     for identification in identifications.identified:
         state = condition_on(state, list(identification.components))
     found: list[Posterior] = []
@@ -205,7 +205,9 @@ def _collect_effects(
     """Collect what all identified effects do on an axis; None without any."""
     blocks = identifications.state.blocks
     shape = (blocks.sizes["block"], blocks.sizes["band"])
-    out = AxisEffects(np.zeros(shape), np.ones(shape[1]))
+    # twice the error of the size, because power grows with its square
+    doubt = 2.0 * identifications.state.settings.size_error_share
+    out = AxisEffects(np.zeros(shape), np.ones(shape[1]), doubt)
     touched = False
     for identification in identifications.identified:
         components = [component for component in identification.components if axis in component.row]
@@ -263,7 +265,9 @@ def _add_component(
     axis: str,
 ) -> None:
     statistic = component.candidate.statistic
-    state = initial_state(identifications.state.blocks, baseline)
+    state = initial_state(
+        identifications.state.blocks, baseline, settings=identifications.state.settings
+    )
     if is_filter(statistic, component.variant):
         return
     if statistic == "transfer":

@@ -18,6 +18,7 @@ from gyrostab.diagnose.predict.candidates import Variant, rebuild_variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.linear_model import State, cross_column, pair_rows
 from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 
 __all__ = ["estimate_shared_factors"]
@@ -28,7 +29,6 @@ FACTOR_ROUNDS = 50  # of the iteration for a matrix of rank 1
 # Grid of low-passes: bandwidths as parts of the sampling rate, their number, and interpolation.
 WIDEST_PART, NARROWEST_PART, BANDWIDTHS, FINE_STEPS = 1.5, 40.0, 11, 12
 ORDER_ERROR = 0.05  # relative change of the level below a low-pass if it has two poles
-_ENDS = (0.025, 0.975)  # of a 95 % interval
 
 
 def estimate_shared_factors(
@@ -86,7 +86,7 @@ def estimate_shared_factors(
 
 def _summarise_draws(draws: Array, alike: NDArray[np.bool_]) -> tuple[float, float, float, float]:
     """Return the median of the likelier draws, and spread and ends of the 95 % interval of all."""
-    low, high = np.quantile(draws, _ENDS)
+    low, high = np.quantile(draws, INTERVAL_TAILS)
     return (
         float(np.median(draws[alike])),
         float((high - low) / (2.0 * NORMAL_95)),

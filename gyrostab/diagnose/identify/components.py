@@ -9,9 +9,9 @@ import numpy as np
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.search import CandidateEvidence, combine_rows
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
-    "MIN_COMPONENT_NATS",
     "PLAIN_LINE",
     "are_lines",
     "axes_of",
@@ -23,18 +23,14 @@ __all__ = [
     "sum_evidence",
 ]
 
-#: Evidence that an axis must add to be named with the others: odds of 7 to 1.
-MIN_COMPONENT_NATS = 2.0
 #: The effect for a line of unknown cause.
 PLAIN_LINE = "spectral_line"
 
 
-def find_components(found: CandidateEvidence) -> list[Component]:
+def find_components(found: CandidateEvidence, *, settings: Settings = DEFAULTS) -> list[Component]:
     """Return the rows of a candidate with enough evidence, or the best one."""
     evidence_nats = found.evidence_nats[0]
-    rows = [
-        number for number in range(evidence_nats.size) if evidence_nats[number] > MIN_COMPONENT_NATS
-    ]
+    rows = [row for row, nats in enumerate(evidence_nats) if nats > settings.component_nats]
     rows = rows or [int(evidence_nats.argmax())]
     return [
         Component(
@@ -48,14 +44,16 @@ def find_components(found: CandidateEvidence) -> list[Component]:
     ]
 
 
-def group_components(found: Sequence[CandidateEvidence]) -> dict[str, list[Component]]:
+def group_components(
+    found: Sequence[CandidateEvidence], *, settings: Settings = DEFAULTS
+) -> dict[str, list[Component]]:
     """Return the components of each effect with enough evidence, the strongest first."""
     out: dict[str, list[Component]] = {}
     for one in found:
-        out.setdefault(one.candidate.key, []).extend(find_components(one))
+        out.setdefault(one.candidate.key, []).extend(find_components(one, settings=settings))
     for key, components in out.items():
         good = _drop_repeated_power(
-            [component for component in components if component.evidence_nats > MIN_COMPONENT_NATS]
+            [one for one in components if one.evidence_nats > settings.component_nats]
         )
         out[key] = sorted(good or components, key=lambda component: -component.evidence_nats)
     return out

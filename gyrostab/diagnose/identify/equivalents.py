@@ -14,11 +14,6 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 
 __all__ = ["prefer_plainer"]
 
-MAX_CORRELATION = 0.999  # of the errors of two terms, from which on the data do not separate them
-AMBIGUOUS_NATS = 3.0  # by which one term alone must be better than another: odds of 20 to 1
-NEEDED_NATS = 6.0  # that a second term must add: odds of 400 to 1
-FORM_ERROR_SHARE = 0.01  # of the first term's evidence, that an error of its form may leave
-
 
 def prefer_plainer(component: Component, state: State) -> tuple[Component, str]:
     """Return a component with a single term where that explains as much, and a sentence about it.
@@ -54,15 +49,16 @@ def prefer_plainer(component: Component, state: State) -> tuple[Component, str]:
     gains = {
         name: _single_term_evidence(component, state, variant) for name, variant in alone.items()
     }
+    needed, share = state.settings.reject_nats, state.settings.form_error_share
     best = max(gains.values())
     # the first that explains as much as the best
     name = next(
-        name for name in component.variant.columns if gains.get(name, -np.inf) > best - NEEDED_NATS
+        name for name in component.variant.columns if gains.get(name, -np.inf) > best - needed
     )
     whole = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
     if (
-        correlation < MAX_CORRELATION
-        and whole - gains[name] > NEEDED_NATS + FORM_ERROR_SHARE * gains[name]
+        correlation < state.settings.term_correlation
+        and whole - gains[name] > needed + share * gains[name]
     ):
         return component, ""
     others = [other for other in component.variant.columns if other != name]
@@ -84,7 +80,7 @@ def _prefer_first_term(component: Component, state: State) -> tuple[Component, s
         for one in terms
         if one.columns == component.variant.columns
         or _single_term_evidence(component, state, one)
-        > own - AMBIGUOUS_NATS - FORM_ERROR_SHARE * own
+        > own - state.settings.ambiguous_nats - state.settings.form_error_share * own
     ]
     if len(correlation) < 2:
         return component, ""

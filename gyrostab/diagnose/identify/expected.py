@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from gyrostab.diagnose.identify.components import (
-    MIN_COMPONENT_NATS,
     axes_of,
     group_components,
     sum_evidence,
@@ -58,30 +57,29 @@ def identify_expected_effects(
     """
     identified: list[Identification] = []
     state, left = start, list(known)
+    needed = start.settings.component_nats
     rounds = MAX_ROUNDS_PER_EFFECT * len(left)
     while left and rounds > 0:
         rounds -= 1
         found = [(_best_components(effect, candidates, state, gains), effect) for effect in left]
-        left = [
-            effect for components, effect in found if sum_evidence(components) > MIN_COMPONENT_NATS
-        ]
+        left = [effect for components, effect in found if sum_evidence(components) > needed]
         components, effect = max(
-            found, key=lambda one: (_are_anomalous_samples(one[0]), sum_evidence(one[0]))
+            found, key=lambda one: (_are_anomalous_samples(one[0], needed), sum_evidence(one[0]))
         )
-        if sum_evidence(components) <= MIN_COMPONENT_NATS:
+        if sum_evidence(components) <= needed:
             break
         identified.append(_make_identification(components, state))
         state = condition_on(state, components)
-        if _are_anomalous_samples(components):  # their counts cannot be taken out
+        if _are_anomalous_samples(components, needed):  # their counts cannot be taken out
             left = [one for one in left if one is not effect]
     return identified, state
 
 
-def _are_anomalous_samples(components: Sequence[Component]) -> bool:
+def _are_anomalous_samples(components: Sequence[Component], needed: float) -> bool:
     return (
         bool(components)
         and components[0].candidate.statistic == "marks"
-        and sum_evidence(components) > MIN_COMPONENT_NATS
+        and sum_evidence(components) > needed
     )
 
 
@@ -101,7 +99,8 @@ def _best_components(
 ) -> list[Component]:
     """Return the components of an effect with the most evidence on its axes."""
     by = group_components(
-        gains([one for one in candidates if _is_candidate_of(one, effect)], state)
+        gains([one for one in candidates if _is_candidate_of(one, effect)], state),
+        settings=state.settings,
     )
     own = [
         [
@@ -122,5 +121,5 @@ def _make_identification(components: Sequence[Component], state: State) -> Ident
         axes_of(components, state.axes),
         tuple(components),
         sum_evidence(components),
-        MIN_COMPONENT_NATS,
+        state.settings.component_nats,
     )

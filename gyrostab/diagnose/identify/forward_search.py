@@ -19,6 +19,7 @@ from gyrostab.diagnose.predict.candidates import Candidate, effect_candidates
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
 from gyrostab.diagnose.predict.search import CountEvidence, compute_evidence, evidence_by_effect
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
@@ -42,6 +43,7 @@ def name_effects(
     seed: int = 0,
     known: Sequence[Effect] = (),
     progress: Stage = no_stage,
+    settings: Settings = DEFAULTS,
 ) -> Identifications:
     """Identify the effects that a recording shows beyond its baseline.
 
@@ -65,6 +67,7 @@ def name_effects(
         the selection begins.
     progress : Stage
         Callback with the number of null records done.
+    settings : Settings
 
     Returns
     -------
@@ -78,7 +81,7 @@ def name_effects(
     folds = fold_blocks(blocks)
     effects, reasons = effect_candidates(blocks, baseline["coefficient"])
     candidates = [*effects, *nuisance_alternatives(blocks)]
-    start = initial_state(blocks, baseline)
+    start = initial_state(blocks, baseline, settings=settings)
     best, count_evidence = _score_null_records(
         candidates, nulls, start, folds, np.random.default_rng(seed), progress
     )
@@ -94,7 +97,9 @@ def name_effects(
             some, state.blocks, state, folds, count_evidence=count_evidence
         ),
     )
-    search = Search(candidates, folds, count_evidence, tail_level(best, level), tuple(expected))
+    search = Search(
+        candidates, folds, count_evidence, tail_level(best, level), tuple(expected), settings
+    )
     identified, unidentified, state = search.run(start)
     return Identifications(
         tuple(identified),

@@ -19,6 +19,7 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import fast_switching_evidence
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.registry import effects
 
 __all__ = [
@@ -38,19 +39,10 @@ OBSERVATIONALLY_EQUIVALENT: dict[str, tuple[str, ...]] = {
 #: Effect -> effect that it becomes at the end of the range of a parameter: without a dead band,
 #: hysteresis is proportional to temperature.
 EQUIVALENTS = {"thermal_hysteresis": "temperature_bias"}
-MIN_FRINGE_STEP = 6e4  # deg/h: one fringe of 5 km of fibre on a coil of 30 cm, lambda c / (L D)
-OUT_OF_RANGE_SIGMA = 3.0  # standard errors beyond its range at which a size is impossible
-MIN_COMB_LINES = 3  # lines that may be one comb
-MOVING_POWER_RATIO = 1.5  # power over expected power at which an axis moves
-MORE_LEVELS_NATS = 3.0  # that further levels may add by chance: odds of 20 to 1
-FORM_ERROR_SHARE = 0.01  # of the evidence, that an error of the form may leave
-MAX_LEAN_RAD = 2e-2  # share of the rotation that an axis across it sees at most: 1 degree
-MIN_LEAN_RAD = 1e-5  # to which an axis can be squared up
-MAX_LEVEL_CORRELATION = 0.97  # of g and g^2, above which the vibration has one level
 
 
 def without_pulses(
-    chosen: Sequence[Identification | Unidentified],
+    chosen: Sequence[Identification | Unidentified], *, settings: Settings = DEFAULTS
 ) -> list[Identification | Unidentified]:
     """Drop spikes on axes that have a comb of lines or a profile of the feedback ramp.
 
@@ -59,7 +51,9 @@ def without_pulses(
     """
     lines: Counter[str] = Counter()
     for component in (component for one in chosen for component in one.components):
-        weight = {"line": 1, "phase_locked": MIN_COMB_LINES}.get(component.candidate.statistic, 0)
+        weight = {"line": 1, "phase_locked": settings.min_comb_lines}.get(
+            component.candidate.statistic, 0
+        )
         lines.update(dict.fromkeys(component.row, weight))
     out: list[Identification | Unidentified] = []
     for one in chosen:
@@ -67,7 +61,7 @@ def without_pulses(
             kept = tuple(
                 component
                 for component in one.components
-                if lines[component.row[0]] < MIN_COMB_LINES
+                if lines[component.row[0]] < settings.min_comb_lines
             )
             out += (
                 [replace(one, components=kept, axes=tuple(component.row[0] for component in kept))]
@@ -108,7 +102,8 @@ def find_plainer_effect(components: Sequence[Component], state: State) -> str | 
     """
     effect = components[0].candidate.effect
     if effect == "real_motion" and all(
-        _is_rotation(component) and _rotation_share(component, state) < MAX_LEAN_RAD
+        _is_rotation(component)
+        and _rotation_share(component, state) < state.settings.max_misalignment_share
         for component in components
     ):
         return "scale_factor"
@@ -140,12 +135,15 @@ def _is_component_physical(component: Component, state: State) -> bool:
         and not _is_moving(component.candidate.reference[0], state)
     ):
         return False
-    if _is_rotation(component) and _rotation_share(component, state) < MIN_LEAN_RAD:
+    if (
+        _is_rotation(component)
+        and _rotation_share(component, state) < state.settings.min_rotation_share
+    ):
         return False
     if (
         effect == "fringe_hop"
         and abs(component_size(component, state)[0]) * np.abs(component.variant.design).max()
-        < MIN_FRINGE_STEP
+        < state.settings.min_fringe_step
     ):
         return False
     if effect in LARGEST_SIZE and component.variant.columns[0] != "any":
@@ -176,7 +174,7 @@ def _is_in_range(component: Component, state: State) -> bool:
         for item in effects()[component.candidate.effect].parameters()
     }
     sizes, covariance = component_mixture(component, state).moments()
-    least = np.abs(sizes) - OUT_OF_RANGE_SIGMA * np.sqrt(np.diagonal(covariance))
+    least = np.abs(sizes) - state.settings.impossible_sigma * np.sqrt(np.diagonal(covariance))
     return all(
         size <= largest.get(name, np.inf)
         for name, size in zip(component.variant.columns, least, strict=True)
@@ -198,23 +196,21 @@ def _is_above_least(component: Component, state: State) -> bool:
     if least is None or not np.isfinite(least):
         return True
     size, error = component_size(component, state)
-    return size >= least - OUT_OF_RANGE_SIGMA * error
+    return size >= least - state.settings.impossible_sigma * error
 
 
 def _has_more_levels(component: Component, state: State) -> bool:
     """Return whether the bias still switches with two levels in the model: it has three or more."""
-    axis = component.row[0]
+    axis, settings = component.row[0], state.settings
+    allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
     if component.variant.inside.size:
         within = fast_switching_evidence(state.blocks, add_fast_switching(state, component), axis)
-        return (
-            within is not None
-            and within.evidence_nats > MORE_LEVELS_NATS + FORM_ERROR_SHARE * component.evidence_nats
-        )
+        return within is not None and within.evidence_nats > allowed
     given = np.stack(
         [*state.given.get(("mean", axis), []), component.variant.design[0, 0]], axis=-1
     )
     evidence_nats, _ = telegraph_evidence(state.blocks, state.baseline, axis=axis, given=given)
-    return bool(evidence_nats[0] > MORE_LEVELS_NATS + FORM_ERROR_SHARE * component.evidence_nats)
+    return bool(evidence_nats[0] > allowed)
 
 
 def _is_moving(axis: str, state: State) -> bool:
@@ -223,7 +219,7 @@ def _is_moving(axis: str, state: State) -> bool:
     expected = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
     return bool(
         np.nanmax(np.nanmean(measured(state.blocks, "power").values[row] / expected, axis=0))
-        > MOVING_POWER_RATIO
+        > state.settings.moving_power_ratio
     )
 
 
@@ -233,7 +229,11 @@ def find_equivalent_effects(
     """Return effects that the data cannot separate from this one; `lines` counts all lines."""
     out = list(OBSERVATIONALLY_EQUIVALENT.get(effect, ()))
     blocks = state.blocks
-    if effect == "spectral_line" and "profile" not in blocks and lines >= MIN_COMB_LINES:
+    if (
+        effect == "spectral_line"
+        and "profile" not in blocks
+        and lines >= state.settings.min_comb_lines
+    ):
         out.append("feedback_reset")
     if (
         effect == "dead_zone" and len(state.axes) == 1
@@ -251,6 +251,9 @@ def find_equivalent_effects(
     if effect == "vibration_rectification":
         vibration = blocks[f"channel_{components[0].candidate.driver[0]}"].values
         good = np.isfinite(vibration)
-        if np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1] > MAX_LEVEL_CORRELATION:
+        if (
+            np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1]
+            > state.settings.level_correlation
+        ):
             out.append("g_sensitivity")
     return out

@@ -10,11 +10,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.identify.components import MIN_COMPONENT_NATS, axes_of, sum_evidence
+from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.designs import Candidate
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import CountEvidence
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
     "Identification",
@@ -29,9 +30,6 @@ __all__ = [
 Array = NDArray[np.float64]
 #: What filters the noise of the log, and would explain an error in the spectrum of another effect.
 _FILTER = "logger_filter"
-#: Share of the evidence of a driven noise that an error of its spectrum may leave to a filter: 0.08
-#: was seen in simulated strong vibration.
-SPECTRUM_ERROR_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -168,7 +166,10 @@ def add_identification(
 
 
 def with_axes_of(
-    identification: Identification, again: Mapping[str, Sequence[Component]]
+    identification: Identification,
+    again: Mapping[str, Sequence[Component]],
+    *,
+    settings: Settings = DEFAULTS,
 ) -> Identification:
     """Return an identification without the axes on which it adds no evidence.
 
@@ -177,7 +178,7 @@ def with_axes_of(
     seen = {
         axis
         for component in again.get(identification.components[0].candidate.key, [])
-        if component.evidence_nats > MIN_COMPONENT_NATS
+        if component.evidence_nats > settings.component_nats
         for axis in component.row
     }
     kept = tuple(component for component in identification.components if set(component.row) <= seen)
@@ -220,7 +221,7 @@ def form_error(
     components: Sequence[Component],
     chosen: Sequence[Identification | Unidentified],
     *,
-    share: float,
+    settings: Settings = DEFAULTS,
 ) -> float:
     """Return what errors of the form of other effects may leave to these components [nats].
 
@@ -248,11 +249,8 @@ def form_error(
                 and bool(one.driver)
                 and _FILTER in beside
             )
-            error += (
-                max(SPECTRUM_ERROR_SHARE if of_spectrum else 0.0, share) * component.evidence_nats
-                if beside
-                else 0.0
-            )
+            share = settings.spectrum_error_share if of_spectrum else settings.form_error_share
+            error += share * component.evidence_nats if beside else 0.0
     return error
 
 

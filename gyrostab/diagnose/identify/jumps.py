@@ -17,15 +17,11 @@ __all__ = ["is_free_jump", "is_lasting", "is_sudden", "lead_to_levels"]
 Array = NDArray[np.float64]
 _JUMP, _INSTANT = "bias_jump", "at"
 _TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is compared with
-#: Evidence by which another form must be better: of 41 jumps put into null records none reached it.
-BETTER_NATS = 3.0
-FORM_ERROR_SHARE = 0.01  # of the evidence of the jump, that an error of its form may leave
 EVENT_LENGTHS = 48  # that are tried, from two blocks up
 MAX_EVENT_SHARE = 0.1  # of the record, that an event lasts at most, but eight blocks always
 MIN_EVENT_LIMIT_BLOCKS = 8.0
 MIN_LEVEL_BLOCKS = 3  # before and after an event, that determine the level there
 _VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # over the usual variance of the means
-OTHER_LEVEL_SIGMA = 3.0  # standard errors between the levels before and after an event
 
 
 def is_free_jump(component: Component, state: State) -> bool:
@@ -63,9 +59,7 @@ def is_sudden(components: Sequence[Component], state: State, *, error: float = 0
         sum(_transition_evidence(component, state, length) for component in jumps)
         for length in _TRANSITION_BLOCKS
     )
-    return gradual - step <= BETTER_NATS + error + FORM_ERROR_SHARE * sum(
-        max(component.evidence_nats, 0.0) for component in jumps
-    )
+    return gradual - step <= error + _allowed_nats(jumps, state)
 
 
 def is_lasting(components: Sequence[Component], state: State) -> bool:
@@ -97,9 +91,7 @@ def is_lasting(components: Sequence[Component], state: State) -> bool:
         for span in spans
     ]
     best = int(np.argmax(events))
-    if events[best] - step <= BETTER_NATS + np.log(len(spans)) + FORM_ERROR_SHARE * sum(
-        max(component.evidence_nats, 0.0) for component in jumps
-    ):
+    if events[best] - step <= np.log(len(spans)) + _allowed_nats(jumps, state):
         return True
     return any(_is_other_level(component, state, spans[best]) for component in jumps)
 
@@ -121,8 +113,15 @@ def lead_to_levels(components: Sequence[Component], state: State) -> bool:
     jumps = [component for component in components if is_free_jump(component, state)]
     return (
         not jumps
-        or sum(_evidence_in_scatter(component, state) for component in jumps) > -BETTER_NATS
+        or sum(_evidence_in_scatter(component, state) for component in jumps)
+        > -state.settings.ambiguous_nats
     )
+
+
+def _allowed_nats(jumps: Sequence[Component], state: State) -> float:
+    """Return what chance and errors of the form may leave to another form than jumps [nats]."""
+    evidence = sum(max(component.evidence_nats, 0.0) for component in jumps)
+    return state.settings.ambiguous_nats + state.settings.form_error_share * evidence
 
 
 def _evidence_in_scatter(component: Component, state: State) -> float:
@@ -202,7 +201,7 @@ def _fit_event(
 def _is_other_level(component: Component, state: State, span: tuple[int, int]) -> bool:
     """Return whether the level after an event clearly differs from that before it."""
     size, covariance = _fit_event(component, state, span)[1].moments()
-    return bool(abs(size[-1]) > OTHER_LEVEL_SIGMA * np.sqrt(covariance[-1, -1]))
+    return bool(abs(size[-1]) > state.settings.impossible_sigma * np.sqrt(covariance[-1, -1]))
 
 
 def _transition_evidence(component: Component, state: State, length: int) -> float:

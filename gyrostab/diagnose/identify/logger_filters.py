@@ -18,6 +18,7 @@ from gyrostab.diagnose.predict.filter_response import band_response, is_filter
 from gyrostab.diagnose.predict.linear_model import State, unspread_share
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.sizes import component_size
+from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 
@@ -28,9 +29,6 @@ MIN_LINE_SHARE = 0.5  # of its evidence, that a line must keep with a filter in 
 ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
 GRID_REACH = 0.25  # distance in ln(cutoff) of one place on the grid of filters
 MIN_ELSEWHERE_SHARE = 0.02  # of the probability, from which on other places widen the interval
-TAIL_PROBABILITY = 0.025  # of each end of a 95 % interval
-DISAGREEMENT_NATS = 6.0  # between axes, that chance explains: odds of 400 to 1
-SPECTRUM_ERROR_SHARE = 0.1  # of the evidence, that an error of the spectrum may leave
 
 
 def without_slopes(
@@ -87,8 +85,9 @@ def fits_all_axes(components: Sequence[Component], state: State) -> bool:
     disagreement = 0.5 * float(
         (weight * (share - (weight * share).sum() / weight.sum()) ** 2).sum()
     )
-    return disagreement <= DISAGREEMENT_NATS + SPECTRUM_ERROR_SHARE * sum(
-        max(component.evidence_nats, 0.0) for component in shown
+    evidence = sum(max(component.evidence_nats, 0.0) for component in shown)
+    return disagreement <= (
+        state.settings.reject_nats + state.settings.spectrum_error_share * evidence
     )
 
 
@@ -183,8 +182,8 @@ def _widen_interval(
     if share[~near].sum() < MIN_ELSEWHERE_SHARE:
         return refined
     below, above = share.cumsum(), share[::-1].cumsum()[::-1]
-    low = min(float(value[below >= TAIL_PROBABILITY].min()), mean - NORMAL_95 * sd)
-    high = max(float(value[above >= TAIL_PROBABILITY].max()), mean + NORMAL_95 * sd)
+    low = min(float(value[below >= INTERVAL_TAILS[0]].min()), mean - NORMAL_95 * sd)
+    high = max(float(value[above >= INTERVAL_TAILS[0]].max()), mean + NORMAL_95 * sd)
     return mean, (high - low) / (2.0 * NORMAL_95), low, high
 
 

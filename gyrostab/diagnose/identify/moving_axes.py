@@ -16,38 +16,33 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.progress import Stage, no_stage
 
 __all__ = ["moving_blocks", "unexplained_motion", "without_motion"]
 
 Array = NDArray[np.float64]
-REST_SIGMA = 6.0  # scatter of the means at rest, within which a block is at rest
-MOTION_SIGMA = 100.0  # that a motion must reach to be left out
 NEIGHBOUR_BLOCKS = 2  # to either side, that belong to a motion
-MIN_MOVING_BLOCKS = 2
-MAX_MOVING_SHARE = 2.0 / 3.0  # of the blocks; what moves longer has no rest to compare with
 #: Share of the blocks whose means lie closest together, and the width of the central quarter of a
 #: normal law in standard deviations: 2 * 0.3186.
 CORE_SHARE, CORE_WIDTH_SIGMA = 0.25, 0.637
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal law
-MIN_REST_BLOCKS = 12
 REST_ROUNDS = 3  # in which centre and scatter at rest are refined
 #: Statistics whose columns show how much of a moving mean they explain.
 _FITTED = ("mean", "levels")
 #: Statistics of effects that explain a moving mean in other ways.
 _EXPLAINING = ("wander", "marks", "order", "transfer")
-#: Share of the squared motion that an effect may leave: an error of its form.
-MAX_LEFT_SHARE = 0.1
 _KEPT_STATISTICS = ("mean", "power", "cross")
 
 
-def moving_blocks(blocks: xr.Dataset) -> NDArray[np.bool_]:
+def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> NDArray[np.bool_]:
     """Find the blocks in which an axis moves far beyond its scatter at rest.
 
     Parameters
     ----------
     blocks : xarray.Dataset
         From `reduce_log`.
+    settings : Settings
 
     Returns
     -------
@@ -62,28 +57,29 @@ def moving_blocks(blocks: xr.Dataset) -> NDArray[np.bool_]:
     array([ 0, 24])
     """
     means = blocks["mean"].transpose("axis", "block").values
-    return np.stack([_moving_blocks_of_axis(row) for row in means])
+    return np.stack([_moving_blocks_of_axis(row, settings) for row in means])
 
 
-def _moving_blocks_of_axis(mean: Array) -> NDArray[np.bool_]:
+def _moving_blocks_of_axis(mean: Array, settings: Settings) -> NDArray[np.bool_]:
     """Find the moving blocks of one axis."""
     good = np.isfinite(mean)
     nothing = np.zeros(mean.size, np.bool_)
-    if good.sum() < MIN_REST_BLOCKS:
+    least = max(settings.min_rest_blocks, (1.0 - settings.max_moving_share) * good.sum())
+    if good.sum() < least:
         return nothing
     centre, scale = _find_rest_level(mean[good])
     away = np.abs(mean - centre)
-    rest = good & (away <= REST_SIGMA * scale)
+    rest = good & (away <= settings.rest_sigma * scale)
     for _ in range(REST_ROUNDS):
-        if rest.sum() < max(MIN_REST_BLOCKS, (1.0 - MAX_MOVING_SHARE) * good.sum()):
+        if rest.sum() < least:
             return nothing
         away = np.abs(mean - np.median(mean[rest]))
         scale = MAD_TO_SIGMA * float(np.median(away[rest]))
-        rest = good & (away <= REST_SIGMA * scale)
-    if not scale > 0.0 or not np.nanmax(away) > MOTION_SIGMA * scale:
+        rest = good & (away <= settings.rest_sigma * scale)
+    if not scale > 0.0 or not np.nanmax(away) > settings.motion_sigma * scale:
         return nothing
     is_moving = good & ~rest
-    if is_moving.sum() < MIN_MOVING_BLOCKS:
+    if is_moving.sum() < 2:  # a motion lasts; a single block is an outlier
         return nothing
     place = np.flatnonzero(good)
     near = (
@@ -91,12 +87,8 @@ def _moving_blocks_of_axis(mean: Array) -> NDArray[np.bool_]:
     )  # neighbours among the blocks that are there
     out = nothing.copy()
     out[place] = near
-    return (
-        out
-        if rest.sum() >= (1.0 - MAX_MOVING_SHARE) * good.sum()
-        and np.count_nonzero(~near) >= MIN_REST_BLOCKS
-        else nothing
-    )
+    has_rest = rest.sum() >= least and np.count_nonzero(~near) >= settings.min_rest_blocks
+    return out if has_rest else nothing
 
 
 def _find_rest_level(mean: Array) -> tuple[float, float]:
@@ -109,7 +101,7 @@ def _find_rest_level(mean: Array) -> tuple[float, float]:
 
 
 def unexplained_motion(
-    blocks: xr.Dataset, identified: Iterable[Identification]
+    blocks: xr.Dataset, identified: Iterable[Identification], *, settings: Settings = DEFAULTS
 ) -> NDArray[np.bool_]:
     """Find the moving blocks of axes without an effect that explains the means.
 
@@ -120,6 +112,7 @@ def unexplained_motion(
     ----------
     blocks : xarray.Dataset
     identified : iterable of Identification
+    settings : Settings
 
     Returns
     -------
@@ -134,7 +127,7 @@ def unexplained_motion(
         if component.candidate.statistic in _EXPLAINING
         for axis in component.row
     }
-    moving = moving_blocks(blocks)
+    moving = moving_blocks(blocks, settings=settings)
     for row, axis in enumerate(map(str, blocks["axis"].values)):
         columns = [
             column
@@ -145,14 +138,19 @@ def unexplained_motion(
         if axis in explained_axes or (
             columns
             and _is_explained(
-                blocks["mean"].sel(axis=axis).values, moving[row], np.stack(columns, axis=1)
+                blocks["mean"].sel(axis=axis).values,
+                moving[row],
+                np.stack(columns, axis=1),
+                settings.spectrum_error_share,
             )
         ):
             moving[row] = False
     return moving
 
 
-def _is_explained(mean: Array, moving: NDArray[np.bool_], columns: Array) -> bool:
+def _is_explained(
+    mean: Array, moving: NDArray[np.bool_], columns: Array, max_left_share: float
+) -> bool:
     """Return whether these columns leave next to nothing of a motion."""
     good = np.isfinite(mean)
     if not (good & moving).any():
@@ -163,7 +161,7 @@ def _is_explained(mean: Array, moving: NDArray[np.bool_], columns: Array) -> boo
     left = mean[good] - design @ size
     away = mean[good] - np.median(mean[good & ~moving])
     is_moving = moving[good]
-    return float((left[is_moving] ** 2).sum()) <= MAX_LEFT_SHARE * float(
+    return float((left[is_moving] ** 2).sum()) <= max_left_share * float(
         (away[is_moving] ** 2).sum()
     )
 

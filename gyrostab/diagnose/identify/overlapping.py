@@ -59,6 +59,8 @@ def find_layers_again(
     axes = {axis for component in components for axis in component.row}
     for before, layer in pairwise(split_layers(components)):
         state = replace(condition_on(state, before), weight=weight)
-        again = group_components(gains(candidates_of(layer), state)).get(key, [])
+        again = group_components(gains(candidates_of(layer), state), settings=state.settings).get(
+            key, []
+        )
         out.append([component for component in again if set(component.row) & axes])
     return out

@@ -60,20 +60,14 @@ from gyrostab.diagnose.predict.search import (
     compute_evidence,
     reusable_mean_evidence,
 )
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-__all__ = ["AMBIGUOUS_NATS", "FORM_ERROR_SHARE", "Search"]
+__all__ = ["Search"]
 
-#: An effect whose evidence is this close to that of the best may be meant as well: odds of 20 to 1.
-AMBIGUOUS_NATS = 3.0
-#: Share of the evidence that an error of the form may leave: 10 % of the size, squared.
-FORM_ERROR_SHARE = 0.01
+# Limits of the time of a search; a record has fewer effects.
 MAX_EFFECTS = 10
 #: Lines are counted apart: whatever rotates or switches makes combs of them.
 MAX_LINES = 40
-#: Structure that may be left in time, in addition to errors of the form.
-MAX_LEFT_NATS = 2.0
-#: Share of the evidence of one effect that may be left in time.
-MAX_LEFT_SHARE = 0.1
 #: Powers are weighted anew with the strongest effect when its evidence exceeds so many thresholds.
 REWEIGHT_THRESHOLDS = 3.0
 #: Effects that change the white variance of the means, which the calibration then misjudges.
@@ -103,6 +97,7 @@ class Search:
         Evidence [nats] that noise alone exceeds with the false-alarm probability.
     expected : tuple of Identification
         Effects that the simulation contains as well.
+    settings : Settings
     """
 
     candidates: Sequence[Candidate]
@@ -110,6 +105,7 @@ class Search:
     count_evidence: CountEvidence
     threshold: float
     expected: tuple[Identification, ...] = ()
+    settings: Settings = DEFAULTS
 
     def run(self, start: State) -> tuple[list[Identification], list[Unidentified], State]:
         """Select effects until none passes, then test each again with the others.
@@ -131,7 +127,7 @@ class Search:
         chosen = drop_explained_jumps(
             chosen, lambda some: self._condition(start, some), self._evidence, self.threshold
         )
-        chosen = self._prune(start, without_pulses(chosen))
+        chosen = self._prune(start, without_pulses(chosen, settings=self.settings))
         chosen, identified = self._settle(start, chosen)
         unidentified = [one for one in chosen if isinstance(one, Unidentified)]
         state = self._condition(start, [*identified, *unidentified])
@@ -223,7 +219,7 @@ class Search:
                 or _positive_evidence(strongest) < REWEIGHT_THRESHOLDS * self.threshold
             ):
                 break
-            trial = condition_on(state, find_components(strongest))
+            trial = condition_on(state, find_components(strongest, settings=self.settings))
             again = compute_evidence(
                 weighted, state.blocks, replace(state, weight=trial.weight), self.folds
             )
@@ -242,10 +238,10 @@ class Search:
         rejected : set of str
             Keys that fail it. Instead of both, None when nothing passes.
         """
-        components = merge_lines(group_components(found))
+        components = merge_lines(group_components(found, settings=self.settings))
         required = {
             key: self.threshold
-            + form_error(several, [*self.expected, *chosen], share=FORM_ERROR_SHARE)
+            + form_error(several, [*self.expected, *chosen], settings=self.settings)
             for key, several in components.items()
         }
         for key, several in list(components.items()):
@@ -259,7 +255,7 @@ class Search:
         for key in rivals:
             passed, p_value = passes_time_shift_test(components[key], state, self.folds)
             if passed:
-                least = sum_evidence(components[key]) - AMBIGUOUS_NATS
+                least = sum_evidence(components[key]) - self.settings.ambiguous_nats
                 close = [
                     components[other][0].candidate.effect
                     for other in rivals
@@ -321,7 +317,7 @@ class Search:
     ) -> list[str]:
         """Return the effects that come close to the best, plainer ones first."""
         best = sum_evidence(components[passing[0]])
-        least = best - AMBIGUOUS_NATS - FORM_ERROR_SHARE * best
+        least = best - self.settings.ambiguous_nats - self.settings.form_error_share * best
         rivals = [
             key
             for key in passing
@@ -335,7 +331,9 @@ class Search:
         }
         return sorted(
             rivals,
-            key=lambda key: -sum_evidence(components[key]) + AMBIGUOUS_NATS * is_later[key],
+            key=lambda key: (
+                self.settings.ambiguous_nats * is_later[key] - sum_evidence(components[key])
+            ),
         )
 
     def _without_locked_lines(
@@ -407,7 +405,9 @@ class Search:
             if len(chosen) < 2:
                 break
             state = self._condition(start, chosen, selection)
-            again = group_components(self._evidence(candidates_of(selection.components), state))
+            again = group_components(
+                self._evidence(candidates_of(selection.components), state), settings=self.settings
+            )
             is_leading = (
                 selection is chosen[0]
                 and isinstance(selection, Identification)
@@ -417,7 +417,7 @@ class Search:
             if not is_leading and best < self.threshold:
                 chosen = [other for other in chosen if other is not selection]
             elif isinstance(selection, Identification):
-                reduced = with_axes_of(selection, again)
+                reduced = with_axes_of(selection, again, settings=self.settings)
                 chosen = [reduced if other is selection else other for other in chosen]
         return chosen
 
@@ -450,7 +450,7 @@ class Search:
         ]
         return max(
             identification.threshold,
-            self.threshold + form_error(identification.components, others, share=FORM_ERROR_SHARE),
+            self.threshold + form_error(identification.components, others, settings=self.settings),
         )
 
     def _finish(
@@ -468,7 +468,8 @@ class Search:
             for other, components in group_components(
                 compute_evidence(
                     near, state.blocks, weighted, self.folds, count_evidence=self.count_evidence
-                )
+                ),
+                settings=self.settings,
             ).items()
         }
         again = find_layers_again(
@@ -477,7 +478,7 @@ class Search:
         evidence_nats = (
             sum(max(sum_evidence(layer), 0.0) for layer in again) or identification.evidence_nats
         )
-        least = evidence_nats - AMBIGUOUS_NATS
+        least = evidence_nats - self.settings.ambiguous_nats
         rivals = [
             components[0].candidate.effect
             for other, components in on_axes.items()
@@ -526,7 +527,9 @@ class Search:
             on_axis = _identified_on(kept, "power", axis)
             if not on_axis:
                 continue
-            weak, _ = _find_weak(on_axis, variance_fluctuation(self._condition(start, kept), axis))
+            weak, _ = self._find_weak(
+                on_axis, variance_fluctuation(self._condition(start, kept), axis)
+            )
             if weak:
                 kept = [one for one in kept if one not in weak]
                 rest = self._condition(start, [*kept, *unidentified])
@@ -558,19 +561,31 @@ class Search:
         left = excess_low_frequency_noise(
             with_neighbouring_variants(state, on_axis, axis), axis, self.folds
         )
-        weak, strength = _find_weak(on_axis, left)
-        if not weak and left <= self.threshold + FORM_ERROR_SHARE * strength:
+        weak, strength = self._find_weak(on_axis, left)
+        if not weak and left <= self.threshold + self.settings.form_error_share * strength:
             return kept, []
         names = tuple(one.effect for one in weak)
         unexplained = Unidentified("~red", (axis,), left, self.threshold, names)
         return [one for one in kept if one not in weak], [unexplained]
+
+    def _find_weak(
+        self, identified: Sequence[Identification], left: float
+    ) -> tuple[list[Identification], float]:
+        """Return the effects that explain too little for what they leave [nats], and their sum."""
+        settings = self.settings
+        strength = sum(one.evidence_nats for one in identified)
+        most = settings.component_nats + settings.form_error_share * strength
+        share = settings.spectrum_error_share
+        return [one for one in identified if left > max(most, share * one.evidence_nats)], strength
 
     def _find_fluctuation(
         self, state: State, axis: str, weak: Sequence[Identification]
     ) -> list[Unidentified]:
         """Return what a free noise level explains on an axis, instead of withdrawn effects."""
         free = [one for one in self.candidates if one.effect == "~N(t)"]
-        found = group_components(compute_evidence(free, state.blocks, state, self.folds))
+        found = group_components(
+            compute_evidence(free, state.blocks, state, self.folds), settings=self.settings
+        )
         components = [
             component
             for component in found.get("~N(t)", [])
@@ -609,16 +624,6 @@ def _find_part_of_drift(
         one.evidence_nats for one in unidentified if one.generic == "~bias(t)" and axis in one.axes
     )
     return [one for one in on_axis if not any(one.driver) and one.evidence_nats < drift]
-
-
-def _find_weak(
-    identified: Sequence[Identification], left: float
-) -> tuple[list[Identification], float]:
-    """Return the effects that explain too little for what they leave [nats], and their sum."""
-    strength = sum(one.evidence_nats for one in identified)
-    most = MAX_LEFT_NATS + FORM_ERROR_SHARE * strength
-    weak = [one for one in identified if left > max(most, MAX_LEFT_SHARE * one.evidence_nats)]
-    return weak, strength
 
 
 def _confirmed_components(components: Sequence[Component], state: State) -> list[Component]:

@@ -16,8 +16,6 @@ __all__ = ["is_always_present"]
 _STEADY = ("gauss_markov", "telegraph", "logger_filter")
 RECORD_PARTS = 8  # of the record, that are compared
 MIN_PART_BLOCKS = 3
-DISAGREEMENT_NATS = 8.0  # between the parts, that chance explains: a chi-square of 16 with 7 dof
-FORM_ERROR_SHARE = 0.1  # of the evidence, that other effects may leave
 
 
 def is_always_present(component: Component, state: State) -> bool:
@@ -50,7 +48,10 @@ def is_always_present(component: Component, state: State) -> bool:
     disagreement = 0.5 * float(
         (weight * (size - (weight * size).sum() / max(weight.sum(), 1e-300)) ** 2).sum()
     )
-    return disagreement <= DISAGREEMENT_NATS + FORM_ERROR_SHARE * max(component.evidence_nats, 0.0)
+    return disagreement <= (
+        state.settings.disagreement_nats
+        + state.settings.spectrum_error_share * max(component.evidence_nats, 0.0)
+    )
 
 
 def _fit_part(component: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:

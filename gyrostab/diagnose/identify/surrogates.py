@@ -19,14 +19,13 @@ __all__ = ["TIME_SHIFTS", "passes_time_shift_test"]
 
 #: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
 TIME_SHIFTS = 200
-MAX_CORRELATION = 0.5  # of a surrogate with the true design, above which it is not a control
 MIN_SURROGATES = 20
 SHIFT_RANGE = (0.05, 0.95)  # of the record
 _FOLLOWING_AXES = ("misalignment",)  # effects that follow the means of other axes
 
 
 def passes_time_shift_test(
-    components: Sequence[Component], state: State, folds: xr.DataArray, *, share: float = 0.01
+    components: Sequence[Component], state: State, folds: xr.DataArray
 ) -> tuple[bool, float]:
     """Return whether an effect explains more than time-shifted surrogates of its channel.
 
@@ -38,8 +37,6 @@ def passes_time_shift_test(
         What is in the model without it.
     folds : xarray.DataArray
         From `fold_blocks`.
-    share : float
-        Share of the surrogates that may explain as much.
 
     Returns
     -------
@@ -60,14 +57,12 @@ def passes_time_shift_test(
     )
     real, shifted = 0.0, np.zeros(shifts.size)
     valid = np.ones(shifts.size, np.bool_)
+    limit = state.settings.surrogate_correlation
     for component in own:
         surrogates = [_make_surrogate(component, state, int(shift)) for shift in shifts]
         row = state.axes.index(component.row[0])
         for number, surrogate in enumerate(surrogates):
-            if (
-                surrogate is None
-                or _max_correlation(surrogate, component.variant, row) > MAX_CORRELATION
-            ):
+            if surrogate is None or _max_correlation(surrogate, component.variant, row) > limit:
                 valid[number] = False
         chosen = [
             surrogate if surrogate is not None else component.variant for surrogate in surrogates
@@ -88,7 +83,7 @@ def passes_time_shift_test(
     if valid.sum() < MIN_SURROGATES:
         return True, np.nan
     p_value = float(np.mean(shifted[valid] >= real))
-    return p_value <= share, p_value
+    return p_value <= state.settings.surrogate_share, p_value
 
 
 def _follows_channel(component: Component, state: State) -> bool:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.held_out import LinearModel, noise_columns, with_independent_cells
 from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.reduce.block_statistics import measured, noise_at_orders
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.periodogram import taper
 
 __all__ = [
@@ -62,6 +63,8 @@ class State:
     given : mapping of (str, str) to list of ndarray
         (statistic, row) -> columns in the model with and without a candidate; the row is an axis,
         or the two axes of a pair with a comma between them.
+    settings : Settings
+        What the diagnosis was started with.
     """
 
     blocks: xr.Dataset
@@ -69,6 +72,7 @@ class State:
     weight: Array
     masked: NDArray[np.bool_]
     given: dict[tuple[str, str], list[Array]] = field(default_factory=dict)
+    settings: Settings = DEFAULTS
 
     def with_columns(self, statistic: str, row: str, columns: Sequence[Array]) -> State:
         """Return the state with more given columns."""
@@ -82,10 +86,12 @@ class State:
         return [str(one) for one in self.blocks["axis"].values]
 
 
-def initial_state(blocks: xr.Dataset, baseline: xr.Dataset) -> State:
+def initial_state(
+    blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> State:
     """Return the state in which no effect is named."""
     weight = baseline["spectrum"].transpose("axis", "block", "band").values
-    return State(blocks, baseline, weight, np.zeros(weight.shape[:2], np.bool_))
+    return State(blocks, baseline, weight, np.zeros(weight.shape[:2], np.bool_), settings=settings)
 
 
 def simulate_noise(model: LinearModel, rng: np.random.Generator, count: int) -> LinearModel:

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.result.text import chance_share, next_measurement, summary, without_chance
+from gyrostab.diagnose.settings import Settings
 from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import Effect
@@ -67,6 +68,11 @@ class Diagnosis:
     def mismatches(self) -> list[dict[str, Any]]:
         """Return the places where recording and simulation differ."""
         return list(self.content["mismatches"])
+
+    @property
+    def settings(self) -> Settings:
+        """Return the numbers that decided what is reported."""
+        return Settings(**self.content["settings"])
 
     def to_json(self) -> str:
         """Return the contents as JSON."""

@@ -83,6 +83,7 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
         "baseline": baseline_table(baseline, fit.expected),
         "verdict": decide_verdict(mismatches, fit.identifications.identified, unexplained, held),
         "false_alarm_level": task.level,
+        "settings": task.settings.to_dict(),
         "mismatches": mismatches,
         "effects": effect_tables(fit.fitted, blocks),
         "unexplained": unexplained,

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
-from gyrostab.diagnose.estimate.joint_fit import FORM_ERROR, fit_identifications
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.forward_search import name_effects
@@ -20,6 +20,7 @@ from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.simulate import simulate
 from tests.support.named import COEFFICIENT, nulls, record
 
@@ -93,7 +94,9 @@ def test_intervals_of_rectification_hold_the_true_value(noise_only, size, power)
 
     found = fit_records(noise_only, change, "vibration_rectification", "mean", ("sensitivity",))
     assert 0.90 <= coverage(found, truth) <= 1.0
-    assert np.mean([one.value for one in found]) == pytest.approx(truth, rel=FORM_ERROR)
+    assert np.mean([one.value for one in found]) == pytest.approx(
+        truth, rel=DEFAULTS.size_error_share
+    )
 
 
 @pytest.mark.parametrize("share", [0.2, 1.0])

@@ -180,10 +180,8 @@ def test_a_steady_line_has_no_model_error() -> None:
         identification(component("spectral_line", "line", 900.0, 3)),
         identification(component("shupe", "mean", 400.0)),
     ]
-    assert form_error([component("spectral_line", "line", 20.0, 9)], chosen, share=0.01) == 0.0
-    assert form_error([component("warm_up", "mean", 20.0)], chosen, share=0.01) == pytest.approx(
-        4.0
-    )
+    assert form_error([component("spectral_line", "line", 20.0, 9)], chosen) == 0.0
+    assert form_error([component("warm_up", "mean", 20.0)], chosen) == pytest.approx(4.0)
 
 
 def test_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
@@ -196,9 +194,7 @@ def test_driven_noise_may_leave_a_filter_but_no_other_noise() -> None:
         (driven, "temperature_noise", 2.0),
         (steady, "logger_filter", 2.0),
     ):
-        assert form_error(
-            [component(effect, "power", 17.0)], [chosen], share=0.01
-        ) == pytest.approx(error)
+        assert form_error([component(effect, "power", 17.0)], [chosen]) == pytest.approx(error)
 
 
 @pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])

@@ -1,0 +1,205 @@
+"""Numbers that decide what a diagnosis reports: value, unit and source of each.
+
+Numbers that only set the accuracy or the cost of a computation are local to their modules.
+`benchmarks/settings_sensitivity.py` scales all of them and compares the diagnoses.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+__all__ = ["DEFAULTS", "INTERVAL_TAILS", "Settings"]
+
+#: Probabilities at the ends of all reported intervals; `diagnosis.json` fixes them to 95 %.
+INTERVAL_TAILS = (0.025, 0.975)
+
+
+def _number(value: float, unit: str, meaning: str, source: str) -> Any:
+    """Declare a setting."""
+    return field(default=value, metadata={"unit": unit, "meaning": meaning, "source": source})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Numbers that decide what a diagnosis reports.
+
+    Each field has the metadata ``unit``, ``meaning`` and ``source``: the derivation, the citation
+    or the script that the default comes from. The defaults are in ``DEFAULTS``.
+
+    Raises
+    ------
+    ValueError
+        When a number is negative or not finite.
+
+    Examples
+    --------
+    >>> strict = Settings(ambiguous_nats=4.6)  # odds of 100 to 1
+    >>> strict.ambiguous_nats, strict.reject_nats
+    (4.6, 6.0)
+    """
+
+    component_nats: float = _number(
+        2.0,
+        "nat",
+        "Evidence that an axis must add to be named with the others.",
+        "odds of 7 to 1: ln 7.4",
+    )
+    ambiguous_nats: float = _number(
+        3.0,
+        "nat",
+        "Difference of evidence within which two effects are alternatives, and by which another "
+        "form must be better than a jump or two levels.",
+        "odds of 20 to 1: ln 20 = 3.0 (strong evidence: Kass and Raftery, 1995, "
+        "doi:10.1080/01621459.1995.10476572)",
+    )
+    reject_nats: float = _number(
+        6.0,
+        "nat",
+        "Evidence that rejects the simpler of two forms: one term in place of two, one filter for "
+        "all axes, one point of a grid beside the best.",
+        "odds of 400 to 1: ln 400 = 6.0, the square of the odds of `ambiguous_nats`",
+    )
+    disagreement_nats: float = _number(
+        8.0,
+        "nat",
+        "Half of the chi-square by which the eighths of a record may differ, or spectrum and means "
+        "about B and K.",
+        "chi-square of 16: P = 0.025 with 7 and 0.0003 with 2 degrees of freedom",
+    )
+    form_error_share: float = _number(
+        0.01,
+        "1",
+        "Share of the evidence of an effect that an error of its form may leave to others.",
+        "square of a size error of 10 %: evidence grows with the square of the size",
+    )
+    spectrum_error_share: float = _number(
+        0.1,
+        "1",
+        "Share of the evidence that an error of the spectrum, or of the course in time, may leave.",
+        "square of a size error of 32 %; 0.08 occurs in simulated strong vibration",
+    )
+    size_error_share: float = _number(
+        0.04,
+        "1",
+        "Error of the form of an effect as a share of its size, added to its standard error.",
+        "coverage of the intervals with wrong forms: docs/diagnosis.md, benchmarks/intervals.py",
+    )
+    impossible_sigma: float = _number(
+        3.0,
+        "standard error",
+        "Distance from its allowed range at which a size is impossible, and from the earlier level "
+        "at which the level after an event is another one.",
+        "two-sided P = 0.0027 for a normal error",
+    )
+    visible_sigma: float = _number(
+        2.0,
+        "standard error",
+        "Size of a harmonic of the rotation below which it is dropped.",
+        "two-sided P = 0.046 for a normal error",
+    )
+    surrogate_share: float = _number(
+        0.01,
+        "1",
+        "Share of the time-shifted surrogates that may explain as much as the channel.",
+        "the default false-alarm probability; two of the 200 surrogates",
+    )
+    surrogate_correlation: float = _number(
+        0.5,
+        "1",
+        "Correlation with the channel above which a time-shifted surrogate is not a control.",
+        "such a surrogate has at least 0.25 of the evidence of the channel (the correlation "
+        "squared)",
+    )
+    term_correlation: float = _number(
+        0.999,
+        "1",
+        "Correlation of the errors of two terms above which the data do not separate them.",
+        "standard errors grow by 1 / sqrt(1 - r^2) = 22 over those of one term",
+    )
+    level_correlation: float = _number(
+        0.97,
+        "1",
+        "Correlation of g and g^2 above which the vibration has one level.",
+        "that of values uniform over one octave and more: 0.97 for g from 0 to 1, where "
+        "corr(g, g^2) = sqrt(15) / 4",
+    )
+    moving_power_ratio: float = _number(
+        1.5,
+        "1",
+        "Power over expected power, in any band, above which an axis moves.",
+        "the mean over at least 24 blocks of a band exceeds 1.5 by chance with P = 0.01 "
+        "(chi-square with 48 degrees of freedom)",
+    )
+    min_comb_lines: int = _number(
+        3, "1", "Lines that may be one comb.", "two lines define a spacing; the third tests it"
+    )
+    min_fringe_step: float = _number(
+        6e4,
+        "degree hour-1",
+        "Smallest step that may be a fringe hop.",
+        "one fringe, lambda c / (L D), of 5 km of fibre on a coil of 30 cm at 1.55 um",
+    )
+    min_rotation_share: float = _number(
+        1e-5,
+        "1",
+        "Share of the rotation that an axis must sense for real motion.",
+        "alignment of 10 urad (2 arcsec): no mounting is better",
+    )
+    max_misalignment_share: float = _number(
+        0.02,
+        "1",
+        "Share of the rotation that an axis across it may sense; a larger one is along it.",
+        "sine of 1 degree, a coarse mounting error",
+    )
+    rest_sigma: float = _number(
+        6.0,
+        "standard deviation",
+        "Distance from the level at rest within which the mean of a block is at rest.",
+        "P = 2e-9 for normal noise; wandering means scatter more than their neighbours show",
+    )
+    motion_sigma: float = _number(
+        100.0,
+        "standard deviation",
+        "Distance from the level at rest that an unexplained motion must reach to be left out.",
+        "below it, effects of the instrument occur; a rotation of the tool exceeds it by far",
+    )
+    max_moving_share: float = _number(
+        2.0 / 3.0,
+        "1",
+        "Largest share of the blocks that an axis may move.",
+        "the level at rest is sought in the closest quarter of the means; a third leaves a margin",
+    )
+    min_rest_blocks: int = _number(
+        12,
+        "block",
+        "Blocks at rest that determine level and scatter.",
+        "scatter to 20 %: 1/sqrt(2n)",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{item.name}={value!r}: give a number from 0 up")
+
+    @classmethod
+    def table(cls) -> str:
+        """Return the settings with value, unit, meaning and source as a Markdown table."""
+        rows = [
+            f"| `{item.name}` | {item.default:.4g} | {item.metadata['unit']} | "
+            f"{item.metadata['meaning']} | {item.metadata['source']} |"
+            for item in fields(cls)
+        ]
+        return "\n".join(
+            ["| name | value | unit | meaning | source |", "|---|---|---|---|---|", *rows]
+        )
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the numbers by name."""
+        return asdict(self)
+
+
+DEFAULTS = Settings()

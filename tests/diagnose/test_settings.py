@@ -1,0 +1,43 @@
+"""The settings of the diagnosis: documented, recorded, and without a copy in a module."""
+
+from __future__ import annotations
+
+import ast
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+
+from gyrostab.diagnose.settings import DEFAULTS, Settings
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_page_lists_every_setting_with_its_source() -> None:
+    page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"<!-- table: begin -->\n(.*)\n<!-- table: end -->", page, re.DOTALL)
+    assert table == Settings.table()
+
+
+def test_every_setting_has_unit_meaning_and_source() -> None:
+    assert len(fields(Settings)) < 80
+    for item in fields(Settings):
+        assert all(item.metadata[key].strip() for key in ("unit", "meaning", "source")), item.name
+
+
+def test_every_setting_is_used() -> None:
+    used = {
+        node.attr
+        for path in (ROOT / "gyrostab" / "diagnose").rglob("*.py")
+        if path.name != "settings.py"
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute)
+    }
+    assert {item.name for item in fields(Settings)} <= used
+
+
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+def test_impossible_numbers_are_refused(value: float) -> None:
+    with pytest.raises(ValueError, match="ambiguous_nats"):
+        replace(DEFAULTS, ambiguous_nats=value)
