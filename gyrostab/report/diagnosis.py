@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gyrostab.diagnose.result.diagnosis import Diagnosis, check_diagnosis
+from gyrostab.diagnose.result.content import check_diagnosis
+from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.text import (
     axes_text,
     chance_share,

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import xarray as xr
 
-from gyrostab.diagnose.result.diagnosis import Diagnosis, check_diagnosis, model_text
+from gyrostab.diagnose.result.content import check_diagnosis
+from gyrostab.diagnose.result.diagnosis import Diagnosis, model_text
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.io.datasets import open_dataset, to_netcdf
 from gyrostab.report import write_diagnosis_report

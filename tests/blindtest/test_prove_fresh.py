@@ -18,7 +18,7 @@ import gyrostab
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED
 from gyrostab.blindtest.scenarios.plan import plan_case
 from gyrostab.blindtest.scoring.table import score_table
-from gyrostab.diagnose.result.diagnosis import check_diagnosis
+from gyrostab.diagnose.result.content import check_diagnosis
 
 NUMBER = 5
 

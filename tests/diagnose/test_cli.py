@@ -16,7 +16,7 @@ from gyrostab.diagnose.inputs import parse_quiescent_span
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.result.attribution import _can_show, join_blocks
-from gyrostab.diagnose.result.diagnosis import check_diagnosis
+from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.result.tables import chance_of_gain
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log

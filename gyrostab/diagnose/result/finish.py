@@ -24,7 +24,8 @@ from gyrostab.diagnose.identify.switching import remove_telegraph_bias
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.predict.condition import Component, mask_anomalous_blocks
 from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
-from gyrostab.diagnose.result.diagnosis import HELD_OUT, SCHEMA, Diagnosis, check_diagnosis, plain
+from gyrostab.diagnose.result.content import HELD_OUT, SCHEMA, check_diagnosis
+from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
 from gyrostab.diagnose.result.held_out import held_out, select_forecast_start
 from gyrostab.diagnose.result.size_gate import keep_supported
 from gyrostab.diagnose.result.surfaces import make_surfaces

@@ -75,7 +75,7 @@ def decide_verdict(
     unexplained: Iterable[int],
     held: Mapping[str, Any],
 ) -> str:
-    """Choose one of `gyrostab.diagnose.result.diagnosis.VERDICTS`.
+    """Choose one of `gyrostab.diagnose.result.content.VERDICTS`.
 
     Parameters
     ----------

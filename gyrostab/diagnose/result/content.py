@@ -1,0 +1,228 @@
+"""Contents of `diagnosis.json` as pydantic models, and their check.
+
+``python -m gyrostab.diagnose.result.content > docs/diagnosis.schema.json`` writes the JSON Schema.
+Further keys are allowed anywhere.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
+
+from gyrostab.errors import SchemaError
+
+__all__ = ["HELD_OUT", "MISMATCH_VIEWS", "SCHEMA", "VERDICTS", "Content", "check_diagnosis"]
+
+Verdict = Literal["no mismatch", "explained", "partly explained", "unknown"]
+View = Literal["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"]
+VERDICTS: tuple[str, ...] = get_args(Verdict)
+MISMATCH_VIEWS: tuple[str, ...] = get_args(View)
+SCHEMA = "gyrostab.diagnosis/1"
+
+
+def _check_time(text: str) -> str:
+    try:
+        np.datetime64(text.removesuffix("Z"))
+    except ValueError:
+        raise ValueError("expected a time in ISO 8601") from None
+    return text
+
+
+Time = Annotated[
+    str, AfterValidator(_check_time), WithJsonSchema({"type": "string", "format": "date-time"})
+]
+Span = Annotated[list[Time], Field(min_length=2, max_length=2)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+
+
+class Recording(_Table):
+    """What was recorded."""
+
+    files: list[str]
+    axes: list[str]
+    start: Time
+    end: Time
+    sampling_rate_hz: float
+    channels: list[str]
+    missing_share: float
+
+
+class NoiseEntry(_Table):
+    """A noise coefficient of an axis; null: the record does not determine it."""
+
+    value: float
+    stderr: float | None
+    unit: str
+
+
+class Expected(_Table):
+    """An effect of the model whose size is that of the recording."""
+
+    name: str
+    axes: list[str]
+    statement: str
+
+
+class Baseline(_Table):
+    """What the recording was compared with."""
+
+    source: Literal["calibrated", "model", "simulation"]
+    noise: dict[str, dict[Literal["Q", "N", "B", "K", "R"], NoiseEntry]]
+    calibrated_on: list[Span]
+    expected: list[Expected] = []
+
+
+class Mismatch(_Table):
+    """Where recording and simulation differ."""
+
+    id: int
+    view: View
+    axes: list[str]
+    start: Time
+    end: Time
+    tau_min_s: float | None
+    tau_max_s: float | None
+    ratio: float | None
+    p_value: Annotated[float, Field(ge=0.0, le=1.0)]
+    explained_by: list[str]
+    statement: str
+
+
+class Size(_Table):
+    """A fitted parameter of an effect."""
+
+    value: float | None
+    stderr: float | None
+    low: float | None
+    high: float | None
+    unit: str
+
+
+class HeldOutGain(_Table):
+    """What an effect gains on held-out data."""
+
+    nats: float
+    stderr: float | None
+    threshold: float
+
+
+class NamedEffect(_Table):
+    """An effect that explains mismatches."""
+
+    name: str
+    axes: list[str]
+    driver: str | None
+    intervals: list[Span]
+    parameters: dict[str, Size]
+    held_out_gain: HeldOutGain
+    alternatives: list[str]
+    statement: str
+
+
+class NotFound(_Table):
+    """An effect that was not seen."""
+
+    upper_limit: float | None
+    unit: str | None
+    reason: str
+
+
+class UnusedChannel(_Table):
+    """A channel that was not used."""
+
+    name: str
+    reason: str
+
+
+class HeldOut(_Table):
+    """Evidence on held-out data."""
+
+    blocks: int
+    log_likelihood_gain: float | None
+    stderr: float | None
+    misfit_before: float | None
+    misfit_after: float | None
+    coverage95_before: float | None
+    coverage95_after: float | None
+    forecast_gain: float | None
+
+
+class Content(_Table):
+    """Contents of `diagnosis.json`."""
+
+    schema_: Annotated[Literal["gyrostab.diagnosis/1"], Field(alias="schema")]
+    recording: Recording
+    baseline: Baseline
+    verdict: Verdict
+    false_alarm_level: float
+    mismatches: list[Mismatch]
+    effects: list[NamedEffect]
+    unexplained: list[int]
+    not_found: dict[str, NotFound]
+    unused_channels: list[UnusedChannel] = []
+    held_out: HeldOut
+    seconds: float
+
+    @model_validator(mode="after")
+    def _check_references(self) -> Content:
+        numbers = [region.id for region in self.mismatches]
+        if len(set(numbers)) < len(numbers):
+            raise ValueError(f"the ids of the mismatches are not unique: {numbers}")
+        names = {effect.name for effect in self.effects}
+        for place, region in enumerate(self.mismatches):
+            if stray := [name for name in region.explained_by if name not in names]:
+                raise ValueError(
+                    f"mismatches[{place}].explained_by lists {stray[0]!r}, "
+                    "which is not among the effects"
+                )
+        if unknown := [number for number in self.unexplained if number not in numbers]:
+            raise ValueError(f"unexplained lists mismatch {unknown[0]}, which does not exist")
+        return self
+
+
+#: Keys of the held-out evidence.
+HELD_OUT = tuple(HeldOut.model_fields)
+
+
+def check_diagnosis(content: Mapping[str, Any]) -> None:
+    """Raise `SchemaError`, naming the place, unless `content` is that of a `diagnosis.json`.
+
+    Examples
+    --------
+    >>> check_diagnosis({"schema": "gyrostab.diagnosis/1"})
+    Traceback (most recent call last):
+    gyrostab.errors.SchemaError: diagnosis: recording is missing
+    """
+    try:
+        Content.model_validate(content)
+    except ValidationError as invalid:
+        error = invalid.errors(include_url=False)[0]
+        place = "".join(
+            f"[{key}]" if isinstance(key, int) else f".{key}" for key in error["loc"]
+        ).removeprefix(".")
+        message = error["msg"].removeprefix("Value error, ")
+        if error["type"] == "missing":
+            message = f"{place} is missing"
+        elif place:
+            message = message.replace("Input should be", "expected")
+            message = f"{place} is {error['input']!r}, {message}"
+        raise SchemaError(f"diagnosis: {message}") from invalid
+
+
+if __name__ == "__main__":
+    print(json.dumps(Content.model_json_schema(), indent=1))
