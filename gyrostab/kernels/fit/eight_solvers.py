@@ -1,6 +1,6 @@
 """Linear algebra of eight small problems at once: elimination, non-negative least squares.
 
-Matrices and vectors are arrays of `gyrostab.kernels.fit.eights`; element (i, j) of a matrix of w
+Matrices and vectors are arrays of `gyrostab.kernels.fit.lanes`; element (i, j) of a matrix of w
 columns is row ``w i + j``. A set of terms is one row per term: above one half in the places whose
 problem has the term. What `gyrostab.kernels.regression.nonnegative` does for one problem is done
 here for eight that differ in their sets.
@@ -11,7 +11,7 @@ from __future__ import annotations
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.fit.eights import PLACES, put, root, take, where_above
+from gyrostab.kernels.fit.lanes import PLACES, put, root, take, where_above
 
 __all__ = [
     "back_substitute",

@@ -3,7 +3,7 @@
 The Allan variance is linear in the squared coefficients, so a window is ``y = X s + e`` with ``s >=
 0``. Overlapping estimates at neighbouring averaging factors share data; the covariance of e follows
 from the noise itself (`gyrostab.kernels.fit.covariance`), so it is taken from the fit and iterated.
-Eight windows are fitted at once (`gyrostab.kernels.fit.eights`); the fit of a window does not
+Eight windows are fitted at once (`gyrostab.kernels.fit.lanes`); the fit of a window does not
 depend on the others.
 """
 
@@ -23,7 +23,7 @@ from gyrostab.kernels.fit.eight_solvers import (
     solve_nonnegative_eights,
     solve_terms,
 )
-from gyrostab.kernels.fit.eights import PLACES, eights, put, root, take, where_above
+from gyrostab.kernels.fit.lanes import PLACES, eights, put, root, take, where_above
 from gyrostab.kernels.fit.mixture import (
     DATA,
     PRODUCTS,
@@ -34,7 +34,6 @@ from gyrostab.kernels.fit.mixture import (
     observe,
     root_squares,
     root_units,
-    total_variance,
     variance_parts,
 )
 
@@ -399,24 +398,20 @@ def _variance_growth(a, apart, cells, fit, room, tables, found):  # type: ignore
 @njit(**INNER)
 def _joint_growth(a, trial, cells, room, tables, parts):  # type: ignore[no-untyped-def]
     """Treat quantization noise that counts as white (see `observe`) as one term with the noise."""
-    seen, inverse, units, roots, weights = (
-        cells.seen,
-        cells.inverse,
-        room.units,
-        room.roots,
-        room.weights,
-    )
+    seen, roots, spread = cells.seen, room.roots, room.scratch[8:11]
     joint = take(cells.facts, 5)
     if a == 1:
         joint = where_above(take(trial, 0), 0.0, joint, 0.0)
     null = take(parts, 0)
     put(trial, a, 1.0)
-    root_squares(trial, seen, units, roots)
-    both = total_variance(roots, inverse, tables, weights)
+    root_squares(trial, seen, room.units, roots)
+    variance_parts(roots, a, room.units, cells.inverse, tables, room.weights, spread)
+    both = take(spread, 0)
     for b in range(5):
         put(trial, b, 1.0 if a == b else 0.0)
-    root_squares(trial, seen, units, roots)
-    alone = total_variance(roots, inverse, tables, weights)
+    root_squares(trial, seen, room.units, roots)
+    variance_parts(roots, a, room.units, cells.inverse, tables, room.weights, spread)
+    alone = take(spread, 0)
     put(parts, 1, where_above(joint, 0.0, both - null - alone, take(parts, 1)))
     put(parts, 2, where_above(joint, 0.0, alone, take(parts, 2)))
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.fit.eights import number, put, root, take, where_above
+from gyrostab.kernels.fit.lanes import number, put, root, take, where_above
 
 __all__ = [
     "DATA",
@@ -23,7 +23,6 @@ __all__ = [
     "observe",
     "root_squares",
     "root_units",
-    "total_variance",
     "variance_parts",
 ]
 
@@ -171,57 +170,32 @@ def _sum_products(tables, at, a0, a1, a2, a3, a4):  # type: ignore[no-untyped-de
 
 
 @njit(**INNER)
+def _multiply_roots(roots, i, j):  # type: ignore[no-untyped-def]
+    """Multiply the roots of two cells, term by term."""
+    return (
+        take(roots, 5 * i) * take(roots, 5 * j),
+        take(roots, 5 * i + 1) * take(roots, 5 * j + 1),
+        take(roots, 5 * i + 2) * take(roots, 5 * j + 2),
+        take(roots, 5 * i + 3) * take(roots, 5 * j + 3),
+        take(roots, 5 * i + 4) * take(roots, 5 * j + 4),
+    )
+
+
+@njit(**INNER)
+def _find_share(inverse, i, j):  # type: ignore[no-untyped-def]
+    """Find the share of two cells: the poorer one uses a part of what the richer one uses."""
+    own, other = take(inverse, i), take(inverse, j)
+    return where_above(own, other, other, own)
+
+
+@njit(**INNER)
 def covariance_rows(roots, inverse, tables, out, width):  # type: ignore[no-untyped-def]
     """Covariance of the cells, on and above the diagonal of `out`, row ``width i + j``."""
     n = inverse.shape[0]
     for i in range(n):
-        s0, s1, s2 = take(roots, 5 * i), take(roots, 5 * i + 1), take(roots, 5 * i + 2)
-        s3, s4, share = take(roots, 5 * i + 3), take(roots, 5 * i + 4), take(inverse, i)
         for j in range(i, n):
-            a0, a1, a2 = (
-                s0 * take(roots, 5 * j),
-                s1 * take(roots, 5 * j + 1),
-                s2 * take(roots, 5 * j + 2),
-            )
-            a3, a4, other = (
-                s3 * take(roots, 5 * j + 3),
-                s4 * take(roots, 5 * j + 4),
-                take(inverse, j),
-            )
-            total = _sum_products(tables, PRODUCTS * (i * n + j), a0, a1, a2, a3, a4)
-            put(
-                out, width * i + j, total * where_above(share, other, other, share)
-            )  # the poorer cell uses a part of what the richer uses
-
-
-@njit(**INNER)
-def total_variance(roots, inverse, tables, weights):  # type: ignore[no-untyped-def]
-    """Variance of the cells added with `weights`, their covariance as in `covariance_rows`."""
-    n = inverse.shape[0]
-    total = take(weights, 0) * 0.0
-    for i in range(n):
-        s0, s1, s2 = take(roots, 5 * i), take(roots, 5 * i + 1), take(roots, 5 * i + 2)
-        s3, s4, share = take(roots, 5 * i + 3), take(roots, 5 * i + 4), take(inverse, i)
-        line = total * 0.0
-        for j in range(i, n):
-            a0, a1, a2 = (
-                s0 * take(roots, 5 * j),
-                s1 * take(roots, 5 * j + 1),
-                s2 * take(roots, 5 * j + 2),
-            )
-            a3, a4, other = (
-                s3 * take(roots, 5 * j + 3),
-                s4 * take(roots, 5 * j + 4),
-                take(inverse, j),
-            )
-            weight = (
-                take(weights, j)
-                * where_above(share, other, other, share)
-                * (1.0 if i == j else 2.0)
-            )
-            line = line + _sum_products(tables, PRODUCTS * (i * n + j), a0, a1, a2, a3, a4) * weight
-        total = total + line * take(weights, i)
-    return total
+            total = _sum_products(tables, PRODUCTS * (i * n + j), *_multiply_roots(roots, i, j))
+            put(out, width * i + j, total * _find_share(inverse, i, j))
 
 
 @njit(**INNER)
@@ -231,39 +205,17 @@ def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: 
     `roots` are those of the noise without the term, `units` those of `root_units`. To the rows of
     `out` go the variance without the term, its growth per unit, and per unit squared.
     """
-    n = inverse.shape[0]
-    t0, t1, t2, t3, t4, itself = (
-        _TABLE[term][0],
-        _TABLE[term][1],
-        _TABLE[term][2],
-        _TABLE[term][3],
-        _TABLE[term][4],
-        _TABLE[term][term],
-    )
-    scatters = 0.0 if term == 4 else 1.0
+    n, table = inverse.shape[0], _TABLE[term]
+    t0, t1, t2, t3, t4, itself = table[0], table[1], table[2], table[3], table[4], table[term]
     null = take(weights, 0) * 0.0
     linear, square = null, null
     for i in range(n):
-        s0, s1, s2 = take(roots, 5 * i), take(roots, 5 * i + 1), take(roots, 5 * i + 2)
-        s3, s4, share = take(roots, 5 * i + 3), take(roots, 5 * i + 4), take(inverse, i)
         unit, factor = take(units, 5 * i + term), take(weights, i)
         for j in range(i, n):
             at = PRODUCTS * (i * n + j)
-            a0, a1, a2 = (
-                s0 * take(roots, 5 * j),
-                s1 * take(roots, 5 * j + 1),
-                s2 * take(roots, 5 * j + 2),
-            )
-            a3, a4, other = (
-                s3 * take(roots, 5 * j + 3),
-                s4 * take(roots, 5 * j + 4),
-                take(inverse, j),
-            )
+            a0, a1, a2, a3, a4 = _multiply_roots(roots, i, j)
             weight = (
-                factor
-                * take(weights, j)
-                * where_above(share, other, other, share)
-                * (1.0 if i == j else 2.0)
+                factor * take(weights, j) * _find_share(inverse, i, j) * (1.0 if i == j else 2.0)
             )
             null = null + _sum_products(tables, at, a0, a1, a2, a3, a4) * weight
             step = unit * take(units, 5 * j + term)
@@ -281,7 +233,7 @@ def variance_parts(roots, term, units, inverse, tables, weights, out):  # type: 
             square = square + step * step * number(tables, at + itself) * weight
     put(out, 0, null)
     put(out, 1, linear)
-    put(out, 2, square * scatters)
+    put(out, 2, square * (0.0 if term == 4 else 1.0))
 
 
 @njit(**INNER)
