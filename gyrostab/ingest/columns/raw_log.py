@@ -295,9 +295,9 @@ class RawLogBuilder:
         if self.bad_index and self.low <= self.high:
             rows = np.concatenate(self.bad_index)
             written = take_rows(stamps, rows)
-            set_rows(
-                stamps, rows[(written < self.low) | (written > self.high)], NAT
-            )  # a number in an unreadable row is not a stamp
+            outside = (written < self.low) | (written > self.high)
+            # a number in an unreadable row is not a stamp
+            set_rows(stamps, rows[outside & (written != NAT)], NAT)
         return as_lazy(stamps.view("datetime64[ns]"))
 
     def _make_dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:

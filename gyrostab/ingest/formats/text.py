@@ -1,14 +1,12 @@
 """Text logs: separated by comma, semicolon, tab or blanks, plain or gzipped, in bounded memory.
 
-Plain rows are parsed by a kernel, several blocks of the file in parallel. At a row that the kernel
-does not know, a piece of text takes another path: a short piece is parsed cell by cell, a long one
-by pyarrow, and cell by cell only if that fails. Consecutive pieces grow in length.
+Several blocks of the file are parsed in parallel, by a kernel; rows that the kernel does not know
+are parsed cell by cell (`gyrostab.ingest.text.cells`).
 """
 
 from __future__ import annotations
 
 import gzip
-import re
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -16,7 +14,7 @@ from dataclasses import replace
 from functools import partial
 from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any, NamedTuple, cast
+from typing import IO, cast
 
 import numpy as np
 import xarray as xr
@@ -28,16 +26,8 @@ from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.ingest.text.cells import (
-    VOID_CELLS,
-    CellTypes,
-    parse_cells,
-    parse_fast,
-    parse_plain,
-    stamp_types,
-)
+from gyrostab.ingest.text.cells import VOID_CELLS, BlockParser
 from gyrostab.ingest.text.layout import (
-    BLANK,
     Layout,
     find_layout,
     is_number,
@@ -54,9 +44,6 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 #: fewer lines than the third.
 HEAD_BYTES, MAX_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
-PIECE_BYTES = 2**18
-LINE_BYTES = 2**8
-SHORT_BYTES = 2**13
 PART_BYTES = 2**16
 COUNTED_BYTES = 2**24
 
@@ -110,17 +97,13 @@ def read(
     layout, plan = _plan_file(path, options)
     options = options if plan.rate is None else replace(options, rate=plan.rate)
     builder = RawLogBuilder(plan.check(), options, limit=limit)
-    cell_types = CellTypes(layout, plan, options, stamp_types(layout, plan))
+    parse = partial(_parse_block, parser=BlockParser(layout, plan, options), builder=builder)
     line = layout.line
-    for parts in map_in_order(
-        partial(_parse_block, cell_types=cell_types, builder=builder),
-        _read_blocks(path, layout.offset),
-    ):
+    for converted, block, starts in map_in_order(parse, _read_blocks(path, layout.offset)):
         if stop is not None and stop():
             raise CancelledError
-        for part in parts:
-            builder.add(part.taken, partial(_line_names, part, line))
-            line += part.lines
+        builder.add(converted, partial(_line_names, block, starts, line))
+        line += block.count(b"\n")
     return builder.finish(layout.notes)
 
 
@@ -147,7 +130,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         rising=partial(_is_rising, layout),
         above=layout.above,
         is_filled=lambda column: any(
-            row[column].strip() not in VOID_CELLS
+            row[column].strip().lower() not in VOID_CELLS
             for row in layout.samples
             if len(row) == layout.width
         ),
@@ -272,88 +255,15 @@ def _read_blocks(path: Path, offset: int) -> Iterator[bytes]:
             yield rest + b"\n"
 
 
-class _ParsedPart(NamedTuple):
-    """Rows of a block that were parsed in one way, and their text, to find line numbers."""
-
-    taken: ConvertedBlock
-    lines: int
-    block: bytes
-    span: slice
+def _parse_block(
+    block: bytes, parser: BlockParser, builder: RawLogBuilder
+) -> tuple[ConvertedBlock, bytes, NDArray[np.int64]]:
+    values, stamps, words, starts = parser.parse(block)
+    return builder.prepare(values, stamps, words=words), block, starts
 
 
-def _parse_block(block: bytes, cell_types: CellTypes, builder: RawLogBuilder) -> list[_ParsedPart]:
-    """Parse one block."""
-    parts: list[_ParsedPart] = []
-    start, reach, left = 0, LINE_BYTES, _count_lines(block, slice(None))
-    while start < len(block):
-        (values, stamps), stop = parse_plain(block, start, left, cell_types)
-        if stop > start:
-            lines = left if stop == len(block) else _count_lines(block, slice(start, stop))
-            parts.append(
-                _ParsedPart(builder.prepare(values, stamps), lines, block, slice(start, stop))
-            )
-            left -= lines
-        if stop == len(block):
-            break
-        reach = LINE_BYTES if stop - start > PIECE_BYTES else min(4 * reach, PIECE_BYTES)
-        start = block.find(b"\n", min(stop + reach, len(block) - 1)) + 1
-        parts.append(
-            _parse_piece(
-                _clean_lines(block[stop:start], cell_types.layout.separator), cell_types, builder
-            )
-        )
-        left -= parts[-1].lines
-    return parts
-
-
-def _count_lines(block: bytes, span: slice) -> int:
-    return int(np.count_nonzero(np.frombuffer(block, dtype=np.uint8)[span] == 10))
-
-
-def _parse_piece(piece: bytes, cell_types: CellTypes, builder: RawLogBuilder) -> _ParsedPart:
-    """Parse a piece in which at least one row is not plain."""
-    lines = piece.count(b"\n")
-    parsed = parse_fast(piece, cell_types) if len(piece) > SHORT_BYTES else None
-    if parsed is not None:
-        rows = _count_rows(*parsed)
-        if (
-            rows == lines
-            or b'"' not in piece
-            or rows == sum(1 for text in piece.split(b"\n") if text.strip())
-        ):
-            return _ParsedPart(
-                builder.prepare(*parsed), lines, piece, slice(None)
-            )  # otherwise an unmatched quote hides line ends
-    values, stamps, words = parse_cells(piece, cell_types)
-    return _ParsedPart(builder.prepare(values, stamps, words=words), lines, piece, slice(None))
-
-
-def _count_rows(values: dict[int, NDArray[np.float64]], stamps: NDArray[np.int64] | None) -> int:
-    return len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
-
-
-def _line_names(part: _ParsedPart, first: int, rows: Sequence[int]) -> list[str]:
-    if part.taken.rows == part.lines:
-        return [f"line {first + row}" for row in rows]
-    tidy = _clean_lines(part.block[part.span], ",")
-    filled = [number for number, text in enumerate(tidy.split(b"\n"), first) if text.strip()]
-    return [f"line {filled[row]}" for row in rows]
-
-
-def _clean_lines(block: bytes, separator: str) -> bytes:
-    """Blank out comment lines (line numbers stay) and, if blanks separate, reduce runs to one."""
-    if b"#" in block or b"%" in block:
-        block = re.sub(rb"(?m)^[ \t]*[#%][^\n]*", b"", block)
-    if separator != BLANK:
-        return block
-    data: NDArray[Any] = np.frombuffer(
-        block.replace(b"\t", b" ").replace(b"\r", b""), dtype=np.uint8
-    )
-    blank, end = data == 32, data == 10
-    drop = np.zeros(len(data), dtype=bool)
-    drop[1:] = blank[1:] & (blank[:-1] | end[:-1])
-    drop[:1] = blank[:1]
-    kept = data[~drop]
-    trailing = np.zeros(len(kept), dtype=bool)
-    trailing[:-1] = (kept[:-1] == 32) & (kept[1:] == 10)
-    return kept[~trailing].tobytes()
+def _line_names(
+    block: bytes, starts: NDArray[np.int64], first: int, rows: Sequence[int]
+) -> list[str]:
+    above = (block.count(b"\n", 0, int(starts[row])) for row in rows)
+    return [f"line {first + lines}" for lines in above]

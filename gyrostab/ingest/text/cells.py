@@ -1,281 +1,146 @@
-"""Parse text cells to numbers and stamps, with a kernel, with pyarrow, or cell by cell."""
+"""Parse blocks of text rows: plain rows with a kernel, all others cell by cell."""
 
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.stamps import NAT, TimeUnit, cells_to_ns, integers_to_ns
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, integers_to_ns
 from gyrostab.ingest.options import ReadOptions
-from gyrostab.ingest.text.layout import BLANK, Layout, is_number, split_line
+from gyrostab.ingest.text.layout import BLANK, Layout, split_line
 
-__all__ = ["VOID_CELLS", "CellTypes", "parse_cells", "parse_fast", "parse_plain", "stamp_types"]
+__all__ = ["VOID_CELLS", "BlockParser", "ParsedBlock"]
 
-#: Cells without a value; other text is unreadable.
-VOID_CELLS = ("", "nan", "NaN", "NAN", "-nan", "null", "NULL", "NA", "N/A", "None")
-_VOID_WORDS = frozenset(word.lower() for word in VOID_CELLS)
-
-Parsed = tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None]
+#: Cells without a value, in lower case; other text is unreadable. The kernel knows them too.
+VOID_CELLS = frozenset(("", "nan", "-nan", "null", "na", "n/a", "none"))
 
 
-@dataclass
-class CellTypes:
-    """Types of the columns of one file; `stamp` is the index in `stamp_types` to try first."""
+class ParsedBlock(NamedTuple):
+    """Rows of a block of text.
 
-    layout: Layout
-    plan: Plan
-    options: ReadOptions
-    stamp_types: tuple[Any, ...]
-    stamp: int = 0
-    sources: list[int] = field(init=False)
-    gyro: frozenset[int] = field(init=False)
-    time: int | None = field(init=False)
-    digits: int = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.sources = [column.source for column in self.plan.columns if column.role != "time"]
-        self.gyro = frozenset(column.source for column in self.plan.of("gyro"))
-        self.time = self.plan.time.source if self.plan.time else None
-        unit = self.unit
-        self.digits = (
-            unit.digits if unit is not None and unit.digits is not None and unit.digits <= 9 else 0
-        )
-
-    @property
-    def unit(self) -> TimeUnit | None:
-        """Unit of a numeric time column, None for ISO 8601."""
-        return self.plan.time.time_unit if self.plan.time else None
-
-
-def parse_plain(block: bytes, start: int, rows: int, cell_types: CellTypes) -> tuple[Parsed, int]:
-    """Parse up to `rows` plain rows from byte `start` on; also return where they end."""
-    from gyrostab.kernels.encoding.rows import BLANKS, ISO, NUMBER, NUMERIC_TIME, SKIPPED, read_rows
-
-    layout = cell_types.layout
-    roles = np.full(layout.width, SKIPPED, dtype=np.int64)
-    roles[cell_types.sources] = NUMBER
-    if cell_types.time is not None:
-        roles[cell_types.time] = NUMERIC_TIME if cell_types.unit else ISO
-    separator = BLANKS if layout.separator == BLANK else ord(layout.separator)
-    point = ord("," if layout.decimal_comma else ".")
-    text = np.frombuffer(block, dtype=np.uint8)
-    numbers, stamps, stop = read_rows(
-        text, start, roles, separator=separator, point=point, digits=cell_types.digits, rows=rows
-    )
-    values = dict(zip(sorted(cell_types.sources), numbers, strict=True))
-    return (values, None if cell_types.time is None else _since_epoch(stamps, cell_types)), stop
-
-
-def _since_epoch(counts: NDArray[np.int64], cell_types: CellTypes) -> NDArray[np.int64]:
-    """Convert counts of nanoseconds or of a non-decimal unit to stamps [ns since 1970]."""
-    unit = cell_types.unit
-    if unit is None:
-        return counts
-    if unit.digits is None or unit.ns != 10**cell_types.digits:
-        return np.where(
-            counts == NAT, NAT, integers_to_ns(counts, unit, cell_types.options.epoch_ns)
-        )
-    zero = cell_types.options.epoch_ns if unit.epoch is None else unit.epoch
-    return (
-        counts
-        if zero == 0
-        else np.where((counts != NAT) & _sum_fits(counts, zero), counts + np.int64(zero), NAT)
-    )
-
-
-def stamp_types(layout: Layout, plan: Plan) -> tuple[Any, ...]:
-    """Return the pyarrow types to try for the time column, fastest first; all are exact.
-
-    Whole numbers are int64. Decimals are decimal128 with digits down to a nanosecond, then with
-    more digits, for texts like ``0.35000000000000003``. Without a suitable type the time column is
-    parsed cell by cell.
-    """
-    import pyarrow as pa
-
-    time = plan.time
-    if time is None:
-        return (None,)
-    cells = [row[time.source] for row in layout.samples if len(row) == layout.width]
-    if time.time_unit is None:
-        return (pa.timestamp("ns"), pa.timestamp("ns", tz="UTC"))
-    digits = time.time_unit.digits
-    integer = (
-        (pa.int64(),)
-        if all(cell.strip().isdigit() or not is_number(cell) for cell in cells)
-        else ()
-    )
-    if digits is None or digits > 9:
-        return integer
-    return (*integer, pa.decimal128(38, digits), pa.decimal128(38, digits + 11))
-
-
-def parse_fast(piece: bytes, cell_types: CellTypes) -> Parsed | None:
-    """Parse a block with pyarrow; None if any cell is not a number, void or expected stamp."""
-    import pyarrow as pa
-
-    if cell_types.time is not None and not cell_types.stamp_types:
-        return None
-    for attempt in range(cell_types.stamp, len(cell_types.stamp_types)):
-        try:
-            table = _read_table(piece, cell_types, cell_types.stamp_types[attempt])
-        except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
-            continue
-        cell_types.stamp = attempt
-        values = {source: _to_floats(table.column(str(source))) for source in cell_types.sources}
-        stamps = (
-            None
-            if cell_types.time is None
-            else _table_stamps(table.column(str(cell_types.time)), cell_types)
-        )
-        return values, stamps
-    return None
-
-
-def _read_table(piece: bytes, cell_types: CellTypes, stamp_type: Any) -> Any:
-    import pyarrow as pa
-    from pyarrow import csv as arrow_csv
-
-    layout = cell_types.layout
-    types = {str(source): pa.float64() for source in cell_types.sources}
-    if cell_types.time is not None:
-        types[str(cell_types.time)] = stamp_type
-    return arrow_csv.read_csv(
-        pa.BufferReader(piece),
-        read_options=arrow_csv.ReadOptions(
-            column_names=[str(index) for index in range(layout.width)]
-        ),
-        parse_options=arrow_csv.ParseOptions(delimiter=layout.separator),
-        convert_options=arrow_csv.ConvertOptions(
-            column_types=types,
-            include_columns=list(types),
-            null_values=list(VOID_CELLS),
-            check_utf8=False,
-            decimal_point="," if layout.decimal_comma else ".",
-        ),
-    )
-
-
-def _to_floats(column: Any) -> NDArray[np.float64]:
-    parts = [chunk.to_numpy(zero_copy_only=False) for chunk in column.chunks]
-    return np.concatenate(parts) if parts else np.empty(0)
-
-
-def _table_stamps(column: Any, cell_types: CellTypes) -> NDArray[np.int64]:
-    import pyarrow as pa
-
-    kind = column.type
-    if pa.types.is_decimal(kind):
-        digits = cell_types.unit.digits  # type: ignore[union-attr]
-        if kind.scale != digits:
-            import pyarrow.compute as compute
-
-            column = compute.round(column, ndigits=digits).cast(pa.decimal128(38, digits))
-    parts = [_chunk_stamps(chunk, cell_types) for chunk in column.chunks]
-    return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
-
-
-def _chunk_stamps(chunk: Any, cell_types: CellTypes) -> NDArray[np.int64]:
-    import pyarrow as pa
-
-    unit = cell_types.unit
-    valid = (
-        np.ones(len(chunk), dtype=bool)
-        if chunk.null_count == 0
-        else chunk.is_valid().to_numpy(zero_copy_only=False)
-    )
-    buffer = chunk.buffers()[1]
-    if pa.types.is_decimal(chunk.type):
-        words = np.frombuffer(buffer, dtype=np.int64)[2 * chunk.offset :][: 2 * len(chunk)].reshape(
-            -1, 2
-        )
-        low, high = words[:, 0], words[:, 1]
-        valid = valid & (high == low >> 63)
-        zero = cell_types.options.epoch_ns if unit is None or unit.epoch is None else unit.epoch
-        return np.where(valid & _sum_fits(low, zero), low + np.int64(zero), NAT)
-    counts = np.frombuffer(buffer, dtype=np.int64)[chunk.offset :][: len(chunk)]
-    if unit is not None:
-        counts = integers_to_ns(counts, unit, cell_types.options.epoch_ns)
-    return np.where(valid, counts, NAT)
-
-
-def _sum_fits(counts: NDArray[np.int64], zero: int) -> NDArray[np.bool_]:
-    limit = 2**63 - 1 - abs(zero)
-    return (counts <= limit) & (counts >= -limit)
-
-
-def parse_cells(
-    piece: bytes, cell_types: CellTypes
-) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.int64] | None, int]:
-    """Parse a piece of text line by line.
-
-    Returns
-    -------
+    Attributes
+    ----------
     values : dict of int to ndarray
         Column number -> numbers, NaN where missing.
     stamps : ndarray of int64 or None
         Stamps [ns since 1970].
     words : int
         Channel cells that are neither a number nor void.
+    starts : ndarray of int64
+        Position of each row in the block.
     """
-    width = cell_types.layout.width
-    rows: list[list[str] | None] = []
-    for text in piece.decode("latin-1").split("\n"):
-        bare = text.split("#")[0].strip("\r") if "#" in text else text.strip("\r")
-        if bare.strip():
-            rows.append(_split_row(bare, cell_types.layout, width))
-    words = 0
-    values = {}
-    for source in cell_types.sources:
-        numbers = np.empty(len(rows))
-        for index, row in enumerate(rows):
-            numbers[index] = (
-                np.nan
-                if row is None
-                else _parse_number(row[source], comma=cell_types.layout.decimal_comma)
+
+    values: dict[int, NDArray[np.float64]]
+    stamps: NDArray[np.int64] | None
+    words: int
+    starts: NDArray[np.int64]
+
+
+class BlockParser:
+    """Parse the rows of one file."""
+
+    def __init__(self, layout: Layout, plan: Plan, options: ReadOptions):
+        from gyrostab.kernels.encoding.rows import ISO, NUMBER, NUMERIC_TIME, SKIPPED
+
+        self.layout, self.epoch = layout, options.epoch_ns
+        self.sources = sorted(column.source for column in plan.columns if column.role != "time")
+        self.channels = {column.source for column in plan.of("channel")}
+        self.time = plan.time.source if plan.time else None
+        self.unit = plan.time.time_unit if plan.time else None
+        digits = self.unit.digits if self.unit else None
+        self.digits = digits if digits is not None and digits <= 9 else 0
+        self.roles = np.full(layout.width, SKIPPED, dtype=np.int64)
+        self.roles[self.sources] = NUMBER
+        if self.time is not None:
+            self.roles[self.time] = NUMERIC_TIME if self.unit else ISO
+
+    def parse(self, block: bytes) -> ParsedBlock:
+        """Parse whole lines; comments and empty lines do not count as rows."""
+        from gyrostab.kernels.encoding.rows import BLANKS, read_rows
+
+        text = np.frombuffer(block, dtype=np.uint8)
+        lines = int(np.count_nonzero(text == 10))
+        values = np.empty((len(self.sources), lines))
+        counts, starts = np.empty(lines, np.int64), np.empty(lines, np.int64)
+        separator = BLANKS if self.layout.separator == BLANK else ord(self.layout.separator)
+        point = ord("," if self.layout.decimal_comma else ".")
+        others: dict[int, str] = {}
+        row = at = 0
+        while True:
+            row, at = read_rows(
+                text, at, row, self.roles, separator, point, self.digits, values, counts, starts
             )
-        if source not in cell_types.gyro:
-            bad = np.flatnonzero(~np.isfinite(numbers))
-            cells = (rows[index] for index in bad)
-            words += sum(
-                1
-                for row in cells
-                if row is not None and row[source].strip().lower() not in _VOID_WORDS
-            )
-        values[source] = numbers
-    return values, _cell_stamps(rows, cell_types), words
+            if at == len(block):
+                break
+            end = block.index(b"\n", at) + 1
+            line = block[at:end].decode("latin-1").split("#")[0].strip("\r\n")
+            if line.strip():
+                others[row], starts[row] = line, at
+                row += 1
+            at = end
+        stamps = None if self.time is None else self._since_epoch(counts[:row])
+        words = self._parse_cells(others, values, stamps) if others else 0
+        found = dict(zip(self.sources, values[:, :row], strict=True))
+        return ParsedBlock(found, stamps, words, starts[:row])
+
+    def _since_epoch(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Convert counts of nanoseconds or of a non-decimal unit to stamps [ns since 1970]."""
+        unit = self.unit
+        if unit is None:
+            return counts
+        if unit.digits is None or unit.ns != 10**self.digits:
+            return np.where(counts == NAT, NAT, integers_to_ns(counts, unit, self.epoch))
+        zero = self.epoch if unit.epoch is None else unit.epoch
+        if zero == 0:
+            return counts
+        limit = 2**63 - 1 - abs(zero)
+        fits = (counts <= limit) & (counts >= -limit)  # NAT does not
+        return np.where(fits, counts + np.int64(zero), NAT)
+
+    def _parse_cells(
+        self,
+        lines: dict[int, str],
+        values: NDArray[np.float64],
+        stamps: NDArray[np.int64] | None,
+    ) -> int:
+        """Parse rows cell by cell into `values` and `stamps`; return the number of words."""
+        rows = [self._split_row(line) for line in lines.values()]
+        at, words = np.array(list(lines)), 0
+        for number, source in enumerate(self.sources):
+            cells = ["" if row is None else row[source] for row in rows]
+            numbers = np.array([_parse_number(cell, self.layout) for cell in cells])
+            values[number, at] = numbers
+            if source in self.channels:
+                bad = np.flatnonzero(~np.isfinite(numbers))
+                words += sum(cells[index].strip().lower() not in VOID_CELLS for index in bad)
+        if stamps is not None and self.time is not None:
+            cells = ["" if row is None else row[self.time] for row in rows]
+            if self.layout.decimal_comma:
+                cells = [cell.replace(",", ".") for cell in cells]
+            if self.unit is not None:  # durations as MATLAB writes them
+                cells = [cell.strip().removesuffix(f" {self.unit.text}") for cell in cells]
+            stamps[at] = cells_to_ns(cells, self.unit, self.epoch)
+        return words
+
+    def _split_row(self, line: str) -> list[str] | None:
+        """Split a row into cells; None if there are too few or too many."""
+        width, separator = self.layout.width, self.layout.separator
+        try:
+            cells = split_line(line, separator)
+        except csv.Error:
+            return None
+        if len(cells) > width and separator != BLANK and not any(cells[width:]):
+            cells = cells[:width]
+        return cells if len(cells) == width else None
 
 
-def _split_row(text: str, layout: Layout, width: int) -> list[str] | None:
-    """Split a row into cells; None if there are too few or too many."""
+def _parse_number(cell: str, layout: Layout) -> float:
     try:
-        cells = split_line(text, layout.separator)
-    except csv.Error:
-        return None
-    if len(cells) > width and layout.separator != BLANK and not any(cells[width:]):
-        cells = cells[:width]
-    return cells if len(cells) == width else None
-
-
-def _parse_number(cell: str, *, comma: bool) -> float:
-    try:
-        value = float(cell.replace(",", ".") if comma else cell)
+        value = float(cell.replace(",", ".") if layout.decimal_comma else cell)
     except ValueError:
         return np.nan
     return np.nan if "_" in cell else value
-
-
-def _cell_stamps(rows: list[list[str] | None], cell_types: CellTypes) -> NDArray[np.int64] | None:
-    if cell_types.time is None:
-        return None
-    cells = ["" if row is None else row[cell_types.time] for row in rows]
-    if cell_types.layout.decimal_comma:
-        cells = [cell.replace(",", ".") for cell in cells]
-    if cell_types.unit is not None:
-        suffix = f" {cell_types.unit.text}"  # durations as MATLAB writes them
-        cells = [cell.strip().removesuffix(suffix) for cell in cells]
-    return cells_to_ns(cells, cell_types.unit, cell_types.options.epoch_ns)

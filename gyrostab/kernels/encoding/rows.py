@@ -1,8 +1,8 @@
 """Read rows of plain text into numbers and stamps, in the form that nearly all logs have.
 
-Cells are decimal numbers, ISO 8601 dates, or empty. Reading stops at the first row that holds
-anything else, and the caller reads that row in another way. Numbers are rounded as by `float`, to
-the last bit; stamps are whole nanoseconds.
+Cells are decimal numbers, ISO 8601 dates, empty, or words for missing values, quoted or not.
+Reading stops at the first row that holds anything else, and the caller reads that row in another
+way. Numbers are rounded as by `float`, to the last bit; stamps are whole nanoseconds.
 """
 
 from __future__ import annotations
@@ -10,9 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from llvmlite import ir
 from numba import njit, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
@@ -25,19 +23,11 @@ SKIPPED, NUMBER, NUMERIC_TIME, ISO = range(4)
 BLANKS = 32
 
 _NAT = np.iinfo(np.int64).min
-_TAB, _LINE, _RETURN, _BLANK, _QUOTE, _HASH, _PERCENT = 9, 10, 13, 32, 34, 35, 37
-_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _E, _SMALL_E, _SMALL_A, _SMALL_N = (
-    43,
-    45,
-    46,
-    48,
-    58,
-    84,
-    90,
-    69,
-    101,
-    97,
-    110,
+_TAB, _LINE, _RETURN, _BLANK, _QUOTE, _HASH, _PERCENT = b'\t\n\r "#%'
+_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _SMALL_E, _SMALL_N = b"+-.0:TZen"
+# words for missing values, in lower case
+_NAN, _NA, _N_A, _NULL, _NONE = (
+    int.from_bytes(word, "big") for word in (b"nan", b"na", b"n/a", b"null", b"none")
 )
 _DIGITS = 19  # that surely fit into 64 bits
 _EXACT = np.uint64(1) << np.uint64(53)
@@ -46,16 +36,11 @@ _WHOLE_TENS = np.array([10**n for n in range(20)], dtype=np.uint64)
 _LEAST, _MOST = -60, 40
 _HALF = np.uint64(2**32 - 1)
 _FULL = np.uint64(2**64 - 1)
-_ZEROS, _TO_TEN, _TOPS = (
-    np.uint64(0x3030303030303030),
-    np.uint64(0x7676767676767676),
-    np.uint64(0x8080808080808080),
-)
-_FIRST_PAIRS, _FIRST_SCALE, _SECOND_SCALE = (
-    np.uint64(0xFF000000FF),
-    np.uint64(0xF424000000064),
-    np.uint64(0x271000000001),
-)
+_ONES, _PAIR_ONES = np.uint64(0x0101010101010101), np.uint64(0x5555555555555555)
+_LOW_PAIRS, _LOW_HALVES = np.uint64(0x3333333333333333), np.uint64(0x0F0F0F0F0F0F0F0F)
+_ZEROS, _TO_TEN = np.uint64(0x3030303030303030), np.uint64(0x7676767676767676)
+_TOPS, _FIRST_PAIRS = np.uint64(0x8080808080808080), np.uint64(0xFF000000FF)
+_FIRST_SCALE, _SECOND_SCALE = np.uint64(0xF424000000064), np.uint64(0x271000000001)
 _LONGEST_NS = np.uint64(2**63 - 1)
 
 
@@ -77,36 +62,38 @@ def _powers_of_five() -> NDArray[np.uint64]:
 _FIVES = _powers_of_five()
 
 
-@intrinsic
-def _load_byte(typing, text, at):  # type: ignore[no-untyped-def]
-    """Load the byte at an address; passing arrays would cost more than the reading."""
-
-    def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        return builder.load(builder.inttoptr(builder.add(*arguments), ir.IntType(8).as_pointer()))
-
-    return types.uint8(types.intp, types.intp), load
+@njit(types.CPointer(types.uint8)(types.CPointer(types.uint8)), **KERNEL)
+def _as_pointer(text):  # type: ignore[no-untyped-def]
+    """Convert ``array.ctypes`` to a pointer; passing arrays would cost more than the reading."""
+    return text
 
 
-@intrinsic
-def _load_eight(typing, text, at):  # type: ignore[no-untyped-def]
-    """Load eight bytes from an address on, little-endian."""
+@njit(**INNER)
+def _load_eight(text, at):  # type: ignore[no-untyped-def]
+    """Load eight bytes, little-endian; the compiler makes one instruction of it."""
+    low = (
+        np.uint64(text[at])
+        | np.uint64(text[at + 1]) << np.uint64(8)
+        | np.uint64(text[at + 2]) << np.uint64(16)
+        | np.uint64(text[at + 3]) << np.uint64(24)
+    )
+    return (
+        low
+        | np.uint64(text[at + 4]) << np.uint64(32)
+        | np.uint64(text[at + 5]) << np.uint64(40)
+        | np.uint64(text[at + 6]) << np.uint64(48)
+        | np.uint64(text[at + 7]) << np.uint64(56)
+    )
 
-    def load(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        return builder.load(
-            builder.inttoptr(builder.add(*arguments), ir.IntType(64).as_pointer()), align=1
-        )
 
-    return types.uint64(types.intp, types.intp), load
-
-
-@intrinsic
-def _zeros_behind(typing, word):  # type: ignore[no-untyped-def]
-    """Count the trailing zero bits of a word; 64 for zero."""
-
-    def count(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        return builder.cttz(arguments[0], ir.IntType(1)(0))
-
-    return types.uint64(types.uint64), count
+@njit(**INNER)
+def _zeros_behind(word):  # type: ignore[no-untyped-def]
+    """Count the trailing zero bits of a word (64 for zero); the compiler knows this form."""
+    bits = ~word & (word - np.uint64(1))
+    bits = bits - ((bits >> np.uint64(1)) & _PAIR_ONES)
+    bits = (bits & _LOW_PAIRS) + ((bits >> np.uint64(2)) & _LOW_PAIRS)
+    bits = (bits + (bits >> np.uint64(4))) & _LOW_HALVES
+    return (bits * _ONES) >> np.uint64(56)
 
 
 @njit(**INNER)
@@ -180,7 +167,7 @@ def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
         if count < np.uint64(8):
             return mantissa, at
     while True:
-        digit = np.uint8(_load_byte(text, at) - np.uint8(_ZERO))
+        digit = np.uint8(text[at] - np.uint8(_ZERO))
         if digit > 9:
             return mantissa, at
         mantissa = mantissa * np.uint64(10) + np.uint64(digit)
@@ -190,21 +177,19 @@ def _read_digits(text, at, size, mantissa):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _read_decimal(text, at, size, point):  # type: ignore[no-untyped-def]
     """Read sign, digits, decimals and end; the end is negative without one, or if long."""
-    negative = _load_byte(text, at) == _MINUS
-    at += np.int64(negative) | np.int64(_load_byte(text, at) == _PLUS)
+    negative = text[at] == _MINUS
+    at += np.int64(negative) | np.int64(text[at] == _PLUS)
     first = at
     mantissa, at = _read_digits(text, at, size, np.uint64(0))
     count, decimals = at - first, np.int64(0)
-    if _load_byte(text, at) == point:
+    if text[at] == point:
         after = at + 1
         mantissa, at = _read_digits(text, after, size, mantissa)
         decimals = at - after
         count += decimals
     if count > _DIGITS:
-        while (
-            _load_byte(text, first) == _ZERO or _load_byte(text, first) == point
-        ):  # zeros in front do not count
-            count -= _load_byte(text, first) == _ZERO
+        while text[first] == _ZERO or text[first] == point:  # zeros in front do not count
+            count -= text[first] == _ZERO
             first += 1
     return (
         negative,
@@ -219,18 +204,11 @@ def _read_number(text, at, size, point):  # type: ignore[no-untyped-def]
     """Read a number: value and end; the end is negative without a number."""
     negative, mantissa, decimals, end = _read_decimal(text, at, size, point)
     if end < 0:
-        here = at + (_load_byte(text, at) == _MINUS)
-        if (
-            _load_byte(text, here) | 32 == _SMALL_N
-            and _load_byte(text, here + 1) | 32 == _SMALL_A
-            and _load_byte(text, here + 2) | 32 == _SMALL_N
-        ):
-            return np.nan, here + 3
         return 0.0, end
     power = -decimals
-    if _load_byte(text, end) | 32 == _SMALL_E:
-        down = _load_byte(text, end + 1) == _MINUS
-        first = end + 1 + (down or _load_byte(text, end + 1) == _PLUS)
+    if text[end] | 32 == _SMALL_E:
+        down = text[end + 1] == _MINUS
+        first = end + 1 + (down or text[end + 1] == _PLUS)
         exponent, end = _read_digits(text, first, size, np.uint64(0))
         if not 0 < end - first < 4:
             return 0.0, np.int64(-1)
@@ -262,8 +240,8 @@ def _count_of_time(text, at, size, point, digits):  # type: ignore[no-untyped-de
 def _read_pair(text, at):  # type: ignore[no-untyped-def]
     """Read a number of two digits; above 99 if invalid."""
     tens, ones = (
-        np.uint8(_load_byte(text, at) - np.uint8(_ZERO)),
-        np.uint8(_load_byte(text, at + 1) - np.uint8(_ZERO)),
+        np.uint8(text[at] - np.uint8(_ZERO)),
+        np.uint8(text[at + 1] - np.uint8(_ZERO)),
     )
     return np.int64(10 * tens + ones) if tens < 10 and ones < 10 else np.int64(1000)
 
@@ -278,24 +256,40 @@ def _days_since_1970(year, month, day):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
+def _read_zone(text, at):  # type: ignore[no-untyped-def]
+    """Read ``Z``, ``+01``, ``-05:30``, ``+0530`` or nothing: minutes and end, negative if wrong."""
+    if text[at] == _Z:
+        return np.int64(0), at + 1
+    if text[at] != _PLUS and text[at] != _MINUS:
+        return np.int64(0), at
+    west, hours, minutes = text[at] == _MINUS, _read_pair(text, at + 1), np.int64(0)
+    end = at + 3
+    if hours < 24 and (text[end] == _COLON or np.uint8(text[end] - np.uint8(_ZERO)) < 10):
+        end += text[end] == _COLON
+        minutes = _read_pair(text, end)
+        end += 2
+    if hours > 23 or minutes > 59:
+        return np.int64(0), np.int64(-1)
+    minutes += 60 * hours
+    return -minutes if west else minutes, end
+
+
+@njit(**INNER)
 def _read_iso_stamp(text, at, size):  # type: ignore[no-untyped-def]
-    """Read ``2026-01-02T03:04:05.678Z`` (or a blank for the T, no Z): nanoseconds and end."""
+    """Read ``2026-01-02T03:04:05.678Z`` (a blank for the T, other zones): nanoseconds and end."""
     none = (np.int64(0), np.int64(-1))
-    if at + 19 >= size:
+    if at + 19 >= size:  # for the caller
         return none
     year = 100 * _read_pair(text, at) + _read_pair(text, at + 2)
-    month, day, hour, minute, second = (
+    month, day, hour, minute = (
         _read_pair(text, at + 5), _read_pair(text, at + 8), _read_pair(text, at + 11),
-        _read_pair(text, at + 14), _read_pair(text, at + 17),
+        _read_pair(text, at + 14),
     )  # fmt: skip
-    if (
-        _load_byte(text, at + 4) != _MINUS
-        or _load_byte(text, at + 7) != _MINUS
-        or _load_byte(text, at + 13) != _COLON
-        or _load_byte(text, at + 16) != _COLON
-    ):
+    has_seconds = text[at + 16] == _COLON
+    second = _read_pair(text, at + 17) if has_seconds else np.int64(0)
+    if text[at + 4] != _MINUS or text[at + 7] != _MINUS or text[at + 13] != _COLON:
         return none
-    if (_load_byte(text, at + 10) != _T and _load_byte(text, at + 10) != _BLANK) or not (
+    if (text[at + 10] != _T and text[at + 10] != _BLANK) or not (
         1700 <= year < 2200 and 1 <= month <= 12 and day >= 1
     ):
         return none
@@ -304,23 +298,25 @@ def _read_iso_stamp(text, at, size):  # type: ignore[no-untyped-def]
     last = 28 + leap if month == 2 else 31 - short
     if day > last or hour > 23 or minute > 59 or second > 59:
         return none
-    end, part = at + 19, np.uint64(0)
-    if _load_byte(text, end) == _POINT:
+    end, part = at + (19 if has_seconds else 16), np.uint64(0)
+    if has_seconds and text[end] == _POINT:
         part, stop = _read_digits(text, end + 1, size, np.uint64(0))
         length = stop - end - 1
         if not 0 < length <= 9:
             return none
         part *= _WHOLE_TENS[9 - length]
         end = stop
-    if _load_byte(text, end) == _Z:
-        end += 1
+    minutes, end = _read_zone(text, end)
+    if end < 0:
+        return none
+    minute -= minutes
     seconds = ((_days_since_1970(year, month, day) * 24 + hour) * 60 + minute) * 60 + second
     return seconds * 1_000_000_000 + np.int64(part), end
 
 
 @njit(**INNER)
 def _past_blanks(text, at, separator):  # type: ignore[no-untyped-def]
-    while _load_byte(text, at) == _BLANK or (_load_byte(text, at) == _TAB and separator != _TAB):
+    while text[at] == _BLANK or (text[at] == _TAB and separator != _TAB):
         at += 1
     return at
 
@@ -330,60 +326,79 @@ def _cell_end(text, at, separator, last):  # type: ignore[no-untyped-def]
     """Find the next cell, or line, after a cell that ends at `at`; negative if malformed."""
     at = _past_blanks(text, at, separator)
     if last:
-        at += _load_byte(text, at) == _RETURN
-        return at + 1 if _load_byte(text, at) == _LINE else np.int64(-1)
+        at += text[at] == _RETURN
+        return at + 1 if text[at] == _LINE else np.int64(-1)
     if separator == BLANKS:  # one was passed, or there is another cell's text here
-        return (
-            at
-            if _load_byte(text, at) != _LINE and _load_byte(text, at) != _RETURN
-            else np.int64(-1)
-        )
-    return at + 1 if _load_byte(text, at) == separator else np.int64(-1)
+        return at if text[at] != _LINE and text[at] != _RETURN else np.int64(-1)
+    return at + 1 if text[at] == separator else np.int64(-1)
 
 
 @njit(**INNER)
-def _skip_cell(text, at, separator):  # type: ignore[no-untyped-def]
+def _skip_cell(text, at, separator, quoted):  # type: ignore[no-untyped-def]
     """Find the end of a skipped cell; negative where quotes or comments make it uncertain."""
+    if quoted:
+        at += 1
+        while text[at] != _QUOTE:
+            if text[at] == _LINE or text[at] == _HASH:
+                return np.int64(-1)
+            at += 1
+        return at + 1 if text[at + 1] != _QUOTE else np.int64(-1)
     while (
-        _load_byte(text, at) != _LINE
-        and _load_byte(text, at) != separator
-        and not (separator == BLANKS and _load_byte(text, at) == _TAB)
+        text[at] != _LINE
+        and text[at] != separator
+        and not (separator == BLANKS and text[at] == _TAB)
     ):
-        if _load_byte(text, at) == _QUOTE or _load_byte(text, at) == _HASH:
+        if text[at] == _QUOTE or text[at] == _HASH:
             return np.int64(-1)
         at += 1
-    return (
-        at - 1
-        if at and _load_byte(text, at) == _LINE and _load_byte(text, at - 1) == _RETURN
-        else at
-    )
+    return at - 1 if at and text[at] == _LINE and text[at - 1] == _RETURN else at
 
 
 @njit(**INNER)
-def _is_void(text, at, separator):  # type: ignore[no-untyped-def]
-    return (
-        _load_byte(text, at) == separator
-        or _load_byte(text, at) == _LINE
-        or _load_byte(text, at) == _RETURN
-    )
+def _is_end(code, separator):  # type: ignore[no-untyped-def]
+    return code in (separator, _LINE, _RETURN, _QUOTE)
 
 
 @njit(**INNER)
-def _read_cell(text, at, size, role, separator, point, digits):  # type: ignore[no-untyped-def]
+def _past_void(text, at, separator):  # type: ignore[no-untyped-def]
+    """Find the end of an empty cell, or of a word for a missing value; negative for others."""
+    first = at + np.int64(text[at] == _MINUS)
+    if _is_end(text[at], separator):
+        return at
+    if text[first] | 32 != _SMALL_N:
+        return np.int64(-1)
+    word, end = np.int64(0), first
+    while end < first + 4 and text[end] > _BLANK and not _is_end(text[end], separator):
+        word = word << 8 | np.int64(text[end] | 32)
+        end += 1
+    known = word == _NAN or (first == at and (word in (_NA, _N_A, _NULL, _NONE)))
+    return end if known else np.int64(-1)
+
+
+@njit(**INNER)
+def _read_cell(text, at, size, role, separator, point, digits, may_quote):  # type: ignore[no-untyped-def]
     """Read number, stamp and end of a cell; the end is negative for other content."""
+    quoted = False
     if role == SKIPPED:
-        return 0.0, np.int64(0), _skip_cell(text, at, separator)
-    if _is_void(text, at, separator):
-        return np.nan, np.int64(_NAT), at
-    if role == NUMBER:
-        value, end = _read_number(text, at, size, point)
-        return value, np.int64(0), end
-    stamp, end = (
-        _read_iso_stamp(text, at, size)
-        if role == ISO
-        else _count_of_time(text, at, size, point, digits)
-    )
-    return 0.0, stamp, end
+        quoted = may_quote and text[at] == _QUOTE
+        return 0.0, np.int64(0), _skip_cell(text, at, separator, quoted)
+    value, stamp, end = np.nan, np.int64(_NAT), np.int64(-1)
+    first = at + np.int64(text[at] == _MINUS)
+    if np.uint8(text[first] - np.uint8(_ZERO)) > 9:  # most cells begin with a digit
+        if may_quote and text[at] == _QUOTE:
+            quoted, at = True, _past_blanks(text, at + 1, separator)
+        end = _past_void(text, at, separator)
+    if end < 0:
+        if role == NUMBER:
+            value, end = _read_number(text, at, size, point)
+        elif role == ISO:
+            stamp, end = _read_iso_stamp(text, at, size)
+        else:
+            stamp, end = _count_of_time(text, at, size, point, digits)
+    if quoted and end >= 0:
+        end = _past_blanks(text, end, separator)
+        end = end + 1 if text[end] == _QUOTE else np.int64(-1)
+    return value, stamp, end
 
 
 @njit(**INNER)
@@ -391,27 +406,60 @@ def _next_row(text, at, size):  # type: ignore[no-untyped-def]
     """Find the next line that is neither blank nor a comment."""
     while at < size:
         here = _past_blanks(text, at, np.int64(_TAB))
-        if _load_byte(text, here) == _HASH or _load_byte(text, here) == _PERCENT:
-            while _load_byte(text, here) != _LINE:
+        if text[here] == _HASH or text[here] == _PERCENT:
+            while text[here] != _LINE:
                 here += 1
-        here += _load_byte(text, here) == _RETURN
-        if _load_byte(text, here) != _LINE:
+        here += text[here] == _RETURN
+        if text[here] != _LINE:
             break
         at = here + 1
     return at
 
 
 @njit(**KERNEL)
-def _read_rows(lines, start, roles, separator, point, digits, values, stamps):  # type: ignore[no-untyped-def]
-    """Run `read_rows` into `values` and `stamps`."""
-    text, size, width = lines.ctypes.data, len(lines), len(roles)
-    row, begin = np.int64(0), _next_row(text, np.int64(start), size)
-    while begin < size and row < len(stamps):
+def read_rows(lines, at, row, roles, separator, point, digits, values, stamps, starts):  # type: ignore[no-untyped-def]
+    """Read rows up to the first with other content, which is for the caller to read.
+
+    Parameters
+    ----------
+    lines : uint8 (bytes,)
+        Whole lines; the last byte is the end of a line.
+    at, row : int
+        Index of the beginning of the first line to read, and the number of its row.
+    roles : int64 (width,)
+        What each column holds: `SKIPPED`, `NUMBER`, `NUMERIC_TIME`, `ISO`.
+    separator, point : int
+        Codes of the separator (`BLANKS` for runs of them) and of the decimal point.
+    digits : int
+        Numeric times are rounded to this number of decimals and given as whole numbers of the last;
+        with 0 they must be whole.
+    values : float64 (numbers, n)
+        Overwritten: one line for each column of numbers, NaN where empty. `n` is the number of
+        lines or more.
+    stamps : int64 (n,)
+        Overwritten: numeric times, or nanoseconds since 1970 for `ISO`; the smallest integer where
+        empty.
+    starts : int64 (n,)
+        Overwritten: index of the beginning of each row.
+
+    Returns
+    -------
+    row : int
+        Number of the first row that was not read.
+    at : int
+        Index of its beginning, or the end of the lines.
+    """
+    text, size, width = _as_pointer(lines.ctypes), len(lines), len(roles)
+    begin = _next_row(text, np.int64(at), size)
+    while begin < size:
         number, at = np.int64(0), begin
         for column in range(width):
-            at = _past_blanks(text, at, separator)
-            first, role = at, roles[column]
-            value, stamp, at = _read_cell(text, at, size, role, separator, point, digits)
+            cell = at
+            first, role = _past_blanks(text, at, separator), roles[column]
+            may_quote = cell == first and separator != BLANKS
+            value, stamp, at = _read_cell(
+                text, first, size, role, separator, point, digits, may_quote
+            )
             if role == NUMBER:
                 values[number, row] = value
                 number += 1
@@ -421,54 +469,9 @@ def _read_rows(lines, start, roles, separator, point, digits, values, stamps):  
             at = _cell_end(text, at, separator, column == width - 1) if at >= 0 else at
             if at < 0 or (separator == BLANKS and (end == first or at == end)):
                 return row, begin
-        begin = _next_row(text, at, size)
-        row += 1
+        starts[row] = begin
+        row, begin = row + 1, _next_row(text, at, size)
     return row, begin
-
-
-def read_rows(
-    text: NDArray[np.uint8],
-    start: int,
-    roles: NDArray[np.int64],
-    *,
-    separator: int,
-    point: int,
-    digits: int,
-    rows: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
-    """Read rows up to the first with other content.
-
-    Parameters
-    ----------
-    text : ndarray of uint8
-        Whole lines; the last byte is the end of a line.
-    start : int
-        Index of the beginning of the first line to read.
-    roles : ndarray of int64
-        What each column holds: `SKIPPED`, `NUMBER`, `NUMERIC_TIME`, `ISO`.
-    separator, point : int
-        Codes of the separator (`BLANKS` for runs of them) and of the decimal point.
-    digits : int
-        Numeric times are rounded to this number of decimals and given as whole numbers of the last;
-        with 0 they must be whole.
-    rows : int
-        Largest number of rows: the number of lines.
-
-    Returns
-    -------
-    values : ndarray of float64, shape (numbers, n)
-        One line for each column of numbers, NaN where empty.
-    stamps : ndarray of int64, shape (n,)
-        Numeric times, or nanoseconds since 1970 for `ISO`; the smallest integer where empty.
-    stop : int
-        Index of the first row with other content, or the end.
-    """
-    values = np.empty((int(np.count_nonzero(roles == NUMBER)), rows))
-    stamps = np.empty(rows, dtype=np.int64)
-    n, stop = _read_rows(text, start, roles, separator, point, digits, values, stamps)
-    if 2 * n < rows:  # a short part must not keep the room of a long one
-        return values[:, :n].copy(), stamps[:n].copy(), int(stop)
-    return values[:, :n], stamps[:n], int(stop)
 
 
 @njit(**KERNEL)

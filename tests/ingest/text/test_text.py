@@ -144,7 +144,6 @@ def test_block_size_does_not_matter(tmp_path: Path, data: st.DataObject) -> None
     whole = read_log(path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(text_reader, "BLOCK_BYTES", data.draw(st.integers(16, 900)))
-        patch.setattr(text_reader, "PIECE_BYTES", data.draw(st.integers(1, 200)))
         pieces = text_reader.read(path, ReadOptions())
     np.testing.assert_array_equal(pieces.rate, whole.rate)
     np.testing.assert_array_equal(pieces.time, whole.time)

@@ -27,15 +27,11 @@ def rows_of(
 ):
     code = BLANKS if separator == " " else ord(separator)
     held = np.frombuffer(text.encode("latin-1"), dtype=np.uint8)
-    return read_rows(
-        held,
-        0,
-        np.array(roles),
-        separator=code,
-        point=ord(point),
-        digits=digits,
-        rows=text.count("\n"),
-    )
+    lines, roles = text.count("\n"), np.array(roles)
+    values = np.empty((np.count_nonzero(roles == NUMBER), lines))
+    stamps, starts = np.empty(lines, np.int64), np.empty(lines, np.int64)
+    row, stop = read_rows(held, 0, 0, roles, code, ord(point), digits, values, stamps, starts)
+    return values[:, :row], stamps[:row], stop
 
 
 numbers = st.one_of(
@@ -103,11 +99,18 @@ def test_common_numbers_are_read(cell):
         "-",
         ".",
         "1.2.3",
-        '"1"',
+        '"1',
+        '1"',
+        ' "1"',
+        '"1"2',
+        '"1""2"',
         "12 34",
         "1#",
         "e5",
-        "na",
+        "-na",
+        "nan1",
+        "nulls",
+        "nothing",
         "--1",
         "1" * 25,
     ],
@@ -125,7 +128,15 @@ def test_row_of_another_width_is_not_read(row):
 
 @pytest.mark.parametrize(
     ("cell", "value"),
-    [("", np.nan), ("  ", np.nan), ("nan", np.nan), ("-NaN", np.nan), (" 7.5 ", 7.5), ("\t7", 7.0)],
+    [
+        ("", np.nan),
+        ("  ", np.nan),
+        *((word, np.nan) for word in ("nan", "-NaN", "NA", "N/A", "null", "None", '""', '"NA "')),
+        (" 7.5 ", 7.5),
+        ("\t7", 7.0),
+        ('"7.5"', 7.5),
+        ('" -7 " ', -7.0),
+    ],
 )
 def test_void_cells_and_blanks_around_cells(cell, value):
     values, stamps, stop = rows_of(f"1,{cell}\r\n", [NUMERIC_TIME, NUMBER], digits=0)
@@ -158,7 +169,34 @@ def test_decimal_comma_and_skipped_columns():
     )
     assert values.tolist() == [[1.25], [2.5]]
     assert stop == 14
-    assert rows_of('"a;b";1;2\n', [SKIPPED, NUMBER, NUMBER], separator=";")[2] == 0
+    values, _, _ = rows_of('"a;b";"1,25";2\n', [SKIPPED, NUMBER, NUMBER], separator=";", point=",")
+    assert values.tolist() == [[1.25], [2.0]]
+    for cell in ('"a"";b"', 'a"b"', '"a', '"a#"'):
+        assert rows_of(f"{cell};1;2\n", [SKIPPED, NUMBER, NUMBER], separator=";")[2] == 0
+
+
+@pytest.mark.parametrize(
+    ("zone", "minutes"),
+    [("Z", 0), ("+00:00", 0), ("+01", 60), ("-0530", -330), ("+13:45", 825), ("", 0)],
+)
+def test_zones_of_dates(zone, minutes):
+    stamps = rows_of(f"1970-01-02T00:00:00.5{zone},1\n", [ISO, NUMBER])[1]
+    assert stamps.tolist() == [86_400_500_000_000 - minutes * 60 * 10**9]
+
+
+@pytest.mark.parametrize("zone", ["+", "+1", "+24:00", "-00:60", "+01:", "+1:30", "z", " Z"])
+def test_wrong_zones_are_not_read(zone):
+    assert rows_of(f"1970-01-02T00:00:00{zone},1\n", [ISO, NUMBER])[2] == 0
+
+
+def test_rows_after_a_row_of_the_caller():
+    text = np.frombuffer(b"1\n# said\n2\nword\n3\n", dtype=np.uint8)
+    values, stamps, starts = np.zeros((1, 4)), np.empty(4, np.int64), np.zeros(4, np.int64)
+    options = np.array([NUMBER]), 44, 46, 0, values, stamps, starts
+    assert read_rows(text, 0, 0, *options) == (2, 11)
+    assert read_rows(text, 16, 3, *options) == (4, 18)
+    assert values.tolist() == [[1.0, 2.0, 0.0, 3.0]]
+    assert starts.tolist() == [0, 9, 0, 16]
 
 
 @settings(deadline=None)
@@ -203,6 +241,7 @@ def test_dates_are_those_of_the_calendar(moment, digits, between, zone):
         "2026-13-01T00:00:00",
         "2026-01-01T24:00:00",
         "2026-01-01T00:00:60",
+        "2026-01-01T00:0",
     ],
 )
 def test_dates_that_do_not_exist_are_not_read(text):
@@ -229,3 +268,8 @@ def test_column_is_cleaned_as_with_numpy(values):
     )
     assert (low, high) == (finite.min(initial=np.inf), finite.max(initial=-np.inf))
     assert whole == (finite == np.rint(finite)).all()
+
+
+def test_dates_to_the_minute():
+    stamps = rows_of("1970-01-02 00:01,1.5\n1970-01-02T00:02Z,1.5\n", [ISO, NUMBER])[1]
+    assert stamps.tolist() == [86_460 * 10**9, 86_520 * 10**9]
