@@ -186,7 +186,7 @@ def _compare(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Comparison
     seen = remove_known_lines(blocks, baseline)
     records = _repeatable_null_records(seen, baseline, task.nulls, task.seed)
     task.progress("comparing", 0)
-    null = null_scores(baseline, records())
+    null = null_scores(baseline, records(), settings=task.settings)
     task.progress("naming", 0)
     known = _effects_left_out(baseline, task.simulation)
     identifications = name_effects(
@@ -203,9 +203,15 @@ def _compare(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> Comparison
     before = expected_baseline(identifications, baseline)
     at_rest = lines_without_motion(task, seen, before) if expected else seen
     mismatches = locate_mismatches(
-        without_expected(at_rest, baseline, expected), before, null, level=level
+        without_expected(at_rest, baseline, expected),
+        before,
+        null,
+        level=level,
+        settings=task.settings,
     )
-    mismatches = drop_expected(mismatches, expected, seen, before, null, level=level)
+    mismatches = drop_expected(
+        mismatches, expected, seen, before, null, level=level, settings=task.settings
+    )
     return Comparison(blocks, baseline, mismatches, identifications, null)
 
 

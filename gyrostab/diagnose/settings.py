@@ -44,22 +44,22 @@ class Settings:
         2.0,
         "nat",
         "Evidence that an axis must add to be named with the others.",
-        "odds of 7 to 1: ln 7.4",
+        "choice: odds of 7 to 1 (ln 7.4 = 2.0)",
     )
     ambiguous_nats: float = _number(
         3.0,
         "nat",
         "Difference of evidence within which two effects are alternatives, and by which another "
         "form must be better than a jump or two levels.",
-        "odds of 20 to 1: ln 20 = 3.0 (strong evidence: Kass and Raftery, 1995, "
+        "odds of 20 to 1, ln 20 = 3.0 (strong evidence: Kass and Raftery, 1995, "
         "doi:10.1080/01621459.1995.10476572)",
     )
     reject_nats: float = _number(
         6.0,
         "nat",
         "Evidence that rejects the simpler of two forms: one term in place of two, one filter for "
-        "all axes, one point of a grid beside the best.",
-        "odds of 400 to 1: ln 400 = 6.0, the square of the odds of `ambiguous_nats`",
+        "all axes.",
+        "odds of 400 to 1 (ln 400 = 6.0), the square of the odds of `ambiguous_nats`",
     )
     disagreement_nats: float = _number(
         8.0,
@@ -72,13 +72,13 @@ class Settings:
         0.01,
         "1",
         "Share of the evidence of an effect that an error of its form may leave to others.",
-        "square of a size error of 10 %: evidence grows with the square of the size",
+        "choice: square of a size error of 10 %, as evidence grows with the square of the size",
     )
     spectrum_error_share: float = _number(
         0.1,
         "1",
         "Share of the evidence that an error of the spectrum, or of the course in time, may leave.",
-        "square of a size error of 32 %; 0.08 occurs in simulated strong vibration",
+        "choice: square of a size error of 32 %; 0.08 occurs in simulated strong vibration",
     )
     size_error_share: float = _number(
         0.04,
@@ -86,17 +86,19 @@ class Settings:
         "Error of the form of an effect as a share of its size, added to its standard error.",
         "coverage of the intervals with wrong forms: docs/diagnosis.md, benchmarks/intervals.py",
     )
-    impossible_sigma: float = _number(
+    clear_sigma: float = _number(
         3.0,
         "standard error",
-        "Distance from its allowed range at which a size is impossible, and from the earlier level "
-        "at which the level after an event is another one.",
+        "Distance from its allowed range at which a size is impossible, from the earlier level at "
+        "which the level after an event is another one, and from noise at which a cell belongs to "
+        "the mismatch next to it.",
         "two-sided P = 0.0027 for a normal error",
     )
     visible_sigma: float = _number(
         2.0,
         "standard error",
-        "Size of a harmonic of the rotation below which it is dropped.",
+        "Size of a harmonic of the rotation below which it is dropped, and score of a short window "
+        "that belongs to a mismatch of a long one.",
         "two-sided P = 0.046 for a normal error",
     )
     surrogate_share: float = _number(
@@ -109,8 +111,7 @@ class Settings:
         0.5,
         "1",
         "Correlation with the channel above which a time-shifted surrogate is not a control.",
-        "such a surrogate has at least 0.25 of the evidence of the channel (the correlation "
-        "squared)",
+        "choice: such a surrogate has 0.25 of the evidence of the channel, the correlation squared",
     )
     term_correlation: float = _number(
         0.999,
@@ -145,37 +146,134 @@ class Settings:
         1e-5,
         "1",
         "Share of the rotation that an axis must sense for real motion.",
-        "alignment of 10 urad (2 arcsec): no mounting is better",
+        "choice: alignment of 10 urad (2 arcsec), beyond that of any mounting",
     )
     max_misalignment_share: float = _number(
         0.02,
         "1",
         "Share of the rotation that an axis across it may sense; a larger one is along it.",
-        "sine of 1 degree, a coarse mounting error",
+        "choice: sine of 1.1 degrees, a coarse mounting error",
     )
     rest_sigma: float = _number(
         6.0,
         "standard deviation",
         "Distance from the level at rest within which the mean of a block is at rest.",
-        "P = 2e-9 for normal noise; wandering means scatter more than their neighbours show",
+        "choice: P = 2e-9 for normal noise; means that wander scatter more",
     )
     motion_sigma: float = _number(
         100.0,
         "standard deviation",
         "Distance from the level at rest that an unexplained motion must reach to be left out.",
-        "below it, effects of the instrument occur; a rotation of the tool exceeds it by far",
+        "choice: smaller motion is left to the effects; a rotation of the tool exceeds it by far",
     )
     max_moving_share: float = _number(
         2.0 / 3.0,
         "1",
         "Largest share of the blocks that an axis may move.",
-        "the level at rest is sought in the closest quarter of the means; a third leaves a margin",
+        "choice: the level at rest is that of the closest quarter of the means; a third is safe",
     )
     min_rest_blocks: int = _number(
         12,
         "block",
         "Blocks at rest that determine level and scatter.",
         "scatter to 20 %: 1/sqrt(2n)",
+    )
+
+    # thresholds from null records
+    tail_share: float = _number(
+        0.25,
+        "1",
+        "Share of the null records, the largest, to which an exponential tail is fitted.",
+        "a hundred of the 400 null records: the scale of the tail is known to 10 %",
+    )
+    pooled_records: float = _number(
+        100.0,
+        "null record",
+        "Weight of the variance over windows of one length in the variance of a cell.",
+        "choice: from as many records the own variance of a cell is known to sqrt(2 / n) = 14 %",
+    )
+    # regions of mismatches
+    window_sum_share: float = _number(
+        0.8,
+        "1",
+        "Share of the score of a window that its short windows must reach to set its ends.",
+        "choice: the share is 1 for a constant deviation; moves the ends of regions",
+    )
+    whole_record_sigma: float = _number(
+        0.7,
+        "standard deviation",
+        "Score by which a part of the record must exceed the whole to be the region.",
+        "choice; moves the ends of regions",
+    )
+    region_excess_share: float = _number(
+        0.25,
+        "1",
+        "Share of the largest excess that the other averaging times of a region must have.",
+        "choice: half of the largest deviation in amplitude; moves the averaging times of regions",
+    )
+    common_time_share: float = _number(
+        0.5,
+        "1",
+        "Share of the time of two regions above which they are one.",
+        "choice: the larger part",
+    )
+    gap_time_share: float = _number(
+        0.25,
+        "1",
+        "Gap between two regions that are one, as a share of the longer.",
+        "choice; moves the ends of regions",
+    )
+    line_width_share: float = _number(
+        0.02,
+        "1",
+        "Difference of two frequencies that are one line, as a share of the frequency.",
+        "choice: slow changes of the speed of a pump or a tool",
+    )
+    max_mean_regions: int = _number(
+        3,
+        "region",
+        "Regions of the mean of an axis beyond which its mean wanders.",
+        "choice; one mismatch that wanders takes the place of many",
+    )
+    # attribution of mismatches to effects, and verdict
+    active_share: float = _number(
+        0.1,
+        "1",
+        "Share of the largest contribution of an effect above which it acts, and of its largest "
+        "step above which it moves the rate within a block.",
+        "choice: 1 % of the largest power",
+    )
+    rest_share: float = _number(
+        0.05,
+        "1",
+        "Share of the largest contribution below which an effect rests, and share of the blocks at "
+        "rest that makes zero its level at rest.",
+        "choice: half of `active_share`",
+    )
+    overlap_share: float = _number(
+        0.3,
+        "1",
+        "Share of the shorter of effect and mismatch that must overlap for them to coincide.",
+        "choice: the ends of a region are known to one of its short windows",
+    )
+    score_error_share: float = _number(
+        0.3,
+        "1",
+        "Share of the score of a mismatch that an error of the form of its effect may leave.",
+        "root of `spectrum_error_share`: evidence is the square of a score",
+    )
+    needed_share: float = _number(
+        0.5,
+        "1",
+        "Share of an equal contribution from which an effect is needed to explain a mismatch.",
+        "choice: with two effects, a quarter of what they explain together",
+    )
+    coverage_tolerance: float = _number(
+        0.013,
+        "1",
+        "Fall of the share of cells within their 95 % band that counts as worse.",
+        "two standard errors, 2 sqrt(0.95 * 0.05 / 1080): 36 stretches, 3 windows, 10 averaging "
+        "times",
     )
 
     def __post_init__(self) -> None:

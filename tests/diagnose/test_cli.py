@@ -12,12 +12,12 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.identify.forward_search import tail_probability
 from gyrostab.diagnose.inputs import parse_quiescent_span
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.result.attribution import _can_show, join_blocks
 from gyrostab.diagnose.result.content import check_diagnosis
-from gyrostab.diagnose.result.tables import chance_of_gain
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import to_netcdf
@@ -304,9 +304,9 @@ def test_line_explains_only_its_own_frequency():
         "tau_min_s": 0.017,
         "tau_max_s": 0.017,
     }
-    assert _can_show(line, region, blocks)
-    assert not _can_show(line, region | {"frequency": 12.5}, blocks)
-    assert not _can_show(line, region | {"what": "ramp phase", "frequency": np.nan}, blocks)
+    assert _can_show(line, region, blocks, 0.02)
+    assert not _can_show(line, region | {"frequency": 12.5}, blocks, 0.02)
+    assert not _can_show(line, region | {"what": "ramp phase", "frequency": np.nan}, blocks, 0.02)
     assert _can_show(
         line,
         {
@@ -317,22 +317,27 @@ def test_line_explains_only_its_own_frequency():
             "tau_max_s": 0.02,
         },
         blocks,
+        0.02,
     )
     assert not _can_show(
         line,
         {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0},
         blocks,
+        0.02,
     )
     assert not _can_show(
         line,
         {"view": "mean", "what": "mean", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0},
         blocks,
+        0.02,
     )
 
 
 def test_p_value_is_extrapolated_beyond_the_null_records():
     best = np.sort(np.random.default_rng(1).exponential(size=400))
-    chances = [chance_of_gain(best, evidence_nats) for evidence_nats in np.linspace(0.0, 20.0, 60)]
+    chances = [
+        tail_probability(best, evidence_nats) for evidence_nats in np.linspace(0.0, 20.0, 60)
+    ]
     assert np.all(np.diff(chances) <= 1e-12)
-    assert chance_of_gain(best, 7.0) == pytest.approx(np.exp(-7.0), rel=0.9)
-    assert chance_of_gain(best, 0.5) == pytest.approx(np.exp(-0.5), abs=0.06)
+    assert tail_probability(best, 7.0) == pytest.approx(np.exp(-7.0), rel=0.9)
+    assert tail_probability(best, 0.5) == pytest.approx(np.exp(-0.5), abs=0.06)

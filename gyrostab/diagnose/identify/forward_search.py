@@ -20,16 +20,14 @@ from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
 from gyrostab.diagnose.predict.search import CountEvidence, compute_evidence, evidence_by_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.errors import OptionError
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 
-__all__ = ["name_effects", "tail_level"]
+__all__ = ["MIN_P_VALUE", "name_effects", "tail_level", "tail_probability"]
 
 Array = NDArray[np.float64]
-#: The exponential tail is fitted to this upper share of the null records: ten of the fewest.
-TAIL_SHARE = 0.25
-MIN_NULL_RECORDS = 40
+#: Floor of an extrapolated probability; decides nothing, because no level is that low.
+MIN_P_VALUE = 1e-12
 #: Keeps the tail from vanishing when null records score alike.
 MIN_TAIL_SCALE_NATS = 0.1
 
@@ -72,11 +70,6 @@ def name_effects(
     Returns
     -------
     Identifications
-
-    Raises
-    ------
-    OptionError
-        When there are too few null records.
     """
     folds = fold_blocks(blocks)
     effects, reasons = effect_candidates(blocks, baseline["coefficient"])
@@ -98,7 +91,12 @@ def name_effects(
         ),
     )
     search = Search(
-        candidates, folds, count_evidence, tail_level(best, level), tuple(expected), settings
+        candidates,
+        folds,
+        count_evidence,
+        tail_level(best, level, settings=settings),
+        tuple(expected),
+        settings,
     )
     identified, unidentified, state = search.run(start)
     return Identifications(
@@ -140,10 +138,6 @@ def _score_null_records(
         kept.append(chunk[[name for name in expected.sums if name in chunk]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
-    if records < MIN_NULL_RECORDS:
-        raise OptionError(
-            f"{records} null records are too few to determine a threshold; give nulls=400"
-        )
     count_evidence = CountEvidence.gathered(expected, rounded_rates(state.blocks, state.baseline))
     best = []
     for linear_sums, chunk in zip(sums, kept, strict=True):
@@ -158,7 +152,7 @@ def _score_null_records(
     return np.sort(np.concatenate(best)), count_evidence
 
 
-def tail_level(best: Array, level: float) -> float:
+def tail_level(best: Array, level: float, *, settings: Settings = DEFAULTS) -> float:
     """Return the value that the best evidence of a null record exceeds with probability `level`.
 
     Beyond the upper quarter of the null records, an exponential tail extrapolates it.
@@ -169,9 +163,26 @@ def tail_level(best: Array, level: float) -> float:
     >>> abs(tail_level(sample, 0.001) - np.log(1000)) < 0.1
     np.True_
     """
-    if level >= TAIL_SHARE:
+    share = settings.tail_share
+    if level >= share:
         return float(np.quantile(best, 1.0 - level))
-    start = float(np.quantile(best, 1.0 - TAIL_SHARE))
+    start, scale = _fit_tail(best, share)
+    return start + scale * math.log(share / level)
+
+
+def tail_probability(best: Array, nats: float, *, settings: Settings = DEFAULTS) -> float:
+    """Return the share of null records whose best evidence reaches `nats`.
+
+    It is the inverse of `tail_level`, and not less than `MIN_P_VALUE`.
+    """
+    start, scale = _fit_tail(best, settings.tail_share)
+    if nats <= start:
+        return float((best >= nats).mean())
+    return max(settings.tail_share * math.exp(-(nats - start) / scale), MIN_P_VALUE)
+
+
+def _fit_tail(best: Array, share: float) -> tuple[float, float]:
+    """Return start and scale of the exponential tail of the upper `share` of null records."""
+    start = float(np.quantile(best, 1.0 - share))
     above = best[best > start]
-    scale = max(float(np.mean(above - start)) if above.size else 0.0, MIN_TAIL_SCALE_NATS)
-    return start + scale * math.log(TAIL_SHARE / level)
+    return start, max(float(np.mean(above - start)) if above.size else 0.0, MIN_TAIL_SCALE_NATS)

@@ -174,7 +174,7 @@ def _is_in_range(component: Component, state: State) -> bool:
         for item in effects()[component.candidate.effect].parameters()
     }
     sizes, covariance = component_mixture(component, state).moments()
-    least = np.abs(sizes) - state.settings.impossible_sigma * np.sqrt(np.diagonal(covariance))
+    least = np.abs(sizes) - state.settings.clear_sigma * np.sqrt(np.diagonal(covariance))
     return all(
         size <= largest.get(name, np.inf)
         for name, size in zip(component.variant.columns, least, strict=True)
@@ -196,7 +196,7 @@ def _is_above_least(component: Component, state: State) -> bool:
     if least is None or not np.isfinite(least):
         return True
     size, error = component_size(component, state)
-    return size >= least - state.settings.impossible_sigma * error
+    return size >= least - state.settings.clear_sigma * error
 
 
 def _has_more_levels(component: Component, state: State) -> bool:

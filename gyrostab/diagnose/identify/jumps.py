@@ -201,7 +201,7 @@ def _fit_event(
 def _is_other_level(component: Component, state: State, span: tuple[int, int]) -> bool:
     """Return whether the level after an event clearly differs from that before it."""
     size, covariance = _fit_event(component, state, span)[1].moments()
-    return bool(abs(size[-1]) > state.settings.impossible_sigma * np.sqrt(covariance[-1, -1]))
+    return bool(abs(size[-1]) > state.settings.clear_sigma * np.sqrt(covariance[-1, -1]))
 
 
 def _transition_evidence(component: Component, state: State, length: int) -> float:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.locate.regions import merge_regions, merge_wandering_regions
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores, standardise
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.mean import region_mean
 from gyrostab.diagnose.statistics.variance_stability import scale_to_expected
@@ -19,11 +20,7 @@ from gyrostab.errors import OptionError
 __all__ = ["FIELDS", "find_level_regions", "locate_mismatches"]
 
 Array = NDArray[np.float64]
-RAISED_SIGMA = 2.0  # of a short window that is part of a mismatch which shows only in a long one
-WHOLE_RECORD_SIGMA = 0.7  # by which a part of the record must exceed the whole
-PIECES_SHARE = 0.8  # of the score of a window, that its short windows reach if they show the same
-NEIGHBOUR_SIGMA = 3.0  # of a cell that belongs to the mismatch next to it
-NEIGHBOUR_EXCESS_SHARE = 0.25  # of the largest excess, that such a cell must have
+# Limits of the table; the rows left out are the least certain.
 MAX_PER_ROW = 8  # mismatches of one statistic and row
 MAX_MISMATCHES = 30  # of a record
 LINE_REACH_BINS = 3  # lines on either side that a strong line leaks into
@@ -52,6 +49,7 @@ def locate_mismatches(
     nulls: Iterable[xr.Dataset] | NullScores,
     *,
     level: float = 0.01,
+    settings: Settings = DEFAULTS,
 ) -> xr.Dataset:
     """Locate where a recording differs from the simulation by more than noise does.
 
@@ -70,6 +68,7 @@ def locate_mismatches(
         Null records from `gyrostab.diagnose.nulls.records.null_records`, or their `null_scores`.
     level : float
         Probability that a recording without missing physics has any mismatch.
+    settings : Settings
 
     Returns
     -------
@@ -83,7 +82,7 @@ def locate_mismatches(
     Raises
     ------
     OptionError
-        When `level` is not between 0 and 0.5, or the null records are too few.
+        When `level` is not between 0 and 0.5.
 
     Examples
     --------
@@ -97,7 +96,9 @@ def locate_mismatches(
             f"level {level!r}: give a false-alarm probability above 0 and below 0.5, "
             "for instance 0.01"
         )
-    null = nulls if isinstance(nulls, NullScores) else null_scores(baseline, nulls)
+    null = (
+        nulls if isinstance(nulls, NullScores) else null_scores(baseline, nulls, settings=settings)
+    )
     regions: list[dict[str, Any]] = []
     for name, score in STATISTICS.items():
         if name not in null.statistics:
@@ -108,8 +109,9 @@ def locate_mismatches(
             if name == "variance_stability"
             else blocks
         )
-        regions += find(name, score, seen, baseline, null, level)
-    return _make_table(merge_regions(regions)[:MAX_MISMATCHES], blocks, null, level)
+        regions += find(name, score, seen, baseline, null, level, settings)
+    merged = merge_regions(regions, settings=settings)
+    return _make_table(merged[:MAX_MISMATCHES], blocks, null, level)
 
 
 def find_level_regions(
@@ -131,7 +133,13 @@ def find_level_regions(
 
 
 def _locate_regions(
-    name: str, score: Any, blocks: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
+    name: str,
+    score: Any,
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    null: NullScores,
+    level: float,
+    settings: Settings,
 ) -> list[dict[str, Any]]:
     """Locate the regions of one statistic, row by row."""
     scores = score(blocks, baseline)
@@ -140,7 +148,7 @@ def _locate_regions(
     for row in range(z.shape[0]):
         left = z[row].copy()
         for _ in range(MAX_PER_ROW):
-            region = _take_region(scores, row, left, z[row], critical)
+            region = _take_region(scores, row, left, z[row], critical, settings)
             if region is None:
                 break
             region["p_value"] = float(null.p_value(name, region["z"]))
@@ -149,7 +157,13 @@ def _locate_regions(
 
 
 def _locate_mean_regions(
-    name: str, score: Any, blocks: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
+    name: str,
+    score: Any,
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    null: NullScores,
+    level: float,
+    settings: Settings,
 ) -> list[dict[str, Any]]:
     """Locate the regions of the mean, each with the ones before it removed.
 
@@ -163,7 +177,7 @@ def _locate_mean_regions(
         scores = score(blocks, now)
         z = standardise(scores, null.statistics[name])
         for row in sorted(open_rows):
-            region = _take_region(scores, row, z[row].copy(), z[row], critical)
+            region = _take_region(scores, row, z[row].copy(), z[row], critical, settings)
             if region is None:
                 open_rows.discard(row)
                 continue
@@ -179,11 +193,11 @@ def _locate_mean_regions(
             found.append(region)
         if not open_rows:
             break
-    return merge_wandering_regions(found)
+    return merge_wandering_regions(found, settings=settings)
 
 
 def _take_region(
-    scores: xr.Dataset, row: int, left: Array, z: Array, critical: float
+    scores: xr.Dataset, row: int, left: Array, z: Array, critical: float, settings: Settings
 ) -> dict[str, Any] | None:
     """Return the region around the largest score left, or None; remove it from `left`."""
     if not np.isfinite(left).any() or np.nanmax(np.abs(left)) < critical:
@@ -193,9 +207,9 @@ def _take_region(
     free = np.where(
         np.isfinite(left[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0
     )  # explained windows do not count
-    begin, end, fine = _find_span(scores, free * sign, int(window))
+    begin, end, fine = _find_span(scores, free * sign, int(window), settings)
     combined, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
-    columns, reach = _find_columns(scores, combined, ratio, int(column))
+    columns, reach = _find_columns(scores, combined, ratio, int(column), settings)
     region = {
         "view": scores.attrs["view"],
         "axes": str(scores["axes"].values[row]),
@@ -224,7 +238,9 @@ def _take_region(
     return region
 
 
-def _find_span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float, NDArray[np.int64]]:
+def _find_span(
+    scores: xr.Dataset, z: Array, window: int, settings: Settings
+) -> tuple[float, float, NDArray[np.int64]]:
     """Return begin and end of the time about a window that explains most of a column.
 
     It is the run of the shortest windows with the largest sum over the root of their number. The
@@ -248,8 +264,10 @@ def _find_span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float,
             best, low, high = float(sums[place]), place, place + count
     chosen = fine[low:high]
     inside = fine[(first[fine] >= first[window]) & (stop[fine] <= stop[window])]
-    if best < PIECES_SHARE * z[window]:  # the short windows do not add up to the whole one
-        raised = inside[z[inside] > RAISED_SIGMA]
+    if (
+        best < settings.window_sum_share * z[window]
+    ):  # the short windows do not add up to the whole one
+        raised = inside[z[inside] > settings.visible_sigma]
         chosen = (
             inside[(inside >= raised[0]) & (inside <= raised[-1])]
             if raised.size
@@ -258,7 +276,7 @@ def _find_span(scores: xr.Dataset, z: Array, window: int) -> tuple[float, float,
     elif (
         first[window] == first.min()
         and stop[window] == stop.max()
-        and best < z[window] + WHOLE_RECORD_SIGMA
+        and best < z[window] + settings.whole_record_sigma
     ):
         chosen = inside
     return float(begin[chosen[0]]), float(end[chosen[-1]]), chosen
@@ -295,11 +313,11 @@ def _combine_windows(
 
 
 def _find_columns(
-    scores: xr.Dataset, combined: Array, ratio: Array, column: int
+    scores: xr.Dataset, combined: Array, ratio: Array, column: int, settings: Settings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the columns of a region, and those that it explains."""
     what, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
-    above = np.nan_to_num(combined) > NEIGHBOUR_SIGMA
+    above = np.nan_to_num(combined) > settings.clear_sigma
     if what[column] == "level":  # of all averaging times: the region has those above the noise
         seen = np.flatnonzero(above & (what == "avar"))
         return (seen if seen.size else np.array([column])), np.arange(what.size)
@@ -310,7 +328,7 @@ def _find_columns(
         upper += 1
     grown = np.arange(lower, upper + 1)
     excess = np.abs(ratio - 1.0) if scores.attrs["view"] == "davar" else np.abs(combined)
-    region = grown[excess[grown] >= NEIGHBOUR_EXCESS_SHARE * excess[column]]
+    region = grown[excess[grown] >= settings.region_excess_share * excess[column]]
     beside = LINE_REACH_BINS if what[column] == "line" else 0
     if what[column] == "line":
         return np.array([column]), np.arange(

@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from gyrostab.diagnose.settings import DEFAULTS, Settings
+
 __all__ = ["merge_regions", "merge_wandering_regions"]
 
 Region = dict[str, Any]
-MIN_COMMON_SHARE = 0.5  # of the time of two regions, above which they are one
-#: Gap between two regions that are one, as a share of the longer; at most the shorter.
-MAX_GAP_SHARE = 0.25
-LINE_TOLERANCE_SHARE = 0.02  # of the frequency, by which one line may differ
 TAU_TOLERANCE = 0.99  # ratio of averaging times that are equal but for rounding
 _SEPARATE_KINDS = ("slow", "variance", "drifting")
-MAX_MEAN_REGIONS = 3  # of an axis, beyond which its mean wanders
 
 
-def merge_regions(regions: Sequence[Region]) -> list[Region]:
+def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -> list[Region]:
     """Merge regions, the surest first; the surest gives the numbers.
 
     Regions of different axes are merged when they share most of their time. Those of the same axes
@@ -27,6 +24,7 @@ def merge_regions(regions: Sequence[Region]) -> list[Region]:
     ----------
     regions : sequence of dict
         With the fields of `gyrostab.diagnose.locate.mismatches.FIELDS`.
+    settings : Settings
 
     Examples
     --------
@@ -41,17 +39,19 @@ def merge_regions(regions: Sequence[Region]) -> list[Region]:
     kept: list[Region] = []
     for region in sorted(regions, key=lambda one: (one["p_value"], -abs(one["z"]))):
         for other in kept:
-            if not _are_alike(region, other):
+            if not _are_alike(region, other, settings):
                 continue
-            if _common_share(region, other) > MIN_COMMON_SHARE or _are_adjacent(region, other):
-                _extend_region(other, region)
+            if _common_share(region, other) > settings.common_time_share or _are_adjacent(
+                region, other, settings
+            ):
+                _extend_region(other, region, settings)
                 break
         else:
             kept.append(dict(region))
     return kept
 
 
-def _are_alike(one: Region, other: Region) -> bool:
+def _are_alike(one: Region, other: Region, settings: Settings) -> bool:
     """Return whether statistic, direction, and averaging times or line are the same."""
     if one["view"] != other["view"] or (
         one["sign"] != other["sign"] and one["view"] != "cross_axis"
@@ -60,7 +60,7 @@ def _are_alike(one: Region, other: Region) -> bool:
     if one["what"] == "line" or other["what"] == "line":
         return bool(
             one["what"] == other["what"]
-            and abs(one["frequency"] / other["frequency"] - 1.0) < LINE_TOLERANCE_SHARE
+            and abs(one["frequency"] / other["frequency"] - 1.0) < settings.line_width_share
         )
     if _kind_of(one) != _kind_of(other):
         return False
@@ -86,7 +86,7 @@ def _common_share(one: Region, other: Region) -> float:
     return float(common / (max(one["end"], other["end"]) - min(one["begin"], other["begin"])))
 
 
-def _are_adjacent(one: Region, other: Region) -> bool:
+def _are_adjacent(one: Region, other: Region, settings: Settings) -> bool:
     """Return whether two regions of the same axes are adjacent."""
     if not set(one["axes"].split()) <= set(other["axes"].split()) or one["view"] in (
         "mean",
@@ -96,13 +96,13 @@ def _are_adjacent(one: Region, other: Region) -> bool:
     shorter, longer = sorted([one["end"] - one["begin"], other["end"] - other["begin"]])
     return bool(
         max(one["begin"], other["begin"]) - min(one["end"], other["end"])
-        <= min(MAX_GAP_SHARE * longer, shorter) + 1e-6
+        <= min(settings.gap_time_share * longer, shorter) + 1e-6
     )
 
 
-def _extend_region(region: Region, other: Region) -> None:
+def _extend_region(region: Region, other: Region, settings: Settings) -> None:
     """Extend a region to another one."""
-    if _common_share(region, other) <= MIN_COMMON_SHARE:
+    if _common_share(region, other) <= settings.common_time_share:
         region["begin"], region["end"] = (
             min(region["begin"], other["begin"]),
             max(region["end"], other["end"]),
@@ -119,7 +119,9 @@ def _extend_region(region: Region, other: Region) -> None:
     )
 
 
-def merge_wandering_regions(regions: Sequence[Region]) -> list[Region]:
+def merge_wandering_regions(
+    regions: Sequence[Region], *, settings: Settings = DEFAULTS
+) -> list[Region]:
     """Merge the regions of the mean of an axis when there are many: its mean wanders.
 
     The largest gives the numbers.
@@ -128,11 +130,12 @@ def merge_wandering_regions(regions: Sequence[Region]) -> list[Region]:
     ----------
     regions : sequence of dict
         Regions of the mean, one axis each.
+    settings : Settings
     """
     found = []
     for axes in dict.fromkeys(region["axes"] for region in regions):
         mine = [region for region in regions if region["axes"] == axes]
-        if len(mine) > MAX_MEAN_REGIONS:
+        if len(mine) > settings.max_mean_regions:
             largest = max(mine, key=lambda region: abs(region["z"]))
             begin, end = (
                 min(region["begin"] for region in mine),

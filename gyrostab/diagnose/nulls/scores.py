@@ -9,8 +9,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
-from gyrostab.errors import OptionError
 
 __all__ = ["MaximumDistribution", "NullScores", "StatisticNull", "null_scores", "standardise"]
 
@@ -18,10 +18,7 @@ Array = NDArray[np.float64]
 _KEPT_BELOW_SIGMA = 1.4  # below the largest of independent cells, from which scores are kept
 _POWERS_AT_ONCE = 1_000_000  # band powers of null records scored at once; limits memory
 _FIRST_RECORDS = 20  # null records for the first estimate of a standard deviation
-_POOLED_RECORDS = 100.0  # weight of the mean variance over equal windows; design choice
-_TAIL_SHARE = 0.25  # of the null records, the largest, to which the tail is fitted
 _MIN_TAIL_SCALE = 0.7  # of half a squared score; that of a single normal cell is 1
-_MIN_RECORDS = 40  # design choice
 _MIN_P_VALUE = 1e-9  # a tail from hundreds of records is unreliable beyond
 
 
@@ -92,7 +89,9 @@ class NullScores:
         return float(np.sqrt(2.0 * max(t, 0.0)))
 
 
-def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores:
+def null_scores(
+    baseline: xr.Dataset, nulls: Iterable[xr.Dataset], *, settings: Settings = DEFAULTS
+) -> NullScores:
     """Collect the scores of null records chunk by chunk, keeping only extreme scores.
 
     Parameters
@@ -102,14 +101,11 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
     nulls : iterable of xarray.Dataset
         Null records in chunks with a leading dimension ``record``.
 
+    settings : Settings
+
     Returns
     -------
     NullScores
-
-    Raises
-    ------
-    OptionError
-        If there are too few records.
     """
     gathered: dict[str, _ScoreSums] = {}
     records = 0
@@ -122,21 +118,17 @@ def null_scores(baseline: xr.Dataset, nulls: Iterable[xr.Dataset]) -> NullScores
                 scores = score(part, baseline)
                 if scores is not None:
                     if name not in gathered:
-                        gathered[name] = _ScoreSums(scores)
+                        gathered[name] = _ScoreSums(scores, settings.pooled_records)
                     gathered[name].add(scores)
-    if records < _MIN_RECORDS:
-        raise OptionError(
-            f"{records} null records are too few to tell how often noise alone does as much; "
-            "give nulls=400"
-        )
     statistics = {}
     largest = {}
     for name, statistic in gathered.items():
         mean, spread, z = statistic.finish()
         half = z**2 / 2.0
-        statistics[name] = StatisticNull(mean, spread, _fit_maximum(half))
+        statistics[name] = StatisticNull(mean, spread, _fit_maximum(half, settings.tail_share))
         largest[name] = statistics[name].tail.surprise(half)
-    return NullScores(statistics, _fit_maximum(np.max(list(largest.values()), axis=0)), records)
+    family = _fit_maximum(np.max(list(largest.values()), axis=0), settings.tail_share)
+    return NullScores(statistics, family, records)
 
 
 def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:
@@ -145,10 +137,10 @@ def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:
     return np.asarray(np.maximum(z, 0.0) if scores.attrs["one_sided"] else z)
 
 
-def _fit_maximum(largest: Array) -> MaximumDistribution:
+def _fit_maximum(largest: Array, tail_share: float) -> MaximumDistribution:
     """Fit the distribution of the largest values."""
     sample = np.sort(largest)
-    start = float(np.quantile(sample, 1.0 - _TAIL_SHARE))
+    start = float(np.quantile(sample, 1.0 - tail_share))
     above = sample[sample > start] - start
     share = max(above.size, 1) / (sample.size + 1.0)
     return MaximumDistribution(
@@ -159,7 +151,8 @@ def _fit_maximum(largest: Array) -> MaximumDistribution:
 class _ScoreSums:
     """Running sums of one statistic over the null records, and its extreme scores."""
 
-    def __init__(self, scores: xr.Dataset) -> None:
+    def __init__(self, scores: xr.Dataset, pooled_records: float) -> None:
+        self.pooled_records = pooled_records
         self.shape = scores["z"].shape[1:]
         self.sums = np.zeros((3, int(np.prod(self.shape))))
         self.extremes: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
@@ -187,7 +180,7 @@ class _ScoreSums:
 
     def _keep_extremes(self) -> None:
         """Keep extreme scores by the moments so far, which suffice to drop the rest."""
-        mean, spread = _pooled_moments(self.sums, self._pool_variance(), self.floor)
+        mean, spread = self._pooled_moments(self.sums, self._pool_variance(), self.floor)
         for z in self.waiting:
             with np.errstate(invalid="ignore"):
                 deviation = (z - mean) / spread
@@ -217,10 +210,10 @@ class _ScoreSums:
         """Return mean and spread of every cell, and the largest scores by the other records."""
         self._keep_extremes()
         pooled_variance = self._pool_variance()
-        mean, spread = _pooled_moments(self.sums, pooled_variance, self.floor)
+        mean, spread = self._pooled_moments(self.sums, pooled_variance, self.floor)
         record, cell, z = (np.concatenate(part) for part in zip(*self.extremes, strict=True))
         others = self.sums[:, cell] - np.stack([np.ones(z.size), z, z**2])
-        own_mean, own_spread = _pooled_moments(others, pooled_variance[cell], self.floor[cell])
+        own_mean, own_spread = self._pooled_moments(others, pooled_variance[cell], self.floor[cell])
         deviation = (z - own_mean) / own_spread
         largest = np.full(self.records, self.kept)
         np.maximum.at(
@@ -228,16 +221,17 @@ class _ScoreSums:
         )
         return mean.reshape(self.shape), spread.reshape(self.shape), largest
 
-
-def _pooled_moments(sums: Array, pooled_variance: Array, floor: Array) -> tuple[Array, Array]:
-    """Return mean and standard deviation from running sums, with shrunk variance."""
-    count, first, second = sums
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = first / count
-        variance = (
-            np.maximum(second - count * mean**2, 0.0) + _POOLED_RECORDS * pooled_variance
-        ) / (count + _POOLED_RECORDS)
-    known = count > 1
-    return np.where(known, mean, np.nan), np.where(
-        known, np.maximum(np.sqrt(variance), floor), np.nan
-    )
+    def _pooled_moments(
+        self, sums: Array, pooled_variance: Array, floor: Array
+    ) -> tuple[Array, Array]:
+        """Return mean and standard deviation from running sums, with shrunk variance."""
+        count, first, second = sums
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = first / count
+            variance = (
+                np.maximum(second - count * mean**2, 0.0) + self.pooled_records * pooled_variance
+            ) / (count + self.pooled_records)
+        known = count > 1
+        return np.where(known, mean, np.nan), np.where(
+            known, np.maximum(np.sqrt(variance), floor), np.nan
+        )

@@ -20,6 +20,7 @@ from gyrostab.diagnose.result.attribution_weights import (
     score_left,
     statistic_scores,
 )
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = ["active_blocks", "attribute_mismatches", "drop_expected", "join_blocks"]
 
@@ -41,21 +42,15 @@ _VIEWS_SHOWN: dict[str, tuple[str, ...]] = {
 _MODELLED = ("mean", "power", "cross", "wander", "levels")
 #: Statistics that may move the rate within a block, which is power at its lowest lines.
 _MOVING = ("mean", "levels")
-# Shares of the largest contribution of an effect; choices that separate acting from resting.
-ACTIVE_SHARE = 0.1  # a contribution above it counts as acting
-REST_SHARE = 0.05  # a contribution below it counts as resting
-MIN_REST_BLOCK_SHARE = 0.05  # share of the blocks at rest that makes zero the level of rest
-MOVING_STEP_SHARE = 0.1  # of the largest step between blocks, above which the rate moves within one
-MIN_OVERLAP_SHARE = 0.3  # of the shorter of effect and mismatch, above which they coincide
 MAX_SPANS = 6  # more intervals than that are reported as the whole record
-# Lines next to a strong one, and share of its frequency, that belong to it.
-LINE_REACH_BINS = 3
-LINE_REACH_SHARE = 0.02  # of the frequency
+LINE_REACH_BINS = 3  # of the taper, that a strong line leaks into
 SINE_TAU_CYCLES = 0.371  # tau * f where the Allan variance of a sine is largest
 TAU_REACH_FACTOR = 4.0  # averaging times around that maximum at which a line still shows
 
 
-def active_blocks(identification: Identification, blocks: xr.Dataset) -> NDArray[np.bool_]:
+def active_blocks(
+    identification: Identification, blocks: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> NDArray[np.bool_]:
     """Return the blocks in which an effect acts, from its designs and the rotation of the tool.
 
     These are all blocks when neither depends on time.
@@ -65,7 +60,7 @@ def active_blocks(identification: Identification, blocks: xr.Dataset) -> NDArray
     for component in identification.components:
         design = component.variant.design
         if component.candidate.statistic == "order":
-            there |= _rotating_blocks(blocks)
+            there |= _rotating_blocks(blocks, settings)
             continue
         if (
             component.candidate.statistic not in ("mean", "power", "cross", "wander")
@@ -76,26 +71,29 @@ def active_blocks(identification: Identification, blocks: xr.Dataset) -> NDArray
         if not place:
             return np.ones(block_count, bool)
         size = np.asarray(np.moveaxis(np.asarray(design), place[0], 0).reshape(block_count, -1))
-        size = np.abs(size - _rest_level(size) if component.candidate.statistic == "mean" else size)
+        if component.candidate.statistic == "mean":
+            size = size - _rest_level(size, settings)
+        size = np.abs(size)
         largest = np.nanmax(size, axis=0, initial=0.0)
-        there |= (size > ACTIVE_SHARE * np.where(largest > 0, largest, np.inf)).any(axis=1)
+        least = settings.active_share * np.where(largest > 0, largest, np.inf)
+        there |= (size > least).any(axis=1)
     return there if there.any() else np.ones(block_count, bool)
 
 
-def _rest_level(size: Array) -> Array:
+def _rest_level(size: Array, settings: Settings) -> Array:
     """Return the level of every column (block, column) at rest.
 
     It is zero where the column stays near zero for a while; else the median, because the constant
     is free.
     """
-    still = np.abs(size) <= REST_SHARE * np.nanmax(np.abs(size), axis=0, initial=0.0)
-    return np.where(still.mean(axis=0) >= MIN_REST_BLOCK_SHARE, 0.0, np.median(size, axis=0))
+    still = np.abs(size) <= settings.rest_share * np.nanmax(np.abs(size), axis=0, initial=0.0)
+    return np.where(still.mean(axis=0) >= settings.rest_share, 0.0, np.median(size, axis=0))
 
 
-def _rotating_blocks(blocks: xr.Dataset) -> NDArray[np.bool_]:
+def _rotating_blocks(blocks: xr.Dataset, settings: Settings) -> NDArray[np.bool_]:
     """Return the blocks in which the tool rotates: its harmonics are measured in these."""
     turn = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values))
-    return np.asarray(turn > REST_SHARE * turn.max(initial=0.0))
+    return np.asarray(turn > settings.rest_share * turn.max(initial=0.0))
 
 
 def join_blocks(there: NDArray[np.bool_], begin: Array, end: Array) -> list[tuple[float, float]]:
@@ -135,6 +133,7 @@ def attribute_mismatches(
     level: float,
     without: Callable[[Sequence[Identification]], xr.Dataset] | None = None,
     still: xr.Dataset | None = None,
+    settings: Settings = DEFAULTS,
 ) -> list[list[str]]:
     """Find the effects that explain each mismatch.
 
@@ -161,6 +160,7 @@ def attribute_mismatches(
         Without it, every effect at the place of a mismatch explains it.
     still : xarray.Dataset, optional
         Line spectra of the recording without the blocks in which an effect moves the rate.
+    settings : Settings
 
     Returns
     -------
@@ -187,13 +187,15 @@ def attribute_mismatches(
                 if number not in chosen
             ]
             known[chosen] = statistic_scores(blocks, without(out), null, regions, rest, still=still)
-        return score_left(region, known[chosen], null, level)
+        return score_left(region, known[chosen], null, level, settings.score_error_share)
 
-    when = [_explained_spans(identification, blocks) for identification in identified]
-    moves = [_moving_spans(identification, blocks, after) for identification in identified]
+    when = [_explained_spans(identification, blocks, settings) for identification in identified]
+    moves = [
+        _moving_spans(identification, blocks, after, settings) for identification in identified
+    ]
     explained = []
     for region in regions:
-        score, limit = score_left(region, scores, null, level)
+        score, limit = score_left(region, scores, null, level, settings.score_error_share)
         shown = []
         for identification, its_time, its_moves in zip(identified, when, moves, strict=True):
             moved = _is_within_blocks(region, blocks) and any(
@@ -202,7 +204,7 @@ def attribute_mismatches(
             components = [
                 component
                 for component in identification.components
-                if _can_show(component, region, blocks)
+                if _can_show(component, region, blocks, settings.line_width_share)
             ]
             components = [
                 component
@@ -219,7 +221,7 @@ def attribute_mismatches(
                 continue
             if (
                 moved
-                or any(_is_coincident(region, span) for span in its_time)
+                or any(_is_coincident(region, span, settings.overlap_share) for span in its_time)
                 or (
                     without is not None
                     and _is_caused_elsewhere(
@@ -230,7 +232,7 @@ def attribute_mismatches(
                 shown.append((identification, components))
         several = without is not None and score < limit
         kept = (
-            needed_effects(region, shown, partial(left, region))
+            needed_effects(region, shown, partial(left, region), settings=settings)
             if several
             else [identification for identification, _ in shown]
         )
@@ -246,6 +248,7 @@ def drop_expected(
     null: NullScores,
     *,
     level: float,
+    settings: Settings = DEFAULTS,
 ) -> xr.Dataset:
     """Drop the mismatches that effects of the simulation itself explain.
 
@@ -259,6 +262,7 @@ def drop_expected(
         The recording, and the baseline with these effects.
     null : NullScores
     level : float
+    settings : Settings
     """
     anomalous = [
         one
@@ -271,7 +275,9 @@ def drop_expected(
     ]
     others = [one for one in expected if one not in anomalous]
     by_count, by_all = (
-        attribute_mismatches(found, identified, blocks, before, null, level=level)
+        attribute_mismatches(
+            found, identified, blocks, before, null, level=level, settings=settings
+        )
         for identified in (anomalous, others)
     )
     is_expected = [
@@ -315,7 +321,9 @@ def _modelled_statistics(identification: Identification, region: Mapping[str, An
     return held - ({"wander"} if wanders else set())
 
 
-def _can_show(component: Component, region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
+def _can_show(
+    component: Component, region: Mapping[str, Any], blocks: xr.Dataset, line_width_share: float
+) -> bool:
     """Return whether a component of an effect can show in a mismatch.
 
     A line explains only a line at its own frequency, and a mean in common only slow covariance.
@@ -341,7 +349,7 @@ def _can_show(component: Component, region: Mapping[str, Any], blocks: xr.Datase
     if np.isfinite(region["frequency"]):
         return bool(
             abs(region["frequency"] - mine)
-            <= LINE_REACH_BINS * (lines[1] - lines[0]) + LINE_REACH_SHARE * mine
+            <= LINE_REACH_BINS * (lines[1] - lines[0]) + line_width_share * mine
         )
     tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
     return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
@@ -350,7 +358,7 @@ def _can_show(component: Component, region: Mapping[str, Any], blocks: xr.Datase
 
 
 def _explained_spans(
-    identification: Identification, blocks: xr.Dataset
+    identification: Identification, blocks: xr.Dataset, settings: Settings
 ) -> list[tuple[float, float]]:
     """Return the stretches whose mismatches an effect can explain.
 
@@ -359,11 +367,13 @@ def _explained_spans(
     begin, end = blocks["begin"].values, blocks["end"].values
     if any(component.candidate.statistic == "order" for component in identification.components):
         return [(float(begin[0]), float(end[-1]))]
-    return join_blocks(active_blocks(identification, blocks), begin, end)
+    return join_blocks(active_blocks(identification, blocks, settings=settings), begin, end)
 
 
-def _is_coincident(region: Mapping[str, Any], span: tuple[float, float]) -> bool:
-    return _overlap_seconds(region, span) >= MIN_OVERLAP_SHARE * min(
+def _is_coincident(
+    region: Mapping[str, Any], span: tuple[float, float], overlap_share: float
+) -> bool:
+    return _overlap_seconds(region, span) >= overlap_share * min(
         float(region["end"] - region["begin"]), span[1] - span[0]
     )
 
@@ -380,7 +390,7 @@ def _is_within_blocks(region: Mapping[str, Any], blocks: xr.Dataset) -> bool:
 
 
 def _moving_spans(
-    identification: Identification, blocks: xr.Dataset, after: xr.Dataset
+    identification: Identification, blocks: xr.Dataset, after: xr.Dataset, settings: Settings
 ) -> list[tuple[float, float]]:
     """Return the blocks [s] in which an effect moves the rate of an axis within the block."""
     axes, moving = (
@@ -396,7 +406,7 @@ def _moving_spans(
         row = axes.index(component.row[0])
         for column in mean_columns(component.variant, row):
             step = np.abs(np.diff(np.nan_to_num(column)))
-            far = step > MOVING_STEP_SHARE * step.max(initial=0.0)
+            far = step > settings.active_share * step.max(initial=0.0)
             there |= moving[row] & (np.append(far, False) | np.append(False, far))
     return [
         (float(blocks["begin"].values[block]), float(blocks["end"].values[block]))

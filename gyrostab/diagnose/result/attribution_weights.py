@@ -16,6 +16,7 @@ from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.condition import Component, drop_changed_tails, mask_anomalous_blocks
 from gyrostab.diagnose.predict.filter_response import is_filter
 from gyrostab.diagnose.predict.linear_model import pair_rows
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.variance_stability import scale_to_expected
 
@@ -42,8 +43,6 @@ _STATISTICS_CONTAINED: dict[str, tuple[str, ...]] = {
     "distribution": ("power",),
 }
 _LINE_STATISTICS = ("spectral_line", "drifting_line")  # of the spectrum at full resolution
-MODEL_ERROR_SHARE = 0.3  # of the score of a mismatch, that an error of an effect's form may leave
-FAIR_SHARE = 0.5  # of an equal share, from which on an effect is needed; see `needed_effects`
 
 
 def statistic_scores(
@@ -136,9 +135,12 @@ def _with_shared_lines(
 
 
 def score_left(
-    region: Region, scores: Scores, null: NullScores, level: float
+    region: Region, scores: Scores, null: NullScores, level: float, error_share: float
 ) -> tuple[float, float]:
-    """Return the largest score left at a mismatch, and the score that still makes it one."""
+    """Return the largest score left at a mismatch, and the score that still makes it one.
+
+    An error of the form of an effect may leave `error_share` of the score of the mismatch.
+    """
     left, limit = 0.0, np.inf
     for name, statistic, z in scores:
         if (
@@ -161,9 +163,8 @@ def score_left(
         cells = np.abs(z[np.ix_(rows, inside, columns)])
         if np.isfinite(cells).any():
             left = max(left, float(np.nanmax(cells)))
-            limit = min(
-                limit, max(null.critical(name, level), MODEL_ERROR_SHARE * abs(float(region["z"])))
-            )
+            allowed = error_share * abs(float(region["z"]))
+            limit = min(limit, max(null.critical(name, level), allowed))
     return left, limit
 
 
@@ -171,6 +172,8 @@ def needed_effects(
     region: Region,
     shown: Sequence[tuple[Identification, Sequence[Component]]],
     left: Callable[[Sequence[Identification]], tuple[float, float]],
+    *,
+    settings: Settings = DEFAULTS,
 ) -> list[Identification]:
     """Select the effects that are needed to explain a mismatch.
 
@@ -190,6 +193,7 @@ def needed_effects(
         statistic.
     left : callable
         Takes effects to leave out; returns the score that is left, and the score of a mismatch.
+    settings : Settings
     """
     weighed = [
         one
@@ -201,7 +205,7 @@ def needed_effects(
     whole = left(())[0]
     brought = left(weighed)[0] - whole
     without = [left((one,)) for one in weighed]
-    fair = FAIR_SHARE * brought / len(shown)
+    fair = settings.needed_share * brought / len(shown)
     kept = [
         number
         for number, (score, limit) in enumerate(without)

@@ -42,6 +42,7 @@ from gyrostab.diagnose.result.tables import (
     unidentified_tables,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
+from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.task import Comparison, Task, lines_without_motion
 from gyrostab.simulate.model import Model
 
@@ -82,11 +83,17 @@ def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diag
         "schema": SCHEMA,
         "recording": recording_table(blocks),
         "baseline": baseline_table(baseline, fit.expected),
-        "verdict": decide_verdict(mismatches, fit.identifications.identified, unexplained, held),
+        "verdict": decide_verdict(
+            mismatches,
+            fit.identifications.identified,
+            unexplained,
+            held,
+            settings=task.settings,
+        ),
         "false_alarm_level": task.level,
         "settings": task.settings.to_dict(),
         "mismatches": mismatches,
-        "effects": effect_tables(fit.fitted, blocks),
+        "effects": effect_tables(fit.fitted, blocks, settings=task.settings),
         "unexplained": unexplained,
         "not_found": limit_tables(find_upper_limits(fit.identifications)),
         "unused_channels": unused_channels(blocks, _used_channels(fit.identifications)),
@@ -192,7 +199,7 @@ def measure_evidence(
     lasting = tuple(
         identification
         for identification in judged.identified
-        if _can_be_forecast(identification, blocks)
+        if _can_be_forecast(identification, blocks, identifications.state.settings)
     )
     evidence = held_out(
         clean,
@@ -211,7 +218,9 @@ def _components(identified: Sequence[Identification]) -> list[Component]:
     return [component for identification in identified for component in identification.components]
 
 
-def _can_be_forecast(identification: Identification, blocks: xr.Dataset) -> bool:
+def _can_be_forecast(
+    identification: Identification, blocks: xr.Dataset, settings: Settings
+) -> bool:
     """Return whether an effect acts both before and after the time that a forecast begins from.
 
     The size of an event in the last part is unknown before, and an event that is over does not
@@ -219,7 +228,8 @@ def _can_be_forecast(identification: Identification, blocks: xr.Dataset) -> bool
     """
     if {component.candidate.statistic for component in identification.components} <= {"marks"}:
         return False
-    acts, known = active_blocks(identification, blocks), select_forecast_start(blocks)
+    acts = active_blocks(identification, blocks, settings=settings)
+    known = select_forecast_start(blocks)
     return bool(acts[known].any() and acts[~known].any())
 
 
@@ -250,9 +260,12 @@ def _attributed_mismatches(
         level=task.level / 2.0,
         without=without,
         still=lines,
+        settings=task.settings,
     )
     mismatches = mismatch_tables(found, blocks, explained)
-    mismatches += identification_tables(fit.identifications, blocks, mismatches)
+    mismatches += identification_tables(
+        fit.identifications, blocks, mismatches, settings=task.settings
+    )
     mismatches += unidentified_tables(fit.identifications, blocks, mismatches)
     return mismatches + motion_tables(identified, blocks, mismatches)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.estimate.upper_limits import UpperLimit
+from gyrostab.diagnose.identify.forward_search import MIN_P_VALUE, tail_probability
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.predict.condition import Component
 from gyrostab.diagnose.predict.nuisance import NUISANCE_ALTERNATIVES
@@ -30,13 +31,13 @@ from gyrostab.diagnose.result.text import (
     span_text,
     unsized_statement,
 )
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.noise import LAWS
 from gyrostab.physics.base import Effect
 from gyrostab.simulate.model import Model
 
 __all__ = [
     "baseline_table",
-    "chance_of_gain",
     "effect_tables",
     "identification_tables",
     "iso",
@@ -50,9 +51,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-TAIL_SHARE = 0.25  # upper share of the null records that the exponential tail is fitted to
-MIN_P_VALUE = 1e-12  # floor of the extrapolated tail; text.py prints no less than 1e-6
-MIN_TAIL_SCALE_NATS = 0.1  # keeps the tail from vanishing when null records score alike
 #: Samples of an instrument that is "much faster than the log" (`instrument = 0`): a low-pass of the
 #: instrument is then resolved in the samples of the log.
 FAST_INSTRUMENT_SAMPLES = 16
@@ -159,20 +157,12 @@ def mismatch_tables(
     return out
 
 
-def chance_of_gain(best: Array, evidence_nats: float) -> float:
-    """Return the share of null records whose best evidence reaches `evidence_nats`.
-
-    Beyond the upper quarter of the null records, an exponential tail extrapolates it.
-    """
-    start = float(np.quantile(best, 1.0 - TAIL_SHARE))
-    if evidence_nats <= start:
-        return float((best >= evidence_nats).mean())
-    scale = max(float((best[best > start] - start).mean()), MIN_TAIL_SCALE_NATS)
-    return max(TAIL_SHARE * math.exp(-(evidence_nats - start) / scale), MIN_P_VALUE)
-
-
 def identification_tables(
-    identifications: Identifications, blocks: xr.Dataset, known: Sequence[Mapping[str, Any]]
+    identifications: Identifications,
+    blocks: xr.Dataset,
+    known: Sequence[Mapping[str, Any]],
+    *,
+    settings: Settings = DEFAULTS,
 ) -> list[dict[str, Any]]:
     """Return mismatches that only the identification shows.
 
@@ -191,8 +181,11 @@ def identification_tables(
         strongest = max(identification.components, key=lambda component: component.evidence_nats)
         statistic = _COMPONENT_VIEWS.get(strongest.candidate.statistic, "davar")
         low, high = _averaging_times(strongest, statistic, blocks)
-        p_value = chance_of_gain(identifications.null_best, identification.evidence_nats)
-        for first, last in join_blocks(active_blocks(identification, blocks), begin, end):
+        p_value = tail_probability(
+            identifications.null_best, identification.evidence_nats, settings=settings
+        )
+        acting = active_blocks(identification, blocks, settings=settings)
+        for first, last in join_blocks(acting, begin, end):
             when = span_text(first, last, float(end[-1]))
             out.append(
                 {
@@ -259,7 +252,9 @@ def _unidentified_table(
     number: int,
     statistic: str,
 ) -> dict[str, Any]:
-    p_value = chance_of_gain(identifications.null_best, one.evidence_nats)
+    p_value = tail_probability(
+        identifications.null_best, one.evidence_nats, settings=identifications.state.settings
+    )
     candidates = ", ".join(plain_name(name) for name in one.candidates)
     nearest = f"; the closest candidates are {candidates}" if candidates else ""
     means, what = statistic == "mean", NUISANCE_ALTERNATIVES.get(one.generic, "something differs")
@@ -363,7 +358,9 @@ def _axes_following(axis: str, identified: Sequence[Identification]) -> list[str
     )
 
 
-def effect_tables(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[dict[str, Any]]:
+def effect_tables(
+    fitted: Sequence[Fitted], blocks: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> list[dict[str, Any]]:
     """Return the named effects, the strongest first.
 
     An effect with different sizes on several axes is one identification in as many tables, each
@@ -374,7 +371,8 @@ def effect_tables(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[dict[str
     out = []
     for one in fitted:
         identification = one.identification
-        when = join_blocks(active_blocks(identification, blocks), begin, end)
+        acting = active_blocks(identification, blocks, settings=settings)
+        when = join_blocks(acting, begin, end)
         whole = float(end[-1])
         out.append(
             {

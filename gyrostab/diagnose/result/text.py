@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gyrostab.diagnose.result.verdict import failed_checks
+from gyrostab.diagnose.settings import Settings
 from gyrostab.physics.registry import effects
 from gyrostab.units import DAY, HOUR
 
@@ -563,7 +564,7 @@ def summary(content: Mapping[str, Any]) -> str:
     if not content["effects"]:
         return f"{differs}; none of the known effects explains {them}."
     names = _list_effects(content["effects"])
-    failed = failed_checks(content["held_out"])
+    failed = failed_checks(content["held_out"], settings=Settings(**content.get("settings", {})))
     doubt = f" The effects do not describe the record well: {'; '.join(failed)}." if failed else ""
     if content["verdict"] == "unknown":
         return f"{differs}. The effects that were found do not explain {them}: {names}.{doubt}"

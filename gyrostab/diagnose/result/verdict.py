@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-__all__ = ["decide_verdict", "failed_checks"]
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-#: Share of the cells inside their 95 % band when the model is right.
-RIGHT_COVERAGE = 0.95
-#: Fall of that share that counts as worse: two standard errors, 2 * sqrt(0.95 * 0.05 / 1080), for
-#: the cells of at least 36 held-out stretches, three window lengths and some ten averaging times.
-COVERAGE_TOLERANCE = 0.013
+__all__ = ["decide_verdict", "failed_checks"]
 
 
 def _is_positive(value: Any) -> bool:
@@ -23,40 +19,21 @@ def _has_gain(held: Mapping[str, Any]) -> bool:
     return _is_positive(held["log_likelihood_gain"])
 
 
-def _has_forecast(held: Mapping[str, Any]) -> bool:
-    return held["forecast_gain"] is None or not held["forecast_gain"] < 0.0
-
-
-def _has_coverage(held: Mapping[str, Any]) -> bool:
+def _has_coverage(held: Mapping[str, Any], tolerance: float) -> bool:
     before, after = held["coverage95_before"], held["coverage95_after"]
     if before is None or after is None or not math.isfinite(before) or not math.isfinite(after):
         return True
-    return bool(after >= min(before, RIGHT_COVERAGE) - COVERAGE_TOLERANCE)
+    return bool(after >= min(before, 0.95) - tolerance)
 
 
-#: Checks of the held-out evidence, each with the message of a failure.
-_CHECKS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
-    (
-        _has_gain,
-        "held-out data are not predicted better "
-        "(log-likelihood gain {log_likelihood_gain:.3g} nats)",
-    ),
-    (_has_forecast, "the forecast of the last 30 % is worse ({forecast_gain:.3g} nats)"),
-    (
-        _has_coverage,
-        "fewer cells lie inside their 95 % band "
-        "({coverage95_after:.1%}, before {coverage95_before:.1%})",
-    ),
-)
-
-
-def failed_checks(held: Mapping[str, Any]) -> list[str]:
+def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> list[str]:
     """List the held-out checks that the effects fail.
 
     Parameters
     ----------
     held : mapping
         The table ``held_out`` of a diagnosis.
+    settings : Settings
 
     Examples
     --------
@@ -65,8 +42,20 @@ def failed_checks(held: Mapping[str, Any]) -> list[str]:
     >>> failed_checks(held)
     ['the forecast of the last 30 % is worse (-3 nats)']
     """
-    known = {name: math.nan if value is None else value for name, value in held.items()}
-    return [text.format_map(known) for check, text in _CHECKS if not check(held)]
+    failed = []
+    if not _has_gain(held):
+        gain = math.nan if held["log_likelihood_gain"] is None else held["log_likelihood_gain"]
+        failed.append(
+            f"held-out data are not predicted better (log-likelihood gain {gain:.3g} nats)"
+        )
+    if held["forecast_gain"] is not None and held["forecast_gain"] < 0.0:
+        failed.append(f"the forecast of the last 30 % is worse ({held['forecast_gain']:.3g} nats)")
+    if not _has_coverage(held, settings.coverage_tolerance):
+        failed.append(
+            f"fewer cells lie inside their 95 % band ({held['coverage95_after']:.1%}, before "
+            f"{held['coverage95_before']:.1%})"
+        )
+    return failed
 
 
 def decide_verdict(
@@ -74,6 +63,8 @@ def decide_verdict(
     named: Sequence[Any],
     unexplained: Iterable[int],
     held: Mapping[str, Any],
+    *,
+    settings: Settings = DEFAULTS,
 ) -> str:
     """Choose one of `gyrostab.diagnose.result.content.VERDICTS`.
 
@@ -85,6 +76,7 @@ def decide_verdict(
         Mismatches that no effect explains.
     held : mapping
         The table ``held_out`` of a diagnosis.
+    settings : Settings
 
     Examples
     --------
@@ -101,4 +93,8 @@ def decide_verdict(
         return "unknown" if mismatches else "no mismatch"
     if not _has_gain(held):
         return "unknown"
-    return "partly explained" if list(unexplained) or failed_checks(held) else "explained"
+    return (
+        "partly explained"
+        if list(unexplained) or failed_checks(held, settings=settings)
+        else "explained"
+    )

@@ -19,7 +19,6 @@ from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict.condition import Component, condition_on
 from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.errors import OptionError
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import WORLD, nulls, record
 
@@ -165,13 +164,6 @@ def test_identified_effect_is_in_the_model_of_the_next(shaken):
     assert loud[vibration < 1].mean() == pytest.approx(1.0, abs=0.05)
     again = condition_on(shaken.state, list(identification.components))
     np.testing.assert_allclose(again.weight, shaken.state.weight, rtol=1e-3)
-
-
-def test_too_few_null_records_are_refused():
-    blocks = record([])
-    baseline, records = nulls(blocks, 20)
-    with pytest.raises(OptionError, match="20 null records are too few"):
-        name_effects(blocks, baseline, records)
 
 
 def test_identifications_are_frozen_data(shaken):

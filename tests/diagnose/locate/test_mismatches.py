@@ -64,11 +64,6 @@ def test_level_sets_the_threshold(base, null):
             locate_mismatches(found, base, null, level=level)
 
 
-def test_too_few_null_records_are_refused(base):
-    with pytest.raises(OptionError, match="25 null records are too few"):
-        null_scores(base, chunks(base, 25, np.random.default_rng(1)))
-
-
 @pytest.mark.parametrize("missing", [0.0, 0.3])
 @pytest.mark.parametrize("share", [0.25, 0.5])
 def test_burst_of_noise_has_a_region(share, missing):
