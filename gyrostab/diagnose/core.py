@@ -259,14 +259,16 @@ def _align_channels(log: xr.Dataset) -> xr.Dataset:
 def _make_baseline(task: Task, blocks: xr.Dataset) -> xr.Dataset:
     """Return what the simulation predicts for the blocks."""
     if task.simulation is None:
-        return calibrate_noise(blocks, quiet=task.quiet)
+        return calibrate_noise(blocks, quiet=task.quiet, settings=task.settings)
     if isinstance(task.simulation, Model):
-        return baseline_from_model(blocks, task.simulation, quiet=task.quiet)
+        return baseline_from_model(
+            blocks, task.simulation, quiet=task.quiet, settings=task.settings
+        )
     same_block = f"{blocks.attrs['block_samples']}samples"
     simulated = reduce_log(
         task.simulation, block=same_block, restart_gap=task.restart_gap, progress=task.progress
     )
-    return baseline_from_simulation(blocks, simulated, quiet=task.quiet)
+    return baseline_from_simulation(blocks, simulated, quiet=task.quiet, settings=task.settings)
 
 
 def _repeatable_null_records(

@@ -179,6 +179,50 @@ class Settings:
         "scatter to 20 %: 1/sqrt(2n)",
     )
 
+    # calibration of the noise
+    noisy_sigma: float = _number(
+        4.5,
+        "standard deviation",
+        "Excess of the noise level of a block above which it is not quiescent.",
+        "one-sided P = 3.4e-6: 0.06 of 6000 blocks and three spans, the longest record",
+    )
+    excess_sigma: float = _number(
+        4.0,
+        "standard deviation",
+        "Excess above which the noise of the mean of a block is raised, and difference from the "
+        "noise terms above which a band of a simulation has a form of its own.",
+        "one-sided P = 3.2e-5: 0.2 of 6000 blocks, and then by the excess itself",
+    )
+    quiescent_share: float = _number(
+        0.25,
+        "1",
+        "Share of the blocks that must be quiescent; below it the quietest are taken.",
+        "choice: N from a quarter of a record is known twice as badly as from the whole",
+    )
+    min_quiescent_blocks: int = _number(
+        16,
+        "block",
+        "Quiescent blocks that must be found; below it the quietest are taken.",
+        "choice: drift is known up to 16 blocks",
+    )
+    after_restart_s: float = _number(
+        900.0,
+        "s",
+        "Time after a restart that is not quiescent, at most a tenth of the record.",
+        "choice: warm-up of a fibre-optic gyro without temperature control, some minutes",
+    )
+    coherency_probability: float = _number(
+        1e-4,
+        "1",
+        "Chance probability of the coherency of two axes of a simulation below which it is real.",
+        "a hundredth of the default false-alarm probability, for three pairs",
+    )
+    line_nats: float = _number(
+        12.0,
+        "nat",
+        "Evidence of a line of a simulation above which it is known.",
+        "odds of 1.6e5 to 1: more than the number of frequencies of a spectrum",
+    )
     # thresholds from null records
     tail_share: float = _number(
         0.25,

@@ -43,6 +43,7 @@ from gyrostab.diagnose.baseline.simulated import (
 )
 from gyrostab.diagnose.baseline.wandering import with_wandering
 from gyrostab.diagnose.evidence.products import mean_products
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import HOUR, LAWS, TERMS
 from gyrostab.simulate.model import Model, read_model
@@ -62,20 +63,21 @@ DRAWS = 512
 #: Values of K and B on the coarse grid, as multiples of the calibrated ones. Design choice.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
 _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a block mean
-_MIN_EXCESS_SIGMA = 4.0  # from which a block is noisier; design choice
 _MIN_BANDS = 6  # that the noise terms are fitted to, with any spectral shape
 _POWER_UNIT = "degree2 hour-2 Hz-1"
 
 
-def _mean_noise_excess(power: Array, shape: Array, spectrum: Array) -> Array:
+def _mean_noise_excess(power: Array, shape: Array, spectrum: Array, settings: Settings) -> Array:
     """Return the excess factor of the white variance of each mean, from the lowest bands.
 
     Inputs (block, band).
     """
     count = np.nan_to_num(shape).sum(axis=0) / max(1, int(np.isfinite(shape).all(axis=1).sum()))
     low = max(2, int(np.searchsorted(np.cumsum(count), _MIN_LOW_SHAPE)) + 1)
-    level, deviation = noise_level_excess(power[:, :low] / spectrum[:, :low] - 1.0, shape[:, :low])
-    return np.asarray(np.where(deviation > _MIN_EXCESS_SIGMA, level, 1.0))
+    level, deviation = noise_level_excess(
+        power[:, :low] / spectrum[:, :low] - 1.0, shape[:, :low], settings=settings
+    )
+    return np.asarray(np.where(deviation > settings.excess_sigma, level, 1.0))
 
 
 def grid_values(term: str, centre: float, scale: float) -> Array:
@@ -103,7 +105,9 @@ def _coarse_grid(posterior: Posterior, density: float, span: float) -> tuple[Arr
     return grid[0], grid[1], np.log(mass.ravel() / mass.sum())
 
 
-def calibrate_noise(blocks: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
+def calibrate_noise(
+    blocks: xr.Dataset, *, quiet: Any = None, settings: Settings = DEFAULTS
+) -> xr.Dataset:
     """Calibrate the noise of every axis on quiescent blocks.
 
     Parameters
@@ -114,6 +118,7 @@ def calibrate_noise(blocks: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
         Known quiescent time: seconds since the start, or ISO times. By default blocks with little
         vibration, steady temperature, no rotation, some time after a restart, and no more noise
         than most.
+    settings : Settings
 
     Returns
     -------
@@ -149,16 +154,19 @@ def calibrate_noise(blocks: xr.Dataset, *, quiet: Any = None) -> xr.Dataset:
     >>> bool(abs(error) < 4.0), baseline.attrs["source"]
     (True, 'calibrated')
     """
-    chosen, reason = find_quiescent_blocks(blocks, quiet)
+    chosen, reason = find_quiescent_blocks(blocks, quiet, settings=settings)
     attrs = {
         "source": "calibrated",
         "calibrated_on": find_quiescent_spans(blocks, chosen),
         "quiet_by": reason,
     }
-    return assemble_baseline(blocks, _calibrate_axes(blocks, chosen), quiet=chosen, attrs=attrs)
+    posteriors = _calibrate_axes(blocks, chosen, settings)
+    return assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, settings=settings)
 
 
-def _calibrate_axes(blocks: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Posterior]:
+def _calibrate_axes(
+    blocks: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
+) -> list[Posterior]:
     """Compute the noise of every axis from the chosen blocks (axis, block)."""
     columns = noise_powers(blocks)
     common, rest = common_variance(blocks)
@@ -191,6 +199,7 @@ def _calibrate_axes(blocks: xr.Dataset, chosen: NDArray[np.bool_]) -> list[Poste
                 step=step,
                 draws=DRAWS,
                 rng=np.random.default_rng(row),
+                max_disagreement_nats=settings.disagreement_nats,
             )
         )
     return posteriors
@@ -211,6 +220,7 @@ def assemble_baseline(
     attrs: Mapping[str, Any],
     known_mean: Array | None = None,
     spectrum: Array | None = None,
+    settings: Settings = DEFAULTS,
 ) -> xr.Dataset:
     """Assemble the noise of all axes as the Dataset described in `calibrate_noise`.
 
@@ -226,6 +236,7 @@ def assemble_baseline(
         Known means of effects [degree hour-1].
     spectrum : ndarray, shape (axis, block, band), optional
         Expected power including effects; that of the noise by default.
+    settings : Settings
     """
     columns = noise_powers(blocks)
     square = np.stack([posterior.square for posterior in posteriors])
@@ -244,7 +255,10 @@ def assemble_baseline(
     )
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
     variance = white * np.stack(
-        [_mean_noise_excess(*arrays) for arrays in zip(power, shape, expected, strict=True)]
+        [
+            _mean_noise_excess(*arrays, settings)
+            for arrays in zip(power, shape, expected, strict=True)
+        ]
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
     grids = [
@@ -378,7 +392,9 @@ def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[n
     return error
 
 
-def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) -> xr.Dataset:
+def baseline_from_model(
+    blocks: xr.Dataset, model: Any, *, quiet: Any = None, settings: Settings = DEFAULTS
+) -> xr.Dataset:
     """Take the noise of a model, and its effects as far as means and band powers show them.
 
     Parameters
@@ -391,6 +407,7 @@ def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) ->
         Quiescent time of the recording. One factor for each axis then fits the noise of the model
         to it; the noise terms keep their proportions, and the effects their sizes. By default the
         noise is taken unchanged.
+    settings : Settings
 
     Returns
     -------
@@ -426,7 +443,7 @@ def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) ->
     chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}
     if quiet is not None:
-        chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet)
+        chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet, settings=settings)
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         posteriors = _scale_to_quiescent(blocks, parsed, posteriors, chosen)
     known = expect_known_effects(
@@ -442,6 +459,7 @@ def baseline_from_model(blocks: xr.Dataset, model: Any, *, quiet: Any = None) ->
         attrs=attrs,
         known_mean=known.mean + ramp[:, None] * hours,
         spectrum=known.spectrum,
+        settings=settings,
     )
     out = with_wandering(out, known.wandering, known.spectrum)
     if known.cross is not None:
@@ -486,7 +504,11 @@ def _scale_axes(posteriors: list[Posterior], factor: Array, error: Array) -> lis
 
 
 def baseline_from_simulation(
-    blocks: xr.Dataset, simulated: xr.Dataset, *, quiet: Any = None
+    blocks: xr.Dataset,
+    simulated: xr.Dataset,
+    *,
+    quiet: Any = None,
+    settings: Settings = DEFAULTS,
 ) -> xr.Dataset:
     """Take the noise of a simulated log with its calibration error, and its level over time.
 
@@ -501,6 +523,7 @@ def baseline_from_simulation(
     quiet : array_like of bool (block,), or (start, end) or several of these, optional
         Quiescent time of the recording: one factor for each axis fits the noise of the simulation
         to it.
+    settings : Settings
 
     Raises
     ------
@@ -525,8 +548,8 @@ def baseline_from_simulation(
                 f"simulation: {name} {got}, but {wanted} in the recording; "
                 "simulate with --like RECORDING"
             )
-    chosen, reason = find_quiescent_blocks(simulated)
-    posteriors, level, unexplained = _calibrate_simulation(simulated, chosen)
+    chosen, reason = find_quiescent_blocks(simulated, settings=settings)
+    posteriors, level, unexplained = _calibrate_simulation(simulated, chosen, settings)
     plain = (
         np.einsum(
             "abfn,an->abf",
@@ -535,7 +558,7 @@ def baseline_from_simulation(
         )
         * level[..., None]
     )
-    shown = measure_extra_statistics(simulated, plain, unexplained)
+    shown = measure_extra_statistics(simulated, plain, unexplained, settings=settings)
     noise = np.einsum(
         "abfn,an->abf",
         noise_powers(blocks),
@@ -548,7 +571,7 @@ def baseline_from_simulation(
     }
     spectrum = noise * level[..., None] * shown.form[:, None]
     if quiet is not None:
-        chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet)
+        chosen, attrs["quiet_by"] = find_quiescent_blocks(blocks, quiet, settings=settings)
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
         factor, error = quiescent_level(blocks, spectrum, 0.0 * spectrum, chosen)
         posteriors, spectrum = (
@@ -556,14 +579,16 @@ def baseline_from_simulation(
             spectrum * factor[:, None, None],
         )
     return add_extra_statistics(
-        assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum),
+        assemble_baseline(
+            blocks, posteriors, quiet=chosen, attrs=attrs, spectrum=spectrum, settings=settings
+        ),
         shown,
         blocks,
     )
 
 
 def _calibrate_simulation(
-    simulated: xr.Dataset, chosen: NDArray[np.bool_]
+    simulated: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
 ) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:
     """Calibrate a simulation on the bands that the noise terms explain.
 
@@ -576,26 +601,28 @@ def _calibrate_simulation(
         explained = simulated.assign(
             power=simulated["power"].where(~xr.DataArray(unexplained, dims=("axis", "band")))
         )
-        posteriors = _calibrate_axes(explained, chosen)
+        posteriors = _calibrate_axes(explained, chosen, settings)
         plain = np.einsum(
             "abfn,an->abf", columns, np.stack([posterior.square for posterior in posteriors])
         )
-        level = _level_over_time(explained, plain)
-        newly_unexplained = worst_band(explained, plain * level[..., None]) & (
-            unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - _MIN_BANDS
-        )
+        level = _level_over_time(explained, plain, settings)
+        newly_unexplained = worst_band(
+            explained, plain * level[..., None], min_sigma=settings.excess_sigma
+        ) & (unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - _MIN_BANDS)
         if not newly_unexplained.any():
             return posteriors, level, unexplained
         unexplained |= newly_unexplained
 
 
-def _level_over_time(simulated: xr.Dataset, plain: Array) -> Array:
+def _level_over_time(simulated: xr.Dataset, plain: Array, settings: Settings) -> Array:
     """Return the noise level of every block (axis, block); 1 if not significant."""
     power, shape = (
         simulated[name].transpose("axis", "block", "band").values for name in ("power", "shape")
     )
     level = np.ones(plain.shape[:2])
     for row in range(len(plain)):
-        risen, deviation = noise_level_excess(power[row] / plain[row] - 1.0, shape[row])
-        level[row] = np.where(deviation > _MIN_EXCESS_SIGMA, risen, 1.0)
+        risen, deviation = noise_level_excess(
+            power[row] / plain[row] - 1.0, shape[row], settings=settings
+        )
+        level[row] = np.where(deviation > settings.excess_sigma, risen, 1.0)
     return level

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.evidence.products import marginalise, mean_products
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import HOUR
 
@@ -24,7 +25,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-_MAX_DISAGREEMENT_NATS = 8.0  # of spectrum and means about B and K; design choice
 _MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice
 _POINTS_AT_ONCE = 64  # points of the grid; limits memory
 _MIN_STEP = 1e-3  # shortest step towards the best fit
@@ -322,6 +322,7 @@ def noise_posterior(
     draws: int,
     rng: np.random.Generator,
     effects: Array | None = None,
+    max_disagreement_nats: float = DEFAULTS.disagreement_nats,
 ) -> Posterior:
     """Compute the posterior of Q, N, B, K.
 
@@ -340,6 +341,8 @@ def noise_posterior(
     rng : numpy.random.Generator
     effects : ndarray, shape (block, column), optional
         Designs of effects in the means, of any size.
+    max_disagreement_nats : float
+        Of spectrum and means about B and K, up to which both together determine them.
     """
     square, information, spectrum = _fit_likelihood(fit)
     density = HOUR * max(float(square[1]), floor_square(fit))
@@ -363,7 +366,7 @@ def noise_posterior(
     )
     slow = -0.5 * (products.square[:, 0] + products.log_determinant)
     fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
-    joined = bool(slow.max() + fast.max() - (slow + fast).max() < _MAX_DISAGREEMENT_NATS)
+    joined = bool(slow.max() + fast.max() - (slow + fast).max() < max_disagreement_nats)
     log = slow + fast if joined else slow
     weight = np.exp(log - log.max())
     weight /= weight.sum()

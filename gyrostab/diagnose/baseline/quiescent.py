@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
 
@@ -18,11 +19,7 @@ __all__ = ["LEVEL_SPANS", "find_quiescent_blocks", "find_quiescent_spans", "nois
 Array = NDArray[np.float64]
 #: Blocks over which the noise level is averaged. Design choice.
 LEVEL_SPANS = (1, 5, 15)
-_MIN_QUIESCENT_SHARE = 0.25  # of the blocks; below, the quietest are taken; design choice
-_MIN_QUIESCENT_BLOCKS = 16  # below, the quietest are taken; design choice
 _MIN_GIVEN_SAMPLES = 100  # as in the shortest default block; they give N to 7 %
-_AFTER_RESTART_S = 900.0  # time to settle after a restart; design choice
-_NOISY_SIGMA = 4.5  # from which a block is noisy; design choice
 
 
 def _running_sum(values: Array, count: int) -> Array:
@@ -34,7 +31,7 @@ def _running_sum(values: Array, count: int) -> Array:
     return np.asarray(total[np.minimum(place + half + 1, n)] - total[np.maximum(place - half, 0)])
 
 
-def _distance_from_rest(blocks: xr.Dataset) -> dict[str, Array]:
+def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> dict[str, Array]:
     """Return by channel how far each block is from rest, 1 at the limit."""
     distances: dict[str, Array] = {}
     step = float(blocks["end"][0] - blocks["begin"][0])
@@ -43,7 +40,7 @@ def _distance_from_rest(blocks: xr.Dataset) -> dict[str, Array]:
             continue
         values = blocks[name].values.astype(np.float64)
         good = np.isfinite(values)
-        if good.sum() < max(_MIN_QUIESCENT_BLOCKS, values.size // 4):
+        if good.sum() < max(settings.min_quiescent_blocks, values.size // 4):
             continue
         place = np.arange(values.size)
         filled = np.interp(place, place[good], values[good])
@@ -69,7 +66,8 @@ def _distance_from_rest(blocks: xr.Dataset) -> dict[str, Array]:
     if blocks.sizes.get("restart", 0):
         since = blocks["begin"].values[:, None] - blocks["restart_end"].values
         since = np.where(since < -step, np.inf, np.maximum(since, 1.0)).min(axis=1)
-        distances["restarts"] = min(_AFTER_RESTART_S, _record_length(blocks) / 10.0) / since
+        settling = min(settings.after_restart_s, _record_length(blocks) / 10.0)
+        distances["restarts"] = settling / since
     return distances
 
 
@@ -78,7 +76,9 @@ def _record_length(blocks: xr.Dataset) -> float:
     return float(blocks["end"][-1] - blocks["begin"][0])
 
 
-def noise_level_excess(residual: Array, weight: Array) -> tuple[Array, Array]:
+def noise_level_excess(
+    residual: Array, weight: Array, *, settings: Settings = DEFAULTS
+) -> tuple[Array, Array]:
     """Measure the noise level of every block over the smallest span in which it is significant.
 
     Parameters
@@ -87,6 +87,7 @@ def noise_level_excess(residual: Array, weight: Array) -> tuple[Array, Array]:
         Power over expected power, minus 1; NaN where missing.
     weight : ndarray, shape (block, band)
         Shape of the gamma distribution.
+    settings : Settings
 
     Returns
     -------
@@ -102,7 +103,7 @@ def noise_level_excess(residual: Array, weight: Array) -> tuple[Array, Array]:
     for span in LEVEL_SPANS:
         excess, shape = _running_sum(total, span)[:, 0], _running_sum(count, span)[:, 0]
         z = excess / np.sqrt(np.maximum(shape, 1e-9))
-        better = (z > deviation) & (deviation < _NOISY_SIGMA)
+        better = (z > deviation) & (deviation < settings.noisy_sigma)
         level[better] = 1.0 + (excess / np.maximum(shape, 1e-9))[better]
         deviation = np.maximum(deviation, z)
     block_level, spread = (
@@ -127,7 +128,9 @@ def _typical_spectrum(power: Array, shape: Array) -> Array | None:
     return np.asarray(mean * np.median(level))
 
 
-def _drop_noisy_blocks(blocks: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _drop_noisy_blocks(
+    blocks: xr.Dataset, start: NDArray[np.bool_], settings: Settings
+) -> NDArray[np.bool_]:
     """Return blocks (axis, block) that are not noisier than the typical block of `start`."""
     power, shape = (
         blocks["power"].transpose("axis", "block", "band").values,
@@ -139,10 +142,12 @@ def _drop_noisy_blocks(blocks: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[
             typical = _typical_spectrum(power[row][quiescent[row]], shape[row][quiescent[row]])
             if typical is None:
                 break
-            _, deviation = noise_level_excess(power[row] / typical - 1.0, shape[row])
-            kept = start & (deviation < _NOISY_SIGMA)
+            _, deviation = noise_level_excess(
+                power[row] / typical - 1.0, shape[row], settings=settings
+            )
+            kept = start & (deviation < settings.noisy_sigma)
             if (
-                kept.sum() < max(_MIN_QUIESCENT_BLOCKS, 0.3 * start.sum())
+                kept.sum() < max(settings.min_quiescent_blocks, 0.3 * start.sum())
                 or (kept == quiescent[row]).all()
             ):
                 break
@@ -150,7 +155,9 @@ def _drop_noisy_blocks(blocks: xr.Dataset, start: NDArray[np.bool_]) -> NDArray[
     return quiescent
 
 
-def find_quiescent_blocks(blocks: xr.Dataset, quiet: Any = None) -> tuple[NDArray[np.bool_], str]:
+def find_quiescent_blocks(
+    blocks: xr.Dataset, quiet: Any = None, *, settings: Settings = DEFAULTS
+) -> tuple[NDArray[np.bool_], str]:
     """Find the quiescent blocks, to calibrate on.
 
     Parameters
@@ -159,6 +166,7 @@ def find_quiescent_blocks(blocks: xr.Dataset, quiet: Any = None) -> tuple[NDArra
         From `reduce_log`.
     quiet : array_like of bool (block,), or sequence of (start, end), optional
         Quiescent time given by the user; spans in seconds since the start, or ISO times.
+    settings : Settings
 
     Returns
     -------
@@ -173,22 +181,22 @@ def find_quiescent_blocks(blocks: xr.Dataset, quiet: Any = None) -> tuple[NDArra
     """
     n, axes = blocks.sizes["block"], blocks.sizes["axis"]
     if quiet is not None:
-        given = _given_blocks(blocks, quiet)
+        given = _given_blocks(blocks, quiet, settings)
         return np.broadcast_to(given, (axes, n)).copy(), "the time given as quiet"
-    distances = _distance_from_rest(blocks)
+    distances = _distance_from_rest(blocks, settings)
     worst = np.max([*distances.values(), np.zeros(n)], axis=0)
     start = worst <= 1.0
     names = [name.removeprefix("channel_") for name in distances]
     criterion = ", ".join(names)
     reason = f"quiescent {criterion}" if names else "the level of each block (no channel)"
-    least = max(_MIN_QUIESCENT_BLOCKS, int(_MIN_QUIESCENT_SHARE * n))
+    least = max(settings.min_quiescent_blocks, int(settings.quiescent_share * n))
     if start.sum() < least:
         start = worst <= np.sort(worst)[min(least, n) - 1]
         reason = f"no quiescent block by {criterion}: the quietest blocks"
-    return _drop_noisy_blocks(blocks, start), reason
+    return _drop_noisy_blocks(blocks, start, settings), reason
 
 
-def _given_blocks(blocks: xr.Dataset, quiet: Any) -> NDArray[np.bool_]:
+def _given_blocks(blocks: xr.Dataset, quiet: Any, settings: Settings) -> NDArray[np.bool_]:
     """Return the blocks given as quiescent by the user."""
     n = blocks.sizes["block"]
     array = np.asarray(quiet)
@@ -206,11 +214,11 @@ def _given_blocks(blocks: xr.Dataset, quiet: Any) -> NDArray[np.bool_]:
         for pair in pairs:
             low, high = (_seconds_since_start(blocks, edge) for edge in pair)
             chosen |= (begin >= low - 1e-6) & (end <= high + 1e-6)
-    _check_size(blocks, int(chosen.sum()))
+    _check_size(blocks, int(chosen.sum()), settings.min_quiescent_blocks)
     return np.asarray(chosen)
 
 
-def _check_size(blocks: xr.Dataset, count: int) -> None:
+def _check_size(blocks: xr.Dataset, count: int, better_count: int) -> None:
     """Refuse quiescent blocks with too few samples; warn if they are too few for slow noise."""
     step, size = float(blocks.attrs["block_s"]), int(blocks.attrs["block_samples"])
     if count * size < _MIN_GIVEN_SAMPLES:
@@ -221,12 +229,12 @@ def _check_size(blocks: xr.Dataset, count: int) -> None:
             f"{_white_error(_MIN_GIVEN_SAMPLES):.0%}: name {(least + 1) * step:g} s or more within "
             f"the {_record_length(blocks):g} s of the record, or give a shorter block"
         )
-    if count < _MIN_QUIESCENT_BLOCKS:
+    if count < better_count:
         warnings.warn(
             f"the quiet time holds {count} block{'' if count == 1 else 's'} of {step:g} s: "
             f"N is known to {_white_error(count * size):.1%} at best, and drift slower than "
             f"{count * step:g} s not at all, so that slow mismatches may be missed; "
-            f"{_MIN_QUIESCENT_BLOCKS * step:g} s or more are better",
+            f"{better_count * step:g} s or more are better",
             stacklevel=2,
         )
 

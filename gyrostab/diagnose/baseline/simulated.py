@@ -15,14 +15,12 @@ from gyrostab.diagnose.evidence.spectral_lines import (
     local_level,
 )
 from gyrostab.diagnose.predict.linear_model import band_widths, pair_rows, unspread_share
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = ["ExtraStatistics", "add_extra_statistics", "measure_extra_statistics", "worst_band"]
 
 Array = NDArray[np.float64]
 _POWER_UNIT = "degree2 hour-2 Hz-1"
-_MIN_BAND_SIGMA = 4.0  # by which a band differs from the noise terms; design choice
-_COHERENCY_P_VALUE = 1e-4  # below which axes have something in common; design choice
-_MIN_LINE_NATS = 12.0  # evidence of a known line; design choice
 _MAX_LINES = 100  # on an axis; limits time
 _SMOOTHING_LINES = 5  # over which a peak is smoothed; design choice
 
@@ -53,7 +51,7 @@ class ExtraStatistics(NamedTuple):
     peaks: Array
 
 
-def worst_band(simulated: xr.Dataset, expected: Array) -> NDArray[np.bool_]:
+def worst_band(simulated: xr.Dataset, expected: Array, *, min_sigma: float) -> NDArray[np.bool_]:
     """Find the band of each axis that differs most from the noise terms, if significantly.
 
     Parameters
@@ -62,6 +60,8 @@ def worst_band(simulated: xr.Dataset, expected: Array) -> NDArray[np.bool_]:
         From `reduce_log`; bands without powers are skipped.
     expected : ndarray, shape (axis, block, band)
         Power of its noise terms, with their level over time.
+    min_sigma : float
+        Least difference [standard deviations].
 
     Returns
     -------
@@ -69,11 +69,15 @@ def worst_band(simulated: xr.Dataset, expected: Array) -> NDArray[np.bool_]:
     """
     form, known = _spectral_form(simulated, expected)
     off = np.abs(form - 1.0) * np.sqrt(known)
-    return np.asarray((off > _MIN_BAND_SIGMA) & (off == off.max(axis=1, keepdims=True)))
+    return np.asarray((off > min_sigma) & (off == off.max(axis=1, keepdims=True)))
 
 
 def measure_extra_statistics(
-    simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_]
+    simulated: xr.Dataset,
+    expected: Array,
+    unexplained: NDArray[np.bool_],
+    *,
+    settings: Settings = DEFAULTS,
 ) -> ExtraStatistics:
     """Measure what a simulation has in addition to its noise terms.
 
@@ -85,15 +89,17 @@ def measure_extra_statistics(
         Power of its noise terms, with their level over time.
     unexplained : ndarray of bool, shape (axis, band)
         Bands that the noise terms do not explain.
+    settings : Settings
     """
     form, known = _spectral_form(simulated, expected)
     # An unexplained band reaches into others.
     measured = unexplained.any(axis=1, keepdims=True)
     form, form_shape = np.where(measured, form, 1.0), np.where(measured, known, np.inf)
-    coherency, error = _measure_coherency(simulated, expected * form[:, None])
-    return ExtraStatistics(
-        form, form_shape, coherency, error, *_measure_lines(simulated, expected, unexplained)
+    coherency, error = _measure_coherency(
+        simulated, expected * form[:, None], settings.coherency_probability
     )
+    lines, peaks = _measure_lines(simulated, expected, unexplained, settings.line_nats)
+    return ExtraStatistics(form, form_shape, coherency, error, lines, peaks)
 
 
 def _spectral_form(simulated: xr.Dataset, expected: Array) -> tuple[Array, Array]:
@@ -115,7 +121,7 @@ def _weighted_mean(values: NDArray[Any], shape: Array) -> tuple[NDArray[Any], Ar
 
 
 def _measure_coherency(
-    simulated: xr.Dataset, expected: Array
+    simulated: xr.Dataset, expected: Array, p_value: float
 ) -> tuple[NDArray[np.complex128], Array]:
     """Return the coherency of the axes and its error, 0 if not significant."""
     from scipy.stats import chi2
@@ -136,7 +142,7 @@ def _measure_coherency(
     found, known = _weighted_mean(cross / geometric_mean, shape)
     total = 2.0 * (np.abs(found) ** 2 * known).sum(axis=1, keepdims=True)
     significant = (known > 0.0) & (
-        chi2.sf(total, 2.0 * (known > 0.0).sum(axis=1, keepdims=True)) < _COHERENCY_P_VALUE
+        chi2.sf(total, 2.0 * (known > 0.0).sum(axis=1, keepdims=True)) < p_value
     )
     with np.errstate(divide="ignore"):
         return np.where(significant, found, 0.0), np.where(
@@ -145,7 +151,7 @@ def _measure_coherency(
 
 
 def _measure_lines(
-    simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_]
+    simulated: xr.Dataset, expected: Array, unexplained: NDArray[np.bool_], line_nats: float
 ) -> tuple[Array, Array]:
     """Return the power of significant lines, with leakage, and of peaks near unexplained bands."""
     power, weight = (
@@ -168,7 +174,7 @@ def _measure_lines(
         known = np.zeros(evidence_nats.shape[1], np.bool_)
         for _ in range(_MAX_LINES):
             place = int(np.argmax(np.where(known, -np.inf, evidence_nats[row])))
-            if known[place] or not evidence_nats[row, place] > _MIN_LINE_NATS:
+            if known[place] or not evidence_nats[row, place] > line_nats:
                 break
             known |= line_skirt(simulated, str(axis), place)
         good = (weight[row] > 0.0) & np.isfinite(power[row]).all(axis=1)

@@ -140,6 +140,7 @@ def recalibrate(
         quiet=quiet,
         attrs={**baseline.attrs, "recalibrated": changed},
         spectrum=power,
+        settings=state.settings,
     )
     out["columns"] = out["columns"].copy(data=columns)
     for row, axis in enumerate(state.axes):
@@ -368,6 +369,7 @@ def _fit_noise(
         draws=DRAWS,
         rng=np.random.default_rng(row),
         effects=effect_means,
+        max_disagreement_nats=state.settings.disagreement_nats,
     )
 
 

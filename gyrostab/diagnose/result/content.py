@@ -170,6 +170,7 @@ class Content(_Table):
     baseline: Baseline
     verdict: Verdict
     false_alarm_level: float
+    settings: dict[str, float] = {}
     mismatches: list[Mismatch]
     effects: list[NamedEffect]
     unexplained: list[int]
