@@ -16,6 +16,7 @@ import xarray as xr
 from pyarrow import parquet
 from scipy.io import savemat
 
+import gyrostab
 from gyrostab.errors import FormatError, MissingUnitError, OptionError
 from gyrostab.ingest import ReadOptions, read_log, readers, scan_file
 from gyrostab.ingest.columns.buffers import Buffers, as_lazy, set_rows, take_rows
@@ -296,6 +297,19 @@ def test_a_damaged_file_is_named(tmp_path: Path, name: str) -> None:
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     with pytest.raises(FormatError, match=rf"{name}.*copy it again"):
         read_log(cut)
+
+
+def test_empty_row_groups_of_parquet_are_passed_over(tmp_path: Path) -> None:
+    table = pa.table({"time [s]": np.arange(100) * 0.01, "gyro_x [deg/h]": np.arange(100.0)})
+    path = tmp_path / "log.parquet"
+    with parquet.ParquetWriter(path, table.schema) as writer:
+        for part in (table[:0], table[:60], table[60:], table[:0]):
+            writer.write_table(part)
+    assert parquet.ParquetFile(path).metadata.row_group(0).num_rows == 0
+    row = gyrostab.scan(path).iloc[0]
+    assert row["rows"] == 100
+    assert (row["end"] - row["start"]) / np.timedelta64(1, "ms") == pytest.approx(990.0)
+    assert read_log(path).sizes["row"] == 100
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".mat"])

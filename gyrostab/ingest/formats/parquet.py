@@ -42,13 +42,20 @@ def matches(path: Path) -> bool:
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise schema and row count from the footer, and first and last stamps."""
     file, plan = _open_parquet(path, options)
+    groups = range(file.num_row_groups)
+    filled = [group for group in groups if file.metadata.row_group(group).num_rows > 0]
 
     def fetch(source: int, start: int, stop: int) -> Any:
-        group = 0 if start == 0 else file.num_row_groups - 1
         parts = file.iter_batches(
-            batch_size=batch_rows(1), row_groups=[group], columns=[file.schema_arrow.names[source]]
+            batch_size=batch_rows(1),
+            row_groups=filled[:1] if start == 0 else filled[-1:],
+            columns=[file.schema_arrow.names[source]],
         )
-        part = next(parts) if start == 0 else deque(parts, maxlen=1)[0]
+        part = next(parts, None) if start == 0 else next(iter(deque(parts, maxlen=1)), None)
+        if part is None:
+            raise FormatError(
+                f"{path.name}: a row group holds fewer rows than the file says; copy it again"
+            )
         values = _to_numpy(part.column(0))
         return values[: stop - start] if start == 0 else values[start - stop :]
 
