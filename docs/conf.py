@@ -1,0 +1,46 @@
+"""Sphinx configuration: ``make docs`` builds the site in ``docs/_build/html``."""
+
+import gyrostab
+
+project = "gyrostab"
+author = "The gyrostab developers"
+release = gyrostab.__version__
+root_doc = "index"
+
+extensions = [
+    "cyclopts.sphinx_ext",
+    "myst_nb",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.intersphinx",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build", "Thumbs.db", ".DS_Store"]
+templates_path = ["_templates"]
+nitpicky = False
+suppress_warnings = ["myst.strikethrough"]
+
+# Markdown and notebooks
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 4
+nb_execution_mode = "cache"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
+nb_merge_streams = True
+
+# API reference
+autosummary_generate = True
+autodoc_typehints = "none"
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+intersphinx_mapping = {}  # the build needs no network
+
+html_theme = "pydata_sphinx_theme"
+html_title = "gyrostab"
+html_show_sourcelink = False
+html_theme_options = {
+    "navigation_depth": 2,
+    "show_toc_level": 2,
+    "header_links_before_dropdown": 6,
+    "secondary_sidebar_items": ["page-toc"],
+}
