@@ -10,7 +10,7 @@ N      ?= 100000
 SEED   ?= 1
 JOBS   ?= $(shell nproc 2>/dev/null || echo 2)
 
-.PHONY: demo test test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
+.PHONY: demo docs test test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
@@ -48,6 +48,13 @@ test-minimum: $(VENV)-minimum/.installed  ## the tests with the lowest versions 
 
 fuzz: $(VENV)/.installed-test  ## try damaged inputs and write docs/fuzzing.md (N=100000 SEED=1 JOBS=2); can be stopped and repeated
 	$(BIN)/python -W ignore -m tests.fuzz --count $(N) --seed $(SEED) --jobs $(JOBS) --output docs/fuzzing.md
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[docs]"
+	touch $@
+
+docs: $(VENV)/.installed-docs  ## build the site in docs/_build/html, with executed tutorials
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 lint: $(VENV)/.installed-lint  ## style, types, imports and wording
 	$(BIN)/ruff check .

@@ -1,6 +1,10 @@
 """Sphinx configuration: ``make docs`` builds the site in ``docs/_build/html``."""
 
+import re
+from pathlib import Path
+
 import gyrostab
+from gyrostab.cli import app
 
 project = "gyrostab"
 author = "The gyrostab developers"
@@ -8,7 +12,6 @@ release = gyrostab.__version__
 root_doc = "index"
 
 extensions = [
-    "cyclopts.sphinx_ext",
     "myst_nb",
     "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
@@ -44,3 +47,10 @@ html_theme_options = {
     "header_links_before_dropdown": 6,
     "secondary_sidebar_items": ["page-toc"],
 }
+
+# Command line reference, from the help texts; an asterisk in an example is no emphasis.
+commands = app.generate_docs(output_format="rst", include_hidden=False)
+commands = re.sub(r"^Example: (.*?)\s*$", r"Example: ``\1``", commands, flags=re.MULTILINE)
+Path(__file__).with_name("reference").joinpath("commands.rst").write_text(
+    commands, encoding="utf-8"
+)
