@@ -49,8 +49,8 @@ html_theme_options = {
 }
 
 # Command line reference, from the help texts; an asterisk in an example is no emphasis.
-commands = app.generate_docs(output_format="rst", include_hidden=False)
-commands = re.sub(r"^Example: (.*?)\s*$", r"Example: ``\1``", commands, flags=re.MULTILINE)
+commands = app.generate_docs(output_format="rst").replace(" -m sphinx ", " ")
+commands = re.sub(r"^Example: (.*?) *$", r"Example: ``\1``", commands, flags=re.MULTILINE)
 Path(__file__).with_name("reference").joinpath("commands.rst").write_text(
     commands, encoding="utf-8"
 )
