@@ -19,12 +19,8 @@ extensions = [
     "sphinx.ext.viewcode",
 ]
 exclude_patterns = ["_build", "Thumbs.db", ".DS_Store"]
-templates_path = ["_templates"]
-nitpicky = False
-suppress_warnings = ["myst.strikethrough"]
 
 # Markdown and notebooks
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
 nb_execution_mode = "cache"
 nb_execution_raise_on_error = True
@@ -38,6 +34,8 @@ napoleon_google_docstring = False
 napoleon_use_rtype = False
 intersphinx_mapping = {}  # the build needs no network
 
+html_static_path = ["_static"]
+html_css_files = ["wrap.css"]
 html_theme = "pydata_sphinx_theme"
 html_title = "gyrostab"
 html_show_sourcelink = False

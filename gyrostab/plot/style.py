@@ -141,9 +141,12 @@ def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
 def new_figure(width: float, height: float, *, stacked: bool = False) -> Figure:
     """Make an empty figure [inches] with automatic layout, or for `stack_panels`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout=None if stacked else "constrained", dpi=_DPI)
+    from gyrostab.plot.notebook import NotebookFigure
+
+    figure = NotebookFigure(
+        figsize=(width, height), layout=None if stacked else "constrained", dpi=_DPI
+    )
     FigureCanvasAgg(figure)  # attaches to the figure, so that text can be measured
     return figure
 

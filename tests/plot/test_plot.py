@@ -43,6 +43,11 @@ def test_signal_has_a_panel_with_unit_for_each_axis_and_channel():
     assert "300 Hz" in figure.get_suptitle()
 
 
+def test_notebooks_show_a_figure_as_the_value_of_a_cell(product):
+    picture = plot_adev(product, "x")._repr_png_()
+    assert picture.startswith(b"\x89PNG")
+
+
 def test_signal_of_chosen_axis_and_channels():
     figure = plot_signal(synthetic.log(), axis="z", channels=["temperature"])
     assert [ax.get_ylabel() for ax in figure.axes] == ["z [deg/h]", "temperature\n[°C]"]
