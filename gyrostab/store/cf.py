@@ -452,7 +452,7 @@ def _make_time_axes(
 
 
 def _decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
-    for name in str(attrs.pop(_JSON_NAMES, "")).split():
+    for name in set(str(attrs.pop(_JSON_NAMES, "")).split()) & set(attrs):
         attrs[name] = json.loads(attrs[name])
     for name, value in attrs.items():
         attrs[name] = value.item() if isinstance(value, np.generic) else value
