@@ -12,8 +12,14 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
-from gyrostab.ingest.columns.buffers import CHUNK_ROWS, as_lazy, pieces_of
-from gyrostab.ingest.columns.pieces import NaNPiece, PiecewiseColumn, Spool
+from gyrostab.ingest.columns.pieces import (
+    CHUNK_ROWS,
+    NaNPiece,
+    PiecewiseColumn,
+    Spool,
+    as_lazy,
+    pieces_of,
+)
 from gyrostab.ingest.concat import group_axes, merge_notes, name_some, split_axes
 from gyrostab.ingest.overlap import drop_repeats, stamp_span
 from gyrostab.schema import SIGNAL_UNITS

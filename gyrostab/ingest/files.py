@@ -17,8 +17,7 @@ from typing import Any, Protocol, cast
 import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError, reading_of
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
-from gyrostab.ingest.columns.pieces import Spool
+from gyrostab.ingest.columns.pieces import SPILL_BYTES, Spool
 from gyrostab.ingest.combine import attach_channels, concatenate, memory_bytes, move_to_disk
 from gyrostab.ingest.concat import concatenate_logs, log_span
 from gyrostab.ingest.damaged_files import (

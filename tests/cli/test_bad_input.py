@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.errors import OutputError
-from gyrostab.ingest.columns.buffers import Buffers
+from gyrostab.ingest.columns.pieces import Buffers
 from gyrostab.io.datasets import open_log, open_product, to_netcdf
 from gyrostab.jobs.run import load_log
 from tests.support.command_line import RATE, WINDOW, call, stopped, write_log

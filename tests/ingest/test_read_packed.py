@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.ingest import files, read_log
-from gyrostab.ingest.columns import buffers
+from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import (
     DecimalPiece,
     EvenStampsPiece,
@@ -131,9 +131,8 @@ def test_pieces_of_every_kind_in_memory_and_on_disk(where):
     for begin, end in [(0, 6), (2, 4), (3, 6), (5, 5)]:
         np.testing.assert_array_equal(bits(pieces[begin:end]), bits(wanted[begin:end]))
         np.testing.assert_array_equal(times[begin:end].view(np.int64), stamps[begin:end])
-    for row in (1, 5):
-        times.set_value(row, NO_STAMP)
-        stamps[row] = NO_STAMP
+    times.changed, times.value = np.array([1, 5]), NO_STAMP
+    stamps[[1, 5]] = NO_STAMP
     np.testing.assert_array_equal(times[:].view(np.int64), stamps)
 
 
@@ -161,7 +160,7 @@ def test_packed_log_equals_the_plain_log(tmp_path, monkeypatch, limit, decimals)
     ]
     plain = read_log(paths)
     assert isinstance(plain.rate.data, np.ndarray)
-    monkeypatch.setattr(buffers, "_MAX_PLAIN_VALUES", 0)
+    monkeypatch.setattr(pieces, "_MAX_PLAIN_VALUES", 0)
     monkeypatch.setattr(files, "SPILL_BYTES", limit)
     packed = read_log(paths)
     assert packed.rate.chunks is not None
@@ -194,7 +193,7 @@ def test_reading_ahead_stops_with_an_error(tmp_path, monkeypatch):
 
 
 def test_whole_numbers_at_even_steps_take_less_than_half_the_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(buffers, "_MAX_PLAIN_VALUES", 0)
+    monkeypatch.setattr(pieces, "_MAX_PLAIN_VALUES", 0)
     path = text_log(tmp_path / "log.csv", 0, 3000, decimals=2)
     assert memory_bytes(read_log(path)) < 0.55 * 8 * 4 * 3000
 

@@ -1,4 +1,4 @@
-"""Columns of 8-byte values in pieces, packed without loss, in memory or in a temporary file.
+"""Growing columns of 8-byte values in pieces, packed without loss, in memory or on disk.
 
 Files are read back with `gyrostab.store.system.read_at`, not mapped: the pages of a mapped file
 count as memory of this process, and their number grows as a long log is read. Each map also holds a
@@ -9,26 +9,44 @@ from __future__ import annotations
 
 import tempfile
 import threading
+import uuid
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import IO, Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
+from gyrostab.store.lazy_slices import stack_rows, with_row_reader
 from gyrostab.store.system import read_at, write_at
 
 __all__ = [
+    "CHUNK_ROWS",
+    "SPILL_BYTES",
+    "Buffers",
     "DecimalPiece",
     "EvenStampsPiece",
     "FilePiece",
+    "NaNPiece",
     "Piece",
     "PiecewiseColumn",
     "PlainPiece",
     "Spool",
+    "as_lazy",
+    "pieces_of",
+    "stack_as_rows",
 ]
+
+#: Largest total size of the columns of one file that is held in memory [bytes].
+SPILL_BYTES = 128 * 2**20
+
+#: Rows of one dask chunk of a piecewise column.
+CHUNK_ROWS = 2**21
+
+#: Largest number of values of all columns of a file for which `finish` returns plain arrays.
+_MAX_PLAIN_VALUES = 2**21
 
 
 class Spool:
@@ -45,8 +63,10 @@ class Spool:
             with self._lock:
                 if self.file is None:
                     self.file = tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)  # noqa: SIM115
-                _write_all(self.handle, values.data.cast("B"), self.end)
-                begin, self.end = self.end, self.end + values.nbytes
+                begin, view = self.end, values.data.cast("B")
+                while view.nbytes:
+                    count = write_at(self.handle, view, self.end)
+                    view, self.end = view[count:], self.end + count
                 return begin
         except OSError as error:
             where = tempfile.gettempdir()
@@ -58,11 +78,8 @@ class Spool:
 
     def store(self, values: NDArray[Any]) -> PiecewiseColumn:
         """Write a column to the file and return it as a piecewise column."""
-        pieces = PiecewiseColumn(
-            values.dtype, [PlainPiece(np.ascontiguousarray(values).view(np.int64))]
-        )
-        pieces.move_to(self)
-        return pieces
+        piece = PlainPiece(np.ascontiguousarray(values).view(np.int64)).to_spool(self)
+        return PiecewiseColumn(values.dtype, [piece])
 
     @property
     def handle(self) -> int:
@@ -71,159 +88,92 @@ class Spool:
         return self.file.fileno()
 
 
-def _write_all(handle: int, view: memoryview, begin: int) -> None:
-    while view.nbytes:
-        count = write_at(handle, view, begin)
-        view, begin = view[count:], begin + count
-
-
 @dataclass(frozen=True)
 class _SpooledArray:
-    """An array in a spool."""
+    """An array in a spool, which takes no memory."""
 
     spool: Spool
     begin: int
     size: int
     dtype: np.dtype[Any]
+    nbytes: int = 0
 
-    def read(self, first: int, out: NDArray[Any]) -> None:
-        """Read values from index `first` on into `out`."""
-        wide, done = self.dtype.itemsize, 0
-        view = out.data.cast("B")
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        out = np.empty(rows.stop - rows.start, self.dtype)
+        begin, view, done = self.begin + self.dtype.itemsize * rows.start, out.data.cast("B"), 0
         while done < view.nbytes:
-            got = read_at(self.spool.handle, view[done:], self.begin + wide * first + done)
+            got = read_at(self.spool.handle, view[done:], begin + done)
             if got < 1:
                 raise OSError("the temporary file of a long log is shorter than it was")
             done += got
-
-    def write(self, number: int, value: int) -> None:
-        """Set one value."""
-        write_at(
-            self.spool.handle,
-            np.array(value, self.dtype).tobytes(),
-            self.begin + self.dtype.itemsize * number,
-        )
+        return out
 
 
-_Values = NDArray[Any] | _SpooledArray
+class Piece:
+    """Consecutive rows of a column; takes no memory unless a subclass says so."""
 
-
-def _memory_bytes(kept: _Values) -> int:
-    return kept.nbytes if isinstance(kept, np.ndarray) else 0
-
-
-def _move_to_spool(kept: _Values, spool: Spool) -> _Values:
-    return (
-        _SpooledArray(spool, spool.add(kept), kept.size, kept.dtype)
-        if isinstance(kept, np.ndarray) and kept.size
-        else kept
-    )
-
-
-def _read_part(kept: _Values, first: int, size: int) -> NDArray[Any]:
-    if isinstance(kept, np.ndarray):
-        return kept[first : first + size]
-    out = np.empty(size, kept.dtype)
-    kept.read(first, out)
-    return out
-
-
-class Piece(Protocol):
-    """Consecutive rows of a column."""
-
-    @property
-    def rows(self) -> int:
-        """Number of rows."""
+    rows: int
 
     @property
     def memory_bytes(self) -> int:
         """Bytes in memory."""
+        return 0
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Read the values from row `first` on into `out`."""
+        raise NotImplementedError
 
     def to_spool(self, spool: Spool) -> Piece:
         """Return the piece with its values moved to a spool."""
-
-    def set_value(self, row: int, value: int) -> Piece:
-        """Return the piece with the bits of one value replaced."""
-
-
-@dataclass(frozen=True)
-class PlainPiece:
-    """Values stored as they are, by their bits."""
-
-    words: _Values  # int64
-
-    @property
-    def rows(self) -> int:
-        """Number of rows."""
-        return self.words.size
-
-    @property
-    def memory_bytes(self) -> int:
-        """Bytes in memory."""
-        return _memory_bytes(self.words)
-
-    def read_into(self, first: int, out: NDArray[Any]) -> None:
-        """Read the values from row `first` on into `out`."""
-        target = out.view(np.int64)
-        if isinstance(self.words, np.ndarray):
-            target[:] = self.words[first : first + out.size]
-        else:
-            self.words.read(first, target)
-
-    def to_spool(self, spool: Spool) -> Piece:
-        """Return the piece with its values moved to a spool."""
-        return PlainPiece(_move_to_spool(self.words, spool))
-
-    def set_value(self, row: int, value: int) -> Piece:
-        """Return the piece with the bits of one value replaced."""
-        if isinstance(self.words, np.ndarray):
-            self.words[row] = value
-        else:
-            self.words.write(row, value)
         return self
 
 
 @dataclass(frozen=True)
-class DecimalPiece:
-    """Decimals stored as 32-bit integers (`kernels.encoding.decimals`), converted when read."""
+class PlainPiece(Piece):
+    """Values stored as they are, by their bits (int64)."""
 
-    counts: _Values  # int32
-    tens: float
-    factor: float
-    offset: float
+    kept: NDArray[Any] | _SpooledArray
 
     @property
-    def rows(self) -> int:
+    def rows(self) -> int:  # type: ignore[override]
         """Number of rows."""
-        return self.counts.size
+        return self.kept.size
 
     @property
     def memory_bytes(self) -> int:
         """Bytes in memory."""
-        return _memory_bytes(self.counts)
+        return self.kept.nbytes
+
+    def read_into(self, first: int, out: NDArray[Any]) -> None:
+        """Read the values from row `first` on into `out`."""
+        out.view(np.int64)[:] = self.kept[first : first + out.size]
+
+    def to_spool(self, spool: Spool) -> Piece:
+        """Return the piece with its values moved to a spool."""
+        if not isinstance(self.kept, np.ndarray) or not self.kept.size:
+            return self
+        begin = spool.add(self.kept)
+        return replace(self, kept=_SpooledArray(spool, begin, self.kept.size, self.kept.dtype))
+
+
+@dataclass(frozen=True)
+class DecimalPiece(PlainPiece):
+    """Decimals stored as 32-bit integers (`kernels.encoding.decimals`), converted when read."""
+
+    tens: float
+    factor: float
+    offset: float
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Read the values from row `first` on into `out`."""
         from gyrostab.kernels.encoding.decimals import from_decimals
 
-        from_decimals(
-            _read_part(self.counts, first, out.size), self.tens, self.factor, self.offset, out
-        )
-
-    def to_spool(self, spool: Spool) -> Piece:
-        """Return the piece with its values moved to a spool."""
-        return DecimalPiece(_move_to_spool(self.counts, spool), self.tens, self.factor, self.offset)
-
-    def set_value(self, row: int, value: int) -> Piece:
-        """Return the piece with the bits of one value replaced."""
-        return _unpack_piece(self, np.float64).set_value(row, value)
+        counts = self.kept[first : first + out.size]
+        from_decimals(counts, self.tens, self.factor, self.offset, out)
 
 
 @dataclass(frozen=True)
-class EvenStampsPiece:
+class EvenStampsPiece(Piece):
     """Stamps stored as runs of even steps; small enough to stay in memory."""
 
     table: NDArray[np.int64]
@@ -240,84 +190,41 @@ class EvenStampsPiece:
 
         unroll_steps(self.table, first, out.view(np.int64))
 
-    def to_spool(self, spool: Spool) -> Piece:
-        """Return the piece with its values moved to a spool."""
-        return self
-
-    def set_value(self, row: int, value: int) -> Piece:
-        """Return the piece with the bits of one value replaced."""
-        return _unpack_piece(self, np.int64).set_value(row, value)
-
 
 @dataclass(frozen=True)
-class FilePiece:
-    """Values that stay in their source file and are read and converted on each access.
+class FilePiece(Piece):
+    """Values that stay in their source file, from row `begin` on.
 
-    Attributes
-    ----------
-    read : callable
-        First row of the file, row after the last one -> converted values.
-    begin, rows : int
-        First row of the file, and number of rows.
-    changes : dict
-        Row of the piece -> bits of the value that replaces the stored one.
+    `read` takes the first row of the file and the row after the last one, and returns converted
+    values.
     """
 
     read: Callable[[int, int], NDArray[Any]]
     begin: int
     rows: int
-    changes: dict[int, int] = field(default_factory=dict)
-
-    @property
-    def memory_bytes(self) -> int:
-        """Bytes in memory."""
-        return 0
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Read the values from row `first` on into `out`."""
         out[:] = self.read(self.begin + first, self.begin + first + out.size).view(out.dtype)
-        for row, value in self.changes.items():
-            if first <= row < first + out.size:
-                out.view(np.int64)[row - first] = value
-
-    def to_spool(self, spool: Spool) -> Piece:
-        """Return the piece, which takes no memory."""
-        return self
-
-    def set_value(self, row: int, value: int) -> Piece:
-        """Return the piece with the bits of one value replaced."""
-        self.changes[row] = value
-        return self
 
 
 @dataclass(frozen=True)
-class NaNPiece:
-    """Rows without a value; they take no memory."""
+class NaNPiece(Piece):
+    """Rows without a value."""
 
     rows: int
-    memory_bytes: int = 0
 
     def read_into(self, first: int, out: NDArray[Any]) -> None:
         """Fill `out` with NaN."""
         out[:] = np.nan
 
-    def to_spool(self, spool: Spool) -> Piece:
-        """Return the piece, which takes no memory."""
-        return self
-
-    def set_value(self, row: int, value: int) -> Piece:
-        """Return the piece with the bits of one value replaced."""
-        return _unpack_piece(self, np.float64).set_value(row, value)
-
-
-def _unpack_piece(piece: Piece, dtype: Any) -> PlainPiece:
-    values = np.empty(piece.rows, dtype)
-    piece.read_into(0, values)
-    return PlainPiece(values.view(np.int64))
-
 
 class PiecewiseColumn:
-    """A column with the few attributes that dask needs; no ``copy``, which dask would call."""
+    """A column with the few attributes that dask needs; no ``copy``, which dask would call.
+
+    Values of single rows can be replaced: `changed` lists these rows in order, and `value` holds
+    the bits of all of them.
+    """
 
     ndim = 1
 
@@ -328,11 +235,12 @@ class PiecewiseColumn:
             [0, *(piece.rows for piece in self._pieces)]
         ).tolist()  # first row of each piece, and the end of the last
         self.shape = (self._rows[-1],)
+        self.changed, self.value = np.empty(0, np.int64), 0
 
     def view(self, dtype: Any) -> PiecewiseColumn:
         """Return the same bytes as another type; both share their pieces."""
         same = PiecewiseColumn(dtype, ())
-        same._pieces, same._rows, same.shape = self._pieces, self._rows, self.shape
+        same.__dict__.update({**self.__dict__, "dtype": np.dtype(dtype)})
         return same
 
     @property
@@ -342,16 +250,19 @@ class PiecewiseColumn:
 
     def find_line(self) -> tuple[int, int] | None:
         """Return first value and step if all values are evenly spaced, otherwise None."""
-        if not self._pieces or not all(
-            isinstance(piece, EvenStampsPiece) and len(piece.table) == 1 for piece in self._pieces
-        ):
+        lines = [
+            (row, piece.rows, *piece.table[0, 1:].tolist())
+            for row, piece in zip(self._rows, self._pieces, strict=False)
+            if isinstance(piece, EvenStampsPiece) and len(piece.table) == 1
+        ]
+        if not lines or len(lines) < len(self._pieces) or len(self.changed):
             return None
-        _, first, step = (int(number) for number in self._pieces[0].table[0])  # type: ignore[attr-defined]
-        for row, piece in zip(self._rows, self._pieces, strict=False):
-            _, start, own = (int(number) for number in piece.table[0])  # type: ignore[attr-defined]
-            if start != first + row * step or (own != step and piece.rows > 1):
-                return None
-        return first, step
+        _, _, first, step = lines[0]
+        even = all(
+            start == first + row * step and (own == step or rows == 1)
+            for row, rows, start, own in lines
+        )
+        return (first, step) if even else None
 
     def move_to(self, spool: Spool) -> None:
         """Move the pieces in memory to a file."""
@@ -371,8 +282,104 @@ class PiecewiseColumn:
             part = out[done : done + self._pieces[number].rows - first]
             self._pieces[number].read_into(first, part)
             done, number = done + part.size, number + 1
+        low, high = np.searchsorted(self.changed, [begin, begin + out.size])
+        if high > low:
+            out.view(np.int64)[self.changed[low:high] - begin] = self.value
 
-    def set_value(self, row: int, value: int) -> None:
-        """Replace the bits of a value."""
-        number = bisect_right(self._rows, row) - 1
-        self._pieces[number] = self._pieces[number].set_value(row - self._rows[number], value)
+    def take_rows(self, rows: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the values of a few rows."""
+        found = (self[row : row + 1] for row in rows.tolist())
+        return np.concatenate([np.empty(0, self.dtype), *found])
+
+
+class Buffers:
+    """Columns of 8-byte numbers that grow block by block.
+
+    Up to `limit` bytes they stay in memory; beyond it they are appended to a spool. Small columns
+    in memory are returned as arrays, and the columns `rows_of` as the rows of one matrix.
+    """
+
+    def __init__(
+        self, dtypes: Mapping[Any, Any], *, limit: int = SPILL_BYTES, rows_of: Sequence[Any] = ()
+    ):
+        self.rows_of = rows_of
+        self.dtypes = {key: np.dtype(dtype) for key, dtype in dtypes.items()}
+        self.limit = limit
+        self.rows = 0
+        self._pieces: dict[Any, list[Piece]] = {key: [] for key in dtypes}
+        self._spool: Spool | None = None
+        self._held = self._moved = 0  # bytes in memory; pieces of each column that were spilled
+
+    def add(self, block: Mapping[Any, NDArray[Any] | Piece]) -> None:
+        """Append one block, in which all columns have the same length."""
+        size = 0
+        for key, values in block.items():
+            piece = self._as_piece(key, values) if isinstance(values, np.ndarray) else values
+            self._pieces[key].append(piece)
+            self._held += piece.memory_bytes
+            size = piece.rows
+        self.rows += size
+        if self._spool or self._held > self.limit:
+            self._spool = spool = self._spool or Spool()
+            for pieces in self._pieces.values():
+                pieces[self._moved :] = [piece.to_spool(spool) for piece in pieces[self._moved :]]
+            self._held, self._moved = 0, max(map(len, self._pieces.values()))
+
+    def _as_piece(self, key: Any, values: NDArray[Any]) -> Piece:
+        whole = np.ascontiguousarray(values, dtype=self.dtypes[key])
+        if isinstance(whole.base, np.ndarray) and whole.base.nbytes > whole.nbytes:
+            whole = whole.copy()  # a view would keep its whole base in memory
+        return PlainPiece(whole.view(np.int64))
+
+    def finish(self) -> dict[Any, NDArray[Any] | PiecewiseColumn]:
+        """Return the columns: plain arrays if they are small, otherwise piecewise columns."""
+        columns = {
+            key: PiecewiseColumn(self.dtypes[key], pieces) for key, pieces in self._pieces.items()
+        }
+        stays = any(isinstance(piece, FilePiece) for own in self._pieces.values() for piece in own)
+        self._pieces.clear()
+        if stays or self._spool is not None or self.rows * len(columns) > _MAX_PLAIN_VALUES:
+            return dict(columns)
+        matrix = np.empty((len(self.rows_of), self.rows))
+        arrays: dict[Any, NDArray[Any] | PiecewiseColumn] = {}
+        for key, column in columns.items():
+            plain = (
+                matrix[self.rows_of.index(key)]
+                if key in self.rows_of
+                else np.empty(self.rows, self.dtypes[key])
+            )
+            column.read_into(0, 0, plain)
+            arrays[key] = plain
+        return arrays
+
+
+def stack_as_rows(columns: Sequence[Any]) -> Any:
+    """Stack columns as the rows of one array, without a copy if they already share one matrix."""
+    if not isinstance(columns[0], np.ndarray):
+        stacked = stack_rows(columns)
+        stacked.gyrostab_pieces = [pieces for column in columns for pieces in pieces_of(column)]
+        return stacked
+    whole = columns[0].base
+    same = whole is not None and whole.shape[:-1] == (len(columns),)
+    return whole if same and all(one.base is whole for one in columns) else np.stack(columns)
+
+
+def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:
+    """Wrap a piecewise column in a dask array; return an array in memory unchanged."""
+    if not isinstance(values, PiecewiseColumn):
+        return values
+    import dask.array
+
+    name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
+    lazy = with_row_reader(
+        dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta),
+        values.read_into,
+    )
+    lazy.gyrostab_pieces = [values]
+    lazy.gyrostab_line = values.find_line()
+    return lazy
+
+
+def pieces_of(array: Any) -> list[PiecewiseColumn]:
+    """Return the piecewise columns that an array of `as_lazy` or `stack_as_rows` reads."""
+    return list(getattr(array, "gyrostab_pieces", ()))

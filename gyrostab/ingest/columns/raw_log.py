@@ -10,15 +10,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.buffers import (
+from gyrostab.ingest.columns.pieces import (
     SPILL_BYTES,
     Buffers,
+    DecimalPiece,
+    EvenStampsPiece,
+    Piece,
+    PiecewiseColumn,
     as_lazy,
-    set_rows,
     stack_as_rows,
-    take_rows,
 )
-from gyrostab.ingest.columns.pieces import DecimalPiece, EvenStampsPiece, Piece, PiecewiseColumn
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.options import FileSummary, ReadOptions
@@ -294,10 +295,13 @@ class RawLogBuilder:
         stamps = columns.pop(self.time.source)
         if self.bad_index and self.low <= self.high:
             rows = np.concatenate(self.bad_index)
-            written = take_rows(stamps, rows)
+            written = stamps[rows] if isinstance(stamps, np.ndarray) else stamps.take_rows(rows)
             outside = (written < self.low) | (written > self.high)
-            # a number in an unreadable row is not a stamp
-            set_rows(stamps, rows[outside & (written != NAT)], NAT)
+            rows = rows[outside & (written != NAT)]  # a number in a bad row is not a stamp
+            if isinstance(stamps, np.ndarray):
+                stamps[rows] = NAT
+            else:
+                stamps.changed, stamps.value = rows, NAT
         return as_lazy(stamps.view("datetime64[ns]"))
 
     def _make_dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:

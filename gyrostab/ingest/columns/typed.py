@@ -10,8 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
-from gyrostab.ingest.columns.pieces import EvenStampsPiece, FilePiece
+from gyrostab.ingest.columns.pieces import SPILL_BYTES, EvenStampsPiece, FilePiece
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import (

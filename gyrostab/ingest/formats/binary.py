@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 

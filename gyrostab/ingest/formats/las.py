@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.stamps import dates_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.optional import library

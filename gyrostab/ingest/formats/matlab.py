@@ -17,13 +17,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     KNOWN_CHANNEL_PATTERN,
     TIME_PATTERN,
     is_time_unit,
 )
+from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.typed import Fetch, float32_note, read_columns, summarise_columns
 from gyrostab.ingest.formats.matlab5 import check_structure

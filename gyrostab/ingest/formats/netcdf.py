@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError, TimeError, reading_of
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder
 from gyrostab.ingest.columns.typed import (

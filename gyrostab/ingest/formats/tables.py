@@ -11,7 +11,7 @@ from typing import Any
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.typed import read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels

@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.buffers import SPILL_BYTES
+from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Column, Plan, plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, looks_iso, texts_to_ns
