@@ -11,8 +11,13 @@ from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     split_header,
 )
-from gyrostab.ingest.columns.plan_draft import Column, PlanDraft, list_names
-from gyrostab.ingest.columns.plan_names import name_columns, resolve_duplicates
+from gyrostab.ingest.columns.plan_draft import (
+    Column,
+    PlanDraft,
+    list_names,
+    name_columns,
+    resolve_duplicates,
+)
 from gyrostab.ingest.columns.plan_roles import find_time, plan_channels, plan_gyro
 from gyrostab.ingest.columns.preset import PresetMatch, find_preset
 from gyrostab.ingest.limits import check_columns

@@ -20,8 +20,7 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.stamps import dates_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
-from gyrostab.ingest.formats.optional import library
-from gyrostab.ingest.formats.tables import Table, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]

@@ -18,8 +18,14 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES
-from gyrostab.ingest.formats.optional import library
-from gyrostab.ingest.formats.tables import ReadSlice, Table, plain_names, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import (
+    ReadSlice,
+    Table,
+    library,
+    plain_names,
+    read_tables,
+    scan_tables,
+)
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.time.grid import grid_times
 

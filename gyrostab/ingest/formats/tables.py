@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.plan import Plan, plan_columns
 from gyrostab.ingest.columns.typed import read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
-__all__ = ["Table", "plain_names", "read_tables", "scan_tables"]
+__all__ = ["Table", "library", "plain_names", "read_tables", "scan_tables"]
 
 #: First row, row after the last one -> values.
 ReadSlice = Callable[[int, int], Any]
@@ -188,3 +189,19 @@ def read_tables(
         if "axis_rows" not in log.attrs
         else log
     )
+
+
+def library(name: str, path: Path, *, extra: str) -> Any:
+    """Import a format library.
+
+    Raises
+    ------
+    OptionError
+        When it is not installed; the message names the extra that installs it.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise OptionError(
+            f"{path.name}: reading it needs {name}; install it with pip install 'gyrostab[{extra}]'"
+        ) from error

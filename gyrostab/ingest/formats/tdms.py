@@ -19,8 +19,14 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.stamps import NAT, dates_to_ns
-from gyrostab.ingest.formats.optional import library
-from gyrostab.ingest.formats.tables import ReadSlice, Table, plain_names, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import (
+    ReadSlice,
+    Table,
+    library,
+    plain_names,
+    read_tables,
+    scan_tables,
+)
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]

@@ -14,8 +14,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES
-from gyrostab.ingest.formats.optional import library
-from gyrostab.ingest.formats.tables import Table, plain_names, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import Table, library, plain_names, read_tables, scan_tables
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.grid.jitter import JitterModel, count_samples
-from gyrostab.ingest.grid.starting_period import GAIN
-from gyrostab.ingest.grid.stretches import SECOND, Stamps, readable_stamps
+from gyrostab.ingest.grid.starting_period import GAIN, SECOND, Stamps, readable_stamps
 from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
 from gyrostab.store.threads import map_in_order
 

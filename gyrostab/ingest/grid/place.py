@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import TimeError
 from gyrostab.ingest.gap_table import format_duration, format_stamp
 from gyrostab.ingest.grid.scan_pass import file_of
-from gyrostab.ingest.grid.stretches import Stamps
+from gyrostab.ingest.grid.starting_period import Stamps
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
 from gyrostab.kernels.grid.stamps import DUPLICATE, LOOK_AHEAD, OUT_OF_ORDER

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gyrostab.ingest.grid.place import Placement, make_placement
 from gyrostab.ingest.grid.rate import RateEstimate
-from gyrostab.ingest.grid.stretches import Stamps
+from gyrostab.ingest.grid.starting_period import Stamps
 from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
 from gyrostab.time.grid import period_ns
 

@@ -17,7 +17,7 @@ from gyrostab.ingest.grid.jitter import (
     observe_rows,
 )
 from gyrostab.ingest.grid.place import NO_STAMPS, Placement, make_placement
-from gyrostab.ingest.grid.stretches import SECOND, Stamps
+from gyrostab.ingest.grid.starting_period import SECOND, Stamps
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
 from gyrostab.time.grid import period_ns

@@ -19,14 +19,17 @@ from gyrostab.errors import TimeError
 from gyrostab.ingest.grid.jitter import JitterModel, fit_jitter, fit_jitter_near
 from gyrostab.ingest.grid.period_fit import fit_pieces, longest_step, pool_pieces
 from gyrostab.ingest.grid.starting_period import (
+    SECOND,
     SHARED_SHARE,
+    Stamps,
+    finer_period,
     period_of_lines,
+    recut_blocks,
     rms_misfit,
+    sample_stretches,
     starting_period,
     step_scatter,
 )
-from gyrostab.ingest.grid.steps import finer_period
-from gyrostab.ingest.grid.stretches import SECOND, Stamps, recut_blocks, sample_stretches
 from gyrostab.kernels.grid.stamps import NO_STAMP
 
 __all__ = ["RateEstimate", "deviating_stretches", "estimate_near", "estimate_rate", "is_far_worse"]

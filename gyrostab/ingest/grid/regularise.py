@@ -38,7 +38,7 @@ from gyrostab.ingest.grid.rate import (
 )
 from gyrostab.ingest.grid.repeats import find_repeats, with_repeats
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows, stamp_blocks
-from gyrostab.ingest.grid.stretches import Stamps
+from gyrostab.ingest.grid.starting_period import Stamps
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts

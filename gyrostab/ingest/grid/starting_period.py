@@ -2,21 +2,141 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.ingest.grid.steps import cut_stretches, refine_period
-from gyrostab.ingest.grid.stretches import SECOND
-from gyrostab.kernels.grid.stamps import track
+from gyrostab.kernels.grid.stamps import NO_STAMP, track
 
 __all__ = [
     "GAIN",
+    "SECOND",
     "SHARED_SHARE",
+    "Stamps",
+    "cut_stretches",
+    "finer_period",
     "period_of_lines",
+    "readable_stamps",
+    "recut_blocks",
+    "refine_period",
     "rms_misfit",
+    "sample_stretches",
     "starting_period",
     "step_scatter",
 ]
+
+SECOND = 1e9
+
+
+#: Returns a new iterator over all blocks of row numbers and stamps at each call.
+Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
+
+
+def recut_blocks(
+    stamps: Stamps, size: int
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Yield rows and stamps in blocks of `size`, independent of the input blocks."""
+    held: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    waiting = 0
+    for block in stamps():
+        held.append(block)
+        waiting += len(block[0])
+        if waiting < size:
+            continue
+        rows, values = _concatenate_blocks(held)
+        whole = waiting // size * size
+        for begin in range(0, whole, size):
+            yield rows[begin : begin + size], values[begin : begin + size]
+        held, waiting = [(rows[whole:], values[whole:])], waiting - whole
+    if waiting:
+        yield _concatenate_blocks(held)
+
+
+def _concatenate_blocks(
+    held: list[tuple[NDArray[np.int64], NDArray[np.int64]]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Concatenate blocks of rows and stamps; a single non-empty block is not copied."""
+    held = [block for block in held if len(block[0])]
+    if len(held) == 1:
+        return held[0]
+    rows, values = (np.concatenate(column) for column in zip(*held, strict=True))
+    return rows, values
+
+
+def readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the readable stamps, without a copy if all are readable."""
+    known = block != NO_STAMP
+    return block if known.all() else block[known]
+
+
+def sample_stretches(
+    stamps: Stamps, *, size: int = 8192, most: int = 64
+) -> list[NDArray[np.int64]]:
+    """Return stretches of stamps from the whole log, a few hundred thousand in all."""
+    found: list[NDArray[np.int64]] = []
+    for _, block in stamps():
+        block = readable_stamps(block)
+        found += [block[i : i + size] for i in range(0, len(block), size)]
+        if len(found) > 2 * most:
+            found = found[::2]
+    return [part for part in found if len(part) > 1]
+
+
+_PATTERN, _ROWS = (
+    8,
+    17,
+)  # longest pattern of steps, and further rows in which it must recur
+_WHOLE = 0.15  # largest distance of a step of a pattern from whole samples [samples]
+_LONGEST = 5.0  # longest step of a pattern [samples]
+
+
+def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
+    """Return stretches of `length` stamps, relative to the first stamp of each [ns]."""
+    stride = length if sum(map(len, parts)) > 200 * length else 1  # overlap in a short log
+    several = [
+        np.lib.stride_tricks.sliding_window_view(part, length)[::stride]
+        for part in parts
+        if len(part) >= length
+    ]
+    table = np.concatenate([*several, np.empty((0, length), dtype=np.int64)])
+    return np.asarray(table - table[:, :1], dtype=np.float64)
+
+
+def refine_period(steps: NDArray[np.float64], period: float) -> float:
+    """Refine a first guess of the period [ns] of which the steps are multiples, if there is one."""
+    start = period
+    for _ in range(30):
+        near = np.abs(steps) < 5.5 * period
+        count = np.rint(steps[near] / period).sum()
+        if count <= 0 or not 0.3 < period / start < 2.0:  # no common period
+            return start
+        new = float(steps[near].sum() / count)
+        if abs(new - period) < 1e-12 * period:
+            break
+        period = new
+    return period
+
+
+def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
+    """Find the period [ns] of recurring steps such as 1, 1, 3, 1, 1, 3; None if there is none.
+
+    In such a log the same two of every five rows are missing, or rows are read in groups; stamps
+    alone cannot distinguish these. The rounding of even stamps also makes patterns, but of steps
+    that differ by one tick; steps by jitter do not recur; pauses between bursts are longer.
+    """
+    table = np.diff(cut_stretches(parts, _PATTERN + _ROWS))
+    rising = table[table > 0]
+    if rising.size == 0:
+        return None
+    single = refine_period(table.ravel(), float(np.quantile(rising, 0.1)))
+    if single > 0.9 * period:
+        return None
+    counts = np.rint(table / single)
+    whole = (np.abs(table / single - counts) < _WHOLE).all(axis=1)
+    again = [(counts[:, rows:] == counts[:, :-rows]).all(axis=1) for rows in range(2, _PATTERN + 1)]
+    uneven = (counts.min(axis=1) == 1) & (counts.max(axis=1) > 2) & (counts.max(axis=1) <= _LONGEST)
+    return single if (whole & np.any(again, axis=0) & uneven).mean() > 0.5 else None
 
 
 GAIN = 0.1
