@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -176,67 +175,47 @@ def _value_chunks(variable: xr.DataArray) -> Iterator[NDArray[np.float64]]:
 
 
 def _inspect_column(column: ColumnSummary, log: xr.Dataset, name: str) -> ColumnInspection:
-    counts: dict[str, Any] = dict.fromkeys(("rows", "steps", "same", "up"), 0)
-    low, high, total, squares, origin, first, last, whole = (
-        math.inf,
-        -math.inf,
-        0.0,
-        0.0,
-        0.0,
-        math.nan,
-        math.nan,
-        0,
-    )
-    scatters: list[tuple[float, int]] = []
+    chunks: list[tuple[float, ...]] = []
     paces: list[float] = []
     for values in _value_chunks(log[name]) if name in log.data_vars else ():
         if not values.size:
             continue
-        if counts["rows"] == 0:
-            first = origin = float(values[0])
-        last = float(values[-1])
-        low, high = min(low, float(values.min())), max(high, float(values.max()))
-        total += float((values - origin).sum())
-        squares += float(((values - origin) ** 2).sum())
-        whole += int(np.count_nonzero(values == np.rint(values)))
+        first, last = values[[0, -1]]
+        away = values - (chunks[0][0] if chunks else first)
         steps = np.diff(values)
-        paces += _mean_steps(values)
-        counts["rows"] += values.size
-        counts["steps"] += steps.size
-        counts["same"] += int((steps == 0).sum())
-        counts["up"] += int((steps > 0).sum())
-        if steps.size:
+        scatter = 0.0
+        if steps.size:  # most samples may repeat the previous one
             typical = float(np.median(np.abs(steps))) / _MEDIAN_STEP
-            scatters.append(
-                (typical or float(np.sqrt(np.mean(steps**2) / 2)), steps.size)
-            )  # most samples may repeat the previous one
-    rows, steps_seen = counts["rows"], max(1, counts["steps"])
-    mean = origin + total / rows if rows else math.nan
-    variance = squares / rows - (total / rows) ** 2 if rows else math.nan
-    scatter = (
-        sum(size * weight for size, weight in scatters) / sum(weight for _, weight in scatters)
-        if scatters
-        else math.nan
-    )
+            scatter = steps.size * (typical or float(np.sqrt(np.mean(steps**2) / 2)))
+        whole, same, up = values == np.rint(values), steps == 0, steps > 0
+        counts = values.size, steps.size, whole.sum(), same.sum(), up.sum()
+        sums = away.sum(), (away**2).sum(), scatter
+        chunks.append((first, last, values.min(), values.max(), *sums, *counts))
+        paces += _mean_steps(values)
+    table = np.array(chunks, dtype=np.float64).reshape(-1, 12)
+    known = len(table) > 0
+    total, squares, scatters, rows, steps_seen, wholes, held, rising = table[:, 4:].sum(axis=0)
+    ends = (table[0, 0], table[-1, 1], table[:, 2].min(), table[:, 3].max()) if known else ()
+    first, last, low, high = ends or (math.nan,) * 4
+    variance = max(0.0, squares / rows - (total / rows) ** 2) if known else math.nan
     dim = str(log[name].dims[0]) if name in log.data_vars else "row"
-    filled = rows / max(1, log.sizes.get(dim, 1))
     return ColumnInspection(
         key=column.key or column.header,
         header=column.header,
         name=column.name,
         role=column.role,
         unit=column.unit,
-        rows=rows,
-        low=low if rows else math.nan,
-        high=high if rows else math.nan,
-        mean=mean,
-        std=math.sqrt(max(0.0, variance)) if rows else math.nan,
-        scatter=scatter,
-        held=counts["same"] / steps_seen,
-        rising=counts["up"] / steps_seen,
-        whole=rows > 0 and whole > WHOLE_SHARE * rows,
-        first=first,
-        last=last,
+        rows=int(rows),
+        low=float(low),
+        high=float(high),
+        mean=float(table[0, 0] + total / rows) if known else math.nan,
+        std=math.sqrt(variance),
+        scatter=float(scatters / steps_seen) if steps_seen else math.nan,
+        held=float(held / max(1, steps_seen)),
+        rising=float(rising / max(1, steps_seen)),
+        whole=bool(rows > 0 and wholes > WHOLE_SHARE * rows),
+        first=float(first),
+        last=float(last),
         pace=float(np.median(paces)) if paces else math.nan,
-        rate_hz=_row_rate(log, dim) * filled,
+        rate_hz=_row_rate(log, dim) * float(rows) / max(1, log.sizes.get(dim, 1)),
     )

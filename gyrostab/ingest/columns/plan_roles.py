@@ -167,72 +167,47 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
     match = AXIS_PATTERN.match(column.low)
     assert match is not None
     stem, axis = match.groups()
-    example = "deg/s" if stem == "gyro" else "deg"
-    allowed = ("rate", "angle") if stem == "gyro" else ("angle",)
+    example, allowed = ("deg/s", ("rate", "angle")) if stem == "gyro" else ("deg", ("angle",))
+    where = f"{draft.path.name}: column {column.header!r}"
     keys = [column.low, column.key, column.header, stem]
     text = draft.find_unit(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
+
+    def refuse(error: UnitError | MissingUnitError, quantity: str | None = None) -> None:
+        draft.problems.append(error)
+        draft.add_summary(column, column.low, "gyro", quantity, text)
+
     if text is None:
-        message = f"{draft.path.name}: the gyro column {column.header!r} carries no unit"
         advice = f"give it with --unit {stem}={example} (all axes) or --unit {column.low}={example}"
-        draft.problems.append(
-            MissingUnitError(
-                f"{message}; {advice}, or write it in the header: {column.low} [{example}]"
-            )
-        )
-        draft.add_summary(column, column.low, "gyro", None, None)
+        message = f"{draft.path.name}: the gyro column {column.header!r} carries no unit; {advice}"
+        refuse(MissingUnitError(f"{message}, or write it in the header: {column.low} [{example}]"))
         return None
+    quantity = next((quantity for quantity in allowed if is_unit_of(text, (quantity,))), None)
     try:
-        unit = parse_unit(
-            text,
-            next((quantity for quantity in allowed if is_unit_of(text, (quantity,))), None),
-        )
+        unit = parse_unit(text, quantity)
     except UnitError as error:
         if "factor" in str(error):
-            draft.problems.append(
-                UnitError(f"{draft.path.name}: column {column.header!r}: {error}")
-            )
+            draft.problems.append(UnitError(f"{where}: {error}"))
             return None
         hint = (
             f"known are {known_units('rate')}; give it with --unit {stem}={example}, or with "
             f'a factor --unit "{stem}=0.1 arcsec/s"'
         )
-        draft.problems.append(
-            UnitError(
-                f"{draft.path.name}: column {column.header!r}: unit {text!r} is not known; {hint}"
-            )
-        )
-        draft.add_summary(column, column.low, "gyro", None, text)
+        refuse(UnitError(f"{where}: unit {text!r} is not known; {hint}"))
         return None
     if unit.quantity not in allowed:
-        message = (
-            f"{draft.path.name}: column {column.header!r} has the unit {text!r}, which is "
-            f"a unit of {unit.quantity}, not of {allowed[0]}"
-        )
+        kinds = f"a unit of {unit.quantity}, not of {allowed[0]}"
         advice = (
             f"{allowed[0]} units are {known_units(allowed[0])}; give the right one with --unit "
-            f"{stem}={example}"
+            f"{stem}={example}, or with a factor for counts: --unit "
+            f'"{stem}=0.1 {"arcsec/s" if stem == "gyro" else "arcsec"}"'
         )
-        draft.problems.append(
-            UnitError(
-                f'{message}; {advice}, or with a factor for counts: --unit "{stem}=0.1 '
-                f'{_arcsec_unit(stem)}"'
-            )
+        refuse(
+            UnitError(f"{where} has the unit {text!r}, which is {kinds}; {advice}"), unit.quantity
         )
-        draft.add_summary(column, column.low, "gyro", unit.quantity, text)
         return None
     inner = INNER[unit.quantity]
-    draft.columns.append(
-        Column(
-            column.source,
-            column.header,
-            "gyro",
-            axis,
-            unit.quantity,
-            inner,
-            unit.factor,
-            unit.offset,
-        )
-    )
+    planned = column.source, column.header, "gyro", axis, unit.quantity, inner
+    draft.columns.append(Column(*planned, unit.factor, unit.offset))
     draft.add_summary(column, column.low, "gyro", unit.quantity, text)
     return unit.quantity
 
@@ -333,23 +308,9 @@ def _plan_channel(
         else:
             quantity = None
     draft.kept_channels += 1
-    draft.columns.append(
-        Column(
-            column.source,
-            column.header,
-            "channel",
-            name,
-            quantity or "other",
-            units,
-            factor,
-            offset,
-        )
-    )
+    planned = column.source, column.header, "channel", name, quantity or "other", units
+    draft.columns.append(Column(*planned, factor, offset))
     draft.add_summary(column, name, "channel", quantity or "other", text)
-
-
-def _arcsec_unit(stem: str) -> str:
-    return "arcsec/s" if stem == "gyro" else "arcsec"
 
 
 def _no_gyro(path: Path, headers: Sequence[str]) -> FormatError:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES
 from gyrostab.ingest.columns.stamps import dates_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
-from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import Table, library, read_tables, scan_tables, sliced
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]
@@ -59,7 +58,7 @@ def _read_curves(path: Path, options: ReadOptions) -> Table:
         None if holds_dates(curve.data) else str(curve.unit or "").strip() or None
         for curve in curves
     )
-    columns = tuple(partial(_slice_values, np.asarray(curve.data)) for curve in curves)
+    columns = tuple(sliced(np.asarray(curve.data)) for curve in curves)
     clocks = [
         curve
         for curve in curves
@@ -84,7 +83,7 @@ def _read_curves(path: Path, options: ReadOptions) -> Table:
         names,
         units,
         columns,
-        None if dates is None else partial(_slice_values, np.asarray(dates)),
+        None if dates is None else sliced(np.asarray(dates)),
     )
 
 
@@ -163,7 +162,3 @@ def _has_date_format(order: str, days: list[str]) -> bool:
     except ValueError:
         return False
     return bool(filled)
-
-
-def _slice_values(values: Any, start: int, stop: int) -> Any:
-    return values[start:stop]

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError, OptionError
@@ -18,7 +19,7 @@ from gyrostab.ingest.columns.typed import read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
-__all__ = ["Table", "library", "plain_names", "read_tables", "scan_tables"]
+__all__ = ["Table", "library", "plain_names", "read_tables", "scan_tables", "sliced"]
 
 #: First row, row after the last one -> values.
 ReadSlice = Callable[[int, int], Any]
@@ -40,6 +41,11 @@ class Table:
     stamps: ReadSlice | None = None
     time_unit: str | None = None
     coded: tuple[str | None, ...] = ()
+
+
+def sliced(values: Any) -> ReadSlice:
+    """Return a function that slices an array, or what can be sliced like one."""
+    return lambda start, stop: np.asarray(values[start:stop])
 
 
 def plain_names(names: Sequence[tuple[str, ...]]) -> list[str]:

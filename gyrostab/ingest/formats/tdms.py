@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from gyrostab.ingest.formats.tables import (
     plain_names,
     read_tables,
     scan_tables,
+    sliced,
 )
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
@@ -116,15 +116,9 @@ def _make_table(members: list[tuple[str, Any]], clock: tuple[float, Any] | None)
     units = tuple(
         str(channel.properties.get("unit_string") or "").strip() or None for _, channel in own
     )
-    stamps = (
-        _waveform_stamps(*clock)
-        if clock
-        else None
-        if dates is None
-        else partial(_read_slice, dates)
-    )
+    stamps = _waveform_stamps(*clock) if clock else None if dates is None else sliced(dates)
     dated = clock is None or isinstance(clock[1], np.datetime64)
-    columns = tuple(partial(_read_slice, channel) for _, channel in own)
+    columns = tuple(sliced(channel) for _, channel in own)
     return Table(
         len(members[0][1]),
         tuple(name for name, _ in own),
@@ -144,7 +138,3 @@ def _waveform_stamps(step: float, start: Any) -> ReadSlice:
         return stamps
 
     return part
-
-
-def _read_slice(channel: Any, start: int, stop: int) -> Any:
-    return np.asarray(channel[start:stop])

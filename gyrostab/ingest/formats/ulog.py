@@ -5,16 +5,20 @@ Stamps are microseconds since the start of the autopilot. The messages contain n
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES
-from gyrostab.ingest.formats.tables import Table, library, plain_names, read_tables, scan_tables
+from gyrostab.ingest.formats.tables import (
+    Table,
+    library,
+    plain_names,
+    read_tables,
+    scan_tables,
+    sliced,
+)
 from gyrostab.ingest.options import FileSummary, ReadOptions
 
 __all__ = ["matches", "read", "scan"]
@@ -58,8 +62,8 @@ def _make_tables(path: Path) -> tuple[list[Table], list[str]]:
     names = iter(plain_names([(name, field) for name, _, fields in found for field, _ in fields]))
     tables = []
     for _, stamps, fields in found:
-        columns = tuple(partial(_slice_values, values) for _, values in fields)
-        clock = None if stamps is None else partial(_slice_values, stamps)
+        columns = tuple(sliced(values) for _, values in fields)
+        clock = None if stamps is None else sliced(stamps)
         tables.append(
             Table(
                 len(fields[0][1]) if fields else 0,
@@ -84,7 +88,3 @@ def _make_tables(path: Path) -> tuple[list[Table], list[str]]:
             else []
         ),
     ]
-
-
-def _slice_values(values: Any, start: int, stop: int) -> Any:
-    return np.asarray(values)[start:stop]

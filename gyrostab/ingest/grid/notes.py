@@ -62,12 +62,12 @@ def describe_rate(
     """Return notes on the sampling rate."""
     where = file_of(raw)[0]
     notes = []
+    why = (
+        "many rows share one stamp"
+        if estimate.coarse
+        else "the stamps come in bursts, as rows arrive and not as they are sampled"
+    )
     if estimate.counted:
-        why = (
-            "many rows share one stamp"
-            if estimate.coarse
-            else "the stamps come in bursts, as rows arrive and not as they are sampled"
-        )
         reach = (
             f"; stamps and samples differ by up to {format_duration(placement.wander / rate)} in "
             "the long run"
@@ -77,11 +77,6 @@ def describe_rate(
         notes.append(f"{where}: {why}: rows are placed by their count at {rate:.10g} Hz{reach}")
     jitter = estimate.jitter
     if jitter is not None and jitter.group >= 2:
-        why = (
-            "many rows share one stamp"
-            if estimate.coarse
-            else "the stamps come in bursts, as rows arrive and not as they are sampled"
-        )
         notes.append(
             f"{where}: {why}: rows are placed in their order at {rate:.10g} Hz; samples are "
             "missing where a group comes late"

@@ -16,7 +16,7 @@ from gyrostab.ingest.grid.jitter import (
     JitterModel,
     observe_rows,
 )
-from gyrostab.ingest.grid.place import NO_STAMPS, Placement, make_placement
+from gyrostab.ingest.grid.place import NO_STAMPS, Placement, append_runs, make_placement
 from gyrostab.ingest.grid.starting_period import SECOND, Stamps
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
@@ -158,22 +158,6 @@ class _Placer:
         if len(rows):
             self.last = int(sample[-1])
             self.runs.append(append_runs(self.runs, sample, rows))
-
-
-def append_runs(runs: list[Integers], sample: Integers, rows: Integers) -> Integers:
-    """Make runs of rows and samples; extend the last run of `runs` if they continue it."""
-    new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
-    first = np.concatenate([[0], new])
-    table = np.stack([sample[first], rows[first], np.diff(np.append(first, len(rows)))], axis=1)
-    before = runs[-1][-1] if runs and len(runs[-1]) else None
-    if (
-        before is not None
-        and before[0] + before[2] == table[0, 0]
-        and before[1] + before[2] == table[0, 1]
-    ):
-        before[2] += table[0, 2]
-        table = table[1:]
-    return table
 
 
 def place_rows(

@@ -24,10 +24,10 @@ from gyrostab.ingest.grid.notes import describe_channels, describe_placement, de
 from gyrostab.ingest.grid.place import (
     Placement,
     check_grid,
+    place_by_count,
     place_by_stamp,
     place_without_time,
 )
-from gyrostab.ingest.grid.place_by_count import place_by_count
 from gyrostab.ingest.grid.place_in_order import place_in_order
 from gyrostab.ingest.grid.rate import (
     RateEstimate,

@@ -1,4 +1,4 @@
-"""Restore a log after xarray operations: sampling rate from its time, NaN at missing samples."""
+"""Restore a log after xarray operations: rate from its time, NaN at missing samples, gaps."""
 
 from __future__ import annotations
 
@@ -9,20 +9,33 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import SchemaError, TimeError
-from gyrostab.ingest.gap_table import clip_table
-from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
-from gyrostab.ingest.uniform.place import place_samples
-from gyrostab.ingest.uniform.table import (
-    add_holes,
-    change_rate,
-    has_gap_table,
-    read_table,
-    with_table,
+from gyrostab.ingest.concat.lazy import chunk_of, place_on_grid
+from gyrostab.ingest.gap_table import (
+    CAUSE,
+    END,
+    FIRST,
+    ROWS,
+    SAMPLES,
+    clip_table,
+    gap_variables,
+    merge_neighbours,
 )
-from gyrostab.schema import check_log, signal_name
-from gyrostab.time.grid import TimeGridIndex, time_coordinate
+from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
+from gyrostab.schema import GAP_CAUSES, check_log, signal_name, texts
+from gyrostab.store.lazy_slices import make_lazy
+from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 
-__all__ = ["as_uniform", "grid_of"]
+__all__ = [
+    "add_holes",
+    "add_spans",
+    "as_uniform",
+    "change_rate",
+    "grid_of",
+    "has_gap_table",
+    "place_samples",
+    "read_table",
+    "with_table",
+]
 
 
 def as_uniform(log: xr.Dataset) -> xr.Dataset:
@@ -156,3 +169,218 @@ def _with_true_table(
     if fitting is table or np.array_equal(fitting, table):
         return log
     return with_table(log, fitting, grid.start, grid.rate)
+
+
+Runs = NDArray[np.int64]
+
+#: Largest variable that stays in memory after placing [numbers]; 16 MB.
+SMALL_SIZE = 2**21
+#: Chunk length of variables that were in memory [samples].
+CHUNK_SAMPLES = 2**20
+
+
+def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: int) -> xr.Dataset:
+    """Place the samples of a log on a grid, NaN where missing; lazy variables stay lazy.
+
+    Parameters
+    ----------
+    log : xarray.Dataset
+        Log whose variables along ``time`` are placed; others stay.
+    runs : ndarray of int64, shape (n, 3)
+        First sample of the grid, first sample of the log, length.
+    start, rate, size : int, float, int
+        First stamp [ns since 1970], sampling rate [Hz] and samples of the grid.
+
+    Returns
+    -------
+    xarray.Dataset
+        Log with a computed time axis. Variables without numbers are left out, with a note.
+    """
+    moved = {name: variable for name, variable in log.variables.items() if "time" in variable.dims}
+    placed, left_out = {}, []
+    for name, variable in moved.items():
+        if name not in log.data_vars:
+            continue
+        if variable.dtype.kind not in "biuf" or variable.ndim > 2:
+            left_out.append(str(name))
+            continue
+        turned = variable.transpose(..., "time")
+        array = _place_array(turned.data, runs, size)
+        placed[name] = xr.Variable(turned.dims, array, variable.attrs, variable.encoding).transpose(
+            *variable.dims
+        )
+    whole = (
+        log.drop_vars(list(moved)).assign(placed).assign_coords(time_coordinate(start, rate, size))
+    )
+    whole = whole[[name for name in log.data_vars if name in whole.data_vars]]
+    whole.set_close(log._close)
+    if left_out:
+        note = f"left out, as missing samples of it could not be marked: {', '.join(left_out)}"
+        whole = whole.assign_attrs(notes=[*texts(log, "notes"), note])
+    return whole
+
+
+def _place_array(array: Any, runs: Runs, size: int) -> Any:
+    lead = int(np.prod(array.shape[:-1], dtype=np.int64))
+    if isinstance(array, np.ndarray) and size * lead <= max(SMALL_SIZE, 2 * array.size):
+        out = np.full((*array.shape[:-1], size), np.nan)
+        length = runs[:, 2]
+        within = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
+        out[..., np.repeat(runs[:, 0], length) + within] = array[
+            ..., np.repeat(runs[:, 1], length) + within
+        ]
+        return out
+    lazy = make_lazy(array, CHUNK_SAMPLES) if isinstance(array, np.ndarray) else array
+    rows = (
+        [[(lazy, None, runs)]]
+        if array.ndim == 1
+        else [[(lazy, row, runs)] for row in range(array.shape[0])]
+    )
+    return place_on_grid(rows, size, chunk_of([lazy]), flat=array.ndim == 1)
+
+
+Table = NDArray[np.int64]
+
+_MISSING = GAP_CAUSES.index("missing")
+
+
+def has_gap_table(log: xr.Dataset) -> bool:
+    """Return whether a log has variables by gap."""
+    return "gap" in log.dims
+
+
+def read_table(log: xr.Dataset, start: int, rate: float) -> Table | None:
+    """Read the table of gaps in grid samples (`gap_table.COLUMNS`); None if it is inconsistent."""
+    found = _read_columns(log)
+    if found is None:
+        return None
+    first, end, *rest = found
+    return np.stack(
+        [
+            *(np.rint(grid_index(start, rate, stamps)).astype(np.int64) for stamps in (first, end)),
+            *rest,
+        ],
+        axis=1,
+    )
+
+
+def _read_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
+    """Return stamps of both ends [ns since 1970], samples, rows, cause; None if inconsistent."""
+    columns: list[NDArray[np.int64]] = []
+    for name, kind in (
+        ("gap_start", "M"),
+        ("gap_end", "M"),
+        ("gap_samples", "iu"),
+        ("gap_rows", "iu"),
+        ("gap_cause", "iu"),
+    ):
+        variable = log.variables.get(name)
+        if variable is None and name == "gap_rows":
+            columns.append(np.zeros_like(columns[-1]))
+            continue
+        if variable is None or variable.dims != ("gap",) or variable.dtype.kind not in kind:
+            return None
+        values = np.asarray(variable.values)
+        if kind == "M" and np.isnat(values).any():
+            raise SchemaError(
+                f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time "
+                "must be known"
+            )
+        columns.append(
+            values.astype("datetime64[ns]").view(np.int64)
+            if kind == "M"
+            else values.astype(np.int64)
+        )
+    first, end, samples, _, cause = columns
+    spoilt = (
+        np.any(end < first)
+        or np.any(samples < 0)
+        or np.any((cause < 0) | (cause >= len(GAP_CAUSES)))
+    )
+    return None if spoilt else columns
+
+
+def change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
+    """Convert the table for a log of which every n-th sample was selected.
+
+    Parameters
+    ----------
+    table : ndarray of int64, shape (n, 5)
+        Table of `read_table`, on the grid of the selected samples.
+    log : xarray.Dataset
+        Log with the exact ends of the gaps.
+    old_rate : float
+        Sampling rate for which the table was made [Hz].
+    start, rate : int, float
+        First stamp [ns since 1970] and present sampling rate [Hz].
+    """
+    columns = _read_columns(log)
+    assert columns is not None  # read_table has read them
+    table = table.copy()
+    old_length = np.rint((columns[1] - columns[0]) * (old_rate / 1e9)).astype(np.int64)
+    for column, stamps in ((FIRST, columns[0]), (END, columns[1])):
+        table[:, column] = np.ceil(
+            grid_index(start, rate, stamps) - 1e-6
+        )  # the first selected sample at or after it
+    length = table[:, END] - table[:, FIRST]
+    share = np.divide(table[:, SAMPLES], old_length, out=np.zeros(len(table)), where=old_length > 0)
+    lost = (table[:, SAMPLES] > 0) & (length == 0)  # between two selected samples
+    table[:, SAMPLES] = np.rint(share * length)
+    table[:, ROWS] = np.minimum(table[:, ROWS], np.maximum(length, 1))
+    return np.asarray(table[~lost])
+
+
+def add_holes(table: Table, runs: Table) -> Table:
+    """Add the samples between runs that the table does not list, with cause "missing"."""
+    first, end = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
+    begin, stop = _merge_lines(table[table[:, END] > table[:, FIRST]])
+    if len(begin):  # clip by listed gaps at either end, then count listed samples within
+        which = np.maximum(np.searchsorted(begin, first, side="right") - 1, 0)
+        first = np.where((begin[which] <= first) & (first < stop[which]), stop[which], first)
+        which = np.minimum(np.searchsorted(stop, end, side="left"), len(stop) - 1)
+        end = np.where((begin[which] < end) & (end <= stop[which]), begin[which], end)
+        listed = np.concatenate([[0], np.cumsum(stop - begin)])
+        within = (
+            listed[np.searchsorted(stop, end, side="right")] - listed[np.searchsorted(begin, first)]
+        )
+    else:
+        within = np.zeros_like(first)
+    samples = end - first - np.maximum(within, 0)
+    new = (end > first) & (samples > 0)
+    cause = np.full(int(new.sum()), _MISSING)
+    holes = np.stack([first[new], end[new], samples[new], np.zeros_like(cause), cause], axis=1)
+    return _sort_table(np.concatenate([table, holes]))
+
+
+def _merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return first samples and ends of the union of the lines of a table."""
+    order = np.argsort(table[:, FIRST], kind="stable")
+    first, end = (
+        table[order, FIRST],
+        np.maximum.accumulate(table[order, END]) if len(table) else table[:, END],
+    )
+    new = np.concatenate([[True], first[1:] > end[:-1]]) if len(table) else np.zeros(0, np.bool_)
+    last = np.concatenate([new[1:], [True]]) if len(table) else new
+    return first[new], end[last]
+
+
+def add_spans(table: Table, spans: Table, cause: int) -> Table:
+    """Add spans of samples (first, end) of one cause to a table."""
+    rows = [
+        np.array([[first, end, end - first, 0, cause]], dtype=np.int64)
+        for first, end in spans.tolist()
+    ]
+    return _sort_table(np.concatenate([table, *rows]))
+
+
+def _sort_table(table: Table) -> Table:
+    table = merge_neighbours(table)
+    return np.asarray(table[np.lexsort((table[:, CAUSE], table[:, FIRST]))])
+
+
+def with_table(log: xr.Dataset, table: Table | None, start: int, rate: float) -> xr.Dataset:
+    """Replace the table of gaps of a log; None removes it."""
+    bare = log.drop_vars(
+        [name for name, variable in log.variables.items() if "gap" in variable.dims]
+    )
+    return bare if table is None else bare.assign(gap_variables(table, start, rate))

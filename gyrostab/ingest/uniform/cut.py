@@ -14,10 +14,15 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.gap_table import clip_table
-from gyrostab.ingest.uniform.core import grid_of
+from gyrostab.ingest.uniform.core import (
+    add_spans,
+    grid_of,
+    has_gap_table,
+    place_samples,
+    read_table,
+    with_table,
+)
 from gyrostab.ingest.uniform.grid import UniformGrid
-from gyrostab.ingest.uniform.place import place_samples
-from gyrostab.ingest.uniform.table import add_spans, has_gap_table, read_table, with_table
 from gyrostab.schema import GAP_CAUSES, check_log
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
