@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -186,7 +185,9 @@ def _concatenate_parts(
         axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
         stack = _stack_signal(parts, signal, axes)
         for axis in axes:
-            absent[f"axis {axis}"] = _files_without(groups, partial(_has_axis, axis=axis))
+            absent[f"axis {axis}"] = _files_without(
+                groups, {id(part) for part in parts if axis in _axis_names(part)}
+            )
         packing = common_packing(part[signal].encoding for part in parts)
         data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]}, packing)
         coords["axis"] = np.array(axes, dtype=str)
@@ -200,7 +201,9 @@ def _concatenate_parts(
         ]
         packing = common_packing(part[channel].encoding for part in parts if channel in part)
         data[channel] = ("row", concatenate_columns(columns, CHUNK_ROWS), {"units": units}, packing)
-        absent[f"channel {channel}"] = _files_without(groups, partial(_has_channel, name=channel))
+        absent[f"channel {channel}"] = _files_without(
+            groups, {id(part) for part in parts if channel in part}
+        )
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     gaps = [
         f"{what} is not in {name_some(files)} and is missing there"
@@ -230,23 +233,15 @@ def _concatenate_parts(
     return joined
 
 
-def _has_axis(part: xr.Dataset, *, axis: str) -> bool:
-    return axis in _axis_names(part)
-
-
-def _has_channel(part: xr.Dataset, *, name: str) -> bool:
-    return name in part
-
-
-def _files_without(groups: list[list[xr.Dataset]], has: Callable[[xr.Dataset], bool]) -> list[str]:
+def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[str]:
     """Name the files that lack something which other files of their group contain."""
-    found = [
-        (str(part.attrs["source_files"][0]), has(part))
+    return [
+        str(part.attrs["source_files"][0])
         for group in groups
-        if any(map(has, group))
+        if any(id(part) in holders for part in group)
         for part in group
+        if id(part) not in holders
     ]
-    return [name for name, is_there in found if not is_there]
 
 
 def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:

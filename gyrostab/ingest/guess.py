@@ -76,9 +76,6 @@ _TIME_UNIT_PATTERNS = (
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
-_AXES = {**{a: a for a in "xyz"}, **dict(zip("012", "xyz", strict=True)), "pqr": "xyz"}
-
-
 @dataclass(frozen=True)
 class Guess:
     """Guessed roles of the columns of a file, with the reasons.

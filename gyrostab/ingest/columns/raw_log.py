@@ -74,14 +74,6 @@ class ConvertedBlock(NamedTuple):
 _NO_ROWS = np.empty(0, np.int64)
 
 
-def _not_finite(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return ~np.isfinite(values)
-
-
-def _row_names(first: int) -> Locate:
-    return lambda rows: [f"row {first + row}" for row in rows]
-
-
 class RawLogBuilder:
     """Collect the blocks of one file and build its raw log.
 
@@ -146,10 +138,8 @@ class RawLogBuilder:
         for column in [*self.gyro, *self.channels]:
             source = column.source
             block[source], ranges[source] = self._convert_column(column, values[source])
-            unknown = (
-                np.isnan if block[source] is values[source] else _not_finite
-            )  # packed values are not converted yet
-            masks.append(unknown(values[source]) if ranges[source][0] else None)
+            # packed values are not converted yet: infinite ones are not NaN
+            masks.append(~np.isfinite(values[source]) if ranges[source][0] else None)
         gyro = [mask for mask in masks[: len(self.gyro)] if mask is not None]
         bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro)
         if self.gyro and all(mask is not None for mask in masks):
@@ -181,7 +171,8 @@ class RawLogBuilder:
         """
         if converted.rows == 0:
             return
-        locate = locate or _row_names(self.buffers.rows)
+        first = self.buffers.rows
+        locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_cells += converted.bad_cells
         for source, (missing, low, high, whole) in converted.ranges.items():
             span = self.whole[source]
@@ -206,15 +197,11 @@ class RawLogBuilder:
         for _ in range(2):
             counts = np.empty(values.size if tens else 0, np.int32)
             if tens:
-                fits, *found = to_decimals(values, tens, counts)
+                fits, missing, low, high, whole = to_decimals(values, tens, counts)
                 if fits:
                     self.tens[column.source] = tens
-                    return DecimalPiece(counts, tens, column.factor, column.offset), (
-                        found[0],
-                        found[1],
-                        found[2],
-                        found[3],
-                    )
+                    piece = DecimalPiece(counts, tens, column.factor, column.offset)
+                    return piece, (missing, low, high, whole)
             tens = decimals_of(values) if tens else 0.0
         self.tens[column.source] = 0.0  # not decimals: do not try later blocks
         missing, low, high, whole = clean_column(values, column.factor, column.offset)

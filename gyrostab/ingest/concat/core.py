@@ -112,7 +112,7 @@ def concatenate_logs(
     signal = xr.Variable(
         ("axis", "time"),
         place_on_grid([_placed_arrays(pieces, name, axis) for axis in axes], size, chunk),
-        _signal_attributes(sources, name),
+        {**sources[0].log[name].attrs, "units": SIGNAL_UNITS[name]},
     )
     signal.encoding = common_packing(source.log[name].encoding for source in sources)
     channels, stamps = concatenate_channels(pieces, start, rate, size, chunk)
@@ -187,10 +187,6 @@ def _placed_arrays(pieces: Sequence[PlacedLog], name: str, axis: str) -> list[An
         if axis in rows:
             found.append((piece.source.log.variables[name].data, rows.index(axis), piece.runs))
     return found
-
-
-def _signal_attributes(sources: Sequence[Source], name: str) -> dict[str, Any]:
-    return {**sources[0].log[name].attrs, "units": SIGNAL_UNITS[name]}
 
 
 def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:

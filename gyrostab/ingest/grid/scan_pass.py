@@ -132,8 +132,8 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
             filled[key] += count
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
-            f"{_source_names(raw)}: none of the {rows} rows holds a number for any gyro axis; "
-            "check the columns, the units and --map"
+            f"{', '.join(_source_names(raw))}: none of the {rows} rows holds a number for any "
+            "gyro axis; check the columns, the units and --map"
         )
     axes = [str(axis) for axis in raw["axis"].values]
     still = [
@@ -151,15 +151,8 @@ def stamp_blocks(
     raw: xr.Dataset, scanned: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
-    return map_in_order(
-        _identity, _read_stamp_blocks(raw, scanned, block, all_rows=all_rows), workers=1
-    )
-
-
-def _identity(
-    block: tuple[NDArray[np.int64], NDArray[np.int64]],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    return block
+    blocks = _read_stamp_blocks(raw, scanned, block, all_rows=all_rows)
+    return map_in_order(lambda item: item, blocks, workers=1)
 
 
 def _read_stamp_blocks(
@@ -176,13 +169,13 @@ def _read_stamp_blocks(
             yield np.flatnonzero(keep) + begin, values[keep]
 
 
-def _source_names(raw: xr.Dataset) -> str:
-    return ", ".join(texts(raw, "source_files") or ["the raw log"])
+def _source_names(raw: xr.Dataset) -> list[str]:
+    return texts(raw, "source_files") or ["the raw log"]
 
 
 def file_of(raw: xr.Dataset, row: int = 0) -> tuple[str, int]:
     """Return the source file of a row, and the number of the row in it, from 0."""
-    names = texts(raw, "source_files") or ["the raw log"]
+    names = _source_names(raw)
     starts = [int(start) for start in np.atleast_1d(raw.attrs.get("row_start", 0))]
     if len(starts) != len(names):
         return ", ".join(names), row
