@@ -22,10 +22,10 @@ from page import machine
 from scipy.stats import binom, kstest
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.evidence.held_out import mean_evidence, power_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
+from tests.support.evidence import mean_evidence, power_evidence
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 VIEWS = {"means": mean_evidence, "powers": power_evidence}

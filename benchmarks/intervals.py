@@ -23,10 +23,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.nulls.records import null_records
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component, condition_on
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from tests.support.named import COEFFICIENT, record
 

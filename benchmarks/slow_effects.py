@@ -18,7 +18,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.reduce.block_statistics import reduce_log

@@ -12,14 +12,13 @@ import numpy as np
 from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.text import (
-    axes_text,
     chance_share,
-    length_text,
     next_measurement,
     plain_name,
     summary,
     without_chance,
 )
+from gyrostab.diagnose.statistics.wording import axes_text, length_text
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import embedded
 from gyrostab.report.page import page_text

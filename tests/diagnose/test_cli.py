@@ -14,10 +14,11 @@ import gyrostab
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.forward_search import tail_probability
 from gyrostab.diagnose.inputs import parse_quiescent_span
-from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.result.attribution import _can_show, join_blocks
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.result.attribution import join_blocks
 from gyrostab.diagnose.result.content import check_diagnosis
+from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import to_netcdf
@@ -290,7 +291,7 @@ def test_intervals_are_few_or_the_whole_record():
 
 def test_line_explains_only_its_own_frequency():
     line = Component(
-        Candidate("spectral_line", "line", (), ()),
+        Candidate("spectral_line", find_statistic("spectral_line"), (), ()),
         Variant({}, ("amplitude",), np.empty(0)),
         ("x",),
         50.0,
@@ -304,33 +305,19 @@ def test_line_explains_only_its_own_frequency():
         "tau_min_s": 0.017,
         "tau_max_s": 0.017,
     }
-    assert _can_show(line, region, blocks, 0.02)
-    assert not _can_show(line, region | {"frequency": 12.5}, blocks, 0.02)
-    assert not _can_show(line, region | {"what": "ramp phase", "frequency": np.nan}, blocks, 0.02)
-    assert _can_show(
-        line,
-        {
-            "view": "davar",
-            "what": "avar",
-            "frequency": np.nan,
-            "tau_min_s": 0.01,
-            "tau_max_s": 0.02,
-        },
-        blocks,
-        0.02,
-    )
-    assert not _can_show(
-        line,
-        {"view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0},
-        blocks,
-        0.02,
-    )
-    assert not _can_show(
-        line,
-        {"view": "mean", "what": "mean", "frequency": np.nan, "tau_min_s": 1.0, "tau_max_s": 9.0},
-        blocks,
-        0.02,
-    )
+
+    def can_explain(region):
+        return line.statistic.can_explain(line, region, blocks, DEFAULTS)
+
+    short = {
+        "view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 0.01, "tau_max_s": 0.02
+    }  # fmt: skip
+    assert can_explain(region)
+    assert not can_explain(region | {"frequency": 12.5})
+    assert not can_explain(region | {"what": "ramp phase", "frequency": np.nan})
+    assert can_explain(short)
+    assert not can_explain(short | {"tau_min_s": 1.0, "tau_max_s": 9.0})
+    assert not can_explain(short | {"view": "mean", "what": "mean"})
 
 
 def test_p_value_is_extrapolated_beyond_the_null_records():

@@ -12,7 +12,7 @@ import pytest
 import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.sample_counts import has_coarse_grid
-from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from tests.support.scripts import load_script
 
@@ -80,7 +80,9 @@ def test_coarse_quantization_grid_is_not_a_dead_zone(open_recording: Callable[..
     for name in ("dead_zone", "held_samples", "clipping"):
         assert "quantization grid" in reasons[name]
         assert name not in {one.effect for one in found}
-    assert "rate_quantization" in {one.effect for one in found if one.statistic == "marks"}
+    assert "rate_quantization" in {
+        one.effect for one in found if one.statistic.name == "sample_counts"
+    }
 
 
 def test_platform_sway_is_real_motion(open_recording: Callable[..., Any]) -> None:

@@ -79,11 +79,13 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
 
 def content() -> dict[str, Any]:
     region = {
-        "view": "davar", "what": "avar", "axes": ["x"], "begin": 1500.0, "end": 1800.0,
+        "statistic": "power", "view": "davar", "what": "avar", "axes": ["x"],
+        "begin": 1500.0, "end": 1800.0,
         "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
         "sign": 1, "p_value": 0.0004, "estimate": 1.8, "frequency": np.nan,
     }  # fmt: skip
     shift = region | {
+        "statistic": "mean",
         "view": "mean",
         "what": "mean",
         "tau_min_s": 20.0,

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
-from gyrostab.diagnose.statistics import STATISTICS
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.noise import TERMS
 
 RATE, BLOCK_S, PARTS = 100.0, 20.0, 8
@@ -132,7 +132,7 @@ def smallest_p(blocks: xr.Dataset, base: xr.Dataset, null: NullScores) -> np.nda
     """Return by record the smallest p-value over all statistics."""
     p = []
     for name, statistic in null.statistics.items():
-        scores = STATISTICS[name](blocks, base)
+        scores = find_statistic(name).score(blocks, base)
         if scores is not None:
             z = np.abs(np.nan_to_num(standardise(scores, statistic))).max(axis=(-3, -2, -1))
             p.append(null.p_value(name, z))

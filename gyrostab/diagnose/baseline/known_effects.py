@@ -18,7 +18,6 @@ from gyrostab.diagnose.baseline.wandering import (
     is_described_by_variance,
 )
 from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES, expected_lines
-from gyrostab.diagnose.predict.candidates import make_windows
 from gyrostab.diagnose.predict.filter_response import band_response, frequencies_in_bands
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
@@ -26,6 +25,7 @@ from gyrostab.diagnose.predict.linear_model import (
     spread_by_gaps,
     unspread_share,
 )
+from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.logger import LoggerFilter

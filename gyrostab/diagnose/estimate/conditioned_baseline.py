@@ -10,12 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.predict.condition import (
-    MIN_POWER_RATIO,
-    Component,
-    condition_on,
-    power_shares,
-)
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, condition_on, power_shares
 from gyrostab.diagnose.predict.linear_model import (
     State,
     cross_column,
@@ -100,7 +96,7 @@ def predict_baseline(
         component
         for identification in remaining
         for component in identification.components
-        if component.candidate.statistic == "cross"
+        if component.statistic.is_pairwise
     ]
     if not shared:
         return after

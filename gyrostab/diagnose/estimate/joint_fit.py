@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,18 +11,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.nuisance import average_sizes
-from gyrostab.diagnose.estimate.shared_factors import estimate_shared_factors
-from gyrostab.diagnose.estimate.telegraph_sizes import estimate_telegraph
 from gyrostab.diagnose.identify.equivalents import prefer_plainer
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes
-from gyrostab.diagnose.identify.sample_sizes import estimate_from_counts, estimate_line
-from gyrostab.diagnose.predict.condition import Component, condition_on, is_reversed
-from gyrostab.diagnose.predict.filter_response import is_filter
-from gyrostab.diagnose.predict.linear_model import State, harmonic_sets, initial_state
-from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
+from gyrostab.diagnose.statistics import Statistic
+from gyrostab.diagnose.statistics.base import SizeFit
+from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets, is_reversed
 from gyrostab.errors import GyrostabError
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
@@ -33,8 +31,7 @@ __all__ = ["Estimate", "Fitted", "fit_identifications"]
 
 Array = NDArray[np.float64]
 _ANGLE = "deg"
-_PLACE = "line", "frequency"  # where a line is does not depend on what makes it
-EARTH_RATE = 15.041067  # deg/h: 360 degrees in a sidereal day of 23.934470 h
+_PLACE = "frequency"  # of a line: where it is does not depend on what makes it
 
 
 @dataclass(frozen=True)
@@ -124,17 +121,16 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
 def _fit_identification(
     identification: Identification, state: State, identifications: Identifications
 ) -> list[Fitted]:
-    statistics = {component.candidate.statistic for component in identification.components}
+    statistics = {component.statistic for component in identification.components}
     kind = effects()[identification.effect]
     many = any(item.many for item in kind.parameters() if item.name in kind.size_parameters)
     filtered = any(
-        is_filter(component.candidate.statistic, component.variant)
-        for component in identification.components
+        component.is_filter for component in identification.components
     )  # all axes pass the filter of the one logger
     fitted_together = (
         many
         or filtered
-        or "cross" in statistics
+        or any(statistic.is_pairwise for statistic in statistics)
         or any(not component.candidate.each for component in identification.components)
     )
     if fitted_together:
@@ -178,7 +174,7 @@ def _split_harmonics(identification: Identification, state: State) -> list[list[
     turning = [
         component
         for component in identification.components
-        if component.candidate.statistic == "order" and component.candidate.each
+        if component.statistic.is_rotation and component.candidate.each
     ]
     sets = harmonic_sets(state.blocks.sizes["harmonic"]) if turning else []
     there = sorted({k for component in turning for k in sets[component.place]})
@@ -191,7 +187,7 @@ def _split_harmonics(identification: Identification, state: State) -> list[list[
     clear = [
         max(
             size / error
-            for size, error, _ in (_fit_amplitude(component, state) for component in components)
+            for size, error, _ in (fit_amplitude(component, state) for component in components)
         )
         for components in alone
     ]
@@ -215,23 +211,21 @@ def _fit_components(
     units = {item.name: item.unit for item in kind.parameters()}
     values: dict[str, Any] = {}
     estimates: dict[str, Estimate] = {}
-    by_statistic: dict[str, list[Component]] = {}
+    by_statistic: dict[Statistic, list[Component]] = {}
     for component in components:
-        by_statistic.setdefault(component.candidate.statistic, []).append(component)
+        by_statistic.setdefault(component.statistic, []).append(component)
     statistic = max(
         by_statistic,
         key=lambda name: sum(component.evidence_nats for component in by_statistic[name]),
     )
     plain = [prefer_plainer(component, state) for component in by_statistic[statistic]]
     by_statistic[statistic] = [component for component, _ in plain]
-    filtered = is_filter(statistic, by_statistic[statistic][0].variant)
+    filtered = by_statistic[statistic][0].is_filter
     sizes: Mapping[str, tuple[float, ...]]
     if filtered:
         sizes, values = fit_filter_sizes(by_statistic[statistic], state)
     else:
-        own = _SIZES.get(statistic, _linear_sizes)(
-            by_statistic[statistic], axes, state, identifications
-        )
+        own = _estimate_sizes(by_statistic[statistic], axes, state, identifications)
         sizes = {
             **_sizes_on_other_axes(by_statistic, statistic, axes, state, identifications),
             **own,
@@ -240,7 +234,8 @@ def _fit_components(
         unit = units.get(name.split(".")[0], "1")
         # a low-pass of infinite bandwidth is not given; nor is an exponent that was not measured
         if math.isfinite(mean) and not math.isnan(sd):
-            is_exact = unit == _ANGLE or (statistic, name) == _PLACE  # angles have it already
+            # the error of an angle has it already
+            is_exact = unit == _ANGLE or (statistic.is_line and name == _PLACE)
             form = 0.0 if is_exact else state.settings.size_error_share * mean
             estimates[name] = _make_estimate(
                 mean, sd, unit, ends=ends, positive=_is_positive(kind, name), form=form
@@ -262,8 +257,8 @@ def _fit_components(
 
 
 def _sizes_on_other_axes(
-    by_statistic: Mapping[str, list[Component]],
-    statistic: str,
+    by_statistic: Mapping[Statistic, list[Component]],
+    statistic: Statistic,
     axes: tuple[str, ...],
     state: State,
     identifications: Identifications,
@@ -277,14 +272,25 @@ def _sizes_on_other_axes(
     ):
         lacking = {axis for component in by_statistic[other] for axis in component.row} - seen
         if lacking:
-            sizes = _SIZES.get(other, _linear_sizes)(
-                by_statistic[other], axes, state, identifications
-            )
+            sizes = _estimate_sizes(by_statistic[other], axes, state, identifications)
             found |= {
                 name: size for name, size in sizes.items() if name.partition(".")[2] in lacking
             }
             seen |= lacking
     return found
+
+
+def _estimate_sizes(
+    components: list[Component],
+    axes: tuple[str, ...],
+    state: State,
+    identifications: Identifications,
+) -> Mapping[str, tuple[float, ...]]:
+    """Return parameters with their errors from components in one statistic."""
+    fit = SizeFit(
+        components, axes, state, identifications.candidates, identifications.count_evidence
+    )
+    return components[0].statistic.estimate(fit)
 
 
 def _is_positive(kind: type[Effect], name: str) -> bool:
@@ -370,146 +376,3 @@ def _make_estimate(
         mean + math.hypot(high - mean, NORMAL_95 * form),
     )
     return Estimate(mean, math.hypot(sd, form), max(low, 0.0) if positive else low, high, unit)
-
-
-# --------------------------------------------------------------------------------------------------
-# -------------- sizes
-
-
-def _linear_sizes(
-    components: list[Component],
-    axes: tuple[str, ...],
-    state: State,
-    identifications: Identifications,
-) -> dict[str, tuple[float, ...]]:
-    """Return parameters of means, powers, profiles and transfers; by axis if there are several."""
-    out: dict[str, tuple[float, ...]] = {}
-    for component in components:
-        if component.variant.columns[:1] == ("any",):
-            continue
-        mean, covariance, nuisance = average_sizes(component, state, identifications)
-        for number, name in enumerate(component.variant.columns):
-            value, sd = float(mean[number]), float(math.sqrt(covariance[number, number]))
-            if component.variant.squared:
-                value, sd = _square_root(value, sd)
-            out[name if len(axes) == 1 else f"{name}.{component.row[0]}"] = (value, sd)
-        out |= nuisance
-    return out
-
-
-def _square_root(square: float, sd: float) -> tuple[float, float]:
-    """Return a size and its error from those of its square."""
-    value = math.sqrt(max(square, 0.0))
-    return value, sd / (2.0 * value) if square > sd else math.sqrt(max(square, 0.0) + sd) - value
-
-
-def _common_sizes(
-    components: list[Component],
-    axes: tuple[str, ...],
-    state: State,
-    identifications: Identifications,
-) -> dict[str, tuple[float, ...]]:
-    return estimate_shared_factors(components, axes, state)
-
-
-def _rotation_sizes(
-    components: list[Component],
-    axes: tuple[str, ...],
-    state: State,
-    identifications: Identifications,
-) -> dict[str, tuple[float, ...]]:
-    """Return amplitude and phase of components locked to the rotation.
-
-    For the earth rate these are latitude and tool face of a tool that points down. Angles get the
-    error of the form of the amplitude: a share of an angle has no meaning.
-    """
-    out: dict[str, tuple[float, ...]] = {}
-    for component in components:
-        size, sd, angle = _fit_amplitude(component, state)
-        error = math.hypot(sd / max(size, 1e-300), state.settings.size_error_share)
-        if not component.candidate.each:
-            across = size * float(np.abs(component.variant.design).max())
-            return {
-                "latitude": _latitude_from_rate(across, error * across),
-                "toolface": (angle, math.degrees(error)),
-            }
-        label = "" if len(axes) == 1 else f".{component.row[0]}"
-        out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
-        out["order"] = (
-            float(
-                state.blocks["harmonic"].values[component.place % state.blocks.sizes["harmonic"]]
-            ),
-            0.0,
-        )
-    return out
-
-
-def _latitude_from_rate(across: float, error: float) -> tuple[float, float, float, float]:
-    """Return the latitude of a tool that points down, from the earth rate across it [deg/h].
-
-    The result [deg] has the standard error and the ends of the 95 % interval.
-    """
-    low, middle, high = (
-        math.degrees(math.acos(min(max(rate, 0.0) / EARTH_RATE, 1.0)))
-        for rate in (across + NORMAL_95 * error, across, across - NORMAL_95 * error)
-    )
-    return middle, max((high - low) / (2.0 * NORMAL_95), 1e-12), low, high
-
-
-def _fit_amplitude(component: Component, state: State) -> tuple[float, float, float]:
-    """Return amplitude, standard error and phase [deg] of the first harmonic of a component."""
-    mean, covariance = component_mixture(component, state).moments()
-    sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
-    return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
-
-
-def _line_sizes(
-    components: list[Component],
-    axes: tuple[str, ...],
-    state: State,
-    identifications: Identifications,
-) -> dict[str, tuple[float, float]]:
-    name = {"real_motion": "sway"}.get(
-        components[0].candidate.effect, components[0].variant.columns[0]
-    )
-    out: dict[str, tuple[float, float]] = {}
-    for component in sorted(
-        components, key=lambda component: component.evidence_nats
-    ):  # the strongest of several lines of an axis is last
-        amplitude, frequency = estimate_line(state.blocks, component.row[0], component.place)
-        label = "" if len(axes) == 1 or name == "sway" else f".{component.row[0]}"
-        out[f"{name}{label}"], out["frequency"] = amplitude, frequency
-    return out
-
-
-def _count_sizes(
-    components: list[Component],
-    axes: tuple[str, ...],
-    state: State,
-    identifications: Identifications,
-) -> dict[str, tuple[float, float]]:
-    return estimate_from_counts(
-        components[0].candidate.effect,
-        components[0].variant.columns[0],
-        components[0].row[0],
-        state.blocks,
-        identifications.count_evidence,
-    )
-
-
-def _telegraph_sizes(
-    components: list[Component],
-    axes: tuple[str, ...],
-    state: State,
-    identifications: Identifications,
-) -> dict[str, tuple[float, float]]:
-    return estimate_telegraph(components, axes, state)
-
-
-_SIZES: Mapping[str, Callable[..., Mapping[str, tuple[float, ...]]]] = {
-    "cross": _common_sizes,
-    "order": _rotation_sizes,
-    "line": _line_sizes,
-    "marks": _count_sizes,
-    "levels": _telegraph_sizes,
-}

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.estimate.joint_fit import Fitted
-from gyrostab.diagnose.predict.candidates import make_windows
+from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.noise import sampled_psd
 
 __all__ = ["add_outlier_power"]
@@ -39,7 +39,7 @@ def add_outlier_power(
     added = np.zeros(spectrum.shape)
     for one in fitted:
         if one.effect is None or not any(
-            component.candidate.statistic == "marks" for component in one.identification.components
+            component.statistic.is_count for component in one.identification.components
         ):
             continue
         rows = [axes.index(axis) for axis in one.axes]

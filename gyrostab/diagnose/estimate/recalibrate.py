@@ -28,23 +28,16 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.predict.candidates import make_windows, rebuild_variant
-from gyrostab.diagnose.predict.condition import (
-    Component,
-    condition_on,
-    condition_on_component,
-    find_anomalous_blocks,
-)
-from gyrostab.diagnose.predict.filter_response import band_response, is_filter
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
+from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     State,
     initial_state,
-    reference_channel_power,
     spread_by_gaps,
 )
-from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.predict.windows import make_windows, rebuild_variant
 from gyrostab.physics.base import Effect
-from gyrostab.physics.phase import fold
 
 __all__ = ["recalibrate", "remove_fast_switching", "with_noise"]
 
@@ -221,13 +214,16 @@ def _collect_effects(
         )
         effect = None if numbers is None else numbers.effect
         in_power = any(
-            component.candidate.statistic == "power" for component in components
+            component.statistic.is_power for component in components
         )  # that power has a free size
         if (
             numbers is not None
             and effect is not None
             and not in_power
-            and any(_is_power_from_effect(component, blocks) for component in components)
+            and any(
+                component.statistic.has_power_of_effect(component, blocks)
+                for component in components
+            )
         ):
             out.known += _effect_power(effect, blocks, axis)
             out.doubt = max(
@@ -240,22 +236,9 @@ def _collect_effects(
                     ),
                 ]
             )
-        if effect is not None and any(
-            is_filter(component.candidate.statistic, component.variant) for component in components
-        ):
+        if effect is not None and any(component.is_filter for component in components):
             out.response = out.response * band_response(effect, blocks)
     return out if touched else None
-
-
-def _is_power_from_effect(component: Component, blocks: xr.Dataset) -> bool:
-    """Return whether only the effect itself, and no column, gives the power of a component.
-
-    Blocks with anomalous samples are left out, and then their power may be too.
-    """
-    return component.candidate.statistic == "cross" or (
-        component.candidate.statistic == "marks"
-        and not find_anomalous_blocks(component, blocks).any()
-    )
 
 
 def _add_component(
@@ -265,54 +248,18 @@ def _add_component(
     baseline: xr.Dataset,
     axis: str,
 ) -> None:
-    statistic = component.candidate.statistic
+    """Add what a component takes from the noise of an axis."""
+    if component.is_filter:
+        return
     state = initial_state(
         identifications.state.blocks, baseline, settings=identifications.state.settings
     )
-    if is_filter(statistic, component.variant):
-        return
-    if statistic == "transfer":
-        out.known += _transferred_power(
-            component, replace(state, weight=identifications.state.weight)
-        )
-    elif statistic == "phase_locked":
-        out.known += _phase_locked_power(
-            component, replace(state, weight=identifications.state.weight)
-        )
-    elif statistic in ("mean", "levels", "power", "order", "line"):
-        given = condition_on_component(state, component).given
-        out.free += [
-            np.broadcast_to(one, out.known.shape) for one in given.get(("power", axis), [])
-        ]
-        out.means += given.get(("mean", axis), [])
-
-
-def _transferred_power(component: Component, state: State) -> Array:
-    """Return the power that follows a channel or another axis, (block, band)."""
-    mean, _ = component_mixture(component, state).moments()
-    transfer = np.tensordot(mean, component.variant.design, axes=1)
-    return np.asarray(
-        np.abs(transfer) ** 2
-        * np.nan_to_num(reference_channel_power(component.candidate.reference[0], state.blocks))
+    known, free, means = component.statistic.noise_shares(
+        component, axis, state, identifications.state.weight
     )
-
-
-def _phase_locked_power(component: Component, state: State) -> Array:
-    """Return the power locked to the ramp, (block, band): the aliased lines of its profile."""
-    blocks = state.blocks
-    mean, _ = component_mixture(component, state).moments()
-    profile = np.tensordot(mean, component.variant.design, axes=1)
-    square = np.abs(np.fft.rfft(profile)[1:] / profile.size) ** 2
-    turns, rate = np.abs(blocks["ramp_turns"].values), float(blocks.attrs["sampling_rate_hz"])
-    turns = np.where(np.isfinite(turns), turns, 0.0)
-    low, high = blocks["band_low"].values, blocks["band_high"].values
-    out = np.zeros((turns.size, low.size))
-    for number, size in enumerate(square, start=1):
-        place = fold(number * turns, rate)[:, None]
-        out += np.where(
-            (place >= low) & (place < high) & (turns > 0.0)[:, None], size / (high - low), 0.0
-        )
-    return out
+    out.known += known
+    out.free += [np.broadcast_to(one, out.known.shape) for one in free]
+    out.means += means
 
 
 def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
@@ -457,7 +404,7 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
         for component in identification.components
     ):
         one = component.candidate
-        if one.statistic == "power" and id(one) not in swapped:
+        if one.statistic.is_power and id(one) not in swapped:
             made = [
                 rebuild_variant(one, variant, blocks, baseline["coefficient"]) or variant
                 for variant in one.variants

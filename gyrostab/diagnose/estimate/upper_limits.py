@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
-from gyrostab.diagnose.estimate.nuisance import plain_places
 from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.predict.condition import Component, mean_columns
-from gyrostab.diagnose.predict.designs import Candidate, Variant
-from gyrostab.diagnose.predict.linear_model import State, pair_rows
+from gyrostab.diagnose.predict.average_sizes import plain_places
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.condition import mean_columns
+from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
 
@@ -60,7 +60,7 @@ def find_upper_limits(identifications: Identifications) -> dict[str, UpperLimit]
         found = [
             _limit_candidate(one, identifications.state)
             for one in identifications.candidates
-            if one.effect == name and one.statistic in ("mean", "power", "cross")
+            if one.effect == name and one.statistic.has_course and one.statistic.has_size
         ]
         known = [(value, column) for value, column in found if math.isfinite(value)]
         if not known:
@@ -87,11 +87,7 @@ def _limit_candidate(candidate: Candidate, state: State) -> tuple[float, str]:
         candidate,
         [one for one in candidate.variants if one.columns == candidate.variants[0].columns],
     )
-    rows = (
-        pair_rows(state.blocks)
-        if candidate.statistic == "cross"
-        else [(axis,) for axis in state.axes]
-    )
+    rows = candidate.statistic.rows(candidate, state)
     found = [_limit_row(Component(candidate, family[0], row, 0.0), family, state) for row in rows]
     known = [bound for bound in found if math.isfinite(bound)]
     worst = max(known) if known else math.nan
@@ -106,7 +102,7 @@ def _select_variants(candidate: Candidate, family: Sequence[Variant]) -> Sequenc
     """
     plain = (
         [family[place] for place in plain_places(candidate.effect, family)]
-        if candidate.statistic == "mean"
+        if candidate.statistic.is_linear_in_means
         else []
     )
     every = -(-len(plain) // MAX_VARIANTS)
@@ -118,7 +114,7 @@ def _limit_row(component: Component, family: Sequence[Variant], state: State) ->
     moving = [
         one
         for one in family
-        if component.candidate.statistic != "mean"
+        if not component.statistic.is_linear_in_means
         or np.ptp(mean_columns(one, state.axes.index(component.row[0]))[0]) > 0.0
     ]
     sizes = [component_mixture(component, state, one) for one in moving]
@@ -141,7 +137,7 @@ def _limit_row(component: Component, family: Sequence[Variant], state: State) ->
         return math.nan
     share = np.exp(evidence - np.logaddexp.reduce(evidence))
     one_sided = (
-        component.variant.squared and component.candidate.statistic == "power"
+        component.variant.squared and component.statistic.is_power
     )  # the product of two axes may have either sign
     size = np.maximum(mean, 0.0) if one_sided else np.abs(mean)
     return mixture_limit(size, sd, share)

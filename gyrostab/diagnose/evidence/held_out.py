@@ -15,7 +15,7 @@ its factor when the fold is held out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -44,11 +44,10 @@ __all__ = [
     "Tier",
     "held_out_evidence",
     "linear_model_factors",
-    "mean_evidence",
     "mean_factors",
     "noise_columns",
-    "power_evidence",
-    "power_factors",
+    "stack_designs",
+    "values_by_record",
     "with_independent_cells",
 ]
 
@@ -57,7 +56,7 @@ __all__ = [
 Tier = Literal["free", "calibrated"]
 
 
-def _stack_designs(
+def stack_designs(
     designs: Sequence[Array], shape: tuple[int, ...]
 ) -> tuple[Array, list[NDArray[np.int64]]]:
     """Concatenate designs as (cell, column); return them with the column indices of each."""
@@ -76,7 +75,7 @@ def _stack_designs(
     return np.concatenate([*products, np.empty((int(np.prod(shape)), 0))], axis=1), numbers
 
 
-def _values_by_record(values: xr.DataArray, *dims: str) -> Array:
+def values_by_record(values: xr.DataArray, *dims: str) -> Array:
     """Return values with `dims` first and records last; one record if there is no such dim."""
     array = values if "record" in values.dims else values.expand_dims("record")
     return np.asarray(array.transpose(*dims, "record").values, dtype=np.float64)
@@ -128,8 +127,8 @@ def mean_factors(
         evidence without any design.
     """
     n = data.sizes["block"]
-    values = _values_by_record((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
-    columns, numbers = _stack_designs(designs, (n,))
+    values = values_by_record((data["mean"] - baseline["known_mean"]).sel(axis=axis), "block")
+    columns, numbers = stack_designs(designs, (n,))
     columns_given = (
         np.empty((n, 0)) if given is None else np.asarray(given, dtype=np.float64).reshape(n, -1)
     )
@@ -340,118 +339,3 @@ def _fill_free_precision(precision: Array, square: Array) -> Array:
     known = np.diagonal(precision)
     free = np.where(square > 0.0, square, 1.0) / WIDTHS[-1] ** 2
     return np.diag(np.where(known < 0.0, free, known))
-
-
-def power_factors(
-    data: xr.Dataset,
-    baseline: xr.Dataset,
-    designs: Sequence[Array],
-    *,
-    axis: str,
-    tier: Tier = "free",
-    given: Array | None = None,
-    folds: xr.DataArray | None = None,
-) -> Array:
-    """Compute factors of designs in the band powers, for changes small against the spectrum.
-
-    Parameters
-    ----------
-    data : xarray.Dataset
-        Block statistics, one record or many with equal gaps: ``power`` ((record,) axis block band).
-    baseline : xarray.Dataset
-        ``spectrum``, ``shape_alone``, ``common``, and the variables of `noise_columns`.
-    designs : sequence of ndarray, shape (block, band) or (block, band, column)
-        Relative change of the spectrum per unit of the factor.
-    axis, tier, given, folds
-        As in `mean_factors`; `given` has the shape (block, band, column), and the level of the
-        noise is always given.
-
-    Returns
-    -------
-    ndarray, shape (subset, 1 + design, record)
-        As in `mean_factors`.
-    """
-    shape = (data.sizes["block"], data.sizes["band"])
-    values = _values_by_record(
-        (data["power"] / baseline["spectrum"] - 1.0).sel(axis=axis), "block", "band"
-    )
-    weight = np.asarray(
-        baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64
-    )
-    level, precision = noise_columns(baseline, axis=axis, tier=tier)
-    columns_given = (
-        np.empty((*shape, 0))
-        if given is None
-        else np.asarray(given, dtype=np.float64).reshape(*shape, -1)
-    )
-    widest_limits = np.diag([*np.diagonal(precision), *[-1.0] * columns_given.shape[2]])
-    columns, numbers = _stack_designs(designs, shape)
-    design_columns = [columns[:, chosen].reshape(*shape, -1) for chosen in numbers]
-    model = LinearModel(
-        values,
-        weight,
-        design_columns,
-        np.concatenate([level, columns_given], axis=2),
-        widest_limits,
-    )
-    return linear_model_factors(
-        with_independent_cells(model, baseline["common"].sel(axis=axis).values),
-        fold_blocks(data) if folds is None else folds,
-    )
-
-
-def _label_evidence(factors: Array, candidates: Mapping[str, Sequence[Array]]) -> xr.DataArray:
-    """Label the held-out evidence of candidates."""
-    owner = np.repeat(np.arange(len(candidates)), [len(designs) for designs in candidates.values()])
-    return xr.DataArray(
-        held_out_evidence(factors[:, 1:], owner),
-        dims=("candidate", "record"),
-        coords={"candidate": list(candidates)},
-        name="gain",
-        attrs={"units": "1", "long_name": "held-out evidence [nats]"},
-    )
-
-
-def mean_evidence(
-    data: xr.Dataset,
-    baseline: xr.Dataset,
-    candidates: Mapping[str, Sequence[Array]],
-    *,
-    axis: str,
-    tier: Tier = "free",
-    **more: Any,
-) -> xr.DataArray:
-    """Compute the held-out evidence of candidates in the block means.
-
-    Parameters
-    ----------
-    data, baseline, axis, tier
-        As in `mean_factors`, with `more` for its further options.
-    candidates : mapping of str to sequence of ndarray
-        Designs by name, one for every value of the nuisance parameters.
-
-    Returns
-    -------
-    xarray.DataArray
-        ``gain(candidate, record)`` [nats].
-    """
-    designs = [design for several in candidates.values() for design in several]
-    return _label_evidence(
-        mean_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates
-    )
-
-
-def power_evidence(
-    data: xr.Dataset,
-    baseline: xr.Dataset,
-    candidates: Mapping[str, Sequence[Array]],
-    *,
-    axis: str,
-    tier: Tier = "free",
-    **more: Any,
-) -> xr.DataArray:
-    """Compute the held-out evidence of candidates in the band powers, as `mean_evidence`."""
-    designs = [design for several in candidates.values() for design in several]
-    return _label_evidence(
-        power_factors(data, baseline, designs, axis=axis, tier=tier, **more), candidates
-    )

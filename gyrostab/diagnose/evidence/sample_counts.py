@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from gyrostab.diagnose.evidence.folds import FOLDS
 __all__ = [
     "COUNTS",
     "GRID_COUNTS",
+    "CountEvidence",
     "ExpectedCounts",
     "excess_extremes",
     "expected_counts",
@@ -134,6 +136,33 @@ def expected_counts(values: Array) -> tuple[Array, Array]:
     equal_counts = np.broadcast_to(mean[:, None] / block_count, values.shape[1:])
     observed = np.where(total.any(axis=0)[:, None], values.mean(axis=0), equal_counts)
     return (records * observed + equal_counts) / (records + 1.0), spread
+
+
+@dataclass(frozen=True)
+class CountEvidence:
+    """Expected sample counts from null records, and the axes with a quantized rate.
+
+    Mean (axis, block) and spread (axis,) by name; of the kurtosis of a block both (axis,).
+    """
+
+    of: dict[str, tuple[Array, Array]]
+    rounded: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    @classmethod
+    def gathered(cls, expected: ExpectedCounts, rounded: NDArray[np.bool_]) -> CountEvidence:
+        """Compute the expected counts from all null records."""
+        found = {}
+        for name, counts in expected.sums.items():
+            if not counts:
+                continue
+            values = expected.block_count(name)
+            if name == "kurtosis":
+                good = np.isfinite(values)
+                clean = np.where(good, values, np.nan)
+                found[name] = (np.nanmean(clean, axis=(0, 2)), np.nanstd(clean, axis=(0, 2)))
+            else:
+                found[name] = expected_counts(values)
+        return cls(found, rounded)
 
 
 def _log_ratio(count: Array, mean: Array) -> Array:

@@ -39,7 +39,7 @@ def with_neighbouring_variants(
         component
         for one in identified
         for component in one.components
-        if component.candidate.statistic == "mean" and component.row == (axis,)
+        if component.statistic.is_linear_in_means and component.row == (axis,)
     ):
         family = [
             one for one in component.candidate.variants if one.columns == component.variant.columns

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gyrostab.diagnose.predict.candidates import Candidate
-from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.search import CandidateEvidence, combine_rows
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
@@ -67,12 +66,12 @@ def _drop_repeated_power(components: Sequence[Component]) -> list[Component]:
     has_course = {
         component.row
         for component in components
-        if component.candidate.statistic == "levels" and component.variant.inside.size
+        if component.statistic.is_switching and component.variant.inside.size
     }
     return [
         component
         for component in components
-        if component.candidate.statistic != "power" or component.row not in has_course
+        if not component.statistic.is_power or component.row not in has_course
     ]
 
 
@@ -88,7 +87,7 @@ def merge_lines(components: dict[str, list[Component]]) -> dict[str, list[Compon
         kept = (
             several
             if plain
-            else [component for component in several if component.candidate.statistic != "line"]
+            else [component for component in several if not component.statistic.is_line]
         )
         if kept:
             out[key] = kept
@@ -97,9 +96,7 @@ def merge_lines(components: dict[str, list[Component]]) -> dict[str, list[Compon
 
 def are_lines(components: Sequence[Component]) -> bool:
     """Return whether all components are lines."""
-    return bool(components) and all(
-        component.candidate.statistic == "line" for component in components
-    )
+    return bool(components) and all(component.statistic.is_line for component in components)
 
 
 def sum_evidence(components: Sequence[Component]) -> float:
@@ -126,11 +123,11 @@ def evidence_of(components: Sequence[Component], like: Component) -> float:
 
 def candidates_of(components: Sequence[Component]) -> list[Candidate]:
     """Return the candidates that the components come from, each once."""
-    seen: dict[tuple[str, str, tuple[str, ...]], Candidate] = {}
+    seen: dict[tuple[object, ...], Candidate] = {}
     for component in components:
-        seen[
-            component.candidate.key, component.candidate.statistic, component.candidate.reference
-        ] = component.candidate
+        seen[component.candidate.key, component.statistic, component.candidate.reference] = (
+            component.candidate
+        )
     return list(seen.values())
 
 

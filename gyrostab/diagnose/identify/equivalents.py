@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gyrostab.diagnose.predict.candidates import Variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 
@@ -35,7 +34,7 @@ def prefer_plainer(component: Component, state: State) -> tuple[Component, str]:
     sentence : str
         Empty when the component is unchanged.
     """
-    if component.candidate.statistic not in ("mean", "power"):
+    if not (component.statistic.is_linear_in_means or component.statistic.is_power):
         return component, ""
     if len(component.variant.columns) == 1:
         return _prefer_first_term(component, state)

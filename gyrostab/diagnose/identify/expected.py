@@ -13,10 +13,9 @@ from gyrostab.diagnose.identify.components import (
     sum_evidence,
 )
 from gyrostab.diagnose.identify.identification import Identification
-from gyrostab.diagnose.predict.candidates import Candidate
-from gyrostab.diagnose.predict.condition import Component, condition_on
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import CandidateEvidence
 from gyrostab.physics.base import Effect
 
 __all__ = ["identify_expected_effects"]
@@ -77,9 +76,7 @@ def identify_expected_effects(
 
 def _are_anomalous_samples(components: Sequence[Component], needed: float) -> bool:
     return (
-        bool(components)
-        and components[0].candidate.statistic == "marks"
-        and sum_evidence(components) > needed
+        bool(components) and components[0].statistic.is_count and sum_evidence(components) > needed
     )
 
 

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.sample_counts import ExpectedCounts
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence, ExpectedCounts
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.expected import identify_expected_effects
 from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.selection import Search
-from gyrostab.diagnose.predict.candidates import Candidate, effect_candidates
+from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.linear_model import State, initial_state
-from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
-from gyrostab.diagnose.predict.search import CountEvidence, compute_evidence, evidence_by_effect
+from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
@@ -127,8 +128,8 @@ def _score_null_records(
     which the counts are kept.
     """
     expected = ExpectedCounts()
-    linear = [candidate for candidate in candidates if candidate.statistic != "marks"]
-    counts = [candidate for candidate in candidates if candidate.statistic == "marks"]
+    linear = [candidate for candidate in candidates if not candidate.statistic.is_count]
+    counts = [candidate for candidate in candidates if candidate.statistic.is_count]
     sums: list[dict[str, Array]] = []
     kept: list[xr.Dataset] = []
     records = 0

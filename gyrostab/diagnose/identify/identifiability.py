@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 
 from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
+from gyrostab.diagnose.identify.effect_candidates import LARGEST_SIZE
 from gyrostab.diagnose.identify.identification import Identification, Unidentified
 from gyrostab.diagnose.identify.jumps import is_lasting, is_sudden, lead_to_levels
 from gyrostab.diagnose.identify.logger_filters import fits_all_axes
 from gyrostab.diagnose.identify.steady import is_always_present
-from gyrostab.diagnose.predict.candidates import LARGEST_SIZE
-from gyrostab.diagnose.predict.condition import Component, add_fast_switching
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import fast_switching_evidence
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.telegraph import add_fast_switching, fast_switching_evidence
 from gyrostab.physics.registry import effects
 
 __all__ = [
@@ -51,9 +51,8 @@ def without_pulses(
     """
     lines: Counter[str] = Counter()
     for component in (component for one in chosen for component in one.components):
-        weight = {"line": 1, "phase_locked": settings.min_comb_lines}.get(
-            component.candidate.statistic, 0
-        )
+        has_profile = component.statistic.is_phase_locked and not component.statistic.is_rotation
+        weight = settings.min_comb_lines if has_profile else int(component.statistic.is_line)
         lines.update(dict.fromkeys(component.row, weight))
     out: list[Identification | Unidentified] = []
     for one in chosen:
@@ -114,7 +113,7 @@ def _is_rotation(component: Component) -> bool:
     """Return whether a component is that of an axis that senses the rotation of the tool."""
     return (
         component.candidate.effect == "real_motion"
-        and component.candidate.statistic == "mean"
+        and component.statistic.is_linear_in_means
         and component.variant.columns == ("spin",)
     )
 
@@ -128,10 +127,10 @@ def _rotation_share(component: Component, state: State) -> float:
 def _is_component_physical(component: Component, state: State) -> bool:
     from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 
-    effect, statistic = component.candidate.effect, component.candidate.statistic
+    effect, statistic = component.candidate.effect, component.statistic
     if (
         effect == "misalignment"
-        and statistic == "transfer"
+        and statistic.is_transfer
         and not _is_moving(component.candidate.reference[0], state)
     ):
         return False
@@ -150,17 +149,17 @@ def _is_component_physical(component: Component, state: State) -> bool:
         return bool(
             np.abs(component_mixture(component, state).moments()[0]).max() <= LARGEST_SIZE[effect]
         )
-    if statistic == "mean" and not _is_in_range(component, state):
+    if statistic.is_linear_in_means and not _is_in_range(component, state):
         return False
-    if statistic == "power" and not _is_above_least(component, state):
+    if statistic.is_power and not _is_above_least(component, state):
         return False
-    if statistic == "levels" and _has_more_levels(component, state):
+    if statistic.is_switching and _has_more_levels(component, state):
         return False
     if not is_always_present(component, state):
         return False
     return not (
         component.variant.squared
-        and statistic == "power"
+        and statistic.is_power
         and component_size(component, state)[0] <= 0.0
     )
 
@@ -245,7 +244,7 @@ def find_equivalent_effects(
     ):
         out.append("rate_quantization")  # truncation towards zero makes the zero bin twice as wide
     if effect == "telegraph" and not any(
-        component.candidate.statistic == "levels" for component in components
+        component.statistic.is_switching for component in components
     ):
         out.append("gauss_markov")  # two levels show only in the means
     if effect == "vibration_rectification":

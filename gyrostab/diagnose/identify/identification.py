@@ -10,11 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
-from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.designs import Candidate
+from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import CountEvidence
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 __all__ = [
@@ -73,7 +72,7 @@ class Unidentified:
     Attributes
     ----------
     generic : str
-        One of `gyrostab.diagnose.predict.nuisance.NUISANCE_ALTERNATIVES`.
+        One of `gyrostab.diagnose.identify.nuisance_alternatives.NUISANCE_ALTERNATIVES`.
     axes : tuple of str
     evidence_nats : float
         Held-out log Bayes factor [nats].
@@ -198,7 +197,7 @@ def _is_same_effect(one: Identification, other: Identification) -> bool:
         component.place
         for identification in (one, other)
         for component in identification.components
-        if component.candidate.statistic == "line"
+        if component.statistic.is_line
     }
     return (one.effect, one.driver) == (other.effect, other.driver) and len(lines) < 2
 
@@ -231,9 +230,9 @@ def form_error(
     decimators. A filter would explain what this leaves over frequency.
     """
     statistics = [
-        (_statistic_group(component), set(component.row), component.candidate.effect)
+        (component.statistic, set(component.row), component.candidate.effect)
         for component in components
-        if component.candidate.statistic != "line"
+        if not component.statistic.is_line
     ]
     error = 0.0
     for one in chosen:
@@ -241,10 +240,11 @@ def form_error(
             beside = [
                 effect
                 for statistic, axes, effect in statistics
-                if statistic in _affected_statistics(component) and axes & set(component.row)
+                if statistic.error_shows_in[0] in component.statistic.error_shows_in
+                and axes & set(component.row)
             ]
             of_spectrum = (
-                component.candidate.statistic == "power"
+                component.statistic.is_power
                 and isinstance(one, Identification)
                 and bool(one.driver)
                 and _FILTER in beside
@@ -252,20 +252,3 @@ def form_error(
             share = settings.spectrum_error_share if of_spectrum else settings.form_error_share
             error += share * component.evidence_nats if beside else 0.0
     return error
-
-
-def _affected_statistics(component: Component) -> tuple[str, ...]:
-    """Return the statistics in which an error of the form of a component shows.
-
-    A harmonic at a slightly wrong frequency is power, and common to the axes.
-    """
-    return (
-        ("order", "power", "cross")
-        if component.candidate.statistic == "order"
-        else (_statistic_group(component),)
-    )
-
-
-def _statistic_group(component: Component) -> str:
-    """Return the statistic of a component, with telegraph biases among the means."""
-    return "mean" if component.candidate.statistic == "levels" else component.candidate.statistic

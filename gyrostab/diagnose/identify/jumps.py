@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture, mean_mixture
 
@@ -28,7 +28,7 @@ def is_free_jump(component: Component, state: State) -> bool:
     """Return whether a component is a jump at a free instant, not at a restart."""
     if (
         component.candidate.effect != _JUMP
-        or component.candidate.statistic != "mean"
+        or not component.statistic.is_linear_in_means
         or _INSTANT not in component.variant.values
     ):
         return False

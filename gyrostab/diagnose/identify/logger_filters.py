@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, common_variance
 from gyrostab.diagnose.baseline.posterior import Fit, expected_powers
-from gyrostab.diagnose.predict.candidates import Candidate
-from gyrostab.diagnose.predict.condition import Component, condition_on
-from gyrostab.diagnose.predict.filter_response import band_response, is_filter
+from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.predict.condition import condition_on
+from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, unspread_share
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.sizes import component_size
@@ -40,15 +40,8 @@ def without_slopes(
     average, look like one. Lines that keep half of their evidence come before the filter: many of
     them together leave a broad form in the powers too.
     """
-    lines = [key for key in passing if components[key][0].candidate.statistic == "line"]
-    filters = [
-        key
-        for key in passing
-        if any(
-            is_filter(component.candidate.statistic, component.variant)
-            for component in components[key]
-        )
-    ]
+    lines = [key for key in passing if components[key][0].candidate.statistic.is_line]
+    filters = [key for key in passing if any(component.is_filter for component in components[key])]
     if not lines or not filters:
         return passing
     trial = condition_on(state, list(components[filters[0]]))
@@ -70,11 +63,7 @@ def fits_all_axes(components: Sequence[Component], state: State) -> bool:
     They pass the same logger, which takes the same share of the noise of each. The share of the
     strongest component is fitted on every axis, and once for all of them.
     """
-    shown = [
-        component
-        for component in components
-        if is_filter(component.candidate.statistic, component.variant)
-    ]
+    shown = [component for component in components if component.is_filter]
     if not shown:
         return True
     first = max(shown, key=lambda component: component.evidence_nats)
@@ -120,7 +109,11 @@ def fit_filter_sizes(
         )
         return sum(_max_log_likelihood(fit._replace(columns=seen @ filtered)) for fit, seen in fits)
 
-    family = [one.values for one in components[0].candidate.variants if is_filter("power", one)]
+    family = [
+        one.values
+        for one in components[0].candidate.variants
+        if components[0].statistic.is_filter(one)
+    ]
     log = [likelihood(one) for one in family]
     best = family[int(np.argmax(log))]
     name = "cutoff" if best["cutoff"] else "length"

@@ -28,10 +28,6 @@ NEIGHBOUR_BLOCKS = 2  # to either side, that belong to a motion
 CORE_SHARE, CORE_WIDTH_SIGMA = 0.25, 0.637
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal law
 REST_ROUNDS = 3  # in which centre and scatter at rest are refined
-#: Statistics whose columns show how much of a moving mean they explain.
-_FITTED = ("mean", "levels")
-#: Statistics of effects that explain a moving mean in other ways.
-_EXPLAINING = ("wander", "marks", "order", "transfer")
 _KEPT_STATISTICS = ("mean", "power", "cross")
 
 
@@ -124,7 +120,7 @@ def unexplained_motion(
     explained_axes = {
         axis
         for component in components
-        if component.candidate.statistic in _EXPLAINING
+        if component.statistic.explains_motion
         for axis in component.row
     }
     moving = moving_blocks(blocks, settings=settings)
@@ -132,7 +128,7 @@ def unexplained_motion(
         columns = [
             column
             for component in components
-            if component.candidate.statistic in _FITTED and component.row == (axis,)
+            if component.statistic.is_in_means and component.row == (axis,)
             for column in mean_columns(component.variant, row)
         ]
         if axis in explained_axes or (

@@ -11,10 +11,9 @@ from dataclasses import replace
 from itertools import pairwise
 
 from gyrostab.diagnose.identify.components import candidates_of, group_components
-from gyrostab.diagnose.predict.candidates import Candidate
-from gyrostab.diagnose.predict.condition import Component, condition_on
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import CandidateEvidence
 
 __all__ = ["find_layers_again", "split_layers"]
 
@@ -24,7 +23,7 @@ def split_layers(components: Sequence[Component]) -> list[list[Component]]:
     out: list[list[Component]] = []
     seen: Counter[tuple[object, ...]] = Counter()
     for component in components:
-        place = component.candidate.statistic, component.row, component.candidate.reference
+        place = component.statistic, component.row, component.candidate.reference
         if seen[place] == len(out):
             out.append([])
         out[seen[place]].append(component)

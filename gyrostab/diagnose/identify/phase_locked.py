@@ -8,8 +8,6 @@ from gyrostab.diagnose.identify.identification import Identifications
 
 __all__ = ["remove_phase_locked"]
 
-_PHASE_LOCKED = ("order", "phase_locked")
-
 
 def remove_phase_locked(identifications: Identifications) -> tuple[Identifications, float]:
     """Drop phase-locked components, and return their held-out evidence [nats].
@@ -23,7 +21,7 @@ def remove_phase_locked(identifications: Identifications) -> tuple[Identificatio
         locked = [
             component
             for component in identification.components
-            if component.candidate.statistic in _PHASE_LOCKED
+            if component.statistic.is_phase_locked
         ]
         evidence_nats += sum(component.evidence_nats for component in locked)
         rest = (

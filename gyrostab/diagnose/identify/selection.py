@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.completeness import (
     excess_low_frequency_noise,
     variance_fluctuation,
@@ -46,17 +47,14 @@ from gyrostab.diagnose.identify.switching import (
     put_followers_first,
     renew_component,
 )
-from gyrostab.diagnose.predict.candidates import Candidate
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import (
-    Component,
     condition_on,
     condition_on_components,
     refit_weights,
 )
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import (
-    CandidateEvidence,
-    CountEvidence,
     compute_evidence,
     reusable_mean_evidence,
 )
@@ -72,9 +70,6 @@ MAX_LINES = 40
 REWEIGHT_THRESHOLDS = 3.0
 #: Effects that change the white variance of the means, which the calibration then misjudges.
 _SPECTRAL_SHAPES = ("logger_filter", "held_samples", "gauss_markov", "telegraph")
-_PHASE_LOCKED = ("order", "phase_locked")
-#: Statistics whose weights are the expected powers.
-_POWER_WEIGHTED = ("power", "cross", "order", "phase_locked", "transfer")
 #: Sample counts of zeros: a sample is zero for one reason only.
 _ZERO_COUNTS = {"stuck", "filled"}
 
@@ -176,7 +171,7 @@ class Search:
             component.candidate.effect in ("logger_filter", "~S(f)") for component in components
         ):
             return {"~outliers"}  # the kurtosis of a block is that of other noise
-        if not any(component.candidate.statistic == "marks" for component in components):
+        if not any(component.statistic.is_count for component in components):
             return set()
         counts = {name for component in components for name in component.variant.columns}
         counts |= {"kurtosis"}
@@ -184,7 +179,7 @@ class Search:
         return {
             candidate.key
             for candidate in self.candidates
-            if candidate.statistic == "marks" and counts & set(candidate.marks)
+            if candidate.statistic.is_count and counts & candidate.columns
         }
 
     def _evidence(self, candidates: Sequence[Candidate], state: State) -> list[CandidateEvidence]:
@@ -210,9 +205,9 @@ class Search:
             *(one for one in known if one.candidate.key not in barred),
             *self._evidence(sought, state),
         ]
-        weighted = [one.candidate for one in found if one.candidate.statistic in _POWER_WEIGHTED]
+        weighted = [one.candidate for one in found if one.candidate.statistic.is_power_weighted]
         for _ in range(2):
-            powers = [one for one in found if one.candidate.statistic == "power"]
+            powers = [one for one in found if one.candidate.statistic.is_power]
             strongest = max(powers, key=_positive_evidence, default=None)
             if (
                 strongest is None
@@ -223,7 +218,7 @@ class Search:
             again = compute_evidence(
                 weighted, state.blocks, replace(state, weight=trial.weight), self.folds
             )
-            found = [one for one in found if one.candidate.statistic not in _POWER_WEIGHTED] + again
+            found = [one for one in found if not one.candidate.statistic.is_power_weighted] + again
         return found
 
     def _select_next(
@@ -288,7 +283,7 @@ class Search:
         counts = [
             key
             for key in passing
-            if components[key][0].candidate.statistic == "marks" and not key.startswith("~")
+            if components[key][0].candidate.statistic.is_count and not key.startswith("~")
         ]
         confirmed = [
             key
@@ -340,8 +335,8 @@ class Search:
         self, passing: list[str], components: dict[str, list[Component]], state: State
     ) -> list[str]:
         """Drop lines that a passing phase-locked effect explains."""
-        locked = [key for key in passing if components[key][0].candidate.statistic in _PHASE_LOCKED]
-        lines = [key for key in passing if components[key][0].candidate.statistic == "line"]
+        locked = [key for key in passing if components[key][0].statistic.is_phase_locked]
+        lines = [key for key in passing if components[key][0].candidate.statistic.is_line]
         if not lines:
             return passing
         masks = [
@@ -358,7 +353,7 @@ class Search:
     def _is_on_single_axis(self, components: Sequence[Component]) -> bool:
         """Return whether an effect that should be one process on all axes shows on one only."""
         key = components[0].candidate.key
-        is_common = any(one.key == key and one.statistic == "cross" for one in self.candidates)
+        is_common = any(one.key == key and one.statistic.is_pairwise for one in self.candidates)
         return is_common and len({axis for component in components for axis in component.row}) == 1
 
     def _identify(
@@ -411,7 +406,7 @@ class Search:
             is_leading = (
                 selection is chosen[0]
                 and isinstance(selection, Identification)
-                and selection.components[0].candidate.statistic != "marks"
+                and not selection.components[0].statistic.is_count
             )
             best = max((sum_evidence(components) for components in again.values()), default=0.0)
             if not is_leading and best < self.threshold:
@@ -460,7 +455,7 @@ class Search:
         state = self._condition(start, chosen, identification)
         weight = condition_on(state, list(identification.components)).weight
         weighted = replace(state, weight=weight)
-        statistics = {component.candidate.statistic for component in identification.components}
+        statistics = {component.statistic for component in identification.components}
         near = [one for one in self.candidates if one.statistic in statistics]
         axes, key = set(identification.axes), identification.components[0].candidate.key
         on_axes = {
@@ -524,7 +519,7 @@ class Search:
             kept, unexplained = self._withdraw_in_means(state, kept, unidentified, axis)
             withdrawn += unexplained
         for axis in state.axes:
-            on_axis = _identified_on(kept, "power", axis)
+            on_axis = _identified_on(kept, axis, in_means=False)
             if not on_axis:
                 continue
             weak, _ = self._find_weak(
@@ -544,7 +539,7 @@ class Search:
         axis: str,
     ) -> tuple[list[Identification], list[Unidentified]]:
         """Withdraw effects on the means of an axis that leave more slow noise than calibrated."""
-        on_axis = _identified_on(kept, "mean", axis)
+        on_axis = _identified_on(kept, axis, in_means=True)
         part_of_drift = _find_part_of_drift(on_axis, unidentified, axis)
         kept = [one for one in kept if one not in part_of_drift]
         has_alternative = any(
@@ -600,14 +595,15 @@ def _positive_evidence(found: CandidateEvidence) -> float:
 
 
 def _identified_on(
-    identified: Sequence[Identification], statistic: str, axis: str
+    identified: Sequence[Identification], axis: str, *, in_means: bool
 ) -> list[Identification]:
-    """Return the identifications with a component in a statistic of an axis."""
+    """Return the identifications with a component in the means of an axis, or in its powers."""
     return [
         one
         for one in identified
         if any(
-            component.candidate.statistic == statistic and component.row == (axis,)
+            (component.statistic.is_linear_in_means if in_means else component.statistic.is_power)
+            and component.row == (axis,)
             for component in one.components
         )
     ]
@@ -631,6 +627,5 @@ def _confirmed_components(components: Sequence[Component], state: State) -> list
     return [
         component
         for component in components
-        if component.candidate.statistic == "transfer"
-        and component.candidate.reference[0] not in state.axes
+        if component.statistic.is_transfer and component.candidate.reference[0] not in state.axes
     ]

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.condition import Component, condition_on
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 
@@ -32,7 +33,7 @@ def is_always_present(component: Component, state: State) -> bool:
     """
     if (
         component.candidate.effect not in _STEADY
-        or component.candidate.statistic != "power"
+        or not component.statistic.is_power
         or state.blocks.sizes["block"] < RECORD_PARTS * MIN_PART_BLOCKS
     ):
         return True

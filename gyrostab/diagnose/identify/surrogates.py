@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Candidate, Variant, rebuild_variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
+from gyrostab.diagnose.predict.windows import rebuild_variant
 
 __all__ = ["TIME_SHIFTS", "passes_time_shift_test"]
 
@@ -88,10 +88,10 @@ def passes_time_shift_test(
 
 def _follows_channel(component: Component, state: State) -> bool:
     """Return whether a component follows a channel, or the means of other axes."""
-    if component.candidate.statistic not in ("mean", "power"):
+    if not (component.statistic.is_linear_in_means or component.statistic.is_power):
         return False
     return any(component.candidate.driver) or (
-        component.candidate.statistic == "mean" and component.candidate.effect in _FOLLOWING_AXES
+        component.statistic.is_linear_in_means and component.candidate.effect in _FOLLOWING_AXES
     )
 
 

@@ -15,10 +15,9 @@ from gyrostab.diagnose.evidence.telegraph import telegraph_evidence
 from gyrostab.diagnose.identify.components import axes_of, evidence_of
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
 from gyrostab.diagnose.identify.jumps import is_free_jump
-from gyrostab.diagnose.predict.condition import Component, mean_columns
-from gyrostab.diagnose.predict.designs import Candidate
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import CandidateEvidence
 
 __all__ = [
     "drop_explained_jumps",
@@ -28,7 +27,6 @@ __all__ = [
     "renew_component",
 ]
 
-_TELEGRAPH = "levels"
 #: Share of the variance of a switching course that a channel explains if it may be its cause.
 LEADING_SHARE = 0.5
 
@@ -46,7 +44,7 @@ def put_followers_first(
         component
         for key in passing
         for component in components[key]
-        if component.candidate.statistic == "mean" and any(component.candidate.driver)
+        if component.statistic.is_linear_in_means and any(component.candidate.driver)
     ]
     return [
         key
@@ -56,11 +54,7 @@ def put_followers_first(
 
 
 def _has_possible_cause(component: Component, led: Sequence[Component], state: State) -> bool:
-    beside = [
-        one
-        for one in led
-        if component.candidate.statistic == _TELEGRAPH and one.row == component.row
-    ]
+    beside = [one for one in led if component.statistic.is_switching and one.row == component.row]
     return any(
         one.evidence_nats >= component.evidence_nats
         or _explained_share(component, one, state) > LEADING_SHARE
@@ -133,7 +127,7 @@ def drop_explained_jumps(
         component
         for one in chosen
         for component in one.components
-        if component.candidate.statistic == _TELEGRAPH
+        if component.statistic.is_switching
     ]:
         jumps = _jumps_on_axis(component, out, state_with([]))
         for some in [jumps, *([one] for one in jumps if len(jumps) > 1)]:
@@ -244,13 +238,13 @@ def renew_component(components: Sequence[Component], component: Component) -> Co
     These were found with all other effects in the model.
     """
     fresh = replace(component, evidence_nats=evidence_of(components, component))
-    if component.candidate.statistic != _TELEGRAPH:
+    if not component.statistic.is_switching:
         return fresh
     return next(
         (
             replace(fresh, variant=one.variant)
             for one in components
-            if (one.candidate.statistic, one.row) == (_TELEGRAPH, component.row)
+            if one.statistic.is_switching and one.row == component.row
         ),
         fresh,
     )
@@ -264,9 +258,7 @@ def remove_telegraph_bias(identifications: Identifications) -> tuple[Identificat
     those = [
         identification
         for identification in identifications.identified
-        if any(
-            component.candidate.statistic == _TELEGRAPH for component in identification.components
-        )
+        if any(component.statistic.is_switching for component in identification.components)
     ]
     kept = tuple(
         identification

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.locate.regions import merge_regions, merge_wandering_regions
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.diagnose.statistics import STATISTICS
+from gyrostab.diagnose.statistics import STATISTICS, Statistic
 from gyrostab.diagnose.statistics.mean import region_mean
-from gyrostab.diagnose.statistics.variance_stability import scale_to_expected
 from gyrostab.errors import OptionError
 
-__all__ = ["FIELDS", "find_level_regions", "locate_mismatches"]
+__all__ = ["FIELDS", "locate_mismatches"]
 
 Array = NDArray[np.float64]
 # Limits of the table; the rows left out are the least certain.
@@ -27,6 +26,7 @@ LINE_REACH_BINS = 3  # lines on either side that a strong line leaks into
 
 #: Fields of a mismatch, and their units.
 FIELDS = {
+    "statistic": None,
     "view": None,
     "axes": None,
     "what": None,
@@ -73,10 +73,10 @@ def locate_mismatches(
     Returns
     -------
     xarray.Dataset
-        Along ``mismatch``, the surest first: ``view``, ``axes`` (separated by blanks), ``what``,
-        ``begin``, ``end`` [s since the start], ``start_time``, ``end_time``, ``tau_min_s``,
-        ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``,
-        ``ratio`` (observed over expected; for means and restarts the number of standard
+        Along ``mismatch``, the surest first: ``statistic``, ``view``, ``axes`` (separated by
+        blanks), ``what``, ``begin``, ``end`` [s since the start], ``start_time``, ``end_time``,
+        ``tau_min_s``, ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders),
+        ``z``, ``ratio`` (observed over expected; for means and restarts the number of standard
         deviations), ``estimate`` (depends on the statistic), ``p_value``.
 
     Raises
@@ -100,41 +100,17 @@ def locate_mismatches(
         nulls if isinstance(nulls, NullScores) else null_scores(baseline, nulls, settings=settings)
     )
     regions: list[dict[str, Any]] = []
-    for name, score in STATISTICS.items():
-        if name not in null.statistics:
-            continue
-        find = _locate_mean_regions if name == "mean" else _locate_regions
-        seen = (
-            scale_to_expected(blocks, baseline, find_level_regions(regions))
-            if name == "variance_stability"
-            else blocks
-        )
-        regions += find(name, score, seen, baseline, null, level, settings)
+    for statistic in STATISTICS:
+        if statistic.name in null.statistics:
+            find = _locate_mean_regions if statistic.is_linear_in_means else _locate_regions
+            seen = statistic.prepare(blocks, baseline, regions)
+            regions += find(statistic, seen, baseline, null, level, settings)
     merged = merge_regions(regions, settings=settings)
     return _make_table(merged[:MAX_MISMATCHES], blocks, null, level)
 
 
-def find_level_regions(
-    regions: Iterable[Mapping[str, Any]],
-) -> list[tuple[list[str], float, float]]:
-    """Return axes, begin and end [s] of the regions in which the noise level differs.
-
-    A change of level there is not reported again as a fluctuation.
-    """
-    level_regions = (
-        region
-        for region in regions
-        if region["view"] == "davar" and region["what"] in ("avar", "level")
-    )
-    return [
-        (str(region["axes"]).split(), float(region["begin"]), float(region["end"]))
-        for region in level_regions
-    ]
-
-
 def _locate_regions(
-    name: str,
-    score: Any,
+    statistic: Statistic,
     blocks: xr.Dataset,
     baseline: xr.Dataset,
     null: NullScores,
@@ -142,13 +118,15 @@ def _locate_regions(
     settings: Settings,
 ) -> list[dict[str, Any]]:
     """Locate the regions of one statistic, row by row."""
-    scores = score(blocks, baseline)
+    scores, name = statistic.score(blocks, baseline), statistic.name
+    if scores is None:
+        return []
     z, critical = standardise(scores, null.statistics[name]), null.critical(name, level)
     found = []
     for row in range(z.shape[0]):
         left = z[row].copy()
         for _ in range(MAX_PER_ROW):
-            region = _take_region(scores, row, left, z[row], critical, settings)
+            region = _take_region(statistic, scores, row, left, z[row], critical, settings)
             if region is None:
                 break
             region["p_value"] = float(null.p_value(name, region["z"]))
@@ -157,8 +135,7 @@ def _locate_regions(
 
 
 def _locate_mean_regions(
-    name: str,
-    score: Any,
+    statistic: Statistic,
     blocks: xr.Dataset,
     baseline: xr.Dataset,
     null: NullScores,
@@ -169,15 +146,18 @@ def _locate_mean_regions(
 
     A step at one place shifts the mean of the whole record.
     """
+    name = statistic.name
     critical, found = null.critical(name, level), []
     known = baseline["known_mean"].transpose("axis", "block").copy(deep=True)
     open_rows = set(range(blocks.sizes["axis"]))
     for _ in range(MAX_PER_ROW):
         now = baseline.assign(known_mean=known)
-        scores = score(blocks, now)
+        scores = statistic.score(blocks, now)
+        if scores is None:
+            break
         z = standardise(scores, null.statistics[name])
         for row in sorted(open_rows):
-            region = _take_region(scores, row, z[row].copy(), z[row], critical, settings)
+            region = _take_region(statistic, scores, row, z[row].copy(), z[row], critical, settings)
             if region is None:
                 open_rows.discard(row)
                 continue
@@ -197,7 +177,13 @@ def _locate_mean_regions(
 
 
 def _take_region(
-    scores: xr.Dataset, row: int, left: Array, z: Array, critical: float, settings: Settings
+    statistic: Statistic,
+    scores: xr.Dataset,
+    row: int,
+    left: Array,
+    z: Array,
+    critical: float,
+    settings: Settings,
 ) -> dict[str, Any] | None:
     """Return the region around the largest score left, or None; remove it from `left`."""
     if not np.isfinite(left).any() or np.nanmax(np.abs(left)) < critical:
@@ -209,9 +195,10 @@ def _take_region(
     )  # explained windows do not count
     begin, end, fine = _find_span(scores, free * sign, int(window), settings)
     combined, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
-    columns, reach = _find_columns(scores, combined, ratio, int(column), settings)
+    columns, reach = _find_columns(statistic, scores, combined, ratio, int(column), settings)
     region = {
-        "view": scores.attrs["view"],
+        "statistic": statistic.name,
+        "view": statistic.view,
         "axes": str(scores["axes"].values[row]),
         "what": str(scores["what"].values[column]),
         "begin": begin,
@@ -313,7 +300,12 @@ def _combine_windows(
 
 
 def _find_columns(
-    scores: xr.Dataset, combined: Array, ratio: Array, column: int, settings: Settings
+    statistic: Statistic,
+    scores: xr.Dataset,
+    combined: Array,
+    ratio: Array,
+    column: int,
+    settings: Settings,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the columns of a region, and those that it explains."""
     what, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
@@ -327,7 +319,7 @@ def _find_columns(
     while upper + 1 < what.size and above[upper + 1] and what[upper + 1] == what[column]:
         upper += 1
     grown = np.arange(lower, upper + 1)
-    excess = np.abs(ratio - 1.0) if scores.attrs["view"] == "davar" else np.abs(combined)
+    excess = np.abs(ratio - 1.0) if statistic.is_ratio else np.abs(combined)
     region = grown[excess[grown] >= settings.region_excess_share * excess[column]]
     beside = LINE_REACH_BINS if what[column] == "line" else 0
     if what[column] == "line":
@@ -343,7 +335,13 @@ def _make_table(
 ) -> xr.Dataset:
     variables: dict[str, Any] = {}
     for field, units in FIELDS.items():
-        kind = str if field in ("view", "axes", "what") else int if field == "sign" else float
+        kind = (
+            str
+            if field in ("statistic", "view", "axes", "what")
+            else int
+            if field == "sign"
+            else float
+        )
         values = np.array([region[field] for region in regions], dtype=kind)
         variables[field] = ("mismatch", values, {"units": units} if units else {})
     start = (

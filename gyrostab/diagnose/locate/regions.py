@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics import find_statistic
 
 __all__ = ["merge_regions", "merge_wandering_regions"]
 
@@ -28,9 +29,9 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
 
     Examples
     --------
-    >>> region = {"view": "davar", "axes": "x", "what": "avar", "begin": 0.0, "end": 60.0,
-    ...           "tau_min_s": 0.01, "tau_max_s": 0.1, "frequency": float("nan"), "sign": 1,
-    ...           "z": 9.0, "p_value": 1e-6}
+    >>> region = {"statistic": "power", "view": "davar", "axes": "x", "what": "avar",
+    ...           "begin": 0.0, "end": 60.0, "tau_min_s": 0.01, "tau_max_s": 0.1,
+    ...           "frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
     >>> on_y = region | {"axes": "y", "z": 8.0}
     >>> later = region | {"begin": 60.0, "end": 90.0, "z": 7.0}
     >>> [(merged["axes"], merged["end"]) for merged in merge_regions([region, on_y, later])]
@@ -88,9 +89,9 @@ def _common_share(one: Region, other: Region) -> float:
 
 def _are_adjacent(one: Region, other: Region, settings: Settings) -> bool:
     """Return whether two regions of the same axes are adjacent."""
-    if not set(one["axes"].split()) <= set(other["axes"].split()) or one["view"] in (
-        "mean",
-        "restart",
+    if (
+        not set(one["axes"].split()) <= set(other["axes"].split())
+        or not find_statistic(one["statistic"]).grows_in_time
     ):
         return False
     shorter, longer = sorted([one["end"] - one["begin"], other["end"] - other["begin"]])

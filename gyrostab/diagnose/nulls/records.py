@@ -7,7 +7,7 @@ error.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import line_columns, white_variance
 from gyrostab.diagnose.evidence.wandering import expected_processes
-from gyrostab.diagnose.nulls.counts import COARSE_STEP_SIGMA, null_counts
 from gyrostab.diagnose.nulls.shared_noise import (
     SharedNoise,
     draw_shared_spectra,
     draw_shared_white,
     find_shared_noise,
 )
-from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
+from gyrostab.diagnose.statistics import STATISTICS
+from gyrostab.diagnose.statistics.base import NullDraw
+from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
+from gyrostab.diagnose.statistics.null_counts import COARSE_STEP_SIGMA
 from gyrostab.kernels.random.stochastic import (
     brownian_means,
     flicker_means,
@@ -33,9 +35,15 @@ from gyrostab.kernels.random.stochastic import (
 from gyrostab.kernels.spectra.periodogram import band_covariance, taper
 from gyrostab.noise import HOUR
 
-__all__ = ["null_records"]
+__all__ = ["null_records", "repeatable_null_records"]
 
 Array = NDArray[np.float64]
+#: Null records up to this size stay in memory; larger ones are drawn again on each pass.
+MAX_KEPT_NULL_BYTES = 3e8
+#: Band powers of the null records that are drawn and scored together; bounds the memory.
+MAX_BATCH_POWER_BYTES = 6.4e7
+#: Fewer records in a batch would spend the time on the loop around them.
+MIN_BATCH_RECORDS = 25
 _RECORDS_PER_CHUNK = 25  # limits memory
 _KURTOSIS_SAMPLES = 10**6  # simulated sample by sample; limits time
 _MAX_BANDS_APART = 4  # of bands that the taper correlates
@@ -102,6 +110,33 @@ def null_records(
     setup = _prepare_nulls(blocks, baseline, rng)
     for first in range(0, count, chunk):
         yield _draw_records(setup, min(chunk, count - first), rng)
+
+
+def repeatable_null_records(
+    blocks: xr.Dataset, baseline: xr.Dataset, count: int, seed: int
+) -> Callable[[], Iterable[xr.Dataset]]:
+    """Return a function that gives the same null records on each call.
+
+    Small ones are kept in memory; large ones are drawn again.
+    """
+    power_bytes = blocks["power"].size * 8
+    batch = int(np.clip(MAX_BATCH_POWER_BYTES / power_bytes, MIN_BATCH_RECORDS, count))
+
+    def draw() -> Iterable[xr.Dataset]:
+        rng = np.random.default_rng(seed)
+        return null_records(blocks, baseline, count=count, rng=rng, chunk=batch)
+
+    # with lines and cross-spectra, a null record takes about three times as much as its powers
+    if count * power_bytes * 3 > MAX_KEPT_NULL_BYTES:
+        return draw
+    kept: list[xr.Dataset] = []
+
+    def recall() -> Iterable[xr.Dataset]:
+        if not kept:
+            kept.extend(draw())
+        return kept
+
+    return recall
 
 
 def _values_in_order(data: xr.Dataset, name: str, *dims: str) -> Array:
@@ -270,19 +305,12 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
             else _scale_shared_cross(setup, expected * swell, between),
         ),
     }
+    draw = NullDraw(blocks, baseline, count, rng, expected, power, setup.sd)
     variables |= {
-        name: (("axis", "block"), values)
-        for name, values in null_counts(blocks, setup.sd, count, rng).items()
+        name: (tuple(map(str, blocks[name].dims)), values)
+        for statistic in STATISTICS
+        for name, values in statistic.null(draw).items()
     }
-    if "reference_cross" in blocks:
-        variables["reference_cross"] = (
-            ("axis", "reference", "block", "band"),
-            _draw_channel_cross(setup, power, rng),
-        )
-    if "order" in blocks:
-        variables["order"] = (("axis", "block", "harmonic"), _draw_orders(setup, expected, rng))
-    if "profile" in blocks:
-        variables["profile"] = (("axis", "block", "phase"), _draw_profiles(setup, count, rng))
     return blocks.assign(
         {
             name: (("record", *dims), values, blocks[name].attrs)
@@ -406,17 +434,6 @@ def _correlate_lines(drawn: Array, size: int) -> Array:
     return np.asarray(np.maximum(leaked, drawn.min(axis=-1, keepdims=True)))
 
 
-def _draw_coherency(
-    shape: Array, size: tuple[int, ...], rng: np.random.Generator
-) -> NDArray[np.complex128]:
-    """Draw the sample coherency of independent signals, from `shape` complex frequencies."""
-    rest = np.maximum(np.where(np.isfinite(shape), shape, 1.0) - 1.0, 0.0)
-    with np.errstate(divide="ignore", over="ignore"):
-        # Beta(1, n - 1)
-        squared = np.where(rest > 0.0, 1.0 - rng.random(size) ** (1.0 / rest), 1.0)
-    return np.asarray(np.sqrt(squared) * np.exp(2j * np.pi * rng.random(size)))
-
-
 def _draw_independent_cross(
     setup: _NullSetup, power: Array, rng: np.random.Generator
 ) -> NDArray[np.complex128]:
@@ -428,7 +445,7 @@ def _draw_independent_cross(
     shape = np.minimum(setup.shape[one], setup.shape[other])
     if "cross_shape" in setup.blocks:
         shape = _values_in_order(setup.blocks, "cross_shape", "pair", "block", "band")
-    cross = size * _draw_coherency(shape, size.shape, rng)
+    cross = size * draw_coherency(shape, size.shape, rng)
     cross[..., np.isnan(_values_in_order(setup.blocks, "cross", "pair", "block", "band"))] = np.nan
     return np.asarray(cross)
 
@@ -442,62 +459,6 @@ def _scale_shared_cross(
     cross = between * np.sqrt(level[:, one] * level[:, other])
     cross[..., np.isnan(_values_in_order(setup.blocks, "cross", "pair", "block", "band"))] = np.nan
     return np.asarray(cross)
-
-
-def _draw_channel_cross(
-    setup: _NullSetup, power: Array, rng: np.random.Generator
-) -> NDArray[np.complex128]:
-    """Draw cross-spectra of axes with reference channels."""
-    recorded = _values_in_order(
-        setup.blocks, "reference_cross", "axis", "reference", "block", "band"
-    )
-    channel_power = _values_in_order(setup.blocks, "reference_power", "reference", "block", "band")
-    size = np.sqrt(power[:, :, None] * channel_power)
-    cross = size * _draw_coherency(setup.shape[:, None], size.shape, rng)
-    cross[..., np.isnan(recorded)] = np.nan
-    return np.asarray(cross)
-
-
-def _draw_orders(
-    setup: _NullSetup, expected: Array, rng: np.random.Generator
-) -> NDArray[np.complex128]:
-    """Draw Gaussian amplitudes at the rotation orders, with the density near that frequency."""
-    blocks = setup.blocks
-    recorded = _values_in_order(blocks, "order", "axis", "block", "harmonic")
-    rate = float(blocks.attrs["sampling_rate_hz"])
-    samples = np.maximum(_values_in_order(blocks, "samples", "axis", "block"), 1)
-    turning = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values)) / 360.0
-    bands = np.log(blocks["frequency"].values)
-    density = np.empty((len(expected), *recorded.shape))
-    for place, harmonic in enumerate(blocks["harmonic"].values):
-        folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
-        at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
-        low = np.minimum(at.astype(int), bands.size - 2)
-        block = np.arange(turning.size)
-        density[..., place] = expected[:, :, block, low] * (1.0 - (at - low)) + expected[
-            :, :, block, low + 1
-        ] * (at - low)
-    noise = rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
-    out = np.asarray(
-        np.sqrt(2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]) * noise
-    )
-    out[..., np.isnan(recorded)] = np.nan
-    return out
-
-
-def _draw_profiles(setup: _NullSetup, count: int, rng: np.random.Generator) -> Array:
-    """Draw ramp profiles."""
-    recorded = _values_in_order(setup.blocks, "profile", "axis", "block", "phase")
-    samples = _values_in_order(setup.blocks, "profile_samples", "axis", "block", "phase").astype(
-        np.float64
-    )
-    safe = np.maximum(samples, 1.0)
-    noise = rng.standard_normal((count, *recorded.shape)) * setup.sd[:, :1, None] / np.sqrt(safe)
-    noise -= (noise * samples).sum(axis=-1, keepdims=True) / np.maximum(samples.sum(axis=-1), 1.0)[
-        ..., None
-    ]
-    noise[..., np.isnan(recorded)] = np.nan
-    return np.asarray(noise)
 
 
 def _kurtosis_moments(n: Array) -> tuple[Array, Array, Array]:

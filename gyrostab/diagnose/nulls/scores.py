@@ -114,16 +114,16 @@ def null_scores(
         size = max(1, _POWERS_AT_ONCE * chunk.sizes["record"] // chunk["power"].size)
         for first in range(0, chunk.sizes["record"], size):
             part = chunk.isel(record=slice(first, first + size))
-            for name, score in STATISTICS.items():
-                scores = score(part, baseline)
+            for statistic in STATISTICS:
+                scores = statistic.score(part, baseline)
                 if scores is not None:
-                    if name not in gathered:
-                        gathered[name] = _ScoreSums(scores, settings.pooled_records)
-                    gathered[name].add(scores)
+                    if statistic.name not in gathered:
+                        gathered[statistic.name] = _ScoreSums(scores, settings.pooled_records)
+                    gathered[statistic.name].add(scores)
     statistics = {}
     largest = {}
-    for name, statistic in gathered.items():
-        mean, spread, z = statistic.finish()
+    for name, sums in gathered.items():
+        mean, spread, z = sums.finish()
         half = z**2 / 2.0
         statistics[name] = StatisticNull(mean, spread, _fit_maximum(half, settings.tail_share))
         largest[name] = statistics[name].tail.surprise(half)

@@ -11,11 +11,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.spectral_lines import local_level
-from gyrostab.diagnose.predict.candidates import Variant, make_windows
+from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 
-__all__ = ["band_response", "frequencies_in_bands", "is_filter", "undo_filter"]
+__all__ = ["band_response", "frequencies_in_bands", "undo_filter"]
 
 Array = NDArray[np.float64]
 _FREQUENCIES_PER_BAND = 48  # to average a response; design choice
@@ -35,11 +35,6 @@ def _estimate_size(power: Array, full: Array) -> float:
     return float(
         shares[np.argmin(np.log((usual[passed] / form).mean(axis=1)) + np.log(form).mean(axis=1))]
     )
-
-
-def is_filter(statistic: str, variant: Variant) -> bool:
-    """Return whether a variant multiplies the spectrum rather than adds to it."""
-    return statistic == "power" and not variant.columns
 
 
 def band_response(effect: Effect, blocks: xr.Dataset) -> Array:

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.evidence.wandering import expected_processes
-from gyrostab.diagnose.predict.candidates import Variant
-from gyrostab.diagnose.predict.condition import Component, mean_columns
-from gyrostab.diagnose.predict.linear_model import State, build_linear_model, statistic_rows
+from gyrostab.diagnose.predict.candidates import Component, Variant
+from gyrostab.diagnose.predict.linear_model import State
 
-__all__ = ["Mixture", "component_mixture", "component_size", "mean_mixture"]
+__all__ = ["Mixture", "component_mixture", "component_size", "linear_mixture", "mean_mixture"]
 
 Array = NDArray[np.float64]
 _RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
@@ -122,18 +121,20 @@ def component_mixture(
 ) -> Mixture:
     """Compute the sizes of a component's columns, in units of the parameters (or squares).
 
-    All effects of `state` are in the model.
+    All effects of `state` are in the model. `variance` is that of `mean_mixture`.
     """
-    variant = variant or component.variant
-    if component.candidate.statistic in ("mean", "levels"):
-        row = state.axes.index(component.row[0])
-        return mean_mixture(state, component.row[0], mean_columns(variant, row), variance=variance)
+    return component.statistic.mixture(
+        component, state, variant or component.variant, variance=variance
+    )
+
+
+def linear_mixture(component: Component, state: State, variant: Variant) -> Mixture:
+    """Compute the sizes of columns in the linear model of a statistic, as one point."""
     candidate = replace(component.candidate, variants=(variant,))
-    row = statistic_rows(candidate, state).index(component.row)
-    model = build_linear_model([candidate], row, state.blocks, state)
-    design = model.designs[
-        max(component.place, 0) if component.candidate.statistic == "order" else 0
-    ]
+    row = candidate.statistic.rows(candidate, state).index(component.row)
+    model = candidate.statistic.model([candidate], row, state.blocks, state)
+    # several designs belong to a variant only for the rotation, where the place selects one
+    design = model.designs[max(component.place, 0) if candidate.statistic.is_rotation else 0]
     columns = np.concatenate([design, model.given], axis=2).reshape(
         -1, design.shape[2] + model.given.shape[2]
     )
@@ -163,7 +164,7 @@ def component_mixture(
 
 def component_size(component: Component, state: State) -> tuple[float, float]:
     """Return size and standard error of the first column; 0 and inf for statistics without size."""
-    if component.candidate.statistic in ("marks", "line", "wander"):
+    if not component.statistic.has_size:
         return 0.0, np.inf
     mean, covariance = component_mixture(component, state).moments()
     return float(mean[0]), float(np.sqrt(covariance[0, 0]))

@@ -24,6 +24,7 @@ from gyrostab.diagnose.reduce.log_blocks import (
     read_batches,
 )
 from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
+from gyrostab.diagnose.reduce.schema import check_block_statistics, label_variables
 from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths
 from gyrostab.errors import OptionError
 from gyrostab.kernels.regression.smooth import smooth_curve
@@ -52,7 +53,6 @@ _MIN_BLOCKS = 24  # fewer are refused: held-out stretches and calibration need t
 _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
 _STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
 _MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
-_POWER_UNIT = "degree2 hour-2 Hz-1"
 _RATE_UNIT = INNER["rate"]
 _MIN_NEIGHBOUR_RATIO = 2.0  # times expected density from which noise near an order is significant
 
@@ -142,20 +142,8 @@ def reduce_log(
     Returns
     -------
     xarray.Dataset
-        By ``(axis, block)``: ``mean`` [degree hour-1], ``variance`` [degree2 hour-2], ``samples``,
-        ``neighbours``, ``adjacent``, ``kurtosis``, ``peaks``, ``outliers``, ``repeats`` and their
-        ``repeat_runs``, ``extremes``, ``zeros`` and their ``zero_runs``, and among the zeros
-        ``stuck`` and ``filled``. By ``(axis, block, band)``: ``power`` [degree2 hour-2 Hz-1],
-        two-sided, and the ``shape`` of its gamma distribution. ``cross``, ``cross_shape`` (pair,
-        block, band), ``cross_neighbours``, ``cross_samples`` (pair, block), ``reference_power``,
-        ``reference_cross`` (reference channels), ``line_power(axis, part, line)``, ``line_weight``,
-        ``order`` and ``order_level`` (axis, block, harmonic), ``profile(axis, block, phase)``,
-        ``sub_block_mean`` and ``sub_block_samples`` (axis, block, sub_block),
-        ``quantization_step(axis)`` [degree hour-1], ``bin_width(axis, bin)`` [quantization steps],
-        ``axes_at_once(subset, axis)``, ``at_once(subset, block)``, ``channel_<name>(block)``,
-        ``fine_<name>(block, block_part)`` of channels that effects follow with a lag, and gaps and
-        restarts in seconds.
-        Coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
+        With the variables of `gyrostab.diagnose.reduce.schema.BLOCK_STATISTICS`, the channels, and
+        coordinates ``time``, ``begin``, ``end`` [s] of the blocks, ``frequency`` [Hz] of the bands.
 
     Raises
     ------
@@ -227,7 +215,6 @@ def _label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> 
     axes = slice(0, work.axes)
     counts, moments = work.counts[axes], work.moments[axes]
     present = counts[..., 0]
-    plane, cube = ("axis", "block"), ("axis", "block", "band")
     enough = present >= max(_MIN_MEAN_SHARE * work.length, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
@@ -248,129 +235,52 @@ def _label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> 
     weight *= _equal_block_share(work.power[axes], work.shape, present, weight.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         lines = work.line_sum / (work.line_expected * work.rate)
-    variables: dict[str, Any] = {
-        "mean": (
-            plane,
-            np.where(enough, moments[..., 0], np.nan),
-            _make_attrs("mean rate of the block", _RATE_UNIT),
-        ),
-        "variance": (
-            plane,
-            np.where(enough, moments[..., 1], np.nan),
-            _make_attrs("variance of the samples about it", "degree2 hour-2"),
-        ),
-        "samples": (plane, present, _make_attrs("samples present", "1")),
-        "power": (
-            cube,
-            work.power[axes],
-            _make_attrs("mean periodogram of the band, two-sided density", _POWER_UNIT),
-        ),
-        "shape": (
-            cube,
-            work.shape,
-            _make_attrs("shape of the gamma distribution of the power in white noise", "1"),
-        ),
-        "neighbours": (
-            plane,
-            work.neighbours,
-            _make_attrs("share of neighbouring pairs of samples, tapered", "1"),
-        ),
-        "kurtosis": (
-            plane,
-            np.where(np.isnan(work.neighbours), np.nan, kurtosis),
-            _make_attrs("excess kurtosis of the block", "1"),
-        ),
-        "peaks": (plane, peaks, _make_attrs("isolated outliers", "1")),
-        "outliers": (
-            plane,
-            outliers,
-            _make_attrs("isolated outliers, three times those beyond twice the limit", "1"),
-        ),
-        "adjacent": (
-            plane,
-            work.adjacent,
-            _make_attrs("samples with another one right before them in the block", "1"),
-        ),
-        "repeats": (
-            plane,
-            _count_repeats(moments, counts),
-            _make_attrs("samples equal to the one before, except zeros and range ends", "1"),
-        ),
-        "repeat_runs": (
-            plane,
-            counts[..., 7],
-            _make_attrs("runs of samples equal to the one before, except zeros", "1"),
-        ),
-        "zero_runs": (
-            plane,
-            counts[..., 8],
-            _make_attrs("runs of samples that are exactly 0", "1"),
-        ),
-        "extremes": (
-            plane,
-            _count_extremes(moments, counts),
-            _make_attrs("samples equal to the smallest or largest of the record", "1"),
-        ),
-        "zeros": (plane, counts[..., 1], _make_attrs("samples that are exactly 0", "1")),
-        "stuck": (
-            plane,
-            _count_stuck(moments, counts, filled),
-            _make_attrs("zeros of one axis, within its range", "1"),
-        ),
-        "filled": (
-            plane,
-            filled,
-            _make_attrs("simultaneous zeros of all axes; of a single axis, zeros in runs", "1"),
-        ),
-        "axes_at_once": (
-            ("subset", "axis"),
-            subset,
-            _make_attrs("axes that have samples at once", "1"),
-        ),
-        "at_once": (
-            ("subset", "block"),
-            at_once,
-            _make_attrs("samples that exactly these axes have at once", "1"),
-        ),
-        "quantization_step": (
-            "axis",
-            steps,
-            _make_attrs("quantization step of the values, 0 for none", _RATE_UNIT),
-        ),
-        "line_power": (
-            ("axis", "part", "line"),
-            lines,
-            _make_attrs("mean periodogram at full resolution, two-sided density", _POWER_UNIT),
-        ),
-        "line_weight": (
-            ("axis", "part"),
-            weight,
-            _make_attrs("equivalent number of equal blocks in each mean", "1"),
-        ),
+    arrays: dict[str, Any] = {
+        "mean": np.where(enough, moments[..., 0], np.nan),
+        "variance": np.where(enough, moments[..., 1], np.nan),
+        "samples": present,
+        "power": work.power[axes],
+        "shape": work.shape,
+        "neighbours": work.neighbours,
+        "kurtosis": np.where(np.isnan(work.neighbours), np.nan, kurtosis),
+        "peaks": peaks,
+        "outliers": outliers,
+        "adjacent": work.adjacent,
+        "repeats": _count_repeats(moments, counts),
+        "repeat_runs": counts[..., 7],
+        "zero_runs": counts[..., 8],
+        "extremes": _count_at_range_ends(moments, counts[..., 3], counts[..., 4]),
+        "zeros": counts[..., 1],
+        "stuck": _count_stuck(moments, counts, filled),
+        "filled": filled,
+        "axes_at_once": subset,
+        "at_once": at_once,
+        "quantization_step": steps,
+        "line_power": lines,
+        "line_weight": weight,
+        "bin_width": widths[:, 0],
+        "bin_width_stderr": widths[:, 1],
     }
-    variables |= {
-        "bin_width": (
-            ("axis", "bin"),
-            widths[:, 0],
-            _make_attrs("width of the zero bin and of its neighbours, in quantization steps", "1"),
-        ),
-        "bin_width_stderr": (
-            ("axis", "bin"),
-            widths[:, 1],
-            _make_attrs("standard error of it", "1"),
-        ),
-    }
-    variables |= (
-        _sub_block_means(work)
+    variables = (
+        label_variables(
+            arrays
+            | _sub_block_means(work)
+            | _phase_locked_statistics(work)
+            | _gap_table(work, log, restart)
+        )
         | _cross_spectra(work, log)
-        | _phase_locked_statistics(work)
         | _channel_means(work, log)
         | _channel_part_means(work, log)
-        | _gap_table(work, log, restart)
     )
-    return xr.Dataset(
-        variables, coords=_make_coordinates(work, log), attrs=_make_attributes(work, log, present)
-    ).set_coords(["first", "second"])
+    if work.ramp_turns is not None:
+        variables["ramp_turns"][2].update(zip(("low", "high"), work.ramp_range, strict=True))
+    return check_block_statistics(
+        xr.Dataset(
+            variables,
+            coords=_make_coordinates(work, log),
+            attrs=_make_attributes(work, log, present),
+        ).set_coords(["first", "second"])
+    )
 
 
 def _kept_values(work: Accumulator, row: int, most: int | None = None) -> Array:
@@ -381,21 +291,8 @@ def _kept_values(work: Accumulator, row: int, most: int | None = None) -> Array:
 def _sub_block_means(work: Accumulator) -> dict[str, Any]:
     """Return means over sub-blocks, which show a bias that switches within blocks."""
     total, count = work.sub_blocks
-    dims = ("axis", "block", "sub_block")
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = total / count
-    return {
-        "sub_block_mean": (
-            dims,
-            mean,
-            _make_attrs("mean rate of a sub-block", _RATE_UNIT),
-        ),
-        "sub_block_samples": (
-            dims,
-            count.astype(np.int64),
-            _make_attrs("samples of a sub-block", "1"),
-        ),
-    }
+        return {"sub_block_mean": total / count, "sub_block_samples": count.astype(np.int64)}
 
 
 def _make_attrs(name: str, units: str) -> dict[str, Any]:
@@ -454,10 +351,6 @@ def _count_at_range_ends(
     )
 
 
-def _count_extremes(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    return _count_at_range_ends(moments, counts[..., 3], counts[..., 4])
-
-
 def _count_repeats(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Count held samples; those at zero or at an end of the range have another cause."""
     return counts[..., 2] - _count_at_range_ends(moments, counts[..., 5], counts[..., 6])
@@ -474,87 +367,48 @@ def _count_stuck(
 def _cross_spectra(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
     axes, names = work.axes, [str(name) for name in log["axis"].values]
-    variables: dict[str, Any] = {}
     own = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
-    attrs = _make_attrs(
-        "mean cross-periodogram of the samples that both axes have, two-sided density", _POWER_UNIT
+    variables = label_variables(
+        {
+            "cross": work.cross[own],
+            "cross_shape": work.cross_shape[own],
+            "cross_neighbours": work.cross_neighbours[own],
+            "cross_samples": work.cross_samples[own],
+        }
     )
-    variables["cross"] = (("pair", "block", "band"), work.cross[own], attrs)
-    attrs = _make_attrs(
-        "shape of the gamma distribution of powers over the samples that both axes have", "1"
-    )
-    variables["cross_shape"] = (("pair", "block", "band"), work.cross_shape[own], attrs)
-    attrs = _make_attrs(
-        "share of neighbouring pairs of the samples that both axes have, tapered", "1"
-    )
-    variables["cross_neighbours"] = (("pair", "block"), work.cross_neighbours[own], attrs)
-    variables["cross_samples"] = (
-        ("pair", "block"),
-        work.cross_samples[own],
-        _make_attrs("samples that both axes have", "1"),
-    )
-    variables["first"] = (
-        "pair",
-        np.array([names[work.pairs[number][0]] for number in own], dtype=object),
-    )
-    variables["second"] = (
-        "pair",
-        np.array([names[work.pairs[number][1]] for number in own], dtype=object),
-    )
+    for side, name in enumerate(("first", "second")):
+        variables[name] = (
+            "pair",
+            np.array([names[work.pairs[number][side]] for number in own], dtype=object),
+        )
     if work.channels:
         shape = (axes, len(work.channels), *work.cross.shape[1:])
         with_axes = np.full(shape, np.nan + 0j)
         for number, (a, b) in enumerate(work.pairs):
             if b >= axes:
                 with_axes[a, b - axes] = work.cross[number]
-        units = [str(log[name].attrs.get("units", "1")) for name in work.channels]
         unit_list = ", ".join(
-            f"{name} in {unit}" for name, unit in zip(work.channels, units, strict=True)
+            f"{name} in {log[name].attrs.get('units', '1')}" for name in work.channels
         )
-        attrs = {
-            "long_name": "mean periodogram of a channel, two-sided density",
-            "units": f"square of the channel's unit per Hz ({unit_list})",
-        }
-        variables["reference_power"] = (("reference", "block", "band"), work.power[axes:], attrs)
-        attrs = {"long_name": "mean cross-periodogram of axis and channel, F_axis conj(F_channel)",
-                 "units": f"degree hour-1 Hz-1 times the channel's unit ({unit_list})"}  # fmt: skip
-        variables["reference_cross"] = (("axis", "reference", "block", "band"), with_axes, attrs)
+        references = label_variables(
+            {"reference_power": work.power[axes:], "reference_cross": with_axes}
+        )
+        for _, _, attrs in references.values():
+            attrs["units"] += f" ({unit_list})"
+        variables |= references
     return variables
 
 
 def _phase_locked_statistics(work: Accumulator) -> dict[str, Any]:
     """Return what is locked to the tool rotation and to the ramp phase."""
-    variables: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     if work.order is not None:
-        attrs = _make_attrs(
-            "complex amplitude at multiples of the rotation, NaN below one turn per block",
-            _RATE_UNIT,
-        )
-        variables["order"] = (("axis", "block", "harmonic"), work.order, attrs)
-        level = _make_attrs(
-            "density of what turns 1 to 4 times in the block more or less than that, two-sided",
-            _POWER_UNIT,
-        )
-        variables["order_level"] = (("axis", "block", "harmonic"), work.order_level, level)
+        arrays |= {"order": work.order, "order_level": work.order_level}
     if work.profile_sums is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
-            profile = work.profile_sums / work.profile_counts
-        dims = ("axis", "block", "phase")
-        variables["profile"] = (
-            dims,
-            profile,
-            _make_attrs("mean rate less the block's mean, by phase of the ramp", _RATE_UNIT),
-        )
-        variables["profile_samples"] = (
-            dims,
-            work.profile_counts,
-            _make_attrs("samples of each mean", "1"),
-        )
-        attrs = _make_attrs("turns of the ramp in a second, negative where it falls", "Hz") | dict(
-            zip(("low", "high"), work.ramp_range, strict=True)
-        )
-        variables["ramp_turns"] = ("block", work.ramp_turns, attrs)
-    return variables
+            arrays["profile"] = work.profile_sums / work.profile_counts
+        arrays |= {"profile_samples": work.profile_counts, "ramp_turns": work.ramp_turns}
+    return arrays
 
 
 def _channel_means(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
@@ -633,18 +487,10 @@ def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, 
         ]
     restarts = np.array(sorted(starts), dtype=np.float64).reshape(-1, 2)
     return {
-        "gap_begin": ("gap", gaps[:, 0], _make_attrs("first missing sample, since the start", "s")),
-        "gap_end": (
-            "gap",
-            gaps[:, 1],
-            _make_attrs("first sample present again, since the start", "s"),
-        ),
-        "restart_begin": (
-            "restart",
-            restarts[:, 0],
-            _make_attrs("power lost, since the start", "s"),
-        ),
-        "restart_end": ("restart", restarts[:, 1], _make_attrs("power back, since the start", "s")),
+        "gap_begin": gaps[:, 0],
+        "gap_end": gaps[:, 1],
+        "restart_begin": restarts[:, 0],
+        "restart_end": restarts[:, 1],
     }
 
 

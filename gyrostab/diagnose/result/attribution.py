@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.nulls.scores import NullScores
-from gyrostab.diagnose.predict.condition import Component, find_anomalous_blocks, mean_columns
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.result.attribution_weights import (
     Scores,
     needed_effects,
@@ -21,31 +22,12 @@ from gyrostab.diagnose.result.attribution_weights import (
     statistic_scores,
 )
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks
 
 __all__ = ["active_blocks", "attribute_mismatches", "drop_expected", "join_blocks"]
 
 Array = NDArray[np.float64]
-#: Statistic of a component -> values of `view` of the mismatches that it can explain.
-_VIEWS_SHOWN: dict[str, tuple[str, ...]] = {
-    "mean": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
-    "power": ("davar", "spectrum", "distribution"),
-    "cross": ("cross_axis", "davar"),
-    "marks": ("distribution", "davar", "spectrum", "cross_axis"),
-    "line": ("spectrum", "davar", "distribution", "cross_axis"),
-    "order": ("spectrum", "davar", "mean", "distribution", "cross_axis"),
-    "phase_locked": ("spectrum", "davar", "distribution", "mean"),
-    "transfer": ("davar", "cross_axis", "spectrum", "mean", "distribution"),
-    "wander": ("mean", "davar", "restart", "cross_axis"),
-    "levels": ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum"),
-}
-#: Statistics of the components that the baseline with the effects contains.
-_MODELLED = ("mean", "power", "cross", "wander", "levels")
-#: Statistics that may move the rate within a block, which is power at its lowest lines.
-_MOVING = ("mean", "levels")
 MAX_SPANS = 6  # more intervals than that are reported as the whole record
-LINE_REACH_BINS = 3  # of the taper, that a strong line leaks into
-SINE_TAU_CYCLES = 0.371  # tau * f where the Allan variance of a sine is largest
-TAU_REACH_FACTOR = 4.0  # averaging times around that maximum at which a line still shows
 
 
 def active_blocks(
@@ -59,19 +41,16 @@ def active_blocks(
     there = np.zeros(block_count, bool)
     for component in identification.components:
         design = component.variant.design
-        if component.candidate.statistic == "order":
+        if component.statistic.is_rotation:
             there |= _rotating_blocks(blocks, settings)
             continue
-        if (
-            component.candidate.statistic not in ("mean", "power", "cross", "wander")
-            or design.size == 0
-        ):
+        if not component.statistic.has_course or design.size == 0:
             return np.ones(block_count, bool)
         place = [number for number, size in enumerate(design.shape) if size == block_count]
         if not place:
             return np.ones(block_count, bool)
         size = np.asarray(np.moveaxis(np.asarray(design), place[0], 0).reshape(block_count, -1))
-        if component.candidate.statistic == "mean":
+        if component.statistic.is_linear_in_means:
             size = size - _rest_level(size, settings)
         size = np.abs(size)
         largest = np.nanmax(size, axis=0, initial=0.0)
@@ -204,20 +183,21 @@ def attribute_mismatches(
             components = [
                 component
                 for component in identification.components
-                if _can_show(component, region, blocks, settings.line_width_share)
+                if component.statistic.can_explain(component, region, blocks, settings)
             ]
             components = [
                 component
                 for component in components
-                if moved
-                or component.candidate.statistic not in _MOVING
-                or region["view"] != "spectrum"
+                if moved or not component.statistic.is_in_means or region["view"] != "spectrum"
             ]
             if not components or not set(str(region["axes"]).split()) & set(identification.axes):
                 continue
-            if score >= limit and {
-                component.candidate.statistic for component in components
-            } <= _modelled_statistics(identification, region):
+            common = set(str(region["axes"]).split()) & set(identification.axes)
+            together = str(region["what"]) == "slow" and len(common) > 1
+            if score >= limit and all(
+                component.statistic.is_modelled_in(region, together=together)
+                for component in components
+            ):
                 continue
             if (
                 moved
@@ -268,8 +248,7 @@ def drop_expected(
         one
         for one in expected
         if any(
-            component.candidate.statistic == "marks"
-            and find_anomalous_blocks(component, blocks).any()
+            component.statistic.is_count and find_anomalous_blocks(component, blocks).any()
             for component in one.components
         )
     ]
@@ -297,64 +276,12 @@ def _is_caused_elsewhere(
     The constant of a record is free: a mean that is higher in one part is lower in the rest, and
     either may be the mismatch.
     """
-    if str(region["view"]) != "mean" or not {
-        component.candidate.statistic for component in components
-    } <= {
-        "mean",
-        "levels",
-    }:
+    if str(region["view"]) != "mean" or not all(
+        component.statistic.is_in_means for component in components
+    ):
         return False
     score, limit = left()
     return score >= limit
-
-
-def _modelled_statistics(identification: Identification, region: Mapping[str, Any]) -> set[str]:
-    """Return the statistics of components whose effect on a mismatch the baseline contains.
-
-    Several axes that wander together are in no model, so that a wandering effect may explain that.
-    """
-    held = {*_MODELLED, "line", "marks"} if region["view"] == "cross_axis" else set(_MODELLED)
-    wanders = (
-        str(region["what"]) == "slow"
-        and len(set(str(region["axes"]).split()) & set(identification.axes)) > 1
-    )
-    return held - ({"wander"} if wanders else set())
-
-
-def _can_show(
-    component: Component, region: Mapping[str, Any], blocks: xr.Dataset, line_width_share: float
-) -> bool:
-    """Return whether a component of an effect can show in a mismatch.
-
-    A line explains only a line at its own frequency, and a mean in common only slow covariance.
-    """
-    if str(region["view"]) not in _VIEWS_SHOWN.get(component.candidate.statistic, ()):
-        return False
-    if (
-        component.candidate.statistic in ("mean", "wander", "levels")
-        and region["view"] == "cross_axis"
-        and region["what"] != "slow"
-    ):
-        return False
-    if component.candidate.statistic == "line" and region["view"] == "cross_axis":
-        return str(region["what"]) != "slow"
-    if (
-        component.candidate.statistic != "line"
-        or component.place < 0
-        or region["view"] == "distribution"
-    ):
-        return True
-    lines = blocks["line_frequency"].values
-    mine = float(lines[component.place])
-    if np.isfinite(region["frequency"]):
-        return bool(
-            abs(region["frequency"] - mine)
-            <= LINE_REACH_BINS * (lines[1] - lines[0]) + line_width_share * mine
-        )
-    tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
-    return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
-        region["tau_min_s"] / TAU_REACH_FACTOR <= tau <= region["tau_max_s"] * TAU_REACH_FACTOR
-    )
 
 
 def _explained_spans(
@@ -365,7 +292,7 @@ def _explained_spans(
     A line locked to the rotation shows also in parts that rotate only a little.
     """
     begin, end = blocks["begin"].values, blocks["end"].values
-    if any(component.candidate.statistic == "order" for component in identification.components):
+    if any(component.statistic.is_rotation for component in identification.components):
         return [(float(begin[0]), float(end[-1]))]
     return join_blocks(active_blocks(identification, blocks, settings=settings), begin, end)
 
@@ -401,7 +328,7 @@ def _moving_spans(
     for component in (
         component
         for component in identification.components
-        if component.candidate.statistic in _MOVING and component.variant.design.size
+        if component.statistic.is_in_means and component.variant.design.size
     ):
         row = axes.index(component.row[0])
         for column in mean_columns(component.variant, row):

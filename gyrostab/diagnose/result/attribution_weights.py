@@ -11,38 +11,18 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import remove_known_motion
 from gyrostab.diagnose.identify.identification import Identification
-from gyrostab.diagnose.locate.mismatches import find_level_regions
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
-from gyrostab.diagnose.predict.condition import Component, drop_changed_tails, mask_anomalous_blocks
-from gyrostab.diagnose.predict.filter_response import is_filter
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
-from gyrostab.diagnose.statistics.variance_stability import scale_to_expected
+from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 
 __all__ = ["Scores", "needed_effects", "score_left", "statistic_scores"]
 
 Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
 Region = Mapping[str, Any]
-#: View of a mismatch -> parts of effects of which it holds what they bring there.
-_STATISTICS_CONTAINED: dict[str, tuple[str, ...]] = {
-    "davar": (
-        "mean",
-        "levels",
-        "power",
-        "cross",
-        "marks",
-        "line",
-        "order",
-        "phase_locked",
-        "transfer",
-    ),
-    "mean": ("mean", "levels", "marks"),
-    "restart": ("mean", "levels", "marks"),
-    "cross_axis": ("mean", "levels", "cross", "line", "marks"),
-    "distribution": ("power",),
-}
-_LINE_STATISTICS = ("spectral_line", "drifting_line")  # of the spectrum at full resolution
 
 
 def statistic_scores(
@@ -70,19 +50,22 @@ def statistic_scores(
     turns_left_out = drop_changed_tails(
         blocks, after["spectrum"].transpose("axis", "block", "band").values
     )
-    special = {
-        "sample_counts": turns_left_out,
-        "variance_stability": scale_to_expected(seen, after, find_level_regions(regions)),
-    }
+    lines = seen
     if still is not None:
-        special |= dict.fromkeys(
-            _LINE_STATISTICS,
-            seen.assign({name: still[name] for name in ("line_power", "line_weight")}),
-        )
-    for name, score in STATISTICS.items():
-        scores = score(special.get(name, seen), after) if name in null.statistics else None
+        lines = seen.assign({name: still[name] for name in ("line_power", "line_weight")})
+    for statistic in STATISTICS:
+        if statistic.name not in null.statistics:
+            continue
+        judged = seen
+        if statistic.is_count:
+            judged = turns_left_out
+        elif statistic.uses_line_spectra:
+            judged = lines
+        scores = statistic.score(statistic.prepare(judged, after, regions), after)
         if scores is not None:
-            out.append((name, scores, standardise(scores, null.statistics[name])))
+            out.append(
+                (statistic.name, scores, standardise(scores, null.statistics[statistic.name]))
+            )
     return out
 
 
@@ -98,7 +81,7 @@ def _with_shared_lines(
         (component.place, component.row[0])
         for identification in identified
         for component in identification.components
-        if component.candidate.statistic == "line" and component.place >= 0
+        if component.statistic.is_line and component.place >= 0
     ]
     if "cross" not in blocks or len(lines) < 2:
         return after
@@ -222,6 +205,4 @@ def _is_weighed(component: Component, region: Region) -> bool:
 
     A low-pass may be in the noise of the baseline already.
     """
-    return component.candidate.statistic in _STATISTICS_CONTAINED.get(
-        str(region["view"]), ()
-    ) and not is_filter(component.candidate.statistic, component.variant)
+    return str(region["view"]) in component.statistic.contained_in and not component.is_filter

@@ -21,8 +21,8 @@ from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.identify.phase_locked import remove_phase_locked
 from gyrostab.diagnose.identify.switching import remove_telegraph_bias
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.channel_use import unused_channels
-from gyrostab.diagnose.predict.condition import Component, mask_anomalous_blocks
 from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
 from gyrostab.diagnose.result.content import HELD_OUT, SCHEMA, check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
@@ -43,6 +43,7 @@ from gyrostab.diagnose.result.tables import (
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
 from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.diagnose.task import Comparison, Task, lines_without_motion
 from gyrostab.simulate.model import Model
 
@@ -179,7 +180,7 @@ def measure_evidence(
     count_nats = sum(
         component.evidence_nats
         for component in _components(identified)
-        if component.candidate.statistic == "marks"
+        if component.statistic.is_count
     )
     clean = mask_anomalous_blocks(
         blocks, [*_components(identified), *_components(without_telegraph.expected)]
@@ -226,7 +227,7 @@ def _can_be_forecast(
     The size of an event in the last part is unknown before, and an event that is over does not
     affect the last part. Sample counts are in neither means nor powers, which are forecast.
     """
-    if {component.candidate.statistic for component in identification.components} <= {"marks"}:
+    if all(component.statistic.is_count for component in identification.components):
         return False
     acts = active_blocks(identification, blocks, settings=settings)
     known = select_forecast_start(blocks)

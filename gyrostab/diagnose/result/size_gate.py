@@ -8,16 +8,10 @@ from dataclasses import replace
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.physics.registry import effects
 
 __all__ = ["has_zero", "keep_supported", "supported_axes"]
-
-#: Statistic of a component -> nuisance alternative that its unexplained rest is reported as.
-_NUISANCE_ALTERNATIVE_OF = {
-    "mean": "~bias(t)", "levels": "~bias(t)", "wander": "~red", "power": "~N(t)", "cross": "~cov",
-    "marks": "~outliers",
-}  # fmt: skip
 
 
 def has_zero(estimate: Estimate) -> bool:
@@ -101,15 +95,14 @@ def _make_unidentified(
     identification: Identification, components: tuple[Component, ...]
 ) -> Unidentified:
     """Turn the components of an effect whose size may be zero into something unidentified."""
-    strongest = max(components, key=lambda component: component.evidence_nats).candidate.statistic
+    strongest = max(components, key=lambda component: component.evidence_nats).statistic
     axes = tuple(
         axis
         for axis in identification.axes
         if any(axis in component.row for component in components)
     )
-    generic = _NUISANCE_ALTERNATIVE_OF.get(strongest, "~S(f)")
     return Unidentified(
-        generic,
+        strongest.nuisance_alternative,
         axes,
         sum_evidence(components),
         identification.threshold,

@@ -15,13 +15,11 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.estimate.upper_limits import UpperLimit
 from gyrostab.diagnose.identify.forward_search import MIN_P_VALUE, tail_probability
 from gyrostab.diagnose.identify.identification import Identification, Identifications, Unidentified
-from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.nuisance import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
 from gyrostab.diagnose.result.text import (
-    axes_text,
     chance,
     effect_statement,
     mismatch_statement,
@@ -32,6 +30,7 @@ from gyrostab.diagnose.result.text import (
     unsized_statement,
 )
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.noise import LAWS
 from gyrostab.physics.base import Effect
 from gyrostab.simulate.model import Model
@@ -59,14 +58,6 @@ _NUISANCE_VIEWS = {
     "~bias(t)": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar", "~S(f)": "davar",
     "~cov": "cross_axis", "~outliers": "distribution",
 }  # fmt: skip
-#: Statistic of a component -> `view` in `diagnosis.json`.
-_COMPONENT_VIEWS = {
-    "mean": "mean", "wander": "mean", "levels": "mean", "power": "davar", "transfer": "davar",
-    "cross": "cross_axis", "marks": "distribution", "line": "spectrum", "order": "spectrum",
-    "phase_locked": "spectrum",
-}  # fmt: skip
-#: tau * f at the maximum of sin(pi f tau)^4 / (pi f tau)^2, the Allan variance of a sine.
-SINE_TAU_CYCLES = 0.371
 MAX_LINES = 4000  # bins of the line spectrum in `diagnosis.nc`: enough for a page, small on disk
 
 
@@ -179,8 +170,8 @@ def identification_tables(
         ):
             continue
         strongest = max(identification.components, key=lambda component: component.evidence_nats)
-        statistic = _COMPONENT_VIEWS.get(strongest.candidate.statistic, "davar")
-        low, high = _averaging_times(strongest, statistic, blocks)
+        view = strongest.statistic.view
+        low, high = strongest.statistic.averaging_times(strongest, blocks)
         p_value = tail_probability(
             identifications.null_best, identification.evidence_nats, settings=settings
         )
@@ -190,7 +181,7 @@ def identification_tables(
             out.append(
                 {
                     "id": len(known) + len(out) + 1,
-                    "view": statistic,
+                    "view": view,
                     "axes": list(identification.axes),
                     "start": iso(blocks, first),
                     "end": iso(blocks, last),
@@ -200,27 +191,11 @@ def identification_tables(
                     "p_value": p_value,
                     "explained_by": [identification.effect],
                     "statement": named_statement(
-                        statistic, identification.effect, identification.axes, when, p_value
+                        view, identification.effect, identification.axes, when, p_value
                     ),
                 }
             )
     return out
-
-
-def _averaging_times(
-    component: Component, statistic: str, blocks: xr.Dataset
-) -> tuple[float, float]:
-    """Return the averaging times [s] at which a component shows.
-
-    A line shows near its period, a mean at those of block means, and anything else within a block.
-    """
-    block, whole = float(blocks.attrs["block_s"]), float(blocks["end"].values[-1])
-    if component.candidate.statistic == "line" and component.place >= 0:
-        tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.place])
-        return tau, tau
-    if statistic == "mean":
-        return block, whole / 2.0
-    return 1.0 / float(blocks.attrs["sampling_rate_hz"]), block
 
 
 def unidentified_tables(

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
-
-import numpy as np
 
 from gyrostab.diagnose.result.verdict import failed_checks
 from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.wording import axes_text, subject
 from gyrostab.physics.registry import effects
-from gyrostab.units import DAY, HOUR
 
 __all__ = [
-    "axes_text",
     "chance",
     "chance_share",
     "clock",
     "effect_statement",
-    "length_text",
     "mismatch_statement",
     "motion_statement",
     "named_statement",
@@ -184,14 +181,6 @@ def plain_name(name: str) -> str:
     return effects()[name].short if name in effects() else name.strip("~").replace("_", " ")
 
 
-def axes_text(axes: Sequence[str]) -> str:
-    """Return ``"axis x"`` or ``"axes x and y"``."""
-    if not axes:
-        return "the record"
-    names = " and ".join(filter(None, [", ".join(axes[:-1]), axes[-1]]))
-    return f"ax{'i' if len(axes) == 1 else 'e'}s {names}"
-
-
 def chance(p_value: float) -> str:
     """Describe the probability that noise alone gives a result, no smaller than is known.
 
@@ -246,14 +235,6 @@ def span_text(begin: float, end: float, whole: float) -> str:
     return f"from {clock(begin)} to {clock(end)} after the start"
 
 
-def length_text(seconds: float) -> str:
-    """Write a duration with the unit that suits it."""
-    for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min")):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.3g} {name}"
-    return f"{seconds:.3g} s" if seconds >= 0.1 else f"{seconds * 1e3:.3g} ms"
-
-
 # ------------------------------------------------------------------------------------------------
 # mismatches
 
@@ -270,7 +251,7 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
 
     Examples
     --------
-    >>> mismatch_statement({"view": "davar", "what": "avar", "axes": ["x"], "begin": 1500.0,
+    >>> mismatch_statement({"statistic": "power", "what": "avar", "axes": ["x"], "begin": 1500.0,
     ...                     "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
     ...                     "sign": 1, "p_value": 0.0004, "estimate": 1.8}, 3600.0)
     'Axis x is noisier than the simulation from 25:00 to 30:00 after the start: at averaging times
@@ -278,131 +259,8 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
      this in 1 of 2 500 such records).'
     """
     when = span_text(region["begin"], region["end"], whole)
-    describe = _DESCRIBERS.get(str(region["view"]), _describe_samples)
-    return f"{describe(region, when)} ({chance(region['p_value'])})."
-
-
-def _describe_allan_variance(region: Mapping[str, Any], when: str) -> str:
-    if str(region.get("what", "")).startswith("variance"):
-        return _describe_fluctuation(region, when)
-    is_single = len(region["axes"]) == 1
-    return (
-        f"{_subject(region)} {'is' if is_single else 'are'} "
-        f"{'noisier' if _is_higher(region) else 'quieter'} than the simulation {when}: "
-        f"at {_taus_text(region)} {'its' if is_single else 'their'} Allan variance is "
-        f"{region['ratio']:.3g} times the expected value"
-    )
-
-
-def _describe_fluctuation(region: Mapping[str, Any], when: str) -> str:
-    pace = length_text(float(str(region["what"]).split()[1]))
-    estimate = region.get("estimate", np.nan)
-    size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
-    return (
-        f"The noise level of {axes_text(region['axes'])} fluctuates {when}: at "
-        f"{_taus_text(region)} its power changes{size} from one stretch of {pace} to another, "
-        f"which is {region['ratio']:.3g} times the scatter of steady noise"
-    )
-
-
-def _describe_mean(region: Mapping[str, Any], when: str) -> str:
-    axes, estimate = axes_text(region["axes"]), region.get("estimate", np.nan)
-    if region.get("sign", 1) == 0:
-        return (
-            f"The mean rate of {axes} wanders {when}, by up to {abs(estimate):.3g} deg/h, more "
-            "than drift and noise allow"
-        )
-    size = f"{abs(estimate):.3g} deg/h " if np.isfinite(estimate) else ""
-    return (
-        f"The mean rate of {axes} is {size}{'above' if _is_higher(region) else 'below'} its "
-        f"expected value {when}, more than drift and noise allow"
-    )
-
-
-def _describe_cross_axis(region: Mapping[str, Any], when: str) -> str:
-    estimate = region.get("estimate", np.nan)
-    if region.get("what") == "slow":
-        return (
-            f"{_subject(region)} drift together (correlation {estimate:.2g}) {when}, at "
-            f"{_taus_text(region)}, which the random walks of independent gyros do not"
-        )
-    size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
-    return (
-        f"{_subject(region)} vary together{size} {when}, at {_taus_text(region)}, which "
-        "independent gyros do not"
-    )
-
-
-def _describe_spectrum(region: Mapping[str, Any], when: str) -> str:
-    axes, what = axes_text(region["axes"]), str(region.get("what", ""))
-    if what.startswith("order"):
-        order = what.removeprefix("order ")
-        multiple = "" if order == "1" else f"{order} times "
-        return (
-            f"The rate of {axes} has a component of {region['estimate']:.3g} deg/h at {multiple}"
-            f"the rotation rate of the tool {when}"
-        )
-    if what == "ramp phase":
-        return (
-            f"The rate of {axes} has a component of {region['estimate']:.3g} deg/h rms that is "
-            f"locked to the phase of the feedback ramp {when}"
-        )
-    if what.startswith("drifting"):
-        first, last = what.split()[1:]
-        return (
-            f"The spectrum of {axes} has a drifting line {when}, from about {first} Hz to about "
-            f"{last} Hz"
-        )
-    return (
-        f"The spectrum of {axes} has a line at {region.get('frequency', np.nan):.5g} Hz {when}, at "
-        f"{region['ratio']:.3g} times the noise level"
-    )
-
-
-def _describe_restart(region: Mapping[str, Any], when: str) -> str:
-    return (
-        f"The rate of {axes_text(region['axes'])} does not resume where it ended when the power "
-        f"returns, {when}"
-    )
-
-
-def _describe_samples(region: Mapping[str, Any], when: str) -> str:
-    samples = _SAMPLES.get(str(region.get("what", "")), "an unusual distribution of its samples")
-    verb = "has" if len(region["axes"]) == 1 else "have"
-    return f"{_subject(region)} {verb} {samples} {when}"
-
-
-_DESCRIBERS: dict[str, Callable[[Mapping[str, Any], str], str]] = {
-    "davar": _describe_allan_variance,
-    "mean": _describe_mean,
-    "cross_axis": _describe_cross_axis,
-    "spectrum": _describe_spectrum,
-    "restart": _describe_restart,
-}
-_SAMPLES = {
-    "outliers": "outliers",
-    "repeats": "more repeated samples than noise produces",
-    "extremes": "many samples at the same smallest or largest value",
-    "zeros": "samples that are exactly zero",
-    "kurtosis": "a sample distribution that is not normal",
-    "lattice": "values on a coarse quantization grid",
-}
-
-
-def _subject(region: Mapping[str, Any]) -> str:
-    axes = axes_text(region["axes"])
-    return axes[0].upper() + axes[1:]
-
-
-def _is_higher(region: Mapping[str, Any]) -> bool:
-    return bool(region.get("sign", 1) >= 0)
-
-
-def _taus_text(region: Mapping[str, Any]) -> str:
-    low, high = length_text(region["tau_min_s"]), length_text(region["tau_max_s"])
-    if region["tau_max_s"] > 1.01 * region["tau_min_s"]:
-        return f"averaging times of {low} to {high}"
-    return f"an averaging time of {low}"
+    sentence = find_statistic(str(region["statistic"])).describe(region, when)
+    return f"{sentence} ({chance(region['p_value'])})."
 
 
 def motion_statement(axis: str, when: str, largest: float, followers: Sequence[str]) -> str:
@@ -427,9 +285,9 @@ def motion_statement(axis: str, when: str, largest: float, followers: Sequence[s
     size = f"by up to {largest:.3g} deg/h"
     text = f"The rate of axis {axis} moves far beyond its noise {when}, {size}"
     if followers:
-        subject = _subject({"axes": followers})
+        them = subject({"axes": followers})
         return (
-            f"{text}. {subject} {'senses' if len(followers) == 1 else 'sense'} part of it, so it "
+            f"{text}. {them} {'senses' if len(followers) == 1 else 'sense'} part of it, so it "
             "is real rotation of the tool; no channel records its true rate."
         )
     causes = " or ".join(plain_name(name) for name in ("real_motion", "scale_factor"))

@@ -1,41 +1,55 @@
-"""Statistics that compare a recording with a simulation: near-normal scores of windows of blocks.
+"""Statistics that compare a recording with a simulation: one class each, and their registry.
 
-A statistic is a module with a function ``score(blocks, baseline)``, which returns a Dataset from
-`scores.statistic_dataset`, or None if the recording lacks its data. Only the table below names the
-statistics.
+To add a statistic, write its class in a module of this package and add one line to `STATISTICS`;
+docs/architecture.md has an example. All steps of the diagnosis loop over the registry, or hold the
+instance that a candidate belongs to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from gyrostab.diagnose.statistics.base import Statistic
+from gyrostab.diagnose.statistics.common_mode import CommonMode
+from gyrostab.diagnose.statistics.cross_spectrum import CrossSpectrum
+from gyrostab.diagnose.statistics.drifting_line import DriftingLine
+from gyrostab.diagnose.statistics.mean import Mean
+from gyrostab.diagnose.statistics.power import Power
+from gyrostab.diagnose.statistics.ramp_phase import RampPhase
+from gyrostab.diagnose.statistics.random_process import RandomProcess
+from gyrostab.diagnose.statistics.restart import Restart
+from gyrostab.diagnose.statistics.rotation_order import RotationOrder
+from gyrostab.diagnose.statistics.sample_counts import SampleCounts
+from gyrostab.diagnose.statistics.spectral_line import SpectralLine
+from gyrostab.diagnose.statistics.telegraph import Telegraph
+from gyrostab.diagnose.statistics.transfer import Transfer
+from gyrostab.diagnose.statistics.variance_stability import VarianceStability
 
-import xarray as xr
+__all__ = ["STATISTICS", "Statistic", "find_statistic"]
 
-from gyrostab.diagnose.statistics import (
-    common_mode,
-    cross_spectrum,
-    drifting_line,
-    mean,
-    phase_locked,
-    power,
-    restart,
-    sample_counts,
-    spectral_line,
-    variance_stability,
+#: All statistics, in the order in which effects are searched, and null records drawn.
+STATISTICS: tuple[Statistic, ...] = (
+    SampleCounts(),
+    Mean(),
+    Power(),
+    CrossSpectrum(),
+    Transfer(),
+    RotationOrder(),
+    RampPhase(),
+    SpectralLine(),
+    RandomProcess(),
+    Telegraph(),
+    CommonMode(),
+    Restart(),
+    VarianceStability(),
+    DriftingLine(),
 )
 
-__all__ = ["STATISTICS"]
 
-#: Statistics by name. The attribute ``view`` of their result is the name in diagnosis.json.
-STATISTICS: dict[str, Callable[[xr.Dataset, xr.Dataset], xr.Dataset | None]] = {
-    "power": power.score,
-    "mean": mean.score,
-    "cross_spectrum": cross_spectrum.score,
-    "common_mode": common_mode.score,
-    "spectral_line": spectral_line.score,
-    "phase_locked": phase_locked.score,
-    "sample_counts": sample_counts.score,
-    "restart": restart.score,
-    "variance_stability": variance_stability.score,
-    "drifting_line": drifting_line.score,
-}
+def find_statistic(name: str) -> Statistic:
+    """Return the statistic of this name.
+
+    Examples
+    --------
+    >>> find_statistic("spectral_line").view
+    'spectrum'
+    """
+    return next(statistic for statistic in STATISTICS if statistic.name == name)

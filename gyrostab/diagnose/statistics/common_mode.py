@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.wandering import expected_processes
+from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
 from gyrostab.diagnose.statistics.scores import (
     Array,
@@ -19,10 +22,11 @@ from gyrostab.diagnose.statistics.scores import (
     values_in_order,
     window_set,
 )
+from gyrostab.diagnose.statistics.wording import subject, taus_text
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.noise import HOUR
 
-__all__ = ["LENGTHS", "SPANS", "score"]
+__all__ = ["LENGTHS", "SPANS", "CommonMode"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (60,)
@@ -36,71 +40,80 @@ _MIN_LOG_DETERMINANT = -27.0  # that of a singular matrix, up to rounding
 _PROBE_COUNT, _PROBE_SEED = 64, 20
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    """Score the correlation of the increments of block means between axes, over 1 to 64 blocks.
+class CommonMode(Statistic):
+    """Slow motion common to axes."""
 
-    The block means of each axis are whitened by its noise: the increment is the part that the means
-    before do not predict, that is the increment of a random walk or the mean of white noise. The
-    noise of different axes is independent, whatever its size. The score is therefore the
-    correlation, which no calibration error changes. The increments are averaged over several
-    blocks, because the common motion may be slow.
+    name = "common_mode"
+    view = "cross_axis"
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records, and the expectation of the simulation; common white noise by its
-        ``cross`` is subtracted.
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+        """Score the correlation of the increments of block means between axes, over 1 to 64 blocks.
 
-    Returns
-    -------
-    xarray.Dataset or None
-        None with one axis, or for too short a record. A row for each pair, whose ``ratio`` and
-        ``estimate`` are the correlation. Three axes or more have a row of all together, by the
-        determinant of their correlations; its ``estimate`` is the root of their mean square.
-    """
-    axes = [str(axis) for axis in blocks["axis"].values]
-    block_count = blocks.sizes["block"]
-    spans = [span for span in SPANS if _OVERLAP_FACTOR * block_count / span >= _MIN_AVERAGES]
-    if len(axes) < 2 or not spans:
-        return None
-    windows = window_set(block_count, LENGTHS)
-    residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
-        baseline, "known_mean", "axis", "block"
-    )
-    present = np.isfinite(residual).reshape(-1, *residual.shape[-2:]).all(axis=0)
-    increments = _whiten_means(residual, present, blocks, baseline)
-    pairs = list(combinations(range(len(axes)), 2))
-    shared = _shared_increments(present, pairs, blocks, baseline) if "cross" in baseline else None
-    correlations = [
-        _correlate_pairs(increments, present, pairs, windows, span, shared) for span in spans
-    ]
-    r, count = (
-        np.stack([first for first, _ in correlations], axis=-1),
-        np.stack([first for _, first in correlations], axis=-1),
-    )
-    z = correlation_score(r, np.broadcast_to(count, r.shape))
-    rows = [f"{axes[a]} {axes[b]}" for a, b in pairs]
-    if len(rows) > 1:
-        z = np.concatenate(
-            [z, _score_all_axes(r, count, pairs, len(axes))[..., None, :, :]], axis=-3
+        The block means of each axis are whitened by its noise: the increment is the part that the
+        means before do not predict, that is the increment of a random walk or the mean of white
+        noise. The noise of different axes is independent, whatever its size. The score is therefore
+        the correlation, which no calibration error changes. The increments are averaged over
+        several blocks, because the common motion may be slow.
+
+        Returns
+        -------
+        xarray.Dataset or None
+            None with one axis, or for too short a record. A row for each pair, whose ``ratio`` and
+            ``estimate`` are the correlation. Three axes or more have a row of all together, by the
+            determinant of their correlations; its ``estimate`` is the root of their mean square.
+        """
+        axes = [str(axis) for axis in blocks["axis"].values]
+        block_count = blocks.sizes["block"]
+        spans = [span for span in SPANS if _OVERLAP_FACTOR * block_count / span >= _MIN_AVERAGES]
+        if len(axes) < 2 or not spans:
+            return None
+        windows = window_set(block_count, LENGTHS)
+        residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
+            baseline, "known_mean", "axis", "block"
         )
-        r = np.concatenate([r, np.sqrt((r**2).mean(axis=-3, keepdims=True))], axis=-3)
-        rows = [*rows, " ".join(axes)]
-    block = float(blocks.attrs["block_s"])
-    return statistic_dataset(
-        "cross_axis",
-        blocks,
-        rows=rows,
-        windows=windows,
-        columns={
-            "what": "slow",
-            "tau_min_s": block * np.array(spans, dtype=float),
-            "tau_max_s": block * block_count / 2.0,
-        },
-        z=z,
-        ratio=np.abs(r),
-        estimate=r,
-    )
+        present = np.isfinite(residual).reshape(-1, *residual.shape[-2:]).all(axis=0)
+        increments = _whiten_means(residual, present, blocks, baseline)
+        pairs = list(combinations(range(len(axes)), 2))
+        shared = (
+            _shared_increments(present, pairs, blocks, baseline) if "cross" in baseline else None
+        )
+        correlations = [
+            _correlate_pairs(increments, present, pairs, windows, span, shared) for span in spans
+        ]
+        r, count = (
+            np.stack([first for first, _ in correlations], axis=-1),
+            np.stack([first for _, first in correlations], axis=-1),
+        )
+        z = correlation_score(r, np.broadcast_to(count, r.shape))
+        rows = [f"{axes[a]} {axes[b]}" for a, b in pairs]
+        if len(rows) > 1:
+            z = np.concatenate(
+                [z, _score_all_axes(r, count, pairs, len(axes))[..., None, :, :]], axis=-3
+            )
+            r = np.concatenate([r, np.sqrt((r**2).mean(axis=-3, keepdims=True))], axis=-3)
+            rows = [*rows, " ".join(axes)]
+        block = float(blocks.attrs["block_s"])
+        return statistic_dataset(
+            "cross_axis",
+            blocks,
+            rows=rows,
+            windows=windows,
+            columns={
+                "what": "slow",
+                "tau_min_s": block * np.array(spans, dtype=float),
+                "tau_max_s": block * block_count / 2.0,
+            },
+            z=z,
+            ratio=np.abs(r),
+            estimate=r,
+        )
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe axes that drift together."""
+        return (
+            f"{subject(region)} drift together (correlation {region['estimate']:.2g}) {when}, at "
+            f"{taus_text(region)}, which the random walks of independent gyros do not"
+        )
 
 
 def _whiten_means(

@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.evidence.held_out import LinearModel
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    band_widths,
+    cross_column,
+    expected_cross,
+    given_columns,
+    mix_with_mean,
+    pair_rows,
+    power_column,
+    real_and_imaginary,
+    records_last,
+    select_row,
+    stack_columns,
+    unspread_share,
+)
+from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.power import with_axis
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -15,80 +37,191 @@ from gyrostab.diagnose.statistics.scores import (
     values_in_order,
     window_set,
 )
+from gyrostab.diagnose.statistics.shared_factors import estimate_shared_factors
+from gyrostab.diagnose.statistics.wording import subject, taus_text
 
-__all__ = ["LENGTHS", "correlation_score", "score"]
+__all__ = ["LENGTHS", "CrossSpectrum", "correlation_score"]
 
 Complex = NDArray[np.complex128]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (5, 15, 45)
+#: Least share of the variance of a cross-spectrum in quadrature to shared noise. Design choice.
+_MIN_QUADRATURE_SHARE = 0.05
+_MAX_WHITE_RANGE = 0.04  # of a density, over the bands, for white noise; design choice
 _MIN_FREQUENCIES = 8.0  # complex frequencies, for a meaningful coherency; design choice
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    """Score the coherency of every pair of axes, in bands and in total, against independent axes.
+class CrossSpectrum(Statistic):
+    """Cross-spectra of pairs of axes, which the Allan variance of one axis does not show."""
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records, and the expectation of the simulation: its spectrum weights the
-        bands, and its ``cross`` (pair, block, band) is subtracted.
+    name = "cross_spectrum"
+    view = "cross_axis"
+    explains = ("cross_axis", "davar")
+    contained_in = ("davar", "cross_axis")
+    nuisance_alternative = "~cov"
+    error_shows_in = ("cross_spectrum",)
+    null_variable = "cross"
+    is_power_weighted = True
+    is_in_baseline = True
+    is_pairwise = True
+    has_course = True
 
-    Returns
-    -------
-    xarray.Dataset or None
-        None with one axis. Columns ``in phase`` and ``in quadrature``; ``ratio`` and ``estimate``
-        are the coherency. Three axes or more have a row of all pairs together, over all bands in
-        phase.
-    """
-    if "cross" not in blocks or blocks.sizes.get("pair", 0) == 0:
-        return None
-    axes = [str(axis) for axis in blocks["axis"].values]
-    left = [axes.index(str(axis)) for axis in blocks["first"].values]
-    right = [axes.index(str(axis)) for axis in blocks["second"].values]
-    windows = window_set(blocks.sizes["block"], LENGTHS)
-    coherency, count = _pair_coherency(blocks, baseline, left, right, windows)
-    parts = [coherency.real, coherency.imag]
-    r = np.concatenate(parts, axis=-1)
-    z = correlation_score(r, np.concatenate([2.0 * count] * 2, axis=-1))
-    rows = [f"{axes[a]} {axes[b]}" for a, b in zip(left, right, strict=True)]
-    bands = blocks.sizes["band"]
-    if len(rows) > 1:
-        z, r = (
-            np.concatenate(
-                [part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)],
-                axis=-3,
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+        """Score the coherency of every pair of axes, in bands and in total.
+
+        Returns
+        -------
+        xarray.Dataset or None
+            None with one axis. Columns ``in phase`` and ``in quadrature``; ``ratio`` and
+            ``estimate`` are the coherency. Three axes or more have a row of all pairs together,
+            over all bands in phase.
+        """
+        if "cross" not in blocks or blocks.sizes.get("pair", 0) == 0:
+            return None
+        axes = [str(axis) for axis in blocks["axis"].values]
+        left = [axes.index(str(axis)) for axis in blocks["first"].values]
+        right = [axes.index(str(axis)) for axis in blocks["second"].values]
+        windows = window_set(blocks.sizes["block"], LENGTHS)
+        coherency, count = _pair_coherency(blocks, baseline, left, right, windows)
+        parts = [coherency.real, coherency.imag]
+        r = np.concatenate(parts, axis=-1)
+        z = correlation_score(r, np.concatenate([2.0 * count] * 2, axis=-1))
+        rows = [f"{axes[a]} {axes[b]}" for a, b in zip(left, right, strict=True)]
+        bands = blocks.sizes["band"]
+        if len(rows) > 1:
+            z, r = (
+                np.concatenate(
+                    [part, np.full((*part.shape[:-3], 1, *part.shape[-2:]), np.nan)],
+                    axis=-3,
+                )
+                for part in (z, r)
             )
-            for part in (z, r)
+            broad = z[..., :-1, :, bands]
+            mean_square = (broad**2).mean(axis=-2)
+            z[..., -1, :, bands] = cube_root_score(
+                mean_square, np.full(mean_square.shape, len(rows) / 2.0)
+            )
+            r[..., -1, :, bands] = np.sqrt((r[..., :-1, :, bands] ** 2).mean(axis=-2))
+            rows = [*rows, " ".join(axes)]
+        low, high = blocks["band_low"].values, blocks["band_high"].values
+        low = np.maximum(low, 0.5 / float(blocks.attrs["block_s"]))
+        f_min, f_max = np.append(low, low[0]), np.append(high, high[-1])
+        return statistic_dataset(
+            "cross_axis",
+            blocks,
+            rows=rows,
+            windows=windows,
+            columns={
+                "what": np.repeat(
+                    ["in phase", "all in phase", "in quadrature", "all in quadrature"],
+                    [bands, 1, bands, 1],
+                ),
+                "tau_min_s": np.tile(0.5 / f_max, 2),
+                "tau_max_s": np.tile(0.5 / f_min, 2),
+                "frequency": np.tile(np.append(blocks["frequency"].values, np.nan), 2),
+            },
+            z=z,
+            ratio=np.abs(r),
+            estimate=r,
         )
-        broad = z[..., :-1, :, bands]
-        mean_square = (broad**2).mean(axis=-2)
-        z[..., -1, :, bands] = cube_root_score(
-            mean_square, np.full(mean_square.shape, len(rows) / 2.0)
+
+    def design(self, case: Prospect) -> Iterator[Variant]:
+        """Yield cross-densities per product of the factors of both axes."""
+        if not case.seen.coherent or case.seen.line is not None or "cross" not in case.blocks:
+            return
+        for name, density in case.seen.spectrum.items():
+            yield Variant(case.values, (name,), with_axis(density)[None], squared=True)
+
+    def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
+        """Return the two axes of each pair."""
+        return pair_rows(state.blocks)
+
+    def model(
+        self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+    ) -> LinearModel:
+        """Build the model of the cross-spectrum of a pair of axes."""
+        pair = pair_rows(state.blocks)[row]
+        i, j = (state.axes.index(axis) for axis in pair)
+        known = expected_cross(state.baseline)
+        shared = known[row] if known is not None else np.zeros(1)
+        values = (
+            records_last(data["cross"].transpose(..., "pair", "block", "band").values, 3)[row]
+            - shared[..., None]
         )
-        r[..., -1, :, bands] = np.sqrt((r[..., :-1, :, bands] ** 2).mean(axis=-2))
-        rows = [*rows, " ".join(axes)]
-    low, high = blocks["band_low"].values, blocks["band_high"].values
-    low = np.maximum(low, 0.5 / float(blocks.attrs["block_s"]))
-    f_min, f_max = np.append(low, low[0]), np.append(high, high[-1])
-    return statistic_dataset(
-        "cross_axis",
-        blocks,
-        rows=rows,
-        windows=windows,
-        columns={
-            "what": np.repeat(
-                ["in phase", "all in phase", "in quadrature", "all in quadrature"],
-                [bands, 1, bands, 1],
-            ),
-            "tau_min_s": np.tile(0.5 / f_max, 2),
-            "tau_max_s": np.tile(0.5 / f_min, 2),
-            "frequency": np.tile(np.append(blocks["frequency"].values, np.nan), 2),
-        },
-        z=z,
-        ratio=np.abs(r),
-        estimate=r,
-    )
+        shape = state.blocks["cross_shape"].transpose("pair", "block", "band").values[row]
+        # The scatter is larger in phase with shared noise, and smaller in quadrature.
+        alone, apart = state.weight[i] * state.weight[j], (shared**2).real
+        weight = np.concatenate(
+            [
+                2.0 * shape / (alone + apart),
+                2.0 * shape / np.maximum(alone - apart, _MIN_QUADRATURE_SHARE * alone),
+            ],
+            axis=1,
+        )
+        weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
+        given, precision = given_columns(state, "cross", pair, weight.shape)
+        near, width = unspread_share(state.blocks, "pair")[row], band_widths(state.blocks)
+        designs = [
+            stack_columns(
+                [
+                    real_and_imaginary(mix_with_mean(select_row(one, row) + 0j, near, width))
+                    for one in variant.design
+                ],
+                weight.shape,
+            )
+            for candidate in candidates
+            for variant in candidate.variants
+        ]
+        return LinearModel(real_and_imaginary(values, axis=1), weight, designs, given, precision)
+
+    def condition(self, state: State, component: Component) -> State:
+        """Condition on a component in the cross-spectra."""
+        row = pair_rows(state.blocks).index(component.row)
+        columns = []
+        for one in component.variant.design:
+            chosen = cross_column(one, row, state.blocks)
+            columns.append(np.concatenate([chosen.real, chosen.imag], axis=-1))
+        state = state.with_columns("cross", ",".join(component.row), columns)
+        if not component.variant.squared:
+            return state
+        calibrated = state.baseline.attrs.get("source", "calibrated") == "calibrated"
+        # White noise was calibrated with it.
+        added = [
+            one.real for one in component.variant.design if not (calibrated and _is_white(one))
+        ]
+        for axis in component.row if added else ():
+            powers = [power_column(one, state.axes.index(axis), state) for one in added]
+            known = state.given.get(("power", axis), [])
+            state = state.with_columns(
+                "power",
+                axis,
+                [one for one in powers if not any(np.array_equal(one, other) for other in known)],
+            )
+        return state
+
+    def noise_shares(
+        self, component: Component, axis: str, state: State, weight: Array
+    ) -> tuple[Array | float, list[Array], list[Array]]:
+        """Return nothing: only the effect itself gives the power of each axis."""
+        return 0.0, [], []
+
+    def has_power_of_effect(self, component: Component, blocks: xr.Dataset) -> bool:
+        """Return True: the powers of the axes have no column."""
+        return True
+
+    def estimate(self, fit: SizeFit) -> Sizes:
+        """Estimate the factor of every axis from the products of two."""
+        return estimate_shared_factors(fit.components, fit.axes, fit.state)
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe axes that vary together."""
+        estimate = region.get("estimate", np.nan)
+        size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
+        return (
+            f"{subject(region)} vary together{size} {when}, at {taus_text(region)}, which "
+            "independent gyros do not"
+        )
 
 
 def _pair_coherency(
@@ -142,3 +275,20 @@ def correlation_score(r: Array, samples: Array) -> Array:
     freedom = np.maximum(samples - 1.0, 1.0)
     size = np.sqrt(-freedom * np.log1p(-np.minimum(r**2, 1.0 - 1e-12)))
     return np.asarray(np.sign(r) * size * (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0))
+
+
+def _is_white(density: NDArray[np.complex128]) -> bool:
+    """Return whether a density is the same in all bands, up to `_MAX_WHITE_RANGE`."""
+    size = np.abs(density)
+    return bool(np.ptp(size, axis=-1).max() <= _MAX_WHITE_RANGE * size.max(initial=0.0))
+
+
+def draw_coherency(
+    shape: Array, size: tuple[int, ...], rng: np.random.Generator
+) -> NDArray[np.complex128]:
+    """Draw the sample coherency of independent signals, from `shape` complex frequencies."""
+    rest = np.maximum(np.where(np.isfinite(shape), shape, 1.0) - 1.0, 0.0)
+    with np.errstate(divide="ignore", over="ignore"):
+        # Beta(1, n - 1)
+        squared = np.where(rest > 0.0, 1.0 - rng.random(size) ** (1.0 / rest), 1.0)
+    return np.asarray(np.sqrt(squared) * np.exp(2j * np.pi * rng.random(size)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import xarray as xr
 from scipy.special import log_ndtr
 
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, local_level
+from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -18,8 +19,9 @@ from gyrostab.diagnose.statistics.scores import (
     statistic_dataset,
     values_in_order,
 )
+from gyrostab.diagnose.statistics.wording import axes_text
 
-__all__ = ["score"]
+__all__ = ["DriftingLine"]
 
 _SPECTRUM_SECTIONS = 8  # in which paths begin and end; design choice
 _MIN_PARTS = 6  # of the record, that a path must cover; design choice
@@ -35,81 +37,94 @@ _ADEV_PEAK_PRODUCT = (
 )
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    r"""Score the lines of the spectrum along paths: each part of the record at another frequency.
+class DriftingLine(Statistic):
+    """Lines that drift through the spectrum."""
 
-    A line of power :math:`E` over the density of the noise in every block, moving over L lines
-    while B blocks pass, is in each line of each of P parts for only B / L blocks. There it raises
-    the mean of B / P blocks by E P / L, which scatters by :math:`\sqrt{P / B}`; the L cells of its
-    path together exceed noise by :math:`E \sqrt{P B / L}` standard deviations. Paths begin
-    anywhere, cover 4 lines or more in either direction, and accelerate or slow down by up to a half
-    of their mean speed. The largest sum from one eighth of the spectrum to another is the score of
-    that column.
+    name = "drifting_line"
+    view = "spectrum"
+    uses_line_spectra = True
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records, and the expectation of the simulation.
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+        r"""Score lines along paths, at another frequency in each part of the record.
 
-    Returns
-    -------
-    xarray.Dataset or None
-        None without lines, or with spectra of fewer than 6 parts of the record. ``ratio`` is the
-        power along the path over that of the noise. Several axes have a row of all together.
+        A line of power :math:`E` over the density of the noise in every block, moving over L lines
+        while B blocks pass, is in each line of each of P parts for only B / L blocks. There it
+        raises the mean of B / P blocks by E P / L, which scatters by :math:`\sqrt{P / B}`; the L
+        cells of its path together exceed noise by :math:`E \sqrt{P B / L}` standard deviations.
+        Paths begin anywhere, cover 4 lines or more in either direction, and accelerate or slow down
+        by up to a half of their mean speed. The largest sum from one eighth of the spectrum to
+        another is the score of that column.
 
-    Notes
-    -----
-    Every line is relative to the lines around it in its part and to its own mean over the parts,
-    and its contribution is limited: neither a steady line nor a noisier part of the record is a
-    drifting line.
-    """
-    if "line_power" not in blocks:
-        return None
-    power, weight = (
-        values_in_order(blocks, "line_power", "axis", "part", "line"),
-        values_in_order(blocks, "line_weight", "axis", "part"),
-    )
-    present = np.isfinite(power).reshape(-1, *power.shape[-3:]).all(axis=(0, 3)) & (weight > 0)
-    parts = np.flatnonzero(present.all(axis=0))
-    lines = power.shape[-1]
-    if parts.size < _MIN_PARTS or lines < 2 * _SPECTRUM_SECTIONS:
-        return None
-    cells = _score_cells(
-        power[..., parts, :],
-        weight[:, parts, None],
-        _expected_spectrum(blocks, baseline)[:, parts],
-    )
-    axes = [str(axis) for axis in blocks["axis"].values]
-    if len(axes) > 1:
-        cells, axes = (
-            np.concatenate(
-                [cells, cells.sum(axis=-3, keepdims=True) / np.sqrt(len(axes))], axis=-3
-            ),
-            [*axes, " ".join(axes)],
+        Returns
+        -------
+        xarray.Dataset or None
+            None without lines, or with spectra of fewer than 6 parts of the record. ``ratio`` is
+            the power along the path over that of the noise. Several axes have a row of all
+            together.
+
+        Notes
+        -----
+        Every line is relative to the lines around it in its part and to its own mean over the
+        parts, and its contribution is limited: neither a steady line nor a noisier part of the
+        record is a drifting line.
+        """
+        if "line_power" not in blocks:
+            return None
+        power, weight = (
+            values_in_order(blocks, "line_power", "axis", "part", "line"),
+            values_in_order(blocks, "line_weight", "axis", "part"),
         )
-    # Axes with common noise add up to more.
-    cells = cells / np.maximum(cells.std(axis=(-2, -1), keepdims=True), 1.0)
-    edges = np.stack([parts, parts + 1]) - parts[0]
-    largest, path_count = _largest_path_sums(cells, edges / edges.max())
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # Expected number of paths of noise with this score.
-        expected_count = np.exp(np.log(_INDEPENDENT_SHARE * path_count) + log_ndtr(-largest))
-        z = np.where(
-            path_count > 0,
-            exponential_score(-np.log(-np.expm1(-np.minimum(expected_count, _MAX_EXPECTED_PATHS)))),
-            np.nan,
+        present = np.isfinite(power).reshape(-1, *power.shape[-3:]).all(axis=(0, 3)) & (weight > 0)
+        parts = np.flatnonzero(present.all(axis=0))
+        lines = power.shape[-1]
+        if parts.size < _MIN_PARTS or lines < 2 * _SPECTRUM_SECTIONS:
+            return None
+        cells = _score_cells(
+            power[..., parts, :],
+            weight[:, parts, None],
+            _expected_spectrum(blocks, baseline)[:, parts],
         )
-    block_count = -(-np.arange(power.shape[-2] + 1) * blocks.sizes["block"] // power.shape[-2])
-    return statistic_dataset(
-        "spectrum",
-        blocks,
-        rows=axes,
-        windows=Windows(block_count[parts[:1]], block_count[parts[-1:] + 1]),
-        columns=_path_columns(blocks["line_frequency"].values),
-        z=z[..., None, :],
-        ratio=np.where(path_count > 0, largest, np.nan)[..., None, :],
-        one_sided=True,
-    )
+        axes = [str(axis) for axis in blocks["axis"].values]
+        if len(axes) > 1:
+            cells, axes = (
+                np.concatenate(
+                    [cells, cells.sum(axis=-3, keepdims=True) / np.sqrt(len(axes))], axis=-3
+                ),
+                [*axes, " ".join(axes)],
+            )
+        # Axes with common noise add up to more.
+        cells = cells / np.maximum(cells.std(axis=(-2, -1), keepdims=True), 1.0)
+        edges = np.stack([parts, parts + 1]) - parts[0]
+        largest, path_count = _largest_path_sums(cells, edges / edges.max())
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Expected number of paths of noise with this score.
+            expected_count = np.exp(np.log(_INDEPENDENT_SHARE * path_count) + log_ndtr(-largest))
+            z = np.where(
+                path_count > 0,
+                exponential_score(
+                    -np.log(-np.expm1(-np.minimum(expected_count, _MAX_EXPECTED_PATHS)))
+                ),
+                np.nan,
+            )
+        block_count = -(-np.arange(power.shape[-2] + 1) * blocks.sizes["block"] // power.shape[-2])
+        return statistic_dataset(
+            "spectrum",
+            blocks,
+            rows=axes,
+            windows=Windows(block_count[parts[:1]], block_count[parts[-1:] + 1]),
+            columns=_path_columns(blocks["line_frequency"].values),
+            z=z[..., None, :],
+            ratio=np.where(path_count > 0, largest, np.nan)[..., None, :],
+            one_sided=True,
+        )
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe a drifting line."""
+        first, last = region["what"].split()[1:]
+        return (
+            f"The spectrum of {axes_text(region['axes'])} has a drifting line {when}, from about "
+            f"{first} Hz to about {last} Hz"
+        )
 
 
 def _expected_spectrum(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:

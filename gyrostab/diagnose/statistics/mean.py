@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
+from gyrostab.diagnose.evidence.held_out import mean_factors
 from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
+from gyrostab.diagnose.predict.candidates import (
+    Candidate,
+    CandidateEvidence,
+    Component,
+    Prospect,
+    Variant,
+)
+from gyrostab.diagnose.predict.condition import mean_columns
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import Trial, collect_evidence
+from gyrostab.diagnose.predict.sizes import Mixture, mean_mixture
+from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics.base import Statistic, column_choices
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -16,6 +33,7 @@ from gyrostab.diagnose.statistics.scores import (
     values_in_order,
     window_set,
 )
+from gyrostab.diagnose.statistics.wording import axes_text, is_higher
 from gyrostab.kernels.regression.boxcars import (
     boxcar_information,
     filter_gains,
@@ -27,16 +45,19 @@ from gyrostab.noise import HOUR
 
 __all__ = [
     "LENGTHS",
+    "Mean",
     "MeanNoise",
     "apply_precision",
     "mean_noise",
     "region_mean",
-    "score",
     "window_means",
 ]
 
 #: Lengths of the windows [blocks].
 LENGTHS = (1, 5, 15, 45)
+#: Kinds of mismatches that a mean can explain.
+MEAN_VIEWS = ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum")
+_MAX_MASKED_SHARE = 0.5  # of the blocks; design choice
 
 
 class MeanNoise(NamedTuple):
@@ -49,43 +70,153 @@ class MeanNoise(NamedTuple):
     remaining: Array
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
-    """Score the mean of windows of four lengths against the rest of the record.
+class Mean(Statistic):
+    """Block means, which the Allan variance does not show."""
 
-    The score is that of a constant added only in the window, by generalised least squares with the
-    noise of the simulation and a constant of the record. For white noise it is the window's mean
-    minus that of the rest, over its standard deviation; for slow noise, neighbours count more.
+    name = "mean"
+    view = "mean"
+    explains = MEAN_VIEWS
+    contained_in = ("davar", "mean", "restart", "cross_axis")
+    nuisance_alternative = "~bias(t)"
+    error_shows_in = ("mean",)
+    is_in_baseline = True
+    is_in_means = True
+    is_linear_in_means = True
+    has_course = True
+    grows_in_time = False
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records, and the expectation of the simulation.
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+        """Score the mean of windows of four lengths against the rest of the record.
 
-    Returns
-    -------
-    xarray.Dataset
-        See `gyrostab.diagnose.statistics.scores.statistic_dataset`; ``estimate`` is the constant
-        [degree hour-1].
-    """
-    windows = window_set(blocks.sizes["block"], LENGTHS, whole=False)
-    amount, information = window_means(blocks, baseline, windows)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z, estimate = (amount / np.sqrt(information))[..., None], (amount / information)[..., None]
-    block = float(blocks.attrs["block_s"])
-    return statistic_dataset(
-        "mean",
-        blocks,
-        windows=windows,
-        columns={
-            "what": "mean",
-            "tau_min_s": [block],
-            "tau_max_s": [block * max(windows.length, default=1)],
-        },
-        z=z,
-        ratio=np.abs(z),
-        estimate=estimate,
-        units="degree hour-1",
+        The score is that of a constant added only in the window, by generalised least squares with
+        the noise of the simulation and a constant of the record. For white noise it is the window's
+        mean minus that of the rest, over its standard deviation; for slow noise, neighbours count
+        more.
+
+        Returns
+        -------
+        xarray.Dataset
+            See `gyrostab.diagnose.statistics.scores.statistic_dataset`; ``estimate`` is the
+            constant [degree hour-1].
+        """
+        windows = window_set(blocks.sizes["block"], LENGTHS, whole=False)
+        amount, information = window_means(blocks, baseline, windows)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z, estimate = (
+                (amount / np.sqrt(information))[..., None],
+                (amount / information)[..., None],
+            )
+        block = float(blocks.attrs["block_s"])
+        return statistic_dataset(
+            "mean",
+            blocks,
+            windows=windows,
+            columns={
+                "what": "mean",
+                "tau_min_s": [block],
+                "tau_max_s": [block * max(windows.length, default=1)],
+            },
+            z=z,
+            ratio=np.abs(z),
+            estimate=estimate,
+            units="degree hour-1",
+        )
+
+    def design(self, case: Prospect) -> Iterator[Variant]:
+        """Yield designs of the mean that are not constant; the constant is free."""
+        columns = {}
+        for name, design in case.seen.mean.items():
+            moved = design - design.mean(axis=-1, keepdims=True)
+            if np.isfinite(moved).all() and np.abs(moved).max() > 1e-9 * np.abs(design).max(
+                initial=1e-300
+            ):
+                columns[name] = design
+        for chosen in column_choices(list(columns)):
+            yield Variant(case.values, chosen, np.stack([columns[name] for name in chosen]))
+
+    def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
+        """Compute the evidence in block means."""
+        factors = []
+        for row, axis in enumerate(trial.state.axes):
+            designs = [
+                np.moveaxis(variant.design[:, row if variant.design.shape[1] > 1 else 0], 0, -1)
+                for candidate in group
+                for variant in candidate.variants
+            ]
+            factors.append(
+                mean_factors(
+                    trial.data,
+                    trial.state.baseline,
+                    designs,
+                    axis=axis,
+                    given=trial.state.given_to("mean", axis),
+                    folds=trial.folds,
+                )[:, 1:]
+            )
+        return collect_evidence(group, [(axis,) for axis in trial.state.axes], factors)
+
+    def condition(self, state: State, component: Component) -> State:
+        """Put columns into the means, and mask blocks in which the effect moves much."""
+        return condition_means(state, component)
+
+    def mixture(
+        self,
+        component: Component,
+        state: State,
+        variant: Variant,
+        *,
+        variance: Array | None = None,
+    ) -> Mixture:
+        """Compute sizes over the grid of random walk and flicker."""
+        return block_mean_mixture(component, state, variant, variance)
+
+    def can_explain(
+        self,
+        component: Component,
+        region: Mapping[str, Any],
+        blocks: xr.Dataset,
+        settings: Settings,
+    ) -> bool:
+        """Return whether the mismatch is one of means; of several axes only a slow one."""
+        return shows_in_means(self, region)
+
+    def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
+        """Return the averaging times of block means."""
+        return mean_averaging_times(blocks)
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe another mean, or one that wanders."""
+        axes, estimate = axes_text(region["axes"]), region.get("estimate", np.nan)
+        if region.get("sign", 1) == 0:
+            return (
+                f"The mean rate of {axes} wanders {when}, by up to {abs(estimate):.3g} deg/h, more "
+                "than drift and noise allow"
+            )
+        size = f"{abs(estimate):.3g} deg/h " if np.isfinite(estimate) else ""
+        return (
+            f"The mean rate of {axes} is {size}{'above' if is_higher(region) else 'below'} its "
+            f"expected value {when}, more than drift and noise allow"
+        )
+
+
+def block_mean_mixture(
+    component: Component, state: State, variant: Variant, variance: Array | None
+) -> Mixture:
+    """Compute the sizes of the columns of block means."""
+    columns = mean_columns(variant, state.axes.index(component.row[0]))
+    return mean_mixture(state, component.row[0], columns, variance=variance)
+
+
+def shows_in_means(statistic: Statistic, region: Mapping[str, Any]) -> bool:
+    """Return whether means can show in a mismatch: of several axes only in slow covariance."""
+    return str(region["view"]) in statistic.explains and (
+        region["view"] != "cross_axis" or region["what"] == "slow"
     )
+
+
+def mean_averaging_times(blocks: xr.Dataset) -> tuple[float, float]:
+    """Return the averaging times [s] at which block means show."""
+    return float(blocks.attrs["block_s"]), float(blocks["end"].values[-1]) / 2.0
 
 
 def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:
@@ -197,3 +328,32 @@ def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Arr
     columns = np.stack([np.ones(residual.size), inside.astype(float)])
     solved = np.linalg.lstsq(rows @ columns.T, rows @ np.nan_to_num(residual), rcond=None)[0]
     return float(solved[1])
+
+
+def condition_means(state: State, component: Component) -> State:
+    """Condition on a component in the means."""
+    axis = component.row[0]
+    row = state.axes.index(axis)
+    columns = mean_columns(component.variant, row)
+    state = state.with_columns("mean", axis, columns)
+    return replace(state, masked=state.masked | _moving_blocks(state, row, columns))
+
+
+def _moving_blocks(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
+    """Return the blocks in which the effect moves enough to show in the power of the axis."""
+    blocks = state.blocks
+    y = blocks["mean"].values[row] - state.baseline["known_mean"].values[row]
+    good = np.isfinite(y)
+    design = np.nan_to_num(np.stack([np.ones(y.size), *columns], axis=1))
+    largest = np.abs(design).max(axis=0)
+    design = design[:, largest > 0.0] / largest[largest > 0.0]
+    size, *_ = np.linalg.lstsq(design[good], y[good], rcond=None)
+    curve = design @ size
+    step = np.abs(np.diff(curve))
+    moved = np.maximum(np.append(step, 0.0), np.append(0.0, step))
+    seconds = float(blocks.attrs["block_s"])
+    strong = moved**2 * seconds > 5.0 * state.weight[row, :, 0]
+    mask = np.zeros_like(state.masked)
+    if strong.mean() <= _MAX_MASKED_SHARE:
+        mask[row] = strong
+    return mask

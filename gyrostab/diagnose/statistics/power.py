@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.evidence.held_out import LinearModel, noise_columns, with_independent_cells
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
+from gyrostab.diagnose.predict.filter_response import undo_filter
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    band_widths,
+    given_columns,
+    mix_with_mean,
+    power_column,
+    records_last,
+    select_row,
+    stack_columns,
+    unspread_share,
+)
+from gyrostab.diagnose.statistics.base import Statistic, column_choices
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -16,12 +34,15 @@ from gyrostab.diagnose.statistics.scores import (
     values_in_order,
     window_set,
 )
-from gyrostab.noise import LAWS
+from gyrostab.diagnose.statistics.wording import is_higher, subject, taus_text
+from gyrostab.noise import LAWS, sampled_psd
 
-__all__ = ["LENGTHS", "allan_surface", "allan_transfer", "score"]
+__all__ = ["LENGTHS", "Power", "allan_surface", "allan_transfer"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
+#: Columns of the score that show another level of the noise.
+LEVEL_COLUMNS = ("avar", "level")
 _INTEGRATION_POINTS = 256  # of the transfer function in one band, at least
 
 
@@ -63,34 +84,158 @@ def allan_transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
     return out
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
-    """Score the Allan variance in windows of three lengths and of the whole record.
+class Power(Statistic):
+    """Band powers and their dynamic Allan variance."""
 
-    Within blocks it is computed from the band powers, at octaves of the sampling interval up to a
-    quarter of a block; the column ``level`` weights all bands equally, as the likelihood does. From
-    a block on it is computed from the block means.
+    name = "power"
+    view = "davar"
+    explains = ("davar", "spectrum", "distribution")
+    contained_in = ("davar", "distribution")
+    nuisance_alternative = "~N(t)"
+    error_shows_in = ("power",)
+    null_variable = "power"
+    is_power_weighted = True
+    is_in_baseline = True
+    is_power = True
+    has_course = True
+    is_ratio = True
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records, and the expectation of the simulation.
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+        """Score the Allan variance in windows of three lengths and of the whole record.
 
-    Returns
-    -------
-    xarray.Dataset
-        See `gyrostab.diagnose.statistics.scores.statistic_dataset`.
-    """
-    surface = allan_surface(blocks, baseline)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = surface["observed"] / surface["expected"]
-    return statistic_dataset(
-        "davar",
-        blocks,
-        windows=surface["windows"],
-        columns=surface["columns"],
-        z=cube_root_score(ratio, surface["shape"]),
-        ratio=ratio,
-    )
+        Within blocks it is computed from the band powers, at octaves of the sampling interval up to
+        a quarter of a block; the column ``level`` weights all bands equally, as the likelihood
+        does. From a block on it is computed from the block means.
+
+        Returns
+        -------
+        xarray.Dataset
+            See `gyrostab.diagnose.statistics.scores.statistic_dataset`.
+        """
+        surface = allan_surface(blocks, baseline)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = surface["observed"] / surface["expected"]
+        return statistic_dataset(
+            "davar",
+            blocks,
+            windows=surface["windows"],
+            columns=surface["columns"],
+            z=cube_root_score(ratio, surface["shape"]),
+            ratio=ratio,
+        )
+
+    def design(self, case: Prospect) -> Iterator[Variant]:
+        """Yield added densities; for a filter what it adds or removes at its full size.
+
+        Constant coherent densities are left to the cross-spectra.
+        """
+        frequency, rate = (
+            case.blocks["frequency"].values,
+            float(case.blocks.attrs["sampling_rate_hz"]),
+        )
+        level: dict[str, Array] = {}
+        for (symbol, name), share in case.seen.level.items():
+            square = (
+                case.coefficient.sel(term=symbol).values ** 2
+                if symbol in case.coefficient["term"].values
+                else np.zeros(case.coefficient.sizes["axis"])
+            )
+            component = (
+                np.atleast_2d(share)[..., None]
+                * square[:, None, None]
+                * sampled_psd(symbol, frequency, rate)
+            )
+            level[name] = level.get(name, 0.0) + component
+        spectrum = {}
+        if case.seen.line is None:
+            spectrum = {
+                name: with_axis(density)
+                for name, density in case.seen.spectrum.items()
+                if _changes_over_time(density) or not case.seen.coherent
+            }
+        for columns, squared in ((level, False), (spectrum, True)):
+            kept = {
+                name: density
+                for name, density in columns.items()
+                if np.abs(density).max(initial=0.0) > 0 and not _is_white_and_constant(density)
+            }
+            for chosen in column_choices(list(kept)):
+                yield Variant(
+                    case.values, chosen, np.stack([kept[name] for name in chosen]), squared=squared
+                )
+        if case.seen.response is not None:
+            yield Variant(
+                case.values,
+                (),
+                _filter_change(case.seen.response, case.coefficient, frequency, rate)[None],
+            )
+
+    def model(
+        self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+    ) -> LinearModel:
+        """Build the model of the band powers of an axis."""
+        axis = state.axes[row]
+        expected = state.baseline["spectrum"].sel(axis=axis).transpose("block", "band").values
+        values = (
+            records_last(data["power"].transpose(..., "axis", "block", "band").values, 3)[row]
+            - expected[..., None]
+        )
+        weight = (
+            state.baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values
+            / state.weight[row] ** 2
+        )
+        weight = np.where(state.masked[row][:, None], 0.0, weight)
+        level, precision = noise_columns(state.baseline, axis=axis)
+        known = [level[..., number] * expected for number in range(level.shape[2])]
+        given, whole = given_columns(
+            state, "power", (axis,), weight.shape, known, np.diagonal(precision)
+        )
+        near, width = unspread_share(state.blocks)[row], band_widths(state.blocks)
+        designs = [
+            stack_columns(
+                [mix_with_mean(select_row(one, row), near, width) for one in variant.design],
+                weight.shape,
+            )
+            for candidate in candidates
+            for variant in candidate.variants
+        ]
+        return with_independent_cells(
+            LinearModel(values, weight, designs, given, whole),
+            state.baseline["common"].sel(axis=axis).values,
+            state.weight[row],
+        )
+
+    def is_filter(self, variant: Variant) -> bool:
+        """Return whether a variant has no size: what a filter does at its full size."""
+        return not variant.columns
+
+    def condition(self, state: State, component: Component) -> State:
+        """Condition on a component in the powers."""
+        axis = component.row[0]
+        row = state.axes.index(axis)
+        if self.is_filter(component.variant) and "line_power" in state.blocks:
+            expected = expected_lines(state.baseline, state.blocks["line_frequency"].values)[row]
+            blocks, stopped = undo_filter(
+                state.blocks, axis, component.candidate.effect, component.variant.values, expected
+            )
+            state = replace(state, blocks=blocks).with_columns("line", "all", [stopped])
+        if self.is_filter(component.variant) and axis in state.baseline.attrs.get(
+            "recalibrated", ()
+        ):
+            return state  # the noise of the baseline is filtered already
+        return state.with_columns(
+            "power", axis, [power_column(one, row, state) for one in component.variant.design]
+        )
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe another Allan variance."""
+        is_single = len(region["axes"]) == 1
+        return (
+            f"{subject(region)} {'is' if is_single else 'are'} "
+            f"{'noisier' if is_higher(region) else 'quieter'} than the simulation {when}: "
+            f"at {taus_text(region)} {'its' if is_single else 'their'} Allan variance is "
+            f"{region['ratio']:.3g} times the expected value"
+        )
 
 
 def allan_surface(
@@ -274,3 +419,32 @@ def _gamma_shape(count: Any, k: int) -> Array:
     n = np.maximum(count, 1.0)[..., None]
     pairs = np.where(lag == 0, n, 2.0 * np.maximum(n - lag, 0.0)) * r2
     return np.asarray(0.5 * n[..., 0] ** 2 / pairs.sum(axis=-1))
+
+
+def _filter_change(
+    response: Array, coefficient: xr.DataArray, frequency: Array, rate: float
+) -> Array:
+    """Return the change of the baseline spectrum by a response."""
+    total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
+    size, terms = coefficient.transpose("axis", "term").values, list(coefficient["term"].values)
+    for symbol in (one for one in "QNBK" if one in terms):
+        total += size[:, terms.index(symbol), None, None] ** 2 * sampled_psd(
+            symbol, frequency, rate
+        )
+    return total * (response - 1.0)
+
+
+def with_axis(density: Array) -> Array:
+    """Return a density with the axis first."""
+    return np.asarray(density if np.ndim(density) == 3 else np.asarray(density)[None])
+
+
+def _changes_over_time(density: Array) -> bool:
+    """Return whether a density changes over time."""
+    rows = with_axis(density)
+    return bool(np.abs(rows - rows[:, :1]).max(initial=0.0) > 1e-6 * np.abs(rows).max(initial=0.0))
+
+
+def _is_white_and_constant(density: Array) -> bool:
+    """Return whether a density is white and constant: a change of N, which is free."""
+    return bool(np.ptp(with_axis(density)) <= 1e-6 * np.abs(density).max(initial=0.0))

@@ -2,72 +2,86 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import xarray as xr
 
+from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.mean import MeanNoise, apply_precision, mean_noise
 from gyrostab.diagnose.statistics.scores import Array, Windows, statistic_dataset, values_in_order
+from gyrostab.diagnose.statistics.wording import axes_text
 
-__all__ = ["score"]
+__all__ = ["Restart"]
 
 _DECAY_BLOCKS = (2, 6, 18)  # in which a transient falls to 1/e; design choice
 _SIDE_BLOCKS = 15  # before and after a restart, that are compared; design choice
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    """Score transients that begin equally at every restart, and a jump of the mean at each.
+class Restart(Statistic):
+    """Transients after restarts, with all restarts superposed."""
 
-    Both are independent of a constant of the record, and have the noise of the simulation.
+    name = "restart"
+    view = "restart"
+    grows_in_time = False
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records, and the expectation of the simulation.
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+        """Score transients that begin equally at every restart, and a jump of the mean at each.
 
-    Returns
-    -------
-    xarray.Dataset or None
-        None without restarts. ``estimate`` is the transient at the restart, or the jump [degree
-        hour-1].
-    """
-    restarts = restart_blocks(blocks)
-    if restarts.size == 0:
-        return None
-    block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
-    designs, windows = _restart_designs(restarts, block_count)
-    residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
-        baseline, "known_mean", "axis", "block"
-    )
-    z, estimate = (np.full((*residual.shape[:-1], len(designs)), np.nan) for _ in range(2))
-    for axis in range(blocks.sizes["axis"]):
-        present = np.isfinite(residual[..., axis, :]).reshape(-1, block_count).any(axis=0)
-        noise = mean_noise(blocks, baseline, axis, present)
-        amount, information = _matched_filter(residual[..., axis, :], designs, noise)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z[..., axis, :] = amount / np.sqrt(information)
-            estimate[..., axis, :] = amount / information
-    # Each window has only one column.
-    what = [f"transient of {k} blocks" for k in _DECAY_BLOCKS] + ["jump"]
-    column = np.concatenate(
-        [np.arange(len(_DECAY_BLOCKS)), np.full(restarts.size, len(_DECAY_BLOCKS))]
-    )
-    scores = np.full((*z.shape, len(what)), np.nan)
-    size = scores.copy()
-    scores[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = (
-        z,
-        estimate,
-    )
-    tau = np.array([*_DECAY_BLOCKS, _SIDE_BLOCKS], dtype=float) * block
-    return statistic_dataset(
-        "restart",
-        blocks,
-        windows=windows,
-        columns={"what": what, "tau_min_s": block, "tau_max_s": tau},
-        z=scores,
-        ratio=np.abs(scores),
-        estimate=size,
-        units="degree hour-1",
-    )
+        Both are independent of a constant of the record, and have the noise of the simulation.
+
+        Returns
+        -------
+        xarray.Dataset or None
+            None without restarts. ``estimate`` is the transient at the restart, or the jump [degree
+            hour-1].
+        """
+        restarts = restart_blocks(blocks)
+        if restarts.size == 0:
+            return None
+        block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
+        designs, windows = _restart_designs(restarts, block_count)
+        residual = values_in_order(blocks, "mean", "axis", "block") - values_in_order(
+            baseline, "known_mean", "axis", "block"
+        )
+        z, estimate = (np.full((*residual.shape[:-1], len(designs)), np.nan) for _ in range(2))
+        for axis in range(blocks.sizes["axis"]):
+            present = np.isfinite(residual[..., axis, :]).reshape(-1, block_count).any(axis=0)
+            noise = mean_noise(blocks, baseline, axis, present)
+            amount, information = _matched_filter(residual[..., axis, :], designs, noise)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                z[..., axis, :] = amount / np.sqrt(information)
+                estimate[..., axis, :] = amount / information
+        # Each window has only one column.
+        what = [f"transient of {k} blocks" for k in _DECAY_BLOCKS] + ["jump"]
+        column = np.concatenate(
+            [np.arange(len(_DECAY_BLOCKS)), np.full(restarts.size, len(_DECAY_BLOCKS))]
+        )
+        scores = np.full((*z.shape, len(what)), np.nan)
+        size = scores.copy()
+        scores[..., np.arange(column.size), column], size[..., np.arange(column.size), column] = (
+            z,
+            estimate,
+        )
+        tau = np.array([*_DECAY_BLOCKS, _SIDE_BLOCKS], dtype=float) * block
+        return statistic_dataset(
+            "restart",
+            blocks,
+            windows=windows,
+            columns={"what": what, "tau_min_s": block, "tau_max_s": tau},
+            z=scores,
+            ratio=np.abs(scores),
+            estimate=size,
+            units="degree hour-1",
+        )
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe a mean that does not resume where it ended."""
+        return (
+            f"The rate of {axes_text(region['axes'])} does not resume where it ended when the "
+            f"power returns, {when}"
+        )
 
 
 def restart_blocks(blocks: xr.Dataset) -> np.ndarray:

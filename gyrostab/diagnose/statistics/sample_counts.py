@@ -2,10 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, excess_extremes, has_coarse_grid
+from gyrostab.diagnose.evidence.folds import fold_subsets
+from gyrostab.diagnose.evidence.sample_counts import (
+    GRID_COUNTS,
+    CountEvidence,
+    excess_extremes,
+    has_coarse_grid,
+    kurtosis_evidence,
+    sample_count_evidence,
+)
+from gyrostab.diagnose.predict.candidates import (
+    Candidate,
+    CandidateEvidence,
+    Component,
+    Prospect,
+    Variant,
+)
+from gyrostab.diagnose.predict.condition import free_shape
+from gyrostab.diagnose.predict.linear_model import State, cross_without
+from gyrostab.diagnose.predict.search import Trial
+from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.null_counts import null_counts
+from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
 from gyrostab.diagnose.statistics.scores import (
     Array,
     statistic_dataset,
@@ -13,79 +39,184 @@ from gyrostab.diagnose.statistics.scores import (
     values_in_order,
     window_set,
 )
+from gyrostab.diagnose.statistics.wording import subject
 
-__all__ = ["COUNTS", "LENGTHS", "score"]
+__all__ = ["COUNTS", "LENGTHS", "SampleCounts"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
 #: Counts of samples.
 COUNTS = ("outliers", "repeats", "extremes", "zeros")
+_MAX_ANOMALOUS_SHARE = 0.75  # of an axis's blocks, left out for anomalous samples; design choice
+_MIN_SAMPLE_SHARE = 0.1  # of the fullest block's samples, from which an axis has a block
+_SAMPLES = {
+    "outliers": "outliers",
+    "repeats": "more repeated samples than noise produces",
+    "extremes": "many samples at the same smallest or largest value",
+    "zeros": "samples that are exactly zero",
+    "kurtosis": "a sample distribution that is not normal",
+    "lattice": "values on a coarse quantization grid",
+}
 _MAX_BLOCK_SIGMA = 4.0  # of the kurtosis of one block: the counts judge single outliers
 #: Least scatter of the scores: if null records never have one, a single one is not a mismatch.
 _MIN_SCATTER = (0.35, 0.35, 0.35, 0.35, 0.2)
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
-    """Score counts and kurtosis in windows of three lengths and of the whole record.
+class SampleCounts(Statistic):
+    """Sample counts unlike Gaussian noise: outliers, repeats, clipping, zeros, tails."""
 
-    Anscombe's root makes the scatter of the counts equal; null records define their expectation.
-    With a coarse quantization grid, counts that the grid alone changes are left out.
+    name = "sample_counts"
+    view = "distribution"
+    explains = ("distribution", "davar", "spectrum", "cross_axis")
+    contained_in = ("davar", "mean", "restart", "cross_axis")
+    nuisance_alternative = "~outliers"
+    error_shows_in = ("sample_counts",)
+    is_count = True
+    explains_motion = True
+    has_size = False
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records; the baseline is not used.
+    def null(self, draw: NullDraw) -> Mapping[str, NDArray[Any]]:
+        """Draw outliers, repeats, extremes and zeros by chance."""
+        return null_counts(draw.blocks, draw.sample_sd, draw.record_count, draw.rng)
 
-    Returns
-    -------
-    xarray.Dataset
-        See `gyrostab.diagnose.statistics.scores.statistic_dataset`. ``ratio`` and ``estimate`` are
-        the count, or the mean kurtosis.
-    """
-    windows = window_set(blocks.sizes["block"], LENGTHS)
-    samples = values_in_order(blocks, "samples", "axis", "block").astype(float)
-    counts_by_block = {
-        name: np.nan_to_num(values_in_order(blocks, name, "axis", "block").astype(float))
-        for name in COUNTS
-    }
-    counts_by_block["extremes"] = excess_extremes(counts_by_block["extremes"])
-    counts = sum_over_windows(
-        np.stack([counts_by_block[name] for name in COUNTS], axis=-1), windows
-    )
-    tail_score, used = kurtosis_score(values_in_order(blocks, "kurtosis", "axis", "block"), samples)
-    # Rounding has no tails, so that the noise itself may differ from 0.
-    usual = np.median(tail_score, axis=-1, keepdims=True)
-    tail_score = np.where(
-        used > 0, usual + np.clip(tail_score - usual, -_MAX_BLOCK_SIGMA, _MAX_BLOCK_SIGMA), 0.0
-    )
-    n = sum_over_windows(used[..., None], windows)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        tails = np.where(
-            n > 0, sum_over_windows(tail_score[..., None], windows) / np.sqrt(n), np.nan
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+        """Score counts and kurtosis in windows of three lengths and of the whole record.
+
+        Anscombe's root makes the scatter of the counts equal; null records define their
+        expectation. With a coarse quantization grid, counts that the grid alone changes are left
+        out.
+
+        Returns
+        -------
+        xarray.Dataset
+            See `gyrostab.diagnose.statistics.scores.statistic_dataset`. ``ratio`` and ``estimate``
+            are the count, or the mean kurtosis.
+        """
+        windows = window_set(blocks.sizes["block"], LENGTHS)
+        samples = values_in_order(blocks, "samples", "axis", "block").astype(float)
+        counts_by_block = {
+            name: np.nan_to_num(values_in_order(blocks, name, "axis", "block").astype(float))
+            for name in COUNTS
+        }
+        counts_by_block["extremes"] = excess_extremes(counts_by_block["extremes"])
+        counts = sum_over_windows(
+            np.stack([counts_by_block[name] for name in COUNTS], axis=-1), windows
         )
-        excess = np.where(
-            used > 0, np.nan_to_num(values_in_order(blocks, "kurtosis", "axis", "block")), 0.0
+        tail_score, used = kurtosis_score(
+            values_in_order(blocks, "kurtosis", "axis", "block"), samples
         )
-        mean = sum_over_windows(excess[..., None], windows) / n
-    rate = float(blocks.attrs["sampling_rate_hz"])
-    number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
-    z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
-    is_grid_count = np.array([name in GRID_COUNTS for name in (*COUNTS, "kurtosis")])
-    z = np.where(has_coarse_grid(blocks)[:, None, None] & is_grid_count, np.nan, z)
-    return statistic_dataset(
-        "distribution",
-        blocks,
-        windows=windows,
-        columns={
-            "what": [*COUNTS, "kurtosis"],
-            "tau_min_s": 1.0 / rate,
-            "tau_max_s": 1.0 / rate,
-            "floor": _MIN_SCATTER,
-        },
-        z=z,
-        ratio=number,
-        estimate=number,
-    )
+        # Rounding has no tails, so that the noise itself may differ from 0.
+        usual = np.median(tail_score, axis=-1, keepdims=True)
+        tail_score = np.where(
+            used > 0, usual + np.clip(tail_score - usual, -_MAX_BLOCK_SIGMA, _MAX_BLOCK_SIGMA), 0.0
+        )
+        n = sum_over_windows(used[..., None], windows)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tails = np.where(
+                n > 0, sum_over_windows(tail_score[..., None], windows) / np.sqrt(n), np.nan
+            )
+            excess = np.where(
+                used > 0, np.nan_to_num(values_in_order(blocks, "kurtosis", "axis", "block")), 0.0
+            )
+            mean = sum_over_windows(excess[..., None], windows) / n
+        rate = float(blocks.attrs["sampling_rate_hz"])
+        number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
+        z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
+        is_grid_count = np.array([name in GRID_COUNTS for name in (*COUNTS, "kurtosis")])
+        z = np.where(has_coarse_grid(blocks)[:, None, None] & is_grid_count, np.nan, z)
+        return statistic_dataset(
+            "distribution",
+            blocks,
+            windows=windows,
+            columns={
+                "what": [*COUNTS, "kurtosis"],
+                "tau_min_s": 1.0 / rate,
+                "tau_max_s": 1.0 / rate,
+                "floor": _MIN_SCATTER,
+            },
+            z=z,
+            ratio=number,
+            estimate=number,
+        )
+
+    def design(self, case: Prospect) -> Iterator[Variant]:
+        """Yield the counts that the effect raises."""
+        if case.seen.marks:
+            yield Variant(case.values, case.seen.marks, np.empty(0))
+
+    def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
+        """Compute the evidence in sample counts."""
+        if trial.counts is None:
+            return []
+        subsets = fold_subsets(trial.folds)
+        rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
+        coarse = has_coarse_grid(trial.state.blocks)
+        out = []
+        for candidate in group:
+            evidence_nats, best = [], []
+            for variant in candidate.variants:
+                by_name = [
+                    np.where(
+                        coarse & (name in GRID_COUNTS),
+                        0.0,
+                        _count_evidence(name, trial.data, trial.state, subsets, trial.counts),
+                    )
+                    for name in variant.columns
+                ]
+                evidence_nats.append(np.max(by_name, axis=0))
+            place = np.argmax([by_axis[0] for by_axis in evidence_nats], axis=0)
+            best = [candidate.variants[int(number)] for number in place]
+            out.append(
+                CandidateEvidence(candidate, rows, np.max(evidence_nats, axis=0), tuple(best))
+            )
+        return out
+
+    def condition(self, state: State, component: Component) -> State:
+        """Leave out blocks with anomalous samples; if too many, free the shape of the spectrum."""
+        if _is_everywhere(component):
+            return state
+        axis, anomalous = component.row[0], find_anomalous_blocks(component, state.blocks)
+        if not anomalous.any():
+            return free_shape(state, axis)
+        keep = xr.DataArray(~anomalous, dims="block")
+        is_axis = state.blocks["axis"] == axis
+        blocks = state.blocks.copy()
+        for variable in ("mean", "power"):
+            blocks[variable] = blocks[variable].where(keep | ~is_axis)
+        if "cross" in blocks:
+            rows = np.array([one == axis for one in state.axes])
+            blocks["cross"] = cross_without(blocks, anomalous & rows[:, None])
+        return replace(state, blocks=blocks)
+
+    def noise_shares(
+        self, component: Component, axis: str, state: State, weight: Array
+    ) -> tuple[Array | float, list[Array], list[Array]]:
+        """Return nothing: counts have no columns."""
+        return 0.0, [], []
+
+    def has_power_of_effect(self, component: Component, blocks: xr.Dataset) -> bool:
+        """Return whether no block is left out: with the blocks their power may be left out too."""
+        return not find_anomalous_blocks(component, blocks).any()
+
+    def estimate(self, fit: SizeFit) -> Sizes:
+        """Estimate the parameters of an effect on the sample distribution."""
+        return estimate_from_counts(
+            fit.components[0].candidate.effect,
+            fit.components[0].variant.columns[0],
+            fit.components[0].row[0],
+            fit.state.blocks,
+            fit.counts,
+        )
+
+    def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
+        """Return whether the mismatch is of several axes: anomalous blocks are left out there."""
+        return bool(region["view"] == "cross_axis")
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe an unusual distribution of samples."""
+        samples = _SAMPLES.get(str(region["what"]), "an unusual distribution of its samples")
+        verb = "has" if len(region["axes"]) == 1 else "have"
+        return f"{subject(region)} {verb} {samples} {when}"
 
 
 def kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
@@ -117,3 +248,70 @@ def kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
             2.0 / (9.0 * a)
         )
     return np.where(used, z, 0.0), used.astype(float)
+
+
+def _count_evidence(
+    name: str,
+    data: xr.Dataset,
+    state: State,
+    subsets: NDArray[np.bool_],
+    count_evidence: CountEvidence,
+) -> Array:
+    """Return the evidence of a raised count, (record, axis)."""
+    records = data.sizes.get("record", 1)
+    if name == "lattice":
+        return np.broadcast_to(
+            _grid_evidence(state, count_evidence) if "record" not in data.dims else 0.0,
+            (records, len(state.axes)),
+        )
+    if name not in data or name not in count_evidence.of:
+        return np.zeros((records, len(state.axes)))
+    values = data[name].transpose(..., "axis", "block").values.astype(np.float64)
+    values = values if values.ndim == 3 else values[None]
+    values = excess_extremes(values) if name == "extremes" else values
+    compute = kurtosis_evidence if name == "kurtosis" else sample_count_evidence
+    return compute(values, *count_evidence.of[name], subsets)
+
+
+def _grid_evidence(state: State, count_evidence: CountEvidence) -> Array:
+    """Count samples of a rounded rate, one nat each: unrounded noise is never on the grid."""
+    samples = state.blocks["samples"].transpose("axis", "block").values.sum(axis=1)
+    return (
+        np.where(count_evidence.rounded, samples, 0.0).astype(np.float64)
+        if count_evidence.rounded.size
+        else np.zeros(samples.size)
+    )
+
+
+def _is_everywhere(component: Component) -> bool:
+    """Return whether the samples are anomalous in all blocks alike."""
+    return (
+        component.candidate.effect == "rate_quantization"
+        or component.candidate.effect.startswith("~")
+    )
+
+
+def find_anomalous_blocks(component: Component, blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Return the blocks left out for anomalous samples; none if too many, or if all are alike."""
+    samples = blocks["samples"].sel(axis=component.row[0]).values
+    kept = samples > _MIN_SAMPLE_SHARE * samples.max(initial=0)
+    if _is_everywhere(component) or not kept.any():
+        return np.zeros(kept.size, np.bool_)
+    count = blocks[component.variant.columns[0]].sel(axis=component.row[0]).values
+    # The noise has a negligible number of outliers.
+    usual = 0.0 if component.variant.columns[0] == "outliers" else float(np.median(count[kept]))
+    anomalous = count > usual + 3.0 * np.sqrt(max(usual, 0.0))
+    return np.asarray(anomalous & (anomalous[kept].mean() <= _MAX_ANOMALOUS_SHARE))
+
+
+def mask_anomalous_blocks(blocks: xr.Dataset, components: Iterable[Component]) -> xr.Dataset:
+    """Leave out blocks with named anomalous samples, whose powers have no model."""
+    axes = [str(axis) for axis in blocks["axis"].values]
+    anomalous = np.zeros((len(axes), blocks.sizes["block"]), np.bool_)
+    for component in (component for component in components if component.statistic.is_count):
+        anomalous[axes.index(component.row[0])] |= find_anomalous_blocks(component, blocks)
+    if not anomalous.any():
+        return blocks
+    kept = xr.DataArray(~anomalous, dims=("axis", "block"))
+    left = blocks.assign(mean=blocks["mean"].where(kept), power=blocks["power"].where(kept))
+    return left.assign(cross=cross_without(blocks, anomalous)) if "cross" in blocks else left

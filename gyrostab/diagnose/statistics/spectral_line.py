@@ -2,10 +2,31 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines
+from gyrostab.diagnose.evidence.spectral_lines import (
+    expected_lines,
+    line_evidence,
+    line_skirt,
+    local_level,
+)
+from gyrostab.diagnose.predict.candidates import (
+    Candidate,
+    CandidateEvidence,
+    Component,
+    Prospect,
+    Variant,
+)
+from gyrostab.diagnose.predict.condition import bands_at, free_covariance
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import Trial
+from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -14,63 +35,185 @@ from gyrostab.diagnose.statistics.scores import (
     sum_over_windows,
     values_in_order,
 )
+from gyrostab.diagnose.statistics.wording import axes_text
 
-__all__ = ["score"]
+__all__ = ["SpectralLine"]
 
+# Lines next to a strong one, and share of its frequency, that belong to it.
+REGION_REACH_BINS = 3
+#: tau * f at the maximum of sin(pi f tau)^4 / (pi f tau)^2, the Allan variance of a sine.
+SINE_TAU_CYCLES = 0.371
+TAU_REACH_FACTOR = 4.0  # averaging times around that maximum at which a line still shows
 _LEAK_LINES = 2  # lines on either side that a line leaks into
 _AROUND_LINES = 40  # lines on either side that define the level; design choice
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    """Score every line of the spectrum, in parts of the record and in the whole.
+class SpectralLine(Statistic):
+    """Spectral lines that exceed the spectrum around them."""
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records, and the expectation of the simulation: its spectrum defines the
-        slope of the surroundings, and the recording their level.
+    name = "spectral_line"
+    view = "spectrum"
+    explains = ("spectrum", "davar", "distribution", "cross_axis")
+    contained_in = ("davar", "cross_axis")
+    is_line = True
+    has_size = False
+    uses_line_spectra = True
 
-    Returns
-    -------
-    xarray.Dataset or None
-        None without lines. ``estimate`` is the amplitude of a sine with the same excess [degree
-        hour-1].
-    """
-    if "line_power" not in blocks:
-        return None
-    power, weight = (
-        values_in_order(blocks, "line_power", "axis", "part", "line"),
-        values_in_order(blocks, "line_weight", "axis", "part"),
-    )
-    frequency = blocks["line_frequency"].values
-    windows = _part_windows(blocks)
-    expected = expected_lines(baseline, frequency)[:, None, :]
-    flat = power / expected
-    present = np.isfinite(flat) & (weight > 0)[..., None]
-    used_weight = np.where(present, weight[..., None], 0.0)
-    flat = np.where(present, flat, 0.0) * used_weight
-    with np.errstate(divide="ignore", invalid="ignore"):
-        whole = flat.sum(axis=-2, keepdims=True)
-        count = np.concatenate([used_weight, used_weight.sum(axis=-2, keepdims=True)], axis=-2)
-        flat = np.concatenate([flat, whole], axis=-2) / count
-        count = count * _equal_block_share(blocks, windows)
-        around = _mean_around(flat)
-        ratio = flat / around
-    # A sum over lines, which only a recording needs.
-    excess = _sum_leakage(flat - around) * expected if flat.ndim == 3 else np.zeros(1)
-    z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND_LINES)))
-    half = 0.371 / frequency  # at which the Allan variance of a sine is largest
-    return statistic_dataset(
-        "spectrum",
-        blocks,
-        windows=windows,
-        columns={"what": "line", "tau_min_s": half, "tau_max_s": half, "frequency": frequency},
-        z=z,
-        ratio=ratio,
-        estimate=2.0 * np.sqrt(np.maximum(excess, 0.0) / float(blocks.attrs["block_s"])),
-        units="degree hour-1",
-        one_sided=True,
-    )
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+        """Score every line of the spectrum, in parts of the record and in the whole.
+
+        Returns
+        -------
+        xarray.Dataset or None
+            None without lines. ``estimate`` is the amplitude of a sine with the same excess [degree
+            hour-1].
+        """
+        if "line_power" not in blocks:
+            return None
+        power, weight = (
+            values_in_order(blocks, "line_power", "axis", "part", "line"),
+            values_in_order(blocks, "line_weight", "axis", "part"),
+        )
+        frequency = blocks["line_frequency"].values
+        windows = _part_windows(blocks)
+        expected = expected_lines(baseline, frequency)[:, None, :]
+        flat = power / expected
+        present = np.isfinite(flat) & (weight > 0)[..., None]
+        used_weight = np.where(present, weight[..., None], 0.0)
+        flat = np.where(present, flat, 0.0) * used_weight
+        with np.errstate(divide="ignore", invalid="ignore"):
+            whole = flat.sum(axis=-2, keepdims=True)
+            count = np.concatenate([used_weight, used_weight.sum(axis=-2, keepdims=True)], axis=-2)
+            flat = np.concatenate([flat, whole], axis=-2) / count
+            count = count * _equal_block_share(blocks, windows)
+            around = _mean_around(flat)
+            ratio = flat / around
+        # A sum over lines, which only a recording needs.
+        excess = _sum_leakage(flat - around) * expected if flat.ndim == 3 else np.zeros(1)
+        z = cube_root_score(ratio, count / (1.0 + 1.0 / (2.0 * _AROUND_LINES)))
+        half = 0.371 / frequency  # at which the Allan variance of a sine is largest
+        return statistic_dataset(
+            "spectrum",
+            blocks,
+            windows=windows,
+            columns={"what": "line", "tau_min_s": half, "tau_max_s": half, "frequency": frequency},
+            z=z,
+            ratio=ratio,
+            estimate=2.0 * np.sqrt(np.maximum(excess, 0.0) / float(blocks.attrs["block_s"])),
+            units="degree hour-1",
+            one_sided=True,
+        )
+
+    def design(self, case: Prospect) -> Iterator[Variant]:
+        """Yield a line of constant frequency; the spectrum itself determines the frequency."""
+        if (
+            case.seen.line is None
+            or "line_power" not in case.blocks
+            or not case.seen.coherent
+            or np.ptp(case.seen.line) > 0
+        ):
+            return
+        yield Variant({}, tuple(case.seen.spectrum), np.empty(0), squared=True)
+
+    def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
+        """Compute the evidence of one steady line on all axes."""
+        power = trial.data["line_power"].transpose(..., "axis", "part", "line").values
+        power = power if power.ndim == 4 else power[None]
+        expected = expected_lines(trial.state.baseline, trial.state.blocks["line_frequency"].values)
+        evidence_nats = line_evidence(
+            power, trial.state.blocks["line_weight"].transpose("axis", "part").values, expected
+        )
+        taken = trial.state.given.get(("line", "all"), [])
+        for mask in taken:
+            evidence_nats = np.where(mask, -np.inf, evidence_nats)
+        # (record,), one line for all axes
+        place = np.maximum(evidence_nats, 0.0).sum(axis=1).argmax(axis=-1)
+        best = np.take_along_axis(evidence_nats, place[:, None, None], axis=2)[..., 0]
+        best = np.where(np.isfinite(best), best, -np.log(power.shape[-1]))
+        rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
+        places = np.repeat(place[:, None], len(rows), axis=1)
+        return [
+            CandidateEvidence(
+                candidate, rows, best, tuple(candidate.variants[0] for _ in rows), places
+            )
+            for candidate in group
+        ]
+
+    def condition(self, state: State, component: Component) -> State:
+        """Condition on a spectral line."""
+        frequency = float(state.blocks["line_frequency"].values[component.place])
+        axis = component.row[0]
+        density = bands_at(state, np.asarray(frequency)).astype(float)
+        known = state.given.get(("power", axis), [])
+        for band in np.flatnonzero(density.any(axis=0)):
+            column = np.zeros_like(density)
+            column[:, band] = 1.0
+            if any(np.array_equal(column, other) for other in known):
+                continue  # another line in the same band is already given
+            state = state.with_columns("power", axis, [column])
+            state = free_covariance(state, (axis,), column)
+        return state.with_columns("line", "all", [line_skirt(state.blocks, axis, component.place)])
+
+    def estimate(self, fit: SizeFit) -> Sizes:
+        """Estimate amplitudes and the frequency, from the power about the line."""
+        name = {"real_motion": "sway"}.get(
+            fit.components[0].candidate.effect, fit.components[0].variant.columns[0]
+        )
+        out: dict[str, tuple[float, float]] = {}
+        for component in sorted(
+            fit.components, key=lambda component: component.evidence_nats
+        ):  # the strongest of several lines of an axis is last
+            amplitude, frequency = estimate_line(
+                fit.state.blocks, component.row[0], component.place
+            )
+            label = "" if len(fit.axes) == 1 or name == "sway" else f".{component.row[0]}"
+            out[f"{name}{label}"], out["frequency"] = amplitude, frequency
+        return out
+
+    def can_explain(
+        self,
+        component: Component,
+        region: Mapping[str, Any],
+        blocks: xr.Dataset,
+        settings: Settings,
+    ) -> bool:
+        """Return whether a mismatch is at the frequency of the line, or of samples."""
+        if str(region["view"]) not in self.explains:
+            return False
+        if region["view"] == "cross_axis":
+            return str(region["what"]) != "slow"
+        if component.place < 0 or region["view"] == "distribution":
+            return True
+        lines = blocks["line_frequency"].values
+        mine = float(lines[component.place])
+        if np.isfinite(region["frequency"]):
+            return bool(
+                abs(region["frequency"] - mine)
+                <= REGION_REACH_BINS * (lines[1] - lines[0]) + settings.line_width_share * mine
+            )
+        tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
+        return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
+            region["tau_min_s"] / TAU_REACH_FACTOR <= tau <= region["tau_max_s"] * TAU_REACH_FACTOR
+        )
+
+    def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
+        """Return whether the mismatch is of several axes: the baseline has their common lines."""
+        return bool(region["view"] == "cross_axis")
+
+    def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
+        """Return the averaging time at which the Allan variance of the line is largest."""
+        if component.place < 0:
+            return super().averaging_times(component, blocks)
+        tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.place])
+        return tau, tau
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe a line."""
+        return (
+            f"The spectrum of {axes_text(region['axes'])} has a line at "
+            f"{region.get('frequency', np.nan):.5g} Hz {when}, at {region['ratio']:.3g} times the "
+            "noise level"
+        )
 
 
 def _part_windows(blocks: xr.Dataset) -> Windows:
@@ -125,3 +268,27 @@ def _mean_around(flat: Array) -> Array:
     inner = total[..., near_high] - total[..., near_low]
     outer = total[..., low + width] - total[..., low]
     return np.asarray((outer - inner) / np.maximum(width - (near_high - near_low), 1))
+
+
+def estimate_line(
+    blocks: xr.Dataset, axis: str, place: int
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Estimate amplitude [degree hour-1] and frequency [Hz] of a line, each with its error.
+
+    The amplitude follows from the power about the line that exceeds the local level.
+    """
+    lines = blocks["line_frequency"].values
+    weight = blocks["line_weight"].sel(axis=axis).values
+    power = blocks["line_power"].sel(axis=axis).transpose("part", "line").values
+    good = (weight > 0) & np.isfinite(power).all(axis=1)
+    total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
+    level = local_level(total[None, None])[0, 0]
+    near = line_skirt(blocks, axis, place)
+    step = float(np.diff(lines[:2])[0])
+    above = total[near] - level[near]
+    square = 4.0 * max(float(above.sum()) * step, 0.0)
+    noise = 4.0 * step * float(np.sqrt((level[near] * total[near]).sum() / weight[good].sum()))
+    amplitude = math.sqrt(square)
+    positive = np.maximum(above, 0.0)
+    frequency = float((positive * lines[near]).sum() / max(positive.sum(), 1e-300))
+    return (amplitude, noise / (2.0 * max(amplitude, math.sqrt(noise)))), (frequency, 0.5 * step)

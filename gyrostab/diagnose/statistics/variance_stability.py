@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.statistics.base import Statistic
+from gyrostab.diagnose.statistics.power import LEVEL_COLUMNS
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -18,8 +21,9 @@ from gyrostab.diagnose.statistics.scores import (
     values_in_order,
     window_set,
 )
+from gyrostab.diagnose.statistics.wording import axes_text, length_text, taus_text
 
-__all__ = ["LENGTHS", "SPANS", "scale_to_expected", "scatter_moments", "score"]
+__all__ = ["LENGTHS", "SPANS", "VarianceStability", "scale_to_expected", "scatter_moments"]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (20, 80)
@@ -32,75 +36,99 @@ _MIN_FREQUENCY_LINES = 3.5  # lower bands show a mean that moves within blocks r
 _MAX_AVERAGE_SIGMA = 4.0
 
 
-def score(blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
-    r"""Score the scatter of the band powers over time about their own mean, against steady noise.
+class VarianceStability(Statistic):
+    """Variance fluctuation: powers that scatter more than their degrees of freedom allow."""
 
-    The powers of a block over the expected ones, averaged over bands and over 1, 2, 4 ... blocks,
-    are the levels :math:`y_j`. In steady noise each is gamma-distributed with a known shape
-    :math:`w_j`, and the statistic of a window of J of them is
+    name = "variance_stability"
+    view = "davar"
+    is_ratio = True
 
-    .. math::
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+        r"""Score the scatter of the band powers over time against that of steady noise.
 
-        Q = \sum_j w_j (y_j - \bar y)^2 / \bar y^2, \quad
-        \bar y = \sum_j w_j y_j / \sum_j w_j,
+        The powers of a block over the expected ones, averaged over bands and over 1, 2, 4 ...
+        blocks, are the levels :math:`y_j`. In steady noise each is gamma-distributed with a known
+        shape :math:`w_j`, and the statistic of a window of J of them is
 
-    about :math:`J - 1`, with a variance of :math:`2 (J - 1) + 6 \sum_j 1 / w_j` or a little less
-    (`scatter_moments` has both exactly). Noise whose log power varies by v rms from one average to
-    the next raises Q by :math:`v^2 \sum_j w_j`. It is therefore z standard deviations above steady
-    noise if :math:`v^2 = z \sqrt{2 (J - 1)} / \sum_j w_j`: for white noise in 100 blocks of 200
-    samples (w = 93 each) five, if v = 9 %. Averages over k blocks have a variance smaller by the
-    root of k, and lose variations faster than some 3 k blocks.
+        .. math::
 
-    Parameters
-    ----------
-    blocks, baseline : xarray.Dataset
-        Recording or null records, and the expectation of the simulation, whose spectrum is the
-        reference of the levels.
+            Q = \sum_j w_j (y_j - \bar y)^2 / \bar y^2, \quad
+            \bar y = \sum_j w_j y_j / \sum_j w_j,
 
-    Returns
-    -------
-    xarray.Dataset or None
-        None for too short a record. A column for each span and each band, each quarter of the
-        bands, all bands, and each band against its own mean. ``ratio`` is the scatter over that of
-        steady noise, ``estimate`` the variation of the power, rms over mean. Several axes have a
-        row of all together, the mean of their levels, because axes often fluctuate together.
+        about :math:`J - 1`, with a variance of :math:`2 (J - 1) + 6 \sum_j 1 / w_j` or a little
+        less (`scatter_moments` has both exactly). Noise whose log power varies by v rms from one
+        average to the next raises Q by :math:`v^2 \sum_j w_j`. It is therefore z standard
+        deviations above steady noise if :math:`v^2 = z \sqrt{2 (J - 1)} / \sum_j w_j`: for white
+        noise in 100 blocks of 200 samples (w = 93 each) five, if v = 9 %. Averages over k blocks
+        have a variance smaller by the root of k, and lose variations faster than some 3 k blocks.
 
-    Notes
-    -----
-    The lowest bands are left out, because a moving mean shows in them.
-    """
-    block_count, block = blocks.sizes["block"], float(blocks.attrs["block_s"])
-    spans = [span for span in SPANS if block_count // span >= _MIN_AVERAGES]
-    low, high = (blocks[name].values for name in ("band_low", "band_high"))
-    used = low * block >= _MIN_FREQUENCY_LINES
-    if not spans or not used.any():
-        return None
-    members = _band_groups(int(used.sum()))
-    level, weight, rows = _relative_levels(blocks, baseline, used, members)
-    windows = window_set(block_count, LENGTHS)
-    scatter = [
-        _score_scatter(level, weight, windows, span, single=int(used.sum())) for span in spans
-    ]
-    z, ratio, variation = (
-        np.concatenate([one[place] for one in scatter], axis=-1) for place in range(3)
-    )
-    f_low = np.append([low[used][one].min() for one in members], low[used][0])
-    f_high = np.append([high[used][one].max() for one in members], high[used][-1])
-    return statistic_dataset(
-        "davar",
-        blocks,
-        rows=rows,
-        windows=windows,
-        columns={
-            "what": np.repeat([f"variance {span * block:g} s" for span in spans], f_low.size),
-            "tau_min_s": np.tile(0.5 / f_high, len(spans)),
-            "tau_max_s": np.tile(0.5 / f_low, len(spans)),
-        },
-        z=z,
-        ratio=ratio,
-        estimate=variation,
-        one_sided=True,
-    )
+        Returns
+        -------
+        xarray.Dataset or None
+            None for too short a record. A column for each span and each band, each quarter of the
+            bands, all bands, and each band against its own mean. ``ratio`` is the scatter over that
+            of steady noise, ``estimate`` the variation of the power, rms over mean. Several axes
+            have a row of all together, the mean of their levels, because axes often fluctuate
+            together.
+
+        Notes
+        -----
+        The lowest bands are left out, because a moving mean shows in them.
+        """
+        block_count, block = blocks.sizes["block"], float(blocks.attrs["block_s"])
+        spans = [span for span in SPANS if block_count // span >= _MIN_AVERAGES]
+        low, high = (blocks[name].values for name in ("band_low", "band_high"))
+        used = low * block >= _MIN_FREQUENCY_LINES
+        if not spans or not used.any():
+            return None
+        members = _band_groups(int(used.sum()))
+        level, weight, rows = _relative_levels(blocks, baseline, used, members)
+        windows = window_set(block_count, LENGTHS)
+        scatter = [
+            _score_scatter(level, weight, windows, span, single=int(used.sum())) for span in spans
+        ]
+        z, ratio, variation = (
+            np.concatenate([one[place] for one in scatter], axis=-1) for place in range(3)
+        )
+        f_low = np.append([low[used][one].min() for one in members], low[used][0])
+        f_high = np.append([high[used][one].max() for one in members], high[used][-1])
+        return statistic_dataset(
+            "davar",
+            blocks,
+            rows=rows,
+            windows=windows,
+            columns={
+                "what": np.repeat([f"variance {span * block:g} s" for span in spans], f_low.size),
+                "tau_min_s": np.tile(0.5 / f_high, len(spans)),
+                "tau_max_s": np.tile(0.5 / f_low, len(spans)),
+            },
+            z=z,
+            ratio=ratio,
+            estimate=variation,
+            one_sided=True,
+        )
+
+    def prepare(
+        self, blocks: xr.Dataset, baseline: xr.Dataset, regions: Sequence[Mapping[str, Any]]
+    ) -> xr.Dataset:
+        """Scale the powers where the noise level differs: that is reported already."""
+        spans = [
+            (str(region["axes"]).split(), float(region["begin"]), float(region["end"]))
+            for region in regions
+            if region["what"] in LEVEL_COLUMNS
+        ]
+        return scale_to_expected(blocks, baseline, spans)
+
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe a noise level that fluctuates."""
+        pace = length_text(float(str(region["what"]).split()[1]))
+        estimate = region.get("estimate", np.nan)
+        size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
+        return (
+            f"The noise level of {axes_text(region['axes'])} fluctuates {when}: at "
+            f"{taus_text(region)} its power changes{size} from one stretch of {pace} to another, "
+            f"which is {region['ratio']:.3g} times the scatter of steady noise"
+        )
 
 
 def scale_to_expected(

@@ -11,11 +11,11 @@ from gyrostab.diagnose.baseline.quantization_grid import angle_share, rounded_ra
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_equivalent_effects
-from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes, truncated_axes
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
 
@@ -170,7 +170,12 @@ def test_both_names_are_given_if_the_bins_do_not_decide() -> None:
     assert possibly_truncated_axes(blocks).all()
     assert not truncated_axes(blocks).any()
     variant = Variant({}, ("stuck",), np.empty(0))
-    component = Component(Candidate("dead_zone", "marks", (), (variant,)), variant, ("x",), 20.0)
+    component = Component(
+        Candidate("dead_zone", find_statistic("sample_counts"), (), (variant,)),
+        variant,
+        ("x",),
+        20.0,
+    )
     state = initial_state(blocks, calibrate_noise(blocks))
     assert "rate_quantization" in find_equivalent_effects("dead_zone", [component], state)
     told = cut_record(np.rint, zone=1.0, size=15_000)

@@ -13,14 +13,15 @@ from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.identify.sample_sizes import estimate_line
 from gyrostab.diagnose.nulls.records import null_records
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component, condition_on
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.simulate import simulate
 from tests.support.named import COEFFICIENT, nulls, record
 
@@ -38,7 +39,9 @@ def identify_by_hand(
 ) -> Identifications:
     """Return the identification of one effect on the first axis."""
     candidates, reasons = effect_candidates(blocks, COEFFICIENT)
-    one = next(one for one in candidates if one.effect == effect and one.statistic == statistic)
+    one = next(
+        one for one in candidates if one.effect == effect and one.statistic.name == statistic
+    )
     variant = next(variant for variant in one.variants if variant.columns == columns)
     component = Component(one, variant, ("x",), 50.0)
     identification = Identification(effect, one.driver, ("x",), (component,), 50.0, 8.0)
@@ -237,7 +240,9 @@ def test_line_frequency_is_known_to_one_bin():
     true = 4.013
     blocks = record([{"name": "spectral_line", "amplitude": 0.4, "frequency": true, "axes": ["x"]}])
     baseline = calibrate_noise(blocks)
-    identifications = identify_by_hand(blocks, baseline, "spectral_line", "line", ("amplitude",))
+    identifications = identify_by_hand(
+        blocks, baseline, "spectral_line", "spectral_line", ("amplitude",)
+    )
     place = int(blocks["line_power"].sel(axis="x").mean("part").values.argmax())
     component = replace(identifications.identified[0].components[0], place=place)
     (fitted,) = fit_identifications(
@@ -287,9 +292,11 @@ def test_axes_missing_in_the_strongest_statistic_get_sizes_from_the_next():
     candidates, reasons = effect_candidates(blocks, baseline["coefficient"])
     power, cross = (
         next(
-            one for one in candidates if (one.effect, one.statistic) == (effect["name"], statistic)
+            one
+            for one in candidates
+            if (one.effect, one.statistic.name) == (effect["name"], statistic)
         )
-        for statistic in ("power", "cross")
+        for statistic in ("power", "cross_spectrum")
     )
     components = [
         Component(cross, cross.variants[0], ("x", "y"), 90.0),

@@ -13,11 +13,12 @@ from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component, condition_on
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
-from gyrostab.diagnose.predict.search import CountEvidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.simulate import simulate
@@ -41,7 +42,7 @@ def reduce_simulation(*effects, axes=("x", "y"), environment=(), lost=0.0):
 def identify_by_hand(blocks, baseline, effect, statistic, columns, **values):
     """Return the identification of one effect on x, or on both axes if it belongs to the pair."""
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    one = next(one for one in known if one.effect == effect and one.statistic == statistic)
+    one = next(one for one in known if one.effect == effect and one.statistic.name == statistic)
     fits = [each for each in one.variants if each.columns == columns]
     variant = min(
         fits,
@@ -50,7 +51,7 @@ def identify_by_hand(blocks, baseline, effect, statistic, columns, **values):
             for name, size in values.items()
         ),
     )
-    rows = [("x", "y")] if statistic == "cross" else [("x",)]
+    rows = [("x", "y")] if statistic == "cross_spectrum" else [("x",)]
     components = tuple(Component(one, variant, row, 500.0) for row in rows)
     identification = Identification(effect, one.driver, rows[0], components, 500.0, 8.0)
     state = condition_on(initial_state(blocks, baseline), list(components))
@@ -165,7 +166,7 @@ def test_common_noise_is_not_noise_of_one_axis():
     blocks = reduce_simulation({"name": "shared_source", "N": 0.002})
     baseline = calibrate_noise(blocks)
     identifications = identify_by_hand(
-        blocks, baseline, "shared_source", "cross", ("N",), bandwidth=np.inf
+        blocks, baseline, "shared_source", "cross_spectrum", ("N",), bandwidth=np.inf
     )
     after = recalibrate(identifications, baseline, fit_identifications(identifications, baseline))
     for axis in "xy":
@@ -190,12 +191,12 @@ def test_phase_locked_power_is_counted_once():
     )
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    statistics = {one.statistic: one for one in known if one.effect == "aliased_vibration"}
+    statistics = {one.statistic.name: one for one in known if one.effect == "aliased_vibration"}
     variants = {
         statistic: next(each for each in one.variants if each.values["sampling"] == "point")
         for statistic, one in statistics.items()
     }
-    places = [("power", ("x",)), ("power", ("y",)), ("cross", ("x", "y"))]
+    places = [("power", ("x",)), ("power", ("y",)), ("cross_spectrum", ("x", "y"))]
     components = tuple(
         Component(statistics[statistic], variants[statistic], row, 500.0)
         for statistic, row in places
@@ -239,7 +240,7 @@ def test_anomalous_samples_do_not_raise_the_noise(size):
         {"name": "spikes", "kind": "outlier", "per_hour": 60.0, "size": size}, axes=["x"]
     )
     baseline = calibrate_noise(blocks)
-    identifications = identify_by_hand(blocks, baseline, "spikes", "marks", ("outliers",))
+    identifications = identify_by_hand(blocks, baseline, "spikes", "sample_counts", ("outliers",))
     identifications = replace(
         identifications, count_evidence=CountEvidence({"outliers": (np.zeros(1), np.ones(1))})
     )

@@ -10,17 +10,10 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
-from gyrostab.diagnose.evidence.held_out import (
-    held_out_evidence,
-    mean_evidence,
-    mean_factors,
-    noise_columns,
-    power_evidence,
-    power_factors,
-)
+from gyrostab.diagnose.evidence.held_out import held_out_evidence, mean_factors, noise_columns
 from gyrostab.diagnose.evidence.products import WIDTHS
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.nulls.records import null_records
-from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -29,6 +22,7 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.noise import HOUR
 from tests.kernels.regression.test_state_space import relaxation_covariance, walk_covariance
+from tests.support.evidence import mean_evidence, power_evidence, power_factors
 
 STEP = 20.0
 

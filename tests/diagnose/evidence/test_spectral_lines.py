@@ -12,16 +12,17 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.identify.components import group_components, merge_lines
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identification, add_identification, form_error
-from gyrostab.diagnose.identify.sample_sizes import estimate_line
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component, condition_on
-from gyrostab.diagnose.predict.designs import Candidate, Variant
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, reusable_mean_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
 
@@ -113,7 +114,7 @@ def test_a_line_does_not_change_the_evidence_of_means() -> None:
     assert line.evidence_nats > 10.0
     named = condition_on(state, [line])
     kept = reusable_mean_evidence(found, state, named)
-    assert {one.candidate.statistic for one in kept} == {"mean", "levels"}
+    assert {one.candidate.statistic.name for one in kept} == {"mean", "telegraph"}
     again = compute_evidence([one.candidate for one in kept], named.blocks, named, folds)
     for one, other in zip(kept, again, strict=True):
         np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)
@@ -129,7 +130,11 @@ def test_a_line_does_not_change_the_evidence_of_means() -> None:
 def component(effect: str, statistic: str, evidence_nats: float, place: int = -1) -> Component:
     variant = Variant({}, ("size",), np.empty(0))
     return Component(
-        Candidate(effect, statistic, (), (variant,)), variant, ("x",), evidence_nats, place
+        Candidate(effect, find_statistic(statistic), (), (variant,)),
+        variant,
+        ("x",),
+        evidence_nats,
+        place,
     )
 
 
@@ -139,29 +144,32 @@ def identification(one: Component) -> Identification:
 
 def test_a_line_counts_only_for_the_simplest_effect() -> None:
     found = {
-        "spectral_line": [component("spectral_line", "line", 50.0)],
+        "spectral_line": [component("spectral_line", "spectral_line", 50.0)],
         "supply_bias(supply)": [
-            component("supply_bias", "line", 50.0),
+            component("supply_bias", "spectral_line", 50.0),
             component("supply_bias", "mean", 9.0),
         ],
-        "real_motion": [component("real_motion", "line", 50.0)],
+        "real_motion": [component("real_motion", "spectral_line", 50.0)],
     }
     kept = merge_lines(found)
     assert kept["spectral_line"] == found["spectral_line"]
-    assert [one.candidate.statistic for one in kept["supply_bias(supply)"]] == ["mean"]
+    assert [one.statistic.name for one in kept["supply_bias(supply)"]] == ["mean"]
     assert "real_motion" not in kept
 
 
 def test_identifications_of_one_effect_merge_except_lines_of_other_frequencies() -> None:
-    first = identification(component("spectral_line", "line", 50.0, 3))
+    first = identification(component("spectral_line", "spectral_line", 50.0, 3))
     assert (
         len(
-            add_identification([first], identification(component("spectral_line", "line", 20.0, 9)))
+            add_identification(
+                [first], identification(component("spectral_line", "spectral_line", 20.0, 9))
+            )
         )
         == 2
     )
     (both,) = add_identification(
-        [first], replace(identification(component("spectral_line", "line", 20.0, 3)), axes=("y",))
+        [first],
+        replace(identification(component("spectral_line", "spectral_line", 20.0, 3)), axes=("y",)),
     )
     assert (both.axes, both.evidence_nats) == (("x", "y"), 70.0)
     assert (
@@ -177,10 +185,10 @@ def test_identifications_of_one_effect_merge_except_lines_of_other_frequencies()
 
 def test_a_steady_line_has_no_model_error() -> None:
     chosen = [
-        identification(component("spectral_line", "line", 900.0, 3)),
+        identification(component("spectral_line", "spectral_line", 900.0, 3)),
         identification(component("shupe", "mean", 400.0)),
     ]
-    assert form_error([component("spectral_line", "line", 20.0, 9)], chosen) == 0.0
+    assert form_error([component("spectral_line", "spectral_line", 20.0, 9)], chosen) == 0.0
     assert form_error([component("warm_up", "mean", 20.0)], chosen) == pytest.approx(4.0)
 
 

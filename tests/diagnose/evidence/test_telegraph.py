@@ -8,7 +8,7 @@ import xarray as xr
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.estimate.telegraph_sizes import estimate_telegraph
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.telegraph import (
     MIN_SWITCHES,
     telegraph_courses,
@@ -18,11 +18,12 @@ from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.identify.switching import drop_explained_jumps, put_followers_first
-from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Component, condition_on_components
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
+from gyrostab.diagnose.predict.condition import condition_on_components
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.predict.search import CandidateEvidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.base import SizeFit
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
 from tests.support.named import nulls
@@ -170,7 +171,10 @@ def component(
         {"low": 100.0, "high": 200.0, "switches": 18.0}, ("step",), course[None, None]
     )
     return Component(
-        Candidate("telegraph", "levels", (), (variant,)), variant, (axis,), evidence_nats
+        Candidate("telegraph", find_statistic("telegraph"), (), (variant,)),
+        variant,
+        (axis,),
+        evidence_nats,
     )
 
 
@@ -194,7 +198,8 @@ def test_sizes_match_those_of_the_course() -> None:
     rng = np.random.default_rng(9)
     course = telegraph_share(rng, 100.0, 200.0)
     state = state_of(0.5 * course + white(rng, 1)[0])
-    sizes = estimate_telegraph([component(state, course)], ("x",), state)
+    shown = component(state, course)
+    sizes = shown.statistic.estimate(SizeFit([shown], ("x",), state, [], CountEvidence({})))
     value, error = sizes["step"]
     assert abs(value - 0.5) < 4.0 * error
     assert 0.015 < error < 0.06  # twice the error of a mean over all blocks
@@ -206,7 +211,7 @@ def led(course: np.ndarray, evidence_nats: float, axis: str = "x") -> Component:
     """A mean that follows the temperature."""
     variant = Variant({}, ("sensitivity",), course[None, None])
     return Component(
-        Candidate("temperature_bias", "mean", ("temperature",), (variant,)),
+        Candidate("temperature_bias", find_statistic("mean"), ("temperature",), (variant,)),
         variant,
         (axis,),
         evidence_nats,
@@ -217,7 +222,12 @@ def jump(place: int, evidence_nats: float) -> Component:
     variant = Variant(
         {"at": place * STEP}, ("step",), (np.arange(BLOCKS) >= place).astype(float)[None, None]
     )
-    return Component(Candidate("bias_jump", "mean", (), (variant,)), variant, ("x",), evidence_nats)
+    return Component(
+        Candidate("bias_jump", find_statistic("mean"), (), (variant,)),
+        variant,
+        ("x",),
+        evidence_nats,
+    )
 
 
 FOLLOWS, HOPS_FIRST = (

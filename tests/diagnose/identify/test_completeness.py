@@ -10,13 +10,15 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.completeness import variance_fluctuation
 from gyrostab.diagnose.identify.forward_search import name_effects
+from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.selection import Search
+from gyrostab.diagnose.predict.candidates import CandidateEvidence
 from gyrostab.diagnose.predict.condition import refit_weights
 from gyrostab.diagnose.predict.linear_model import State, initial_state
-from gyrostab.diagnose.predict.nuisance import nuisance_alternatives
-from gyrostab.diagnose.predict.search import CandidateEvidence, CountEvidence, compute_evidence
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls

@@ -10,17 +10,17 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import is_physical
+from gyrostab.diagnose.identify.nuisance_alternatives import burst_intervals
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.nulls.records import null_records
-from gyrostab.diagnose.predict.candidates import Candidate, effect_candidates
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
-from gyrostab.diagnose.predict.nuisance import burst_intervals
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics import phase_locked as locked
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import nulls
 
@@ -56,7 +56,7 @@ def state_of_rates(rate: np.ndarray) -> State:
 
 def candidate(state: State, effect: str, statistic: str) -> Candidate:
     known, _ = effect_candidates(state.blocks, state.baseline["coefficient"])
-    return next(one for one in known if (one.effect, one.statistic) == (effect, statistic))
+    return next(one for one in known if (one.effect, one.statistic.name) == (effect, statistic))
 
 
 def components_of(state: State, one: Candidate) -> list[Component]:
@@ -242,7 +242,7 @@ def state_of_rotation(rate: np.ndarray, turns: np.ndarray) -> State:
 @pytest.mark.parametrize("size", [0.0, 6.0])
 def test_waves_not_locked_to_the_rotation_are_not_rotation_lines(size: float) -> None:
     state = make_swell(size)
-    found = components_of(state, candidate(state, "rotation_line", "order"))
+    found = components_of(state, candidate(state, "rotation_line", "rotation_order"))
     assert (sum_evidence(found) > 15.0) == (size > 0.0)
 
 
@@ -269,7 +269,9 @@ def test_scores_at_orders_scatter_like_null_records() -> None:
     (drawn,) = null_records(
         state.blocks, state.baseline, count=40, rng=np.random.default_rng(1), chunk=40
     )
-    real, noise = (locked.score(one, state.baseline) for one in (state.blocks, drawn))
+    real, noise = (
+        find_statistic("ramp_phase").score(one, state.baseline) for one in (state.blocks, drawn)
+    )
     assert real is not None
     assert noise is not None
     largest = noise["z"].max([dim for dim in noise["z"].dims if dim != "record"])

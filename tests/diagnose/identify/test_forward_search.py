@@ -16,7 +16,8 @@ from gyrostab.diagnose.identify.forward_search import name_effects, tail_level
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.identification import Identification
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
-from gyrostab.diagnose.predict.condition import Component, condition_on
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log
@@ -61,7 +62,9 @@ def test_vibration_noise_is_identified_on_its_axis(shaken):
 def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
     """Only the component of negative size, on an axis without the effect, is dropped."""
     state, (identification,) = shaken.state, shaken.identified
-    (component,) = (one for one in identification.components if one.candidate.statistic == "power")
+    (component,) = (
+        one for one in identification.components if one.candidate.statistic.name == "power"
+    )
     elsewhere = [replace(component, row=(axis,)) for axis in "yz"]
     sizes = {"x": 1.0, "y": -0.1, "z": 0.1}
     monkeypatch.setattr(
@@ -77,7 +80,7 @@ def test_sizes_outside_the_registry_are_rejected(shaken):
     bias = next(
         one
         for one in shaken.candidates
-        if one.effect == "temperature_bias" and one.statistic == "mean"
+        if one.effect == "temperature_bias" and one.statistic.name == "mean"
     )
     variant = next(one for one in bias.variants if one.columns == ("sensitivity",))
     component = Component(bias, variant, ("y",), 50.0)

@@ -12,13 +12,11 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.predict.condition import Component, drop_changed_tails
-from gyrostab.diagnose.predict.designs import Candidate, Variant
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.tables import identification_tables
-from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
-from gyrostab.diagnose.statistics import sample_counts as distribution
-from gyrostab.diagnose.statistics import spectral_line as spectrum
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.conftest import ROOT
 from tests.support.scripts import load_script
@@ -117,7 +115,7 @@ def identifications(
     there[..., 10:20] = 1.0
     variant = Variant({}, ("sensitivity",), there if statistic == "mean" else there[..., None])
     component = Component(
-        Candidate("shupe", statistic, ("temperature",), (variant,)),
+        Candidate("shupe", find_statistic(statistic), ("temperature",), (variant,)),
         variant,
         ("y",),
         evidence_nats,
@@ -153,18 +151,18 @@ def blocks() -> xr.Dataset:
     [
         ("mean", "mean", (20.0, 400.0)),
         ("power", "davar", (0.1, 20.0)),
-        ("line", "spectrum", (0.371 / 0.5,) * 2),
+        ("spectral_line", "spectrum", (0.371 / 0.5,) * 2),
     ],
 )
 def test_effect_without_a_mismatch_gets_one_where_it_acts(
     statistic: str, told: str, taus: tuple[float, float]
 ) -> None:
     (region,) = identification_tables(
-        identifications(statistic, place=9 if statistic == "line" else -1), blocks(), []
+        identifications(statistic, place=9 if statistic == "spectral_line" else -1), blocks(), []
     )
     assert (region["view"], region["axes"], region["explained_by"]) == (told, ["y"], ["shupe"])
     assert (region["tau_min_s"], region["tau_max_s"]) == pytest.approx(taus)
-    whole = statistic == "line"  # a steady line is there all the time
+    whole = statistic == "spectral_line"  # a steady line is there all the time
     start, end = ("00:00", "13:20") if whole else ("03:20", "06:40")
     assert region["start"] == f"1970-01-01T00:{start}.000Z"
     assert region["end"] == f"1970-01-01T00:{end}.000Z"
@@ -204,7 +202,9 @@ def flatten_levels(blocks: xr.Dataset, level: np.ndarray) -> xr.Dataset:
 
 
 def test_one_noisy_block_makes_no_lines(noisy_log) -> None:
-    scores = spectrum.score(noisy_log, flatten_levels(noisy_log, np.ones(noisy_log.sizes["block"])))
+    scores = find_statistic("spectral_line").score(
+        noisy_log, flatten_levels(noisy_log, np.ones(noisy_log.sizes["block"]))
+    )
     assert scores is not None
     assert np.nanmax(scores["z"].values) < 4.8  # of 2 898, of which few are independent
 
@@ -219,7 +219,8 @@ def test_two_levels_in_a_block_make_no_tails(noisy_log) -> None:
     base = flatten_levels(noisy_log, 1.0 + share * 899.0)
     calm = drop_changed_tails(noisy_log, base["spectrum"].values)
     before, after = (
-        distribution.score(one, base).isel(tau=-1)["ratio"].max() for one in (noisy_log, calm)
+        find_statistic("sample_counts").score(one, base).isel(tau=-1)["ratio"].max()
+        for one in (noisy_log, calm)
     )
     assert before > 4.0
     assert after < 1.4  # of 324 samples: five standard deviations
@@ -234,7 +235,8 @@ def test_common_noise_of_the_model_is_not_a_mismatch(noisy_log) -> None:
         cross=(("pair", "block", "band"), np.full(shared["cross"].shape, 1.0 / 50.0, complex))
     )
     before, after = (
-        np.nanmax(np.abs(cross_axis.score(shared, one)["z"].values)) for one in (base, model)
+        np.nanmax(np.abs(find_statistic("cross_spectrum").score(shared, one)["z"].values))
+        for one in (base, model)
     )
     assert before > 30.0
     assert after < 8.0

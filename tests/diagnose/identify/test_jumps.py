@@ -8,10 +8,10 @@ import pytest
 from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.jumps import is_free_jump, is_sudden
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -36,7 +36,7 @@ def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> No
     (jumps,) = (
         one
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if (one.effect, one.statistic) == ("bias_jump", "mean")
+        if (one.effect, one.statistic.name) == ("bias_jump", "mean")
     )
     state = initial_state(blocks, baseline)
     components = group_components(compute_evidence([jumps], blocks, state, fold_blocks(blocks)))[
@@ -60,7 +60,7 @@ def test_jump_at_a_restart_may_settle() -> None:
     (jumps,) = (
         one
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if (one.effect, one.statistic) == ("bias_jump", "mean")
+        if (one.effect, one.statistic.name) == ("bias_jump", "mean")
     )
     state = initial_state(blocks, baseline)
     at = np.array([one.values["at"] for one in jumps.variants])

@@ -10,11 +10,10 @@ from scipy.signal import butter, lfilter, sosfilt
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.logger_filters import fit_filter_sizes, fits_all_axes
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.filter_response import is_filter
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -86,7 +85,7 @@ def _cutoff_interval(log: xr.Dataset) -> tuple[float, float]:
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
         if one.effect == "logger_filter"
     )
-    variant = next(one for one in candidate.variants if is_filter("power", one))
+    variant = next(one for one in candidate.variants if candidate.statistic.is_filter(one))
     components = [
         Component(candidate, variant, (str(axis),), 50.0) for axis in blocks["axis"].values
     ]

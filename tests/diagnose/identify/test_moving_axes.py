@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab import diagnose
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.moving_axes import moving_blocks, unexplained_motion, without_motion
-from gyrostab.diagnose.predict.candidates import make_windows
+from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
 from gyrostab.diagnose.result.tables import motion_tables
 from gyrostab.errors import SchemaError
@@ -113,7 +113,9 @@ def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced):
     assert not unexplained_motion(
         whole, [identification("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)]
     ).any()
-    assert not unexplained_motion(whole, [identification("rotation_line", "order", "z")]).any()
+    assert not unexplained_motion(
+        whole, [identification("rotation_line", "rotation_order", "z")]
+    ).any()
     step = np.where(np.arange(bump.size) < np.flatnonzero(moving[2]).mean(), 0.0, 1.0)
     for other in (
         identification("bias_jump", "mean", "z", course=step),

@@ -11,9 +11,9 @@ from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identification, with_axes_of
 from gyrostab.diagnose.identify.overlapping import split_layers
 from gyrostab.diagnose.nulls.records import null_records
-from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.simulate import simulate
 
 VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
@@ -21,7 +21,9 @@ VARIANT = Variant({}, ("size",), np.ones((1, 1, 3)))
 
 def component(evidence_nats, *, row="x", reference=""):
     return Component(
-        Candidate("misalignment", "transfer", (), (VARIANT,), reference=(reference,)),
+        Candidate(
+            "misalignment", find_statistic("transfer"), (), (VARIANT,), reference=(reference,)
+        ),
         VARIANT,
         (row,),
         evidence_nats,

@@ -11,8 +11,8 @@ import xarray as xr
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.identify.phase_locked import remove_phase_locked
-from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.simulate import simulate
 
 N = 0.003  # deg/sqrt(h)
@@ -21,7 +21,10 @@ N = 0.003  # deg/sqrt(h)
 def component(statistic: str, evidence_nats: float) -> Component:
     variant = Variant({}, np.ones((1, 1, 1)), ("any",))
     return Component(
-        Candidate("rotation_line", statistic, (), (variant,)), variant, ("x",), evidence_nats
+        Candidate("rotation_line", find_statistic(statistic), (), (variant,)),
+        variant,
+        ("x",),
+        evidence_nats,
     )
 
 
@@ -34,8 +37,8 @@ def identification(*components: Component) -> Identification:
 def test_only_phase_locked_components_are_removed() -> None:
     mean, wave, comb = (
         component("mean", 5.0),
-        component("order", 20.0),
-        component("phase_locked", 7.0),
+        component("rotation_order", 20.0),
+        component("ramp_phase", 7.0),
     )
     identifications = Identifications(
         (identification(mean, wave), identification(comb), identification(mean)),

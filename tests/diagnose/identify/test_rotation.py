@@ -9,9 +9,9 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, is_physical
-from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -54,7 +54,10 @@ def _find_components(blocks: xr.Dataset):
     state = initial_state(blocks, baseline)
     components = group_components(
         compute_evidence(
-            [one for one in known if one.statistic == "mean"], blocks, state, fold_blocks(blocks)
+            [one for one in known if one.statistic.name == "mean"],
+            blocks,
+            state,
+            fold_blocks(blocks),
         )
     )
     return {several[0].candidate.effect: several for several in components.values()}, state

@@ -9,10 +9,10 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.baseline.calibrate import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identifiability import is_physical
 from gyrostab.diagnose.identify.steady import is_always_present
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -35,7 +35,7 @@ def _simulate_wander(size: float, share: float, seed: int) -> tuple[list[Compone
     biases = [
         one
         for one in effect_candidates(blocks, baseline["coefficient"])[0]
-        if one.key == "gauss_markov" and one.statistic == "power"
+        if one.key == "gauss_markov" and one.statistic.name == "power"
     ]
     state = initial_state(blocks, baseline)
     return group_components(compute_evidence(biases, blocks, state, fold_blocks(blocks)))[

@@ -6,9 +6,9 @@ import numpy as np
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
@@ -36,7 +36,9 @@ def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float
     blocks = reduce_log(simulate(model, duration="30min", rate=10.0, seed=5).compute())
     baseline = calibrate_noise(blocks)
     known, _ = effect_candidates(blocks, baseline["coefficient"])
-    one = next(one for one in known if one.effect == "temperature_bias" and one.statistic == "mean")
+    one = next(
+        one for one in known if one.effect == "temperature_bias" and one.statistic.name == "mean"
+    )
     variant = next(each for each in one.variants if each.columns == ("sensitivity",))
     return passes_time_shift_test(
         [Component(one, variant, ("x",), 50.0)],

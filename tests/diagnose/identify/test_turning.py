@@ -9,8 +9,8 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components, sum_evidence
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.predict.candidates import effect_candidates
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
@@ -50,7 +50,7 @@ def test_earth_rate_is_recovered(around):
     blocks = reduce_log(log)
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    orders = [one for one in known if one.statistic == "order"]
+    orders = [one for one in known if one.statistic.name == "rotation_order"]
     start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(compute_evidence(orders, blocks, start, folds))[
         "earth_rate(rotation_rate)"
@@ -94,7 +94,9 @@ def test_angles_have_the_relative_error_of_the_size(latitude, most):
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
     start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(
-        compute_evidence([one for one in known if one.statistic == "order"], blocks, start, folds)
+        compute_evidence(
+            [one for one in known if one.statistic.name == "rotation_order"], blocks, start, folds
+        )
     )["earth_rate(rotation_rate)"]
     identification = Identification(
         "earth_rate", components[0].candidate.driver, ("x", "y"), tuple(components), 500.0, 8.0
@@ -136,7 +138,11 @@ def test_all_harmonics_of_the_rotation_are_recovered():
     blocks = reduce_log(log)
     baseline = calibrate_noise(blocks)
     known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    orders = [one for one in known if one.statistic == "order" and one.effect == "rotation_line"]
+    orders = [
+        one
+        for one in known
+        if one.statistic.name == "rotation_order" and one.effect == "rotation_line"
+    ]
     start, folds = initial_state(blocks, baseline), fold_blocks(blocks)
     components = group_components(compute_evidence(orders, blocks, start, folds))[
         "rotation_line(rotation_rate)"

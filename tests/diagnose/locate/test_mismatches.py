@@ -156,6 +156,7 @@ def test_wandering_mean_is_one_mismatch(base, null):
 
 def test_pieces_of_one_region_are_merged_and_others_are_not():
     region = {
+        "statistic": "power",
         "view": "davar",
         "axes": "x",
         "what": "avar",
@@ -176,6 +177,7 @@ def test_pieces_of_one_region_are_merged_and_others_are_not():
     assert len(merge_regions([region, region | {"sign": -1}])) == 2
     assert len(merge_regions([region, region | {"tau_min_s": 1.0, "tau_max_s": 2.0}])) == 2
     line = region | {
+        "statistic": "spectral_line",
         "view": "spectrum",
         "what": "line",
         "frequency": 13.35,

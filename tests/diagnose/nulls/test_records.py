@@ -9,12 +9,12 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import baseline_from_model, calibrate_noise
-from gyrostab.diagnose.evidence.held_out import mean_evidence, power_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.outliers import EXPECTED_FALSE_OUTLIERS
 from gyrostab.kernels.spectra.periodogram import band_covariance
 from gyrostab.simulate import simulate
+from tests.support.evidence import mean_evidence, power_evidence
 
 NOISE = {"Q": 0.05, "N": 0.003, "B": 0.004, "K": 0.02}
 RECORDS = 30

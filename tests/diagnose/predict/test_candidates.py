@@ -8,25 +8,23 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.held_out import linear_model_factors, power_factors
-from gyrostab.diagnose.predict.candidates import (
-    STATISTIC_NAMES,
-    effect_candidates,
-    make_windows,
-)
+from gyrostab.diagnose.evidence.held_out import linear_model_factors
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.identify.nuisance_alternatives import hat_functions, nuisance_alternatives
 from gyrostab.diagnose.predict.linear_model import (
-    build_linear_model,
     initial_state,
     power_column,
     simulate_noise,
     spread_by_gaps,
 )
-from gyrostab.diagnose.predict.nuisance import hat_functions, nuisance_alternatives
+from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import simulate
+from tests.support.evidence import power_factors
 from tests.support.named import COEFFICIENT, WORLD, record
 
 
@@ -51,7 +49,9 @@ def test_every_effect_is_tried_or_has_a_reason(found):
     tried = {one.effect for one in candidates}
     assert tried.isdisjoint(reasons)
     assert tried | set(reasons) | {"fringe_hop"} == set(effects())
-    assert {one.statistic for one in candidates} <= set(STATISTIC_NAMES)
+    assert {one.statistic.name for one in candidates} <= {
+        statistic.name for statistic in STATISTICS
+    }
     for reason in reasons.values():
         assert reason.startswith("not identifiable: ")
 
@@ -61,19 +61,19 @@ def test_every_effect_is_tried_or_has_a_reason(found):
     [
         ("shupe", {"mean"}),
         ("vibration_noise", {"power"}),
-        ("aliased_vibration", {"power", "cross"}),
-        ("shared_source", {"cross"}),
+        ("aliased_vibration", {"power", "cross_spectrum"}),
+        ("shared_source", {"cross_spectrum"}),
         ("g_sensitivity", {"mean"}),
-        ("earth_rate", {"mean", "order"}),
-        ("rotation_line", {"mean", "order"}),
-        ("spectral_line", {"line"}),
-        ("spikes", {"marks"}),
+        ("earth_rate", {"mean", "rotation_order"}),
+        ("rotation_line", {"mean", "rotation_order"}),
+        ("spectral_line", {"spectral_line"}),
+        ("spikes", {"sample_counts"}),
         ("logger_filter", {"power"}),
-        ("gauss_markov", {"power", "wander"}),
+        ("gauss_markov", {"power", "random_process"}),
     ],
 )
 def test_effects_show_in_the_expected_statistics(found, effect, statistics):
-    assert {one.statistic for one in found[0] if one.effect == effect} == statistics
+    assert {one.statistic.name for one in found[0] if one.effect == effect} == statistics
 
 
 def test_reason_names_the_missing_channel(plain):
@@ -119,7 +119,7 @@ def test_an_axis_does_not_explain_itself(plain, found):
     leak = next(
         one
         for one in effect_candidates(moving, COEFFICIENT)[0]
-        if one.effect == "misalignment" and one.statistic == "mean"
+        if one.effect == "misalignment" and one.statistic.name == "mean"
     )
     for variant in leak.variants:
         for name, design in zip(variant.columns, variant.design, strict=True):
@@ -127,18 +127,20 @@ def test_an_axis_does_not_explain_itself(plain, found):
     assert not [
         one
         for one in found[0]
-        if one.effect in ("dead_zone", "clock_error") and one.statistic == "mean"
+        if one.effect in ("dead_zone", "clock_error") and one.statistic.name == "mean"
     ]
 
 
 def test_axes_at_rest_do_not_leak(plain, found):
-    assert not [one for one in found[0] if one.effect == "misalignment" and one.statistic == "mean"]
+    assert not [
+        one for one in found[0] if one.effect == "misalignment" and one.statistic.name == "mean"
+    ]
     course = xr.DataArray(np.linspace(0.0, 500.0, plain.sizes["block"]), dims="block")
     turning = plain.assign(mean=plain["mean"] + course.where(plain["axis"] == "z", 0.0))
     leak = next(
         one
         for one in effect_candidates(turning, COEFFICIENT)[0]
-        if one.effect == "misalignment" and one.statistic == "mean"
+        if one.effect == "misalignment" and one.statistic.name == "mean"
     )
     assert [variant.columns for variant in leak.variants] == [("z",)]
 
@@ -154,7 +156,11 @@ def test_mean_designs_match_the_simulator(plain):
 
 def test_earth_rate_is_in_quadrature_between_the_cross_axes(rich):
     candidates, _ = effect_candidates(rich, COEFFICIENT)
-    one = next(one for one in candidates if one.effect == "earth_rate" and one.statistic == "order")
+    one = next(
+        one
+        for one in candidates
+        if one.effect == "earth_rate" and one.statistic.name == "rotation_order"
+    )
     pattern = one.variants[0].design[0, :, 0]
     turning = [*WORLD["turning"]]
     table = {"name": "earth_rate", "latitude": 60.0}
@@ -220,7 +226,7 @@ def test_linear_model_of_powers_gives_the_evidence_of_powers(plain, common):
     folds = fold_blocks(plain)
     generic = [one for one in nuisance_alternatives(plain) if one.effect == "~N(t)"]
     state = initial_state(plain, baseline)
-    cells = build_linear_model(generic, 0, plain, state)
+    cells = generic[0].statistic.model(generic, 0, plain, state)
     mine = linear_model_factors(cells, folds)[:, 1:]
     designs = [
         power_column(one, 0, state) / baseline["spectrum"].values[0]
@@ -232,15 +238,15 @@ def test_linear_model_of_powers_gives_the_evidence_of_powers(plain, common):
     np.testing.assert_allclose(mine, theirs, atol=1e-6)
 
 
-@pytest.mark.parametrize("statistic", ["cross", "order"])
+@pytest.mark.parametrize("statistic", ["cross_spectrum", "rotation_order"])
 def test_simulated_noise_has_the_variance_of_the_weights(rich, statistic):
     baseline = calibrate_noise(rich)
     candidates = [
         one
         for one in effect_candidates(rich, COEFFICIENT)[0]
-        if one.statistic == statistic and one.each
+        if one.statistic.name == statistic and one.each
     ][:1]
-    cells = build_linear_model(candidates, 0, rich, initial_state(rich, baseline))
+    cells = candidates[0].statistic.model(candidates, 0, rich, initial_state(rich, baseline))
     z = (cells.values[..., 0] * np.sqrt(cells.weight))[
         (cells.weight > 0) & np.isfinite(cells.values[..., 0])
     ]
@@ -279,12 +285,12 @@ def test_simulated_wander_has_the_predicted_variance():
 
 
 def test_nuisance_alternatives_have_the_axes_of_the_record(plain):
-    assert {one.statistic for one in nuisance_alternatives(plain)} == {
+    assert {one.statistic.name for one in nuisance_alternatives(plain)} == {
         "mean",
         "power",
-        "cross",
-        "marks",
+        "cross_spectrum",
+        "sample_counts",
     }
     alone = plain.isel(axis=[0]).drop_dims("pair") if "pair" in plain.dims else plain
     assert isinstance(alone, xr.Dataset)
-    assert "cross" not in {one.statistic for one in nuisance_alternatives(alone)}
+    assert "cross_spectrum" not in {one.statistic.name for one in nuisance_alternatives(alone)}

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import (
-    Component,
-    condition_on_component,
-    mask_anomalous_blocks,
-)
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.condition import condition_on_components
 from gyrostab.diagnose.predict.linear_model import cross_without, initial_state
+from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from tests.support.reduced_records import baseline, records
 
 BLOCKS = 40
@@ -32,7 +30,9 @@ def blocks() -> xr.Dataset:
 
 def spikes(axis: str) -> Component:
     variant = Variant({}, ("outliers",), np.ones((1, 1, 1)))
-    return Component(Candidate("spikes", "marks", (), (variant,)), variant, (axis,), 20.0)
+    return Component(
+        Candidate("spikes", find_statistic("sample_counts"), (), (variant,)), variant, (axis,), 20.0
+    )
 
 
 def lost(found: xr.DataArray, before: xr.DataArray) -> set[tuple[str, int]]:
@@ -80,7 +80,7 @@ def test_blocks_with_named_spikes_are_left_out_of_all_statistics(
 
 def test_blocks_with_spikes_are_left_out_in_the_next_search(blocks: xr.Dataset) -> None:
     state = initial_state(blocks, baseline(block_count=BLOCKS))
-    found = condition_on_component(state, spikes("y")).blocks
+    found = condition_on_components(state, [spikes("y")]).blocks
     for name in ("mean", "power"):
         assert lost(found[name], blocks[name]) == {("y", 5), ("y", 9)}
     assert lost(found["cross"], blocks["cross"]) == {("xy", 5), ("yz", 5), ("xy", 9), ("yz", 9)}

@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -33,7 +33,11 @@ def test_random_gaps_do_not_bias_a_shared_band(log, rows):
     blocks = reduce_log(log.assign(rate=rate.where(there).assign_attrs(rate.attrs)))
     baseline = calibrate_noise(blocks)
     known, _ = effect_candidates(blocks, baseline["coefficient"])
-    one = next(one for one in known if one.effect == "shared_source" and one.statistic == "cross")
+    one = next(
+        one
+        for one in known
+        if one.effect == "shared_source" and one.statistic.name == "cross_spectrum"
+    )
     variant = next(each for each in one.variants if each.values["bandwidth"] == 0.5)
     mean, covariance = component_mixture(
         Component(one, variant, ("x", "y"), 1.0), initial_state(blocks, baseline)

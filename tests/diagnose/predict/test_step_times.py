@@ -9,7 +9,7 @@ import pytest
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.step_times import select_step_times
@@ -32,7 +32,7 @@ def _jump_candidates(blocks):
     return next(
         one
         for one in effect_candidates(blocks, COEFFICIENT)[0]
-        if one.effect == "bias_jump" and one.statistic == "mean"
+        if one.effect == "bias_jump" and one.statistic.name == "mean"
     )
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.predict.candidates import effect_candidates
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -218,7 +218,7 @@ def candidates_of(log: xr.Dataset) -> tuple[xr.Dataset, list[Any], dict[str, str
 def test_a_ramp_from_another_file_is_used():
     blocks, found, reasons = candidates_of(kicked(1 / 3))
     assert "feedback_reset" not in reasons
-    assert {one.statistic for one in found if one.effect == "feedback_reset"} >= {"phase_locked"}
+    assert {one.statistic.name for one in found if one.effect == "feedback_reset"} >= {"ramp_phase"}
     profile = blocks["profile"].mean("block").values[0]
     late = 4.17 / RATE / 3.0  # turns between a sample and its ramp value
     assert profile[-2:].mean() - profile[2:36].mean() == pytest.approx(
@@ -285,7 +285,7 @@ def test_a_seismometer_with_its_own_stamps_is_compared_sample_by_sample():
         with_channel(log, "seismometer_z", (np.arange(60_000) + 0.37) / RATE, ground)
     )
     assert ("real_motion", ("seismometer_z",)) in {
-        (one.effect, one.reference) for one in found if one.statistic == "transfer"
+        (one.effect, one.reference) for one in found if one.statistic.name == "transfer"
     }
     assert unused_channels(blocks, {"seismometer_z"}) == []
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from tests.support.named import COEFFICIENT, WORLD, record
 
@@ -26,14 +26,16 @@ def turning():
 
 def identification(blocks, effect, statistic):
     candidates, _ = effect_candidates(blocks, COEFFICIENT)
-    one = next(one for one in candidates if one.effect == effect and one.statistic == statistic)
+    one = next(
+        one for one in candidates if one.effect == effect and one.statistic.name == statistic
+    )
     component = Component(one, one.variants[0], ("x",), 50.0, place=0)
     return Identification(effect, one.driver, ("x",), (component,), 50.0, 8.0)
 
 
 def test_rotation_line_acts_while_the_tool_rotates(turning):
     found = join_blocks(
-        active_blocks(identification(turning, "rotation_line", "order"), turning),
+        active_blocks(identification(turning, "rotation_line", "rotation_order"), turning),
         turning["begin"].values,
         turning["end"].values,
     )
@@ -41,7 +43,7 @@ def test_rotation_line_acts_while_the_tool_rotates(turning):
 
 
 def test_effect_present_at_rest_acts_at_rest(turning):
-    one = identification(turning, "earth_rate", "order")
+    one = identification(turning, "earth_rate", "rotation_order")
     both = replace(
         one, components=(*one.components, *identification(turning, "earth_rate", "mean").components)
     )

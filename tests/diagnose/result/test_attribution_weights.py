@@ -10,27 +10,29 @@ import xarray as xr
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
-from gyrostab.diagnose.predict.candidates import effect_candidates
-from gyrostab.diagnose.predict.condition import Component, condition_on, find_anomalous_blocks
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.attribution_weights import needed_effects
-from gyrostab.diagnose.statistics import mean
+from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks
 from tests.support.named import COEFFICIENT, nulls, record
 
 NAMES = (
     ("vibration_noise", "power", "white"),
     ("vibration_rectification", "mean", "sensitivity"),
-    ("spikes", "marks", "outliers"),
+    ("spikes", "sample_counts", "outliers"),
 )
 
 
 def _make_identification(candidates, effect, statistic, column):
-    one = next(one for one in candidates if (one.effect, one.statistic) == (effect, statistic))
+    one = next(one for one in candidates if (one.effect, one.statistic.name) == (effect, statistic))
     variant = next(
         one
         for one in one.variants
@@ -137,7 +139,9 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
         mean=blocks["mean"] + step * np.stack([after_it, 0 * after_it, 0 * after_it])
     )
     candidates, reasons = effect_candidates(moved, COEFFICIENT)
-    one = next(one for one in candidates if (one.effect, one.statistic) == ("bias_jump", "mean"))
+    one = next(
+        one for one in candidates if (one.effect, one.statistic.name) == ("bias_jump", "mean")
+    )
     variant = next(variant for variant in one.variants if variant.values["at"] == 1800.0)
     identification = Identification(
         "bias_jump", one.driver, ("x",), (Component(one, variant, ("x",), 50.0),), 50.0, 8.0
@@ -154,6 +158,7 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
         fold_blocks(moved),
     )
     fields = {
+        "statistic": "mean",
         "view": "mean",
         "axes": "x",
         "what": "mean",
@@ -164,7 +169,7 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
     }
     fields |= {"frequency": np.nan, "sign": -1, "z": -8.0}
     region = xr.Dataset({name: ("mismatch", [value]) for name, value in fields.items()})
-    assert mean.score(moved, baseline)["what"].values.tolist() == ["mean"]
+    assert find_statistic("mean").score(moved, baseline)["what"].values.tolist() == ["mean"]
 
     def explained(**options):
         return attribute_mismatches(
@@ -226,11 +231,11 @@ def test_effect_is_needed_alone_or_by_a_fair_share(sizes, kept):
 def test_effect_not_contained_in_the_statistic_stays():
     assert needed_effects(
         BOX | {"view": "spectrum"},
-        _make_shown("power", "line"),
+        _make_shown("power", "spectral_line"),
         _scores_without(effect_0=0.0, effect_1=0.0),
     ) == ["effect 0", "effect 1"]
     assert needed_effects(
-        BOX, _make_shown("power", "wander"), _scores_without(effect_0=9.0, effect_1=0.0)
+        BOX, _make_shown("power", "random_process"), _scores_without(effect_0=9.0, effect_1=0.0)
     ) == [
         "effect 0",
         "effect 1",
@@ -246,6 +251,7 @@ def test_effect_not_contained_in_the_statistic_stays():
 @pytest.mark.parametrize(("begin", "regions"), [(70.0, 2), (85.0, 1)])
 def test_short_mismatch_is_merged_only_with_a_near_long_one(begin, regions):
     long = {
+        "statistic": "power",
         "view": "davar",
         "axes": "x y",
         "what": "level",
@@ -278,7 +284,9 @@ def test_line_on_two_axes_explains_their_covariance(shaken, axes, attributed):
     place = int(np.abs(shared["line_frequency"].values - 2.0).argmin())
     candidates, _ = effect_candidates(shared, COEFFICIENT)
     one = next(
-        one for one in candidates if (one.effect, one.statistic) == ("spectral_line", "line")
+        one
+        for one in candidates
+        if (one.effect, one.statistic.name) == ("spectral_line", "spectral_line")
     )
     identification = Identification(
         "spectral_line",

@@ -380,12 +380,24 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
 
 
 @pytest.mark.parametrize(
-    "statistic", ["davar", "mean", "cross_axis", "spectrum", "distribution", "restart"]
+    ("statistic", "what"),
+    [
+        ("power", "avar"),
+        ("mean", "mean"),
+        ("cross_spectrum", "in phase"),
+        ("common_mode", "slow"),
+        ("spectral_line", "line"),
+        ("ramp_phase", "order 2"),
+        ("sample_counts", "outliers"),
+        ("restart", "jump"),
+        ("variance_stability", "variance 20 s"),
+        ("drifting_line", "drifting 1 2"),
+    ],
 )
 @pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
-def test_every_statistic_has_a_sentence(statistic: str, axes: list[str]):
+def test_every_statistic_has_a_sentence(statistic: str, what: str, axes: list[str]):
     region = {
-        "view": statistic, "what": "outliers", "axes": axes, "begin": 0.0, "end": 3600.0,
+        "statistic": statistic, "what": what, "axes": axes, "begin": 0.0, "end": 3600.0,
         "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
         "sign": -1, "p_value": 0.002, "estimate": -0.2, "frequency": 13.0,
     }  # fmt: skip

@@ -20,13 +20,13 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import mixture_limit
 from gyrostab.diagnose.identify.identification import Identification, Identifications
-from gyrostab.diagnose.predict.condition import Component
-from gyrostab.diagnose.predict.designs import Candidate
+from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.result.size_gate import keep_supported, supported_axes
 from gyrostab.diagnose.result.tables import effect_tables, unidentified_tables
 from gyrostab.diagnose.result.text import summary
 from gyrostab.diagnose.result.verdict import decide_verdict, failed_checks
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.physics.registry import effects
 from tests.diagnose.estimate.test_recalibrate import SHAKE, identify_by_hand, reduce_simulation
 from tests.support.diagnosed import content
@@ -45,7 +45,7 @@ def estimate(value: float, error: float) -> Estimate:
 def make_identification(
     effect: str, axes: str, gains: tuple[float, ...] | None = None, *, statistic: str = "mean"
 ) -> Identification:
-    one: Any = Candidate(effect, statistic, (), ())
+    one: Any = Candidate(effect, find_statistic(statistic), (), ())
     variant: Any = SimpleNamespace(values={}, columns=())
     components = tuple(
         Component(one, variant, (axis,), evidence_nats)
@@ -79,7 +79,7 @@ def test_axis_is_supported_if_a_size_differs_from_zero(
 
 
 def test_line_of_zero_amplitude_is_not_an_effect():
-    identification = make_identification("spectral_line", "x", statistic="line")
+    identification = make_identification("spectral_line", "x", statistic="spectral_line")
     nothing = {
         "amplitude": Estimate(0.0, 0.0, 0.0, 0.0, "deg/h"),
         "frequency": Estimate(0.0, 0.1, 0.0, 0.2, "Hz"),

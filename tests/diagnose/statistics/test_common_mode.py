@@ -14,12 +14,10 @@ from scipy import stats
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
-from gyrostab.diagnose.predict.candidates import Candidate, Variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.text import mismatch_statement
-from gyrostab.diagnose.statistics import common_mode as common
-from gyrostab.diagnose.statistics import mean
+from gyrostab.diagnose.statistics import find_statistic
 from tests.support.reduced_records import BLOCK_S, baseline, chunks, records
 
 BLOCKS = 180
@@ -76,7 +74,7 @@ def _with_waveform(found, shares):
 def test_independent_axes_have_normal_scores(assumed, true, missing):
     found = _records_of_means(baseline(walk=true), 60, 3)
     found["mean"][:, 1, 30 : 30 + missing] = np.nan
-    z = common.score(found, baseline(walk=assumed))["z"].values
+    z = find_statistic("common_mode").score(found, baseline(walk=assumed))["z"].values
     few = z[:, :-1, -1, :3]  # each pair over the whole record, for spans with many averages
     assert abs(few.mean()) < 4.0 / np.sqrt(180.0)
     assert 0.7 < few.std() < 1.2  # smaller if independent increments are taken as correlated
@@ -86,10 +84,18 @@ def test_independent_axes_have_normal_scores(assumed, true, missing):
 def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares):
     found = _with_waveform(_quiet_records(30, 5), shares)
     z = np.abs(
-        np.nan_to_num(standardise(common.score(found, base), null.statistics["common_mode"]))
+        np.nan_to_num(
+            standardise(
+                find_statistic("common_mode").score(found, base), null.statistics["common_mode"]
+            )
+        )
     )
     assert (z.max(axis=(1, 2, 3)) > null.critical("common_mode", 0.005)).mean() >= 0.9
-    alone = np.abs(np.nan_to_num(standardise(mean.score(found, base), null.statistics["mean"])))
+    alone = np.abs(
+        np.nan_to_num(
+            standardise(find_statistic("mean").score(found, base), null.statistics["mean"])
+        )
+    )
     assert (alone.max(axis=(1, 2, 3)) > null.critical("mean", 0.005)).mean() <= 0.1
 
 
@@ -101,7 +107,10 @@ def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares)
 def test_scores_do_not_depend_on_sizes_of_axes(sizes, signs):
     noise, found = baseline(walk=WALK), _quiet_records(1, 9).isel(record=0)
     scaled = found.assign(mean=found["mean"] * xr.DataArray(np.multiply(sizes, signs), dims="axis"))
-    before, after = (common.score(one, noise)["estimate"].values for one in (found, scaled))
+    before, after = (
+        find_statistic("common_mode").score(one, noise)["estimate"].values
+        for one in (found, scaled)
+    )
     turned = np.array([signs[0] * signs[1], signs[0] * signs[2], signs[1] * signs[2], 1.0])[
         :, None, None
     ]
@@ -111,7 +120,7 @@ def test_scores_do_not_depend_on_sizes_of_axes(sizes, signs):
 def test_score_of_all_axes_is_that_of_the_determinant():
     noise = baseline()
     found = _records_of_means(noise, 500, 12)
-    scores = common.score(found, noise)
+    scores = find_statistic("common_mode").score(found, noise)
     assert stats.kstest(stats.norm.sf(scores["z"].values[:, -1, -1, 0]), "uniform").pvalue > 1e-3
     matrix = np.corrcoef(
         found["mean"].values[0]
@@ -135,7 +144,8 @@ def test_known_common_white_noise_is_subtracted():
     ).isel(axis=0)
     known = noise.assign(cross=(("pair", "block", "band"), share * noise["spectrum"].values + 0j))
     before, after = (
-        common.score(found, each)["estimate"].values[:, :3, -1, 0] for each in (noise, known)
+        find_statistic("common_mode").score(found, each)["estimate"].values[:, :3, -1, 0]
+        for each in (noise, known)
     )
     assert before.mean() == pytest.approx(share, abs=0.03)
     assert abs(after.mean()) < 0.04
@@ -146,7 +156,7 @@ def test_known_means_are_subtracted(base):
     found = _with_waveform(_quiet_records(20, 5), shares)
     known = base.assign(known_mean=(("axis", "block"), shares[:, None] * _slow_waveform()))
     before, after = (
-        np.abs(common.score(found, each)["z"].values[:, :3, -1, :3]).mean()
+        np.abs(find_statistic("common_mode").score(found, each)["z"].values[:, :3, -1, :3]).mean()
         for each in (base, known)
     )
     assert after < 1.2 < 2.5 < before
@@ -154,10 +164,18 @@ def test_known_means_are_subtracted(base):
 
 def test_one_axis_or_a_short_record_has_no_score():
     alone = baseline(axes="x")
-    assert common.score(records(alone, 2, np.random.default_rng(1)), alone) is None
+    assert (
+        find_statistic("common_mode").score(records(alone, 2, np.random.default_rng(1)), alone)
+        is None
+    )
     found = _records_of_means(baseline(), 2, 1)
-    assert common.score(found.isel(block=slice(0, 4)), baseline().isel(block=slice(0, 4))) is None
-    assert common.score(found, baseline())["tau_min_s"].values.tolist() == [
+    assert (
+        find_statistic("common_mode").score(
+            found.isel(block=slice(0, 4)), baseline().isel(block=slice(0, 4))
+        )
+        is None
+    )
+    assert find_statistic("common_mode").score(found, baseline())["tau_min_s"].values.tolist() == [
         BLOCK_S * span for span in (1, 2, 4, 8, 16, 32)
     ]
 
@@ -165,7 +183,9 @@ def test_one_axis_or_a_short_record_has_no_score():
 def _identification_of(statistic: str, axes: str):
     variant = Variant({}, ("0",), np.broadcast_to(_slow_waveform(), (1, 1, BLOCKS)))
     components = tuple(
-        Component(Candidate("cause", statistic, (), (variant,)), variant, (axis,), 10.0)
+        Component(
+            Candidate("cause", find_statistic(statistic), (), (variant,)), variant, (axis,), 10.0
+        )
         for axis in axes
     )
     return SimpleNamespace(effect="cause", axes=tuple(axes), components=components)
@@ -197,12 +217,15 @@ def test_common_motion_is_one_region_explained_by_its_effect(base, null):
 
     assert explanation_of("mean", "xyz", known) == ["cause"]
     assert explanation_of("mean", "xyz", base) == []  # in the model, but leaves the mismatch
-    assert explanation_of("wander", "xyz", base) == ["cause"]  # its covariance is in no model
-    assert explanation_of("wander", "x", base) == []
+    assert explanation_of("random_process", "xyz", base) == [
+        "cause"
+    ]  # its covariance is in no model
+    assert explanation_of("random_process", "x", base) == []
 
 
 def test_common_motion_is_separate_from_common_noise_within_blocks():
     slow = {
+        "statistic": "common_mode",
         "view": "cross_axis",
         "axes": "x y z",
         "what": "slow",

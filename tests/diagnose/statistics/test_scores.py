@@ -12,12 +12,9 @@ from scipy import stats
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics import STATISTICS, mean, restart
 from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
-from gyrostab.diagnose.statistics import phase_locked as locked
+from gyrostab.diagnose.statistics import find_statistic, mean
 from gyrostab.diagnose.statistics import power as davar
-from gyrostab.diagnose.statistics import sample_counts as distribution
-from gyrostab.diagnose.statistics import spectral_line as spectrum
 from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     exponential_score,
@@ -121,7 +118,7 @@ def test_scores_are_normal_without_an_effect(missing, slow):
     base = baseline(missing=missing, **slow)
     found = records(base, 40, np.random.default_rng(3), missing=missing)
     for name in ("power", "mean", "cross_spectrum", "spectral_line"):
-        scores = STATISTICS[name](found, base)
+        scores = find_statistic(name).score(found, base)
         z = scores["z"].values
         z = z[np.isfinite(z)]
         assert abs(z.mean()) < 0.05, name
@@ -135,13 +132,13 @@ def _detection_share(scores, null, name, level=0.01):
     return float((z.max(axis=(1, 2, 3)) > null.critical(name, level)).mean())
 
 
-def _shares_around_limit(make, limit, statistic, name, base, null):
+def _shares_around_limit(make, limit, name, base, null):
     """Return the share of records detected at 3/4 and at 5/4 of the theoretical limit."""
     shares = []
     for factor in (0.75, 1.25):
         found = records(base, 60, np.random.default_rng(17))
         make(found, factor * limit)
-        shares.append(_detection_share(statistic.score(found, base), null, name))
+        shares.append(_detection_share(find_statistic(name).score(found, base), null, name))
     return shares
 
 
@@ -151,9 +148,7 @@ def test_detection_limit_of_raised_noise(base, null):
 
     samples = 0.86 * 15 * BLOCK_S * RATE  # effective number under the taper
     nats = null.critical("power", 0.01) ** 2 / 2.0
-    below, above = _shares_around_limit(
-        burst, 2.0 * np.sqrt(nats / samples), davar, "power", base, null
-    )
+    below, above = _shares_around_limit(burst, 2.0 * np.sqrt(nats / samples), "power", base, null)
     assert below < 0.5 < above
 
 
@@ -164,7 +159,7 @@ def test_detection_limit_of_a_mean_step(base, null):
     nats = null.critical("mean", 0.01) ** 2 / 2.0
     on, record = 15 * BLOCK_S, 180 * BLOCK_S
     limit = np.sqrt(LEVEL) * np.sqrt(2.0 * nats / (on * (1.0 - on / record)))
-    below, above = _shares_around_limit(step, limit, mean, "mean", base, null)
+    below, above = _shares_around_limit(step, limit, "mean", base, null)
     assert below < 0.5 < above
 
 
@@ -176,7 +171,7 @@ def test_detection_limit_of_shared_noise(base, null):
 
     nats = null.critical("cross_spectrum", 0.01) ** 2 / 2.0
     limit = np.sqrt(2.0 * nats / (0.86 * 180 * BLOCK_S * RATE) / 3.0)  # three equal pairs
-    below, above = _shares_around_limit(shared, limit, cross_axis, "cross_spectrum", base, null)
+    below, above = _shares_around_limit(shared, limit, "cross_spectrum", base, null)
     assert below < 0.5 < above
 
 
@@ -192,15 +187,15 @@ def test_detection_limit_of_a_line(base, null):
     limit = 2.0 * np.sqrt(
         null.critical("spectral_line", 0.01) * LEVEL / (0.926 * BLOCK_S * np.sqrt(180))
     )
-    below, above = _shares_around_limit(line, limit, spectrum, "spectral_line", base, null)
+    below, above = _shares_around_limit(line, limit, "spectral_line", base, null)
     assert below < 0.5 < above
 
 
 def test_the_mean_shows_a_step_between_windows_that_davar_does_not(base, null):
     found = records(base, 40, np.random.default_rng(4))
     found["mean"][:, 0, 60:120] += 0.06
-    assert _detection_share(mean.score(found, base), null, "mean") > 0.9
-    scores = davar.score(found, base)
+    assert _detection_share(find_statistic("mean").score(found, base), null, "mean") > 0.9
+    scores = find_statistic("power").score(found, base)
     scores["z"] = scores["z"].where(
         scores["stop"] - scores["first"] <= 15
     )  # the whole record shows it at its longest tau
@@ -224,7 +219,7 @@ def test_a_step_raises_the_allan_variance_by_the_closed_form():
 def test_the_mean_estimates_the_step(base):
     found = records(base, 1, np.random.default_rng(8)).isel(record=0)
     found["mean"][2, 60:105] += 0.5
-    scores = mean.score(found, base)
+    scores = find_statistic("mean").score(found, base)
     best = int(np.nanargmax(scores["z"].values[2, :, 0]))
     assert (int(scores["first"][best]), int(scores["stop"][best])) == (60, 105) or abs(
         int(scores["first"][best]) - 60
@@ -244,7 +239,7 @@ def test_a_line_estimates_its_amplitude():
         {"spectrum": (("axis", "block", "band"), np.full(blocks["power"].shape, LEVEL))},
         coords={"axis": blocks["axis"], "frequency": blocks["frequency"]},
     )
-    scores = spectrum.score(blocks, flat)
+    scores = find_statistic("spectral_line").score(blocks, flat)
     best = int(np.nanargmax(scores["z"].values[0, -1]))
     assert float(scores["frequency"][best]) == pytest.approx(13.37, abs=0.06)
     assert float(scores["estimate"][0, -1, best]) == pytest.approx(0.3, rel=0.1)
@@ -253,7 +248,7 @@ def test_a_line_estimates_its_amplitude():
 def test_phase_locked_rates_are_detected(base):
     rng = np.random.default_rng(9)
     found = records(base, 1, rng).isel(record=0)
-    assert locked.score(found, base) is None
+    assert find_statistic("ramp_phase").score(found, base) is None
     block_count, samples = 180, BLOCK_S * RATE
     spread = np.sqrt(2.0 * LEVEL * RATE / samples)
     order = spread * (
@@ -264,7 +259,7 @@ def test_phase_locked_rates_are_detected(base):
     found["profile"] = (("record", "axis", "block", "phase"), profile)
     found["profile_samples"] = (("axis", "block", "phase"), np.full((3, block_count, 40), 50))
     found["channel_rotation_rate"] = ("block", np.full(block_count, 720.0))
-    scores = locked.score(found, base)
+    scores = find_statistic("ramp_phase").score(found, base)
     z = scores["z"].values
     assert scores["what"].values.tolist() == ["order 1", "order 2", "order 3", "ramp phase"]
     assert np.allclose(z.std(axis=(0, 1, 2)), 1.0, atol=0.1)
@@ -273,7 +268,7 @@ def test_phase_locked_rates_are_detected(base):
     found["profile"] = found["profile"] + xr.DataArray(
         0.1 * np.sin(2 * np.pi * np.arange(40) / 40), dims="phase"
     )
-    scores = locked.score(found, base)
+    scores = find_statistic("ramp_phase").score(found, base)
     assert np.median(scores["estimate"].values[:, 0, -1, 1]) == pytest.approx(0.05, rel=0.1)
     assert np.median(scores["estimate"].values[:, 1, -1, 3]) == pytest.approx(
         0.1 / np.sqrt(2.0), rel=0.1
@@ -283,10 +278,10 @@ def test_phase_locked_rates_are_detected(base):
 
 def test_transients_and_jumps_after_restarts_are_detected(base):
     found = records(base, 60, np.random.default_rng(10))
-    assert restart.score(found, base) is None
+    assert find_statistic("restart").score(found, base) is None
     found["restart_begin"] = ("restart", np.array([1000.0, 2400.0]))
     found["restart_end"] = ("restart", np.array([1010.0, 2410.0]))
-    z = restart.score(found, base)["z"].values
+    z = find_statistic("restart").score(found, base)["z"].values
     assert np.nanstd(z) == pytest.approx(1.0, abs=0.06)
     since = np.where(
         np.arange(180) >= 121,
@@ -295,11 +290,11 @@ def test_transients_and_jumps_after_restarts_are_detected(base):
     )
     raised = found.copy()
     raised["mean"] = found["mean"] + xr.DataArray(0.2 * np.exp(-since / 6.0), dims="block")
-    scores = restart.score(raised, base)
+    scores = find_statistic("restart").score(raised, base)
     assert float(np.nanmean(scores["estimate"].values[..., 1, 1])) == pytest.approx(0.2, rel=0.05)
     jumped = found.copy()
     jumped["mean"][:, :, 121:] += 0.1
-    scores = restart.score(jumped, base)
+    scores = find_statistic("restart").score(jumped, base)
     jump = scores["estimate"].values[:, :, -1, -1]
     assert np.mean(jump) == pytest.approx(0.1, rel=0.05)
     assert int(scores["first"][-1]) == 121
@@ -310,7 +305,7 @@ def test_sample_counts_and_tails_are_detected(base):
     found["outliers"][:] = 0
     found["outliers"][1, 0, 40:43] = 2
     found["kurtosis"][1, 2, 90:120] += 0.5
-    scores = distribution.score(found, base)
+    scores = find_statistic("sample_counts").score(found, base)
     of = scores["what"].values.tolist().index
     z = scores["z"].values
     short = scores["stop"].values - scores["first"].values == 5
@@ -351,7 +346,7 @@ def test_correlation_score_matches_student():
 def test_one_axis_has_no_pairs():
     base = baseline(axes="x")
     found = records(base, 2, np.random.default_rng(1))
-    assert cross_axis.score(found, base) is None
+    assert find_statistic("cross_spectrum").score(found, base) is None
 
 
 @pytest.mark.parametrize("loud", [(6_050, 12_000), (6_050, 6_540)])
@@ -365,6 +360,8 @@ def test_a_noise_burst_is_neither_shared_nor_a_line(loud):
         )
         base = calibrate_noise(found, quiet=np.arange(120) < 60)
         for name, values in largest.items():
-            values.append(float(np.nanmax(np.abs(STATISTICS[name](found, base)["z"].values))))
+            values.append(
+                float(np.nanmax(np.abs(find_statistic(name).score(found, base)["z"].values)))
+            )
     assert max(largest["cross_spectrum"]) < 4.8
     assert max(largest["spectral_line"]) < 4.8

@@ -15,9 +15,7 @@ from gyrostab.diagnose.nulls.records import _correlate_lines
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.text import mismatch_statement
-from gyrostab.diagnose.statistics import drifting_line as gliding
-from gyrostab.diagnose.statistics import spectral_line as spectrum
-from gyrostab.diagnose.statistics import variance_stability
+from gyrostab.diagnose.statistics import find_statistic, variance_stability
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import taper
 from tests.support.reduced_records import baseline, chunks, records
@@ -42,7 +40,7 @@ def _some_records(base, count, seed):
 
 def _largest_score(statistic, found, base, null, row=slice(None)):
     """Return the largest standardised score of each record."""
-    name = statistic.__name__.rsplit(".", 1)[1]
+    name = statistic.name
     z = np.nan_to_num(standardise(statistic.score(found, base), null.statistics[name]))
     return z[:, row].reshape(z.shape[0], -1).max(axis=1)
 
@@ -64,7 +62,7 @@ def test_moments_of_the_scatter_match_simulated_levels(count, seed):
 
 
 def test_scores_of_steady_noise_are_normal(base):
-    z = variance_stability.score(_some_records(base, 60, 3), base)["z"].values
+    z = find_statistic("variance_stability").score(_some_records(base, 60, 3), base)["z"].values
     z = z[np.isfinite(z)]
     assert abs(z.mean()) < 0.05
     assert z.std() == pytest.approx(1.0, abs=0.06)
@@ -83,7 +81,10 @@ def test_detection_limit_of_variance_fluctuation(base, null):
         found = _some_records(base, 60, 17)
         found["power"][:, 0] *= np.exp(factor * limit * swell)[:, None]
         shares.append(
-            (_largest_score(variance_stability, found, base, null, row=0) > critical).mean()
+            (
+                _largest_score(find_statistic("variance_stability"), found, base, null, row=0)
+                > critical
+            ).mean()
         )
     assert shares[0] < 0.5 < shares[1]
 
@@ -92,7 +93,7 @@ def test_common_variance_fluctuation_is_detected_jointly(base, null):
     found = _some_records(base, 30, 5)
     found["power"] *= np.exp(0.09 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 12.0))[:, None]
     together, alone = (
-        np.median(_largest_score(variance_stability, found, base, null, row=row))
+        np.median(_largest_score(find_statistic("variance_stability"), found, base, null, row=row))
         for row in (3, slice(0, 3))
     )
     assert together > null.critical("variance_stability", 0.01) > alone
@@ -106,7 +107,7 @@ def test_scores_do_not_depend_on_the_noise_level(factor):
     louder = found.copy(deep=True)
     louder["power"][:, 1] *= factor
     kept = [
-        variance_stability.score(one, base)["z"].isel(row=[0, 1, 2]).values
+        find_statistic("variance_stability").score(one, base)["z"].isel(row=[0, 1, 2]).values
         for one in (found, louder)
     ]
     np.testing.assert_allclose(*kept, atol=1e-6)
@@ -116,7 +117,7 @@ def test_a_single_noisy_block_is_not_variance_fluctuation(base, null):
     found = _some_records(base, 20, 6)
     found["power"][:, 0, 50] *= 30.0
     assert (
-        _largest_score(variance_stability, found, base, null)
+        _largest_score(find_statistic("variance_stability"), found, base, null)
         > null.critical("variance_stability", 0.01)
     ).mean() <= 0.1
 
@@ -127,9 +128,14 @@ def test_shared_noise_is_not_variance_fluctuation(base, null):
     found["power"][:, 2] = found["power"][:, 0]
     found["cross"][:] = found["power"][:, 0].values[:, None]
     critical = null.critical("variance_stability", 0.01)
-    assert (_largest_score(variance_stability, found, base, null, row=3) > critical).mean() <= 0.1
     assert (
-        _largest_score(variance_stability, found.drop_vars("cross"), base, null, row=3) > critical
+        _largest_score(find_statistic("variance_stability"), found, base, null, row=3) > critical
+    ).mean() <= 0.1
+    assert (
+        _largest_score(
+            find_statistic("variance_stability"), found.drop_vars("cross"), base, null, row=3
+        )
+        > critical
     ).mean() > 0.9  # if it were not known
 
 
@@ -182,8 +188,10 @@ def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, ben
     energy = 9.0 * np.sqrt(abs(last - first) / (8.0 * BLOCKS))  # nine standard deviations in theory
     _moving_line(found, 1, first, last, energy, bend)
     critical = null.critical("drifting_line", 0.01)
-    assert (_largest_score(gliding, found, base, null) > critical).mean() > 0.5
-    scores = gliding.score(found, base)
+    assert (
+        _largest_score(find_statistic("drifting_line"), found, base, null) > critical
+    ).mean() > 0.5
+    scores = find_statistic("drifting_line").score(found, base)
     best = scores["what"].values[
         np.bincount(
             standardise(scores, null.statistics["drifting_line"])[:, 1, 0].argmax(axis=1)
@@ -193,7 +201,9 @@ def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, ben
     assert begins == pytest.approx(first * 0.05, abs=0.65)
     assert ends == pytest.approx(last * 0.05, abs=0.65)
     single = null.critical("spectral_line", 0.01)
-    assert (_largest_score(spectrum, found, base, null) > single).mean() < 0.5
+    assert (
+        _largest_score(find_statistic("spectral_line"), found, base, null) > single
+    ).mean() < 0.5
 
 
 def test_a_steady_line_and_a_temporary_hump_do_not_drift(base, null):
@@ -202,17 +212,20 @@ def test_a_steady_line_and_a_temporary_hump_do_not_drift(base, null):
     found["line_power"][:, 1, 3, 20:60] *= 3.0
     found["line_power"][:, 2, 2:6] *= 4.0
     assert (
-        _largest_score(gliding, found, base, null) > null.critical("drifting_line", 0.01)
+        _largest_score(find_statistic("drifting_line"), found, base, null)
+        > null.critical("drifting_line", 0.01)
     ).mean() <= 0.1
 
 
 def test_steady_noise_has_no_drifting_line(base, null):
     assert (
-        _largest_score(gliding, _some_records(base, 100, 14), base, null)
+        _largest_score(find_statistic("drifting_line"), _some_records(base, 100, 14), base, null)
         > null.critical("drifting_line", 0.01)
     ).mean() <= 0.03
     assert (
-        _largest_score(variance_stability, _some_records(base, 100, 15), base, null)
+        _largest_score(
+            find_statistic("variance_stability"), _some_records(base, 100, 15), base, null
+        )
         > null.critical("variance_stability", 0.01)
     ).mean() <= 0.03
 
@@ -220,21 +233,21 @@ def test_steady_noise_has_no_drifting_line(base, null):
 def test_short_records_have_no_score(base):
     few = {"rate": 10.0, "block_count": 5}
     assert (
-        variance_stability.score(
+        find_statistic("variance_stability").score(
             records(baseline(**few), 2, np.random.default_rng(1), **few), baseline(**few)
         )
         is None
     )
     found = _some_records(base, 2, 1)
-    assert gliding.score(found.drop_vars("line_power"), base) is None
+    assert find_statistic("drifting_line").score(found.drop_vars("line_power"), base) is None
     found["line_weight"][:, 4:] = 0.0
-    assert gliding.score(found, base) is None
+    assert find_statistic("drifting_line").score(found, base) is None
 
 
 @pytest.mark.parametrize("block_count", [213, 218, 255])
 def test_windows_after_the_last_average_have_no_score(block_count):
     small = {"rate": 10.0, "block_count": block_count}
-    found = variance_stability.score(
+    found = find_statistic("variance_stability").score(
         records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small)
     )
     behind = (found["first"] > block_count // 32 * 32).values
@@ -250,7 +263,7 @@ def test_a_part_without_samples_is_skipped(base, null):
     found = _some_records(base, 12, 16)
     _moving_line(found, 0, 20, 60, 7.0 * np.sqrt(40.0 / (8.0 * BLOCKS)))
     found["line_power"][:, :, 4], found["line_weight"][:, 4] = np.nan, 0.0
-    z = gliding.score(found, base)["z"].values
+    z = find_statistic("drifting_line").score(found, base)["z"].values
     assert np.isfinite(z).any()
     assert np.median(np.nanmax(z, axis=(1, 2, 3))) > 3.0
 
@@ -258,12 +271,13 @@ def test_a_part_without_samples_is_skipped(base, null):
 def test_one_axis_has_no_joint_row():
     one = baseline(axes="x", **SMALL)
     found = records(one, 2, np.random.default_rng(1), **SMALL)
-    assert variance_stability.score(found, one)["axes"].values.tolist() == ["x"]
-    assert gliding.score(found, one)["axes"].values.tolist() == ["x"]
+    assert find_statistic("variance_stability").score(found, one)["axes"].values.tolist() == ["x"]
+    assert find_statistic("drifting_line").score(found, one)["axes"].values.tolist() == ["x"]
 
 
 def test_a_level_and_its_scatter_are_two_mismatches():
     region = {
+        "statistic": "variance_stability",
         "view": "davar",
         "axes": "x",
         "what": "avar",
@@ -289,6 +303,7 @@ def test_a_level_and_its_scatter_are_two_mismatches():
 
 def test_statements_give_time_scale_and_frequencies():
     region = {
+        "statistic": "variance_stability",
         "view": "davar",
         "what": "variance 40 s",
         "axes": ["x", "y"],
@@ -302,7 +317,7 @@ def test_statements_give_time_scale_and_frequencies():
     assert "axes x and y fluctuates over the whole record" in told
     assert "one stretch of 40 s to another" in told
     assert "8 % (rms)" in told
-    glide = region | {"view": "spectrum", "what": "drifting 1.58 3.42", "axes": ["y"]}
+    glide = region | {"statistic": "drifting_line", "what": "drifting 1.58 3.42", "axes": ["y"]}
     assert (
         "a drifting line over the whole record, from about 1.58 Hz to about 3.42 Hz"
         in mismatch_statement(glide, 2000.0)
@@ -336,4 +351,6 @@ def test_an_interval_that_ends_within_a_block_leaves_no_fluctuation():
     )
     base = calibrate_noise(blocks, quiet=np.arange(60) < 20)
     told = variance_stability.scale_to_expected(blocks, base, [(("x", "y"), 2_000.0, 4_100.0)])
-    assert float(np.nanmax(variance_stability.score(told, base)["z"].values)) < 4.8
+    assert (
+        float(np.nanmax(find_statistic("variance_stability").score(told, base)["z"].values)) < 4.8
+    )

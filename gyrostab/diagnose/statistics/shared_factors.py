@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Variant, rebuild_variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State, cross_column, pair_rows
 from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 
@@ -43,7 +43,7 @@ def estimate_shared_factors(
     Parameters
     ----------
     components : sequence of Component
-        In the statistic "cross".
+        Of cross-spectra.
     axes : tuple of str
         Axes of the effect.
     state : State

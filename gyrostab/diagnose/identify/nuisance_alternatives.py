@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.noise import sampled_psd
 
 __all__ = ["NUISANCE_ALTERNATIVES", "burst_intervals", "hat_functions", "nuisance_alternatives"]
@@ -79,26 +80,35 @@ def nuisance_alternatives(blocks: xr.Dataset) -> list[Candidate]:
     )
     candidates = [
         Candidate(
-            "~bias(t)", "mean", (), (Variant({}, _numbered_columns(len(hats)), hats[:, None, :]),)
+            "~bias(t)",
+            find_statistic("mean"),
+            (),
+            (Variant({}, _numbered_columns(len(hats)), hats[:, None, :]),),
         ),
-        Candidate("~N(t)", "power", (), (Variant({}, _numbered_columns(len(hats)), level),)),
-        Candidate("~burst", "power", (), bursts),
+        Candidate(
+            "~N(t)",
+            find_statistic("power"),
+            (),
+            (Variant({}, _numbered_columns(len(hats)), level),),
+        ),
+        Candidate("~burst", find_statistic("power"), (), bursts),
         Candidate(
             "~S(f)",
-            "power",
+            find_statistic("power"),
             (),
             (*_single_designs(shapes), Variant({}, _numbered_columns(bands), shapes)),
         ),
         Candidate(
             "~outliers",
-            "marks",
+            find_statistic("sample_counts"),
             (),
             (Variant({}, ("kurtosis",), np.empty(0)),),
-            marks=("kurtosis",),
         ),
     ]
     if "cross" in blocks and blocks.sizes["pair"]:
-        candidates.append(Candidate("~cov", "cross", (), _covariance_variants(bands)))
+        candidates.append(
+            Candidate("~cov", find_statistic("cross_spectrum"), (), _covariance_variants(bands))
+        )
     return candidates
 
 

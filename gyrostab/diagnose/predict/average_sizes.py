@@ -8,10 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.grid_refinement import Point, refine_grid
-from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.predict.candidates import Variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.grid_refinement import Point, refine_grid
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
 from gyrostab.diagnose.settings import INTERVAL_TAILS
@@ -24,7 +22,7 @@ MAX_ZERO_LAG_S = 1e-2  # a lag that counts as zero
 
 
 def average_sizes(
-    component: Component, state: State, identifications: Identifications
+    component: Component, state: State, candidates: Sequence[Candidate]
 ) -> tuple[Array, Array, dict[str, tuple[float, ...]]]:
     """Return the sizes of a component, averaged over the noise and the nuisance parameters.
 
@@ -38,8 +36,8 @@ def average_sizes(
     component : Component
     state : State
         With all other effects in the model.
-    identifications : Identifications
-        Its candidates have the grid.
+    candidates : sequence of Candidate
+        All that were tried; they have the grid.
 
     Returns
     -------
@@ -52,7 +50,7 @@ def average_sizes(
     """
     grid = [
         Point(variant, component_mixture(component, state, variant))
-        for variant in _variant_family(component, identifications)
+        for variant in _variant_family(component, candidates)
     ]
     usual = _usual_places(
         component,
@@ -112,13 +110,13 @@ def _merge_points(points: Sequence[Point]) -> Mixture:
     )
 
 
-def _variant_family(component: Component, identifications: Identifications) -> list[Variant]:
+def _variant_family(component: Component, candidates: Sequence[Candidate]) -> list[Variant]:
     """Return the variants of the component with the same columns: the grid."""
     candidate = next(
         (
             one
-            for one in identifications.candidates
-            if one.key == component.candidate.key and one.statistic == component.candidate.statistic
+            for one in candidates
+            if one.key == component.candidate.key and one.statistic is component.statistic
         ),
         component.candidate,
     )

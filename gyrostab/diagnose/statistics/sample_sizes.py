@@ -7,11 +7,11 @@ import math
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.predict.search import CountEvidence
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
 from gyrostab.units import HOUR
 
-__all__ = ["estimate_from_counts", "estimate_line"]
+__all__ = ["estimate_from_counts"]
 
 #: Standard deviation of the difference of white noise and the median of its eight neighbours, in
 #: standard deviations of the noise.
@@ -22,30 +22,6 @@ MIN_CLEAN_BLOCKS = 5  # without an outlier, that determine the noise level
 #: half of the share that is not seen.
 LAW_ERROR_SHARE = 0.1
 Pair = tuple[float, float]
-
-
-def estimate_line(blocks: xr.Dataset, axis: str, place: int) -> tuple[Pair, Pair]:
-    """Estimate amplitude [degree hour-1] and frequency [Hz] of a line, each with its error.
-
-    The amplitude follows from the power about the line that exceeds the local level.
-    """
-    from gyrostab.diagnose.evidence.spectral_lines import line_skirt, local_level
-
-    lines = blocks["line_frequency"].values
-    weight = blocks["line_weight"].sel(axis=axis).values
-    power = blocks["line_power"].sel(axis=axis).transpose("part", "line").values
-    good = (weight > 0) & np.isfinite(power).all(axis=1)
-    total = (power[good] * weight[good, None]).sum(axis=0) / weight[good].sum()
-    level = local_level(total[None, None])[0, 0]
-    near = line_skirt(blocks, axis, place)
-    step = float(np.diff(lines[:2])[0])
-    above = total[near] - level[near]
-    square = 4.0 * max(float(above.sum()) * step, 0.0)
-    noise = 4.0 * step * float(np.sqrt((level[near] * total[near]).sum() / weight[good].sum()))
-    amplitude = math.sqrt(square)
-    positive = np.maximum(above, 0.0)
-    frequency = float((positive * lines[near]).sum() / max(positive.sum(), 1e-300))
-    return (amplitude, noise / (2.0 * max(amplitude, math.sqrt(noise)))), (frequency, 0.5 * step)
 
 
 def estimate_from_counts(

@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from gyrostab.diagnose.predict.candidates import Variant, rebuild_variant
-from gyrostab.diagnose.predict.condition import Component
+from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
+from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.errors import OptionError
 from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
@@ -122,7 +122,7 @@ class PlacedPoint:
 
 def _find_scale(component: Component, points: Sequence[Point]) -> str | None:
     """Return the first parameter of the grid that is a scale and has several values."""
-    if component.candidate.statistic != "mean":
+    if not component.statistic.is_linear_in_means:
         return None
     for name in points[0].variant.values:
         values = {point.variant.values.get(name) for point in points}

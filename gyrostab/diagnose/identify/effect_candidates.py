@@ -1,0 +1,257 @@
+"""Candidates: the predictions of every registered effect over its grid of nuisance parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.sample_counts import GRID_COUNTS, has_coarse_grid
+from gyrostab.diagnose.predict.candidates import Candidate
+from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
+from gyrostab.diagnose.predict.step_times import select_step_times
+from gyrostab.diagnose.predict.windows import (
+    TIME_PARAMETER,
+    channel_units,
+    make_windows,
+    predict_exogenous,
+)
+from gyrostab.diagnose.statistics import STATISTICS
+from gyrostab.errors import OptionError
+from gyrostab.noise import HOUR
+from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Prediction, Windows
+from gyrostab.physics.registry import effects
+
+__all__ = ["LARGEST_SIZE", "effect_candidates"]
+
+Array = NDArray[Any]
+_MAX_VALUES = 60  # of a nuisance parameter; limits time
+_MAX_VARIANTS = 200  # of a candidate; limits time
+#: Effect -> largest plausible size of each of its parameters. Design choice.
+LARGEST_SIZE = {"misalignment": 20.0, "earth_rate": 20.0}
+_MIN_SIZE_STDERRS = 3.0  # of an effect of the largest size, to be tried; design choice
+_SAME_DESIGN = {"fringe_hop": "bias_jump"}  # effects with the same design; the size decides
+
+
+def effect_candidates(
+    blocks: xr.Dataset, coefficient: xr.DataArray
+) -> tuple[list[Candidate], dict[str, str]]:
+    """Build the candidates of all registered effects that this record can show.
+
+    Parameters
+    ----------
+    blocks : xarray.Dataset
+        From `reduce_log`.
+    coefficient : xarray.DataArray
+        ``(axis, term)``: noise of the baseline, in units of the noise model.
+
+    Returns
+    -------
+    candidates : list of Candidate
+    reasons : dict of str to str
+        Why an effect cannot be seen in this record.
+
+    Examples
+    --------
+    >>> from gyrostab.diagnose.reduce.block_statistics import reduce_log
+    >>> from gyrostab.ingest.make_log import make_log
+    >>> noise = 1.8 * np.random.default_rng(1).standard_normal((1, 60_000))
+    >>> blocks = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
+    >>> coordinates = {"axis": ["axis_0"], "term": ["N", "B"]}
+    >>> level = xr.DataArray([[0.003, 0.0]], coordinates, ("axis", "term"))
+    >>> found, reasons = effect_candidates(blocks, level)
+    >>> reasons["shupe"]
+    'not identifiable: the recording has no channel temperature'
+    >>> sorted({one.effect for one in found if one.statistic.is_count})
+    ['clipping', 'dead_zone', 'held_samples', 'rate_quantization', 'spikes']
+    """
+    units = channel_units(blocks)
+    found: list[Candidate] = []
+    reasons: dict[str, str] = {}
+    for name, kind in effects().items():
+        if name in _SAME_DESIGN:
+            continue
+        built: list[Candidate] = []
+        reason = ""
+        if _is_hidden_by_grid(kind, blocks):
+            reasons[name] = "not identifiable: the quantization grid is too coarse"
+            continue
+        for drivers in _driver_assignments(kind, blocks, units):
+            added, why = _candidates_of_effect(kind, blocks, drivers, coefficient)
+            built += added
+            reason = reason or why
+        found += built
+        if not built:
+            why = reason or "it leaves no trace in means, spectra and distribution of this record"
+            reasons[name] = f"not identifiable: {why}"
+    return found, reasons
+
+
+def _is_hidden_by_grid(kind: type[Effect], blocks: xr.Dataset) -> bool:
+    """Return whether a coarse quantization grid hides every statistic of the effect on all axes."""
+    if kind.channels or not has_coarse_grid(blocks).all():
+        return False
+    marks = kind.example().explain(make_windows(blocks, {})).marks
+    return bool(marks) and set(marks) <= set(GRID_COUNTS)
+
+
+# -------------------------------------------------------------------------------
+# channels
+
+
+def _driver_assignments(
+    kind: type[Effect], blocks: xr.Dataset, units: Mapping[str, str]
+) -> Iterator[dict[str, str]]:
+    """Yield assignments of the log's channels to the effect's, in all sensible ways."""
+    options = [
+        _matching_channels(channel, unit, tuple(kind.channels), blocks, units) or [""]
+        for channel, unit in kind.channels.items()
+    ]
+    assigned = set()
+    for chosen in product(*options):
+        named = [name for name in chosen if name]
+        if len(set(named)) < len(named) or frozenset(named) in assigned:
+            continue
+        assigned.add(frozenset(named))
+        yield {channel: name for channel, name in zip(kind.channels, chosen, strict=True) if name}
+    if not assigned:
+        yield {}
+
+
+def _matching_channels(
+    channel: str,
+    unit: str,
+    channels: tuple[str, ...],
+    blocks: xr.Dataset,
+    units: Mapping[str, str],
+) -> list[str]:
+    """Return channels of the log for one of the effect's: vectors by name, others by prefix."""
+    if sum(other[:-1] == channel[:-1] for other in channels) > 1 and channel[-1] in "xyz":
+        names = [channel]
+    else:
+        base = channel.rstrip("0123456789").rstrip("_")
+        names = sorted(
+            (name for name in units if name == base or name.startswith(base + "_")),
+            key=lambda name: (name != channel, name),
+        )
+    return [
+        name
+        for name in names
+        if units.get(name) == unit
+        and np.isfinite(blocks[f"channel_{name}"].values).mean() >= MIN_BLOCK_SHARE
+    ]
+
+
+# -------------------------------------------------------------------------------
+# variants
+
+
+def _candidates_of_effect(
+    kind: type[Effect], blocks: xr.Dataset, drivers: dict[str, str], coefficient: xr.DataArray
+) -> tuple[list[Candidate], str]:
+    """Build the candidates of an effect with its channels, by statistic; or say why not."""
+    if kind.channels and not drivers:
+        without = [
+            candidate
+            for statistic in STATISTICS
+            for candidate in statistic.candidates_without_channel(kind, blocks)
+        ]
+        return without, missing_channel_reason(tuple(kind.channels), blocks)
+    windows = make_windows(blocks, drivers)
+    predictions: list[tuple[dict[str, Any], Prediction]] = []
+    why = ""
+    for values in _nuisance_grid(kind, windows):
+        try:
+            effect = kind.example(**values)
+            predictions.append(
+                (
+                    values,
+                    _drop_hidden_means(
+                        kind.name, predict_exogenous(effect, windows), blocks, coefficient
+                    ),
+                )
+            )
+        except KeyError as error:
+            why = missing_channel_reason((str(error.args[0]),), blocks)
+        except OptionError as error:
+            why = str(error)
+    driver = tuple(drivers.get(channel, "") for channel in kind.channels) if drivers else ()
+    constant_channels = [
+        name
+        for name in drivers.values()
+        if np.ptp(windows.drivers[_effect_channel(drivers, name)]) == 0.0
+    ]
+    if constant_channels:
+        verb = "does" if len(constant_channels) == 1 else "do"
+        why = f"{' and '.join(constant_channels)} {verb} not change"
+    built = [
+        candidate
+        for statistic in STATISTICS
+        for candidate in statistic.candidates(
+            kind, driver, predictions, windows, blocks, coefficient
+        )
+    ]
+    return built, why
+
+
+def _effect_channel(drivers: Mapping[str, str], name: str) -> str:
+    """Return the effect's name of a channel of the log."""
+    return next(inner for inner, outer in drivers.items() if outer == name)
+
+
+def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, Any]]:
+    """Yield values of the nuisance parameters and choices."""
+    try:
+        grid: dict[str, Sequence[Any]] = {
+            name: select_step_times(values, windows)
+            if name == TIME_PARAMETER
+            else _thin_out(values, _MAX_VALUES)
+            for name, values in kind.example().nuisance(windows).items()
+        }
+    except KeyError:
+        grid = {}
+    grid |= {item.name: item.choices for item in kind.parameters() if item.choices}
+    known = kind.example().points(windows)
+    if known:
+        yield from (dict(point) for point in known)
+        return
+    points = list(product(*grid.values()))
+    most = max(_MAX_VARIANTS, len(grid.get(TIME_PARAMETER, ())))
+    for point in points[:: max(1, -(-len(points) // most))]:
+        yield {
+            name: value if isinstance(value, str) else float(value)
+            for name, value in zip(grid, point, strict=True)
+        }
+
+
+def _thin_out(values: Array, most: int) -> list[Any]:
+    """Select at most `most` values at equal steps."""
+    every = max(1, -(-len(values) // most))
+    return list(values[every // 2 :: every])
+
+
+def _drop_hidden_means(
+    name: str, prediction: Prediction, blocks: xr.Dataset, coefficient: xr.DataArray
+) -> Prediction:
+    """Drop predicted means that white noise hides on every axis even at the largest size.
+
+    An axis at rest cannot leak into others: its noise, taken for motion, would only blur real
+    motion.
+    """
+    if name not in LARGEST_SIZE or not prediction.mean:
+        return prediction
+    good = np.isfinite(blocks["mean"].transpose("axis", "block").values)
+    white = coefficient.sel(term="N").values * np.sqrt(HOUR / float(blocks.attrs["block_s"]))
+    mean = {}
+    for column, design in prediction.mean.items():
+        rows = np.where(good, np.broadcast_to(np.atleast_2d(design), good.shape), np.nan)
+        moved = np.sqrt(np.nansum((rows - np.nanmean(rows, axis=1, keepdims=True)) ** 2, axis=1))
+        if (LARGEST_SIZE[name] * moved > _MIN_SIZE_STDERRS * white).any():
+            mean[column] = design
+    return replace(prediction, mean=mean)

@@ -1,0 +1,204 @@
+"""Predictions of effects for the blocks of a record, with the channels that they follow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.predict.candidates import Candidate, Prospect, Variant
+from gyrostab.diagnose.predict.step_times import power_on_times
+from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Prediction, Windows
+from gyrostab.physics.registry import effects
+
+__all__ = [
+    "TIME_PARAMETER",
+    "channel_units",
+    "distinct_variants",
+    "make_windows",
+    "predict_exogenous",
+    "rebuild_variant",
+    "weigh_by_time",
+]
+
+Array = NDArray[Any]
+#: Nuisance parameter that is a time.
+TIME_PARAMETER = "at"
+_MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
+
+
+def channel_units(blocks: xr.Dataset) -> dict[str, str]:
+    """Return the units of the channels of the log."""
+    begin = "channel_"
+    return {
+        str(name)[len(begin) :]: str(blocks[name].attrs.get("units", ""))
+        for name in blocks.data_vars
+        if str(name).startswith(begin)
+    }
+
+
+def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
+    """Return the record in the form that effects take for their predictions.
+
+    Parameters
+    ----------
+    blocks : xarray.Dataset
+        From `reduce_log`.
+    drivers : mapping of str to str
+        Channels of the log by channel of the effect.
+    """
+    axes = tuple(str(axis) for axis in blocks["axis"].values)
+    own = dict(
+        zip(
+            axes,
+            map(_fill_linearly, measured(blocks, "mean").transpose("axis", "block").values),
+            strict=True,
+        )
+    )
+
+    def spans(name: str) -> Array:
+        if f"{name}_begin" not in blocks:
+            return np.empty((0, 2))
+        return np.stack(
+            [blocks[f"{name}_begin"].values, blocks[f"{name}_end"].values], axis=1
+        ).astype(np.float64)
+
+    return Windows(
+        begin=blocks["begin"].values.astype(np.float64),
+        end=blocks["end"].values.astype(np.float64),
+        frequency=blocks["frequency"].values,
+        rate=float(blocks.attrs["sampling_rate_hz"]),
+        axes=axes,
+        drivers={
+            inner: _fill_linearly(blocks[f"channel_{name}"].values)
+            for inner, name in drivers.items()
+        },
+        fine={
+            inner: blocks[f"fine_{name}"].values
+            for inner, name in drivers.items()
+            if f"fine_{name}" in blocks
+        },
+        own=own,
+        gaps=spans("gap"),
+        restarts=spans("restart"),
+        phase=(np.arange(blocks.sizes["phase"]) + 0.5) / blocks.sizes["phase"]
+        if "profile" in blocks
+        else np.empty(0),
+        turns=blocks["ramp_turns"].values if "ramp_turns" in blocks else np.empty(0),
+        bands={
+            inner: band
+            for inner, name in drivers.items()
+            if (band := _rms_band(blocks[f"channel_{name}"])) is not None
+        },
+    )
+
+
+def _rms_band(channel: xr.DataArray) -> tuple[float, float] | None:
+    """Return the edges of the band of an rms channel [Hz]; None if it does not have any."""
+    try:
+        low, high = (float(edge) for edge in channel.attrs.get("band_hz", ()))
+    except (TypeError, ValueError):
+        return None
+    return (low, high) if 0.0 <= low < high < np.inf else None
+
+
+def _fill_linearly(values: Array) -> Array:
+    """Interpolate missing values linearly."""
+    good = np.isfinite(values)
+    if good.all() or not good.any():
+        return np.asarray(values, np.float64)
+    place = np.arange(values.size)
+    return np.interp(place, place[good], values[good])
+
+
+def predict_exogenous(effect: Effect, windows: Windows) -> Prediction:
+    """Predict an effect without those means of an axis that follow its own noisy reading."""
+    full = effect.explain(windows)
+    if not full.mean:
+        return full
+    shape = (len(windows.axes), windows.begin.size)
+    mean = {
+        name: np.array(np.broadcast_to(np.atleast_2d(values), shape))
+        for name, values in full.mean.items()
+    }
+    nothing = np.full(windows.begin.size, np.nan)
+    without_means = effect.explain(replace(windows, own=dict.fromkeys(windows.axes, nothing))).mean
+    for name, values in mean.items():
+        if name in without_means and np.isfinite(without_means[name]).all():
+            continue
+        for row, axis in enumerate(windows.axes):
+            blind = replace(windows, own=dict(windows.own) | {axis: nothing})
+            without_axis = np.broadcast_to(np.atleast_2d(effect.explain(blind).mean[name]), shape)[
+                row
+            ]
+            if not np.array_equal(without_axis, values[row]):
+                values[row] = 0.0
+    return replace(full, mean=mean)
+
+
+def rebuild_variant(
+    candidate: Candidate, variant: Variant, blocks: xr.Dataset, coefficient: xr.DataArray
+) -> Variant | None:
+    """Rebuild a variant for other channels or parameter values; None if it vanishes."""
+    kind = effects()[candidate.effect]
+    drivers = {
+        inner: name for inner, name in zip(kind.channels, candidate.driver, strict=False) if name
+    }
+    prediction = predict_exogenous(kind.example(**variant.values), make_windows(blocks, drivers))
+    built = candidate.statistic.design(
+        Prospect(dict(variant.values), prediction, blocks, coefficient)
+    )
+    return next(
+        (one for one in built if one.columns == variant.columns and one.squared == variant.squared),
+        None,
+    )
+
+
+def distinct_variants(variants: list[Variant]) -> tuple[Variant, ...]:
+    """Drop variants with empty designs, or designs equal to others."""
+    kept: list[Variant] = []
+    known_designs: set[tuple[Any, ...]] = set()
+    for one in variants:
+        if one.design.size:
+            size = np.abs(one.design).max(initial=0.0)
+            if not (np.isfinite(size) and size > 0.0):
+                continue
+            mark: tuple[Any, ...] = (
+                one.columns,
+                one.time,
+                np.round(one.design / size / _MAX_DESIGN_DIFFERENCE).tobytes(),
+            )
+        else:
+            mark = (one.columns,)
+        if mark not in known_designs:
+            known_designs.add(mark)
+            kept.append(one)
+    return tuple(kept)
+
+
+def weigh_by_time(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
+    """Weight variants by the prior probability of their time.
+
+    Times at which power came back have the same total probability as all others, which have that of
+    the interval they represent.
+    """
+    if not variants or not all(TIME_PARAMETER in one.values for one in variants):
+        return variants
+    at = np.array([one.values[TIME_PARAMETER] for one in variants])
+    known = np.array([bool(np.isclose(power_on_times(windows), instant).any()) for instant in at])
+    others, place = np.unique(at[~known], return_inverse=True)
+    if others.size < 2:
+        return variants
+    weight = np.ones(at.size)
+    span = np.gradient(others)[place]
+    weight[~known] = span / span.mean()
+    weight[known] = weight[~known].sum() / max(int(known.sum()), 1)
+    return tuple(
+        replace(one, weight=float(share)) for one, share in zip(variants, weight, strict=True)
+    )

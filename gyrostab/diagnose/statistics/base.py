@@ -1,0 +1,352 @@
+"""What every statistic of the diagnosis defines, or inherits as a step without work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.held_out import LinearModel, linear_model_factors
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
+from gyrostab.diagnose.predict.average_sizes import average_sizes
+from gyrostab.diagnose.predict.candidates import (
+    Candidate,
+    CandidateEvidence,
+    Component,
+    Prospect,
+    Variant,
+)
+from gyrostab.diagnose.predict.linear_model import State, simulate_noise
+from gyrostab.diagnose.predict.search import Trial, collect_evidence
+from gyrostab.diagnose.predict.sizes import Mixture, linear_mixture
+from gyrostab.diagnose.predict.windows import distinct_variants, weigh_by_time
+from gyrostab.diagnose.settings import Settings
+from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Prediction, Windows
+
+__all__ = ["NullDraw", "SizeFit", "Sizes", "Statistic", "column_choices"]
+
+Array = NDArray[Any]
+Sizes = Mapping[str, tuple[float, ...]]
+Region = Mapping[str, Any]
+
+
+class NullDraw(NamedTuple):
+    """Some null records, of which means, powers, lines and cross-spectra are drawn.
+
+    Attributes
+    ----------
+    blocks, baseline : xarray.Dataset
+        The recording, for its blocks, gaps and channels, and the noise.
+    record_count : int
+    rng : numpy.random.Generator
+    expected, power : ndarray, shape (record, axis, block, band)
+        Expected and drawn powers [degree2 hour-2 Hz-1].
+    sample_sd : ndarray, shape (axis, 2)
+        Standard deviations of a sample and of a difference of neighbours [degree hour-1].
+    """
+
+    blocks: xr.Dataset
+    baseline: xr.Dataset
+    record_count: int
+    rng: np.random.Generator
+    expected: Array
+    power: Array
+    sample_sd: Array
+
+
+class SizeFit(NamedTuple):
+    """What the sizes of an effect are estimated from.
+
+    Attributes
+    ----------
+    components : sequence of Component
+        Of one effect, all in one statistic.
+    axes : tuple of str
+        Axes of the effect.
+    state : State
+        With all other effects in the model.
+    candidates : sequence of Candidate
+        All that were tried; they have the grids of nuisance parameters.
+    counts : CountEvidence
+        Expected sample counts.
+    """
+
+    components: Sequence[Component]
+    axes: tuple[str, ...]
+    state: State
+    candidates: Sequence[Candidate]
+    counts: CountEvidence
+
+
+class Statistic:
+    """One way to look at a recording, with all steps of the diagnosis in which it takes part.
+
+    A subclass sets the attributes and overrides the methods of the steps in which it takes part.
+    The registry `gyrostab.diagnose.statistics.STATISTICS` has one instance of each.
+
+    Attributes
+    ----------
+    name : str
+        Unique name. The key ``view`` of a mismatch in diagnosis.json is the attribute of this name.
+    explains : tuple of str
+        Kinds of mismatches that an effect in this statistic can explain.
+    contained_in : tuple of str
+        Kinds of mismatches whose score against the baseline with effects contains what an
+        effect in this statistic contributes.
+    nuisance_alternative : str
+        As what the rest of an effect is reported that explains too little in this statistic.
+    error_shows_in : tuple of str
+        Names of the statistics in which an error of the form of an effect shows.
+    null_variable : str
+        Variable of the null records that the evidence uses; "" to draw the noise of the linear
+        model instead.
+    is_power_weighted : bool
+        Whether the expected powers are its weights.
+    is_phase_locked : bool
+        Whether it is locked to the rotation of the tool or to the feedback ramp.
+    is_in_baseline : bool
+        Whether the baseline with the effects contains what an effect contributes.
+    is_in_means, is_linear_in_means, is_switching : bool
+        Whether effects move the block means; by columns; by two levels of free course.
+    is_power, is_pairwise, is_rotation, is_transfer, is_line, is_count, is_random : bool
+        Whether effects add power, covariance of two axes, amplitudes at multiples of the rotation,
+        what follows a reference channel, a spectral line, anomalous samples, a random process.
+    explains_motion : bool
+        Whether an effect explains a moving mean although it has no columns in the means.
+    has_course, has_size : bool
+        Whether designs are by block; whether the size follows from a linear model.
+    uses_line_spectra : bool
+        Whether the score is of the spectrum at full resolution.
+    is_ratio : bool
+        Whether the score is of a variance over the expected one.
+    grows_in_time : bool
+        Whether adjacent regions of a mismatch are one.
+    """
+
+    name: str
+    view: str
+    explains: tuple[str, ...] = ()
+    contained_in: tuple[str, ...] = ()
+    nuisance_alternative = "~S(f)"
+    error_shows_in: tuple[str, ...] = ()
+    null_variable = ""
+    is_power_weighted = False
+    is_phase_locked = False
+    is_in_baseline = False
+    is_in_means = False
+    is_linear_in_means = False
+    is_switching = False
+    is_power = False
+    is_pairwise = False
+    is_rotation = False
+    is_transfer = False
+    is_line = False
+    is_count = False
+    is_random = False
+    has_course = False
+    explains_motion = False
+    has_size = True
+    uses_line_spectra = False
+    is_ratio = False
+    grows_in_time = True
+
+    def __repr__(self) -> str:
+        return f"<{self.name}>"
+
+    # ---------------------------------------------------------------------- measurement and noise
+
+    def null(self, draw: NullDraw) -> Mapping[str, Array]:
+        """Draw what noise alone produces, by variable with the record first.
+
+        By default nothing: the powers, means and cross-spectra of a null record, from which most
+        statistics follow, are drawn together.
+        """
+        return {}
+
+    def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
+        """Score windows of blocks against the baseline; None where there is nothing to score."""
+        return None
+
+    def prepare(
+        self, blocks: xr.Dataset, baseline: xr.Dataset, regions: Sequence[Region]
+    ) -> xr.Dataset:
+        """Return the blocks to score, when these mismatches are known."""
+        return blocks
+
+    # ---------------------------------------------------------------------- candidates
+
+    def design(self, case: Prospect) -> Iterator[Variant]:
+        """Yield what an effect does to the statistic; by default nothing."""
+        yield from ()
+
+    def candidates(
+        self,
+        kind: type[Effect],
+        driver: tuple[str, ...],
+        predictions: Sequence[tuple[dict[str, Any], Prediction]],
+        windows: Windows,
+        blocks: xr.Dataset,
+        coefficient: xr.DataArray,
+    ) -> list[Candidate]:
+        """Return the candidates of an effect that follows these channels."""
+        variants = distinct_variants(
+            [
+                variant
+                for values, prediction in predictions
+                for variant in self.design(Prospect(values, prediction, blocks, coefficient))
+            ]
+        )
+        if not variants:
+            return []
+        return [Candidate(kind.name, self, driver, weigh_by_time(variants, windows))]
+
+    def candidates_without_channel(self, kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
+        """Return the candidates of an effect none of whose channels is in the record."""
+        return []
+
+    # ---------------------------------------------------------------------- evidence
+
+    def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
+        """Return the axes of each row; by default one axis."""
+        return [(axis,) for axis in state.axes]
+
+    def model(
+        self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+    ) -> LinearModel:
+        """Build the linear model of one row, with the designs of all variants in order."""
+        raise NotImplementedError(f"{self.name} has no linear model")
+
+    def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
+        """Compute the held-out evidence of candidates; by default from the linear model.
+
+        The candidates have the same rows and reference channel.
+        """
+        rows = self.rows(group[0], trial.state)
+        if not rows:  # pairs of a single axis
+            return []
+        factors = []
+        spread = 1
+        for row in range(len(rows)):
+            is_given = trial.rng is None or self.null_variable in trial.data
+            model = self.model(
+                group, row, trial.data if is_given else trial.state.blocks, trial.state
+            )
+            if not is_given and trial.rng is not None:
+                model = simulate_noise(model, trial.rng, trial.data.sizes["record"])
+            factors.append(linear_model_factors(model, trial.folds)[:, 1:])
+            spread = factors[-1].shape[1] // sum(len(one.variants) for one in group)
+        return collect_evidence(group, rows, factors, spread)
+
+    # ---------------------------------------------------------------------- in the model
+
+    def is_filter(self, variant: Variant) -> bool:
+        """Return whether a variant multiplies the spectrum rather than adds to it."""
+        return False
+
+    def condition(self, state: State, component: Component) -> State:
+        """Put a component into the state; by default there is nothing to put in."""
+        return state
+
+    def noise_shares(
+        self, component: Component, axis: str, state: State, weight: Array
+    ) -> tuple[Array | float, list[Array], list[Array]]:
+        """Return what a component takes from the noise of an axis.
+
+        Parameters
+        ----------
+        component : Component
+        axis : str
+        state : State
+            Without any effect.
+        weight : ndarray, shape (axis, block, band)
+            Powers with all effects.
+
+        Returns
+        -------
+        known : ndarray, shape (block, band)
+            Power of known size.
+        free, means : list of ndarray
+            Powers and means of free size.
+        """
+        given = self.condition(state, component).given
+        return 0.0, given.get(("power", axis), []), given.get(("mean", axis), [])
+
+    def has_power_of_effect(self, component: Component, blocks: xr.Dataset) -> bool:
+        """Return whether only the effect itself, and no column, gives the power of a component."""
+        return False
+
+    # ---------------------------------------------------------------------- sizes
+
+    def mixture(
+        self,
+        component: Component,
+        state: State,
+        variant: Variant,
+        *,
+        variance: Array | None = None,
+    ) -> Mixture:
+        """Compute the sizes of a component's columns; by default from the linear model."""
+        return linear_mixture(component, state, variant)
+
+    def estimate(self, fit: SizeFit) -> Sizes:
+        """Estimate parameters with their standard errors; by axis if there are several.
+
+        Returns
+        -------
+        dict of str to (float, float) or (float, float, float, float)
+            Value and standard error, with the ends of an asymmetric 95 % interval. Keys are
+            ``name``, or ``name.axis``.
+        """
+        out: dict[str, tuple[float, ...]] = {}
+        for component in fit.components:
+            if component.variant.columns[:1] == ("any",):
+                continue
+            mean, covariance, nuisance = average_sizes(component, fit.state, fit.candidates)
+            for number, name in enumerate(component.variant.columns):
+                value, sd = float(mean[number]), float(np.sqrt(covariance[number, number]))
+                if component.variant.squared:
+                    value, sd = _square_root(value, sd)
+                out[name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"] = (value, sd)
+            out |= nuisance
+        return out
+
+    # ---------------------------------------------------------------------- explanation
+
+    def can_explain(
+        self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
+    ) -> bool:
+        """Return whether a component of an effect can show in a mismatch."""
+        return str(region["view"]) in self.explains
+
+    def is_modelled_in(self, region: Region, *, together: bool) -> bool:
+        """Return whether the baseline with the effects contains what an effect does to a mismatch.
+
+        `together` says whether several axes of the effect wander together there.
+        """
+        return self.is_in_baseline
+
+    def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
+        """Return the averaging times [s] at which a component shows; by default within a block."""
+        return 1.0 / float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
+
+    def describe(self, region: Region, when: str) -> str:
+        """Describe a mismatch in a sentence without its full stop; `when` is its time."""
+        raise NotImplementedError(f"{self.name} locates no mismatches")
+
+
+def _square_root(square: float, sd: float) -> tuple[float, float]:
+    """Return a size and its error from those of its square."""
+    value = float(np.sqrt(max(square, 0.0)))
+    return value, sd / (2.0 * value) if square > sd else float(
+        np.sqrt(max(square, 0.0) + sd)
+    ) - value
+
+
+def column_choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return each parameter alone, and all together."""
+    alone: list[tuple[str, ...]] = [(name,) for name in columns]
+    return alone if len(alone) < 2 else [*alone, tuple(columns)]

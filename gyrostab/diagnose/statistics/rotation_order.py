@@ -1,0 +1,339 @@
+"""Amplitudes at multiples of the rotation of the tool."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.held_out import LinearModel
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
+from gyrostab.diagnose.predict.condition import bands_at, free_covariance
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    given_columns,
+    real_and_imaginary,
+    records_last,
+    stack_columns,
+)
+from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
+from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.scores import (
+    Windows,
+    exponential_score,
+    sum_over_windows,
+    values_in_order,
+)
+from gyrostab.noise import NORMAL_95
+from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Prediction
+from gyrostab.physics.prediction import Windows as EffectWindows
+
+Array = NDArray[Any]
+
+EARTH_RATE = 15.041067  # deg/h: 360 degrees in a sidereal day of 23.934470 h
+
+
+class RotationOrder(Statistic):
+    """Amplitudes at multiples of the rotation of the tool.
+
+    Their score is part of that of `RampPhase`: both are phase-locked, and share one threshold.
+    """
+
+    name = "rotation_order"
+    view = "spectrum"
+    explains = ("spectrum", "davar", "mean", "distribution", "cross_axis")
+    contained_in = ("davar",)
+    error_shows_in = ("rotation_order", "power", "cross_spectrum")
+    is_power_weighted = True
+    is_phase_locked = True
+    is_rotation = True
+    explains_motion = True
+
+    def null(self, draw: NullDraw) -> Mapping[str, Array]:
+        """Draw Gaussian amplitudes at the rotation orders."""
+        return {"order": _draw_orders(draw)} if "order" in draw.blocks else {}
+
+    def design(self, case: Prospect) -> Iterator[Variant]:
+        """Yield patterns of the harmonics over the axes."""
+        if "order" not in case.blocks:
+            return
+        count = case.blocks.sizes["harmonic"]
+        for name, pattern in case.seen.order.items():
+            yield Variant(case.values, (name,), pattern[None, :, :count])
+
+    def candidates(
+        self,
+        kind: type[Effect],
+        driver: tuple[str, ...],
+        predictions: Sequence[tuple[dict[str, Any], Prediction]],
+        windows: EffectWindows,
+        blocks: xr.Dataset,
+        coefficient: xr.DataArray,
+    ) -> list[Candidate]:
+        """Return the candidates, with one size for all axes unless the effect has several."""
+        many = {item.name for item in kind.parameters() if item.many}
+        return [
+            replace(candidate, each=bool(many & set(candidate.variants[0].columns)))
+            for candidate in super().candidates(
+                kind, driver, predictions, windows, blocks, coefficient
+            )
+        ]
+
+    def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
+        """Return each axis, or all axes of one size together."""
+        if candidate.each:
+            return super().rows(candidate, state)
+        pattern = np.abs(candidate.variants[0].design[0]).max(axis=-1)
+        return [tuple(axis for axis, size in zip(state.axes, pattern, strict=True) if size > 0)]
+
+    def model(
+        self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+    ) -> LinearModel:
+        """Build the model of the rotation orders of an axis, or of all axes together."""
+        values = records_last(data["order"].transpose(..., "axis", "block", "harmonic").values, 3)
+        weight = order_weight(state)
+        count = weight.shape[-1]
+        if candidates[0].each:
+            both = np.concatenate([weight[row], weight[row]], axis=1)
+            designs = [
+                stack_columns(order_columns(np.ones(count, complex), chosen), both.shape)
+                for chosen in harmonic_sets(count)
+            ]
+            given, precision = given_columns(state, "order", (state.axes[row],), both.shape)
+            return LinearModel(
+                real_and_imaginary(values[row], axis=1),
+                both,
+                designs * len(candidates),
+                given,
+                precision,
+            )
+        # The cells of all axes side by side.
+        both = np.concatenate([np.concatenate([one, one], axis=1) for one in weight], axis=1)
+        stacked = np.concatenate([real_and_imaginary(one, axis=1) for one in values], axis=1)
+        designs = []
+        for candidate in candidates:
+            for variant in candidate.variants:
+                for pattern in (variant.design[0], np.conj(variant.design[0])):
+                    by_axis = [order_columns(one, (0,)) for one in pattern]
+                    designs.append(
+                        stack_columns(
+                            [np.concatenate(columns) for columns in zip(*by_axis, strict=True)],
+                            both.shape,
+                        )
+                    )
+        named_columns = [state.given.get(("order", axis), []) for axis in state.axes]
+        given, precision = np.empty((*both.shape, 0)), np.empty((0, 0))
+        for number, columns in enumerate(named_columns):
+            for one in columns:
+                wide = np.zeros((*both.shape, 1))
+                wide[:, number * 2 * count : (number + 1) * 2 * count, 0] = one
+                given = np.concatenate([given, wide], axis=2)
+        if given.shape[2]:
+            precision = -np.eye(given.shape[2])
+        return LinearModel(stacked, both, designs, given, precision)
+
+    def condition(self, state: State, component: Component) -> State:
+        """Condition on a component in the rotation orders."""
+        count = state.blocks.sizes["harmonic"]
+        turn = np.abs(state.blocks["channel_rotation_rate"].values) / 360.0
+        if component.candidate.each:
+            chosen = harmonic_sets(count)[component.place]
+            patterns = [(axis, np.ones(count, np.complex128)) for axis in component.row]
+        else:
+            chosen = (0,)
+            pattern = (
+                np.conj(component.variant.design[0])
+                if is_reversed(component)
+                else component.variant.design[0]
+            )
+            patterns = [(axis, pattern[state.axes.index(axis)]) for axis in component.row]
+        for axis, pattern in patterns:
+            state = state.with_columns("order", axis, order_columns(pattern, chosen))
+            for k in chosen:
+                density = bands_at(state, turn * (k + 1)).astype(float)
+                for band in np.flatnonzero(density.any(axis=0)):
+                    column = np.zeros_like(density)
+                    column[:, band] = density[:, band]
+                    state = state.with_columns("power", axis, [column])
+                    state = free_covariance(state, (axis,), column)
+        lines = state.blocks["line_frequency"].values
+        taken = np.zeros(lines.size, np.bool_)
+        for k in chosen:
+            taken |= (lines >= np.nanmin(turn) * (k + 1) - 2 * lines[0]) & (
+                lines <= np.nanmax(turn) * (k + 1) + 2 * lines[0]
+            )
+        return state.with_columns("line", "all", [taken])
+
+    def estimate(self, fit: SizeFit) -> Sizes:
+        """Return amplitude and phase of components locked to the rotation.
+
+        For the earth rate these are latitude and tool face of a tool that points down. Angles get
+        the error of the form of the amplitude: a share of an angle has no meaning.
+        """
+        out: dict[str, tuple[float, ...]] = {}
+        for component in fit.components:
+            size, sd, angle = fit_amplitude(component, fit.state)
+            error = math.hypot(sd / max(size, 1e-300), fit.state.settings.size_error_share)
+            if not component.candidate.each:
+                across = size * float(np.abs(component.variant.design).max())
+                return {
+                    "latitude": _latitude_from_rate(across, error * across),
+                    "toolface": (angle, math.degrees(error)),
+                }
+            label = "" if len(fit.axes) == 1 else f".{component.row[0]}"
+            out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
+            out["order"] = (
+                float(
+                    fit.state.blocks["harmonic"].values[
+                        component.place % fit.state.blocks.sizes["harmonic"]
+                    ]
+                ),
+                0.0,
+            )
+        return out
+
+
+def is_reversed(component: Component) -> bool:
+    """Return whether the rotation is reversed: y at -90 degrees from x, or a reversed channel."""
+    return (
+        component.statistic.is_rotation
+        and not component.candidate.each
+        and component.place % 2 == 1
+    )
+
+
+def order_weight(state: State) -> Array:
+    """Return (axis, block, harmonic): one over the variance of each part of an amplitude."""
+    blocks = state.blocks
+    rate, frequency = float(blocks.attrs["sampling_rate_hz"]), blocks["frequency"].values
+    place = (
+        np.abs(blocks["channel_rotation_rate"].values)[:, None] / 360.0 * blocks["harmonic"].values
+    )
+    good = (
+        np.isfinite(blocks["order"].values)
+        & (place * float(blocks.attrs["block_s"]) >= 2.0)
+        & (place < rate / 2.0)
+    )
+    nearest = np.abs(np.log(np.maximum(place, frequency[0])[..., None] / frequency)).argmin(axis=-1)
+    level = np.take_along_axis(
+        state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2
+    )
+    level = noise_at_orders(blocks, level)
+    seconds = blocks["samples"].values[..., None] / rate
+    return np.where(good, seconds / (2.0 * level), 0.0)
+
+
+def harmonic_sets(count: int) -> list[tuple[int, ...]]:
+    """Return each harmonic alone, and all together."""
+    return [*((k,) for k in range(count)), *([tuple(range(count))] if count > 1 else [])]
+
+
+def order_columns(pattern: Array, chosen: tuple[int, ...]) -> list[Array]:
+    """Return columns (cell,) of a complex factor for each chosen harmonic.
+
+    The cells are the real parts, then the imaginary parts of the harmonics.
+    """
+    columns = []
+    for k in chosen:
+        one = np.zeros_like(pattern)
+        one[..., k] = pattern[..., k]
+        columns += [real_and_imaginary(one), real_and_imaginary(1j * one)]
+    return columns
+
+
+def _draw_orders(draw: NullDraw) -> NDArray[np.complex128]:
+    """Draw Gaussian amplitudes at the rotation orders, with the density near that frequency."""
+    blocks, expected = draw.blocks, draw.expected
+    recorded = values_in_order(blocks, "order", "axis", "block", "harmonic")
+    rate = float(blocks.attrs["sampling_rate_hz"])
+    samples = np.maximum(values_in_order(blocks, "samples", "axis", "block"), 1)
+    turning = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values)) / 360.0
+    bands = np.log(blocks["frequency"].values)
+    density = np.empty((len(expected), *recorded.shape))
+    for place, harmonic in enumerate(blocks["harmonic"].values):
+        folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
+        at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
+        low = np.minimum(at.astype(int), bands.size - 2)
+        block = np.arange(turning.size)
+        density[..., place] = expected[:, :, block, low] * (1.0 - (at - low)) + expected[
+            :, :, block, low + 1
+        ] * (at - low)
+    noise = draw.rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
+    out = np.asarray(
+        np.sqrt(2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]) * noise
+    )
+    out[..., np.isnan(recorded)] = np.nan
+    return out
+
+
+def _latitude_from_rate(across: float, error: float) -> tuple[float, float, float, float]:
+    """Return the latitude of a tool that points down, from the earth rate across it [deg/h].
+
+    The result [deg] has the standard error and the ends of the 95 % interval.
+    """
+    low, middle, high = (
+        math.degrees(math.acos(min(max(rate, 0.0) / EARTH_RATE, 1.0)))
+        for rate in (across + NORMAL_95 * error, across, across - NORMAL_95 * error)
+    )
+    return middle, max((high - low) / (2.0 * NORMAL_95), 1e-12), low, high
+
+
+def fit_amplitude(component: Component, state: State) -> tuple[float, float, float]:
+    """Return amplitude, standard error and phase [deg] of the first harmonic of a component."""
+    mean, covariance = component_mixture(component, state).moments()
+    sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
+    return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
+
+
+def turns_per_second(blocks: xr.Dataset) -> Array:
+    """Return turns per second in each block."""
+    if "channel_rotation_rate" not in blocks:
+        return np.zeros(blocks.sizes["block"])
+    return np.asarray(np.nan_to_num(np.abs(blocks["channel_rotation_rate"].values) / 360.0))
+
+
+def score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+    """Return score, ratio and amplitude of the coherent sum by (record), axis, window, harmonic."""
+    order = values_in_order(blocks, "order", "axis", "block", "harmonic")
+    samples = values_in_order(blocks, "samples", "axis", "block")
+    rate = float(blocks.attrs["sampling_rate_hz"])
+    turning, spectrum = (
+        turns_per_second(blocks),
+        baseline["spectrum"].transpose("axis", "block", "band").values,
+    )
+    bands = np.log(baseline["frequency"].values)
+    log_frequency = np.log(
+        np.clip(
+            turning[:, None] * np.arange(1, order.shape[-1] + 1),
+            np.exp(bands[0]),
+            np.exp(bands[-1]),
+        )
+    )
+    density = np.empty((*spectrum.shape[:2], order.shape[-1]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis, block in np.ndindex(spectrum.shape[:2]):
+            density[axis, block] = np.exp(
+                np.interp(log_frequency[block], bands, np.log(spectrum[axis, block]))
+            )
+        density = noise_at_orders(blocks, density)
+        # Of |order|^2: two parts of 2 S rate / n each.
+        variance = 4.0 * density * rate / samples[..., None]
+        present = (
+            np.isfinite(order)
+            & np.isfinite(variance)
+            & (variance > 0)
+            & (turning > 0.5 / float(blocks.attrs["block_s"]))[:, None]
+        )
+        weight = np.where(present, 1.0 / variance, 0.0)
+        sums = sum_over_windows(np.where(present, order, 0.0) * weight, windows)
+        total = sum_over_windows(weight, windows)
+        ratio = np.where(total > 0, np.abs(sums) ** 2 / total, np.nan)
+        amplitude = np.abs(sums) / total
+    return exponential_score(ratio), ratio, amplitude

@@ -1,0 +1,254 @@
+"""Biases of two levels, whose course the means themselves determine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.fast_switching import (
+    SwitchingEvidence,
+    switching_evidence,
+    switching_powers,
+)
+from gyrostab.diagnose.evidence.telegraph import TelegraphCourses, telegraph_evidence
+from gyrostab.diagnose.predict.candidates import (
+    Candidate,
+    CandidateEvidence,
+    Component,
+    Prospect,
+    Variant,
+)
+from gyrostab.diagnose.predict.condition import mean_columns
+from gyrostab.diagnose.predict.linear_model import State, power_column
+from gyrostab.diagnose.predict.search import Trial
+from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
+from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.mean import (
+    MEAN_VIEWS,
+    block_mean_mixture,
+    condition_means,
+    mean_averaging_times,
+    shows_in_means,
+)
+
+Array = NDArray[Any]
+
+_MAX_FAST_BLOCKS = 2.0  # mean time on a level, up to which sub-blocks are better; design choice
+_MAX_REFUTED_BLOCKS = 3.0  # mean time on a level, up to which sub-blocks can refute it
+#: Standard deviations of a block mean; for larger steps four parts of a block are too few for the
+#: course. Design choice.
+_MAX_COARSE_STEP_SIGMA = 16.0
+_MAX_NULL_BLOCKS = 20_000  # of null records that are searched for two levels; limits time
+_MIN_SHARE_RANGE = 0.05  # within a block, of a course that switches there; design choice
+
+
+class Telegraph(Statistic):
+    """A bias that switches between two levels, in block means or within blocks."""
+
+    name = "telegraph"
+    view = "mean"
+    explains = MEAN_VIEWS
+    contained_in = ("davar", "mean", "restart", "cross_axis")
+    nuisance_alternative = "~bias(t)"
+    error_shows_in = ("mean",)
+    is_in_baseline = True
+    is_in_means = True
+    is_switching = True
+
+    def design(self, case: Prospect) -> Iterator[Variant]:
+        """Yield two levels; the means determine the course and its times."""
+        if case.seen.levels:
+            yield Variant({}, (case.seen.levels,), np.empty(0))
+
+    def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
+        """Compute the evidence of a bias of two levels, by axis.
+
+        It is a lower bound of a log Bayes factor, which exceeds x nats by chance in at most exp(-x)
+        of all records. Some of the null records are therefore enough if records are long.
+        """
+        records = trial.data.sizes.get("record", 1)
+        searched = (
+            trial.data.isel(record=slice(max(1, _MAX_NULL_BLOCKS // trial.data.sizes["block"])))
+            if "record" in trial.data.dims
+            else trial.data
+        )
+        rows: list[tuple[str, ...]] = [(axis,) for axis in trial.state.axes]
+        evidence_nats = np.full((records, len(rows)), -np.inf)
+        courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
+        for row, axis in enumerate(trial.state.axes):
+            found, course = telegraph_evidence(
+                searched, trial.state.baseline, axis=axis, given=trial.state.given_to("mean", axis)
+            )
+            evidence_nats[: found.size, row] = found
+            within, refuted = _search_fast_switching(
+                searched, trial.state, axis, course, float(found[0])
+            )
+            if refuted:
+                evidence_nats[0, row] = -np.inf
+            if within is not None:
+                evidence_nats[0, row] = max(within.evidence_nats, evidence_nats[0, row])
+            courses.append((course, within))
+        return [
+            CandidateEvidence(
+                candidate,
+                rows,
+                evidence_nats,
+                tuple(
+                    _variant_with_course(candidate.variants[0], *pair, trial.state)
+                    for pair in courses
+                ),
+            )
+            for candidate in group
+        ]
+
+    def condition(self, state: State, component: Component) -> State:
+        """Condition on a bias of two levels.
+
+        If it switches within blocks, its course is the power there and invalidates their kurtosis.
+        """
+        inside = component.variant.inside
+        if not inside.size:
+            return condition_means(state, component)
+        axis = component.row[0]
+        row = state.axes.index(axis)
+        attrs = state.blocks.attrs
+        low, high = (float(component.variant.values[name]) for name in ("low", "high"))
+        power = switching_powers(
+            inside, low, high, int(attrs["block_samples"]), float(attrs["sampling_rate_hz"])
+        )
+        state = add_fast_switching(state, component)
+        state = state.with_columns("power", axis, [power_column(power[None], row, state)])
+        moves = xr.DataArray(np.ptp(inside, axis=1) > _MIN_SHARE_RANGE, dims="block") & (
+            state.blocks["axis"] == axis
+        )
+        blank = {
+            name: state.blocks[name].where(~moves, other)
+            for name, other in (("kurtosis", np.nan), ("outliers", 0))
+        }
+        return replace(state, blocks=state.blocks.assign(blank))
+
+    def mixture(
+        self,
+        component: Component,
+        state: State,
+        variant: Variant,
+        *,
+        variance: Array | None = None,
+    ) -> Mixture:
+        """Compute the step over the grid of random walk and flicker."""
+        return block_mean_mixture(component, state, variant, variance)
+
+    def estimate(self, fit: SizeFit) -> Sizes:
+        """Estimate the step of every axis [degree hour-1] and the dwell times of both levels [s].
+
+        The lower level is that of the strongest axis; an axis that switches the other way has a
+        negative step.
+        """
+        ranked = sorted(fit.components, key=lambda component: -component.evidence_nats)
+        name, first = ranked[0].variant.columns[0], ranked[0].variant
+        course = first.design[0, 0]
+        out: dict[str, tuple[float, float]] = {}
+        for component in ranked:
+            mean, covariance = component_mixture(component, fit.state).moments()
+            own = component.variant.design[0, 0]
+            sign = (
+                1.0 if component is ranked[0] or float(np.cov(own, course)[0, 1]) >= 0.0 else -1.0
+            )
+            label = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
+            out[label] = (sign * float(mean[0]), float(math.sqrt(covariance[0, 0])))
+        stays = max(float(first.values["switches"]) / 2.0, 1.0)  # on either level
+        return out | {
+            time: (float(first.values[time]), float(first.values[time]) / math.sqrt(stays))
+            for time in ("low", "high")
+        }
+
+    def can_explain(
+        self,
+        component: Component,
+        region: Mapping[str, Any],
+        blocks: xr.Dataset,
+        settings: Settings,
+    ) -> bool:
+        """Return whether the mismatch is one of means; of several axes only a slow one."""
+        return shows_in_means(self, region)
+
+    def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
+        """Return the averaging times of block means."""
+        return mean_averaging_times(blocks)
+
+
+def add_fast_switching(state: State, component: Component) -> State:
+    """Add the course of a bias that switches within blocks to the block and sub-block means."""
+    axis = component.row[0]
+    return state.with_columns("mean", axis, mean_columns(component.variant, 0)).with_columns(
+        "sub_block", axis, [component.variant.inside]
+    )
+
+
+def _search_fast_switching(
+    data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, evidence_nats: float
+) -> tuple[SwitchingEvidence | None, bool]:
+    """Find switching within blocks, if better than in block means; and whether it refutes it."""
+    found, block = _search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
+    if found is None:
+        return None, False
+    if not _is_resolved(found, block):
+        return None, found.refuted and float(course.times[0].min()) < _MAX_REFUTED_BLOCKS
+    deviation = float(np.sqrt(np.nanmedian(state.baseline["mean_variance"].sel(axis=axis).values)))
+    coarse = (
+        np.isfinite(evidence_nats) and float(course.step[0]) < _MAX_COARSE_STEP_SIGMA * deviation
+    )
+    return (None if coarse and found.times.min() > _MAX_FAST_BLOCKS * block else found), False
+
+
+def fast_switching_evidence(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
+    """Compute the evidence of a bias that switches within blocks; None if there is none."""
+    found = _search_sub_blocks(data, state, axis)
+    return (
+        found
+        if found is not None and _is_resolved(found, float(state.blocks.attrs["block_s"]))
+        else None
+    )
+
+
+def _is_resolved(found: SwitchingEvidence, block: float) -> bool:
+    """Return whether sub-blocks resolve two levels; anything shorter is a spike."""
+    return (
+        bool(np.isfinite(found.evidence_nats))
+        and float(found.times.min()) >= block / found.share.shape[1]
+    )
+
+
+def _search_sub_blocks(data: xr.Dataset, state: State, axis: str) -> SwitchingEvidence | None:
+    """Search sub-blocks; None if more is named in block means than is known in sub-blocks."""
+    if len(state.given.get(("sub_block", axis), [])) < len(state.given.get(("mean", axis), [])):
+        return None
+    return switching_evidence(
+        data, state.baseline, axis=axis, given=state.given_to("sub_block", axis)
+    )
+
+
+def _variant_with_course(
+    variant: Variant, found: TelegraphCourses, within: SwitchingEvidence | None, state: State
+) -> Variant:
+    """Return the variant with the course of the first record, and its mean times [s]."""
+    if within is not None:
+        low, high = within.times
+        values = {"low": float(low), "high": float(high), "switches": within.switch_count}
+        return replace(
+            variant,
+            values=values,
+            design=within.share.mean(axis=1)[None, None],
+            inside=within.share,
+        )
+    block = float(state.blocks.attrs["block_s"])
+    low, high = found.times[0] * block
+    values = {"low": float(low), "high": float(high), "switches": float(found.switch_count[0])}
+    return replace(variant, values=values, design=found.share[0][None, None])

@@ -1,0 +1,260 @@
+"""Transfers from a reference channel, or from another axis, to an axis."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.evidence.held_out import LinearModel
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.condition import free_covariance
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    expected_cross,
+    given_columns,
+    pair_rows,
+    real_and_imaginary,
+    records_last,
+    reference_channel_power,
+    stack_columns,
+)
+from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.predict.windows import distinct_variants
+from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.statistics.base import NullDraw, Statistic
+from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
+from gyrostab.diagnose.statistics.scores import values_in_order
+from gyrostab.physics.base import Effect
+from gyrostab.physics.prediction import Prediction, Windows
+from gyrostab.physics.registry import effects
+
+Array = NDArray[Any]
+
+#: Power over noise beyond which the power of an axis is motion, three in amplitude. Design choice.
+_MIN_MOTION_RATIO = 9.0
+_QUIESCENT_QUANTILE = 0.25  # of the powers over blocks, taken as power at rest; design choice
+
+
+class Transfer(Statistic):
+    """What an axis has in common with a channel on the log's time, or with another axis."""
+
+    name = "transfer"
+    view = "davar"
+    explains = ("davar", "cross_axis", "spectrum", "mean", "distribution")
+    contained_in = ("davar",)
+    error_shows_in = ("transfer",)
+    is_power_weighted = True
+    is_transfer = True
+    explains_motion = True
+
+    def null(self, draw: NullDraw) -> Mapping[str, Array]:
+        """Draw cross-spectra of axes with reference channels."""
+        if "reference_cross" not in draw.blocks:
+            return {}
+        return {"reference_cross": _draw_channel_cross(draw)}
+
+    def candidates(
+        self,
+        kind: type[Effect],
+        driver: tuple[str, ...],
+        predictions: Sequence[tuple[dict[str, Any], Prediction]],
+        windows: Windows,
+        blocks: xr.Dataset,
+        coefficient: xr.DataArray,
+    ) -> list[Candidate]:
+        """Return candidates of rates that follow another channel or axis at every frequency."""
+        return [
+            replace(one, driver=driver)
+            for one in self._candidates_by_channel(kind.name, predictions, windows, blocks)
+        ]
+
+    def _candidates_by_channel(
+        self,
+        name: str,
+        predictions: Sequence[tuple[dict[str, Any], Prediction]],
+        windows: Windows,
+        blocks: xr.Dataset,
+    ) -> list[Candidate]:
+        """Build candidates of rates that follow another channel or axis at every frequency."""
+        reference_channels = (
+            {str(one) for one in blocks["reference"].values}
+            if "reference" in blocks.dims
+            else set()
+        )
+        axes = set(windows.axes) if "cross" in blocks else set()
+        found: dict[str, list[Variant]] = {}
+        for values, prediction in predictions:
+            for (parameter, channel), transfer in prediction.transfer.items():
+                if channel in reference_channels or channel in axes:
+                    found.setdefault(channel, []).append(
+                        Variant(values, (parameter,), np.asarray(transfer)[None])
+                    )
+        if found and effects()[name].stage == "motion":
+            unknown_channels = [
+                channel for channel in sorted(reference_channels) if not _is_known_channel(channel)
+            ]
+            for channel in [*found, *unknown_channels]:
+                found[channel] = found.get(channel, []) + _any_transfer(windows.frequency.size)
+        return [
+            Candidate(name, self, (), distinct_variants(variants), reference=(channel,))
+            for channel, variants in found.items()
+        ]
+
+    def candidates_without_channel(self, kind: type[Effect], blocks: xr.Dataset) -> list[Candidate]:
+        """Build real motion that only channels of no known effect see, such as a seismometer."""
+        if kind.name != "real_motion" or "reference" not in blocks.dims:
+            return []
+        variants = distinct_variants(_any_transfer(blocks.sizes["band"]))
+        unknown_channels = sorted(
+            str(one) for one in blocks["reference"].values if not _is_known_channel(str(one))
+        )
+        return [
+            Candidate(kind.name, self, (), variants, reference=(channel,))
+            for channel in unknown_channels
+        ]
+
+    def model(
+        self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
+    ) -> LinearModel:
+        """Build the model of the transfer from a reference channel to an axis."""
+        cross, power = reference_channel_of(
+            candidates[0].reference[0], row, data, state.blocks, state.baseline
+        )
+        root = np.sqrt(np.where(power > 0.0, power, np.nan))
+        share = _moving_share(candidates[0].reference[0], power, state)
+        weight = 2.0 * state.blocks["shape"].values[row] / state.weight[row]
+        weight = np.where(
+            np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0
+        )
+        weight = np.concatenate([weight, weight], axis=1)
+        with np.errstate(invalid="ignore"):
+            values = real_and_imaginary(cross / root[..., None], axis=1)
+        given, precision = given_columns(state, "transfer", (state.axes[row],), weight.shape)
+        designs = [
+            stack_columns(
+                [real_and_imaginary(one * root * share) for one in variant.design], weight.shape
+            )
+            for candidate in candidates
+            for variant in candidate.variants
+        ]
+        return LinearModel(values, weight, designs, given, precision)
+
+    def condition(self, state: State, component: Component) -> State:
+        """Condition on a transfer from a reference channel."""
+        axis = component.row[0]
+        power = reference_channel_power(component.candidate.reference[0], state.blocks)
+        power = np.where(np.isfinite(power), power, 0.0)
+        columns = np.concatenate(
+            [
+                component.variant.design.real * np.sqrt(power)[:, None],
+                component.variant.design.imag * np.sqrt(power)[:, None],
+            ],
+            axis=-1,
+        )
+        state = state.with_columns("transfer", axis, list(np.moveaxis(columns, 1, 0)))
+        for band in range(power.shape[1]):
+            column = np.zeros_like(power)
+            column[:, band] = power[:, band] / max(power[:, band].max(initial=0.0), 1e-300)
+            if np.ptp(column[:, band]) > 0.5:
+                state = state.with_columns("power", axis, [column])
+            state = free_covariance(state, (axis,), column)
+        return state
+
+    def noise_shares(
+        self, component: Component, axis: str, state: State, weight: Array
+    ) -> tuple[Array | float, list[Array], list[Array]]:
+        """Return the power that follows the channel or the other axis."""
+        return _transferred_power(component, replace(state, weight=weight)), [], []
+
+
+def reference_channel_of(
+    name: str, row: int, data: xr.Dataset, blocks: xr.Dataset, baseline: xr.Dataset
+) -> tuple[Array, Array]:
+    """Return the cross-power of an axis with a channel or other axis, and the power of that.
+
+    Shapes (block, band, record) and (block, band). Expected cross-spectra are subtracted.
+    """
+    axes = [str(one) for one in blocks["axis"].values]
+    if name in axes:
+        cross = records_last(
+            measured(data, "cross").transpose(..., "pair", "block", "band").values, 3
+        )
+        has_power = np.isfinite(blocks["power"].values[row])[..., None]
+        known = expected_cross(baseline)
+        cross = cross if known is None else cross - known[..., None]
+        cross_power = np.full(cross.shape[1:], np.nan + 0j)
+        for number, pair in enumerate(pair_rows(blocks)):
+            if set(pair) == {name, axes[row]} and name != axes[row]:
+                cross_power = np.where(
+                    has_power, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan
+                )
+        return cross_power, reference_channel_power(name, blocks)
+    place = [str(one) for one in blocks["reference"].values].index(name)
+    cross = records_last(
+        data["reference_cross"].transpose(..., "axis", "reference", "block", "band").values, 4
+    )
+    return cross[row, place], reference_channel_power(name, blocks)
+
+
+def _moving_share(name: str, power: Array, state: State) -> Array:
+    """Return the share of another axis's power (block, band) that is motion; 1 for a channel.
+
+    Only intermittent motion leaks: at rest the axes may have noise and lines in common, which are
+    not a leak. Therefore the power of an axis in the quieter blocks of a band, and its expected
+    noise, do not count as motion. The noise of a channel is unknown.
+    """
+    if name not in state.axes:
+        return np.ones_like(power)
+    row = state.axes.index(name)
+    noise = state.baseline["spectrum"].transpose("axis", "block", "band").values[row]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a band without data has no motion
+        noise = np.fmax(noise, np.nanquantile(power, _QUIESCENT_QUANTILE, axis=0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(power > _MIN_MOTION_RATIO * noise, 1.0 - noise / power, 0.0)
+
+
+def _is_known_channel(channel: str) -> bool:
+    """Return whether a channel drives a registered effect, or cannot show motion."""
+    bases = {name for kind in effects().values() for name in kind.channels}
+    return (
+        any(
+            channel == name or channel.startswith(name.rstrip("0123456789").rstrip("_") + "_")
+            for name in bases
+        )
+        or channel == "pressure"
+    )
+
+
+def _any_transfer(bands: int) -> list[Variant]:
+    """Return any factor in each band, and in all bands: a mounting may resonate."""
+    alone = np.eye(bands, dtype=np.complex128)
+    one = [Variant({}, ("any",) * 2, np.stack([row, 1j * row])) for row in alone]
+    return [*one, Variant({}, ("any",) * (2 * bands), np.concatenate([alone, 1j * alone]))]
+
+
+def _transferred_power(component: Component, state: State) -> Array:
+    """Return the power that follows a channel or another axis, (block, band)."""
+    mean, _ = component_mixture(component, state).moments()
+    transfer = np.tensordot(mean, component.variant.design, axes=1)
+    return np.asarray(
+        np.abs(transfer) ** 2
+        * np.nan_to_num(reference_channel_power(component.candidate.reference[0], state.blocks))
+    )
+
+
+def _draw_channel_cross(draw: NullDraw) -> NDArray[np.complex128]:
+    """Draw cross-spectra of axes with reference channels."""
+    recorded = values_in_order(draw.blocks, "reference_cross", "axis", "reference", "block", "band")
+    shape = values_in_order(draw.blocks, "shape", "axis", "block", "band")
+    channel_power = values_in_order(draw.blocks, "reference_power", "reference", "block", "band")
+    size = np.sqrt(draw.power[:, :, None] * channel_power)
+    cross = size * draw_coherency(shape[:, None], size.shape, draw.rng)
+    cross[..., np.isnan(recorded)] = np.nan
+    return np.asarray(cross)

@@ -1,0 +1,45 @@
+"""Wording of sentences on a mismatch: its axes and averaging times."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gyrostab.units import DAY, HOUR
+
+__all__ = ["axes_text", "is_higher", "length_text", "subject", "taus_text"]
+
+
+def axes_text(axes: Sequence[str]) -> str:
+    """Return ``"axis x"`` or ``"axes x and y"``."""
+    if not axes:
+        return "the record"
+    names = " and ".join(filter(None, [", ".join(axes[:-1]), axes[-1]]))
+    return f"ax{'i' if len(axes) == 1 else 'e'}s {names}"
+
+
+def length_text(seconds: float) -> str:
+    """Write a duration with the unit that suits it."""
+    for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.3g} {name}"
+    return f"{seconds:.3g} s" if seconds >= 0.1 else f"{seconds * 1e3:.3g} ms"
+
+
+def subject(region: Mapping[str, Any]) -> str:
+    """Write the axes of a mismatch as the beginning of a sentence."""
+    axes = axes_text(region["axes"])
+    return axes[0].upper() + axes[1:]
+
+
+def is_higher(region: Mapping[str, Any]) -> bool:
+    """Return whether the recording exceeds the expectation."""
+    return bool(region.get("sign", 1) >= 0)
+
+
+def taus_text(region: Mapping[str, Any]) -> str:
+    """Write the averaging times of a mismatch."""
+    low, high = length_text(region["tau_min_s"]), length_text(region["tau_max_s"])
+    if region["tau_max_s"] > 1.01 * region["tau_min_s"]:
+        return f"averaging times of {low} to {high}"
+    return f"an averaging time of {low}"
