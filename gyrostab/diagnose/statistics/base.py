@@ -27,7 +27,7 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction, Windows
 
-__all__ = ["NullDraw", "SizeFit", "Sizes", "Statistic", "column_choices"]
+__all__ = ["NullDraw", "Region", "SizeFit", "Sizes", "Statistic", "column_choices"]
 
 Array = NDArray[Any]
 Sizes = Mapping[str, tuple[float, ...]]

@@ -24,7 +24,7 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial, collect_evidence
 from gyrostab.diagnose.predict.sizes import Mixture, mean_mixture
 from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.base import Statistic, column_choices
+from gyrostab.diagnose.statistics.base import Region, Statistic, column_choices
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -45,6 +45,7 @@ from gyrostab.noise import HOUR
 
 __all__ = [
     "LENGTHS",
+    "BlockMeanStatistic",
     "Mean",
     "MeanNoise",
     "apply_precision",
@@ -55,8 +56,6 @@ __all__ = [
 
 #: Lengths of the windows [blocks].
 LENGTHS = (1, 5, 15, 45)
-#: Kinds of mismatches that a mean can explain.
-MEAN_VIEWS = ("mean", "restart", "davar", "distribution", "cross_axis", "spectrum")
 _MAX_MASKED_SHARE = 0.5  # of the blocks; design choice
 
 
@@ -70,16 +69,51 @@ class MeanNoise(NamedTuple):
     remaining: Array
 
 
-class Mean(Statistic):
-    """Block means, which the Allan variance does not show."""
+class BlockMeanStatistic(Statistic):
+    """What statistics of effects in the block means share."""
 
-    name = "mean"
     view = "mean"
-    explains = MEAN_VIEWS
-    contained_in = ("davar", "mean", "restart", "cross_axis")
+    explains: tuple[str, ...] = (
+        "mean",
+        "restart",
+        "davar",
+        "distribution",
+        "cross_axis",
+        "spectrum",
+    )
+    contained_in: tuple[str, ...] = ("davar", "mean", "restart", "cross_axis")
     nuisance_alternative = "~bias(t)"
     error_shows_in = ("mean",)
     is_in_baseline = True
+
+    def mixture(
+        self,
+        component: Component,
+        state: State,
+        variant: Variant,
+        *,
+        variance: Array | None = None,
+    ) -> Mixture:
+        """Compute sizes over the grid of random walk and flicker."""
+        columns = mean_columns(variant, state.axes.index(component.row[0]))
+        return mean_mixture(state, component.row[0], columns, variance=variance)
+
+    def can_explain(
+        self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
+    ) -> bool:
+        """Return whether the mismatch is one of means; of several axes only a slow one."""
+        is_slow = region["view"] != "cross_axis" or region["what"] == "slow"
+        return str(region["view"]) in self.explains and bool(is_slow)
+
+    def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
+        """Return the averaging times of block means."""
+        return float(blocks.attrs["block_s"]), float(blocks["end"].values[-1]) / 2.0
+
+
+class Mean(BlockMeanStatistic):
+    """Block means, which the Allan variance does not show."""
+
+    name = "mean"
     is_in_means = True
     is_linear_in_means = True
     has_course = True
@@ -159,31 +193,6 @@ class Mean(Statistic):
         """Put columns into the means, and mask blocks in which the effect moves much."""
         return condition_means(state, component)
 
-    def mixture(
-        self,
-        component: Component,
-        state: State,
-        variant: Variant,
-        *,
-        variance: Array | None = None,
-    ) -> Mixture:
-        """Compute sizes over the grid of random walk and flicker."""
-        return block_mean_mixture(component, state, variant, variance)
-
-    def can_explain(
-        self,
-        component: Component,
-        region: Mapping[str, Any],
-        blocks: xr.Dataset,
-        settings: Settings,
-    ) -> bool:
-        """Return whether the mismatch is one of means; of several axes only a slow one."""
-        return shows_in_means(self, region)
-
-    def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
-        """Return the averaging times of block means."""
-        return mean_averaging_times(blocks)
-
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         """Describe another mean, or one that wanders."""
         axes, estimate = axes_text(region["axes"]), region.get("estimate", np.nan)
@@ -197,26 +206,6 @@ class Mean(Statistic):
             f"The mean rate of {axes} is {size}{'above' if is_higher(region) else 'below'} its "
             f"expected value {when}, more than drift and noise allow"
         )
-
-
-def block_mean_mixture(
-    component: Component, state: State, variant: Variant, variance: Array | None
-) -> Mixture:
-    """Compute the sizes of the columns of block means."""
-    columns = mean_columns(variant, state.axes.index(component.row[0]))
-    return mean_mixture(state, component.row[0], columns, variance=variance)
-
-
-def shows_in_means(statistic: Statistic, region: Mapping[str, Any]) -> bool:
-    """Return whether means can show in a mismatch: of several axes only in slow covariance."""
-    return str(region["view"]) in statistic.explains and (
-        region["view"] != "cross_axis" or region["what"] == "slow"
-    )
-
-
-def mean_averaging_times(blocks: xr.Dataset) -> tuple[float, float]:
-    """Return the averaging times [s] at which block means show."""
-    return float(blocks.attrs["block_s"]), float(blocks["end"].values[-1]) / 2.0
 
 
 def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:

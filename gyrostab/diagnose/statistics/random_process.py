@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.candidates import (
@@ -18,14 +17,14 @@ from gyrostab.diagnose.predict.candidates import (
 )
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
-from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.base import Statistic
-from gyrostab.diagnose.statistics.mean import mean_averaging_times, shows_in_means
+from gyrostab.diagnose.statistics.mean import (
+    BlockMeanStatistic,
+)
 
 Array = NDArray[Any]
 
 
-class RandomProcess(Statistic):
+class RandomProcess(BlockMeanStatistic):
     """A random process in the block means, which widens their scatter.
 
     No null record, score or evidence is its own: the flicker and random walk of the noise are free
@@ -34,11 +33,10 @@ class RandomProcess(Statistic):
     """
 
     name = "random_process"
-    view = "mean"
     explains = ("mean", "davar", "restart", "cross_axis")
+    contained_in = ()
     nuisance_alternative = "~red"
     error_shows_in = ("random_process",)
-    is_in_baseline = True
     is_random = True
     explains_motion = True
     has_course = True
@@ -57,16 +55,6 @@ class RandomProcess(Statistic):
         """Return nothing: free flicker and random walk explain as much."""
         return []
 
-    def can_explain(
-        self,
-        component: Component,
-        region: Mapping[str, Any],
-        blocks: xr.Dataset,
-        settings: Settings,
-    ) -> bool:
-        """Return whether the mismatch is one of means; of several axes only a slow one."""
-        return shows_in_means(self, region)
-
     def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
         """Return whether the baseline contains it: axes that wander together are in no model."""
         return not together
@@ -76,7 +64,3 @@ class RandomProcess(Statistic):
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return nothing: the process is noise."""
         return 0.0, [], []
-
-    def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
-        """Return the averaging times of block means."""
-        return mean_averaging_times(blocks)

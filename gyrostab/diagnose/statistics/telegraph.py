@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,15 +27,11 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, power_column
 from gyrostab.diagnose.predict.search import Trial
-from gyrostab.diagnose.predict.sizes import Mixture, component_mixture
-from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
+from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.statistics.base import SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import (
-    MEAN_VIEWS,
-    block_mean_mixture,
+    BlockMeanStatistic,
     condition_means,
-    mean_averaging_times,
-    shows_in_means,
 )
 
 Array = NDArray[Any]
@@ -49,16 +45,10 @@ _MAX_NULL_BLOCKS = 20_000  # of null records that are searched for two levels; l
 _MIN_SHARE_RANGE = 0.05  # within a block, of a course that switches there; design choice
 
 
-class Telegraph(Statistic):
+class Telegraph(BlockMeanStatistic):
     """A bias that switches between two levels, in block means or within blocks."""
 
     name = "telegraph"
-    view = "mean"
-    explains = MEAN_VIEWS
-    contained_in = ("davar", "mean", "restart", "cross_axis")
-    nuisance_alternative = "~bias(t)"
-    error_shows_in = ("mean",)
-    is_in_baseline = True
     is_in_means = True
     is_switching = True
 
@@ -134,17 +124,6 @@ class Telegraph(Statistic):
         }
         return replace(state, blocks=state.blocks.assign(blank))
 
-    def mixture(
-        self,
-        component: Component,
-        state: State,
-        variant: Variant,
-        *,
-        variance: Array | None = None,
-    ) -> Mixture:
-        """Compute the step over the grid of random walk and flicker."""
-        return block_mean_mixture(component, state, variant, variance)
-
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate the step of every axis [degree hour-1] and the dwell times of both levels [s].
 
@@ -168,20 +147,6 @@ class Telegraph(Statistic):
             time: (float(first.values[time]), float(first.values[time]) / math.sqrt(stays))
             for time in ("low", "high")
         }
-
-    def can_explain(
-        self,
-        component: Component,
-        region: Mapping[str, Any],
-        blocks: xr.Dataset,
-        settings: Settings,
-    ) -> bool:
-        """Return whether the mismatch is one of means; of several axes only a slow one."""
-        return shows_in_means(self, region)
-
-    def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
-        """Return the averaging times of block means."""
-        return mean_averaging_times(blocks)
 
 
 def add_fast_switching(state: State, component: Component) -> State:
