@@ -46,7 +46,7 @@ html_theme_options = {
     "secondary_sidebar_items": ["page-toc"],
 }
 
-# Command line reference, from the help texts; an asterisk in an example is no emphasis.
+# Command line reference, from the help texts; asterisks in examples are literal.
 commands = app.generate_docs(output_format="rst").replace(" -m sphinx ", " ")
 commands = re.sub(r"^Example: (.*?) *$", r"Example: ``\1``", commands, flags=re.MULTILINE)
 Path(__file__).with_name("reference").joinpath("commands.rst").write_text(
