@@ -14,6 +14,7 @@ from gyrostab.diagnose.identify.moving_axes import moving_blocks, unexplained_mo
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
 from gyrostab.diagnose.result.tables import motion_tables
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.errors import SchemaError
 from gyrostab.simulate import simulate
 
@@ -99,10 +100,15 @@ def identification(
     design = np.empty(0) if course is None else course[None, None]
     variant, candidate = (
         SimpleNamespace(columns=(column,), design=design),
-        SimpleNamespace(statistic=statistic, reference=()),
+        SimpleNamespace(statistic=find_statistic(statistic), reference=()),
     )
     return SimpleNamespace(
-        effect=effect, components=(SimpleNamespace(candidate=candidate, row=row, variant=variant),)
+        effect=effect,
+        components=(
+            SimpleNamespace(
+                candidate=candidate, statistic=candidate.statistic, row=row, variant=variant
+            ),
+        ),
     )
 
 

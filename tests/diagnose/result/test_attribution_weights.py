@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from gyrostab.diagnose.identify.identification import Identification, Identifica
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.locate.regions import merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.result.attribution import attribute_mismatches
@@ -193,13 +193,13 @@ BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
 
 
 def _make_shown(*statistics):
-    variant = SimpleNamespace(columns=("white",))
+    variant = Variant({}, ("white",), np.empty(0))
     return [
         (
             f"effect {n}",
-            [SimpleNamespace(candidate=SimpleNamespace(statistic=statistic), variant=variant)],
+            [Component(Candidate("a", find_statistic(name), (), ()), variant, ("x",), 9.0)],
         )
-        for n, statistic in enumerate(statistics)
+        for n, name in enumerate(statistics)
     ]
 
 
@@ -241,7 +241,7 @@ def test_effect_not_contained_in_the_statistic_stays():
         "effect 1",
     ]
     low_pass = _make_shown("power", "power")
-    low_pass[1][1][0].variant = SimpleNamespace(columns=())
+    low_pass[1][1][0] = replace(low_pass[1][1][0], variant=Variant({}, (), np.empty(0)))
     assert needed_effects(BOX, low_pass, _scores_without(effect_0=9.0, effect_1=0.0)) == [
         "effect 0",
         "effect 1",
