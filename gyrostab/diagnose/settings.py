@@ -1,7 +1,8 @@
 """Numbers that decide what a diagnosis reports: value, unit and source of each.
 
-Numbers that only set the accuracy or the cost of a computation are local to their modules.
-`benchmarks/settings_sensitivity.py` scales all of them and compares the diagnoses.
+Other numbers are local to their modules. Some of those of the reduction, the statistics and the
+candidates decide too; the rest set only the accuracy or the cost of a computation.
+`benchmarks/settings_sensitivity.py` scales each of them and compares the diagnoses.
 """
 
 from __future__ import annotations
@@ -101,6 +102,24 @@ class Settings:
         "that belongs to a mismatch of a long one.",
         "two-sided P = 0.046 for a normal error",
     )
+    min_switches: float = _number(
+        5.0,
+        "switch",
+        "Expected switches below which a bias has no two levels.",
+        "choice: one or two switches are jumps",
+    )
+    two_level_nats: float = _number(
+        10.0,
+        "nat",
+        "Evidence by which two levels within blocks must exceed normal noise of any spectrum.",
+        "choice: odds of 2e4 to 1, as the spectrum of normal noise is fitted by an autoregression",
+    )
+    refuting_nats: float = _number(
+        20.0,
+        "nat",
+        "Evidence of means within blocks, not those of two levels, that refutes a telegraph bias.",
+        "choice: twice `two_level_nats`",
+    )
     surrogate_share: float = _number(
         0.01,
         "1",
@@ -190,7 +209,7 @@ class Settings:
         4.0,
         "standard deviation",
         "Excess above which the noise of the mean of a block is raised, and difference from the "
-        "noise terms above which a band of a simulation has a form of its own.",
+        "noise terms above which a band of a simulation has a separate form.",
         "one-sided P = 3.2e-5: 0.2 of 6000 blocks, and then by the excess itself",
     )
     quiescent_share: float = _number(

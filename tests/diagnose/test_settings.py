@@ -7,8 +7,11 @@ import re
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from gyrostab.diagnose.identify.forward_search import tail_level
+from gyrostab.diagnose.result.verdict import failed_checks
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,6 +38,16 @@ def test_every_setting_is_used() -> None:
         if isinstance(node, ast.Attribute)
     }
     assert {item.name for item in fields(Settings)} <= used
+
+
+def test_a_setting_changes_the_decision() -> None:
+    held = {"log_likelihood_gain": 9.0, "forecast_gain": 2.0}
+    held |= {"coverage95_before": 0.95, "coverage95_after": 0.93}
+    assert failed_checks(held)
+    assert not failed_checks(held, settings=Settings(coverage_tolerance=0.03))
+    best = np.sort(np.random.default_rng(1).exponential(size=400))
+    wide = tail_level(best, 0.2, settings=Settings(tail_share=0.1))
+    assert wide == np.quantile(best, 0.8)  # no extrapolation within the sample
 
 
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])

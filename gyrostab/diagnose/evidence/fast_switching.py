@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.products import WIDTHS, marginalise, mean_products
 from gyrostab.diagnose.evidence.telegraph import (
-    MIN_SWITCHES,
     TelegraphCourses,
     course_evidence,
     drift_waves,
     simulated_courses,
     telegraph_courses,
 )
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.periodogram import (
     band_edges,
     band_powers,
@@ -36,9 +36,6 @@ from gyrostab.physics.lorentz import lorentz_density
 __all__ = ["SwitchingEvidence", "switching_evidence", "switching_powers"]
 
 Array = NDArray[np.float64]
-#: Nats by which two levels must be better than normal noise of any spectrum. Design choice.
-MIN_NATS_OVER_NORMAL = 10.0
-_MIN_REFUTED_NATS = 20.0  # evidence of non-white means that are not two levels; design choice
 _AR_ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that approximates any spectrum
 _MAX_MEANS = 12_000  # in the search of a course; sub-blocks are merged beyond; limits time
 _PARTS_PER_SUB_BLOCK = 64  # each on one level; design choice
@@ -71,8 +68,8 @@ class SwitchingEvidence:
     ----------
     evidence_nats : float
         Lower bound of the log Bayes factor against noise [nats]; -inf with fewer than
-        `MIN_SWITCHES` switches, or if normal noise of any spectrum comes within
-        `MIN_NATS_OVER_NORMAL` nats.
+        `min_switches` switches, or if normal noise of any spectrum comes within
+        `two_level_nats`.
     share : ndarray, shape (block, sub_block)
         Share of each sub-block on the upper level.
     times : ndarray, shape (2,)
@@ -91,7 +88,12 @@ class SwitchingEvidence:
 
 
 def switching_evidence(
-    data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None
+    data: xr.Dataset,
+    baseline: xr.Dataset,
+    *,
+    axis: str,
+    given: Array | None = None,
+    settings: Settings = DEFAULTS,
 ) -> SwitchingEvidence | None:
     """Compute the evidence of two levels in means over sub-blocks.
 
@@ -105,6 +107,7 @@ def switching_evidence(
     axis : str
     given : ndarray, shape (block, sub_block, column), optional
         Columns of effects in the model in both cases.
+    settings : Settings
 
     Returns
     -------
@@ -116,7 +119,7 @@ def switching_evidence(
     values, variance, merged = _sub_block_means(data, baseline, axis)
     shape = values.shape
     present = (np.isfinite(values) & np.isfinite(variance)).ravel()
-    if present.sum() < 10.0 * MIN_SWITCHES or np.ptp(values.ravel()[present]) == 0.0:
+    if present.sum() < 10.0 * settings.min_switches or np.ptp(values.ravel()[present]) == 0.0:
         return None
     step = float(data.attrs["block_s"]) / shape[1]
     n = present.size
@@ -140,13 +143,13 @@ def switching_evidence(
         )
         evidence_nats -= np.log(2.0)
         share = np.repeat(courses.share[0].reshape(shape), merged, axis=1)
-        levels_found = courses.switch_count[0] >= MIN_SWITCHES and evidence_nats > 0.0
+        levels_found = courses.switch_count[0] >= settings.min_switches and evidence_nats > 0.0
         similar = levels_found and _is_like_two_levels(courses, variance, present)
         is_switching, refuted = (
-            similar and beyond > MIN_NATS_OVER_NORMAL,
+            similar and beyond > settings.two_level_nats,
             levels_found
-            and evidence_nats > _MIN_REFUTED_NATS
-            and (not similar or beyond < -_MIN_REFUTED_NATS),
+            and evidence_nats > settings.refuting_nats
+            and (not similar or beyond < -settings.refuting_nats),
         )
         result = SwitchingEvidence(
             evidence_nats if is_switching else -np.inf,

@@ -27,11 +27,11 @@ from gyrostab.diagnose.evidence.products import (
     mean_products,
 )
 from gyrostab.diagnose.evidence.wandering import expected_processes
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.evidence import mixed_evidence
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
 __all__ = [
-    "MIN_SWITCHES",
     "TelegraphCourses",
     "course_evidence",
     "drift_waves",
@@ -43,8 +43,6 @@ __all__ = [
 Array = NDArray[np.float64]
 #: Parts of a block, each on one level. Design choice.
 PARTS_PER_BLOCK = 4
-#: Fewest expected switches; one or two are jumps. Design choice.
-MIN_SWITCHES = 5.0
 _MIN_TIME_BLOCKS = 0.5  # shortest mean time on a level
 _START_TIME_BLOCKS = 5.0  # mean time at the start of the search; design choice
 #: Quantiles of the means that start the levels.
@@ -321,7 +319,12 @@ def _time_cost(switch_count: Array, block_count: int) -> Array:
 
 
 def telegraph_evidence(
-    data: xr.Dataset, baseline: xr.Dataset, *, axis: str, given: Array | None = None
+    data: xr.Dataset,
+    baseline: xr.Dataset,
+    *,
+    axis: str,
+    given: Array | None = None,
+    settings: Settings = DEFAULTS,
 ) -> tuple[Array, TelegraphCourses]:
     """Compute the evidence of a bias of two levels on an axis.
 
@@ -335,11 +338,12 @@ def telegraph_evidence(
     axis : str
     given : ndarray, shape (block, column), optional
         Columns in the model with and without it (effects already named).
+    settings : Settings
 
     Returns
     -------
     evidence_nats : ndarray, shape (record,)
-        Lower bound of the log Bayes factor [nats]; -inf with fewer than `MIN_SWITCHES` switches.
+        Lower bound of the log Bayes factor [nats]; -inf with fewer than `min_switches` switches.
     courses : TelegraphCourses
     """
     mean = (data["mean"] - baseline["known_mean"]).sel(axis=axis)
@@ -373,7 +377,8 @@ def telegraph_evidence(
         worth = _course_evidence_by_record(
             found, safe, scaled_given, setup, grid, log_weight
         ) - np.log(len(_DRIFT_WAVES))
-        attempts.append((np.where(found.switch_count >= MIN_SWITCHES, worth, -np.inf), found))
+        has_switches = found.switch_count >= settings.min_switches
+        attempts.append((np.where(has_switches, worth, -np.inf), found))
     chosen = np.argmax([evidence_nats for evidence_nats, _ in attempts], axis=0)
     best = TelegraphCourses(
         *(

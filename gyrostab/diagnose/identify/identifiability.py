@@ -208,7 +208,9 @@ def _has_more_levels(component: Component, state: State) -> bool:
     given = np.stack(
         [*state.given.get(("mean", axis), []), component.variant.design[0, 0]], axis=-1
     )
-    evidence_nats, _ = telegraph_evidence(state.blocks, state.baseline, axis=axis, given=given)
+    evidence_nats, _ = telegraph_evidence(
+        state.blocks, state.baseline, axis=axis, given=given, settings=settings
+    )
     return bool(evidence_nats[0] > allowed)
 
 

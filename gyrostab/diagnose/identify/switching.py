@@ -163,6 +163,7 @@ def _block_evidence(component: Component, state: State) -> float:
         state.baseline,
         axis=component.row[0],
         given=np.stack(given, axis=-1) if given else None,
+        settings=state.settings,
     )
     return float(evidence_nats[0])
 

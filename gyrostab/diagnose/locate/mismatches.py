@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.evidence.spectral_lines import LEAK_LINES
 from gyrostab.diagnose.locate.regions import merge_regions, merge_wandering_regions
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 # Limits of the table; the rows left out are the least certain.
 MAX_PER_ROW = 8  # mismatches of one statistic and row
 MAX_MISMATCHES = 30  # of a record
-LINE_REACH_BINS = 3  # lines on either side that a strong line leaks into
 
 #: Fields of a mismatch, and their units.
 FIELDS = {
@@ -321,7 +321,7 @@ def _find_columns(
     grown = np.arange(lower, upper + 1)
     excess = np.abs(ratio - 1.0) if statistic.is_ratio else np.abs(combined)
     region = grown[excess[grown] >= settings.region_excess_share * excess[column]]
-    beside = LINE_REACH_BINS if what[column] == "line" else 0
+    beside = LEAK_LINES if what[column] == "line" else 0
     if what[column] == "line":
         return np.array([column]), np.arange(
             max(lower - beside, 0), min(upper + beside + 1, what.size)

@@ -74,7 +74,11 @@ class Telegraph(BlockMeanStatistic):
         courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
         for row, axis in enumerate(trial.state.axes):
             found, course = telegraph_evidence(
-                searched, trial.state.baseline, axis=axis, given=trial.state.given_to("mean", axis)
+                searched,
+                trial.state.baseline,
+                axis=axis,
+                given=trial.state.given_to("mean", axis),
+                settings=trial.state.settings,
             )
             evidence_nats[: found.size, row] = found
             within, refuted = _search_fast_switching(
@@ -196,7 +200,11 @@ def _search_sub_blocks(data: xr.Dataset, state: State, axis: str) -> SwitchingEv
     if len(state.given.get(("sub_block", axis), [])) < len(state.given.get(("mean", axis), [])):
         return None
     return switching_evidence(
-        data, state.baseline, axis=axis, given=state.given_to("sub_block", axis)
+        data,
+        state.baseline,
+        axis=axis,
+        given=state.given_to("sub_block", axis),
+        settings=state.settings,
     )
 
 

@@ -10,7 +10,6 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.telegraph import (
-    MIN_SWITCHES,
     telegraph_courses,
     telegraph_evidence,
 )
@@ -22,6 +21,7 @@ from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, C
 from gyrostab.diagnose.predict.condition import condition_on_components
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.base import SizeFit
 from gyrostab.ingest.make_log import make_log
@@ -131,7 +131,7 @@ def test_one_jump_and_its_return_are_not_two_levels() -> None:
         *frame(mean + white(np.random.default_rng(5), 1)), axis="x"
     )
     assert found.switch_count[0] == pytest.approx(2.0, abs=0.2)
-    assert found.switch_count[0] < MIN_SWITCHES
+    assert found.switch_count[0] < DEFAULTS.min_switches
     assert evidence_nats[0] == -np.inf
 
 
