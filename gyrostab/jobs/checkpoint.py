@@ -1,4 +1,4 @@
-"""Finished parts of a product as block files, which can be opened as one dataset.
+"""Finished parts of a product as files, which can be opened as one dataset.
 
 A block file holds, in this order, a magic word, the length of a header, the header as JSON, the
 arrays as they are in memory, and the SHA-256 of everything before. It is written under another
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
 
 _MAGIC = b"GYROBLK1"
 _ALIGN_BYTES = 64
+_DIGEST_BYTES = hashlib.sha256().digest_size
 _MAX_MEMORY_BYTES = 2**26  # bytes of blocks up to which a product is put together in memory
 
 
@@ -39,7 +40,7 @@ class Block(NamedTuple):
     part : slice
         Windows of the part.
     header : dict
-        Dimensions, dtypes, shapes, places and attributes of its variables.
+        Job, windows; dimensions, dtypes, shapes, places and attributes of its variables.
     begin : int
         Byte at which the arrays begin.
     """
@@ -79,57 +80,42 @@ def write_block(folder: Path, part: slice, dataset: xr.Dataset, *, job: str) -> 
     OutputError
         When it cannot be written, with the reason.
     """
-    arrays = {
-        str(name): np.ascontiguousarray(variable.values)
-        for name, variable in dataset.variables.items()
-    }
-    described, place = {}, 0
-    for (name, values), variable in zip(arrays.items(), dataset.variables.values(), strict=True):
-        described[name] = {
-            "dims": list(variable.dims), "dtype": values.dtype.str, "shape": list(values.shape),
-            "place": place, "attrs": _encode_attributes(variable.attrs),
-        }  # fmt: skip
-        place += -(-values.nbytes // _ALIGN_BYTES) * _ALIGN_BYTES
+    described: dict[str, Any] = {}
+    pieces: list[Any] = []
+    place = 0
+    for name, variable in dataset.variables.items():
+        values = np.ascontiguousarray(variable.values)
+        described[str(name)] = {
+            "dims": list(variable.dims),
+            "dtype": values.dtype.str,
+            "shape": list(values.shape),
+            "place": place,
+            "attrs": _encode_attributes(variable.attrs),
+        }
+        pieces += [values.reshape(-1).view(np.uint8), bytes(-values.nbytes % _ALIGN_BYTES)]
+        place += values.nbytes + len(pieces[-1])
     header = {
-        "job": job, "part": [part.start, part.stop],
+        "job": job,
+        "part": [part.start, part.stop],
         "coords": [str(name) for name in dataset.coords],
         "attrs": _encode_attributes(dataset.attrs),
         "variables": described,
-    }  # fmt: skip
+    }
     text = json.dumps(header).encode()
-    head = (_MAGIC + len(text).to_bytes(8, "little") + text).ljust(
-        _find_arrays_offset(len(text)), b"\0"
-    )
-    path = block_path(folder, part)
-    with replace_file(path) as temporary, temporary.open("wb", buffering=0) as file:
-        digest = hashlib.sha256()
-        for piece in (
-            head,
-            *(
-                piece
-                for values in arrays.values()
-                for piece in (values, bytes(-values.nbytes % _ALIGN_BYTES))
-            ),
-        ):
-            view = (
-                memoryview(piece)
-                if isinstance(piece, bytes)
-                else piece.reshape(-1).view(np.uint8).data
-            )
-            digest.update(view)
-            _write_all(file, view)
-        _write_all(file, memoryview(digest.digest()))
-    return Block(path, part, header, len(head))
+    begin = _find_arrays_offset(len(text))
+    head = (_MAGIC + len(text).to_bytes(8, "little") + text).ljust(begin, b"\0")
+    path, digest = block_path(folder, part), hashlib.sha256()
+    with replace_file(path) as temporary, temporary.open("wb") as file:
+        for piece in (head, *pieces):
+            digest.update(piece)
+            file.write(piece)
+        file.write(digest.digest())
+    return Block(path, part, header, begin)
 
 
 def _find_arrays_offset(text: int) -> int:
     """Find the byte at which the arrays begin, after a header text of so many bytes."""
     return -(-(16 + text) // _ALIGN_BYTES) * _ALIGN_BYTES
-
-
-def _write_all(file: Any, view: memoryview) -> None:
-    while view.nbytes:
-        view = view[file.write(view) :]
 
 
 def find_blocks(folder: Path, parts: Sequence[slice], *, job: str) -> dict[int, Block]:
@@ -150,23 +136,13 @@ def find_blocks(folder: Path, parts: Sequence[slice], *, job: str) -> dict[int, 
 def _read_verified_header(path: Path) -> bytes:
     """Read the header of a block file; empty when it is missing or its checksum is wrong."""
     try:
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size - hashlib.sha256().digest_size
-            start = file.read(16)
-            if size < 16 or start[:8] != _MAGIC:
-                return b""
-            digest, left = hashlib.sha256(start), size - 16
-            text = file.read(min(int.from_bytes(start[8:], "little"), left))
-            digest.update(text)
-            left -= len(text)
-            while left > 0 and (piece := file.read(min(left, 2**20))):
-                digest.update(piece)
-                left -= len(piece)
-            if left or file.read() != digest.digest():
-                return b""
-            return text
+        content = path.read_bytes()
     except OSError:
         return b""
+    digest = hashlib.sha256(memoryview(content)[:-_DIGEST_BYTES]).digest()
+    if digest != content[-_DIGEST_BYTES:] or content[:8] != _MAGIC:
+        return b""
+    return content[16 : 16 + int.from_bytes(content[8:16], "little")]
 
 
 def assemble(blocks: Sequence[Block]) -> xr.Dataset:
@@ -185,87 +161,69 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
     """
     first = blocks[0].header
     small = sum(block.path.stat().st_size for block in blocks) <= _MAX_MEMORY_BYTES
-    variables: dict[str, xr.Variable] = {}
-    maps = [np.memmap(block.path, mode="r") for block in blocks] if small else []
-    for name, described in first["variables"].items():
-        dims, attrs = tuple(described["dims"]), _decode_attributes(described["attrs"])
-        if "time" not in dims:
-            # a copy: Windows does not remove a file that is mapped
-            data = np.array(_map_variable(blocks[0], name))
-        elif small:
-            data = np.concatenate(
-                [
-                    _slice_variable(mapped, block, name)
-                    for mapped, block in zip(maps, blocks, strict=True)
-                ],
-                axis=dims.index("time"),
-            )
-        elif name in first["coords"]:
-            data = np.concatenate(
-                [_map_variable(block, name) for block in blocks], axis=dims.index("time")
-            )
-        else:
-            data = _make_lazy(blocks, name)
-        variables[name] = xr.Variable(dims, data, attrs)
+    long = {
+        name: described["dims"].index("time")
+        for name, described in first["variables"].items()
+        if "time" in described["dims"]
+    }
+    at_once = [name for name in long if small or name in first["coords"]]
+    read = [_read_variables(block, at_once) for block in blocks]
+    arrays: dict[str, Any] = _read_variables(blocks[0], first["variables"].keys() - long.keys())
+    for name, along in long.items():
+        arrays[name] = (
+            np.concatenate([part[name] for part in read], axis=along)
+            if name in at_once
+            else _make_lazy(blocks, name, along)
+        )
+    variables = {
+        name: xr.Variable(described["dims"], arrays[name], _decode_attributes(described["attrs"]))
+        for name, described in first["variables"].items()
+    }
     whole = xr.Dataset(variables, attrs=_decode_attributes(first["attrs"]))
     return whole.set_coords(first["coords"])
 
 
-def _slice_variable(mapped: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
-    """Slice one variable from a block that is mapped as a whole."""
+def _read_variables(block: Block, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Copy variables of a block, because Windows does not remove a file that is mapped."""
+    content = np.memmap(block.path, mode="r")
+    return {name: _slice_variable(content, block, name).copy() for name in names}
+
+
+def _slice_variable(content: NDArray[np.uint8], block: Block, name: str) -> NDArray[Any]:
+    """Find a variable in the content of a block file."""
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
     begin = block.begin + described["place"]
-    return np.asarray(
-        mapped[begin : begin + int(np.prod(shape)) * dtype.itemsize].view(dtype).reshape(shape)
-    )
+    values = content[begin : begin + math.prod(shape) * dtype.itemsize]
+    return np.asarray(values.view(dtype).reshape(shape))
 
 
-def _map_variable(block: Block, name: str) -> NDArray[Any]:
-    """Map one variable of a block."""
-    described = block.header["variables"][name]
-    dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
-    if 0 in shape:
-        return np.empty(shape, dtype)
-    return np.memmap(
-        block.path, dtype=dtype, mode="r", offset=block.begin + described["place"], shape=shape
-    )
-
-
-def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
+def _make_lazy(blocks: Sequence[Block], name: str, along: int) -> Any:
     """Make a dask array that reads a variable along time from the block files."""
     import dask.array as da
 
     described = blocks[0].header["variables"][name]
-    along, dtype = described["dims"].index("time"), np.dtype(described["dtype"])
+    dtype = np.dtype(described["dtype"])
     edges = np.cumsum([0, *(block.part.stop - block.part.start for block in blocks)])
     shape = [int(edges[-1]) if i == along else size for i, size in enumerate(described["shape"])]
     dims = list(zip(described["dims"], shape, strict=True))
     inner = int(np.prod([size for dim, size in dims if dim not in ("axis", "term", "time")]))
     sizes = {"axis": 1, "term": 1, "time": max(1, min(shape[along], CHUNK_VALUES // max(1, inner)))}
 
-    def part(place: tuple[slice, ...]) -> NDArray[Any]:
-        begin, end = place[along].start, place[along].stop
-        values = np.empty([one.stop - one.start for one in place], dtype)
+    def read_part(box: tuple[slice, ...]) -> NDArray[Any]:
+        begin, end = box[along].start, box[along].stop
+        pieces = []
         for i in range(
             int(np.searchsorted(edges, begin, side="right")) - 1,
             int(np.searchsorted(edges, end, side="left")),
         ):
-            first, last = max(begin, int(edges[i])), min(end, int(edges[i + 1]))
-            inside = [
-                slice(first - int(edges[i]), last - int(edges[i])) if n == along else one
-                for n, one in enumerate(place)
-            ]
-            _read_into(
-                values[(slice(None),) * along + (slice(first - begin, last - begin),)],
-                blocks[i],
-                name,
-                inside,
-            )
-        return values
+            inside = slice(max(begin - int(edges[i]), 0), end - int(edges[i]))
+            values = _slice_variable(np.memmap(blocks[i].path, mode="r"), blocks[i], name)
+            pieces.append(values[tuple(inside if n == along else one for n, one in enumerate(box))])
+        return np.concatenate(pieces, axis=along)
 
     def read(block_info: Mapping[Any, Any]) -> NDArray[Any]:
-        return part(tuple(slice(*ends) for ends in block_info[None]["array-location"]))
+        return read_part(tuple(slice(*ends) for ends in block_info[None]["array-location"]))
 
     chunks = da.core.normalize_chunks(
         [sizes.get(dim, size) for dim, size in dims], shape=tuple(shape)
@@ -276,52 +234,24 @@ def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
         da.map_blocks(
             read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label
         ),
-        part,
+        read_part,
     )
-
-
-def _read_into(out: NDArray[Any], block: Block, name: str, place: Sequence[slice]) -> None:
-    """Read a part of a variable of a block; directly if it is contiguous, as mapping is slow."""
-    shape = block.header["variables"][name]["shape"]
-    # all of the dimensions after this one is read
-    inner = max((i for i, size in enumerate(shape) if out.shape[i] < size), default=0)
-    if out.flags.c_contiguous and out.size and all(size == 1 for size in out.shape[:inner]):
-        first = int(np.ravel_multi_index([one.start for one in place], shape)) * out.itemsize
-        with block.path.open("rb", buffering=0) as file:
-            file.seek(block.begin + block.header["variables"][name]["place"] + first)
-            if _read_exactly(file, out.reshape(-1).view(np.uint8).data):
-                return
-        raise OSError(f"{block.path}: is cut short")
-    out[...] = _map_variable(block, name)[tuple(place)]
-
-
-def _read_exactly(file: Any, view: memoryview) -> bool:
-    """Read until the memory is full; False when the file ends before."""
-    while view.nbytes and (count := file.readinto(view)):
-        view = view[count:]
-    return not view.nbytes
 
 
 def _encode_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     """Encode attributes for JSON; arrays and numpy scalars are marked, to be restored."""
-    plain: dict[str, Any] = {}
-    for name, value in attrs.items():
-        array = isinstance(value, np.ndarray | np.generic)
-        plain[str(name)] = (
-            {"dtype": value.dtype.str, "shape": list(value.shape), "values": value.tolist()}
-            if array
-            else value
-        )
-    return plain
+    return {
+        str(name): {"dtype": value.dtype.str, "shape": list(value.shape), "values": value.tolist()}
+        if isinstance(value, np.ndarray | np.generic)
+        else value
+        for name, value in attrs.items()
+    }
 
 
 def _decode_attributes(plain: Mapping[str, Any]) -> dict[str, Any]:
-    attrs: dict[str, Any] = {}
-    for name, value in plain.items():
-        marked = isinstance(value, dict) and value.keys() == {"dtype", "shape", "values"}
-        attrs[name] = (
-            np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])[()]
-            if marked
-            else value
-        )
-    return attrs
+    return {
+        name: np.array(value["values"], dtype=value["dtype"]).reshape(value["shape"])[()]
+        if isinstance(value, dict) and value.keys() == {"dtype", "shape", "values"}
+        else value
+        for name, value in plain.items()
+    }
