@@ -170,8 +170,9 @@ def model_text(model: Mapping[str, Any], *, heading: str = "") -> str:
     """
     import tomli_w
 
+    tables = {name: table for name, table in model.items() if isinstance(table, Mapping) or table}
     comment = "".join(f"# {line}\n" for line in heading.splitlines())
-    return f"{comment}\n" * bool(comment) + tomli_w.dumps(_to_toml(model))
+    return f"{comment}\n" * bool(comment) + tomli_w.dumps(_to_toml(tables))
 
 
 def _to_toml(value: Any) -> Any:

@@ -176,6 +176,7 @@ def test_models_are_valid_toml_with_the_same_numbers(noise: dict[str, float], ax
         "effect": [{"name": "warm_up", "axes": axes, "amplitude": 0.1}],
     }
     assert tomllib.loads(model_text(tables, heading="made\nby hand")) == tables
+    assert "environment" not in model_text({**tables, "environment": []})
 
 
 @plain_pages
