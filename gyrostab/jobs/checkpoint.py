@@ -173,7 +173,7 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
         arrays[name] = (
             np.concatenate([part[name] for part in read], axis=along)
             if name in at_once
-            else _make_lazy(blocks, name, along)
+            else _make_lazy(blocks, name)
         )
     variables = {
         name: xr.Variable(described["dims"], arrays[name], _decode_attributes(described["attrs"]))
@@ -194,16 +194,19 @@ def _slice_variable(content: NDArray[np.uint8], block: Block, name: str) -> NDAr
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
     begin = block.begin + described["place"]
-    values = content[begin : begin + math.prod(shape) * dtype.itemsize]
+    size = math.prod(shape) * dtype.itemsize
+    values = content[begin : begin + size]
+    if values.size < size:
+        raise OSError(f"{block.path}: is cut short")
     return np.asarray(values.view(dtype).reshape(shape))
 
 
-def _make_lazy(blocks: Sequence[Block], name: str, along: int) -> Any:
+def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
     """Make a dask array that reads a variable along time from the block files."""
     import dask.array as da
 
     described = blocks[0].header["variables"][name]
-    dtype = np.dtype(described["dtype"])
+    along = described["dims"].index("time")
     edges = np.cumsum([0, *(block.part.stop - block.part.start for block in blocks)])
     shape = [int(edges[-1]) if i == along else size for i, size in enumerate(described["shape"])]
     dims = list(zip(described["dims"], shape, strict=True))
@@ -225,6 +228,7 @@ def _make_lazy(blocks: Sequence[Block], name: str, along: int) -> Any:
     def read(block_info: Mapping[Any, Any]) -> NDArray[Any]:
         return read_part(tuple(slice(*ends) for ends in block_info[None]["array-location"]))
 
+    dtype = np.dtype(described["dtype"])
     chunks = da.core.normalize_chunks(
         [sizes.get(dim, size) for dim, size in dims], shape=tuple(shape)
     )
