@@ -9,6 +9,10 @@ PROOF  ?= proof
 N      ?= 100000
 SEED   ?= 1
 JOBS   ?= $(shell nproc 2>/dev/null || echo 2)
+# Tests start many processes: keep compiled modules, also where the environment asks for none.
+export PYTHONDONTWRITEBYTECODE =
+# One file of tests stays on one worker, with what its tests share.
+PYTEST := -m pytest -n auto --dist loadfile
 
 .PHONY: demo docs test test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
 
@@ -32,10 +36,10 @@ demo: $(VENV)/.installed  ## install, and run the main job on the shipped log
 	$(BIN)/gyrostab demo -o $(OUT) --overwrite
 
 test: $(VENV)/.installed-test  ## install, and run the tests
-	$(BIN)/python -m pytest -n auto --dist loadgroup
+	$(BIN)/python $(PYTEST)
 
-test-full: $(VENV)/.installed-test  ## all tests, including those that take a minute or more
-	$(BIN)/python -m pytest -n auto --dist loadgroup -m "slow or not slow"
+test-full: $(VENV)/.installed-test  ## all tests: also whole diagnoses and calibrations, and more random examples
+	$(BIN)/python $(PYTEST) -m "slow or not slow" --hypothesis-profile full
 
 $(VENV)-minimum/.installed: pyproject.toml tests/support/minimum_versions.py
 	test -x $(VENV)-minimum/bin/python || $(PYTHON) -m venv $(VENV)-minimum
@@ -44,7 +48,7 @@ $(VENV)-minimum/.installed: pyproject.toml tests/support/minimum_versions.py
 	touch $@
 
 test-minimum: $(VENV)-minimum/.installed  ## the tests with the lowest versions of the dependencies that pyproject.toml allows
-	$(VENV)-minimum/bin/python -m pytest -n auto --dist loadgroup
+	$(VENV)-minimum/bin/python $(PYTEST)
 
 fuzz: $(VENV)/.installed-test  ## try damaged inputs and write docs/fuzzing.md (N=100000 SEED=1 JOBS=2); can be stopped and repeated
 	$(BIN)/python -W ignore -m tests.fuzz --count $(N) --seed $(SEED) --jobs $(JOBS) --output docs/fuzzing.md

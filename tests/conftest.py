@@ -7,9 +7,17 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 ROOT = Path(__file__).resolve().parents[1]
+
+# The same examples in every run of `make test`; other ones, and more, in `make test-full`.
+settings.register_profile(
+    "fast", deadline=None, max_examples=25, derandomize=True, database=None, print_blob=True
+)
+settings.register_profile("full", deadline=None, max_examples=100, print_blob=True)
+settings.load_profile("fast")
 
 
 @pytest.fixture(scope="session")

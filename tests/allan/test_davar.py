@@ -10,7 +10,7 @@ import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.allan.davar import davar, davar_part, davar_parts
@@ -57,7 +57,6 @@ def records(draw):
 
 class TestAgainstTheDefinition:
     @given(records(), st.none() | st.integers(1, 700))
-    @settings(max_examples=100, deadline=None)
     def test_block_sums_equal_the_direct_sum(self, record, chunk):
         x, window, step, ks = record
         if (x.size - window) // step > 200:
@@ -86,7 +85,6 @@ class TestAgainstTheDefinition:
         assert np.all(np.abs(got - want)[count > 0] <= (1e-12 * want + floor)[count > 0])
 
     @given(records())
-    @settings(max_examples=40, deadline=None)
     def test_angle_records_use_every_complete_triple(self, record):
         x, window, step, ks = record
         x = x.astype(np.float64)

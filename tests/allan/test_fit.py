@@ -8,7 +8,7 @@ import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
@@ -505,7 +505,6 @@ def quantile_curve():
     return fit._quantile_curve(0.05)
 
 
-@settings(deadline=None)
 @given(st.floats(-4.0, 12.3))
 def test_interpolated_quantile_is_that_of_scipy(quantile_curve, exponent):
     freedom = np.array([10.0**exponent])

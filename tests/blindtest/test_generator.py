@@ -95,7 +95,7 @@ def test_shot_noise_level_matches_textbook():
 
 
 @given(st.lists(st.floats(-0.9, 0.9), min_size=2, max_size=3))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_shared_source_keeps_the_level_of_each_axis(shares):
     rng = np.random.default_rng(1)
     own, common = rng.normal(size=(len(shares), 20_000)) * 3.0, rng.normal(size=20_000)
@@ -246,7 +246,7 @@ def test_log_allan_of_long_records_matches_the_direct_one():
 
 
 @given(st.floats(0.02, 0.6), st.floats(1.0, 8.0))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_telemetry_loses_the_given_share(share, burst):
     lost = telemetry.draw_losses(
         np.random.default_rng(7), 200_000, share=share, frame=5, burst=burst

@@ -1,37 +1,61 @@
-"""A small benchmark with a random seed: properties that hold for any cases.
+"""A small benchmark of every kind of case, and one of a random seed that is diagnosed as well.
 
-The seed is printed; `GYROSTAB_PROVE_SEED=... python -m pytest tests/blindtest/test_prove_fresh.py`
-repeats the run.
+The random seed is printed; `GYROSTAB_PROVE_SEED=... python -m pytest -m slow
+tests/blindtest/test_prove_fresh.py` repeats the run.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
 import os
 import secrets
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
 import gyrostab
+from gyrostab.blindtest.runner.benchmark import Proof
 from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED
-from gyrostab.blindtest.scenarios.plan import plan_case
+from gyrostab.blindtest.scenarios.plan import KINDS, plan_case
 from gyrostab.blindtest.scoring.table import score_table
 from gyrostab.diagnose.result.content import check_diagnosis
+from tests.support.diagnosed import diagnosis
 
 NUMBER = 5
 
 
+def shorten(plan: dict) -> dict:
+    """Plan a short record; a sub-threshold effect needs a longer one."""
+    return plan | {"rate": 10.0, "seconds": 3000.0 if plan["kind"] == "sub_threshold" else 600.0}
+
+
 def short_plans(number: int, *, seed: int) -> list[dict]:
-    """Plan the drawn cases with short records; a sub-threshold effect needs a longer one."""
-    plans = [plan_case(index, seed=seed) for index in range(number)]
-    return [
-        plan | {"rate": 10.0, "seconds": 3000.0 if plan["kind"] == "sub_threshold" else 600.0}
-        for plan in plans
-    ]
+    return [shorten(plan_case(index, seed=seed)) for index in range(number)]
 
 
+def plans_of_each_kind(number: int, *, seed: int) -> list[dict]:
+    """Plan the first case of each kind."""
+    plans = [shorten(plan_case(index, seed=seed)) for index in range(sum(KINDS.values()))]
+    first = {plan["kind"]: plan for plan in reversed(plans)}
+    return [first[kind] for kind in KINDS][:number]
+
+
+def test_each_kind_of_case_is_committed_and_scored(tmp_path, monkeypatch):
+    """All cases get the same diagnosis, with two effects of vibration."""
+    monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", plans_of_each_kind)
+    diagnosing = importlib.import_module("gyrostab.diagnose.core")
+    monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: diagnosis())
+    proof = gyrostab.prove(tmp_path / "proof", cases=len(KINDS), seed=1, nulls=100, workers=0)
+    rows = check_run(tmp_path / "proof", proof, cases=len(KINDS))
+    assert set(rows["kind"]) == set(KINDS)
+    assert rows["kind"].value_counts()["pair"] == 2
+    assert rows["kind"].value_counts()["triple"] == 3
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_random_cases_are_committed_diagnosed_and_scored(tmp_path, monkeypatch, capsys):
     seed = int(
@@ -42,9 +66,13 @@ def test_random_cases_are_committed_diagnosed_and_scored(tmp_path, monkeypatch, 
     monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", short_plans)
     folder = tmp_path / "proof"
     proof = gyrostab.prove(folder, cases=NUMBER, seed=seed, nulls=100, workers=0)
-
-    assert proof.failed == {}
     assert proof.seed == seed
+    check_run(folder, proof, cases=NUMBER)
+
+
+def check_run(folder: Path, proof: Proof, *, cases: int) -> pd.DataFrame:
+    """Check the files of a run against each other; return the rows of its scores."""
+    assert proof.failed == {}
     sums = (folder / "SHA256SUMS").read_text()
     assert hashlib.sha256(sums.encode()).hexdigest() == proof.commitment
     names = []
@@ -52,7 +80,7 @@ def test_random_cases_are_committed_diagnosed_and_scored(tmp_path, monkeypatch, 
         value, path = line.split("  ")
         assert hashlib.sha256((folder / path).read_bytes()).hexdigest() == value
         names.append(path.removeprefix("truth/").removesuffix(".json"))
-    assert len(names) == NUMBER
+    assert len(names) == cases
 
     rows = pd.read_csv(folder / "scores.csv", keep_default_na=False, na_values=[""])
     assert set(rows["name"]) == set(names)
@@ -81,7 +109,8 @@ def test_random_cases_are_committed_diagnosed_and_scored(tmp_path, monkeypatch, 
         == (rows["kind"] == "null").sum()
     )
     page = (folder / "table.md").read_text()
-    assert str(seed) in page
+    assert str(proof.seed) in page
     assert proof.commitment in page
     for name in ("completeness.png", "reliability.png"):
         assert (folder / name).read_bytes()[:4] == b"\x89PNG"
+    return rows

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -472,7 +472,6 @@ def test_only_names_added_by_an_injection_count():
     assert set(main["n"]) == {0}  # excluded from all other figures
 
 
-@settings(deadline=None)
 @given(st.integers(0, 60), st.integers(1, 60))
 def test_wilson_matches_scipy(hits, total):
     hits = min(hits, total)
@@ -480,7 +479,6 @@ def test_wilson_matches_scipy(hits, total):
     np.testing.assert_allclose(wilson(hits, total), (expected.low, expected.high), atol=1e-6)
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 300), st.integers(1, 60)), min_size=1, max_size=4),
     st.integers(-200, 200),

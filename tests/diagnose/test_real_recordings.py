@@ -16,7 +16,6 @@ from gyrostab.diagnose.identify.effect_candidates import effect_candidates
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from tests.support.scripts import load_script
 
-pytestmark = pytest.mark.xdist_group("diagnose_recordings")
 SCRIPT = load_script("pipelines/diagnose_recordings.py")
 RESETS_PER_S = 1502 / 360  # counted in the recording by its publisher's notes
 
@@ -65,6 +64,7 @@ def test_turns_of_the_ramp_are_counted(open_recording: Callable[..., Any]) -> No
     assert -np.mean(turns) == pytest.approx(RESETS_PER_S, rel=0.01)
 
 
+@pytest.mark.slow
 def test_no_resets_without_the_ramp_channel(open_recording: Callable[..., Any]) -> None:
     found = gyrostab.diagnose(open_recording("fog-blueseis-without-ramp", end=180.0), nulls=100)
     assert found.verdict != "no mismatch"
@@ -85,12 +85,14 @@ def test_coarse_quantization_grid_is_not_a_dead_zone(open_recording: Callable[..
     }
 
 
+@pytest.mark.slow
 def test_platform_sway_is_real_motion(open_recording: Callable[..., Any]) -> None:
     found = gyrostab.diagnose(open_recording("rlg-static-30min", end=180.0), nulls=100)
     assert "real_motion" in named_effects(found)
     assert not {"dead_zone", "held_samples", "clipping"} & set(named_effects(found))
 
 
+@pytest.mark.slow
 def test_fibre_optic_axis_does_not_follow_temperature(open_recording: Callable[..., Any]) -> None:
     found = gyrostab.diagnose(open_recording("fog-hybrid-warmup"), nulls=100)
     thermal = [one for one in found.effects if "temperature" in (one["driver"] or "")]

@@ -55,7 +55,7 @@ def simulate_axes(seed: int, *names: str):
     return simulate(model, duration="25min", rate=10.0, seed=seed).compute()
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.slow)])
 def test_steady_effects_of_the_simulation_are_not_mismatches(seed):
     names = ("shared_source", "line", "bump")
     found = gyrostab.diagnose(
@@ -64,7 +64,7 @@ def test_steady_effects_of_the_simulation_are_not_mismatches(seed):
     assert found.verdict == "no mismatch"
 
 
-@pytest.mark.parametrize("lacking", ["shared_source", "line"])
+@pytest.mark.parametrize("lacking", ["shared_source", pytest.param("line", marks=pytest.mark.slow)])
 def test_effect_in_addition_to_the_simulation_is_identified(lacking):
     names = ("shared_source", "line", "bump")
     simulation = simulate_axes(111, *(name for name in names if name != lacking))

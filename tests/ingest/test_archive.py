@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, TimeError, UnitError
@@ -83,7 +83,6 @@ def test_stored_pieces_in_any_order_restore_the_whole_log(tmp_path: Path, suffix
     assert "2.0 s from 2026-03-01T10:00:38.000 are in 1" in said(joined)
 
 
-@settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_every_sample_of_any_piece_appears_once(data: st.DataObject) -> None:
     size = data.draw(st.integers(300, 900), label="samples")
@@ -219,7 +218,6 @@ def test_a_slightly_different_clock_is_followed_sample_by_sample(ppm: float) -> 
     assert gap_table(joined)["samples"].sum() == np.isnan(expected).sum()
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     off=st.floats(-0.5, 0.5),
     ratio=st.floats(-1e-2, 1e-2).map(lambda part: 1 + part),

@@ -148,7 +148,7 @@ def write_text(path: Path, law: Law, form: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz"])
 @given(law=laws, form=st.sampled_from(["iso", "s", "us", "h"]))
-@settings(max_examples=8, deadline=None, phases=PHASES)
+@settings(max_examples=8, phases=PHASES)
 def test_text(suffix, law, form):
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"log{suffix}"
@@ -162,7 +162,7 @@ def test_text(suffix, law, form):
     compression=st.sampled_from(["none", "snappy", "zstd"]),
     nulls=st.booleans(),
 )
-@settings(max_examples=15, deadline=None, phases=PHASES)
+@settings(max_examples=15, phases=PHASES)
 def test_parquet(law, stamps, group, compression, nulls):
     dates = STAMPS.view("M8[ns]")
     if stamps == "s":  # a second does not hold the stamps of this log
@@ -384,7 +384,7 @@ def write_netcdf(
     chunk=st.sampled_from([1, 37, 294]),
     level=st.sampled_from([0, 4]),
 )
-@settings(max_examples=15, deadline=None, phases=PHASES)
+@settings(max_examples=15, phases=PHASES)
 def test_netcdf(form, law, packed, clock, chunk, level):
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.nc"
@@ -403,7 +403,7 @@ def test_netcdf(form, law, packed, clock, chunk, level):
     chunk=st.sampled_from([1, 37, 294]),
     level=st.sampled_from([None, 4]),
 )
-@settings(max_examples=15, deadline=None, phases=PHASES)
+@settings(max_examples=15, phases=PHASES)
 def test_hdf5(law, packed, clock, chunk, level):
     stamps, time_attributes = clock.store()
     stored, void = packed.store()
@@ -432,7 +432,7 @@ def test_hdf5(law, packed, clock, chunk, level):
 @given(
     law=laws, packed=packings, clock=clocks, chunk=st.sampled_from([37, 294]), matrix=st.booleans()
 )
-@settings(max_examples=10, deadline=None, phases=PHASES)
+@settings(max_examples=10, phases=PHASES)
 @pytest.mark.filterwarnings(
     "ignore:The data type", "ignore:variable .* has multiple fill", "ignore:Consolidated metadata"
 )
@@ -468,7 +468,7 @@ def test_zarr(version, law, packed, clock, chunk, matrix):
 
 @pytest.mark.parametrize("version", ["5", "7.3"])
 @given(law=laws, matrix=st.booleans(), whole=st.booleans())
-@settings(max_examples=6, deadline=None, phases=PHASES)
+@settings(max_examples=6, phases=PHASES)
 def test_matlab(version, law, matrix, whole):
     since = (STAMPS - STAMPS[0]) // 1000
     data: dict[str, np.ndarray] = {"time": since[:, None] if whole else since[:, None] / 1e6}
@@ -508,7 +508,7 @@ def test_matlab(version, law, matrix, whole):
     chunk=st.sampled_from([50, 300]),
     epoch=st.sampled_from(EPOCHS),
 )
-@settings(max_examples=10, deadline=None, phases=PHASES)
+@settings(max_examples=10, phases=PHASES)
 @pytest.mark.filterwarnings(
     "ignore:The data type", "ignore:Consolidated metadata", "ignore:variable .* has multiple fill"
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import gyrostab
@@ -297,7 +297,6 @@ def test_a_log_of_angles():
     np.testing.assert_array_equal(made["count"][0], count)
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     rate=st.sampled_from([1.0, 3.0, 7.3, 99.3, 100.0, 300.0, 1024.0, 1e4, 1 / 3]),
     size=st.integers(2, 400),

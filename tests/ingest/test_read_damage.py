@@ -49,7 +49,7 @@ def test_the_structure_of_whole_matlab_files_is_accepted(matlab: list[Path]) -> 
         check_structure(path)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+@settings(max_examples=200, derandomize=True, database=None)
 @given(data=st.data())
 def test_a_matlab_file_that_passes_the_check_is_read_or_refused(
     matlab: list[Path], data: st.DataObject

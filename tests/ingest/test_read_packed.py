@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.ingest import files, read_log
@@ -44,7 +44,6 @@ def bits(values: np.ndarray) -> np.ndarray:
     st.sampled_from([(1.0, 0.0), (0.02, 0.0), (1 / 3, 0.0), (1.8, 32.0)]),
     st.sampled_from([None, np.nan, np.inf, -np.inf]),
 )
-@settings(max_examples=150, deadline=None)
 def test_packed_decimals_equal_parsed_ones(wholes, digits, law, missing):
     texts = [
         f"{'-' * (n < 0)}{abs(n) // 10**digits}.{abs(n) % 10**digits:0{digits}d}"
@@ -81,7 +80,6 @@ def test_other_numbers_than_32_bit_decimals_are_not_packed(odd):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400))
-@settings(max_examples=60, deadline=None)
 def test_packed_even_steps_are_restored(seed, n):
     rng = np.random.default_rng(seed)
     steps = np.where(rng.random(n) < 0.005, rng.integers(-(10**12), 10**12, n), 2_500_000)

@@ -235,9 +235,7 @@ def test_a_unit_that_udunits_refuses_or_misreads_is_not_written_as_units(tmp_pat
     assert open_dataset(path)["it"].attrs["units"] == units
 
 
-@settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     values=hnp.arrays(
         np.float64,
@@ -269,9 +267,7 @@ def test_round_trip_of_anything(tmp_path, values, units, stamps, notes, write):
     assert_same(before, open_dataset(write(before, tmp_path / write.__name__, overwrite=True)))
 
 
-@settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     start=st.integers(-(2**60), 2**60),
     rate=st.sampled_from([300.0, 400.0, 99.3, 1.0, 1000 / 3, 0.1]),

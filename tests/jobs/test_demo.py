@@ -20,8 +20,6 @@ from gyrostab.errors import SchemaError
 from gyrostab.io.datasets import open_log, open_product
 from gyrostab.jobs.demo import FILES, find_parts, sample_log
 
-pytestmark = pytest.mark.xdist_group("demo")  # one worker, one run of the demo
-
 DATA = Path(__file__).resolve().parents[2] / "data"
 
 

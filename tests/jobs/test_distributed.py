@@ -27,7 +27,6 @@ from gyrostab.jobs.run import run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 
 distributed = pytest.importorskip("distributed")
-pytestmark = pytest.mark.xdist_group("distributed")
 WINDOW = {"window": "4000samples", "step": "4000samples", "taus": "12"}
 PARTS = 5
 

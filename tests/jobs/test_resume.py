@@ -24,7 +24,6 @@ from gyrostab.jobs.job import job_folder, lock_job
 from gyrostab.time.grid import time_coordinate
 from tests.support.crashing import WINDOW
 
-pytestmark = pytest.mark.xdist_group("resume")
 OPTIONS = (
     "--window",
     WINDOW["window"],

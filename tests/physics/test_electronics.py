@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
@@ -419,7 +419,6 @@ VARIANTS = [
 ]
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.sampled_from(VARIANTS), st.integers(0, 10_000))
 def test_chunks_do_not_change_the_result(table, seed):
     size = 1200

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kurtosis
 
@@ -20,7 +20,6 @@ from gyrostab.simulate import simulate
 from tests.support.effect_bench import avar, run, windows_of
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(0.0, 20.0), max_size=12), st.integers(0, 12))
 def test_means_of_steps_are_integrals(positions, cut):
     positions = sorted(positions)

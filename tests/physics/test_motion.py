@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, SchemaError
@@ -103,7 +103,6 @@ def tool_axes(inclination, azimuth, toolface):
 
 
 @given(st.floats(-90, 90), st.floats(0, 180), st.floats(-360, 360), st.floats(-360, 360))
-@settings(max_examples=60, deadline=None)
 def test_earth_rate_at_rest_is_the_rotated_vector(latitude, inclination, azimuth, toolface):
     effect = make_effect(
         {

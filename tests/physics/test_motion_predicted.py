@@ -142,7 +142,7 @@ def test_spectra_match_the_prediction(table):
     st.integers(0, 2**32 - 1),
     st.sampled_from(["bent", "band", "resonance", "lines", "earth", "errors"]),
 )
-@settings(max_examples=24, deadline=None)
+@settings(max_examples=24)
 def test_chunks_never_matter(seed, which):
     table = {
         "bent": {

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.linalg import solve_banded
@@ -76,7 +76,6 @@ def test_shupe_matches_heat_conduction_through_a_winding():
 
 
 @given(st.integers(2, 30), st.floats(1.0, 1e4))
-@settings(max_examples=30, deadline=None)
 def test_modes_of_a_winding_share_all_of_the_ramp(count, lag):
     times, whole, halves = slab(lag, count)
     assert whole.sum() == pytest.approx(1.0, abs=1e-12)
@@ -386,7 +385,6 @@ turns = st.lists(st.floats(-50, 100), min_size=2, max_size=8)
 
 
 @given(turns, st.floats(0.1, 20.0))
-@settings(max_examples=60, deadline=None)
 def test_dead_band_is_independent_of_speed_and_forgets_overrun_reversals(values, width):
     coarse, _ = apply_dead_band(np.array(values), width, values[0])
     fine = np.concatenate([np.linspace(a, b, 50) for a, b in itertools.pairwise(values)])

@@ -168,7 +168,6 @@ def test_predicted_spectra_have_the_allan_variance_of_the_law(name, parameter, l
 
 
 @given(st.floats(1.0, 500.0), st.integers(3, 40), st.integers(0, 2**31))
-@settings(max_examples=25, deadline=None)
 def test_lagged_changes_sum_to_the_lagged_temperature(lag, count, seed):
     """Means over adjacent intervals sum to the change of the lagged temperature."""
     rng = np.random.default_rng(seed)
@@ -240,7 +239,7 @@ CASES = [
 
 @pytest.mark.parametrize("table", CASES, ids=lambda table: "-".join(map(str, table.values())))
 @given(st.integers(0, 2**31), st.sampled_from([0.3, 10.0, 977.0]))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_chunk_edges_do_not_matter(table, seed, rate):
     rng = np.random.default_rng(seed)
     size = 600

@@ -18,7 +18,6 @@ from gyrostab.cli import main
 from gyrostab.units import parse_unit
 from tests.support.scripts import load_script
 
-pytestmark = pytest.mark.xdist_group("real_recordings")
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.dates import date2num
@@ -67,7 +67,6 @@ def test_one_spike_in_a_long_record_is_drawn():
     assert np.isnan(drawn).any()  # the line is broken at the gap
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     values=st.lists(st.one_of(st.floats(-1e9, 1e9), st.just(np.nan)), min_size=1, max_size=300),
     columns=st.integers(1, 50),
@@ -235,7 +234,6 @@ def test_coefficients_of_a_surface_are_refused():
         plot_coefficients(synthetic.surface())
 
 
-@settings(max_examples=40, deadline=None)
 @given(edf=st.floats(1.0, 1e5), avar=st.floats(1e-6, 1e6))
 def test_band_is_the_chi_square_band(edf, avar):
     low, high = band(avar, edf)

@@ -22,7 +22,7 @@ from gyrostab.time.grid import time_coordinate
 from tests.support.simulated import model
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     cuts=st.lists(st.integers(1, 399), max_size=6, unique=True),
     rate=st.sampled_from([0.7, 7.0, 20.0, 33.0]),

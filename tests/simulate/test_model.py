@@ -8,7 +8,6 @@ import tomllib
 import numpy as np
 import pytest
 
-from gyrostab.cli import main
 from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.ingest.grid.regularise import gap_table
 from gyrostab.io.datasets import open_log
@@ -16,6 +15,7 @@ from gyrostab.schema import check_log
 from gyrostab.simulate import read_model, simulate
 from gyrostab.simulate.model import PROFILES
 from tests.conftest import ROOT
+from tests.support.command_line import call
 from tests.support.simulated import BIASED, LOG, WORLD, model
 
 # --------------------------------------------------------------------------------
@@ -131,50 +131,21 @@ def test_command_writes_a_log_that_run_takes(tmp_path, capsys):
     )
     out = tmp_path / "log.nc"
     options = ["--duration", "2min", "--rate", "50", "--seed", "3", "--quiet-progress"]
-    assert main(["simulate", str(path), "-o", str(out), *options]) == 0
+    assert call("simulate", path, "-o", out, *options) == 0
     log = open_log(out)
     assert log.sizes["time"] == 6000
     np.testing.assert_array_equal(
         log.rate.values, simulate(path, duration="2min", rate=50.0, seed=3).rate.values
     )
-    assert (
-        main(["run", str(out), "-o", str(tmp_path / "p.nc"), "--window", "30s", "--quiet-progress"])
-        == 0
-    )
+    assert call("run", out, "-o", tmp_path / "p.nc", "--window", "30s", "--quiet-progress") == 0
     again = tmp_path / "again.nc"
     assert (
-        main(
-            [
-                "simulate",
-                str(path),
-                "-o",
-                str(again),
-                "--like",
-                str(out),
-                "--seed",
-                "3",
-                "--quiet-progress",
-            ]
-        )
-        == 2
+        call("simulate", path, "-o", again, "--like", out, "--seed", "3", "--quiet-progress") == 2
     )  # temperature twice
     assert "the channel 'temperature' twice" in capsys.readouterr().err
     path.write_text("[noise]\nN = 0.02\n")
     assert (
-        main(
-            [
-                "simulate",
-                str(path),
-                "-o",
-                str(again),
-                "--like",
-                str(out),
-                "--seed",
-                "3",
-                "--quiet-progress",
-            ]
-        )
-        == 0
+        call("simulate", path, "-o", again, "--like", out, "--seed", "3", "--quiet-progress") == 0
     )
     assert (open_log(again).time.values == log.time.values).all()
 
@@ -183,19 +154,7 @@ def test_command_explains_a_wrong_model(tmp_path, capsys):
     path = tmp_path / "m.toml"
     path.write_text('[noise]\nN = 0.02\n[[effect]]\nname = "temperature_bias"\n')
     assert (
-        main(
-            [
-                "simulate",
-                str(path),
-                "-o",
-                str(tmp_path / "log.nc"),
-                "--duration",
-                "1min",
-                "--rate",
-                "10",
-            ]
-        )
-        == 2
+        call("simulate", path, "-o", tmp_path / "log.nc", "--duration", "1min", "--rate", "10") == 2
     )
     said = capsys.readouterr().err
     assert "lacks the parameter 'sensitivity'" in said

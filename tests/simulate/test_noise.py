@@ -173,7 +173,7 @@ def test_quantization_is_a_bounded_error_of_the_angle():
 ALL = {**SIZES, "gauss_markov": MARKOV, "sinusoid": SINE}
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(chunk=st.integers(1, 700), lazy=st.booleans(), seed=st.integers(0, 2**40))
 def test_chunks_do_not_change_a_bit(chunk, lazy, seed):
     whole = make_noise(rate=RATE, size=600, seed=seed, **ALL)

@@ -70,7 +70,7 @@ def test_noise_reaches_the_analysis_at_its_level():
     np.testing.assert_allclose(n, [0.02, 0.02, 0.04], rtol=0.01)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(
     chunk=st.integers(150, 2500), seed=st.integers(0, 2**32), oversampling=st.sampled_from([1, 3])
 )

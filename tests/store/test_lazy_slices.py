@@ -9,7 +9,7 @@ import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab import make_log, open_product, to_netcdf, to_zarr
@@ -63,7 +63,6 @@ def placed(draw):
     return rows, size
 
 
-@settings(deadline=None)
 @given(placed(), st.data())
 def test_joined_samples_are_those_of_dask(made, data):
     rows, size = made

@@ -31,7 +31,6 @@ from tests.support.stored import (
 )
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     whole=hnp.arrays(
         np.float64,
@@ -55,7 +54,6 @@ def test_counts_come_back_bit_for_bit(whole, factor):
     )
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     values=hnp.arrays(np.float64, st.integers(1, 6), elements=st.floats(width=64)),
     factor=st.sampled_from([1.0, 0.1, 1 / 3]),
@@ -71,9 +69,7 @@ def test_counts_are_made_only_of_what_they_give_back(values, factor):
         np.testing.assert_array_equal(from_counts(counts, factor, -32767)[known], values[known])
 
 
-@settings(
-    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     whole=hnp.arrays(
         np.float64,

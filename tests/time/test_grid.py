@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError
@@ -25,7 +25,6 @@ START = pd.Timestamp("2026-11-20T23:59:59.123456789").value
     ),
     index=st.integers(0, 10**9),
 )
-@settings(max_examples=300, deadline=None)
 def test_every_stamp_is_right_to_a_nanosecond(rate, index):
     exact = Fraction(index) * 10**9 / Fraction(repr(rate))
     if exact > 2**62:

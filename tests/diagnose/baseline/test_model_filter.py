@@ -42,6 +42,7 @@ def test_a_model_expects_its_own_filter(filtering):
     assert np.abs((ratio - 1.0) / error).max() < 4.5
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_a_named_filter_of_a_fast_instrument_simulates_the_recording():
     log = simulate(

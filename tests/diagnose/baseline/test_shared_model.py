@@ -116,7 +116,7 @@ def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
     assert baseline["cross"].isel(band=band).mean("block").values[0].real < 0.0
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_common_noise_of_the_model_is_not_a_mismatch(seed):
     found = gyrostab.diagnose(
         log_of(seed, 0.0015), simulation={"noise": NOISE, "effect": [shared(0.0015)]}, nulls=100
@@ -137,6 +137,7 @@ def test_common_noise_beyond_the_model_is_named_with_its_size():
         )
 
 
+@pytest.mark.slow
 def test_an_effect_missing_in_the_model_is_named_and_explains_the_powers():
     found = gyrostab.diagnose(log_of(4, 0.0015), simulation={"noise": NOISE}, nulls=100)
     assert [effect["name"] for effect in found.effects] == ["shared_source"]
@@ -149,6 +150,7 @@ def test_an_effect_missing_in_the_model_is_named_and_explains_the_powers():
     assert abs(held["misfit_after"] - 1.0) < 0.5 * abs(held["misfit_before"] - 1.0)
 
 
+@pytest.mark.slow
 def test_low_pass_common_noise_is_not_a_filter():
     slow = {"name": "shared_source", "N": [0.0, 0.004, 0.004], "bandwidth": 0.8}
     model = {"noise": NOISE, "effect": [slow], "log": {"axes": ["x", "y", "z"]}}

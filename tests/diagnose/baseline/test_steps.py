@@ -55,6 +55,7 @@ def test_a_jump_within_a_block_explains_its_power(jumped):
     }
 
 
+@pytest.mark.slow
 def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
     seconds = np.arange(jumped.sizes["time"]) / 10.0
     rate = jumped["rate"].transpose("axis", "time").values.copy()

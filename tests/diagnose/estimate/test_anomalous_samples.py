@@ -38,14 +38,26 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
 @pytest.mark.parametrize(
     ("table", "options"),
     [
-        ({"name": "dead_zone", "width": 0.002, "axes": ["x"]}, {}),
-        ({"name": "dead_zone", "width": 0.2, "edge": "jump"}, {}),
+        pytest.param(
+            {"name": "dead_zone", "width": 0.002, "axes": ["x"]}, {}, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {"name": "dead_zone", "width": 0.2, "edge": "jump"}, {}, marks=pytest.mark.slow
+        ),
         ({"name": "dead_zone", "width": 0.2, "edge": "jump", "axes": ["x"]}, {"axes": "x"}),
-        ({"name": "held_samples", "per_hour": 60.0, "length": 0.4}, {}),
-        ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {}),
+        pytest.param(
+            {"name": "held_samples", "per_hour": 60.0, "length": 0.4}, {}, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"},
+            {},
+            marks=pytest.mark.slow,
+        ),
         ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {"axes": "x"}),
         ({"name": "clipping", "limit": 0.6, "axes": ["y"]}, {}),
-        ({"name": "clipping", "limit": 1.75, "axes": ["y"]}, {}),  # seven samples of 15 000
+        pytest.param(
+            {"name": "clipping", "limit": 1.75, "axes": ["y"]}, {}, marks=pytest.mark.slow
+        ),  # seven samples of 15 000
     ],
     ids=lambda value: "-".join(map(str, value.values())),
 )
@@ -62,6 +74,7 @@ def test_stuck_samples_are_identified(table, options):
         assert fitted.effect.fill == table.get("fill", "repeat")
 
 
+@pytest.mark.slow
 def test_periodic_pulse_is_lines_and_not_spikes():
     noise = SCATTER * np.random.default_rng(6).standard_normal((2, 15_000))
     noise[0, ::37] += 8.0 * SCATTER
@@ -105,6 +118,7 @@ def test_zeros_of_a_quantization_grid_coincide_when_an_axis_is_lost():
     np.testing.assert_allclose(drawn[:2], blocks["filled"].values[:2, lost].mean(axis=1), atol=0.12)
 
 
+@pytest.mark.slow
 def test_zero_filled_samples_are_identified_when_an_axis_is_lost():
     blocks = on_quantization_grid(20)
     baseline, records = nulls(blocks, 40)
@@ -132,7 +146,7 @@ def test_axis_lost_early_keeps_blocks_with_anomalous_samples():
     assert (identification.effect, identification.axes) == ("held_samples", ("x", "y", "z"))
 
 
-@pytest.mark.parametrize("fill", ["repeat", "zero"])
+@pytest.mark.parametrize("fill", ["repeat", pytest.param("zero", marks=pytest.mark.slow)])
 def test_number_and_length_of_held_samples_are_estimated(fill):
     """Held stretches: 40 of 6 samples, and 20 of 2."""
     rng = np.random.default_rng(8)
@@ -156,6 +170,7 @@ def test_number_and_length_of_held_samples_are_estimated(fill):
             assert one.parameters[name].low < true < one.parameters[name].high
 
 
+@pytest.mark.slow
 def test_burst_of_bit_errors_has_the_size_of_its_power():
     rng = np.random.default_rng(4)
     noise = SCATTER * rng.standard_normal((3, 15_000))
@@ -170,6 +185,7 @@ def test_burst_of_bit_errors_has_the_size_of_its_power():
     assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0
 
 
+@pytest.mark.slow
 def test_noise_rising_within_a_block_has_no_outliers():
     rng = np.random.default_rng(6)
     shaken = (np.arange(15_000) >= 31 * 162 + 120) & (
@@ -208,6 +224,7 @@ def test_rising_and_falling_noise_has_no_spikes():
         )
 
 
+@pytest.mark.slow
 def test_spikes_of_six_sigma_are_identified_and_counted():
     rng = np.random.default_rng(8)
     noise = SCATTER * rng.standard_normal((3, 15_000))
@@ -255,6 +272,7 @@ def test_spikes_in_most_blocks_keep_their_size_and_power():
         assert before == pytest.approx(1.0, rel=0.4) if known else before < 0.1
 
 
+@pytest.mark.slow
 def test_bursts_shorter_than_a_block_have_no_spikes():
     rng = np.random.default_rng(9)
     loud = np.ones(15_000)

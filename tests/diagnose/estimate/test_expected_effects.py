@@ -50,9 +50,9 @@ def diagnose_against_model(effects, *, environment=(), more=(), axes="xyz", seed
 @pytest.mark.parametrize(
     ("effects", "environment", "axes"),
     [
-        ([SPIKES, MEMORY, WALK], (SHAKE,), "xyz"),
+        pytest.param([SPIKES, MEMORY, WALK], (SHAKE,), "xyz", marks=pytest.mark.slow),
         ([HELD], (), "xy"),
-        ([SWAY], (), "xy"),
+        pytest.param([SWAY], (), "xy", marks=pytest.mark.slow),
         ([EARTH, SCALE], (TURN,), "xyz"),
     ],
     ids=["spikes, memory, walk", "held samples", "sway", "turning"],

@@ -149,7 +149,10 @@ def test_switching_powers_match_those_of_the_samples() -> None:
     assert np.corrcoef(np.log(told[:, 1] + 1e-3), np.log(seen[:, 1] + 1e-3))[0, 1] > 0.99
 
 
-@pytest.mark.parametrize(("low", "high", "deviations"), [(30.0, 3.0, 12.0), (4.0, 4.0, 3.0)])
+@pytest.mark.parametrize(
+    ("low", "high", "deviations"),
+    [pytest.param(30.0, 3.0, 12.0, marks=pytest.mark.slow), (4.0, 4.0, 3.0)],
+)
 def test_diagnosis_names_the_telegraph_with_its_parameters(
     low: float, high: float, deviations: float
 ) -> None:

@@ -125,6 +125,7 @@ def test_noisy_axes_are_not_correlated() -> None:
     assert common(search._score_candidates(state, set())) < 3.0
 
 
+@pytest.mark.slow
 def test_jump_and_ageing_are_withdrawn_in_a_stronger_drift():
     noise = 0.5 * np.random.default_rng(1).standard_normal((2, 9000))[1:]
     seconds = np.arange(9000) / 10.0

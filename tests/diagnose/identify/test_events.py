@@ -65,7 +65,9 @@ def components_of(state: State, one: Candidate) -> list[Component]:
     )[one.key]
 
 
-@pytest.mark.parametrize("inside", [slice(0, 3), slice(-4, None)])
+@pytest.mark.parametrize(
+    "inside", [pytest.param(slice(0, 3), marks=pytest.mark.slow), slice(-4, None)]
+)
 def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     factor = np.ones(BLOCKS)
     factor[inside] = 3.0

@@ -98,25 +98,28 @@ def test_sizes_outside_the_registry_are_rejected(shaken):
 @pytest.mark.parametrize(
     ("table", "environment", "others"),
     [
-        (
+        pytest.param(
             {"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]},
             "usual",
             {"g_sensitivity"},
+            marks=pytest.mark.slow,
         ),
-        (
+        pytest.param(
             {"name": "shupe", "sensitivity": 0.4, "axes": ["x"]},
             "usual",
             {"temperature_bias", "thermal_hysteresis", "warm_up"},
+            marks=pytest.mark.slow,
         ),
         (
             {"name": "shared_source", "N": [0.0012, 0.0012, -0.0012], "axes": ["x", "y", "z"]},
             "usual",
             set(),
         ),
-        (
+        pytest.param(
             {"name": "spikes", "per_hour": 100.0, "kind": "outlier", "size": 30.0, "axes": ["z"]},
             "usual",
             set(),
+            marks=pytest.mark.slow,
         ),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else None,
@@ -129,6 +132,7 @@ def test_single_effects_are_identified(table, environment, others):
     assert set(identification.alternatives) <= others
 
 
+@pytest.mark.slow
 def test_effect_without_its_channel_is_not_identified():
     found = identify(VIBRATION, drop=("vibration",))
     assert not found.identified
@@ -137,6 +141,7 @@ def test_effect_without_its_channel_is_not_identified():
     assert all(one.axes == ("x",) for one in found.unknown)
 
 
+@pytest.mark.slow
 def test_two_effects_are_both_identified():
     found = identify(
         [*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}]
@@ -222,6 +227,7 @@ def test_lost_blocks_are_expected_to_have_no_counts():
     assert many.min() > 40.0
 
 
+@pytest.mark.slow
 def test_every_line_of_a_comb_is_identified():
     """There are more lines than the limit for other effects."""
     quiet = reduce_log(

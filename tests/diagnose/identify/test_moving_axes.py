@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,9 +16,12 @@ from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
 from gyrostab.diagnose.result.tables import motion_tables
 from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.task import Comparison, Task
 from gyrostab.errors import SchemaError
+from gyrostab.progress import no_stage
 from gyrostab.simulate import simulate
 
+core = importlib.import_module("gyrostab.diagnose.core")
 N = 0.01
 BEGIN, END = 2000, 4000  # samples in which z turns
 
@@ -168,21 +172,36 @@ def test_motion_is_one_mismatch_with_the_axes_that_sense_it(reduced):
     assert "real rotation" in witnessed["statement"]
 
 
-def test_motion_stays_when_the_rest_cannot_be_calibrated(turning):
-    sparse = (
-        np.random.default_rng(3).random(turning.sizes["time"]) < 0.85
-    )  # too few samples for spectra
-    sparse[BEGIN:END] = False
-    gone = xr.DataArray(sparse, dims="time") & (turning["axis"] == "z")
-    log = turning.assign(
+@pytest.fixture
+def sparse_at_rest(turning) -> xr.Dataset:
+    """The turning record with too few samples of z at rest for spectra."""
+    lost = np.random.default_rng(3).random(turning.sizes["time"]) < 0.85
+    lost[BEGIN:END] = False
+    gone = xr.DataArray(lost, dims="time") & (turning["axis"] == "z")
+    return turning.assign(
         rate=turning["rate"]
         .where(~gone)
         .transpose("axis", "time")
         .assign_attrs(turning["rate"].attrs)
     )
-    whole = reduce_log(log)
+
+
+KEPT = "the diagnosis includes unexplained motion.*axis z"
+
+
+def test_motion_stays_when_the_rest_cannot_be_calibrated(sparse_at_rest):
+    whole = reduce_log(sparse_at_rest)
     with pytest.raises(SchemaError, match="axis z"):
-        calibrate_noise(without_motion(log, whole, moving_blocks(whole)))
-    with pytest.warns(UserWarning, match="the diagnosis includes unexplained motion.*axis z"):
-        found = diagnose(log, nulls=100)
+        calibrate_noise(without_motion(sparse_at_rest, whole, moving_blocks(whole)))
+    task = Task(sparse_at_rest, None, None, 5.0, 0, 100, 0.01, no_stage)
+    nothing = SimpleNamespace(identified=())
+    before = Comparison(whole, None, None, nothing, None)
+    with pytest.warns(UserWarning, match=KEPT):
+        assert core._compare_without_motion(task, before) is before
+
+
+@pytest.mark.slow
+def test_diagnosis_includes_motion_when_the_rest_cannot_be_calibrated(sparse_at_rest):
+    with pytest.warns(UserWarning, match=KEPT):
+        found = diagnose(sparse_at_rest, nulls=100)
     assert found.verdict != "no mismatch"

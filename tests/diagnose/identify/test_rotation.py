@@ -77,6 +77,7 @@ def test_share_of_the_rotation_selects_the_effect(share, plainer, allowed):
     assert find_plainer_effect(error, state) is None
 
 
+@pytest.mark.slow
 def test_tiny_share_of_the_rotation_is_a_scale_factor_error():
     blocks = _reduce_share(1e-6)
     baseline, records = nulls(blocks, 40)

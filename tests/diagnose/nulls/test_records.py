@@ -108,7 +108,7 @@ def test_statistics_match_those_of_raw_logs(lost):
     )
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.3])
+@pytest.mark.parametrize("lost", [0.3, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_covariance_of_neighbouring_bands_matches_raw_logs(lost):
     shares = []
     for records in both(lost):
@@ -260,7 +260,7 @@ def candidates(record: xr.Dataset) -> tuple[dict, dict]:
     return means, powers
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.3])
+@pytest.mark.parametrize("lost", [0.3, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_largest_evidence_of_raw_logs_matches_null_records(lost):
     """The rank of raw records among null records of their separate calibrations is uniform."""
     count, records = 29, 16

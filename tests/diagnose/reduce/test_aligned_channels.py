@@ -10,7 +10,7 @@ import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import gyrostab
@@ -145,7 +145,6 @@ def test_a_useless_channel_is_left_out_with_a_reason(name: str, seconds: Any, re
     assert not {name, f"time_{name}"} & set(aligned.log.variables)
 
 
-@settings(max_examples=30, deadline=None)
 @given(
     ratio=st.sampled_from([0.2, 0.5, 0.9, 1.0, 1.1, 2.0, 3.0]),
     skew=st.floats(-2.0, 2.0),

@@ -47,7 +47,7 @@ def with_gaps(
 # the spectrum
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     seed=st.integers(0, 2**31),
     size=st.sampled_from([96, 100, 135]),
@@ -385,7 +385,7 @@ def test_restarts_listed_in_the_log_are_used():
     assert blocks.restart_end.values == pytest.approx([302.0, 930.0])
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(chunk=st.integers(300, 9000), seed=st.integers(0, 100))
 def test_statistics_do_not_depend_on_chunks(chunk: int, seed: int):
     rng = np.random.default_rng(seed)

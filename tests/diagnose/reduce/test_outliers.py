@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.diagnose.reduce.outliers import EXPECTED_FALSE_OUTLIERS, count_outliers, find_peaks
@@ -42,7 +42,6 @@ def spiked(rng: np.random.Generator, size: float, number: int) -> np.ndarray:
 # departures
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), lost=st.sampled_from([0.0, 0.2, 0.4]))
 def test_departures_are_from_the_median_of_surrounding_pairs(seed: int, lost: float):
     rng = np.random.default_rng(seed)

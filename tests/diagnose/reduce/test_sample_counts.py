@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -88,7 +88,6 @@ def test_held_samples_do_not_make_outliers_of_the_others():
     assert int(reduce_log(log_of(x), block="10s").outliers.sum()) == 0
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     step=st.floats(0.01, 3.0),

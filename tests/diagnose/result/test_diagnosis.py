@@ -14,7 +14,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.diagnose.result.content import VERDICTS, Content, check_diagnosis
@@ -161,7 +161,6 @@ def test_effect_tables_round_trip(name: str):
     assert read_model(tomllib.loads(written)).effects == (effect,)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     noise=st.dictionaries(st.sampled_from("QNBK"), st.floats(0.0, 1e6), min_size=1),
     axes=st.lists(

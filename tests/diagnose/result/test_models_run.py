@@ -82,7 +82,7 @@ def test_unusual_sizes_can_be_simulated(name: str):
 @pytest.mark.parametrize(
     "name", sorted(name for name, kind in effects().items() if kind.stage == "noise")
 )
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(scale=st.floats(-1e5, 1e5), seed=st.integers(0, 2**16))
 def test_any_noise_change_can_be_simulated(name: str, scale: float, seed: int):
     made = simulate_sizes(name, scale, seed)

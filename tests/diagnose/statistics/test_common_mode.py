@@ -103,7 +103,7 @@ def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares)
     st.lists(st.floats(0.01, 100.0), min_size=3, max_size=3),
     st.lists(st.sampled_from([-1.0, 1.0]), min_size=3, max_size=3),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_scores_do_not_depend_on_sizes_of_axes(sizes, signs):
     noise, found = baseline(walk=WALK), _quiet_records(1, 9).isel(record=0)
     scaled = found.assign(mean=found["mean"] * xr.DataArray(np.multiply(sizes, signs), dims="axis"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -88,7 +88,6 @@ def test_boxcar_kernels_match_dense_algebra():
 
 
 @given(st.integers(1, 80), st.lists(st.integers(1, 30), min_size=1, max_size=4, unique=True))
-@settings(max_examples=50, deadline=None)
 def test_sums_over_windows_match_their_definition(block_count, lengths):
     windows = window_set(block_count, lengths)
     values = np.random.default_rng(block_count).normal(size=(2, block_count, 3))
@@ -317,7 +316,6 @@ def test_sample_counts_and_tails_are_detected(base):
 
 
 @given(st.floats(4.0, 500.0))
-@settings(max_examples=30, deadline=None)
 def test_cube_root_score_is_the_normal_quantile_of_a_gamma(shape):
     for p in (0.01, 0.3, 0.7, 0.99):
         ratio = stats.gamma.ppf(p, shape) / shape
@@ -327,7 +325,6 @@ def test_cube_root_score_is_the_normal_quantile_of_a_gamma(shape):
 
 
 @given(st.floats(1e-6, 600.0))
-@settings(max_examples=30, deadline=None)
 def test_exponential_score_is_exact(value):
     z = float(exponential_score(np.array(value)))
     assert stats.norm.logsf(z) == pytest.approx(-value, rel=1e-6)

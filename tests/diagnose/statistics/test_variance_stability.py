@@ -46,7 +46,7 @@ def _largest_score(statistic, found, base, null, row=slice(None)):
 
 
 @given(st.integers(4, 30), st.integers(0, 10**6))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_moments_of_the_scatter_match_simulated_levels(count, seed):
     rng = np.random.default_rng(seed)
     shape = rng.uniform(1.0, 40.0, count)
@@ -100,7 +100,7 @@ def test_common_variance_fluctuation_is_detected_jointly(base, null):
 
 
 @given(st.floats(0.01, 100.0))
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_scores_do_not_depend_on_the_noise_level(factor):
     base = baseline(**SMALL)
     found = _some_records(base, 1, 8)

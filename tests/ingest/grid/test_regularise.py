@@ -10,7 +10,7 @@ import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, OptionError, TimeError
@@ -56,7 +56,6 @@ def patterns(draw):
     return rate, samples, stamps, random
 
 
-@settings(max_examples=150, deadline=None)
 @given(patterns())
 def test_rows_land_on_their_samples(pattern):
     rate, samples, stamps, _ = pattern
@@ -69,7 +68,6 @@ def test_rows_land_on_their_samples(pattern):
     check_log(log)
 
 
-@settings(max_examples=100, deadline=None)
 @given(patterns(), st.integers(0, 12), st.integers(0, 6))
 def test_doubled_and_swapped_rows(pattern, doubled, swapped):
     rate, samples, stamps, random = pattern
@@ -91,7 +89,6 @@ def test_doubled_and_swapped_rows(pattern, doubled, swapped):
     assert slow_placement(stamps[order], rate) == truth.tolist()
 
 
-@settings(max_examples=40, deadline=None)
 @given(patterns(), st.lists(st.integers(40, 400), min_size=1, max_size=3))
 def test_restarts_append_after_one_missing_sample(pattern, pieces):
     rate, samples, stamps, _ = pattern
@@ -107,7 +104,6 @@ def test_restarts_append_after_one_missing_sample(pattern, pieces):
     assert sum("time restarts at row" in note for note in log.attrs["notes"]) == len(pieces)
 
 
-@settings(max_examples=25, deadline=None)
 @given(patterns(), st.integers(64, 700))
 def test_block_and_chunk_sizes_do_not_matter(pattern, block):
     _, _, stamps, _ = pattern

@@ -81,7 +81,7 @@ def test_a_rate_that_is_not_round_a_clock_that_drifts_and_a_gap():
 def test_jitter_at_random_in_every_way():
     combinations = list(itertools.product(JITTER, LOSSES))
 
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=15)
     @given(
         st.sampled_from(combinations),
         st.floats(0, 0.6),

@@ -94,9 +94,7 @@ def render(log: dict[str, object]) -> tuple[str, list[int | None]]:
 
 
 @given(logs())
-@settings(
-    max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_written_values_are_read_back(tmp_path: Path, log: dict[str, object]) -> None:
     text, expected = render(log)
     data = gzip.compress(text.encode()) if log["gz"] else text.encode()
@@ -133,9 +131,7 @@ def test_written_values_are_read_back(tmp_path: Path, log: dict[str, object]) ->
 
 
 @given(st.data())
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_block_size_does_not_matter(tmp_path: Path, data: st.DataObject) -> None:
     rows = [f"{n},{n * 0.25}" for n in range(300)]
     for at in data.draw(st.sets(st.integers(0, 299), max_size=6)):

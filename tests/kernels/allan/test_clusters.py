@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.allan.davar import davar
@@ -62,7 +62,6 @@ def surface(x: np.ndarray, ks: list[int], *, window: int = N, step: int | None =
 
 
 @given(st.integers(0, 2**32 - 1), st.data())
-@settings(max_examples=40, deadline=None)
 def test_cells_equal_the_sum_over_their_terms(seed, data):
     rng = np.random.default_rng(seed)
     x = rng.standard_normal(data.draw(st.integers(20, 700))) + data.draw(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.kernels.allan.integrate import integrate, present_runs, pyramid_places, thin_pyramid
@@ -16,7 +16,6 @@ from gyrostab.time.durations import thin
 
 class TestKernels:
     @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.booleans(), st.integers(1, 200))
-    @settings(max_examples=100, deadline=None)
     def test_sums_of_several_lags_in_one_pass(self, seed, count, in_a_row, longest):
         rng = np.random.default_rng(seed)
         if in_a_row:
@@ -56,7 +55,6 @@ class TestKernels:
         st.integers(1, 9000),
         st.sampled_from([0.0, 0.001, 0.3, 0.99, 1.0]),
     )
-    @settings(max_examples=40, deadline=None)
     def test_integral_and_its_levels(self, seed, n, missing):
         rng = np.random.default_rng(seed)
         x = rng.integers(-5, 6, n).astype(np.float64)

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.kernels.allan import plain_sums, vectors
@@ -14,7 +14,6 @@ from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, LANES
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 3, 4, 8]), st.integers(1, 300))
-@settings(max_examples=100, deadline=None)
 def test_plain_loop_and_vectors_give_the_same_sums(seed, count, longest):
     rng = np.random.default_rng(seed)
     if count == CONSECUTIVE_LAGS:

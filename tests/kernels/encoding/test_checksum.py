@@ -5,7 +5,7 @@ from __future__ import annotations
 import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numcodecs import Fletcher32
 
@@ -16,7 +16,6 @@ def by_numcodecs(data: np.ndarray) -> int:
     return int.from_bytes(bytes(Fletcher32().encode(data))[-4:], "little")
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     hnp.arrays(
         np.uint8, st.integers(1, 1100), elements=st.integers(0, 255) | st.sampled_from([0, 255])

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.ingest.columns.stamps import NAT
@@ -59,7 +59,6 @@ numbers = st.one_of(
 )
 
 
-@settings(deadline=None)  # the first call compiles
 @given(st.lists(numbers, min_size=1, max_size=20))
 def test_number_is_the_nearest_double_or_is_not_read(cells):
     for cell in cells:
@@ -199,7 +198,6 @@ def test_rows_after_a_row_of_the_caller():
     assert starts.tolist() == [0, 9, 0, 16]
 
 
-@settings(deadline=None)
 @given(st.integers(-(10**18), 10**18), st.integers(0, 9), st.integers(0, 9))
 def test_numeric_times_are_exact_and_halves_round_to_even(count, decimals, digits):
     text = (
@@ -216,7 +214,6 @@ def test_numeric_times_are_exact_and_halves_round_to_even(count, decimals, digit
         assert abs(wanted) >= 10**18 or digits == 0 or len(text.strip("-").replace(".", "")) > 19
 
 
-@settings(deadline=None)
 @given(
     st.datetimes(datetime(1700, 1, 1), datetime(2199, 12, 31), timezones=st.just(UTC)),
     st.integers(0, 9),
@@ -250,7 +247,6 @@ def test_dates_that_do_not_exist_are_not_read(text):
     assert rows_of(",1\n", [ISO, NUMBER])[1].tolist() == [NAT]
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.floats(-1e6, 1e6)

@@ -4,7 +4,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
@@ -48,7 +48,6 @@ def test_result_is_the_sum_over_all_level_sequences(parts: int) -> None:
 
 
 @given(low=st.floats(0.3, 300.0), high=st.floats(0.3, 300.0), parts=st.integers(1, 8))
-@settings(max_examples=40, deadline=None)
 def test_tables_are_probabilities_with_the_given_switching_times(
     low: float, high: float, parts: int
 ) -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.kernels.regression.smooth import smooth_curve
 
 
 @given(st.integers(8, 300), st.floats(-50.0, 50.0), st.floats(-1.0, 1.0))
-@settings(max_examples=25, deadline=None)
 def test_straight_lines_are_unchanged(n, level, slope):
     line = level + slope * np.arange(n)
     np.testing.assert_allclose(smooth_curve(line, longest=8.0), line, atol=1e-8)

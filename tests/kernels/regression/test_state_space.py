@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
@@ -44,7 +44,6 @@ def dense(columns, variance, step, present, K2, ou_variance, ou_time):
     return products, 2.0 * np.log(np.diag(L)).sum() + np.log(u @ u)
 
 
-@settings(deadline=None, max_examples=40)
 @given(
     seed=st.integers(0, 10**6),
     missing=st.floats(0.0, 0.8),

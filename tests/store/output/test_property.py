@@ -17,11 +17,11 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from gyrostab import davar, fit_noise, open_log, to_netcdf, to_zarr
 from gyrostab.io.datasets import open_dataset
 from gyrostab.store import system
 from gyrostab.store.output import is_leftover
-from tests.support.command_line import call, write_log
+from tests.support.command_line import call
+from tests.support.outputs import read_tree, write_inputs
 
 #: Calls that change the disk.
 CALLS = ("replace", "rename", "link", "fsync", "unlink", "rmdir", "mkdir", "open", "ftruncate")
@@ -36,35 +36,10 @@ COMMANDS = {
 }
 
 
-def read_tree(folder: Path) -> dict[str, object]:
-    """What lies in a folder: content of files, target of links, None for folders."""
-    found: dict[str, object] = {}
-    for path in sorted(folder.rglob("*")):
-        place = path.relative_to(folder).as_posix()
-        found[place] = (
-            os.readlink(path)
-            if path.is_symlink()
-            else path.read_bytes()
-            if path.is_file()
-            else None
-        )
-    return found
-
-
-def write_inputs(folder: Path) -> Path:
-    """A log as text, file and store, a product and a model."""
-    write_log(folder / "log.csv", 4.0)
-    assert call("ingest", folder / "log.csv", "-o", folder / "log.nc", "--quiet-progress") == 0
-    log = open_log(folder / "log.nc")
-    to_zarr(log, folder / "log.zarr")
-    to_netcdf(fit_noise(davar(log, window="1s", step="1s", taus=4)), folder / "product.nc")
-    (folder / "model.toml").write_text("[noise]\nN = 0.02\n")
-    return folder
-
-
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory) -> Path:
-    return write_inputs(tmp_path_factory.mktemp("inputs"))
+    folder = tmp_path_factory.mktemp("inputs")
+    return write_inputs(folder, seconds=4.0, window="1s", step="1s", taus=4)
 
 
 #: What may lie under the name of an output, and what may be put into it.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab import davar, fit_noise, make_log, open_log, to_netcdf, to_zarr
+from gyrostab import davar, make_log, open_log, to_netcdf, to_zarr
 from gyrostab.errors import GyrostabError, OptionError, OutputError
 from gyrostab.jobs.job import job_folder
 from gyrostab.jobs.run import run
@@ -22,37 +22,15 @@ from gyrostab.store.output import (
     protect_inputs,
 )
 from tests.support.command_line import WINDOW, call, write_log
+from tests.support.outputs import read_tree, write_inputs
 
 QUIET = "--quiet-progress"
-
-
-def read_tree(folder: Path) -> dict[str, object]:
-    """What lies in a folder: content of files, target of links, None for folders."""
-    found: dict[str, object] = {}
-    for path in sorted(folder.rglob("*")):
-        place = path.relative_to(folder).as_posix()
-        found[place] = (
-            os.readlink(path)
-            if path.is_symlink()
-            else path.read_bytes()
-            if path.is_file()
-            else None
-        )
-    return found
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """A log as text and as store, a product, a model and a picture of a holiday."""
-    folder = tmp_path_factory.mktemp("made")
-    write_log(folder / "log.csv", 40.0)
-    assert call("ingest", folder / "log.csv", "-o", folder / "log.nc", QUIET) == 0
-    to_zarr(open_log(folder / "log.nc"), folder / "log.zarr")
-    to_netcdf(
-        fit_noise(davar(open_log(folder / "log.nc"), window="20s", step="5s")),
-        folder / "product.nc",
-    )
-    (folder / "model.toml").write_text("[noise]\nN = 0.02\n")
+    folder = write_inputs(tmp_path_factory.mktemp("made"), seconds=40.0, window="20s", step="5s")
     (folder / "names.toml").write_text('t_probe = "temperature [degC]"\n')
     (folder / "probe.csv").write_text("time [s],temperature [degC]\n0,20\n20,21\n40,22\n")
     return folder
