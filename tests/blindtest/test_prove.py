@@ -254,6 +254,7 @@ class NothingFound:
         )
 
 
+@pytest.mark.slow
 def test_injections_are_committed_and_scored_separately(small, tmp_path, monkeypatch, recordings):
     real = recordings("mems-static-53min/ch104.csv.gz").parents[1]
     monkeypatch.setattr(core, "_CASES_PER_INJECTION", 1)

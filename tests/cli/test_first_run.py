@@ -6,6 +6,23 @@ import os
 import subprocess
 import sys
 
+import pytest
+
+#: A kernel of three functions.
+SOLVE = """
+import hashlib
+import numpy as np
+from gyrostab.kernels.regression.nonnegative import solve_nonnegative
+
+rng = np.random.default_rng(1)
+found = np.empty((60, 6))
+for row in found:
+    columns = rng.standard_normal((9, 6))
+    solve_nonnegative(columns.T @ columns, columns.T @ rng.standard_normal(9), 63, row, 0)
+assert (found > 0.0).any() and not (found > 0.0).all()
+print(hashlib.sha256(found.tobytes()).hexdigest())
+"""
+#: The largest kernel.
 FIT = """
 import hashlib
 import numpy as np
@@ -27,11 +44,18 @@ print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())
 """
 
 
-def test_the_process_that_compiles_fits_to_the_same_bits_as_those_that_load(tmp_path) -> None:
+@pytest.mark.parametrize(
+    "code", [SOLVE, pytest.param(FIT, marks=pytest.mark.slow)], ids=["small", "large"]
+)
+def test_the_process_that_compiles_gets_the_same_bits_as_those_that_load(tmp_path, code) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     first, second = (
         subprocess.run(
-            [sys.executable, "-c", FIT], env=environment, capture_output=True, text=True, check=True
+            [sys.executable, "-c", code],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout
         for _ in range(2)
     )

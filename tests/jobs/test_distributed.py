@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import signal
@@ -22,7 +21,7 @@ from gyrostab.allan.davar import davar_parts
 from gyrostab.cli import main
 from gyrostab.errors import OptionError, WorkerError
 from gyrostab.io.datasets import open_log
-from gyrostab.jobs import checkpoint, engine
+from gyrostab.jobs import checkpoint, engine, schedule
 from gyrostab.jobs.run import run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 
@@ -345,7 +344,9 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
             )
         )
         _wait_for(where)
-        found = json.loads(where.read_text())["address"]
+        with distributed.Client(scheduler_file=str(where)) as client:
+            client.wait_for_workers(1, timeout=60)
+            found = client.scheduler.address
 
         def write(*arguments, **given):
             if scheduler.poll() is None:
@@ -355,6 +356,7 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
 
         monkeypatch.setattr(engine, "write_block", write)
         monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
+        monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 8.0)  # also that of a reconnection
         begun = time.monotonic()
         assert main(["run", str(log), "-o", str(output), "--scheduler", found, *options]) == 2
         assert time.monotonic() - begun < 60
