@@ -11,10 +11,10 @@ SEED   ?= 1
 JOBS   ?= $(shell nproc 2>/dev/null || echo 2)
 # Tests start many processes: keep compiled modules, also where the environment asks for none.
 export PYTHONDONTWRITEBYTECODE =
-# One file of tests stays on one worker, with what its tests share.
-PYTEST := -m pytest -n auto --dist loadfile
+# One file of tests stays on one worker, with what its tests share; files start in their order.
+PYTEST := -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo docs test test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
+.PHONY: demo docs test test-diagnoses test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
@@ -37,6 +37,9 @@ demo: $(VENV)/.installed  ## install, and run the main job on the shipped log
 
 test: $(VENV)/.installed-test  ## install, and run the tests
 	$(BIN)/python $(PYTEST)
+
+test-diagnoses: $(VENV)/.installed-test  ## the whole diagnoses that make test leaves out
+	$(BIN)/python $(PYTEST) -m slow tests/diagnose
 
 test-full: $(VENV)/.installed-test  ## all tests: also whole diagnoses and calibrations, and more random examples
 	$(BIN)/python $(PYTEST) -m "slow or not slow" --hypothesis-profile full

@@ -14,7 +14,6 @@ from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.effect_candidates import effect_candidates
-from gyrostab.diagnose.identify.forward_search import name_effects
 from gyrostab.diagnose.identify.identification import Identification, Identifications
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
@@ -23,7 +22,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.simulate import simulate
-from tests.support.named import COEFFICIENT, nulls, record
+from tests.support.named import COEFFICIENT, record
 
 RECORDS = 60
 
@@ -35,16 +34,22 @@ def noise_only():
 
 
 def identify_by_hand(
-    blocks: xr.Dataset, baseline: xr.Dataset, effect: str, statistic: str, columns: tuple[str, ...]
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    effect: str,
+    statistic: str,
+    columns: tuple[str, ...],
+    *,
+    axis: str = "x",
 ) -> Identifications:
-    """Return the identification of one effect on the first axis."""
+    """Return the identification of one effect on one axis."""
     candidates, reasons = effect_candidates(blocks, COEFFICIENT)
     one = next(
         one for one in candidates if one.effect == effect and one.statistic.name == statistic
     )
     variant = next(variant for variant in one.variants if variant.columns == columns)
-    component = Component(one, variant, ("x",), 50.0)
-    identification = Identification(effect, one.driver, ("x",), (component,), 50.0, 8.0)
+    component = Component(one, variant, (axis,), 50.0)
+    identification = Identification(effect, one.driver, (axis,), (component,), 50.0, 8.0)
     state = condition_on(initial_state(blocks, baseline), [component])
     return Identifications(
         (identification,),
@@ -172,8 +177,10 @@ def test_single_term_is_the_plainest_of_equivalent_ones(noise_only, levels, colu
 @pytest.fixture(scope="module")
 def shaken():
     blocks = record([{"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]}])
-    baseline, records = nulls(blocks)
-    return name_effects(blocks, baseline, records), baseline
+    baseline, columns = calibrate_noise(blocks), ("sensitivity",)
+    return identify_by_hand(
+        blocks, baseline, "vibration_rectification", "mean", columns, axis="y"
+    ), baseline
 
 
 def test_model_contains_the_effect(shaken):

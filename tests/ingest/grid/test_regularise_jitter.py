@@ -56,7 +56,7 @@ def place(jitter, scatter, losses, unit, *, rate=100.0, rows=20_000, seed=0, **o
         ("late", 0.3, "gap", "us"),
     ],
 )
-@pytest.mark.parametrize("rate", [100.0, 99.7])
+@pytest.mark.parametrize("rate", [pytest.param(100.0, marks=pytest.mark.slow), 99.7])
 def test_every_row_is_kept_and_every_loss_found(jitter, scatter, losses, unit, rate):
     log, true, given, samples = place(jitter, scatter, losses, unit, rate=rate)
     assert len(given) == len(samples)
