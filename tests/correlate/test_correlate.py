@@ -123,7 +123,11 @@ def test_calibration_of_p_values_is_inverted_exactly():
 
 @pytest.mark.parametrize(
     ("noises", "heat", "gap"),
-    [("white", "sine", True), ("flicker", "sine", False), ("walk", "ramps", True)],
+    [
+        pytest.param("white", "sine", True, marks=pytest.mark.slow),
+        ("flicker", "sine", False),
+        ("walk", "ramps", True),
+    ],
 )
 def test_intervals_have_their_coverage_and_agree_with_the_p_values(noises, heat, gap):
     hold = []

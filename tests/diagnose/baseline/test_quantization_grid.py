@@ -103,7 +103,10 @@ def test_angle_share_is_that_of_simulated_counters(mean: float, scatter: float) 
     )
 
 
-@pytest.mark.parametrize(("kind", "names"), [("rate", ["rate_quantization"]), ("angle", [])])
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [("rate", ["rate_quantization"]), pytest.param("angle", [], marks=pytest.mark.slow)],
+)
 def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
     blocks = quantized_record(kind, 2.0, size=9_000)
     baseline, records = nulls(blocks, 40)
@@ -150,7 +153,11 @@ def test_samples_stuck_at_zero_are_missing_in_neighbouring_bins(zone: float) -> 
 
 @pytest.mark.parametrize(
     ("how", "zone", "names"),
-    [(np.trunc, 0.0, ["rate_quantization"]), (np.rint, 1.0, ["dead_zone"]), (np.rint, 0.0, [])],
+    [
+        (np.trunc, 0.0, ["rate_quantization"]),
+        (np.rint, 1.0, ["dead_zone"]),
+        pytest.param(np.rint, 0.0, [], marks=pytest.mark.slow),
+    ],
 )
 def test_truncation_and_dead_zone_are_distinguished(how, zone: float, names: list[str]) -> None:
     blocks = cut_record(how, zone=zone, size=15_000)

@@ -64,7 +64,7 @@ def test_level_sets_the_threshold(base, null):
             locate_mismatches(found, base, null, level=level)
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.3])
+@pytest.mark.parametrize("missing", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 @pytest.mark.parametrize("share", [0.25, 0.5])
 def test_burst_of_noise_has_a_region(share, missing):
     base = baseline(missing=missing)
