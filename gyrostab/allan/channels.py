@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels
-from gyrostab.store.lazy_slices import read_slice
+from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER
 

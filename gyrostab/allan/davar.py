@@ -27,8 +27,7 @@ from gyrostab.kernels.fit.least_squares import identify_noise
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.noise import HOUR, avar_columns, sample_squares
 from gyrostab.schema import attributes
-from gyrostab.store.lazy_slices import can_read_into, read_into, read_slice
-from gyrostab.store.output import pass_sources
+from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
 from gyrostab.time.grid import first_stamp, grid_times
 
 __all__ = ["davar", "davar_part", "davar_parts"]
@@ -285,7 +284,7 @@ def _read_spans(
     With dask, all axes are read together if they are few.
     """
     begin, end = spans[0][0], spans[-1][1]
-    if isinstance(data, da.Array) and can_read_into(data):
+    if find_source(data) is not None:
         longest = max(last - first for first, last in spans)
         line = space.array("samples", longest).view(data.dtype)[:longest]
         for row in range(data.shape[0]):
@@ -389,9 +388,10 @@ def _run_units(data: Any, unit: Unit, rate: float) -> tuple[Any, Any]:
         rows_cells.append(da.concatenate(cells, axis=1))
         rows_means.append(da.concatenate(means, axis=1))
     stacked = da.stack(rows_cells, axis=1), da.stack(rows_means, axis=1)
+    cells_array, means_array = stacked if lazy else dask.compute(*stacked)
     if lazy:
-        pass_sources(data, *stacked)
-    return stacked if lazy else dask.compute(*stacked)
+        cells_array, means_array = (keep_sources(data, part) for part in stacked)
+    return cells_array, means_array
 
 
 def _run_published_method(

@@ -22,8 +22,8 @@ from gyrostab.ingest.columns.pieces import (
 from gyrostab.ingest.concat import group_axes, merge_notes, name_some, split_axes
 from gyrostab.ingest.overlap import drop_repeats, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store import common_packing
-from gyrostab.store.lazy_slices import concatenate_columns, select_row, stack_rows
+from gyrostab.store.lazy import concatenate_columns, select_part, stack_rows
+from gyrostab.store.write import common_packing
 
 __all__ = ["attach_channels", "concatenate", "memory_bytes", "move_to_disk", "with_channels"]
 
@@ -32,14 +32,14 @@ def memory_bytes(part: xr.Dataset) -> int:
     """Return the size of the columns of a raw log that are in memory [bytes]."""
     arrays = sum(
         variable.nbytes
-        for variable in part.variables.values()
-        if isinstance(variable._data, np.ndarray)
+        for name, variable in part.variables.items()
+        if name != "axis" and variable.chunks is None
     )
     return arrays + sum(pieces.memory_bytes for pieces in _columns_in_pieces(part))
 
 
 def _columns_in_pieces(part: xr.Dataset) -> list[PiecewiseColumn]:
-    return [pieces for variable in part.variables.values() for pieces in pieces_of(variable._data)]
+    return [pieces for variable in part.variables.values() for pieces in pieces_of(variable.data)]
 
 
 def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
@@ -58,7 +58,7 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
     long = {
         name: variable
         for name, variable in part.variables.items()
-        if name != "axis" and isinstance(variable._data, np.ndarray)
+        if name != "axis" and variable.chunks is None
     }
     return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in long.items()})
 
@@ -266,7 +266,7 @@ def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
 
 def _read_axis(part: xr.Dataset, signal: str, axis: str) -> Any:
     if axis in part["axis"].values:
-        return select_row(
+        return select_part(
             part[signal].data, [str(name) for name in part["axis"].values].index(axis)
         )
     return as_lazy(PiecewiseColumn(np.float64, [NaNPiece(part.sizes["row"])]))

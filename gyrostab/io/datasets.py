@@ -21,21 +21,20 @@ import xarray as xr
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, reading_of
 from gyrostab.ingest.convert import as_log
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
-from gyrostab.store import (
+from gyrostab.store.cf import from_disk, index_dim, to_disk
+from gyrostab.store.netcdf_compression import append_compressed, large_variables
+from gyrostab.store.output import find_foreign_item, find_sources, new_output
+from gyrostab.store.private import library_lock
+from gyrostab.store.read import open_stored
+from gyrostab.store.write import (
     NotCountsError,
     Progress,
-    append_compressed,
     append_netcdf,
     append_zarr,
     as_counts,
     chunk_samples,
-    large_variables,
-    library_lock,
     long_variables,
-    open_stored,
 )
-from gyrostab.store.cf import from_disk, index_dim, to_disk
-from gyrostab.store.output import find_foreign_item, find_sources, new_output
 
 __all__ = ["open_dataset", "open_log", "open_product", "open_surface", "to_netcdf", "to_zarr"]
 

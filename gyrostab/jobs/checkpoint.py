@@ -19,7 +19,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.io.datasets import CHUNK_VALUES
-from gyrostab.store.lazy_slices import with_box_reader
+from gyrostab.store.lazy import Source, make_dask
 from gyrostab.store.output import replace_file
 
 __all__ = ["Block", "assemble", "block_path", "find_blocks", "write_block"]
@@ -203,8 +203,6 @@ def _slice_variable(content: NDArray[np.uint8], block: Block, name: str) -> NDAr
 
 def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
     """Make a dask array that reads a variable along time from the block files."""
-    import dask.array as da
-
     described = blocks[0].header["variables"][name]
     along = described["dims"].index("time")
     edges = np.cumsum([0, *(block.part.stop - block.part.start for block in blocks)])
@@ -213,33 +211,37 @@ def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
     inner = int(np.prod([size for dim, size in dims if dim not in ("axis", "term", "time")]))
     sizes = {"axis": 1, "term": 1, "time": max(1, min(shape[along], CHUNK_VALUES // max(1, inner)))}
 
-    def read_part(box: tuple[slice, ...]) -> NDArray[Any]:
-        begin, end = box[along].start, box[along].stop
+    source = _BlockSource(blocks, name, along, edges, tuple(shape))
+    return make_dask(source, tuple(sizes.get(dim, size) for dim, size in dims))
+
+
+class _BlockSource(Source):
+    """A variable along time in block files."""
+
+    def __init__(
+        self,
+        blocks: Sequence[Block],
+        name: str,
+        along: int,
+        edges: NDArray[np.int64],
+        shape: tuple[int, ...],
+    ):
+        self.blocks, self.name, self.along, self.edges = blocks, name, along, edges
+        self.shape, self.dtype = shape, np.dtype(blocks[0].header["variables"][name]["dtype"])
+
+    def __getitem__(self, box: Any) -> NDArray[Any]:
+        begin, end = box[self.along].start, box[self.along].stop
         pieces = []
         for i in range(
-            int(np.searchsorted(edges, begin, side="right")) - 1,
-            int(np.searchsorted(edges, end, side="left")),
+            int(np.searchsorted(self.edges, begin, side="right")) - 1,
+            int(np.searchsorted(self.edges, end, side="left")),
         ):
-            inside = slice(max(begin - int(edges[i]), 0), end - int(edges[i]))
-            values = _slice_variable(np.memmap(blocks[i].path, mode="r"), blocks[i], name)
-            pieces.append(values[tuple(inside if n == along else one for n, one in enumerate(box))])
-        return np.concatenate(pieces, axis=along)
-
-    def read(block_info: Mapping[Any, Any]) -> NDArray[Any]:
-        return read_part(tuple(slice(*ends) for ends in block_info[None]["array-location"]))
-
-    dtype = np.dtype(described["dtype"])
-    chunks = da.core.normalize_chunks(
-        [sizes.get(dim, size) for dim, size in dims], shape=tuple(shape)
-    )
-    # without a name, dask would hash everything that `read` refers to
-    label = f"{blocks[0].header['job']}-{name}"
-    return with_box_reader(
-        da.map_blocks(
-            read, chunks=chunks, dtype=dtype, meta=np.empty((0,) * len(shape), dtype), name=label
-        ),
-        read_part,
-    )
+            block, first = self.blocks[i], int(self.edges[i])
+            inside = slice(max(begin - first, 0), end - first)
+            values = _slice_variable(np.memmap(block.path, mode="r"), block, self.name)
+            chosen = [inside if n == self.along else part for n, part in enumerate(box)]
+            pieces.append(values[tuple(chosen)])
+        return np.concatenate(pieces, axis=self.along)
 
 
 def _encode_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any]:

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.schema import check_log, check_product, check_surface, texts
-from gyrostab.store.lazy_slices import transpose_lazy
+from gyrostab.store.lazy import transpose_lazy
+from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.store.safe_names import make_names_storable, restore_names
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
@@ -140,9 +141,8 @@ def _disk_order(dims: tuple[Any, ...]) -> list[Any]:
 
 def _make_lazy(variable: xr.Variable) -> xr.Variable:
     """Make a dask array of a variable that is still in another file, to copy it chunk by chunk."""
-    return (
-        variable if variable._in_memory or variable.chunks is not None else variable.chunk("auto")
-    )
+    ready = is_in_memory(variable) or variable.chunks is not None
+    return variable if ready else variable.chunk("auto")
 
 
 def _find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
@@ -296,7 +296,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     }
     variables: dict[Any, xr.Variable] = {}
     grids = parse_time_grids(stored, where)
-    axes, close = _make_time_axes(stored, grids, where), stored._close
+    axes, close = _make_time_axes(stored, grids, where), close_function(stored)
     dims: dict[Any, Any] = {index_dim(rule["dim"]): rule["dim"] for rule in grids.values()}
     for name, variable in stored.variables.items():
         if name in grids:
@@ -369,7 +369,7 @@ def decode_stamps(variable: xr.Variable, attrs: dict[Any, Any] | None = None) ->
         "units": attrs["units"],
         "calendar": attrs.get("calendar", "standard"),
     }
-    decoded: xr.Variable = xr.conventions.decode_cf_variable("time", timed).load()
+    decoded = xr.decode_cf(xr.Dataset({"stamps": timed})).variables["stamps"].load()
     return decoded.astype("datetime64[ns]")
 
 

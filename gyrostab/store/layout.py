@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.checksum import fletcher32
-from gyrostab.store.netcdf_lock import library_lock
+from gyrostab.store.private import library_lock
 
 __all__ = [
     "ChunkDamage",

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.store.lazy_slices import read_box
-from gyrostab.store.netcdf_lock import library_lock
+from gyrostab.store.lazy import read_box
+from gyrostab.store.private import library_lock
 from gyrostab.store.threads import map_in_order
 from gyrostab.store.write import Progress
 

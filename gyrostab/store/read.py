@@ -22,15 +22,15 @@ from gyrostab.errors import FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.cf import decode_stamps, index_dim, parse_time_grids
 from gyrostab.store.chunk_cache import ChunkCache
-from gyrostab.store.file_errors import name_file_in_errors
 from gyrostab.store.layout import ChunkDamage, is_readable, read_chunk
-from gyrostab.store.lazy_slices import with_row_reader
-from gyrostab.store.log_header import MIN_LAZY_VALUES, Header, read_header
-from gyrostab.store.output import remember_source
+from gyrostab.store.lazy import FileVariable, RowSource, make_dask
+from gyrostab.store.private import close_function
 from gyrostab.time.grid import grid_times
 
 __all__ = ["open_stored"]
 
+#: Values from which a variable of a log is a dask array.
+MIN_LAZY_VALUES = 2**17
 #: Bytes of the cache of chunks of which only a part was requested.
 _CACHE_BYTES = 2**24
 
@@ -57,12 +57,6 @@ def open_stored(path: Path, *, strict: bool = False) -> xr.Dataset:
 
 
 def _open_dataset(path: Path, *, strict: bool) -> xr.Dataset:
-    header = read_header(path)
-    if header is not None:
-        stored = _decode_header(header)
-        long = _find_long_variables(stored, path, strict=strict)
-        if header.long <= long.keys():
-            return _make_variables_lazy(stored, long, small=MIN_LAZY_VALUES)
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
@@ -73,32 +67,17 @@ def _open_dataset(path: Path, *, strict: bool) -> xr.Dataset:
         raise FormatError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
         ) from error
-    stored = name_file_in_errors(stored, path)
     is_log = stored.attrs.get("gyrostab_content") == "log"
     long = _find_long_variables(stored, path, strict=strict) if is_log else {}
-    opened = _make_variables_lazy(stored, long, small=MIN_LAZY_VALUES if is_log else 0)
+    opened = _make_variables_lazy(stored, long, path, small=MIN_LAZY_VALUES if is_log else 0)
     if is_log:
         # opened again when needed: an archive of any length keeps only a few files open
         stored.close()
     return opened
 
 
-def _decode_header(header: Header) -> xr.Dataset:
-    """Decode a header as xarray does: text, missing values and factors, but no times or indexes."""
-    decoded, attrs, names = xr.conventions.decode_cf_variables(
-        header.variables, header.attrs, decode_times=False
-    )
-    coords = {
-        name: variable
-        for name, variable in decoded.items()
-        if name in names or (name,) == variable.dims
-    }
-    data = {name: variable for name, variable in decoded.items() if name not in coords}
-    return xr.Dataset(data, xr.Coordinates(coords, indexes={}), attrs)
-
-
 def _make_variables_lazy(
-    stored: xr.Dataset, long: dict[Any, xr.Variable], *, small: int
+    stored: xr.Dataset, long: dict[Any, xr.Variable], path: Path, *, small: int
 ) -> xr.Dataset:
     """Load small variables, and make dask arrays of the others, by the chunks on disk.
 
@@ -108,22 +87,29 @@ def _make_variables_lazy(
     ready = {  # text is always small, and dask cannot find the size of its chunks
         name: item.load()
         if item.size < small or item.dtype.kind in "OSU"
-        else item.chunk(item.encoding.get("preferred_chunks") or "auto")
+        else _make_variable_lazy(item, path)
         for name, item in rest.items()
     }
-    coords = xr.Coordinates({name: stored.variables[name] for name in stored.coords}, indexes={})
+    coords = xr.Coordinates(
+        {name: stored.variables[name].load() for name in stored.coords}, indexes={}
+    )
     lazy = xr.Dataset(
         {name: long.get(name, ready.get(name)) for name in stored.data_vars}, coords, stored.attrs
     )
     lazy.encoding = stored.encoding
-    lazy.set_close(stored._close)
+    lazy.set_close(close_function(stored))
     return lazy
+
+
+def _make_variable_lazy(variable: xr.Variable, path: Path) -> xr.Variable:
+    cut = variable.encoding.get("preferred_chunks")
+    chunks = tuple(cut[dim] for dim in variable.dims) if cut else "auto"
+    lazy = make_dask(FileVariable(variable, path), chunks)
+    return xr.Variable(variable.dims, lazy, variable.attrs, variable.encoding)
 
 
 def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dict[Any, xr.Variable]:
     """Find the long variables of a log, as arrays that handle damage."""
-    import dask.array as da
-
     labels = [str(label) for label in stored.variables["axis"].values]
     opened = uuid.uuid4().hex
     long: dict[Any, xr.Variable] = {}
@@ -158,24 +144,13 @@ def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dic
             opened=opened,
             zarr=path.is_dir(),
         )
-        meta = np.empty((0,) * variable.ndim, variable.dtype)
-        lazy = da.from_array(
-            array,
-            chunks=tuple(chunks),
-            name=f"gyrostab-{name}-{opened}",
-            asarray=False,
-            fancy=False,
-            inline_array=True,
-            meta=meta,
-        )
-        remember_source(lazy, path.absolute())
         packing = (
             {"dtype": np.dtype(disk["dtype"]), "scale_factor": float(array.scale)}
             if array.scale is not None
             else {}
         )
         long[name] = xr.Variable(
-            variable.dims, with_row_reader(lazy, array.fill), variable.attrs, packing
+            variable.dims, make_dask(array, tuple(chunks)), variable.attrs, packing
         )
     return long
 
@@ -196,9 +171,9 @@ def _find_chunk_spans(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _ChunkedVariable:
-    """A variable on disk in chunks of one row and `length` samples, as an array for dask."""
+@dataclass(eq=False, kw_only=True)
+class _ChunkedVariable(RowSource):
+    """A variable on disk in chunks of one row and `length` samples."""
 
     path: Path
     name: str
@@ -213,21 +188,8 @@ class _ChunkedVariable:
     opened: str
     zarr: bool
 
-    @property
-    def ndim(self) -> int:
-        return len(self.shape)
-
-    def __getitem__(self, part: Any) -> NDArray[np.floating[Any]]:
-        last = range(*part[-1].indices(self.shape[-1]))
-        rows = range(1) if self.ndim == 1 else range(*part[0].indices(self.shape[0]))
-        values = np.empty((len(rows), max(last.stop - last.start, 0)), self.dtype)
-        for row, line in zip(rows, values, strict=True):
-            self.fill(row, last.start, line)
-        values = values[:, :: last.step]
-        return values[0] if self.ndim == 1 else values
-
-    def fill(self, row: int, begin: int, out: NDArray[np.floating[Any]]) -> None:
-        """Samples of one row, from `begin` on; those of a damaged chunk are NaN."""
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        """Read samples of one row; those of a damaged chunk are NaN."""
         end = begin + out.size
         for number in range(begin // self.length, -(-end // self.length)):
             first = number * self.length

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.grid.stamps import scan_cells
 
-__all__ = ["RowInspection", "inspect_rows", "with_inspections"]
+__all__ = ["RowInspection", "inspect_rows"]
 
 _NO_SPANS = np.empty((0, 2), dtype=np.int64)
 
@@ -71,12 +71,3 @@ def inspect_rows(
 def _find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
-
-
-def with_inspections(signal: Any, seen: list[RowInspection]) -> Any:
-    """Attach inspections to a dask array (axis, row), to save a second one.
-
-    Arrays that are derived from it do not carry them.
-    """
-    signal.gyrostab_inspections = seen
-    return signal

@@ -5,19 +5,21 @@ Samples that the source had as integer counts are stored as counts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import dask
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.kernels.encoding.counts import to_counts
-from gyrostab.store.lazy_slices import can_read_into, read_into, with_row_reader
-from gyrostab.store.netcdf_lock import library_lock
+from gyrostab.store.lazy import Converted, find_source, make_dask, read_into
+from gyrostab.store.private import library_lock
+from gyrostab.store.threads import MAX_WORKERS, map_in_order
 
 __all__ = [
     "NotCountsError",
@@ -81,14 +83,12 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
     dtype = "int16" if declared.itemsize == 1 or declared == np.int16 else "int32"
     pack = partial(_pack_counts, name=name, scale=float(scale), dtype=dtype)
     data = variable.data
-    lazy = variable.chunks is not None
-    packed = (
-        data.map_blocks(pack, dtype=dtype, meta=np.empty((0,) * variable.ndim, dtype))
-        if lazy
-        else pack(data)
-    )
-    if lazy and can_read_into(data):
-        packed = with_row_reader(packed, partial(_read_counts_into, data, pack))
+    if variable.chunks is None:
+        packed = pack(data)
+    elif find_source(data) is not None:
+        packed = make_dask(Converted(data, pack, dtype), data.chunks)
+    else:
+        packed = data.map_blocks(pack, dtype=dtype, meta=np.empty((0,) * variable.ndim, dtype))
     return xr.Variable(
         variable.dims,
         packed,
@@ -107,19 +107,6 @@ def _pack_counts(
     if counts is None:
         raise NotCountsError(name)
     return counts
-
-
-def _read_counts_into(
-    data: Any,
-    pack: Callable[[NDArray[np.float64]], NDArray[np.integer[Any]]],
-    row: int,
-    begin: int,
-    out: NDArray[np.integer[Any]],
-) -> None:
-    """Read counts of one row of `data` from `begin` on, without dask."""
-    values = np.empty(out.size)
-    read_into(data, row, begin, values)
-    out[:] = pack(values)
 
 
 def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
@@ -242,101 +229,55 @@ def _copy_variables(
     put: Callable[[str, tuple[int, ...], slice, NDArray[Any]], None],
     progress: Progress | None,
 ) -> None:
-    """Compute lazy variables in batches, and write each batch while the next one is computed."""
-    import dask
+    """Read lazy variables in threads, in whole chunks, and write them in order meanwhile."""
     from dask.system import CPU_COUNT
 
-    def write(
-        parts: list[tuple[str, tuple[int, ...], int]], blocks: Sequence[NDArray[Any]]
-    ) -> None:
-        for (name, row, begin), block in zip(parts, blocks, strict=True):
-            for at in range(0, block.shape[-1], lengths[name]):
-                piece = block[..., at : at + lengths[name]]
-                put(name, row, slice(begin + at, begin + at + piece.shape[-1]), piece)
-
-    readers = ThreadPoolExecutor(
-        dask.config.get("num_workers", None) or CPU_COUNT, thread_name_prefix="gyrostab-read"
+    direct = {name: v for name, v in long.items() if find_source(v.data) is not None}
+    others = {name: v for name, v in long.items() if name not in direct}
+    segments = chain.from_iterable(_plan_batches(direct, lengths, 1))
+    workers = min(dask.config.get("num_workers", None) or CPU_COUNT, MAX_WORKERS)
+    batches = chain(
+        map_in_order(partial(_read_segment, direct), segments, workers=workers),
+        # dask walks a whole graph each time
+        map_in_order(
+            partial(_compute_batch, others),
+            _plan_batches(others, lengths, MAX_BATCH_BYTES),
+            workers=1,
+        ),
     )
-    with readers, ThreadPoolExecutor(1, thread_name_prefix="gyrostab-write") as pool:
-        writing: Future[None] | None = None
-        done, total = 0, sum(variable.size for variable in long.values())
-        buffers: tuple[_Buffers, _Buffers] = ({}, {})  # one is written while the other is filled
-        for number, parts in enumerate(_plan_batches(long, lengths)):
-            blocks = _read_blocks(long, lengths, parts, readers, buffers[number % 2])
-            if writing is not None:
-                writing.result()
-            writing = pool.submit(write, [part[:3] for part in parts], blocks)
-            done += sum(span for _, _, _, span in parts)
-            if progress is not None:
-                progress(done / total)
-        if writing is not None:
-            writing.result()
+    done, total = 0, sum(variable.size for variable in long.values())
+    for batch in batches:
+        for (name, row, begin, span), block in batch:
+            for at in range(0, span, lengths[name]):
+                piece = block[at : at + lengths[name]]
+                put(name, row, slice(begin + at, begin + at + piece.size), piece)
+            done += span
+        if progress is not None:
+            progress(done / total)
 
 
-#: Name, row, first sample and number of samples of a part of a variable; arrays by name and row
-#: that every batch uses again.
+#: Name, row, first sample and number of samples of a part of a variable.
 _Segment = tuple[str, tuple[int, ...], int, int]
-_Buffers = dict[tuple[str, tuple[int, ...]], NDArray[Any]]
+_Batch = list[tuple[_Segment, NDArray[Any]]]
 
 
-def _read_blocks(
-    long: dict[str, xr.Variable],
-    lengths: dict[str, int],
-    parts: list[_Segment],
-    readers: ThreadPoolExecutor,
-    buffers: _Buffers,
-) -> list[NDArray[Any]]:
-    """Read the parts of a batch, by row reader if there is one.
-
-    dask computes the others, and walks its whole graph each time.
-    """
-    import dask
-
-    lazy = [
-        long[name].data[(*row, slice(begin, begin + span))]
-        for name, row, begin, span in parts
-        if not can_read_into(long[name].data)
-    ]
-    blocks: list[NDArray[Any]] = []
-    reading: list[Future[None]] = []
-    computed = iter(dask.compute(*lazy))
-    for name, row, begin, span in parts:
-        data = long[name].data
-        if not can_read_into(data):
-            blocks.append(next(computed))
-            continue
-        if buffers.get((name, row), _NO_VALUES).size < span:
-            buffers[name, row] = np.empty(span, data.dtype)
-        blocks.append(buffers[name, row][:span])
-        for at in range(0, span, lengths[name]):
-            reading.append(
-                readers.submit(
-                    read_into,
-                    data,
-                    row[0] if row else 0,
-                    begin + at,
-                    blocks[-1][at : at + lengths[name]],
-                )
-            )
-    try:
-        for future in reading:
-            future.result()
-    finally:
-        for future in reading:
-            future.cancel()
-    return blocks
+def _read_segment(long: dict[str, xr.Variable], segment: _Segment) -> _Batch:
+    """Read a segment of a variable with a source, in the calling thread."""
+    name, row, begin, span = segment
+    values = np.empty(span, long[name].dtype)
+    read_into(long[name].data, row[0] if row else 0, begin, values)
+    return [(segment, values)]
 
 
-_NO_VALUES = np.empty(0)
+def _compute_batch(long: dict[str, xr.Variable], batch: list[_Segment]) -> _Batch:
+    lazy = [long[name].data[(*row, slice(begin, begin + span))] for name, row, begin, span in batch]
+    return list(zip(batch, dask.compute(*lazy), strict=True))
 
 
 def _plan_batches(
-    long: dict[str, xr.Variable], lengths: dict[str, int]
-) -> Iterator[list[tuple[str, tuple[int, ...], int, int]]]:
-    """Plan batches of whole chunks of all variables on one time axis.
-
-    Each part of a batch is a name, a row, the first sample and the number of samples.
-    """
+    long: dict[str, xr.Variable], lengths: dict[str, int], most_bytes: int
+) -> Iterator[list[_Segment]]:
+    """Plan batches of whole chunks of all variables on one time axis, each a list of segments."""
     for dim in dict.fromkeys(variable.dims[-1] for variable in long.values()):
         rows = [
             (name, row)
@@ -345,7 +286,7 @@ def _plan_batches(
             for row in np.ndindex(*variable.shape[:-1])
         ]
         name = rows[0][0]
-        span = lengths[name] * max(1, MAX_BATCH_BYTES // (8 * len(rows) * lengths[name]))
+        span = lengths[name] * max(1, most_bytes // (8 * len(rows) * lengths[name]))
         size = long[name].shape[-1]
         for begin in range(0, size, span):
             yield [(name, row, begin, min(span, size - begin)) for name, row in rows]

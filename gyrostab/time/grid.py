@@ -19,7 +19,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
-from xarray.core.indexing import IndexSelResult
 from xarray.indexes import CoordinateTransform, CoordinateTransformIndex
 
 from gyrostab.errors import OptionError, TimeError
@@ -302,6 +301,11 @@ class _GridTransform(CoordinateTransform):
         return bool(np.array_equal(own, others))
 
 
+def _selection(positions: dict[Any, Any]) -> Any:
+    """Wrap positions by dimension as xarray expects them; it does not export the class."""
+    return type(xr.indexes.PandasIndex([0], "n").sel({"n": 0}))(positions)
+
+
 class TimeGridIndex(CoordinateTransformIndex):
     """Index of a uniform time axis: slices stay lazy, and labels are found by arithmetic."""
 
@@ -336,19 +340,17 @@ class TimeGridIndex(CoordinateTransformIndex):
         stamps = [index.to_pandas_index() for index in indexes]
         return xr.indexes.PandasIndex(stamps[0].append(stamps[1:]), dim)
 
-    def sel(
-        self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None
-    ) -> IndexSelResult:
+    def sel(self, labels: dict[Any, Any], method: Any = None, tolerance: Any = None) -> Any:
         """Find positions of stamps (exact or nearest), of a day, or of slices with both ends."""
         (name,) = self.transform.coord_names
         label = labels[name]
         dim = self.transform.dims[0]
         if isinstance(label, slice):
-            return IndexSelResult({dim: self._slice(label)})
+            return _selection({dim: self._slice(label)})
         if isinstance(label, str) and method is None and len(label) < len("2000-01-01T00:00:00"):
             # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
             period = pd.Period(label)
-            return IndexSelResult({dim: self._slice(slice(period.start_time, period.end_time))})
+            return _selection({dim: self._slice(slice(period.start_time, period.end_time))})
         stamps = np.asarray(getattr(label, "values", label)).astype("datetime64[ns]")
         position = self.transform.reverse({name: stamps})[dim]
         nearest = np.rint(position).astype(np.int64)
@@ -367,8 +369,8 @@ class TimeGridIndex(CoordinateTransformIndex):
             if np.any(miss > np.timedelta64(pd.Timedelta(tolerance))):
                 raise KeyError(f"no sample within {tolerance} of {label}")
         if isinstance(label, xr.DataArray | xr.Variable):
-            return IndexSelResult({dim: xr.Variable(label.dims, nearest)})
-        return IndexSelResult({dim: int(nearest) if nearest.ndim == 0 else nearest})
+            return _selection({dim: xr.Variable(label.dims, nearest)})
+        return _selection({dim: int(nearest) if nearest.ndim == 0 else nearest})
 
     def _slice(self, label: slice) -> slice:
         (name,), (dim,) = self.transform.coord_names, self.transform.dims

@@ -20,7 +20,7 @@ from gyrostab.kernels.allan.blocks import held_points
 from gyrostab.kernels.allan.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.schema import ESTIMATORS
-from gyrostab.store.lazy_slices import make_lazy
+from gyrostab.store.lazy import make_lazy
 from gyrostab.time.durations import thin
 from tests.reference import direct_angle_surface, direct_surface
 

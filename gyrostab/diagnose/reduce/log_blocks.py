@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.noise import HOUR
 from gyrostab.schema import log_channels, signal_name
 from gyrostab.simulate.drivers import Source, make_source
-from gyrostab.store import lazy_slices
+from gyrostab.store import lazy
 
 __all__ = [
     "BlockBatch",
@@ -150,7 +150,7 @@ def channel_at(
     values = (
         None
         if stretch is None
-        else (stretch, lazy_slices.read_slice(source.values, stretch.low, stretch.high))
+        else (stretch, lazy.read_slice(source.values, stretch.low, stretch.high))
     )
     return source.at(instants, values, carry)
 
@@ -184,7 +184,7 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
             int(np.searchsorted(ends, ends[low] + _CHANNEL_VALUES_PER_READ, side="right")) - 1,
             low + 1,
         )
-        values = np.asarray(lazy_slices.read_slice(data, ends[low], ends[high]), dtype=np.float64)
+        values = np.asarray(lazy.read_slice(data, ends[low], ends[high]), dtype=np.float64)
         good = np.isfinite(values)
         index = np.repeat(np.arange(low, high), np.diff(ends[low : high + 1]))[good]
         sums += np.bincount(index, (values**2 if rms else values)[good], minlength=sums.size)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import tempfile
 import threading
-import uuid
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import OutputError
-from gyrostab.store.lazy_slices import stack_rows, with_row_reader
+from gyrostab.store.lazy import RowSource, Stacked, find_source, make_dask
+from gyrostab.store.row_inspection import RowInspection
 from gyrostab.store.system import read_at, write_at
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "DecimalPiece",
     "EvenStampsPiece",
     "FilePiece",
+    "InspectedRows",
     "NaNPiece",
     "Piece",
     "PiecewiseColumn",
@@ -219,14 +220,12 @@ class NaNPiece(Piece):
         out[:] = np.nan
 
 
-class PiecewiseColumn:
-    """A column with the few attributes that dask needs; no ``copy``, which dask would call.
+class PiecewiseColumn(RowSource):
+    """A column in pieces, as a lazy source.
 
     Values of single rows can be replaced: `changed` lists these rows in order, and `value` holds
     the bits of all of them.
     """
-
-    ndim = 1
 
     def __init__(self, dtype: Any, pieces: Sequence[Piece]):
         self.dtype = np.dtype(dtype)
@@ -268,14 +267,8 @@ class PiecewiseColumn:
         """Move the pieces in memory to a file."""
         self._pieces[:] = [piece.to_spool(spool) for piece in self._pieces]
 
-    def __getitem__(self, part: Any) -> NDArray[Any]:
-        rows = range(*(part[0] if isinstance(part, tuple) else part).indices(self.shape[0]))
-        out = np.empty(max(rows.stop - rows.start, 0), dtype=self.dtype)
-        self.read_into(0, rows.start, out)
-        return out[:: rows.step]
-
-    def read_into(self, _row: int, begin: int, out: NDArray[Any]) -> None:
-        """Read the values from row `begin` of the log on into `out`."""
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        """Read samples of one row from `begin` on into `out`."""
         done, number = 0, bisect_right(self._rows, begin) - 1
         while done < out.size:
             first = begin + done - self._rows[number]
@@ -353,12 +346,18 @@ class Buffers:
         return arrays
 
 
-def stack_as_rows(columns: Sequence[Any]) -> Any:
+class InspectedRows(Stacked):
+    """Columns as rows, with the inspections of their blocks, which save a second pass."""
+
+    def __init__(self, rows: Sequence[Any], inspections: Sequence[RowInspection]):
+        super().__init__(rows)
+        self.inspections = tuple(inspections)
+
+
+def stack_as_rows(columns: Sequence[Any], seen: Sequence[RowInspection] = ()) -> Any:
     """Stack columns as the rows of one array, without a copy if they already share one matrix."""
     if not isinstance(columns[0], np.ndarray):
-        stacked = stack_rows(columns)
-        stacked.gyrostab_pieces = [pieces for column in columns for pieces in pieces_of(column)]
-        return stacked
+        return make_dask(InspectedRows(columns, seen), (1, CHUNK_ROWS))
     whole = columns[0].base
     same = whole is not None and whole.shape[:-1] == (len(columns),)
     return whole if same and all(one.base is whole for one in columns) else np.stack(columns)
@@ -366,20 +365,12 @@ def stack_as_rows(columns: Sequence[Any]) -> Any:
 
 def as_lazy(values: NDArray[Any] | PiecewiseColumn) -> Any:
     """Wrap a piecewise column in a dask array; return an array in memory unchanged."""
-    if not isinstance(values, PiecewiseColumn):
-        return values
-    import dask.array
-
-    name, meta = f"gyrostab-column-{uuid.uuid4().hex}", np.empty(0, dtype=values.dtype)
-    lazy = with_row_reader(
-        dask.array.from_array(values, chunks=CHUNK_ROWS, name=name, asarray=True, meta=meta),
-        values.read_into,
-    )
-    lazy.gyrostab_pieces = [values]
-    lazy.gyrostab_line = values.find_line()
-    return lazy
+    return make_dask(values, CHUNK_ROWS) if isinstance(values, PiecewiseColumn) else values
 
 
 def pieces_of(array: Any) -> list[PiecewiseColumn]:
-    """Return the piecewise columns that an array of `as_lazy` or `stack_as_rows` reads."""
-    return list(getattr(array, "gyrostab_pieces", ()))
+    """Return the piecewise columns that a lazy array reads."""
+    source = find_source(array)
+    if isinstance(source, PiecewiseColumn):
+        return [source]
+    return [] if source is None else [column for part in source.parts for column in pieces_of(part)]

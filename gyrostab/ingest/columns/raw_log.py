@@ -24,7 +24,7 @@ from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store.row_inspection import RowInspection, with_inspections
+from gyrostab.store.row_inspection import RowInspection
 
 __all__ = ["ConvertedBlock", "RawLogBuilder", "summary_of"]
 
@@ -296,8 +296,7 @@ class RawLogBuilder:
         coords: dict[str, Any] = {}
         if self.gyro and self.plan.signal is not None:
             axes = [column.name for column in self.gyro]
-            stack = stack_as_rows([columns[column.source] for column in self.gyro])
-            stack = with_inspections(stack, self.seen) if self.seen else stack
+            stack = stack_as_rows([columns[column.source] for column in self.gyro], self.seen)
             data[self.plan.signal] = (
                 ("axis", "row"),
                 stack,

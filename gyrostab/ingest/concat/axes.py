@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.errors import SchemaError
 from gyrostab.schema import signal_name, texts
-from gyrostab.store.lazy_slices import select_row, select_span, stack_rows
+from gyrostab.store.lazy import select_part, stack_rows
 
 __all__ = ["group_axes", "split_axes"]
 
@@ -76,15 +76,13 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
         zip(texts(raw, "source_files"), np.atleast_1d(raw.attrs["row_start"]).tolist(), strict=True)
     )
     for number, (axes, first, end) in enumerate(groups):
-        rows = [
-            select_span(select_row(signal.data, places.index(axis)), first, end) for axis in axes
-        ]
+        rows = [select_part(signal.data, places.index(axis), first, end) for axis in axes]
         stacked = np.stack(rows) if isinstance(rows[0], np.ndarray) else stack_rows(rows)
         data: dict[Any, Any] = {name: (("axis", "row"), stacked, signal.attrs, signal.encoding)}
         for key, variable in raw.data_vars.items():
             if key != name and (variable.dims == ("row",) or number == 0):
                 kept = (
-                    select_span(variable.data, first, end)
+                    select_part(variable.data, None, first, end)
                     if variable.dims == ("row",)
                     else variable.data
                 )
@@ -95,7 +93,7 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
             if str(key).startswith("time_") and number == 0
         }
         if "time" in raw.variables:
-            coords["time"] = xr.Variable("row", select_span(raw["time"].data, first, end))
+            coords["time"] = xr.Variable("row", select_part(raw["time"].data, None, first, end))
         own = [(file, start - first) for file, start in files if first <= start < end]
         attrs = {key: value for key, value in raw.attrs.items() if key != "axis_rows"}
         attrs |= {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -13,9 +12,8 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import UnitError
 from gyrostab.ingest.concat.grid import PlacedLog
-from gyrostab.ingest.concat.lazy import PlacedArray, place_on_grid, read_parts_into
+from gyrostab.ingest.concat.lazy import PlacedArray, chunk_of, place_on_grid
 from gyrostab.schema import log_channels
-from gyrostab.store.lazy_slices import can_read_into, with_row_reader
 from gyrostab.time.grid import grid_index, grid_times
 
 __all__ = ["concatenate_channels"]
@@ -160,18 +158,11 @@ def _select_values(arrays: Sequence[Any], places: NDArray[np.int64]) -> Any:
     """Select the values at `places` as lazy slices; load them if the slices would be very many."""
     if all(isinstance(array, np.ndarray) for array in arrays):
         return np.concatenate(arrays)[places]
-    import dask.array as da
+    if np.count_nonzero(np.diff(places) != 1) >= _MAX_SLICES_PER_LOG * (len(arrays) + 1):
+        import dask.array as da
 
-    whole = da.concatenate([da.asarray(array) for array in arrays])
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(places) != 1) + 1, [len(places)]])
-    if len(edges) > _MAX_SLICES_PER_LOG * (len(arrays) + 1):
-        return np.asarray(whole)[places]
-    taken = da.concatenate([whole[places[a] : places[b - 1] + 1] for a, b in pairwise(edges)])
-    return (
-        with_row_reader(taken, partial(read_parts_into, [_slices_at(arrays, places)]))
-        if all(map(can_read_into, arrays))
-        else taken
-    )
+        return np.asarray(da.concatenate([da.asarray(array) for array in arrays]))[places]
+    return place_on_grid([_slices_at(arrays, places)], len(places), chunk_of(arrays), flat=True)
 
 
 def _slices_at(arrays: Sequence[Any], places: NDArray[np.int64]) -> list[PlacedArray]:

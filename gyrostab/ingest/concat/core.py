@@ -21,7 +21,8 @@ from gyrostab.ingest.concat.place import place_logs
 from gyrostab.ingest.gap_table import format_stamp, gap_variables, name_lost
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
-from gyrostab.store import common_packing
+from gyrostab.store.private import close_function
+from gyrostab.store.write import common_packing
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_times, time_coordinate
@@ -132,7 +133,7 @@ def concatenate_logs(
         _common_attributes(sources, size, [*notes, *_describe_absent(sources, axes)]),
     )
     joined.set_close(
-        partial(_close_files, [log._close for log in logs if log._close is not None])
+        partial(_close_files, list(filter(None, map(close_function, logs))))
     )  # keeps no other reference to the logs
     return joined
 

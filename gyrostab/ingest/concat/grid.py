@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,7 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.schema import signal_name
-from gyrostab.store.lazy_slices import read_slice
+from gyrostab.store.lazy import read_slice
+from gyrostab.store.threads import map_in_order
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_times
 
 __all__ = ["LogSlice", "PlacedLog", "Source", "log_span", "read_log_slices", "runs_of", "source_of"]
@@ -90,13 +90,8 @@ class PlacedLog:
 
 def read_log_slices(wanted: Iterable[LogSlice]) -> dict[LogSlice, NDArray[np.float64]]:
     """Read the signals of slices (axis, sample) in parallel; NaN beyond the ends of a log."""
-    from dask.system import CPU_COUNT
-
     places = list(dict.fromkeys(wanted))
-    if not places:
-        return {}
-    with ThreadPoolExecutor(CPU_COUNT) as pool:
-        return dict(zip(places, pool.map(_read_log_slice, places), strict=True))
+    return dict(zip(places, map_in_order(_read_log_slice, places), strict=True))
 
 
 def _read_log_slice(place: LogSlice) -> NDArray[np.float64]:

@@ -36,8 +36,9 @@ from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
-from gyrostab.store import name_file_in_errors, open_stored, read_attribute
 from gyrostab.store.cf import from_disk
+from gyrostab.store.layout import read_attribute
+from gyrostab.store.read import open_stored
 from gyrostab.store.rows import LibraryRows, Rows
 from gyrostab.time.grid import grid_times, time_coordinate
 from gyrostab.units import ON_DISK
@@ -116,9 +117,7 @@ def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     stored = _open_regular(path)
     if stored is None:
         return None
-    log = _as_in_memory(
-        path, _chunk_variables(decode_variables(path.name, name_file_in_errors(stored, path)))
-    )  # an index would load every stamp
+    log = _as_in_memory(path, decode_variables(path, stored))  # an index would load every stamp
     log.set_close(stored.close)
     check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
     try:
@@ -201,14 +200,6 @@ def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
     with reading_of(path):
         group = zarr.open_group(path, mode="r")
         return group.metadata.zarr_format, dict(group.attrs)
-
-
-def _chunk_variables(stored: xr.Dataset) -> xr.Dataset:
-    """Convert the variables to dask arrays, in the chunks of the file."""
-    chunks: dict[Any, int] = {}
-    for variable in stored.variables.values():
-        chunks |= variable.encoding.get("preferred_chunks", {})
-    return stored.chunk(chunks)
 
 
 def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:

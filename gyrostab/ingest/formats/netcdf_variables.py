@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import reading_of
 from gyrostab.ingest.formats.netcdf_classic import read_classic_header
 from gyrostab.ingest.limits import check_chunk
-from gyrostab.store import library_lock
+from gyrostab.store.private import library_lock
 from gyrostab.store.rows import ChunkedRows, EvenRows, LibraryRows, Rows, hdf5_rows
 
 __all__ = ["StoredVariable", "open_variables", "with_default_fill"]
@@ -221,18 +223,15 @@ def _load_zarr(
 def _zarr_fill(array: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return the number that marks missing values.
 
-    xarray stores it as the fill value of the array in format 2, and as a coded attribute in format
-    3. A fill value of 0 is the default of Zarr and does not mark missing values.
+    xarray stores it as the fill value of the array in format 2, and as an attribute in format 3 (of
+    floats, eight bytes in base64). A fill value of 0 is the default of Zarr and does not
+    mark missing values.
     """
     if "_FillValue" in attributes:
-        from xarray.backends.zarr import FillValueCoder
-
         value = attributes["_FillValue"]
-        return {
-            "_FillValue": FillValueCoder.decode(value, np.dtype(array.dtype))
-            if isinstance(value, str)
-            else value
-        }
+        if isinstance(value, str) and np.dtype(array.dtype).kind == "f":
+            value = struct.unpack("<d", base64.standard_b64decode(value))[0]
+        return {"_FillValue": value}
     usable = (
         array.metadata.zarr_format == 2 and array.fill_value is not None and bool(array.fill_value)
     )

@@ -12,18 +12,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from xarray.backends import BackendArray
-from xarray.core.indexing import (
-    ExplicitIndexer,
-    IndexingSupport,
-    LazilyIndexedArray,
-    explicit_indexing_adapter,
-)
 
 from gyrostab.errors import FormatError, UnitError
 from gyrostab.ingest.columns.plan import Column, Plan
@@ -36,6 +30,7 @@ from gyrostab.ingest.columns.stamps import (
     parse_time_unit,
     signed_counts,
 )
+from gyrostab.store.lazy import Converted, FileVariable, Source, make_dask
 
 __all__ = [
     "ATTRIBUTES",
@@ -333,13 +328,13 @@ def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
     return replace(unit, ns=step, epoch=None if unit.epoch is None else unit.epoch + int(shift))
 
 
-def decode_variables(name: str, stored: xr.Dataset) -> xr.Dataset:
-    """Decode the variables of an undecoded dataset lazily, when they are read.
+def decode_variables(path: Path, stored: xr.Dataset) -> xr.Dataset:
+    """Decode the variables of an undecoded dataset lazily, in the chunks of the file.
 
     Parameters
     ----------
-    name : str
-        The file, for messages.
+    path : Path
+        The file; it is named in errors of later reads.
     stored : xarray.Dataset
         Stored variables, with all attributes.
 
@@ -354,19 +349,26 @@ def decode_variables(name: str, stored: xr.Dataset) -> xr.Dataset:
     FormatError, UnitError
         When an attribute has no usable value, or an epoch is ambiguous.
     """
-    variables = {
-        key: _decode_variable(name, key, variable) for key, variable in stored.variables.items()
-    }
+    chunks: dict[Any, int] = {}
+    for variable in stored.variables.values():
+        chunks |= variable.encoding.get("preferred_chunks", {})
+    variables = {}
+    for key, variable in stored.variables.items():
+        source, attrs, encoding = _decode_variable(path, key, variable)
+        lazy = make_dask(source, tuple(chunks.get(dim, -1) for dim in variable.dims))
+        variables[key] = xr.Variable(variable.dims, lazy, attrs, encoding)
     coords = {key: variables.pop(key) for key in stored.coords}
-    decoded = xr.Dataset(variables, xr.Coordinates(coords, indexes={}), stored.attrs)
-    decoded.set_close(stored._close)
-    return decoded
+    return xr.Dataset(variables, xr.Coordinates(coords, indexes={}), stored.attrs)
 
 
-def _decode_variable(name: str, key: Any, variable: xr.Variable) -> xr.Variable:
+def _decode_variable(
+    path: Path, key: Any, variable: xr.Variable
+) -> tuple[Source, dict[Any, Any], dict[Any, Any]]:
+    """Return values, attributes and encoding of a variable."""
+    source, where = FileVariable(variable, path), f"{path.name}: variable {key!r}"
     if variable.dtype.kind not in "iuf":
-        return variable
-    packing = Packing.from_attributes(f"{name}: variable {key!r}", variable.dtype, variable.attrs)
+        return source, variable.attrs, variable.encoding
+    packing = Packing.from_attributes(where, variable.dtype, variable.attrs)
     attrs = {
         attribute: value for attribute, value in variable.attrs.items() if attribute not in _PACKING
     }
@@ -377,31 +379,16 @@ def _decode_variable(name: str, key: Any, variable: xr.Variable) -> xr.Variable:
                 str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None))
             )
         except UnitError as error:
-            raise UnitError(f"{name}: variable {key!r}: {error}") from error
-        stamps = _DecodedArray(variable, partial(_read_stamps, packing, unit), "datetime64[ns]")
-        return xr.Variable(variable.dims, LazilyIndexedArray(stamps), attrs, chunks)
+            raise UnitError(f"{where}: {error}") from error
+        read = partial(_read_stamps, packing, unit)
+        return Converted(source, read, "datetime64[ns]"), attrs, chunks
     if packing.is_identity and packing.dtype == variable.dtype:
-        return variable
+        return source, variable.attrs, variable.encoding
     encoding = dict(chunks)
     if packing.dtype.kind in "iu" and packing.scale != 1.0:
         encoding |= {"dtype": variable.dtype, "scale_factor": packing.scale}
         encoding |= {"add_offset": packing.offset} if packing.offset else {}
-    values = _DecodedArray(variable, packing.read_values, np.float64)
-    return xr.Variable(variable.dims, LazilyIndexedArray(values), attrs, encoding)
-
-
-class _DecodedArray(BackendArray):
-    """An array that decodes only the parts that are read."""
-
-    def __init__(self, variable: xr.Variable, decode: Decoder, dtype: Any):
-        self.variable, self.decode = variable, decode
-        self.shape, self.dtype = variable.shape, np.dtype(dtype)
-
-    def __getitem__(self, key: ExplicitIndexer) -> Any:
-        return explicit_indexing_adapter(key, self.shape, IndexingSupport.OUTER, self._read_key)
-
-    def _read_key(self, key: tuple[Any, ...]) -> Any:
-        return self.decode(self.variable[key].values)
+    return Converted(source, packing.read_values, np.float64), attrs, encoding
 
 
 def _read_stamps(packing: Packing, unit: TimeUnit, stored: Any) -> NDArray[np.datetime64]:

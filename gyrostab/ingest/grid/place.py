@@ -24,7 +24,7 @@ from gyrostab.kernels.grid.stamps import (
     RESTART,
     STEP,
 )
-from gyrostab.store.lazy_slices import read_slice
+from gyrostab.store.lazy import read_slice
 from gyrostab.time.grid import period_ns
 
 __all__ = [

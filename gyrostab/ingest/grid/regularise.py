@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import OptionError, TimeError
+from gyrostab.ingest.columns.pieces import PiecewiseColumn
 from gyrostab.ingest.gap_table import gap_variables, name_lost
 from gyrostab.ingest.grid.axes import regularise_axes
 from gyrostab.ingest.grid.fill import gather_channel, rows_on_grid
@@ -42,8 +43,8 @@ from gyrostab.ingest.grid.starting_period import Stamps
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
-from gyrostab.store import chunk_samples
-from gyrostab.store.lazy_slices import read_slice
+from gyrostab.store.lazy import find_source, read_slice
+from gyrostab.store.write import chunk_samples
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import check_rate, check_span, period_ns, stamp_ns, time_coordinate
@@ -170,9 +171,8 @@ def _place_even(
 
     Returns None if the stamps are not even, a row has no sample, or the beginning has notes.
     """
-    line: tuple[int, int] | None = (
-        getattr(raw["time"].data, "gyrostab_line", None) if "time" in raw.variables else None
-    )
+    clock = find_source(raw["time"].data) if "time" in raw.variables else None
+    line = clock.find_line() if isinstance(clock, PiecewiseColumn) else None
     if line is None or scanned.absent or scanned.repeated or scanned.rows <= _EVEN_ROWS:
         return None
     start, step = line

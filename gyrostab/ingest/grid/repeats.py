@@ -10,7 +10,7 @@ from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
 from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
-from gyrostab.store.lazy_slices import read_slice
+from gyrostab.store.lazy import read_slice
 
 __all__ = ["find_repeats", "with_repeats"]
 

@@ -12,8 +12,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.pieces import InspectedRows
 from gyrostab.schema import texts
-from gyrostab.store.lazy_slices import read_slice
+from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.store.row_inspection import RowInspection, inspect_rows
 from gyrostab.store.threads import map_in_order
 
@@ -94,7 +95,10 @@ def _scan_blocks(
 ) -> Iterable[RowInspection]:
     """Yield the findings of each block, from the reader if it has scanned it."""
     rows = raw.sizes["row"]
-    seen: list[RowInspection] = getattr(raw[name].data, "gyrostab_inspections", [])
+    source = find_source(raw[name].data)
+    seen: Sequence[RowInspection] = ()
+    if isinstance(source, InspectedRows):
+        seen = source.inspections
     whole = sum(inspection.rows for inspection in seen) == rows and all(
         inspection.rows % 8 == 0 for inspection in seen[:-1]
     )

@@ -22,7 +22,7 @@ from gyrostab.ingest.gap_table import (
 )
 from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
 from gyrostab.schema import GAP_CAUSES, check_log, signal_name, texts
-from gyrostab.store.lazy_slices import make_lazy
+from gyrostab.store.private import close_function
 from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 
 __all__ = [
@@ -213,7 +213,7 @@ def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: in
         log.drop_vars(list(moved)).assign(placed).assign_coords(time_coordinate(start, rate, size))
     )
     whole = whole[[name for name in log.data_vars if name in whole.data_vars]]
-    whole.set_close(log._close)
+    whole.set_close(close_function(log))
     if left_out:
         note = f"left out, as missing samples of it could not be marked: {', '.join(left_out)}"
         whole = whole.assign_attrs(notes=[*texts(log, "notes"), note])
@@ -230,13 +230,9 @@ def _place_array(array: Any, runs: Runs, size: int) -> Any:
             ..., np.repeat(runs[:, 1], length) + within
         ]
         return out
-    lazy = make_lazy(array, CHUNK_SAMPLES) if isinstance(array, np.ndarray) else array
-    rows = (
-        [[(lazy, None, runs)]]
-        if array.ndim == 1
-        else [[(lazy, row, runs)] for row in range(array.shape[0])]
-    )
-    return place_on_grid(rows, size, chunk_of([lazy]), flat=array.ndim == 1)
+    chunk = CHUNK_SAMPLES if isinstance(array, np.ndarray) else chunk_of([array])
+    rows = [None] if array.ndim == 1 else range(array.shape[0])
+    return place_on_grid([[(array, row, runs)] for row in rows], size, chunk, flat=array.ndim == 1)
 
 
 Table = NDArray[np.int64]

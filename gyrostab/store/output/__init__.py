@@ -5,9 +5,7 @@ from gyrostab.store.output.content import find_foreign_item, read_json
 from gyrostab.store.output.inputs import (
     describe_file,
     find_sources,
-    pass_sources,
     protect_inputs,
-    remember_source,
 )
 from gyrostab.store.output.write import (
     is_leftover,
@@ -27,10 +25,8 @@ __all__ = [
     "is_leftover",
     "new_folder",
     "new_output",
-    "pass_sources",
     "protect_inputs",
     "read_json",
-    "remember_source",
     "remove_leftovers",
     "replace_file",
     "resolve_link",

@@ -23,10 +23,8 @@ __all__ = [
     "describe_file",
     "find_sources",
     "match_files",
-    "pass_sources",
     "protect_inputs",
     "protected_inputs",
-    "remember_source",
 ]
 
 #: Inputs of the current command, each with its first `describe_file`; None where a change does not
@@ -34,8 +32,6 @@ __all__ = [
 _PROTECTED: ContextVar[dict[Path, dict[str, Any] | None] | None] = ContextVar(
     "_PROTECTED", default=None
 )
-#: Files that lazy arrays read, by name of the array.
-_SOURCES: dict[str, set[Path]] = {}
 
 
 def describe_file(path: Path) -> dict[str, Any]:
@@ -137,21 +133,6 @@ def check_unchanged() -> None:
             )
 
 
-def remember_source(array: Any, path: Path) -> None:
-    """Remember the file that a lazy array reads."""
-    _SOURCES[array.name] = {path}
-
-
-def pass_sources(array: Any, *derived: Any) -> None:
-    """Remember the files of derived lazy arrays, if their graphs do not show them."""
-    for made in derived:
-        _SOURCES[made.name] = _find_array_sources(array)
-
-
-def _find_array_sources(array: Any) -> set[Path]:
-    return set().union(*(_SOURCES.get(layer, ()) for layer in array.__dask_graph__().layers))
-
-
 def find_sources(dataset: Any) -> list[Path]:
     """Find the known files that a lazy `xarray.Dataset` still reads from.
 
@@ -161,17 +142,12 @@ def find_sources(dataset: Any) -> list[Path]:
     >>> find_sources(xr.Dataset({"rate": ("time", [1.0])}))
     []
     """
-    lazy = [variable for variable in dataset.variables.values() if not variable._in_memory]
+    from gyrostab.store.lazy import find_files
+    from gyrostab.store.private import is_in_memory
+
+    lazy = [variable for variable in dataset.variables.values() if not is_in_memory(variable)]
     named = [variable.encoding.get("source") for variable in lazy] + [
         dataset.encoding.get("source") if lazy else None
     ]
     found = {Path(path) for path in named if path is not None}
-    return sorted(
-        found.union(
-            *(
-                _find_array_sources(variable.data)
-                for variable in lazy
-                if variable.chunks is not None
-            )
-        )
-    )
+    return sorted(found.union(*(find_files(v.data) for v in lazy if v.chunks is not None)))
