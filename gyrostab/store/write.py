@@ -11,7 +11,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import dask
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -230,6 +229,7 @@ def _copy_variables(
     progress: Progress | None,
 ) -> None:
     """Read lazy variables in threads, in whole chunks, and write them in order meanwhile."""
+    import dask
     from dask.system import CPU_COUNT
 
     direct = {name: v for name, v in long.items() if find_source(v.data) is not None}
@@ -270,6 +270,8 @@ def _read_segment(long: dict[str, xr.Variable], segment: _Segment) -> _Batch:
 
 
 def _compute_batch(long: dict[str, xr.Variable], batch: list[_Segment]) -> _Batch:
+    import dask
+
     lazy = [long[name].data[(*row, slice(begin, begin + span))] for name, row, begin, span in batch]
     return list(zip(batch, dask.compute(*lazy), strict=True))
 
