@@ -127,7 +127,8 @@ def find_source(array: Any) -> Source | None:
 def _source_in_layer(graph: Any, name: str) -> Source | None:
     layer = getattr(graph, "layers", {}).get(name, {})
     found = layer.get(name)
-    found = getattr(found, "value", found)  # some versions of dask wrap data of a graph
+    if not isinstance(found, Source):
+        found = getattr(found, "value", None)  # some versions of dask wrap data of a graph
     return found if isinstance(found, Source) else None
 
 
