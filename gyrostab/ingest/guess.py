@@ -24,6 +24,9 @@ from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 
 __all__ = ["Guess", "guess_columns"]
 
+#: Number of a column, in its name.
+_NUMBER = re.compile(r"[0-9]{1,9}\Z")
+
 
 #: Typical rate of gyro logs [Hz], and spread [decades].
 TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
@@ -287,11 +290,11 @@ def _group_columns(
                         if letter in found
                     },
                 )
+        numbered = [(int(text), column) for text, column in found.items() if _NUMBER.match(text)]
         digits = sorted(
-            ((int(text), column) for text, column in found.items() if text.isdigit()),
+            ((number, column) for number, column in numbered if column.rising < 0.9),
             key=lambda pair: pair[0],
         )
-        digits = [(number, column) for number, column in digits if column.rising < 0.9]
         for place in range(0, len(digits) - 2, 3 if len(digits) % 3 == 0 else 1):
             numbers, trio_columns = zip(*digits[place : place + 3], strict=True)
             if numbers[2] - numbers[0] == 2:

@@ -21,6 +21,9 @@ from gyrostab.simulate.noise import FLICKER_LOW
 
 __all__ = ["PROFILES", "Model", "read_model"]
 
+#: Largest noise coefficient: its square, and sums of squares, stay within the range of numbers.
+_MAX_COEFFICIENT = 1e100
+
 #: Function of the environment -> (the function, unit of each number).
 PROFILES: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
     "steps": (environment.steps, {"sensor_rate": "Hz"}),
@@ -222,11 +225,12 @@ def _read_coefficient(term: str, value: Any, where: str) -> float:
     if (
         isinstance(number, bool)
         or not isinstance(number, int | float)
-        or not math.isfinite(number)
+        or not abs(number) <= _MAX_COEFFICIENT
         or (number < 0 and term != "R")
     ):
         raise OptionError(
-            f"{where}: {term} = {value!r} is not a number from 0 up; give one in {LAWS[term].label}"
+            f"{where}: {term} = {value!r} is not a number from 0 to {_MAX_COEFFICIENT:g}; give one "
+            f"in {LAWS[term].label}"
         )
     return float(number)
 

@@ -25,7 +25,12 @@ from gyrostab.errors import FormatError, SchemaError
 from gyrostab.schema import check_log, check_product, check_surface, texts
 from gyrostab.store.lazy import transpose_lazy
 from gyrostab.store.private import close_function, is_in_memory
-from gyrostab.store.safe_names import make_names_storable, restore_names
+from gyrostab.store.safe_names import (
+    is_storable,
+    make_name_storable,
+    make_names_storable,
+    restore_names,
+)
 from gyrostab.time.clock import time_of_day
 from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import ON_DISK, on_disk
@@ -230,6 +235,8 @@ def _encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
             attrs["units"] = units
         else:
             attrs["source_units"] = attrs.pop("units")
+    for name in [name for name in attrs if not is_storable(str(name))]:
+        attrs[make_name_storable(str(name), attrs, kind="attribute")] = attrs.pop(name)
     coded = []
     for name, value in attrs.items():
         if isinstance(value, np.generic):

@@ -10,7 +10,7 @@ from typing import Any
 
 import xarray as xr
 
-__all__ = ["is_storable", "make_names_storable", "restore_names"]
+__all__ = ["is_storable", "make_name_storable", "make_names_storable", "restore_names"]
 
 # NetCDF User's Guide, "Permitted characters in netCDF names"; Zarr adds that a name is part of a
 # path, and reserves two underscores.
@@ -33,9 +33,16 @@ def is_storable(name: str) -> bool:
     return _STORABLE.fullmatch(name) is not None and len(name.encode()) <= _MAX_NAME_BYTES
 
 
-def _make_safe(name: str, taken: Iterable[str]) -> str:
+def make_name_storable(name: str, taken: Iterable[Any], *, kind: str = "channel") -> str:
+    """Make a name that files can hold, not among those `taken`.
+
+    Examples
+    --------
+    >>> make_name_storable("{{7*7}}", ["channel_7_7"])
+    'channel_7_7_2'
+    """
     plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")[: _MAX_NAME_BYTES // 2]
-    plain = plain if plain[:1].isalpha() else f"channel_{plain}".rstrip("_")
+    plain = plain if plain[:1].isalpha() else f"{kind}_{plain}".rstrip("_")
     safe, number = plain, 1
     while safe in taken:
         number += 1
@@ -56,7 +63,7 @@ def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
     safe: dict[str, str] = {}
     for name in (str(name) for name in dataset.variables if not is_storable(str(name))):
         if name not in (f"time_{other}" for other in dataset.variables):
-            safe[name] = _make_safe(name, taken)
+            safe[name] = make_name_storable(name, taken)
             taken.add(safe[name])
     if not safe:
         return dataset

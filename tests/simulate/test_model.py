@@ -32,7 +32,8 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
             {"noise": {"N": "3 m"}},
             r"the unit 'm' is not known here; give the number in deg/sqrt\(h\)",
         ),
-        ({"noise": {"x": {"N": -1}}}, r"\[noise.x\]: N = -1 is not a number from 0 up"),
+        ({"noise": {"x": {"N": -1}}}, r"\[noise.x\]: N = -1 is not a number from 0 to 1e\+100"),
+        ({"noise": {"N": 1e300}}, r"\[noise\]: N = 1e\+300 is not a number from 0 to 1e\+100"),
         ({"noise": {"flicker_band": 3}}, "flicker_band is 3; write"),
         (
             {"log": {"rat": 10}},
