@@ -1,6 +1,6 @@
 """What gyrostab needs of xarray beyond its public interface, each with a fallback.
 
-docs/decisions/0008-private-interfaces.md lists them with their reasons.
+docs/decisions/0009-private-interfaces.md lists them with their reasons.
 """
 
 from __future__ import annotations

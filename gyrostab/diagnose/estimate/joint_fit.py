@@ -234,7 +234,7 @@ def _fit_components(
         unit = units.get(name.split(".")[0], "1")
         # a low-pass of infinite bandwidth is not given; nor is an exponent that was not measured
         if math.isfinite(mean) and not math.isnan(sd):
-            # the error of an angle has it already
+            # the error of an angle contains it
             is_exact = unit == _ANGLE or (statistic.is_line and name == _PLACE)
             form = 0.0 if is_exact else state.settings.size_error_share * mean
             estimates[name] = _make_estimate(
